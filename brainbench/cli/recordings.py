@@ -47,26 +47,32 @@ def rdm(
     options: Any = None,
     pool: Annotated[str, typer.Option(help="One RDM per 'subject', per 'session', or of 'all' together.")] = "subject",
     seed: Annotated[int, typer.Option(help="Seed of the split halves.")] = 0,
+    metric: Annotated[str, typer.Option(help="RSA metric of the RDMs; 'rsa' is that of scores.")] = "rsa-correlation",
     as_json: JsonOption = False,
 ) -> None:
-    """Compute every animal's RDM (correlation distance) and its split-half reliability."""
+    """Compute every animal's RDM and its split-half reliability."""
     from dataclasses import replace
 
+    from brainbench.core.errors import UsageError
     from brainbench.datasets.trials.session_trials import pooled
     from brainbench.metrics import get_metric
+    from brainbench.metrics.measures.rsa import RSA
     from brainbench.scoring.neural_responses import open_neural_responses
     from brainbench.scoring.options import ScoreOptions
 
+    measure = get_metric(metric)
+    if not isinstance(measure, RSA):
+        raise UsageError(f"The metric {metric!r} has no RDM of animals; choose 'rsa' or another metric of RDMs.")
     with progress_bar() as progress:
         brain = open_neural_responses(source, **options, progress=progress)
     brain = replace(brain, dataset=pooled(brain.dataset, pool))
     labels = brain.vocabulary
-    animals = brain.animals(labels, get_metric("rsa-correlation"), ScoreOptions(seed=seed))
+    animals = brain.animals(labels, measure, ScoreOptions(seed=seed))
     told = ("subject", "units", "trials", "reliability", "problem", "rdm")
     shown = [{name: getattr(item, name) for name in told} for item in animals]
     data = {"labels": labels, "recordings": brain.origin, "animals": shown}
     text = table_of(
-        f"{brain.dataset.attrs['conditions']}, {brain.dataset.attrs['window']}; RDM: correlation distance",
+        f"{brain.dataset.attrs['conditions']}, {brain.dataset.attrs['window']}; RDM: {measure.brain_method} distance",
         animals,
         {
             "animal": "{0.subject}",

@@ -55,6 +55,7 @@ def train(
     """
     from brainbench.models.training.config import TrainingConfig
     from brainbench.models.training.evaluation import RANDOM, RAW, TWIN
+    from brainbench.models.training.run_folder import BEST
     from brainbench.models.training.search_space import best_run, sweep_runs
     from brainbench.models.training.trainer import train as run
 
@@ -95,12 +96,14 @@ def train(
     text += "".join(f"\n{folder}: {result.reason}" for folder, result in results.items() if result.reason)
     done = [result for result in results.values() if result.status == "finished"]
     payload: dict[str, Any] = {"config": chosen, "runs": results}
+    best = done[-1].folder if done else None
     if sweep is not None and done:
         winner, scores = best_run(where)
         payload |= {"best": winner, "validation": scores}
         text += f"\n\nbest by validation  {winner}"
+        best = winner / BEST
     if done:
-        text += f"\n\nscore it: brainbench score local-dir:{done[-1].folder}"
+        text += f"\n\nscore it: brainbench score local-dir:{best}"
     emit(payload, text, as_json=as_json)
     diverged = [folder for folder, result in results.items() if result.status == "diverged"]
     if diverged:
@@ -117,7 +120,7 @@ class SweepFolder:
             whole.verify(again=False, progress=progress)
         self.classes = whole.classes
         self.summary: Mapping[str, Any] = whole.summary
-        self.cells = whole.cells
+        self.cells, self.axes = whole.cells, whole.axes
         self.manifest = whole.manifest
 
     def _open(self, split: str, **options: Any) -> WhiskingDataset:

@@ -60,7 +60,13 @@ class SessionTable:
         self.require(name)
         if f"{name}_index" in self.data:
             raise DataError(f"Column {name!r} of {self.label} holds a list per row; choose one with a single value.")
-        values = decode(self.data[name][...])
+        values = self.data[name][...]
+        if (names := (values.dtype.metadata or {}).get("enum")) is not None:
+            # The numbers of an HDF5 enumeration may differ between files; its names are what was meant.
+            known = {number: word for word, number in names.items()}
+            words = [known.get(number, str(number)) for number in values.ravel().tolist()]
+            values = np.array(words, dtype=str).reshape(values.shape)
+        values = decode(values)
         if values.ndim != 1 or values.dtype.kind not in "biufU":
             raise DataError(
                 f"Column {name!r} of {self.label} has shape {values.shape} and type {values.dtype}; expected one "

@@ -50,8 +50,8 @@ def extract(
 
     A model with ``layers`` and ``activations`` (all of ours) gives its named layers. Any other module is
     read by hooks at its leaf modules, and at its output under the name ``output``. A hooked layer that is
-    called once has the time axis of the stimuli if its tensor is [B, T, ...], [T, B, ...] or [B·T, ...],
-    else T = 1; one called several times per sweep is stacked over calls as time (over calls of unequal
+    called once has the time axis of the stimuli if its tensor is [B, T, ...], [T, B, ...], [B·T, ...] or
+    [T·B, ...], else T = 1; one called several times per sweep is stacked over calls as time (over calls of unequal
     shape: ``name[0]``, ``name[1]``, …). Of a tuple or mapping the first tensor counts.
 
     The model runs in evaluation mode without gradients; modes are put back and no hook stays. Memory
@@ -89,13 +89,15 @@ def extract(
         reader = partial(published_activations, model, layers=layers)
     else:
         reader = named_reader(model, layers)
-        reader = reader or partial(_hooked_run, model, _hooked(model, layers), layers is not None)
+        reader = reader or partial(_hooked_run, model, _hooked(model, layers), layers is not None, {})
     result = Activations()
     with evaluating(model), torch.no_grad():
         for start, stop in _chunks(len(values), chunk, avoid=values.shape[1]):
             part = torch.as_tensor(_writable(values[start:stop])).to(device=like.device, dtype=like.dtype)
             for name, activity in _run(reader, part, model, values).items():
-                rows = activity.detach().to("cpu", dtype=torch.float32).flatten(2).numpy()
+                # Real and imaginary parts are features of their own.
+                real = torch.view_as_real(activity.resolve_conj()) if activity.is_complex() else activity
+                rows = real.detach().to("cpu", dtype=torch.float32).reshape(*real.shape[:2], -1).numpy()
                 if name not in result:
                     result[name] = _room(name, (len(values), *rows.shape[1:]), folder)
                 elif result[name].shape[1:] != rows.shape[1:]:
@@ -201,9 +203,42 @@ def _hooked(model: nn.Module, layers: Collection[str] | None) -> dict[str, nn.Mo
 
 
 def _hooked_run(
-    model: nn.Module, modules: dict[str, nn.Module], strict: bool, part: torch.Tensor
+    model: nn.Module, modules: dict[str, nn.Module], strict: bool, time_first: dict[str, bool], part: torch.Tensor
 ) -> dict[str, torch.Tensor]:
-    """Run any module and return what submodules gave, read by forward hooks; if strict, each must give something."""
+    """Run any module and return what submodules gave, read by forward hooks; if strict, each must give something.
+
+    ``time_first`` keeps, for layers that join stimuli and steps in one axis, whether steps come first in it.
+    """
+    calls = _recorded(model, modules, part)
+    batch, steps = part.shape[:2]
+    joined = [name for name, outputs in calls.items() for item in outputs[:1] if item.shape[:1] == (batch * steps,)]
+    if min(batch, steps) > 1 and (asked := [name for name in joined if name not in time_first]):
+        # Both orders have one shape. Stimuli in another order tell which one it is: a layer's rows move with them.
+        moved = _recorded(model, {name: modules[name] for name in asked}, part.roll(1, 0))
+        for name in asked:
+            one, two = calls[name][0].float(), moved[name][0].float()
+            ours = (one.unflatten(0, (batch, steps)).roll(1, 0).flatten(0, 1) - two).abs().nan_to_num().sum()
+            theirs = (one.unflatten(0, (steps, batch)).roll(1, 1).flatten(0, 1) - two).abs().nan_to_num().sum()
+            # Where rows are equal, later stimuli tell.
+            if max(ours, theirs) > 1e-3 * one.abs().nan_to_num().sum():
+                time_first[name] = bool(theirs < ours)
+    found = {}
+    for name, outputs in calls.items():
+        if time_first.get(name):
+            outputs = [
+                item.unflatten(0, (steps, batch)).transpose(0, 1) if item.shape[:1] == (batch * steps,) else item
+                for item in outputs
+            ]
+        activity = _over_calls(name, outputs, batch, steps)
+        if not activity and strict:
+            seen = [list(output.shape) for output in outputs] or "nothing"
+            raise _LayerError(f"Layer {name!r} gave {seen} for {batch} stimuli of {steps} steps, not one each.")
+        found |= activity
+    return found
+
+
+def _recorded(model: nn.Module, modules: dict[str, nn.Module], part: torch.Tensor) -> dict[str, list[torch.Tensor]]:
+    """Run a module and return what each submodule gave, call by call."""
     calls: dict[str, list[torch.Tensor]] = {name: [] for name in modules}
 
     def record(name: str, output: Any) -> None:
@@ -216,15 +251,7 @@ def _hooked_run(
             handle = module.register_forward_hook(lambda _, inputs, output, name=name: record(name, output))
             handles.callback(handle.remove)
         model(part)
-    batch, steps = part.shape[:2]
-    found = {}
-    for name, outputs in calls.items():
-        activity = _over_calls(name, outputs, batch, steps)
-        if not activity and strict:
-            seen = [list(output.shape) for output in outputs] or "nothing"
-            raise _LayerError(f"Layer {name!r} gave {seen} for {batch} stimuli of {steps} steps, not one each.")
-        found |= activity
-    return found
+    return calls
 
 
 def _first_tensor(value: Any) -> torch.Tensor | None:

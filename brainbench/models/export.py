@@ -54,7 +54,8 @@ def export_model(model: nn.Module, path: str | Path, *, format: str = "onnx", na
     """
     import copy
 
-    from brainbench.core.files import atomic_path, content_hash, provenance, write_json
+    from brainbench.core.files import atomic_path, provenance, write_json
+    from brainbench.models.ops.parameters import weights_hash
     from brainbench.models.streaming import StreamingStep
 
     check_name("export format", format, SUFFIXES)
@@ -72,7 +73,6 @@ def export_model(model: nn.Module, path: str | Path, *, format: str = "onnx", na
                 f"{TOLERANCE:g}), so it was not kept."
             )
     spec: Any = model.spec
-    state = {key: value.detach().cpu() for key, value in model.state_dict().items()}
     contract = {
         "model": name or type(model).__name__,
         "format": format,
@@ -86,7 +86,7 @@ def export_model(model: nn.Module, path: str | Path, *, format: str = "onnx", na
         "full": None if spec.max_steps is None else f"after {spec.max_steps} steps without a reset features are NaN",
         **{key: value for key, value in asdict(spec).items() if key != "outputs"},
         "difference": difference,
-        "weights": content_hash(*(part for key in sorted(state) for part in (key, state[key].numpy()))),
+        "weights": weights_hash(model),
         "provenance": provenance(),
     }
     file = write_json(target.with_name(f"{target.name}.json"), contract)

@@ -6,7 +6,7 @@ last step to [B, classes]. Everything is causal: :meth:`EncoderAttenderDecoder.s
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -50,6 +50,12 @@ class ModelSpec:
     max_steps: int | None
     """Longest sweep; None: any."""
     outputs: int
+
+    def trained_on(self, data: Mapping[str, Any]) -> ModelSpec:
+        """Return the contract of a network after training on data whose card tells other time steps or axes."""
+        rate = 1.0 / data["time_step"] if "time_step" in data else self.sample_rate
+        frame = self.frame.replace("world", str(data.get("axes", "world")), 1)
+        return replace(self, sample_rate=rate, frame=frame)
 
 
 @dataclass(frozen=True)

@@ -157,6 +157,10 @@ class LocatedModel:
             model = self._make(options)
         if self.weights is not None:
             load_weights(model, self.weights, what=self.name)
+        data: Any = (self.trained or {}).get("data")
+        spec: Any = getattr(model, "spec", None)
+        if data and hasattr(spec, "trained_on"):
+            model.spec = spec.trained_on(data)
         return model.eval()
 
     def outline(self) -> nn.Module:

@@ -14,7 +14,7 @@ import numpy as np
 
 from brainbench.core.contracts import CHANNELS
 from brainbench.core.errors import UsageError, check_each, unknown_name
-from brainbench.core.files import content_hash, file_hash
+from brainbench.core.files import file_hash
 from brainbench.core.progress import Progress
 from brainbench.core.reading.regular import readable
 from brainbench.core.records import Interval, ModelCard
@@ -80,7 +80,7 @@ class ResolvedModel:
     def respond(self, options: ScoreOptions, *, progress: Progress | None = None) -> ModelResponses:
         """Run the model on the stimuli, or take the features that were computed elsewhere."""
         card, labels, origin, model_input = self.card, self.labels, self.origin, None
-        if not options.normalize and (self.module is None or hasattr(self.module, "spec")):
+        if not options.normalize and (self.module is None or _has_contract(self.module)):
             reads = "was computed elsewhere" if self.module is None else "normalises SI values by itself"
             raise UsageError(f"normalize=False gives SI values to plain modules; {card.name!r} {reads}: leave it out.")
         card, shown = replace(card, layer=options.layer or card.layer), None
@@ -151,6 +151,7 @@ def resolve_model(model: Any, *, seed: int = 0) -> ResolvedModel:
     import torch
 
     from brainbench.models.diagram import graph_of
+    from brainbench.models.ops.parameters import weights_hash
     from brainbench.models.registry import locate_model
     from brainbench.models.training.checkpoints import CONFIG, PREFIXES
     from brainbench.models.user_models import load_user_model
@@ -186,11 +187,10 @@ def resolve_model(model: Any, *, seed: int = 0) -> ResolvedModel:
             f"{card.name} has lazy layers without weights yet ({', '.join(lazy[:3])}): run it once, on zeros of shape "
             "[1, 22, 30, 5, 7] for instance, before you return it."
         )
-    state = {name: value.detach().cpu() for name, value in module.state_dict().items()}
-    digest = content_hash(*(part for name in sorted(state) for part in (name, state[name].numpy())))
     count = sum(parameter.numel() for parameter in module.parameters())
     layer = card.layer or getattr(module, "committed_layer", None)
-    return ResolvedModel(replace(card, parameters=count, weights=digest, graph=graph_of(module), layer=layer), module)
+    facts = {"parameters": count, "weights": weights_hash(module), "graph": graph_of(module), "layer": layer}
+    return ResolvedModel(replace(card, **facts), module)
 
 
 def _trained(config: Mapping[str, Any] | None) -> dict[str, Any]:
@@ -245,18 +245,30 @@ def _network_input(module: torch.nn.Module, stimuli: Stimuli, normalize: bool) -
         from brainbench.models.normaliser import Normaliser
 
         scaled = Normaliser.physical(given.shape[2] // len(CHANNELS))(torch.from_numpy(given)).numpy()
-    if hasattr(module, "spec"):  # ours, or made like ours: takes SI units
+    if takes_si(module):
         return given, scaled, "SI (N, N·m); normalised inside the model"
     if stimuli.dataset is None:
         return given, scaled, "as given"
     return (scaled, scaled, "forces in 1e-4 N, moments in 1e-6 N·m") if normalize else (given, scaled, "SI (N, N·m)")
 
 
+def takes_si(module: torch.nn.Module) -> bool:
+    """Return whether a module, or a network of ours inside it, normalises SI values by itself."""
+    from brainbench.models.normaliser import Normaliser
+
+    return _has_contract(module) or any(isinstance(part, Normaliser) for part in module.modules())
+
+
+def _has_contract(module: Any) -> bool:
+    """Return whether a module is a network of ours, or made like ours."""
+    return hasattr(getattr(module, "spec", None), "sample_rate")
+
+
 def _unlike_training(module: Any, stimuli: Stimuli) -> str:
     """Return how the frames of simulated stimuli differ from those that a network of ours is made for; else ''."""
     spec: Any = getattr(module, "spec", None)
     dataset = stimuli.dataset
-    if not hasattr(spec, "sample_rate") or dataset is None:
+    if dataset is None or not _has_contract(module):
         return ""
     told = []
     gaps, axes = np.diff(dataset["time"].values), dataset.attrs.get("axes", "world")

@@ -141,9 +141,12 @@ class NeuralResponses:
 
         animals = []
         for subject, sessions in self.trials(kept, averaged=options.time == "mean").items():
-            trials = tuple(replace(item, responses=_flat(item.responses)) for item in sessions)
-            trials, note = reliable_units(trials, len(kept), least=options.units_reliability, seed=options.seed)
+            # Units are chosen over the whole window, before their bins become features.
+            chosen, note = reliable_units(sessions, len(kept), least=options.units_reliability, seed=options.seed)
+            trials = tuple(replace(item, responses=_flat(item.responses)) for item in chosen)
             animal = metric.animal(subject, trials, len(kept), stimuli=kept, seed=options.seed)
+            bins = max((item.responses.shape[1] for item in chosen), default=1)
+            animal = replace(animal, units=-(-animal.units // bins))
             if not trials and note:
                 animal = replace(animal, problem=note)
             elif note:

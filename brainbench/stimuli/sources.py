@@ -127,7 +127,11 @@ def _stimulus_set(
 ) -> tuple[xr.Dataset, str]:  # fmt: skip
     """Return what :func:`load_stimulus_set` does of a source that is known to be no file of arrays."""
     if not isinstance(source, (str, os.PathLike)):
-        return _select(check_stimulus_set(source), whiskers), "stimulus set"
+        dataset = check_stimulus_set(source)
+        if (numbers := hash_stimulus_set(dataset)) != dataset.attrs["content_hash"]:
+            # It was edited since it was hashed, so it is no longer what its configuration gives either.
+            dataset = dataset.assign_attrs(content_hash=numbers, config_hash=numbers)
+        return _select(dataset, whiskers), "stimulus set"
     from brainbench.stimuli.simulation import read_entry, simulate
 
     if cache and isinstance(backend, str) and is_packaged(source):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,11 +15,14 @@ from brainbench.core.contracts import CHANNELS, check_stimulus_set
 from brainbench.core.errors import DataError
 from brainbench.core.files import atomic_path, content_hash
 from brainbench.core.reading.hdf5 import open_hdf5
+from brainbench.stimuli.whiskers.selection import ROWS
 
 if TYPE_CHECKING:
     import xarray as xr
 
     from brainbench.stimuli.scenes.frames import Frames
+
+_CELL = re.compile(rf"(?:.*:)?[LR]?([{ROWS}])(\d+)")
 
 
 def new_stimulus_set(
@@ -56,9 +60,14 @@ def new_stimulus_set(
 
 
 def hash_stimulus_set(dataset: xr.Dataset) -> str:
-    """Hash what a stimulus set says: labels, whiskers, times, forces and the configuration behind them."""
+    """Hash what a stimulus set says: labels, whiskers and cells, times, forces and the configuration behind them."""
+    cells = [*zip(dataset["row"].values.tolist(), dataset["col"].values.tolist(), strict=True)]
+    named = [_CELL.fullmatch(str(name)) for name in dataset["whisker"].values]
+    # Names that tell their own cells need no word of them, as in sets that were hashed when cells were not.
+    own = [cell if of is None else (ROWS.index(of[1]), int(of[2])) for cell, of in zip(cells, named, strict=True)]
     return content_hash(
         {
+            **({} if own == cells else {"cells": cells}),
             "stimulus": [str(label) for label in dataset["stimulus"].values],
             "whisker": [str(name) for name in dataset["whisker"].values],
             **{key: dataset.attrs[key] for key in ("array", "scene", "fidelity", "seed", "backend")},
@@ -94,6 +103,7 @@ def read_stimulus_set(path: str | os.PathLike[str]) -> xr.Dataset:
     if hash_stimulus_set(dataset) != dataset.attrs["content_hash"]:
         raise DataError(
             f"The numbers in {name!r} do not match the content hash in the file: it was damaged or edited;"
-            " simulate the stimuli again, or set the hash anew with brainbench.stimuli.stimulus_set.hash_stimulus_set."
+            " simulate the stimuli again, or set content_hash and config_hash anew, both to"
+            " brainbench.stimuli.stimulus_set.hash_stimulus_set."
         )
     return dataset

@@ -6,6 +6,9 @@ import numpy as np
 import pytest
 
 from brainbench.datasets.synthetic import ResponseGeometry, write_files
+from brainbench.metrics import get_metric
+from brainbench.scoring.neural_responses import open_neural_responses
+from brainbench.scoring.options import ScoreOptions
 from tests.factories.published_recordings import make_zero_filled, write_published
 from tests.factories.recordings import quiet_design
 
@@ -51,6 +54,17 @@ def test_sessions_and_animals_are_pooled_on_request(run, folder, pool, names):
     result = run("recordings", "rdm", str(folder), "--conditions", "trials:stimulus", "--pool", pool, "--json")
     assert len(json.loads(result.out)["animals"]) == names
     assert run("recordings", "rdm", str(folder), "--conditions", "trials:stimulus", "--pool", "al").status == 2
+
+
+def test_the_reliability_of_scores_is_shown_before_scoring(run, folder):
+    result = run("recordings", "rdm", str(folder), "--conditions", "trials:stimulus", "--metric", "rsa", "--json")
+    ours = [animal["reliability"] for animal in json.loads(result.out)["animals"]]
+    brain = open_neural_responses(folder, progress=None, conditions="trials:stimulus")
+    animals = brain.animals(brain.vocabulary, get_metric("rsa"), ScoreOptions())
+    assert ours == [animal.reliability for animal in animals]
+    refused = run("recordings", "rdm", str(folder), "--conditions", "trials:stimulus", "--metric", "cka")
+    assert refused.status == 2
+    assert "'cka'" in refused.err
 
 
 def test_the_demo_recordings_can_be_looked_into_and_checked(run):

@@ -6,8 +6,9 @@ from pathlib import Path
 import h5py
 import pytest
 
+from brainbench.datasets.whisking.dataset import WhiskingDataset
 from brainbench.datasets.whisking.files import Shard
-from brainbench.models.training import trainer
+from brainbench.models.training import search_space, trainer
 from brainbench.models.training.augmentation import Augmentation
 from brainbench.stimuli.sweeps.generation import generate
 from tests.factories.sweep_batches import small_plan
@@ -43,14 +44,24 @@ def test_a_model_is_trained_scored_by_its_folder_and_exported(run, folder, tmp_p
     )
     assert exported.status == 0, exported.err
     assert json.loads(exported.out)["difference"] < 1e-4
-    assert json.loads((tmp_path / "s4.pt2.json").read_text())["outputs"]["features"] == ["batch", 96]
+    contract = json.loads((tmp_path / "s4.pt2.json").read_text())
+    assert contract["outputs"]["features"] == ["batch", 96]
+    assert contract["sample_rate"] == pytest.approx(20)  # five frames of these data, 10 ms apart
+
+
+def test_of_a_search_the_best_run_is_named_to_be_scored(run, folder, tmp_path, monkeypatch):
+    monkeypatch.setattr(search_space, "best_run", lambda out: (out / "other", {"other": 1.0}))
+    found = run("train", "s4-small", *_options(folder, tmp_path), "--sweep", "1/8")
+    assert found.status == 0, found.err
+    assert f"local-dir:{tmp_path / 'other' / 'best'}" in found.out.replace("\n", "")
 
 
 def test_physical_augmentation_keeps_to_the_whiskers_of_the_data(run, folder, tmp_path, monkeypatch):
     made = []
+    monkeypatch.setattr(WhiskingDataset, "axes", "follicle")
     monkeypatch.setattr(trainer, "Augmentation", lambda *values: made.append(Augmentation(*values)) or made[-1])
     assert run("train", "s4-small", *_options(folder, tmp_path / "run"), "--stop-after", "0").status == 0
-    assert [(item.kind, item.cells) for item in made] == [("physical", (16, 17, 22))]
+    assert [(item.kind, item.cells, item.axes) for item in made] == [("physical", (16, 17, 22), "follicle")]
 
 
 def test_a_stopped_run_goes_on_and_options_come_from_a_file(run, folder, tmp_path):

@@ -133,6 +133,20 @@ def test_enumerated_labels_are_names_since_their_numbers_differ_between_files(tm
         open_recordings(path, conditions="trials:kind")
 
 
+def test_labels_of_an_enumerated_type_are_names_since_their_numbers_differ_between_files(tmp_path):
+    for path, names in ((tmp_path / "a.nwb", "ab"), (tmp_path / "b.nwb", "ba")):
+        write_nwb(path, subject=path.stem, session=path.stem)
+        kind = h5py.enum_dtype({name: number for number, name in enumerate(names)}, basetype="u1")
+        with h5py.File(path, "a") as file:
+            trials = file["intervals/trials"]
+            numbers = [names.index("ab"[row % 2]) for row in range(len(trials["id"]))]
+            trials.create_dataset("kind", data=np.array(numbers, np.uint8), dtype=kind)
+    dataset = open_recordings(tmp_path, conditions="trials:kind")
+    assert dataset.attrs["vocabulary"] == ["a", "b"]
+    one, two = (dataset["stimulus"].values[dataset["subject"].values == name].tolist() for name in "ab")
+    assert one == two
+
+
 @pytest.mark.filterwarnings("ignore")
 def test_files_written_by_pynwb_are_read(tmp_path):
     """Another writer: booleans, text, ragged columns, electrode references and observed spans."""

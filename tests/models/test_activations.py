@@ -140,6 +140,54 @@ def test_time_is_found_wherever_it_is(count):
     np.testing.assert_allclose(ours["lstm"], expected, atol=1e-5, rtol=1e-4)
 
 
+@pytest.mark.parametrize("count", [1, 2, T, 7])
+@pytest.mark.parametrize("blank", [0, 4])
+def test_rows_of_all_steps_of_all_stimuli_are_told_from_rows_of_all_stimuli_of_all_steps(count, blank):
+    class Joined(nn.Module):
+        def __init__(self, time_first):
+            super().__init__()
+            self.time_first, self.wide, self.drop = time_first, nn.Linear(1050, 9), nn.Identity()
+
+        def forward(self, x):
+            rows = (x.transpose(0, 1) if self.time_first else x).flatten(2).flatten(0, 1)
+            return self.drop(self.wide(rows)[: len(x)])
+
+    x = torch.randn(count, T, 30, 5, 7)
+    x[:blank] = 0  # alike in every step, they do not tell the order
+    ours, theirs = Joined(False), Joined(True)
+    theirs.load_state_dict(ours.state_dict())
+    with torch.no_grad():
+        expected = ours.wide(x.flatten(2))
+    for model in (ours, theirs):
+        np.testing.assert_allclose(extract(model, x, layers=["wide"], chunk=3)["wide"], expected, atol=1e-5)
+
+
+def test_a_layer_of_one_number_has_one_feature(stimuli):
+    class Sums(nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.steps, self.each, self.all = nn.Identity(), nn.Identity(), nn.Identity()
+
+        def forward(self, x):
+            joined = self.steps(x.flatten(2).flatten(0, 1).sum(1)).unflatten(0, x.shape[:2])
+            return self.all(torch.stack([self.each(joined[:, t]) for t in range(x.shape[1])], 1).sum(1))
+
+    found = extract(Sums(), stimuli)
+    sums = stimuli.reshape(K, T, -1).sum(axis=2)
+    for name, expected in (("steps", sums), ("each", sums), ("all", sums.sum(axis=1, keepdims=True))):
+        np.testing.assert_allclose(found[name], expected[..., None], rtol=1e-3, atol=1e-6)
+
+
+def test_complex_activations_keep_both_parts(stimuli):
+    class Phases(nn.Module):
+        def forward(self, x):
+            return torch.fft.fft(x.flatten(2), dim=1)
+
+    found = extract(Phases(), stimuli)["output"]
+    expected = np.fft.fft(stimuli.reshape(K, T, -1), axis=1)
+    np.testing.assert_allclose(found[..., ::2] + 1j * found[..., 1::2], expected, atol=1e-8)
+
+
 def test_calls_of_unequal_shape_are_kept_apart(stimuli):
     class Shared(nn.Module):
         def __init__(self):

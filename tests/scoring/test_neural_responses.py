@@ -6,7 +6,10 @@ from brainbench.core.errors import DataError, UsageError
 from brainbench.datasets import write_recordings
 from brainbench.datasets.sessions import make_session
 from brainbench.datasets.synthetic import PopulationDesign, ResponseGeometry
+from brainbench.metrics import get_metric
 from brainbench.models.features import write_features
+from brainbench.scoring.neural_responses import open_neural_responses
+from brainbench.scoring.options import ScoreOptions
 from brainbench.scoring.scores import score_record
 from tests.factories.recordings import as_recordings
 
@@ -147,3 +150,18 @@ def test_recordings_without_labels_say_what_is_there(features, tmp_path):
         score(features(), recordings=_session(tmp_path, thing=np.tile(["a", "b", "c"], 20)))
     with pytest.raises(DataError, match="stimulus"):
         score(features(), recordings=_session(tmp_path, stimulus=np.array([""] * 60)), conditions="trials:stimulus")
+
+
+def test_bins_that_are_features_are_no_neurons():
+    whole = open_neural_responses("demo-rodgers", progress=None, bin=0.2)
+    for least in (None, 0.3):
+        mean, each = (
+            whole.animals(whole.vocabulary, get_metric("rsa"), ScoreOptions(time=time, units_reliability=least))
+            for time in ("mean", "concatenate")
+        )
+        if least is None:
+            assert [animal.units for animal in each] == [animal.units for animal in mean]
+        else:
+            counts = [whole.dataset["unit_subject"].values.tolist().count(animal.subject) for animal in each]
+            for animal, count in zip(each, counts, strict=True):
+                assert any(f"of {count} units left out" in note for note in animal.notes)

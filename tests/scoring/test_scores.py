@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 import xarray as xr
 from torch import nn
 
@@ -15,6 +16,7 @@ from brainbench.core.errors import UsageError
 from brainbench.datasets import open_recordings, write_recordings
 from brainbench.datasets.sessions import make_session
 from brainbench.models.features import write_features
+from brainbench.models.registry import load_model
 from brainbench.scoring.model_responses import resolve_model
 from brainbench.scoring.options import ScoreOptions
 from brainbench.scoring.scores import score_record
@@ -295,6 +297,34 @@ def test_the_published_readout_scores_the_layers_of_the_study(recordings: xr.Dat
         score_record(_Tiny(), **given)
     with pytest.raises(UsageError, match="computed elsewhere"):
         score_record({"fc": np.ones((6, 2))}, **given)
+
+
+@pytest.mark.parametrize("normalize", [True, False])
+def test_a_network_of_ours_inside_a_module_of_the_users_sees_si_values(normalize: bool):
+    network, array = load_model("zhuang-small"), WhiskerArray.of("mouse").select("C2")
+    stimuli = simulate([Scene("free", array)], fidelity="fast", cache=False)
+    options = ScoreOptions(stimuli=stimuli, normalize=normalize, layers=("output",))
+    card = resolve_model(nn.Sequential(network)).respond(options).card
+    assert card.input == "SI (N, N·m); normalised inside the model"
+
+
+def test_a_module_with_any_spec_is_plain():
+    class Spectrum(nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.spec = nn.Linear(1050, 3)
+
+        def forward(self, x):
+            return self.spec(x.flatten(2))
+
+    stimuli = simulate([Scene("free", WhiskerArray.of("mouse").select("C2"))], fidelity="fast", cache=False)
+    found = resolve_model(Spectrum()).respond(ScoreOptions(stimuli=stimuli))
+    assert found.card.input == "forces in 1e-4 N, moments in 1e-6 N·m"
+
+
+def test_a_module_in_half_precision_has_a_card():
+    cards = [resolve_model(nn.Linear(3, 2).to(kind)).card for kind in (torch.bfloat16, torch.float16)]
+    assert all(card.weights for card in cards)
 
 
 def test_a_model_whose_input_does_not_fit_says_what_it_was_given(recordings: xr.Dataset, arrays: Path):

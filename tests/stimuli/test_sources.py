@@ -63,6 +63,22 @@ def test_whiskers_of_a_finished_set_can_be_chosen(tmp_path, dataset):
         load_stimuli(path, whiskers="A0")
 
 
+@pytest.mark.parametrize("change", ["wrench", "cells"])
+def test_a_set_that_was_edited_is_another_one(tmp_path, dataset, change):
+    if change == "wrench":
+        edited = dataset.assign(wrench=2 * dataset["wrench"])
+    else:
+        edited = dataset.assign_coords(col=("whisker", dataset["col"].values[[1, 0, *range(2, len(dataset["col"]))]]))
+    before, after = load_stimuli(dataset), load_stimuli(edited)
+    assert (before.input != after.input).any()
+    for name in ("content_hash", "config_hash"):
+        assert getattr(before, name) == dataset.attrs[name]
+        assert getattr(after, name) != getattr(before, name)
+    assert load_stimuli(edited, whiskers="C1").config_hash != load_stimuli(dataset, whiskers="C1").config_hash
+    with pytest.raises(DataError, match="hash_stimulus_set"):
+        read_stimulus_set(write_stimulus_set(edited, tmp_path / "set.h5"))
+
+
 def test_choosing_whiskers_leaves_the_data_set_of_the_caller_alone(dataset):
     before = dataset.attrs["content_hash"]
     load_stimuli(dataset, whiskers="C2")

@@ -38,6 +38,8 @@ SPLITS = ("train", "validation", "test", "all")
 """Values of ``split``; ``all`` is the three together."""
 
 _AHEAD = 2
+_STEP = 0.045
+"""Usual time step [s]: five frames, 9 ms apart."""
 _BLOCK = 64
 
 
@@ -193,12 +195,25 @@ class WhiskingDataset:
         return tuple(np.unique(self._shards[0].cells).tolist())
 
     @property
+    def axes(self) -> str:
+        """Axes of forces and moments, ``world`` or ``follicle``."""
+        return self._shards[0].axes
+
+    @property
     def summary(self) -> dict[str, Any]:
-        """Hash, number of classes, and the sweeps of each split that are used and in all left out: for a card."""
+        """Hash, number of classes, and the sweeps of each split that are used and in all left out: for a card.
+
+        Time steps [s] and axes are told where they are not the usual ones.
+        """
+        step = self.substeps * self._shards[0].interval
+        unusual: dict[str, Any] = {} if np.isclose(step, _STEP, rtol=1e-6) else {"time_step": step}
+        if self.axes != "world":
+            unusual["axes"] = self.axes
         used = self._splits[self._where].tolist()
         sizes = {name: used.count(name) for name in SPLITS[:3]}
         return {
             "hash": self.manifest["content_hash"], "classes": len(self.classes), "left_out": self.skipped, **sizes,
+            **unusual,
         }  # fmt: skip
 
     def __len__(self) -> int:

@@ -46,6 +46,10 @@ class Shard:
     """[sweep] true where there are no forces at all."""
     content_hash: str
     """As the manifest has it."""
+    interval: float
+    """Time between frames [s]."""
+    axes: str
+    """``world`` or ``follicle``."""
 
     def forces(self) -> NDArray[np.float32]:
         """Return the forces [sweep, frame, whisker, channel] (N, N·m), mapped into memory."""
@@ -136,6 +140,8 @@ def open_shard(path: Path, entry: Mapping[str, Any], manifest: Mapping[str, Any]
             broken=(status != 0).any(axis=1),
             empty=(status == _UNUSABLE).all(axis=1),
             content_hash=str(entry["content_hash"]),
+            interval=float(np.diff(file["time"][:2]).sum()),
+            axes=str(file.attrs.get("axes", "world")),
         )
         config = str(file.attrs["config_hash"])
     if path.stat().st_size < end:

@@ -134,6 +134,8 @@ class SweepTree:
             broken=doubtful.sum(axis=1) > 0,
             empty=np.zeros(len(mine), dtype=bool),
             content_hash=self.content_hash,
+            interval=FRAME_TIMES[self.rate][1],
+            axes="world",
             tree=self,
         )
 

@@ -16,7 +16,7 @@ from brainbench.core.trials import Trials
 from brainbench.metrics.animal_to_animal import score_agreement
 from brainbench.metrics.animals import gated
 from brainbench.metrics.arrays import fetch
-from brainbench.metrics.inference.permutation import SMALLEST_STIMULI
+from brainbench.metrics.inference.permutation import SMALLEST_STIMULI, canonical_order
 from brainbench.metrics.rdms.pairs import Floats, Ints
 from brainbench.metrics.reliability.denoising import simulated_animals
 from brainbench.metrics.reliability.noise_correction import Corrected
@@ -111,9 +111,11 @@ class Metric:
 
     def attainable(self, animals: Sequence[SubjectRDM], seed: int) -> Floats:
         """Return the raw value [A] of a model that has each animal's own responses without their noise."""
+        # In the order in which stimuli are scored: folds and noise then do not depend on how they were listed.
+        order = canonical_order(np.stack([animal.rdm for animal in animals]))
         found = []
         for animal in animals:
-            truth, noisy = simulated_animals(animal, seed)
+            truth, noisy = simulated_animals(animal.take(order), seed)
             values = next(iter(self.compare_layers([truth], noisy, [np.arange(len(truth))[None]])))
             found.append(float(np.nanmean(values)) if np.isfinite(values).any() else np.nan)
         return np.array(found)

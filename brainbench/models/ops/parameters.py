@@ -6,8 +6,10 @@ from collections.abc import Mapping
 from typing import Any
 
 import torch
+from torch import nn
 
 from brainbench.core.errors import DataError, listing, nearest
+from brainbench.core.files import content_hash
 
 
 def load_named(targets: Mapping[str, torch.Tensor], state: Mapping[str, Any], *, what: str) -> None:
@@ -45,6 +47,14 @@ def check_named(shapes: Mapping[str, tuple[int, ...]], state: Mapping[str, Any],
         problems.append(f"shapes that do not fit: {shown}")
     if problems:
         raise DataError(f"The parameters do not fit {what}: {'; '.join(problems)}.")
+
+
+def weights_hash(module: nn.Module) -> str:
+    """Return the hash of a module's parameters and buffers."""
+    state = {name: value.detach().cpu() for name, value in module.state_dict().items()}
+    # NumPy has no bfloat16; single precision holds its numbers.
+    plain = {name: value.float() if value.dtype == torch.bfloat16 else value for name, value in state.items()}
+    return content_hash(*(part for name in sorted(plain) for part in (name, plain[name].numpy())))
 
 
 @torch.no_grad()

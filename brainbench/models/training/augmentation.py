@@ -48,6 +48,8 @@ class Augmentation:
     """Share of the time steps that are set to zero (temporal masking; published with 0.75)."""
     cells: tuple[int, ...] = MOUSE
     """Cells of the grid that hold a whisker in these data, ascending; ``physical`` keeps to them."""
+    axes: str = "world"
+    """``world`` or ``follicle``: axes of forces and moments, which ``physical`` mirrors."""
 
     def __post_init__(self) -> None:
         check_name("augmentation", self.kind, KINDS)
@@ -61,7 +63,7 @@ class Augmentation:
         number-th sweep of a larger batch, from rank on; each sweep is then treated as it would be in the whole batch.
         """
         draw = SampledAugmentation(generator, *part)
-        y = KINDS[self.kind](x, draw, self.cells)
+        y = KINDS[self.kind](x, draw, self)
         return mask_steps(y, self.masking, draw) if self.masking else y
 
 
@@ -83,8 +85,11 @@ class SampledAugmentation:
         return (self.uniform(len(x)) < probability).to(x.device).view(-1, *(1,) * (x.ndim - 1))
 
 
-def flip(x: torch.Tensor, direction: str, cells: tuple[int, ...] = MOUSE) -> torch.Tensor:
+def flip(x: torch.Tensor, direction: str, cells: tuple[int, ...] = MOUSE, axes: str = "world") -> torch.Tensor:
     """Mirror sweeps physically: ``vertical`` (z → −z) or ``horizontal`` (y → −y); ``cells`` hold whiskers.
+
+    Follicle axes are mirrored with their whisker: what changes sign, for both directions, is their third axis, which
+    stands on the plane of the whisker's curvature.
 
     Raises:
         UsageError: there is no such direction, or ``x`` is not [B, T, S·6, 5, 7].
@@ -96,7 +101,7 @@ def flip(x: torch.Tensor, direction: str, cells: tuple[int, ...] = MOUSE) -> tor
             f"{GRID_SHAPE[1]}]; received {list(x.shape)}."
         )
     # A mirror turns the normal part of a polar vector (force) and the tangential part of an axial one (moment).
-    normal = _MIRRORED[direction]
+    normal = _MIRRORED[direction] if axes == "world" else "z"
     signs = tuple(-1.0 if (name[1] == normal) == (name[0] == "F") else 1.0 for name in CHANNELS)
     turned = _constant(signs * (x.shape[2] // len(CHANNELS)), x.device).to(x.dtype)
     places = _constant(_places(direction, cells), x.device)
@@ -140,14 +145,14 @@ def _places(direction: str, cells: tuple[int, ...]) -> tuple[int, ...]:
     return tuple(places)
 
 
-def _physical(x: torch.Tensor, draw: SampledAugmentation, cells: tuple[int, ...]) -> torch.Tensor:
+def _physical(x: torch.Tensor, draw: SampledAugmentation, how: Augmentation) -> torch.Tensor:
     # Both flips together are the half turn, so three fair coins draw the eight motions evenly.
     for direction in _MIRRORED:
-        x = torch.where(draw.coins(x), flip(x, direction, cells), x)
+        x = torch.where(draw.coins(x), flip(x, direction, how.cells, how.axes), x)
     return torch.where(draw.coins(x), reverse_time(x), x)
 
 
-def _thesis(x: torch.Tensor, draw: SampledAugmentation, _cells: tuple[int, ...]) -> torch.Tensor:
+def _thesis(x: torch.Tensor, draw: SampledAugmentation, _how: Augmentation) -> torch.Tensor:
     drawn = torch.rand(4, generator=draw.generator, device=draw.generator.device).to(x.device)
     rows, columns = x.shape[3:]
     # Nothing is read back from the device: every outcome is a table, and the one drawn is looked up.
@@ -174,7 +179,7 @@ def _turned_places(rows: int, columns: int) -> tuple[int, ...]:
     return tuple(found)
 
 
-def _image(x: torch.Tensor, draw: SampledAugmentation, _cells: tuple[int, ...]) -> torch.Tensor:
+def _image(x: torch.Tensor, draw: SampledAugmentation, _how: Augmentation) -> torch.Tensor:
     # Pictures have one unit per pixel: work in the units the networks see.
     units = tuple(Normaliser.physical(x.shape[2] // len(CHANNELS)).scale.flatten().tolist())
     scale = _constant(units, x.device).to(x.dtype).view(-1, 1, 1)
@@ -198,8 +203,8 @@ def _image(x: torch.Tensor, draw: SampledAugmentation, _cells: tuple[int, ...]) 
     return y * scale
 
 
-KINDS: Mapping[str, Callable[[torch.Tensor, SampledAugmentation, tuple[int, ...]], torch.Tensor]] = {
-    "none": lambda x, draw, cells: x,
+KINDS: Mapping[str, Callable[[torch.Tensor, SampledAugmentation, Augmentation], torch.Tensor]] = {
+    "none": lambda x, draw, how: x,
     "physical": _physical,
     "thesis": _thesis,
     "image": _image,

@@ -83,7 +83,8 @@ class TrainingResult:
     best_epoch: int | None
     """Epoch of the best validation, from 1."""
     evaluation: Evaluation | None
-    """Accuracy on the test split (else validation, else training); None until the run is finished."""
+    """Accuracy on the test split (else validation, else training); None until the run is finished, and for a
+    self-supervised network without passes of a probe."""
     controls: Mapping[str, Evaluation]
     """Accuracy of :data:`~brainbench.models.training.evaluation.CONTROLS` on the same sweeps; empty until then, and
     without passes of a probe."""
@@ -181,7 +182,8 @@ class _Run:
         )
         # Data in memory need not say where their whiskers are.
         cells: tuple[int, ...] = getattr(data, "cells", MOUSE)
-        self.augmentation = Augmentation(config.augmentation, config.masking, cells)
+        axes: str = getattr(data, "axes", "world")
+        self.augmentation = Augmentation(config.augmentation, config.masking, cells, axes)
         batches = self._batches("train", shuffle=True)
         if batches is None:
             raise DataError("The data set has no split 'train', so there is nothing to train on.")
@@ -243,6 +245,10 @@ class _Run:
     def _advance(self, x: torch.Tensor, labels: torch.Tensor, steps: int) -> str:
         """Take one optimiser step; return why it could not be taken, or ''."""
         config = self.config
+        if len(x) < 2 and config.objective == "simsiam":
+            # The rest of an epoch: the batch norms of the head have no statistics of a single sweep.
+            self.at.step += 1
+            return ""
         x, labels = x.to(self.where.device, non_blocking=True), labels.to(self.where.device, non_blocking=True)
         views = self._views(x, self.at.step)
         span = {"epochs": config.epochs, "warmup_epochs": config.warmup_epochs}
@@ -329,12 +335,17 @@ class _Run:
             if not (self.out / BEST / WEIGHTS).is_file():
                 self._publish(None)
             load_weights(self.model, self.out / BEST / WEIGHTS, what=self.config.model)
-            if self.config.objective != "supervised" and self.config.probe_epochs:
+            probed = self.config.objective != "supervised"
+            if probed and self.config.probe_epochs:
                 self.progress(self._steps, self._steps, "fitting the linear probe")
                 train = self._batches("train", shuffle=False, part=False) or ()
                 fit_probe(self.model, train, classes=len(self.data.classes), device=self.where.device, **self._probe)
+                # The probe is rounded too where the weights are.
+                self._publish(None)
+                load_weights(self.model, self.out / BEST / WEIGHTS, what=self.config.model)
             # The split that was used least for training, of those that the data set has.
-            for split in ("test", "validation", "train"):
+            # Without a probe the decoder of a self-supervised network is random, and its accuracy says nothing.
+            for split in () if probed and not self.config.probe_epochs else ("test", "validation", "train"):
                 batches = self._batches(split, shuffle=False, part=False)
                 if batches is not None:
                     result = evaluate(self.model, batches, device=self.where.device)

@@ -25,7 +25,7 @@ from brainbench.core.records import Interval, Status
 from brainbench.core.statistics import t_interval
 from brainbench.metrics.measures.patterns import LinearCKA
 from brainbench.metrics.measures.registry import get_metric
-from brainbench.scoring.model_responses import ResolvedModel, resolve_model
+from brainbench.scoring.model_responses import ResolvedModel, resolve_model, takes_si
 from brainbench.scoring.options import ScoreOptions
 from brainbench.scoring.recovery.candidates import Candidate
 from brainbench.scoring.recovery.design import FEWEST_STIMULI, RecoveryDesign
@@ -181,7 +181,7 @@ class _Network:
                 raise UsageError(f"{found.card.name} commits to no layer and names none; choose one with --layer.")
             chosen = named[-1]
         # Other modules are read by hooks, which keep no gradient.
-        read = named_reader(found.module, (chosen,)) if hasattr(found.module, "spec") else None
+        read = named_reader(found.module, (chosen,)) if takes_si(found.module) else None
         return cls(found.card.name, found, chosen, read)
 
     def features(self, dataset: Any) -> Array:

@@ -51,6 +51,14 @@ def test_a_batch_is_the_grid_of_the_simulated_sweeps(plan, folder):
     assert [data.classes[label] for label in y.tolist()] == [data.objects[i].split("-")[0] for i in order[:5]]
 
 
+def test_unusual_time_steps_and_axes_are_told(folder, copy):
+    assert WhiskingDataset(folder).summary["time_step"] == pytest.approx(0.05)
+    for path in copy.glob("*.h5"):
+        with h5py.File(path, "r+") as file:
+            file.attrs["axes"] = "follicle"
+    assert WhiskingDataset(copy).summary["axes"] == "follicle"
+
+
 def test_raw_batches_hold_the_forces_as_stored(plan, folder):
     data = WhiskingDataset(folder, split="test", batch_size=3, view="raw", shuffle=False)
     x, _ = next(iter(data))

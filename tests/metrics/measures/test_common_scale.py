@@ -141,6 +141,7 @@ def test_folds_of_ridge_do_not_depend_on_the_order_of_stimuli():
     first = _score(metric, names, blocks, {"a": features})
     second = _score(metric, [names[k] for k in order], moved, {"a": features[order]})
     assert (second.value, second.p) == (pytest.approx(first.value, abs=1e-9), first.p)
+    assert second.attainable == pytest.approx(first.attainable, abs=1e-9)
     np.testing.assert_allclose(second.without_stimulus, np.array(first.without_stimulus)[order], atol=1e-9)
 
 

@@ -41,6 +41,22 @@ def test_forces_and_moments_are_those_of_the_mirrored_scene(direction, axis):
     torch.testing.assert_close(flip(x, direction)[0, 0, :, 2, 3], mirrored)
 
 
+@pytest.mark.parametrize(("direction", "axis"), [("vertical", 2), ("horizontal", 1)])
+def test_follicle_axes_are_mirrored_with_their_whisker(direction, axis):
+    arm, force = torch.randn(3, dtype=torch.float64), torch.randn(3, dtype=torch.float64)
+    pose = torch.linalg.qr(torch.randn(3, 3, dtype=torch.float64)).Q
+    pose *= torch.linalg.det(pose)
+    mirror = torch.eye(3, dtype=torch.float64)
+    mirror[axis, axis] = -1
+    # Whisker and plane of curvature are mirrored; the third axis completes them to a right-handed frame again.
+    partner = mirror @ pose @ torch.diag(torch.tensor([1.0, 1.0, -1.0], dtype=torch.float64))
+    wrench = torch.cat((pose.T @ force, pose.T @ torch.linalg.cross(arm, force)))
+    moment = torch.linalg.cross(mirror @ arm, mirror @ force)
+    x = wrench.view(1, 1, 6, 1, 1).expand(1, 1, 6, 5, 7) * OCCUPIED
+    found = flip(x, direction, axes="follicle")[0, 0, :, 2, 3]
+    torch.testing.assert_close(found, torch.cat((partner.T @ mirror @ force, partner.T @ moment)))
+
+
 def test_whiskers_go_where_the_mirror_takes_them():
     x = torch.zeros(1, 1, 6, 5, 7)
     x[0, 0, 0, 0, 0] = 1.0  # Fx of A0, tangential to both mirrors

@@ -36,6 +36,15 @@ def test_a_folder_is_a_model(folder):
     assert described.family == "resnet18"
 
 
+def test_a_network_states_the_time_steps_and_axes_of_its_training(tmp_path):
+    model = load_model("zhuang-small")
+    told = {"data": {"hash": "a", "time_step": 0.02, "axes": "follicle"}}
+    folder = save_checkpoint(tmp_path, model, architecture="zhuang-small", options={}, info=told)
+    spec = load_model(f"local-dir:{folder}").spec
+    assert spec.sample_rate == 50
+    assert spec.frame == model.spec.frame.replace("world", "follicle")
+
+
 def test_a_folder_can_stand_for_a_tag(folder):
     assert _equal(load_model(f"{NAME}.ae", pretrained=folder), load_model(f"local-dir:{folder}"))
 

@@ -13,6 +13,7 @@ from safetensors.torch import load_file
 
 from brainbench.core.errors import DataError, UsageError
 from brainbench.models.registry import describe_model, load_model
+from brainbench.models.training import trainer
 from brainbench.models.training.batches import BatchOptions
 from brainbench.models.training.config import TrainingConfig
 from brainbench.models.training.evaluation import evaluate, fit_probe
@@ -70,6 +71,14 @@ def test_a_run_learns_what_can_be_learned_and_leaves_a_model_to_load(tmp_path):
 def test_on_the_cpu_precision_is_single_unless_asked_otherwise(tmp_path):
     train(_config(precision="auto", epochs=1), tiny(), out=tmp_path, device="cpu")
     assert json.loads((tmp_path / "run.json").read_text())["run"]["precision"] == "float32"
+
+
+def test_an_epoch_may_end_with_a_single_sweep(tmp_path):
+    config = _config("simsiam", model="s4-small", epochs=1, augmentation="physical", probe_epochs=0)
+    result = train(config, tiny(train=9), out=tmp_path, device="cpu")
+    assert (result.status, result.steps) == ("finished", 2)
+    assert result.evaluation is None  # no probe, no accuracy
+    assert "top-1" not in (result.folder / "README.md").read_text()
 
 
 @pytest.mark.parametrize("objective", ["simclr", pytest.param("simsiam", marks=pytest.mark.slow), "ae"])
@@ -258,6 +267,16 @@ def test_mixed_precision_trains_and_half_precision_weights_are_evaluated_as_ship
     with torch.no_grad():
         again = (load_model(f"local-dir:{result.folder}")(x).argmax(1) == labels).float().mean()
     assert again == pytest.approx(result.evaluation.top1)
+
+
+def test_the_probe_of_half_precision_weights_is_evaluated_as_shipped(tmp_path, monkeypatch):
+    data, probes = tiny(), []
+    monkeypatch.setattr(
+        trainer, "evaluate", lambda model, *given, **how: probes.append(model) or evaluate(model, *given, **how)
+    )
+    result = train(_config("ae", epochs=1, weights_dtype="bfloat16"), data, out=tmp_path, device="cpu")
+    shipped = load_model(f"local-dir:{result.folder}").decoder.state_dict()
+    assert all(torch.equal(value, shipped[name]) for name, value in probes[0].decoder.state_dict().items())
 
 
 @pytest.mark.parametrize(("precision", "stored"), [("bf16", torch.bfloat16), ("float32", torch.float32)])
