@@ -198,6 +198,8 @@ class Env:
             self.touch.suite.seed(seed)
         self.state.generator.manual_seed(seed)
         self.state.actuators.seed(seed)
+        # Friction and mass that are drawn once belong to the seed, not to what ran before it.
+        self.state.started = False
 
     def statistics(self) -> dict[str, float]:
         """Return means over the episodes that ended since the last call; waits for the device."""

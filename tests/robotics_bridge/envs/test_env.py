@@ -76,6 +76,19 @@ def test_the_same_seed_gives_the_same_episode_and_another_seed_another() -> None
     assert not torch.equal(first, run(2))
 
 
+def test_a_seed_fixes_what_is_drawn_once_too() -> None:
+    changes = ObjectRandomisation(friction=(0.5, 2.0), mass_offset=(0.0, 0.1), each_reset=False)
+    found = []
+    for first in (0, 7):
+        env = _make(4, _calm(object_changes=changes), seed=first)
+        env.seed(1)
+        env.reset()
+        found.append(torch.stack((env.state.episode.friction, env.state.episode.mass)))
+    assert torch.equal(*found)
+    env.reset()
+    assert torch.equal(torch.stack((env.state.episode.friction, env.state.episode.mass)), found[1])
+
+
 def test_an_environment_does_not_notice_how_many_others_there_are_in_its_physics() -> None:
     env = _make(3, _calm(placement=replace(tasks.load("in_palm_rotate").placement, x=(0, 0), y=(0, 0), yaw=(0, 0))))
     alone = _make(1, env.task)
