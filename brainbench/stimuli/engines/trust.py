@@ -49,15 +49,10 @@ LARGEST_STRUCK_CHANGE = 0.1
 """The same in rigid contacts with a :data:`BLOW`, when the step is cut to a fifth: contacts may cut a step and its half
 to the same. Of 555 whiskers it finds 99 of the 105 that err by more than a fifth, and 48 others; nothing that a single
 run tells does."""
-LARGEST_ROUGH_CHANGE = 0.65
-"""The same in soft contacts of a whisker that is suspicious for its roughness or overlap and meets no :data:`BLOW`:
-with friction, soft contacts hop at ordinary speeds too, and change by some .3 to .6 in long steps. All measured beyond
-.65 are off by more than two thirds of the force that fine steps of ``rod`` give."""
 BLOW = 1.0
 """Speed (m/s) of an object against the base from which it counts as a blow."""
 HARD_BLOW = 3.0
-"""The same in rigid contacts. Beyond it the presets err by 20 to 90 %, and half the step does not tell: contacts cut
-both to the same steps."""
+"""Speed of a blow beyond which the presets err by 20 to 90 %."""
 BLOW_STRIDE = 0.25
 """Way of an object in a step of such a blow up to which it is followed, in radii of the whisker's base. The median
 whisker is then within 20 % of the force in far shorter steps, up to 25 m/s."""

@@ -112,11 +112,9 @@ def test_with_friction_a_resting_whisker_keeps_the_drag_and_the_step_does_not_ma
     job = Job(CRITICAL, SWEEP, (post(0.010, 0.0022, friction=0.48),), SWEPT)
     coarse, fine = (_run(job, fidelity=Fidelity(links=8, time_step=step))[0] for step in (2e-4, 5e-5))
     assert np.abs((coarse.wrench - fine.wrench) / _scale(fine.wrench)).max() < 0.01
-    # The sweep ends after 40 ms; MuJoCo's soft friction then creeps, Coulomb's does not.
+    # The sweep ends after 40 ms; MuJoCo's soft friction then creeps, and says so, Coulomb's does not.
     np.testing.assert_allclose(coarse.wrench[-1, :3], coarse.wrench[22, :3], rtol=2e-3)
-    mujoco = _run(job, backend="mujoco")[0]
-    assert abs(mujoco.wrench[-1, 2]) < 0.5 * abs(coarse.wrench[-1, 2])
-    assert coarse.wrench[-1, 1] == pytest.approx(mujoco.wrench[-1, 1], rel=0.05)
+    assert "of the friction 0.48" in _run(job, backend="mujoco")[0].reason
 
 
 @needs_bullet
