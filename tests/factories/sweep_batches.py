@@ -8,6 +8,7 @@ import math
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.objects.collections import resolve_objects
 from brainbench.stimuli.scenes.frames import Frames
+from brainbench.stimuli.sweeps.grid import SweepGrid
 from brainbench.stimuli.sweeps.plan import GenerationPlan, GenerationSettings
 from brainbench.stimuli.sweeps.sweep_scenes import GRIDS, SweepScenes
 
@@ -24,6 +25,16 @@ GRID = dataclasses.replace(
 """Four sweeps of .1 s per object, which C2 and C3 feel; from ``start`` = −2 mm C3 would begin inside the brick."""
 
 
+class _Smooth(SweepGrid):
+    """The same past objects without friction, which soft contacts would lose."""
+
+    def scene(self, *args, **options):
+        scene = super().scene(*args, **options)
+        return dataclasses.replace(
+            scene, objects=tuple(dataclasses.replace(item, friction=0.0) for item in scene.objects)
+        )
+
+
 def small_scenes(objects=("brick:2", "cone:2"), whiskers="C3", grid=GRID):
     found = resolve_objects(objects, collision="hull")
     return SweepScenes(grid, {name: item.load for name, item in found.items()}, whiskers=whiskers)
@@ -33,6 +44,8 @@ def small_plan(objects=("brick:2", "cone:2"), *, whiskers="C3", grid=GRID, fidel
     found = resolve_objects(objects, collision="hull")
     # An engine that takes sweeps as any other scenes, and refuses none of these.
     chosen = GenerationSettings(fidelity or Fidelity.preset("fast"), **{"backend": "mujoco", **settings})
+    if chosen.backend == "mujoco":
+        grid = _Smooth(**{item.name: getattr(grid, item.name) for item in dataclasses.fields(grid) if item.init})
     return GenerationPlan("small", grid, found, chosen, whiskers)
 
 

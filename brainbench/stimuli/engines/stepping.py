@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import logging
-import math
 import time
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
@@ -23,25 +21,20 @@ from brainbench.stimuli.engines.overlap import overlap_fault
 from brainbench.stimuli.engines.protocol import Job, Progress, Trace, WhiskerEngine, base_rotation
 from brainbench.stimuli.engines.reach import Reach, reachable
 from brainbench.stimuli.engines.trust import (
-    BLOW,
     GOT_INSIDE,
     LARGEST_CHANGE,
     LARGEST_OVERLAP,
-    LARGEST_ROUGH_CHANGE,
     SUSPICIOUS_ROUGHNESS,
     SUSPICIOUS_SHARE,
     changes_words,
     check_jobs,
     fault,
     force_change,
-    near_travel,
     passed_unseen,
     roughness,
     strongest_force,
 )
 from brainbench.stimuli.whiskers.chain import Chain
-
-logger = logging.getLogger(__name__)
 
 
 def is_silent(job: Job, reach: Reach, position: NDArray[np.float64], euler: NDArray[np.float64]) -> bool:
@@ -173,16 +166,19 @@ class SteppedJob:
         penetration: float,
         reason: str,
         forces: NDArray[np.float64],
-    ) -> tuple[Trace, float]:
-        """Return the trace of values at the frames, NaN where they cannot be trusted.
+        doubt: str = "",
+    ) -> tuple[Trace, bool]:
+        """Return the trace of values at the frames, NaN where they cannot be trusted, and whether it is suspicious.
 
-        Beside it stands by which share the base force may change with half the step, inf where there is no doubt.
-        ``shape`` is in m; ``forces`` [s, 3] (N) are those on the base before the steps that can be trusted.
+        ``shape`` is in m; ``forces`` [s, 3] (N) are those on the base before the steps that can be trusted;
+        ``doubt`` is a fault without a time.
         """
         good, penetration = frames.good, max(penetration, self.overlap[2])
         if not reason and penetration > 2 * LARGEST_OVERLAP:
             # The contacts of these engines are soft, and when it was deepest they do not tell.
-            good, reason = good & False, fault(GOT_INSIDE, self.job.start, penetration)
+            doubt = fault(GOT_INSIDE, self.job.start, penetration)
+        if not reason and doubt:
+            good, reason = good & False, doubt
         trace = Trace(
             wrench=np.where(good[:, None], wrench, np.nan),
             contact=contact & good,
@@ -194,20 +190,10 @@ class SteppedJob:
             seconds=time.thread_time() - self.started,
             link_positions=np.where(good[:, None, None], shape, np.nan) if self.record_shape else None,
         )
-        return trace, math.inf if reason else self._allowed_change(forces, penetration)
-
-    def _allowed_change(self, forces: NDArray[np.float64], penetration: float) -> float:
-        """Return the change of the base force with half the step beyond which it is unstable; inf without doubts."""
-        whisker = self.job.whisker
-        strong = np.linalg.norm(forces, axis=1).max(initial=0.0) > SUSPICIOUS_SHARE * strongest_force(whisker)
+        strongest = SUSPICIOUS_SHARE * strongest_force(self.job.whisker)
+        strong = np.linalg.norm(forces, axis=1).max(initial=0.0) > strongest
         deep = penetration > SUSPICIOUS_SHARE * 2 * LARGEST_OVERLAP
-        if not (strong or deep or roughness(forces) > SUSPICIOUS_ROUGHNESS):
-            return math.inf
-        # Without the turns of the base, which are those of whisking.
-        position, euler = self.pose[0], np.zeros_like(self.pose[1])
-        travels = (near_travel(whisker, position, euler, item, self.times) for item in self.reach.obstacles)
-        struck = any(travel.max() > BLOW * self.step for travel in travels)
-        return LARGEST_CHANGE if strong or struck else LARGEST_ROUGH_CHANGE
+        return trace, not reason and bool(strong or deep or roughness(forces) > SUSPICIOUS_ROUGHNESS)
 
     def halved(self) -> SteppedJob:
         """Return the job in half the step; its processor time counts on."""
@@ -225,25 +211,21 @@ class SteppedEngine(WhiskerEngine):
         """Return what surrounds a run; without the engine's package it is a :class:`MissingDependencyError`."""
 
     @abstractmethod
-    def simulate(self, stepped: SteppedJob) -> tuple[Trace, float]:
+    def simulate(self, stepped: SteppedJob) -> tuple[Trace, bool]:
         """Simulate one job that is not silent; return what :meth:`SteppedJob.trace` does."""
 
-    def _trusted(self, stepped: SteppedJob, changes: list[float]) -> Trace:
-        """Return the trace of a job; one that is in doubt must be much the same with half the step.
-
-        ``changes`` takes up by how much the base force of one that is kept changes, where that is much.
-        """
+    def _trusted(self, stepped: SteppedJob) -> Trace:
+        """Return the trace of a job; one that is suspicious must be much the same with half the step."""
         if is_silent(stepped.job, stepped.reach, *stepped.pose):
             seconds = time.thread_time() - stepped.started
             return silent_trace(stepped.job, stepped.fidelity, stepped.record_shape, seconds)
-        trace, allowed = self.simulate(stepped)
-        if allowed == math.inf:
+        trace, suspicious = self.simulate(stepped)
+        if not suspicious:
             return trace
         half, _ = self.simulate(stepped.halved())
         trace = replace(trace, steps=trace.steps + half.steps, seconds=half.seconds)
         change = float(force_change(*(one.wrench[None, :, None, :3] for one in (trace, half)))[0, 0])
-        if change <= allowed:
-            changes += [change] * (change > LARGEST_CHANGE)
+        if change <= LARGEST_CHANGE:
             return trace
         lost = {
             "wrench": np.full_like(trace.wrench, np.nan),
@@ -265,20 +247,10 @@ class SteppedEngine(WhiskerEngine):
     ) -> list[Trace]:
         """Simulate every job; see :meth:`brainbench.stimuli.engines.protocol.WhiskerEngine.run`."""
 
-        changes: list[float] = []
-
         def run(group: Sequence[int]) -> dict[int, Trace]:
-            return {index: self._trusted(SteppedJob(jobs[index], fidelity, record_shape), changes) for index in group}
+            return {index: self._trusted(SteppedJob(jobs[index], fidelity, record_shape)) for index in group}
 
         with self.session():
             check_jobs(self, jobs, fidelity, workers)
             threads = self.threads or workers or usable_processors()
-            traces = run_groups([[index] for index in range(len(jobs))], run, threads=threads, progress=progress)
-        if changes:
-            logger.warning(
-                "The base forces of %d whiskers change by up to %.0f%% (root mean square) with half the step, because "
-                "soft contacts hop; use the backend 'rod'.",
-                len(changes),
-                100 * max(changes),
-            )
-        return traces
+            return run_groups([[index] for index in range(len(jobs))], run, threads=threads, progress=progress)

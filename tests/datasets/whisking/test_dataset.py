@@ -39,7 +39,7 @@ def copy(folder, tmp_path):
 
 def test_a_batch_is_the_grid_of_the_simulated_sweeps(plan, folder):
     data = WhiskingDataset(folder, split="test", batch_size=5)
-    scenes = SweepScenes(GRID, {name: item.load for name, item in plan.objects.items()}, whiskers=plan.whiskers)
+    scenes = SweepScenes(plan.grid, {name: item.load for name, item in plan.objects.items()}, whiskers=plan.whiskers)
     order = data.order(0)
     x, y = next(iter(data))
     expected = simulate(

@@ -97,7 +97,7 @@ def _push(width, reach=1e-3):
         place[:, 1] = _pulse(0.0102, width, reach)(times)
         return place, np.tile([1.0, 0.0, 0.0, 0.0], (len(times), 1))
 
-    return Obstacle((Sphere((0.008, -1.2e-3, 0.0), 1e-3),), motion)
+    return Obstacle((Sphere((0.008, -1.2e-3, 0.0), 1e-3),), motion, friction=0.0)
 
 
 def test_an_obstacle_pulse_of_a_tenth_of_a_millisecond_is_felt_by_all_engines_alike():

@@ -1,9 +1,11 @@
 """Engines in equal steps simulate suspicious whiskers again with half the step, and flag those that change."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from brainbench.stimuli import WhiskerArray, get_recipe, simulate
+from brainbench.stimuli import WhiskerArray
 from brainbench.stimuli.engines import get_engine
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.protocol import Job, StillFollicle
@@ -94,17 +96,29 @@ def test_whiskers_at_ordinary_speeds_stay_ok_at_no_cost(halves):
     # Whisks at 5 to 20 Hz onto posts, balls, edges and hollows, without friction.
     jobs = [job for job in contact_jobs(3, each=1) if job.obstacles[0].friction == 0.0]
     traces = get_engine("mujoco").run(jobs, Fidelity.preset("fast"), workers=2)
-    assert not [trace.reason for trace in traces if "half the step" in trace.reason]
+    # One errs by 22 % beside rod.
+    assert sum("half the step" in trace.reason for trace in traces) == 1
     assert len(halves) <= 2
-    assert sum(trace.status == "ok" for trace in traces) >= 23
+    assert sum(trace.status == "ok" for trace in traces) >= 22
 
 
-def test_hopping_at_ordinary_speeds_is_told_in_the_log(caplog):
-    scene = get_recipe("rodgers").scenes[0].select("C1")
-    with caplog.at_level("WARNING"):
-        found = simulate(scene, fidelity="fast", backend="mujoco", cache=False)
-    assert found["status"].item() == "ok"
-    assert "forces of 1 whiskers change by up to 39%" in caplog.text
+@pytest.mark.parametrize(("seed", "index"), [(3, 47), (5, 11)])
+def test_hopping_at_ordinary_speeds_is_flagged(seed, index):
+    """With status ok the base forces of these erred by .62 and .63 of those of rod in fine steps."""
+    job = contact_jobs(seed, each=1)[index]
+    (trace,) = get_engine("mujoco").run([job], Fidelity.preset("fast"))
+    assert "with half the step" in trace.reason
+
+
+def test_friction_that_soft_contacts_let_go_is_flagged():
+    """Against a post with friction .4, mujoco gave the forces of a smooth post; rod errs by less than 5 %."""
+    jobs = [job for job in contact_jobs(21, each=1) if job.obstacles[0].friction == 0.4][:3]
+    fidelity = Fidelity(links=10, twist=False)
+    for trace in get_engine("mujoco").run(jobs, fidelity):
+        assert "of the friction 0.4" in trace.reason
+        assert np.isnan(trace.wrench).all()
+    smooth = [replace(job, obstacles=tuple(replace(item, friction=0.0) for item in job.obstacles)) for job in jobs]
+    assert [trace.status for trace in get_engine("mujoco").run(smooth, fidelity)] == ["ok"] * 3
 
 
 def test_a_change_is_told_in_per_cent():

@@ -28,7 +28,7 @@ def test_a_shard_holds_the_simulated_forces_and_what_they_belong_to(tmp_path):
     plan = small_plan(("brick:2", "cone"), whiskers="C2,C3", shard_size=100)
     task = plan.shards[0]
     assert make_shard(task, str(tmp_path)) == len(task)
-    scenes = SweepScenes(GRID, {name: item.load for name, item in plan.objects.items()}, whiskers="C2,C3")
+    scenes = SweepScenes(plan.grid, {name: item.load for name, item in plan.objects.items()}, whiskers="C2,C3")
     with h5py.File(tmp_path / task.name) as file:
         for row, index in enumerate(file["sweep"][:].tolist()):
             dataset = simulate(scenes[index], fidelity="fast", backend="mujoco", cache=False)

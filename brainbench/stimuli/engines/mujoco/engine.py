@@ -21,8 +21,9 @@ from brainbench.stimuli.engines.mujoco.drive import ARMATURE
 from brainbench.stimuli.engines.mujoco.model import SLOT_WIDTH, WhiskerModel, build_model, engine
 from brainbench.stimuli.engines.planarity import stays_in_plane
 from brainbench.stimuli.engines.protocol import Job, Trace
+from brainbench.stimuli.engines.reach import Reach
 from brainbench.stimuli.engines.stepping import SteppedEngine, SteppedJob
-from brainbench.stimuli.engines.trust import LARGEST_BEND, state_fault, strongest_force
+from brainbench.stimuli.engines.trust import LARGEST_BEND, LARGEST_CHANGE, state_fault, strongest_force
 from brainbench.stimuli.engines.units import MICRO, MILLI
 from brainbench.stimuli.whiskers.chain import Chain
 
@@ -51,7 +52,7 @@ class MujocoWhiskerEngine(SteppedEngine):
         finally:
             mujoco.set_mju_user_warning(before)
 
-    def simulate(self, stepped: SteppedJob) -> tuple[Trace, float]:
+    def simulate(self, stepped: SteppedJob) -> tuple[Trace, bool]:
         """See :meth:`SteppedEngine.simulate`."""
         job, chain = stepped.job, stepped.chain
         free = stepped.fidelity.twist is not False
@@ -78,6 +79,7 @@ class MujocoWhiskerEngine(SteppedEngine):
             penetration=_penetration(sensors[: failed + 1, 6:], hinges[: failed + 1], built, chain),
             reason=reason,
             forces=sensors[:failed, :3] / MILLI,
+            doubt=_lost_friction(sensors[:failed, 6:], job, stepped.reach),
         )
 
 
@@ -216,6 +218,27 @@ def _nearest_arcs(points: NDArray, joints: NDArray, chain: Chain) -> NDArray[np.
     link = np.argmin(distance, axis=-1)
     share = np.take_along_axis(share, link[..., None], axis=-1)[..., 0]
     return chain.nodes[link] + share * np.diff(chain.nodes)[link]
+
+
+def _lost_friction(slots: NDArray, job: Job, reach: Reach) -> str:
+    """Return in words that soft contacts hold too little friction, from the contacts of all steps; empty if enough.
+
+    A whisker against an object creeps along it, so that Coulomb's law asks for almost all of the friction. Soft
+    friction is viscous below some cm/s and lets go.
+    """
+    given = (job.whisker.friction if item.friction is None else item.friction for item in reach.obstacles)
+    friction = min(given, default=0.0)
+    squares = np.sum(slots.reshape(-1, SLOT_WIDTH)[:, 1:4] ** 2, axis=0)
+    if friction == 0.0 or squares[0] == 0.0:
+        return ""
+    held = float(np.sqrt(squares[1:].sum() / squares[0]))
+    # What is missing, as a share of the whole force of a contact that slips.
+    if friction - held <= LARGEST_CHANGE * np.hypot(1, friction):
+        return ""
+    return (
+        f"soft contacts hold {held / friction:.0%} of the friction {friction:g} (root mean square); use the backend "
+        "'rod', or friction 0"
+    )
 
 
 def _penetration(slots: NDArray, hinges: NDArray, built: WhiskerModel, chain: Chain) -> float:

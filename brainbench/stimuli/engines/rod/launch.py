@@ -171,7 +171,7 @@ class WhiskerSolver:
             size: rows and columns of the results; jobs that stand in none of them are as if at rest.
             start, gravity: beginning of the simulation (s), acceleration [3] (m/s²).
             axes: rotation [3, 3] of the results; none when None.
-            fast: [3, row, column] ``travel``, ``farthest`` and ``fast_at`` of
+            fast: [4, row, column] ``travel``, ``farthest``, ``fast_at`` and ``struck`` of
                 :class:`brainbench.stimuli.engines.trust.RunFacts`; never when None.
             record_shape: also return shapes and contact wrenches; jobs then stand in their rows in order.
         """
@@ -199,7 +199,8 @@ class WhiskerSolver:
         force = np.sqrt(np.einsum("...d,...d", wrench[..., :3], wrench[..., :3]))
         strongest = table(self.strongest[jobs.whisker])
         strength, strong_at = _first_beyond(strongest, force, readings)
-        travel, farthest, fast_at = np.full((3, *size), np.inf) if fast is None else fast
+        never = np.array([0.0, np.inf, np.inf, 0.0])
+        travel, farthest, fast_at, struck = np.multiply.outer(never, np.ones(size)) if fast is None else fast
         facts = RunFacts(
             status=counts["status"],
             # Single precision rounds a late time; the reading at it must not pass for one before it.
@@ -210,6 +211,7 @@ class WhiskerSolver:
             travel=travel,
             farthest=farthest,
             fast_at=fast_at,
+            struck=struck.astype(bool),
             residual=missed,
             crowded=counts["crowded"],
             steps=counts["steps"],

@@ -28,6 +28,7 @@ from brainbench.stimuli.engines.rod.shapes import PackedShapes, PackedSurface
 from brainbench.stimuli.engines.rod.tasks import followed
 from brainbench.stimuli.engines.rod.tries import Ahead, Try, first_simulation, run_with_retries, tries_ahead
 from brainbench.stimuli.engines.sweep_batch import SweepBatch, describe_unstable, join_batches
+from brainbench.stimuli.engines.trust import BLOW
 from brainbench.stimuli.engines.units import MILLI
 from brainbench.stimuli.objects.solid import Solid
 from brainbench.stimuli.sweeps.sweep_scenes import SweepScenes
@@ -113,8 +114,8 @@ class SweepLauncher:
         radii = np.array([chain.whisker.base_radius for chain in self.solver.chains])
         speeds = speed[sweep]
         way, farthest = followed(speeds, speeds, self.solver.steps[whisker] / MILLI, radii[whisker])
-        fast = np.empty((3, *size))
-        fast[:, row, column] = way, farthest, np.where(way > farthest, 0.0, np.inf)
+        fast = np.empty((4, *size))
+        fast[:, row, column] = way, farthest, np.where(way > farthest, 0.0, np.inf), speeds > BLOW
         placed = time.perf_counter() - started
         result = self.solver.launch(
             PackedJobs(whisker, sweep, bases[whisker], row, column, finer),

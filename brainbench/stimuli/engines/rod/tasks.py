@@ -28,7 +28,7 @@ from brainbench.stimuli.engines.rod.packing import (
 )
 from brainbench.stimuli.engines.rod.shapes import PackedShapes, TrackedObstacle
 from brainbench.stimuli.engines.stepping import is_silent
-from brainbench.stimuli.engines.trust import BLOW_STRIDE, HARD_BLOW, near_travel, step_travel
+from brainbench.stimuli.engines.trust import BLOW, BLOW_STRIDE, HARD_BLOW, near_travel, step_travel
 from brainbench.stimuli.engines.units import MILLI
 from brainbench.stimuli.whiskers.chain import Chain
 
@@ -48,8 +48,8 @@ class JobTask:
     """What tells them from other bodies."""
     limit: NDArray[np.float64] | None
     """[cell] longest step from each cell of the motions on (s); None for any."""
-    fast: tuple[float, float, float]
-    """``travel``, ``farthest`` and ``fast_at`` of :class:`brainbench.stimuli.engines.trust.RunFacts`."""
+    fast: tuple[float, float, float, bool]
+    """``travel``, ``farthest``, ``fast_at`` and ``struck`` of :class:`brainbench.stimuli.engines.trust.RunFacts`."""
     twists: bool
     """Whether it may leave its plane, and may twist at this fidelity."""
 
@@ -171,25 +171,26 @@ def followed(
 
 def _too_fast(
     job: Job, reach: Reach, pose: tuple[NDArray, NDArray], times: NDArray, steps: NDArray, step: float
-) -> tuple[float, float, float]:
+) -> tuple[float, float, float, bool]:
     """Return :attr:`JobTask.fast` from the base's ``pose`` at ``times`` [n] (s).
 
     ``steps`` [n − 1] (s) are the longest there, ``step`` is the longest of the whisker.
     """
     still = next((obstacle for obstacle in reach.obstacles if obstacle.motion is None), None)
     # Against all that stands still, such as the parts of one object, the whisker moves alike.
-    resting = None if still is None else step_travel(job.whisker, *pose, still, times)
+    resting, struck = None if still is None else step_travel(job.whisker, *pose, still, times), False
     for obstacle in reach.obstacles:
         moves = resting is None or obstacle.motion is not None
         travel = step_travel(job.whisker, *pose, obstacle, times) if moves else resting
         speed = travel / np.diff(times)
         blow = np.zeros_like(speed)
-        if speed.max(initial=0.0) > HARD_BLOW:
+        if speed.max(initial=0.0) > BLOW:
             # Without the turns of the base, which are those of whisking. Steps that a brief motion shortens follow it.
             blow = near_travel(job.whisker, pose[0], np.zeros_like(pose[1]), obstacle, times) / np.diff(times)
+            struck |= bool((blow > BLOW).any())
             blow[steps < step] = 0.0
         way, farthest = followed(speed, blow, steps, job.whisker.base_radius)
         if (way > farthest).any():
             first = int(np.argmax(way > farthest))
-            return float(way[first]), float(farthest[first]), float(times[first])
-    return 0.0, math.inf, math.inf
+            return float(way[first]), float(farthest[first]), float(times[first]), struck
+    return 0.0, math.inf, math.inf, struck

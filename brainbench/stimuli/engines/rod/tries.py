@@ -43,7 +43,8 @@ def run_with_retries(
 ) -> LaunchResult:
     """Simulate whiskers, and those that finer steps may mend again: with steps over ``retry``, then over twice that.
 
-    After each of these, suspicious whiskers are compared with half the step (:func:`.trust.halved`).
+    After each of these, suspicious whiskers are compared with half the step (:func:`.trust.halved`), at first
+    with steps over ``retry`` where they meet a blow.
 
     Args:
         simulate: gives the results of tries, which may be simulated at the same time; whiskers of a mask are in its
@@ -83,9 +84,13 @@ def run_with_retries(
                 result = result.replaced(some, found)
         suspicious = result.verdict.suspicious & left
         doubtful = suspicious | result.verdict.retryable
-        run({2 * finer: suspicious} | {retry * k: doubtful for k in (*ahead(), ())[place]})
-        for some, half in parts(suspicious, 2 * finer):
-            result = result.compared(some, half)
+        # Contacts may cut the step of a blow and its half to the same.
+        divisors = np.where(result.verdict.struck, max(retry, 2 * finer), 2 * finer)
+        compared = {int(divisor): suspicious & (divisors == divisor) for divisor in np.unique(divisors)}
+        run(compared | {retry * k: doubtful for k in (*ahead(), ())[place]})
+        for divisor, which in compared.items():
+            for some, half in parts(which, divisor):
+                result = result.compared(some, half)
     return result
 
 

@@ -69,11 +69,10 @@ def test_at_preset_accurate_the_moment_is_within_1_and_the_force_within_2_percen
 def test_the_rodgers_stimuli_feel_alike_on_both_engines_at_fine_steps(label):
     (scene,) = (scene for scene in get_recipe("rodgers", whiskers="C1").scenes if scene.label == label)
     scene = replace(scene, frames=Frames(0.001, 0.001, 149))
-    fine = {"bullet": 2e-5, "mujoco": 2e-6}
-    ours, mujoco = (
-        _run(*scene.jobs(), backend=name, fidelity=Fidelity(links=10, time_step=step))[0] for name, step in fine.items()
+    ours, rod = (
+        _run(*scene.jobs(), backend=name, fidelity=Fidelity(links=10, time_step=2e-5))[0] for name in ("bullet", "rod")
     )
-    moments = [np.linalg.norm(trace.wrench[:, 3:], axis=1) for trace in (ours, mujoco)]
+    moments = [np.linalg.norm(trace.wrench[:, 3:], axis=1) for trace in (ours, rod)]
     assert moments[1].max() > 1e-8
     assert moments[0].max() == pytest.approx(moments[1].max(), rel=0.03)
     assert np.sqrt(np.mean((moments[0] - moments[1]) ** 2)) < 0.04 * moments[1].max()
@@ -112,11 +111,9 @@ def test_with_friction_a_resting_whisker_keeps_the_drag_and_the_step_does_not_ma
     job = Job(CRITICAL, SWEEP, (post(0.010, 0.0022, friction=0.48),), SWEPT)
     coarse, fine = (_run(job, fidelity=Fidelity(links=8, time_step=step))[0] for step in (2e-4, 5e-5))
     assert np.abs((coarse.wrench - fine.wrench) / _scale(fine.wrench)).max() < 0.01
-    # The sweep ends after 40 ms; MuJoCo's soft friction then creeps, Coulomb's does not.
+    # The sweep ends after 40 ms; MuJoCo's soft friction then creeps, and says so, Coulomb's does not.
     np.testing.assert_allclose(coarse.wrench[-1, :3], coarse.wrench[22, :3], rtol=2e-3)
-    mujoco = _run(job, backend="mujoco")[0]
-    assert abs(mujoco.wrench[-1, 2]) < 0.5 * abs(coarse.wrench[-1, 2])
-    assert coarse.wrench[-1, 1] == pytest.approx(mujoco.wrench[-1, 1], rel=0.05)
+    assert "of the friction 0.48" in _run(job, backend="mujoco")[0].reason
 
 
 @needs_bullet

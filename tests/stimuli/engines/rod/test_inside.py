@@ -117,7 +117,7 @@ def test_a_whisker_all_in_a_large_object_is_told_its_whole_depth(obstacle, backe
 
 @pytest.mark.parametrize("backend", ["rod", "mujoco"])
 def test_a_whisker_that_starts_in_touch_is_not_inside(backend):
-    ball = Obstacle((Sphere((0.008, 0.005 + float(C2.radius(0.008)) - 1e-5, 0.0), 0.005),))
+    ball = Obstacle((Sphere((0.008, 0.005 + float(C2.radius(0.008)) - 1e-5, 0.0), 0.005),), friction=0.0)
     trace = get_engine(backend).run([Job(C2, StillFollicle(), (ball,), TIMES)], COARSE)[0]
     assert trace.status == "ok"
     # A ball that overlaps by 10 µm pushes the whisker away.

@@ -9,13 +9,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from brainbench.stimuli.engines.rod.tries import ONE_BY_ONE, run_with_retries
-from brainbench.stimuli.engines.trust import Verdict, halved
+from brainbench.stimuli.engines.trust import LARGEST_STRUCK_CHANGE, Verdict, halved
 
-FINE, SUSPICIOUS, MENDABLE, HOPELESS = range(4)
+FINE, SUSPICIOUS, STRUCK, MENDABLE, HOPELESS = range(5)
 DIVISORS = [1, 2, 3, 4, 5, 6, 8, 10, 12, 20]
-FATES = st.fixed_dictionaries(
-    {divisor: st.tuples(st.sampled_from([FINE, SUSPICIOUS, MENDABLE, HOPELESS]), st.booleans()) for divisor in DIVISORS}
-)
+FATES = st.fixed_dictionaries({divisor: st.tuples(st.integers(FINE, HOPELESS), st.booleans()) for divisor in DIVISORS})
 """What a whisker comes to with steps over each of these, and which of two forces it has then."""
 
 
@@ -28,7 +26,8 @@ class _Runs:
         self.finer, self.steps = np.full(len(fates), finer), np.full(len(fates), 100 * finer)
         bad = self.state >= MENDABLE
         words = np.where(bad, f"bad at {finer}", "").astype(object)
-        self.verdict = Verdict(np.where(bad, 0.0, np.inf), self.state == MENDABLE, words, self.state == SUSPICIOUS)
+        allowed = np.select([self.state == SUSPICIOUS, self.state == STRUCK], [0.2, LARGEST_STRUCK_CHANGE], np.inf)
+        self.verdict = Verdict(np.where(bad, 0.0, np.inf), self.state == MENDABLE, words, allowed)
 
     def _arrays(self):
         return {"force": self.force, "finer": self.finer, "steps": self.steps, **vars(self.verdict)}
@@ -62,9 +61,10 @@ def _one_after_the_other(fate, retry):
         simulated.add(finer)
         state, force = fate[finer]
         changed = False
-        if state == SUSPICIOUS and retry > 1:
-            simulated.add(2 * finer)
-            half, half_force = fate[2 * finer]
+        if state in (SUSPICIOUS, STRUCK) and retry > 1:
+            divisor = max(retry, 2 * finer) if state == STRUCK else 2 * finer
+            simulated.add(divisor)
+            half, half_force = fate[divisor]
             changed = half >= MENDABLE or half_force != force
         if state != MENDABLE and not changed:
             break
