@@ -312,6 +312,7 @@ def _train(
         "observation_shapes": {name: list(shape) for name, shape in env.observation_shapes.items()},
         "action_names": list(env.action_names), "action_map": env.action_map.plain(), "start": origin,
         "task_version": TASK_VERSION, "contacts": asdict(env.task.contacts), "observe": list(options.observe),
+        "rate": 1 / env.step_dt,
     }  # fmt: skip
     _resume(trainer, run, facts)
     writer = Loggers(run, options.loggers, facts)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from itertools import pairwise
 from types import SimpleNamespace
 from typing import Any
@@ -69,3 +70,9 @@ def test_an_orientation_is_worth_more_reached_than_nearly_reached(config: str, r
 def test_a_term_of_rotation_counts_nothing_beyond_the_tilt_that_the_goal_allows() -> None:
     moment: Any = SimpleNamespace(off_axis=torch.tensor([0.7]), allowed_off_axis=0.5, axis_rate=torch.tensor([2.0]))
     assert float(terms.rotation_progress(moment, clip=6.0, penalty_scale=5.0)) == pytest.approx(-1.0)
+
+
+def test_a_gripper_with_fewer_tips_than_are_asked_for_counts_all_of_them() -> None:
+    moment: Any = SimpleNamespace(surface_distance=torch.tensor([[0.04, -0.01]]))
+    found = terms.near_surface(moment, nearest_k=3, sigma=0.04)
+    torch.testing.assert_close(found, torch.tensor([(math.exp(-1) + 1) / 2]))
