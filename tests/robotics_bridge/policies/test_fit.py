@@ -52,6 +52,15 @@ def test_actions_counted_from_another_pose_are_refused() -> None:
         check_fit({**stored("in_palm_rotate.teacher"), "action_map": {"names": ["a"]}}, _env(), "damaged")
 
 
+def test_actions_that_last_for_another_time_are_refused() -> None:
+    faster = apply_overrides(tasks.load("in_palm_rotate"), ["solver.decimation=2"])
+    halved = apply_overrides(tasks.load("in_palm_rotate"), ["solver.timestep=0.0025", "solver.decimation=10"])
+    for name in ("in_palm_rotate.teacher", "in_palm_rotate.student"):
+        with pytest.raises(UsageError, match=r"40\.?0? actions per second, and here are 100.*solver\.decimation"):
+            check_fit(stored(name), tasks.make(faster, num_envs=1, threads=1), name)
+        check_fit(stored(name), tasks.make(halved, num_envs=1, threads=1), name)
+
+
 def test_other_contacts_are_told(caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level(logging.WARNING):
         check_fit({"task_version": TASK_VERSION, "hand": "xhand1"}, _env(), "mine")

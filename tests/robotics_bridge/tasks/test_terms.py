@@ -69,3 +69,11 @@ def test_an_orientation_is_worth_more_reached_than_nearly_reached(config: str, r
 def test_a_term_of_rotation_counts_nothing_beyond_the_tilt_that_the_goal_allows() -> None:
     moment: Any = SimpleNamespace(off_axis=torch.tensor([0.7]), allowed_off_axis=0.5, axis_rate=torch.tensor([2.0]))
     assert float(terms.rotation_progress(moment, clip=6.0, penalty_scale=5.0)) == pytest.approx(-1.0)
+
+
+@pytest.mark.parametrize("tips", [1, 2, 5])
+def test_a_hand_of_few_fingers_is_paid_for_those_that_it_has(tips: int) -> None:
+    distance = torch.linspace(0.01, 0.05, tips)[None]
+    moment: Any = SimpleNamespace(surface_distance=distance)
+    expected = np.exp(-distance[0, :2].numpy() / 0.05).mean()
+    assert float(terms.near_surface(moment, nearest_k=2, sigma=0.05)) == pytest.approx(expected)
