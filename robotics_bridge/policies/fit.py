@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from brainbench.core.errors import DataError, UsageError
+from brainbench.core.errors import DataError, UsageError, shown
 from robotics_bridge.policies.contract import TrainedMap, trained_contacts
 from robotics_bridge.policies.schema import from_json
 from robotics_bridge.policies.shipped import stored
@@ -19,6 +20,8 @@ if TYPE_CHECKING:
     from robotics_bridge.envs.env import Env
 
 _LOG = logging.getLogger(__name__)
+_RATE = 40.0
+"""Control steps per second of teachers that do not state it."""
 _SAME_ANGLE = 1e-4
 """Difference of two positions that is rounding [rad]."""
 
@@ -55,10 +58,10 @@ def check_version(described: Mapping[str, Any], name: str) -> None:
 
 
 def check_actions(described: Mapping[str, Any], env: Env, name: str) -> None:
-    """Check that an action means the target that it meant in training; raise UsageError where it does not.
+    """Check that an action means the target, and lasts as long, as in training; raise UsageError where it does not.
 
     Tasks, their configurations and hands differ in the pose from which actions are counted, and in their units. Earlier
-    runs do not state theirs.
+    runs do not state theirs, and earlier teachers no rate: theirs is that of all tasks of the package.
     """
     given = from_json(dict, described.get("deployment", described), f"deployment of {name}")
     if "action_map" not in given:
@@ -76,6 +79,12 @@ def check_actions(described: Mapping[str, Any], env: Env, name: str) -> None:
                     f"Actions of the policy {name!r} {what} {joint} = {trained:g} rad, and here {now:g} rad: take the "
                     "task, the hand and the configuration (--config) in which it was trained."
                 )
+    rate = given.get("rate", _RATE)
+    if not (isinstance(rate, int | float) and math.isclose(rate * env.step_dt, 1, rel_tol=1e-6)):
+        raise UsageError(
+            f"The policy {name!r} was trained with {shown(rate)} actions per second, and here are {1 / env.step_dt:g}: "
+            "take the solver.timestep and solver.decimation of the task in which it was trained."
+        )
 
 
 def check_fit(described: Mapping[str, Any], env: Env, name: str) -> None:
@@ -86,7 +95,7 @@ def check_fit(described: Mapping[str, Any], env: Env, name: str) -> None:
 
     Raises:
         DataError: the policy is of another version of the tasks.
-        UsageError: it was trained for another hand, or with actions that meant other targets.
+        UsageError: it was trained for another hand, with actions that meant other targets, or reads something else.
     """
     check_version(described, name)
     student = described.get("distill")
@@ -97,6 +106,13 @@ def check_fit(described: Mapping[str, Any], env: Env, name: str) -> None:
             "environment with that hand."
         )
     check_actions(described, env, name)
+    # Encoders that look up taxels by their number would read other taxels.
+    for group, shape in described.get("groups", ()):
+        if (here := env.observation_shapes.get(group)) != tuple(shape):
+            raise UsageError(
+                f"The policy {name!r} reads {group} {shape}, and the environment gives "
+                f"{'none' if here is None else list(here)}: make it with the touch and the task of its training."
+            )
     if unmeasured := [group for group, _ in described.get("groups", ()) if group not in MEASURED]:
         _LOG.warning("The student %r reads %s, which only the simulation knows.", name, ", ".join(unmeasured))
     rate, here = described.get("deployment", described).get("rate"), 1 / env.step_dt

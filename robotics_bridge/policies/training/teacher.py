@@ -13,14 +13,14 @@ import logging
 import math
 import time
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
 
 from brainbench.core.errors import BrainbenchError, DataError, DataFileNotFoundError, UsageError, missing_dependency
-from brainbench.core.files import file_hash, provenance, read_mapping, write_json
+from brainbench.core.files import file_hash, provenance, read_mapping, to_plain, write_json
 from brainbench.core.progress import Progress
 from brainbench.core.reading.ranges import check_fields
 from brainbench.core.reading.regular import readable
@@ -41,7 +41,7 @@ from robotics_bridge.policies.training.loggers import Loggers, check_loggers
 from robotics_bridge.policies.training.sensing import sensed_groups, sensing_policy
 from robotics_bridge.policies.training.student_files import CONFIG, MODEL
 from robotics_bridge.tasks.settings import TeacherSettings
-from robotics_bridge.tasks.task import TASK_VERSION
+from robotics_bridge.tasks.task import TASK_VERSION, Task
 
 if TYPE_CHECKING:
     from robotics_bridge.envs.env import Env
@@ -312,7 +312,7 @@ def _train(
         "observation_shapes": {name: list(shape) for name, shape in env.observation_shapes.items()},
         "action_names": list(env.action_names), "action_map": env.action_map.plain(), "start": origin,
         "task_version": TASK_VERSION, "contacts": asdict(env.task.contacts), "observe": list(options.observe),
-        "rate": 1 / env.step_dt,
+        "rate": 1 / env.step_dt, "world": _plain(env.task), "sensing": to_plain(trainer.sensing),
     }  # fmt: skip
     _resume(trainer, run, facts)
     writer = Loggers(run, options.loggers, facts)
@@ -344,7 +344,9 @@ def _resume(trainer: Trainer, run: Path, facts: dict[str, Any]) -> None:
     check_version(known, str(run))
     # Settings that came later than the run had their defaults in it.
     known["settings"] = asdict(from_json(TeacherSettings, known.get("settings"), f"settings of {config}"))
-    names = ("task", "hand", "num_envs", "seed", "settings", "observe", "contacts")
+    names = ["task", "hand", "num_envs", "seed", "settings", "observe", "contacts"]
+    # Earlier runs do not state these.
+    names += [name for name in ("rate", "world", "sensing") if name in known]
     check_same(run, json.loads(json.dumps(known)), {name: json.loads(json.dumps(facts[name])) for name in names})
     if not (run / RESUME).exists():
         trim_log(run / LOG, "iteration", 0)
@@ -354,6 +356,13 @@ def _resume(trainer: Trainer, run: Path, facts: dict[str, Any]) -> None:
         trainer.load(state)
     # Iterations after the last checkpoint are done again.
     trim_log(run / LOG, "iteration", trainer.iteration)
+
+
+def _plain(task: Task) -> dict[str, Any]:
+    """Return what makes a task as plain values, terms by name, without what the other facts of a run state."""
+    stated = ("name", "text", "contacts", "teacher", "student")
+    parts = {item.name: getattr(task, item.name) for item in fields(task) if item.name not in stated}
+    return json.loads(json.dumps(to_plain(parts), default=lambda term: getattr(term, "__qualname__", str(term))))
 
 
 def _save(trainer: Trainer, run: Path) -> None:

@@ -17,6 +17,9 @@ from robotics_bridge.sensors.queries.kernels.distance import OTHER, WALL, SolidA
 from robotics_bridge.sensors.queries.walls import as_solid, wall_thickness
 
 _UNBOUNDED = 1.0e6
+_LARGER = 1024.0
+"""Factor at which round solids are made: trimesh leaves out triangles below 1e-8 m², such as those at the poles of a
+finger's capsule. A power of two loses no digit."""
 
 
 def bounding_sphere(geometry: Geometry) -> NDArray[np.float32]:
@@ -57,9 +60,11 @@ def tessellate(geometry: Geometry) -> Mesh:
         solid = trimesh.creation.icosphere(4, 1.0)
         solid.apply_scale(size)
     elif geometry.kind == "cylinder":
-        solid = trimesh.creation.cylinder(size[0], 2 * size[1], sections=96)
+        solid = trimesh.creation.cylinder(_LARGER * size[0], _LARGER * 2 * size[1], sections=96)
+        solid.apply_scale(1 / _LARGER)
     elif geometry.kind == "capsule":
-        solid = trimesh.creation.capsule(2 * size[1], size[0], count=[96, 48])
+        solid = trimesh.creation.capsule(_LARGER * 2 * size[1], _LARGER * size[0], count=[96, 48])
+        solid.apply_scale(1 / _LARGER)
         solid.apply_translation([0, 0, -solid.bounds.mean(axis=0)[2]])
     else:
         raise UsageError(f"A {geometry.kind} ({geometry.name!r}) has no triangles to query; use query='sdf'.")

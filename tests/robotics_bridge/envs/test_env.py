@@ -15,7 +15,7 @@ from brainbench.core.rotations import to_matrices
 from robotics_bridge import tasks
 from robotics_bridge.deploy.safety import SafetyLimits
 from robotics_bridge.envs import Env
-from robotics_bridge.hands.observations import observation_type, observe, sensors_for
+from robotics_bridge.hands.observations import OBSERVATIONS, observation_type, observe, sensors_for
 from robotics_bridge.tasks.goals import SteppingRotation
 from robotics_bridge.tasks.task import ActuatorRandomisation, ObjectRandomisation
 
@@ -231,6 +231,15 @@ def test_objects_of_different_kinds_share_one_batch() -> None:
     names = [env.model.shapes[number].name for number in env.simulation.shape_of]
     assert sum(name.startswith("cylinder") for name in names) == 2
     assert env.observations["aux_obj_size"].tolist() == [pytest.approx(shape.extent) for shape in env.model.shapes]
+
+
+@pytest.mark.parametrize("kind", OBSERVATIONS)
+def test_every_observation_type_feels_the_objects_of_a_task(kind: str) -> None:
+    # Blocks and cylinders share one batch: each has the other's solid as a grain.
+    env = _make(2, observe=kind, placement="tips", resolution="low")
+    observations = env.step(torch.zeros(2, env.num_actions))[0]
+    assert ("tactile" in observations) == (observation_type(kind).sensor is not None)
+    assert all(value.isfinite().all() for value in observations.values())
 
 
 @pytest.mark.parametrize("kind", ["force_torque", "agg_bool", "agg_force"])

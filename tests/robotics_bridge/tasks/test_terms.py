@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from itertools import pairwise
 from types import SimpleNamespace
 from typing import Any
@@ -72,7 +71,9 @@ def test_a_term_of_rotation_counts_nothing_beyond_the_tilt_that_the_goal_allows(
     assert float(terms.rotation_progress(moment, clip=6.0, penalty_scale=5.0)) == pytest.approx(-1.0)
 
 
-def test_a_gripper_with_fewer_tips_than_are_asked_for_counts_all_of_them() -> None:
-    moment: Any = SimpleNamespace(surface_distance=torch.tensor([[0.04, -0.01]]))
-    found = terms.near_surface(moment, nearest_k=3, sigma=0.04)
-    torch.testing.assert_close(found, torch.tensor([(math.exp(-1) + 1) / 2]))
+@pytest.mark.parametrize("tips", [1, 2, 5])
+def test_a_hand_of_few_fingers_is_paid_for_those_that_it_has(tips: int) -> None:
+    distance = torch.linspace(0.01, 0.05, tips)[None]
+    moment: Any = SimpleNamespace(surface_distance=distance)
+    expected = np.exp(-distance[0, :2].numpy() / 0.05).mean()
+    assert float(terms.near_surface(moment, nearest_k=2, sigma=0.05)) == pytest.approx(expected)

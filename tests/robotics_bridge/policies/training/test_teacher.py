@@ -199,6 +199,26 @@ def test_a_folder_of_another_run_is_refused(tmp_path: Path) -> None:
         train(_env(), tmp_path, settings=replace(SMALL, epochs=3), iterations=2)
 
 
+def test_a_run_does_not_go_on_with_another_task_touch_or_encoder(tmp_path: Path) -> None:
+    train(_env(), tmp_path / "task", settings=SMALL, iterations=1)
+    rewards = tasks.load("in_palm_rotate").rewards
+    other = {**rewards, "is_dropped": replace(rewards["is_dropped"], weight=-1.0)}
+    for changes, told in (
+        ({"rewards": other}, "is_dropped"),
+        ({"episode": 3.0}, "episode"),
+        ({"rated_speed": False}, "rated_speed"),
+    ):
+        with pytest.raises(UsageError, match=f"another run: .*{told}"):
+            train(_env(**changes), tmp_path / "task", settings=SMALL, iterations=2)
+    felt = {"num_envs": 4, "threads": 1, "resolution": "low", "observe": "agg_bool"}
+    sensed: dict[str, Any] = {"settings": SMALL, "observe": ("proprio", "touch")}
+    train(tasks.make("in_palm_rotate", placement="tips", **felt), tmp_path / "felt", iterations=1, **sensed)
+    for place, encoder, told in (("palm", "rnn", "placement"), ("tips", "mlp", "encoder")):
+        env = tasks.make("in_palm_rotate", placement=place, **felt)
+        with pytest.raises(UsageError, match=f"another run: .*{told}"):
+            train(env, tmp_path / "felt", iterations=2, encoder=encoder, **sensed)
+
+
 def test_a_policy_of_another_task_is_refused(tmp_path: Path) -> None:
     train(_env(), tmp_path, settings=SMALL, iterations=1)
     other = tasks.make("in_hand_repose", num_envs=2, threads=1)

@@ -10,6 +10,7 @@ from scipy.optimize import minimize
 from brainbench.geometry import Mesh
 from robotics_bridge.physics import Geometry
 from robotics_bridge.sensors import Probes, SensorSuite, SurfaceDistanceProbe
+from robotics_bridge.sensors.queries.solids import tessellate
 from tests.factories.touch_scenes import pad_scene, random_pose, rotation_of, state_of
 
 TORUS = trimesh.creation.torus(0.012, 0.005, major_sections=48, minor_sections=24)
@@ -162,3 +163,15 @@ def test_a_box_of_triangles_presses_like_a_box(query: str) -> None:
     assert np.abs(read["box"]).max() > 0.3
     # Samples round the edges off; triangles do not.
     assert error < (0.03 if query == "sdf" else 1e-5)
+
+
+@pytest.mark.parametrize("radius", [1e-4, 0.0028, 0.01, 0.1])
+def test_the_triangles_of_round_solids_close_at_every_size(radius: float) -> None:
+    half = 1.5 * radius
+    side = 4 * np.pi * radius * half
+    expected = {"cylinder": side + 2 * np.pi * radius**2, "capsule": side + 4 * np.pi * radius**2}
+    for kind, area in expected.items():
+        mesh = tessellate(Geometry(name=kind, link="o", kind=kind, size=(radius, half)))
+        found = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+        assert found.is_watertight
+        assert found.area == pytest.approx(area, rel=2e-3)
