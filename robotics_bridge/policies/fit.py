@@ -90,8 +90,8 @@ def check_actions(described: Mapping[str, Any], env: Env, name: str) -> None:
 def check_fit(described: Mapping[str, Any], env: Env, name: str) -> None:
     """Check what the ``config.json`` of a teacher or student says against an environment.
 
-    Other contacts than those of training and another pace of control are told as a warning: how a policy bears them is
-    a question one may ask. So is a student that reads the goal, as published ones do. Earlier runs state no pace.
+    Other contacts than those of training are told as a warning: how a policy bears them is a question one may ask. So
+    is a student that reads the goal, as published ones do.
 
     Raises:
         DataError: the policy is of another version of the tasks.
@@ -115,9 +115,6 @@ def check_fit(described: Mapping[str, Any], env: Env, name: str) -> None:
             )
     if unmeasured := [group for group, _ in described.get("groups", ()) if group not in MEASURED]:
         _LOG.warning("The student %r reads %s, which only the simulation knows.", name, ", ".join(unmeasured))
-    rate, here = described.get("deployment", described).get("rate"), 1 / env.step_dt
-    if isinstance(rate, (int, float)) and abs(rate - here) > 1e-6 * here:
-        _LOG.warning("The policy %r was trained to act %g times a second; here it acts %g times.", name, rate, here)
     if (own := trained_contacts(described)) != env.task.contacts:
         _LOG.warning(
             "The policy %r was trained with contacts %s; these are %s.", name, contacts_name(own),

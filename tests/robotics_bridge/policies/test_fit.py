@@ -24,7 +24,7 @@ from tests.factories.policies import teacher_in
 
 def _env(contacts: str = "published") -> Any:
     hand = SimpleNamespace(name="xhand1", path=None)
-    return SimpleNamespace(hand=hand, task=SimpleNamespace(contacts=CONTACTS[contacts]), step_dt=0.025)
+    return SimpleNamespace(hand=hand, task=SimpleNamespace(contacts=CONTACTS[contacts]))
 
 
 def test_another_version_of_the_tasks_or_another_hand_is_refused() -> None:
@@ -69,16 +69,6 @@ def test_other_contacts_are_told(caplog: pytest.LogCaptureFixture) -> None:
         check_fit({"task_version": TASK_VERSION, "hand": "xhand1"}, _env("firm"), "mine")
     assert "published" in caplog.text
     assert "firm" in caplog.text
-
-
-def test_another_pace_of_control_is_told(caplog: pytest.LogCaptureFixture) -> None:
-    described = stored("in_palm_rotate.student")
-    with caplog.at_level(logging.WARNING):
-        check_fit(described, tasks.make("in_palm_rotate", num_envs=1, threads=1), "mine")
-        assert not caplog.records
-        slower = apply_overrides(tasks.load("in_palm_rotate"), ["solver.decimation=10"])
-        check_fit(described, tasks.make(slower, num_envs=1, threads=1), "mine")
-    assert "trained to act 40 times a second; here it acts 20 times" in caplog.text
 
 
 def test_a_policy_says_in_which_contacts_it_was_trained_and_earlier_ones_had_the_published() -> None:

@@ -127,15 +127,13 @@ def test_a_student_whose_encoder_has_settings_is_read_again_with_them(tmp_path, 
 
 def test_a_student_is_not_read_with_another_probe_file_of_its_name(tmp_path) -> None:
     file, hand = tmp_path / "own.json", hands.load("xhand1")
-    write_probes(file, hand.layout("low", "tips"))
+    usual = hand.layout("low", "tips")
+    write_probes(file, usual)
     _run(tmp_path / "run", iterations=1, resolution=str(file))
     load_student(tmp_path / "run")
     # As many taxels on the same links, elsewhere.
-    moved = {
-        link: replace(probes, position=probes.position + 0.002) for link, probes in hand.layout("low", "tips").items()
-    }
-    write_probes(file, moved)
-    for read in (load_student, partial(_run, iterations=2, resolution=str(file))):
+    write_probes(file, {link: replace(probes, position=probes.position + 0.002) for link, probes in usual.items()})
+    for read in (load_student, partial(_run, iterations=1, resolution=str(file))):
         with pytest.raises(DataError, match=r"own\.json' has changed"):
             read(tmp_path / "run")
 
