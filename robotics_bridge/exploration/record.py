@@ -233,8 +233,7 @@ class _World:
         self._place = model.body(OBJECT).pos.copy()
         self._drives = [model.actuator(name).id for name in self.hand.joints]
         # Jaws are not at zero when they are open.
-        driven = np.isin(self.hand.model.jnt_type, (2, 3))
-        self._open, self._closed = (flexed(self.hand, share)[driven] for share in (0.0, 1.0))
+        self._open, self._closed = (flexed(self.hand, share)[self.hand.joint_numbers] for share in (0.0, 1.0))
         # How far the lowest point of a held object lies below its body's origin (m), by the support function downwards:
         # row 2 of the rotation is the vertical in the object's frame.
         self._bottoms = {id(item): float(item.geometry.reach(-to_matrices(item.quaternion)[2])) for item in kinds}

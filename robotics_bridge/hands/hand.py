@@ -20,7 +20,7 @@ from brainbench.core.errors import DataError, UsageError, check_each, check_kind
 from brainbench.core.reading.regular import check_file, readable
 from brainbench.core.reading.texts import read_text
 from robotics_bridge.hands.facing import palmar_directions
-from robotics_bridge.hands.layouts import Layout, check_names, pad_probes, read_probes, select
+from robotics_bridge.hands.layouts import Layout, check_names, is_probe_file, pad_probes, read_probes, select
 from robotics_bridge.hands.spec import HandSpec, build
 from robotics_bridge.sensors.probes.placement import Probes
 
@@ -77,8 +77,12 @@ class Hand:
     @property
     def joints(self) -> tuple[str, ...]:
         """Names of the hinges and slides, in the model's order."""
-        model = self.model
-        return tuple(model.joint(index).name for index in range(model.njnt) if model.jnt_type[index] in (2, 3))
+        return tuple(self.model.joint(int(number)).name for number in self.joint_numbers)
+
+    @property
+    def joint_numbers(self) -> NDArray[np.intp]:
+        """Numbers of the hinges and slides among the model's joints."""
+        return np.flatnonzero(np.isin(self.model.jnt_type, (2, 3)))
 
     def rated_speeds(self, joints: Iterable[str]) -> NDArray[np.float64]:
         """Return the largest speeds [J] (rad/s or m/s) of joints.
@@ -115,7 +119,7 @@ class Hand:
             UsageError: resolution or placement are unknown, or no link of the placement gets a probe (it says why).
         """
         links = self.links(placement)
-        if resolution.endswith(".json"):
+        if is_probe_file(resolution):
             return self.with_probes(resolution).layout("custom", placement)
         if resolution == "custom" and self.custom is not None:
             return select(self.custom, links)

@@ -101,9 +101,14 @@ def active_count(layout: Mapping[str, Probes]) -> int:
     return int(sum(np.count_nonzero(probes.active) for probes in layout.values()))
 
 
+def is_probe_file(resolution: str) -> bool:
+    """Return whether what names a resolution is a probe file, which may stand for one."""
+    return resolution.endswith(".json")
+
+
 def check_names(resolution: str, placement: str) -> None:
     """Raise UsageError for an unknown resolution or placement; a probe file (.json) stands for a resolution."""
-    if not resolution.endswith(".json"):
+    if not is_probe_file(resolution):
         check_name("resolution", resolution, RESOLUTIONS)
     check_name("placement", placement, PLACEMENTS)
 

@@ -149,7 +149,7 @@ def closing(hand: Hand, share: float) -> NDArray[np.float64]:
         UsageError: the share is not between 0 and 1.
     """
     target, joints = flexed(hand, share), _servoed(hand)
-    return target[np.isin(hand.model.jnt_type, (2, 3)) if joints is None else joints]
+    return target[hand.joint_numbers if joints is None else joints]
 
 
 def flexed(hand: Hand, share: float) -> NDArray[np.float64]:

@@ -127,6 +127,12 @@ def agent(name: str, env: Env, *, seed: int = 0) -> Acting:
     return act
 
 
+def forget(policy: Acting, where: torch.Tensor) -> None:
+    """Let a policy that remembers begin anew in the environments of a mask [B] bool; others have nothing to forget."""
+    if (reset := getattr(policy, "reset", None)) is not None:
+        reset(where)
+
+
 def evaluate(
     env: Env, policy: Acting, *, episodes: int = 100, seed: int | Sequence[int] = (0, 1, 2), name: str = "policy",
     progress: Progress | None = None,
@@ -148,23 +154,20 @@ def evaluate(
     if episodes < 1 or not seeds:
         raise UsageError(f"An evaluation needs at least one episode and one seed; received {episodes} and {seeds}.")
     each = math.ceil(episodes / env.num_envs)
-    forget = getattr(policy, "reset", None)
     limit = None if env.task.goal is None else env.task.goal.limit
     rows: list[list[Any]] = []
     rates = []
     for number in track(seeds, f"evaluating {name}", progress):
         env.seed(number)
         observations = env.reset()
-        if forget is not None:
-            forget(torch.ones(env.num_envs, dtype=torch.bool, device=env.device))
+        forget(policy, torch.ones(env.num_envs, dtype=torch.bool, device=env.device))
         left = torch.full((env.num_envs,), each, device=env.device)
         found: list[list[Any]] = []
         # Whoever is done waits for the slowest, so the device is asked once a step.
         while bool((left > 0).any()):
             observations, _, terminated, truncated, info = env.step(policy(observations))
             done = terminated | truncated
-            if forget is not None:
-                forget(done)
+            forget(policy, done)
             columns = [info[name].float() for name in ("metric", "return", "steps", "diverged", "goals", "turned")]
             full = info["goals"] >= (limit or math.inf)
             dropped = terminated & ~info["diverged"] & ~full

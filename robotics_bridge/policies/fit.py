@@ -107,13 +107,14 @@ def check_fit(described: Mapping[str, Any], env: Env, name: str) -> None:
         )
     check_actions(described, env, name)
     # Encoders that look up taxels by their number would read other taxels.
-    for group, shape in described.get("groups", ()):
+    groups = described.get("groups", ())
+    for group, shape in groups:
         if (here := env.observation_shapes.get(group)) != tuple(shape):
             raise UsageError(
                 f"The policy {name!r} reads {group} {shape}, and the environment gives "
                 f"{'none' if here is None else list(here)}: make it with the touch and the task of its training."
             )
-    if unmeasured := [group for group, _ in described.get("groups", ()) if group not in MEASURED]:
+    if unmeasured := [group for group, _ in groups if group not in MEASURED]:
         _LOG.warning("The student %r reads %s, which only the simulation knows.", name, ", ".join(unmeasured))
     if (own := trained_contacts(described)) != env.task.contacts:
         _LOG.warning(

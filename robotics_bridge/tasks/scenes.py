@@ -165,7 +165,7 @@ def _drives(hand: Hand) -> dict[str, tuple[float, float, float]]:
     for index in range(model.nu):
         if int(model.actuator_trntype[index]) == 0 and model.actuator_biasprm[index, 1] < 0:
             servos.setdefault(int(model.actuator_trnid[index, 0]), index)
-    order = [*servos, *(j for j in range(model.njnt) if j not in servos and int(model.jnt_type[j]) in (2, 3))]
+    order = [*servos, *(joint for joint in hand.joint_numbers.tolist() if joint not in servos)]
     found = {}
     for joint in order:
         effort = float(model.jnt_actfrcrange[joint, 1]) if model.jnt_actfrclimited[joint] else _EFFORT

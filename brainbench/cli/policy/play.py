@@ -82,9 +82,11 @@ def play(
             check_format(path, endings)
     if pictures:
         from brainbench.cli.policy import pictures as drawing
+    # After the checks of names, which need no torch.
+    from robotics_bridge.policies.evaluate import forget
+
     options |= touch_of([agent])
     env = world.make([agent], num_envs=1, threads=1, **options)
-    contacts = contacts_name(env.task.contacts)
     act = agent_of(agent, env, seed=options["seed"])
     steps = max(round(seconds / env.step_dt), 1)
     rewards: list[float] = []
@@ -108,8 +110,8 @@ def play(
             rewards.append(float(reward))
             over = bool(terminated | truncated)
             ended += over
-            if over and (forget := getattr(act, "reset", None)) is not None:
-                forget(terminated | truncated)
+            if over:
+                forget(act, terminated | truncated)
             dropped += bool(terminated) and not bool(info["diverged"]) and float(info["goals"]) < limit
             if over or step == steps - 1:
                 goals, turned = goals + int(info["goals"]), turned + float(info["turned"])
@@ -119,12 +121,12 @@ def play(
         if strip is not None:
             drawing.write_strip(strip, stills, times)
     told = {
-        "task": env.task.name, "hand": env.hand.name, "contacts": contacts, "agent": agent,
+        "task": env.task.name, "hand": env.hand.name, "contacts": contacts_name(env.task.contacts), "agent": agent,
         "seconds": steps * env.step_dt, "reward": sum(rewards), "episodes_ended": ended,
         "metric": env.task.success.metric, "files": pictures, "goals": goals, "turned": turned, "dropped": dropped,
     }  # fmt: skip
     shown: dict[str, object] = {
-        "task": told["task"], "hand": told["hand"], "contacts": contacts, "agent": agent,
+        "task": told["task"], "hand": told["hand"], "contacts": told["contacts"], "agent": agent,
         "simulated": f"{told['seconds']:g} s",
         # What a task does not count stays unsaid.
         **({"goals reached": goals} if env.task.goal is not None else {}),

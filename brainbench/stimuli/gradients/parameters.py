@@ -84,11 +84,7 @@ class JobParameters:
         if kind != "object" or what != "friction":
             return 0.0
         chosen = slice(None) if index < 0 else slice(index, index + 1)
-        found = {
-            job.whisker.friction if one.friction is None else one.friction
-            for job in self.jobs
-            for one in job.obstacles[chosen]
-        }
+        found = {one.friction_beside(job.whisker.friction) for job in self.jobs for one in job.obstacles[chosen]}
         if len(found) != 1:
             raise UsageError(f"{name!r} names no object, or several whose frictions differ; name one.")
         return found.pop()

@@ -203,6 +203,10 @@ class Obstacle:
             raise UsageError(f"A closed surface has at least four vertices and four faces; received shapes {shapes}.")
         check_fields(self, "friction", least=0, of="{} of an obstacle")
 
+    def friction_beside(self, whisker: float) -> float:
+        """Return the Coulomb coefficient of a contact with a whisker whose own is given."""
+        return whisker if self.friction is None else self.friction
+
     def moved(self, rotation: NDArray[np.float64], translation: NDArray[np.float64]) -> Obstacle:
         """Return the body with its geometry rotated by a matrix [3, 3] about the origin, then translated by [3] (m)."""
         surface = self.surface and self.surface.transformed(rotation, translation)

@@ -15,7 +15,7 @@ from brainbench.core.errors import UsageError
 from robotics_bridge.envs.env import Env
 from robotics_bridge.policies.encoders.calibration import HandCalibration
 from robotics_bridge.policies.encoders.taxel_grid import TaxelGrid
-from robotics_bridge.policies.evaluate import Acting
+from robotics_bridge.policies.evaluate import Acting, forget
 
 TARGETS = ("position", "velocity", "spin", "contact")
 """Object (m, m/s, rad/s), and the centre of the contact forces on it (m), [3] each, world axes."""
@@ -57,11 +57,10 @@ def collect(env: Env, policy: Acting, seconds: float) -> TouchRollout:
     """
     if env.options.observe != "force_torque" or env.touch is None:
         raise UsageError("A probe reads force and torque: make the environment with observe='force_torque'.")
-    observations, forget = env.reset(), getattr(policy, "reset", None)
+    observations = env.reset()
     age = torch.zeros(env.num_envs, dtype=torch.long, device=env.device)
-    if forget is not None:
-        # A policy may remember what it did before this rollout.
-        forget(age == 0)
+    # A policy may remember what it did before this rollout.
+    forget(policy, age == 0)
     kept: dict[str, list[torch.Tensor]] = {}
     for _ in range(round(seconds / env.step_dt)):
         velocity, spin = env.state.target_velocity
@@ -73,8 +72,7 @@ def collect(env: Env, policy: Acting, seconds: float) -> TouchRollout:
             kept.setdefault(name, []).append(value.clone())
         observations, _, terminated, truncated, _ = env.step(policy(observations))
         done = terminated | truncated
-        if forget is not None:
-            forget(done)
+        forget(policy, done)
         age = torch.where(done, 0, age + 1)
     stacked = {name: torch.stack(rows) for name, rows in kept.items()}
     targets = {name: stacked.pop(name) for name in TARGETS}

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from brainbench.core.records import Interval
+from robotics_bridge.hands.layouts import is_probe_file
 from robotics_bridge.policies.report.results import STOPPED, StudentResult, learned_of
 from robotics_bridge.policies.training.distill_config import DistillConfig
 
@@ -37,7 +38,7 @@ def sense(config: DistillConfig) -> tuple[str, str, str, str]:
     own = config.encoder_settings
     told = ([tactile.learning] if "learning" in own else []) + ([f"{own['units']} units"] if "units" in own else [])
     # A layout of one's own is a file; its name tells it apart.
-    resolution = Path(config.resolution).stem if config.resolution.endswith(".json") else config.resolution
+    resolution = Path(config.resolution).stem if is_probe_file(config.resolution) else config.resolution
     encoder = f"{tactile.arm} ({', '.join(told)})" if told else tactile.arm
     return config.placement, resolution, "noisy" if config.noisy else "clean", encoder
 

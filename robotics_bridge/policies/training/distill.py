@@ -30,7 +30,7 @@ from brainbench.core.writing.locks import lock_folder
 from brainbench.core.writing.same_run import check_same
 from brainbench.core.writing.tensors import write_tensors
 from brainbench.models.training.run_folder import RunLog, load_state, save_state
-from robotics_bridge.hands.layouts import check_probes
+from robotics_bridge.hands.layouts import check_probes, is_probe_file
 from robotics_bridge.policies.encoders.arms import perceptron
 from robotics_bridge.policies.evaluate import Policy
 from robotics_bridge.policies.fit import check_version
@@ -358,7 +358,7 @@ def describe_run(config: DistillConfig, student: TactilePolicy, env: Any) -> dic
         "actions": env.num_actions,
         "deployment": {
             **{name: getattr(config, name) for name in ("task", "hand", "observe", "placement", "resolution")},
-            **({"probes": file_hash(config.resolution)} if config.resolution.endswith(".json") else {}),
+            **({"probes": file_hash(config.resolution)} if is_probe_file(config.resolution) else {}),
             **({"command": [1.0]} if env.task.command == ("on",) else {}),
             "rate": 1 / env.step_dt,
             "sub_steps": env.decimation,

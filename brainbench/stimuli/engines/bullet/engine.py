@@ -100,9 +100,7 @@ class _Run:
         self.stiffness = np.repeat(chain.stiffness, 2) * MICRO
         self.damping = np.repeat(chain.damping(self.step / MILLI), 2) * MICRO * MILLI
         self._prescribe(*stepped.pose, reach)
-        self.friction = np.array(
-            [job.whisker.friction if item.friction is None else item.friction for item in reach.obstacles]
-        )
+        self.friction = np.array([item.friction_beside(job.whisker.friction) for item in reach.obstacles])
         self.hinges, self.rates = np.zeros(2 * chain.links), np.zeros(2 * chain.links)
         self.wrench = np.zeros((self.steps, 6))
         self.arc = np.full(self.steps, np.nan)

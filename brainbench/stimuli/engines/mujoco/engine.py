@@ -226,8 +226,7 @@ def _lost_friction(slots: NDArray, job: Job, reach: Reach) -> str:
     A whisker against an object creeps along it, so that Coulomb's law asks for almost all of the friction. Soft
     friction is viscous below some cm/s and lets go.
     """
-    given = (job.whisker.friction if item.friction is None else item.friction for item in reach.obstacles)
-    friction = min(given, default=0.0)
+    friction = min((item.friction_beside(job.whisker.friction) for item in reach.obstacles), default=0.0)
     squares = np.sum(slots.reshape(-1, SLOT_WIDTH)[:, 1:4] ** 2, axis=0)
     if friction == 0.0 or squares[0] == 0.0:
         return ""

@@ -261,7 +261,7 @@ def _add_obstacles(
             position = position * MILLI
             body = _add(world, "body", pos=position[0], quat=quaternion[0])
             drives += _add_obstacle_joints(body, position, quaternion, step)
-        friction = whisker_friction if obstacle.friction is None else obstacle.friction
+        friction = obstacle.friction_beside(whisker_friction)
         for index, part in enumerate(obstacle.parts):
             _add(
                 body,
