@@ -24,6 +24,7 @@ from robotics_bridge.deploy.frames import new_key
 from robotics_bridge.deploy.hand_link import HandLink
 from robotics_bridge.deploy.touch import PressureCalibration
 from robotics_bridge.deploy.udp import LOOPBACK
+from robotics_bridge.hands.layouts import check_probes
 from robotics_bridge.hands.observations import observation_type, observe, sensors_for
 from robotics_bridge.hands.scenes import OBJECT, holding
 from robotics_bridge.physics import MujocoEngine
@@ -186,8 +187,11 @@ class ShadowTouch:
 
     def __init__(self, contract: PolicyContract, joints: tuple[str, ...]) -> None:
         more = contract.more
+        if "tactile" not in contract.inputs:
+            raise UsageError("The policy reads no touch, so none can be simulated beside the hand (--shadow).")
         if missing := [name for name in ("placement", "resolution", "sub_steps") if name not in more]:
             raise UsageError(f"The contract does not say {missing[0]!r}, so no touch can be simulated beside the hand.")
+        check_probes(more["resolution"], more.get("probes"))
         self.sub_steps: int = more["sub_steps"]
         senses = {name: more[name] for name in ("placement", "resolution", "twist", "contacts")}
         self.hand = SimulatedHand(contract.hand, contract.rate * self.sub_steps, observe=contract.observe, **senses)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.errors import DataError, UsageError, check_name, shown
-from brainbench.core.files import read_json, write_json
+from brainbench.core.files import file_hash, read_json, write_json
 from brainbench.core.reading.regular import reason
 from robotics_bridge.hands.spec import BoxGeometry, CapsuleGeometry, Grid, Link, Pad
 from robotics_bridge.sensors.probes.placement import Probes
@@ -106,6 +106,15 @@ def check_names(resolution: str, placement: str) -> None:
     if not resolution.endswith(".json"):
         check_name("resolution", resolution, RESOLUTIONS)
     check_name("placement", placement, PLACEMENTS)
+
+
+def check_probes(resolution: str, trained: str | None) -> None:
+    """Raise DataError for a probe file that is no longer what it was, by its hash, when a policy was trained."""
+    if trained is not None and file_hash(resolution) != trained:
+        raise DataError(
+            f"The probe file {resolution!r} has changed since the policy was trained with it, so taxels would lie "
+            "elsewhere: bring back that file, or train again."
+        )
 
 
 def read_probes(path: str | os.PathLike[str]) -> Layout:

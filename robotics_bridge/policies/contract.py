@@ -72,9 +72,13 @@ class _Deployment(msgspec.Struct):
     task: Name | None = None
     placement: Name | None = None
     resolution: Name | None = None
+    probes: Name | None = None
     sub_steps: Annotated[int, Meta(ge=1, le=1000)] | None = None
     command: tuple[Annotated[float, Meta(ge=-1e6, le=1e6)], ...] | None = None
     action_limit: Annotated[float, Meta(ge=1e-6, le=1e6)] | None = None
+
+
+_MORE = ("task", "placement", "resolution", "probes", "sub_steps", "action_limit")
 
 
 class _Written(msgspec.Struct):
@@ -109,9 +113,9 @@ class PolicyContract:
     sha256: str = ""
     """Hash of the file of the network; empty in contracts of earlier versions."""
     more: Mapping[str, Any] = field(default_factory=dict)
-    """``task``, ``placement``, ``resolution``, ``sub_steps``, ``command`` (what it is told by default) and
-    ``action_limit``, where they stand in the contract, and ``twist``, the torsional friction of force taxels (N·m·s;
-    None: they hold), and ``contacts``, the contact model in which it was trained."""
+    """``task``, ``placement``, ``resolution``, ``probes`` (hash of a probe file), ``sub_steps``, ``command`` (what it
+    is told by default) and ``action_limit``, where they stand in the contract, and ``twist``, the torsional
+    friction of force taxels (N·m·s; None: they hold), and ``contacts``, the contact model in which it was trained."""
 
     @classmethod
     def read(cls, path: Path) -> PolicyContract:
@@ -152,7 +156,7 @@ class PolicyContract:
         links, observe = (given.links, given.observe) if "tactile" in inputs else ((), "none")
         if "tactile" in inputs:
             _check_touch(given, inputs["tactile"], where)
-        more = {name: getattr(given, name) for name in ("task", "placement", "resolution", "sub_steps", "action_limit")}
+        more = {name: getattr(given, name) for name in _MORE}
         if "command" in inputs and given.command is not None:
             if len(given.command) != (count := math.prod(inputs["command"])):
                 raise wrong(where, "deployment.command", given.command, f"the policy reads {count} numbers")

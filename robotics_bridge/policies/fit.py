@@ -95,7 +95,7 @@ def check_fit(described: Mapping[str, Any], env: Env, name: str) -> None:
 
     Raises:
         DataError: the policy is of another version of the tasks.
-        UsageError: it was trained for another hand, or with actions that meant other targets.
+        UsageError: it was trained for another hand, with actions that meant other targets, or reads something else.
     """
     check_version(described, name)
     student = described.get("distill")
@@ -106,6 +106,13 @@ def check_fit(described: Mapping[str, Any], env: Env, name: str) -> None:
             "environment with that hand."
         )
     check_actions(described, env, name)
+    # Encoders that look up taxels by their number would read other taxels.
+    for group, shape in described.get("groups", ()):
+        if (here := env.observation_shapes.get(group)) != tuple(shape):
+            raise UsageError(
+                f"The policy {name!r} reads {group} {shape}, and the environment gives "
+                f"{'none' if here is None else list(here)}: make it with the touch and the task of its training."
+            )
     if unmeasured := [group for group, _ in described.get("groups", ()) if group not in MEASURED]:
         _LOG.warning("The student %r reads %s, which only the simulation knows.", name, ", ".join(unmeasured))
     if (own := trained_contacts(described)) != env.task.contacts:

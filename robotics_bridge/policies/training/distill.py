@@ -23,13 +23,14 @@ import torch
 from torch import nn
 
 from brainbench.core.errors import missing_dependency
-from brainbench.core.files import provenance, read_mapping, to_plain, write_json
+from brainbench.core.files import file_hash, provenance, read_mapping, to_plain, write_json
 from brainbench.core.progress import Progress
 from brainbench.core.reading.ranges import check_number
 from brainbench.core.writing.locks import lock_folder
 from brainbench.core.writing.same_run import check_same
 from brainbench.core.writing.tensors import write_tensors
 from brainbench.models.training.run_folder import RunLog, load_state, save_state
+from robotics_bridge.hands.layouts import check_probes
 from robotics_bridge.policies.encoders.arms import perceptron
 from robotics_bridge.policies.evaluate import Policy
 from robotics_bridge.policies.fit import check_version
@@ -299,6 +300,7 @@ class _Run:
             known = read_mapping(path)
             check_version(known, str(self.out))
             check_same(self.out, known.get("distill"), mine, "student")
+            check_probes(self.config.resolution, known.get("deployment", {}).get("probes"))
         else:
             write_json(path, describe_run(self.config, self.student, self.env))
 
@@ -356,6 +358,7 @@ def describe_run(config: DistillConfig, student: TactilePolicy, env: Any) -> dic
         "actions": env.num_actions,
         "deployment": {
             **{name: getattr(config, name) for name in ("task", "hand", "observe", "placement", "resolution")},
+            **({"probes": file_hash(config.resolution)} if config.resolution.endswith(".json") else {}),
             **({"command": [1.0]} if env.task.command == ("on",) else {}),
             "rate": 1 / env.step_dt,
             "sub_steps": env.decimation,

@@ -15,6 +15,7 @@ from brainbench.core.errors import DataError
 from brainbench.core.files import read_mapping
 from brainbench.core.reading.regular import readable
 from brainbench.core.reading.tensors import read_tensors
+from robotics_bridge.hands.layouts import check_probes
 from robotics_bridge.policies.encoders.arms import EncoderConfig
 from robotics_bridge.policies.fit import check_version
 from robotics_bridge.policies.schema import JOINTS, Groups, from_json, shapes_of
@@ -95,6 +96,7 @@ def load_student(folder: str | Path, *, device: str = "cpu") -> tuple[TactilePol
         with torch.random.fork_rng(devices=[]):
             student = build_student(config, shapes, list(shapes), actions)
         student.load_state_dict(read_tensors(folder / MODEL, "file of weights (safetensors)"))
+    check_probes(config.resolution, found.deployment.get("probes"))
     return student.to(device).eval(), described
 
 

@@ -40,7 +40,7 @@ def test_another_version_of_the_tasks_or_another_hand_is_refused() -> None:
 def test_actions_counted_from_another_pose_are_refused() -> None:
     for name in ("in_palm_rotate.teacher", "in_palm_rotate.student"):
         described = stored(name)
-        check_fit(described, tasks.make("in_palm_rotate", num_envs=1, threads=1), name)
+        check_fit(described, tasks.make("in_palm_rotate", num_envs=1, threads=1, observe="force_torque"), name)
         with pytest.raises(UsageError, match=r"from \S*thumb_bend_joint = 1\.2 rad, and here 0 rad.*--config"):
             check_fit(described, tasks.make("in_palm_rotate", config="published", num_envs=1, threads=1), name)
         twice = apply_overrides(tasks.load("in_palm_rotate"), ["action_ratio=1"])
@@ -58,7 +58,7 @@ def test_actions_that_last_for_another_time_are_refused() -> None:
     for name in ("in_palm_rotate.teacher", "in_palm_rotate.student"):
         with pytest.raises(UsageError, match=r"40\.?0? actions per second, and here are 100.*solver\.decimation"):
             check_fit(stored(name), tasks.make(faster, num_envs=1, threads=1), name)
-        check_fit(stored(name), tasks.make(halved, num_envs=1, threads=1), name)
+    check_fit(stored("in_palm_rotate.teacher"), tasks.make(halved, num_envs=1, threads=1), "teacher")
 
 
 def test_other_contacts_are_told(caplog: pytest.LogCaptureFixture) -> None:
@@ -101,3 +101,12 @@ def test_policies_act_in_the_contacts_that_they_were_trained_in(tmp_path: Path) 
         UsageError, match=r"other \(published\), in_palm_rotate.teacher \(firm\).*--change contacts=firm"
     ):
         with_contacts_of(task, (other, "in_palm_rotate.teacher"))
+
+
+def test_a_student_that_reads_other_taxels_is_refused() -> None:
+    # A convolution would find the taxels of the palm where it learned those of the finger tips.
+    described = stored("in_palm_rotate.student")
+    for senses, told in (({"observe": "force_torque", "placement": "tips"}, "100, 6"), ({"observe": "none"}, "none")):
+        env = tasks.make("in_palm_rotate", num_envs=1, threads=1, **senses)
+        with pytest.raises(UsageError, match=rf"tactile \[5, 199, 6\], and the environment gives .*{told}"):
+            check_fit(described, env, "student")

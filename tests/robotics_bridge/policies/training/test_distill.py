@@ -5,12 +5,16 @@ from __future__ import annotations
 import json
 import math
 import sys
+from dataclasses import replace
+from functools import partial
 
 import pytest
 import torch
 
 from brainbench.core.errors import DataError, MissingDependencyError, UsageError
 from brainbench.core.writing.locks import lock_folder
+from robotics_bridge import hands
+from robotics_bridge.hands.layouts import write_probes
 from robotics_bridge.policies.evaluate import Policy
 from robotics_bridge.policies.training.distill import distill
 from robotics_bridge.policies.training.distill_config import DistillConfig
@@ -119,6 +123,19 @@ def test_a_student_whose_encoder_has_settings_is_read_again_with_them(tmp_path, 
     student, described = load_student(tmp_path)
     assert DistillConfig.of(described["distill"]).tactile == config.tactile
     assert torch.isfinite(Policy(student)(TouchWorld(3).observations)).all()
+
+
+def test_a_student_is_not_read_with_another_probe_file_of_its_name(tmp_path) -> None:
+    file, hand = tmp_path / "own.json", hands.load("xhand1")
+    usual = hand.layout("low", "tips")
+    write_probes(file, usual)
+    _run(tmp_path / "run", iterations=1, resolution=str(file))
+    load_student(tmp_path / "run")
+    # As many taxels on the same links, elsewhere.
+    write_probes(file, {link: replace(probes, position=probes.position + 0.002) for link, probes in usual.items()})
+    for read in (load_student, partial(_run, iterations=1, resolution=str(file))):
+        with pytest.raises(DataError, match=r"own\.json' has changed"):
+            read(tmp_path / "run")
 
 
 def test_the_teacher_acts_in_its_share_of_steps(tmp_path) -> None:
