@@ -11,6 +11,8 @@ from typer.testing import CliRunner
 from brainbench.cli import app
 from brainbench.core.errors import BrainbenchError, UsageError
 from brainbench.core.files import write_json
+from robotics_bridge import hands
+from robotics_bridge.hands.layouts import write_probes
 from robotics_bridge.policies.training.distill_config import DistillConfig
 from robotics_bridge.tasks.task import TASK_VERSION
 from tests.factories.policies import export_small
@@ -141,3 +143,27 @@ def test_a_student_is_distilled_evaluated_exported_and_reported(tmp_path) -> Non
     assert (found["status"], found["episodes"]) == ("finished", 6)
     assert json.loads(_run("export", run, "--json"))["difference"] < 1e-4
     assert "agg_bool" in _run("report", tmp_path / "students")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("senses", "encoder"),
+    [
+        (("--observe", "elastomer", "--placement", "tips"), ("--encoder", "tactile_convrnn")),
+        (("--observe", "proximity", "--placement", "tips"), ("--encoder", "rnn", "--units", 9)),
+        (("--resolution", "own.json"), ("--encoder", "reservoir", "--draw", 7)),
+        (("--placement", "fingers"), ("--encoder", "zhuang-small.simclr", "--time", "resampled")),
+    ],
+)
+def test_a_student_of_any_touch_and_encoder_runs_to_the_recorded_episode(
+    tmp_path, monkeypatch, senses: tuple, encoder: tuple
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_probes("own.json", hands.load("xhand1").layout("low", "tips"))
+    teacher, task = ("--teacher", "in_palm_rotate.teacher"), "in_palm_rotate"
+    small = ("--envs", 2, "--iterations", 1, "--episodes", 0)
+    _run("distill", task, *teacher, *small, *senses, *encoder, "--out", "run")
+    assert json.loads(_run("play", task, "--agent", "run", "--seconds", 0.1, "--json"))["agent"] == "run"
+    assert json.loads(_run("export", "run", "--json"))["difference"] < 1e-4
+    deployed = _run("deploy", "run/policy.onnx", "--shadow", "--seconds", 1, "--timeout", 1, "--record", "ep", "--json")
+    assert json.loads(deployed)["status"] == "finished"

@@ -107,7 +107,7 @@ def calibrate(log: Log, *, max_delay: float = 0.5) -> Calibration:
         notes.append("Without a column 'reference' the true signal counts as 0: gain, delay, hysteresis and dead "
                      "probes were not fitted.")  # fmt: skip
     else:
-        estimates |= _delay(extent(lags, guess), len(lags), log.step) | _gain(fit)
+        estimates |= delay_of(extent(lags, guess), len(lags), log.step) | _gain(fit)
         if len(fit.gains) < 20 and estimates["gain_high"].value > estimates["gain_low"].value:
             notes.append(
                 f"The range of gains rests on {len(fit.gains)} probes; log more probes or resets to narrow it."
@@ -148,18 +148,20 @@ def _noise(estimates: Mapping[str, Estimate]) -> Noise:
     return Noise(**knobs)
 
 
-def _delay(lags: tuple[int, int], certain: int, step: float) -> dict[str, Estimate]:
+def delay_of(lags: tuple[int, int], certain: int, step: float) -> dict[str, Estimate]:
     """Return delay and jitter: lags are rounded up to whole readings and spread evenly over twice the jitter."""
     first, last = lags
     middle, half = (first + last - 1) / 2 * step, (last - first + 1) / 2 * step
     if first == last:
         middle, half = last * step, 0.0
+    # No reading comes before its signal.
+    half = min(half, middle)
     low = max(middle - (step if first == last else step / 2), 0.0)
     high = middle if first == last else middle + step / 2
     how = f"{certain} readings whose lag is certain" if certain else "no lag is certain"
     return {
         "read_delay": Estimate(middle, low, high, "best agreement, to one reading"),
-        "jitter": Estimate(min(half, middle), max(half - step / 2, 0.0), half + step / 2, how),
+        "jitter": Estimate(half, max(half - step / 2, 0.0), half + step / 2, how),
     }
 
 

@@ -202,7 +202,8 @@ def test_a_folder_of_another_run_is_refused(tmp_path: Path) -> None:
 def test_a_run_does_not_go_on_with_another_task_touch_or_encoder(tmp_path: Path) -> None:
     train(_env(), tmp_path / "task", settings=SMALL, iterations=1)
     rewards = tasks.load("in_palm_rotate").rewards
-    other = {**rewards, "is_dropped": replace(rewards["is_dropped"], weight=-1.0)}
+    other: Any = {**rewards, "is_dropped": replace(rewards["is_dropped"], weight=-1.0)}
+    changes: dict[str, Any]
     for changes, told in (
         ({"rewards": other}, "is_dropped"),
         ({"episode": 3.0}, "episode"),

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from brainbench.core.errors import DataError
-from robotics_bridge.sensors.calibration.calibrate import calibrate
+from robotics_bridge.sensors.calibration.calibrate import calibrate, delay_of
 from robotics_bridge.sensors.calibration.log import Log, find_quantum, read_log
 from robotics_bridge.sensors.noise.model import Noise
 from robotics_bridge.sensors.noise.stages import simulate
@@ -214,3 +214,9 @@ def test_unusable_logs_are_explained(tmp_path):
         calibrate(Log(np.arange(50) * 0.1, np.ones((50, 2)), np.arange(50.0)))
     with pytest.raises(DataError, match="never changes"):
         calibrate(Log(np.arange(50) * 0.1, np.random.default_rng(0).normal(size=(50, 2)), np.ones(50)))
+
+
+@pytest.mark.parametrize("lags", [(0, 0), (3, 3), (0, 1), (0, 3), (0, 6), (2, 5)])
+def test_delay_and_jitter_lie_within_their_intervals(lags: tuple[int, int]) -> None:
+    for name, found in delay_of(lags, 100, 0.01).items():
+        assert 0 <= found.low <= found.value <= found.high, name
