@@ -161,7 +161,8 @@ def plan(args: argparse.Namespace, *, gpu: bool) -> Any:
 def make_data(args: argparse.Namespace, gpus: int) -> None:
     """Generate the sweeps, every GPU its share of the shards."""
     from brainbench.core.files import to_plain, write_json
-    from brainbench.stimuli.sweeps.generation import CONFIG, generate
+    from brainbench.core.writing.same_run import CONFIG
+    from brainbench.stimuli.sweeps.generation import generate
 
     folder = args.work / "data"
     folder.mkdir(parents=True, exist_ok=True)

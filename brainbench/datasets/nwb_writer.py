@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from brainbench.core.errors import DataError
 from brainbench.core.files import atomic_path
 from brainbench.datasets.nwb import STIMULI
-from brainbench.datasets.sessions import SPIKES, Session, SessionTable, as_labels
+from brainbench.datasets.sessions import SPIKES, Series, Session, SessionTable, as_labels
 
 if TYPE_CHECKING:
     import h5py
@@ -27,8 +27,6 @@ NWB_VERSION = "2.7.0"
 _NO_START = "1970-01-01T00:00:00+00:00"
 _SPACE = uuid.UUID("7d8f2c5e-0b58-5c0e-9b0a-3a8d1f0f6c11")
 
-Columns = Mapping[str, tuple[str, Any]]
-"""Column name → (description, values); values are an array, or a list of arrays for a ragged column."""
 
 _DESCRIPTIONS = {
     "start_time": "Begin, s.",
@@ -65,135 +63,97 @@ def write_nwb(
         raise DataError(f"{session.source} has no units table; there are no spikes to write.")
     session.units.rows(SPIKES)  # what no reader takes is not written
     made = "SYNTHETIC: " if session.synthetic else ""
-    keywords = ["synthetic"] * session.synthetic + ["brainbench"]
-    stimuli = {"stimulus": STIMULI + session.stimuli} if session.stimuli else {}
+    identifier, start = session.identifier or f"{session.subject}-{session.session}", session.start or _NO_START
+    stated = {"session_id": session.session, "keywords": ["synthetic"] * session.synthetic + ["brainbench"]}
+    stated |= {"stimulus": STIMULI + session.stimuli} if session.stimuli else {}
+    texts: dict[str, Any] = {"file_create_date": [start], "identifier": identifier}
+    texts |= {"session_description": f"{made}{description}"}
+    texts |= dict.fromkeys(("session_start_time", "timestamps_reference_time"), start)
+    texts |= {f"general/{name}": value for name, value in {**stated, **(general or {})}.items()}
+    about = {"subject_id": session.subject, **(subject or {})}
+    texts |= {f"general/subject/{name}": value for name, value in about.items()}
     meanings = _DESCRIPTIONS | dict(columns or {})
     with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
-        writer = NwbWriter(
-            file,
-            identifier=session.identifier or f"{session.subject}-{session.session}",
-            description=f"{made}{description}",
-            start=session.start or _NO_START,
-            general={"session_id": session.session, "keywords": keywords, **stimuli, **(general or {})},
-            subject={"subject_id": session.subject, **(subject or {})},
-        )
-        units = "Units with their spike times."
-        writer.table("units", "Units", f"{made}{units}", _ids(session.units), _columns(session.units, meanings))
+        _describe(file, "core", "NWBFile")
+        file.attrs["nwb_version"] = NWB_VERSION
+        for name in ("acquisition", "analysis", "processing", "stimulus/presentation", "stimulus/templates"):
+            file.create_group(name)
+        _describe(file.create_group("general/subject"), "core", "Subject")
+        for name, value in texts.items():
+            file.create_dataset(name, data=value, dtype=h5py.string_dtype())
+        _write_table(_group(file, "units", "Units", f"{made}Units with their spike times."), session.units, meanings)
         for name, table in session.tables.items():
             for column in ("start_time", "stop_time"):
                 if column not in table:
                     raise DataError(f"{table.label} has no {column}, which NWB needs; export to .h5 instead.")
             place = f"processing/{name}" if "/" in name else f"intervals/{name}"
-            writer.table(place, "TimeIntervals", f"{made}Table {name}.", _ids(table), _columns(table, meanings))
+            _write_table(_group(file, place, "TimeIntervals", f"{made}Table {name}."), table, meanings)
         for name, series in session.series.items():
             if series.timestamps is not None:
-                writer.events(name, f"{made}Events {name}.", series.timestamps, series.data)
+                _write_events(_group(file, name, "TimeSeries", f"{made}Events {name}."), series)
+        # Every object has an identifier; the file itself is visited by no walk through it.
+        file.visititems(lambda _, item: _identify(item, identifier))
+        _identify(file, identifier)
     return Path(path)
 
 
-def _columns(table: SessionTable, meanings: Mapping[str, str]) -> Columns:
-    columns: dict[str, tuple[str, Any]] = {}
-    for name in table.columns:
-        values, meaning = np.asarray(table.data[name]), meanings.get(name, name)
-        if f"{name}_index" not in table.data:
-            columns[name] = (meaning, values)
-        elif len(table):
-            columns[name] = (meaning, np.split(values, table.ends(name)[:-1]))
-    return columns
-
-
-def _ids(table: SessionTable) -> NDArray[np.int64]:
-    ids = as_labels(table.ids())
-    try:
-        return ids.astype(np.int64)
-    except ValueError as error:
-        raise DataError(f"{table.label} has ids that are no integers, which NWB needs; export to .h5.") from error
-
-
-class NwbWriter:
-    """Fills an open, empty HDF5 file with one NWB session.
-
-    ``identifier`` is unique among files and ``start`` is ISO 8601 with time zone; ``general`` and ``subject`` are texts
-    (or lists of texts) under ``/general`` and ``/general/subject``, such as experimenter, lab, keywords.
-    """
-
-    def __init__(
-        self,
-        file: h5py.File,
-        *,
-        identifier: str,
-        description: str,
-        start: str,
-        general: Mapping[str, str | Sequence[str]],
-        subject: Mapping[str, str],
-    ) -> None:
-        self.file, self.identifier = file, identifier
-        self._describe(file, "core", "NWBFile")
-        file.attrs["nwb_version"] = NWB_VERSION
-        for name in ("acquisition", "analysis", "processing", "stimulus/presentation", "stimulus/templates"):
-            file.create_group(name)
-        texts: dict[str, Any] = {"file_create_date": [start], "identifier": identifier}
-        texts |= {"session_description": description, "session_start_time": start, "timestamps_reference_time": start}
-        texts |= {f"general/{name}": value for name, value in general.items()}
-        for name, value in texts.items():
-            self._texts(name, value)
-        self._describe(file.create_group("general/subject"), "core", "Subject")
-        for name, value in subject.items():
-            self._texts(f"general/subject/{name}", value)
-
-    def table(self, path: str, kind: str, description: str, ids: NDArray[np.int64], columns: Columns) -> None:
-        """Add a table, such as ``Units`` or ``TimeIntervals``."""
-        group = self._group(path)
-        self._describe(group, "core", kind, description)
-        group.attrs.create("colnames", list(columns), dtype=_text_type())
-        self._describe(group.create_dataset("id", data=ids), "hdmf-common", "ElementIdentifiers")
-        for name, (meaning, values) in columns.items():
-            ragged = isinstance(values, list)
-            dataset = self._array(f"{path}/{name}", np.concatenate(values) if ragged else values)
-            self._describe(dataset, "hdmf-common", "VectorData", meaning)
-            if ragged:
-                # The schema asks for unsigned row ends.
-                ends = np.cumsum([len(row) for row in values], dtype=np.uint32)
-                index = group.create_dataset(f"{name}_index", data=ends)
-                self._describe(index, "hdmf-common", "VectorIndex", f"Index for VectorData '{name}'")
-                index.attrs["target"] = dataset.ref
-
-    def events(self, path: str, description: str, times: NDArray[np.float64], values: NDArray[Any]) -> None:
-        """Add a time series of coded events at ``times`` (s)."""
-        group = self._group(path)
-        self._describe(group, "core", "TimeSeries", description)
-        group.attrs["comments"] = "no comments"
-        data = group.create_dataset("data", data=values)
-        data.attrs.update({"conversion": np.float32(1), "resolution": np.float32(-1), "unit": "code"})
-        stamps = self._array(f"{path}/timestamps", times)
-        stamps.attrs.update({"interval": np.int32(1), "unit": "seconds"})
-
-    def _group(self, path: str) -> h5py.Group:
-        """Make a group, and the processing module around it if it is the first there."""
-        root, _, rest = path.partition("/")
-        module = rest.partition("/")[0]
-        if root == "processing" and f"{root}/{module}" not in self.file:
-            made = self.file.create_group(f"{root}/{module}")
-            self._describe(made, "core", "ProcessingModule", f"Module {module}.")
-        return self.file.create_group(path)
-
-    def _array(self, path: str, values: NDArray[Any]) -> h5py.Dataset:
-        if values.dtype.kind in "UO":
-            return self.file.create_dataset(path, data=values.astype(object), dtype=_text_type())
-        packed = {"compression": "gzip", "compression_opts": 4, "shuffle": True} if values.size > 1000 else {}
-        return self.file.create_dataset(path, data=values, **packed)
-
-    def _describe(self, item: h5py.Group | h5py.Dataset, namespace: str, kind: str, description: str = "") -> None:
-        item.attrs.update({"namespace": namespace, "neurodata_type": kind})
-        item.attrs["object_id"] = str(uuid.uuid5(_SPACE, f"{self.identifier}{item.name}"))
-        if description:
-            item.attrs["description"] = description
-
-    def _texts(self, path: str, value: str | Sequence[str]) -> None:
-        self.file.create_dataset(path, data=value if isinstance(value, str) else list(value), dtype=_text_type())
-
-
-def _text_type() -> Any:
+def _write_table(group: h5py.Group, table: SessionTable, meanings: Mapping[str, str]) -> None:
+    """Write the columns of a table; ragged ones of a table without rows are left out."""
     import h5py
 
-    return h5py.string_dtype()
+    names = [name for name in table.columns if f"{name}_index" not in table.data or len(table)]
+    group.attrs.create("colnames", names, dtype=h5py.string_dtype())
+    try:
+        ids = as_labels(table.ids()).astype(np.int64)
+    except ValueError as error:
+        raise DataError(f"{table.label} has ids that are no integers, which NWB needs; export to .h5.") from error
+    _describe(group.create_dataset("id", data=ids), "hdmf-common", "ElementIdentifiers")
+    for name in names:
+        values = _write_array(group, name, np.asarray(table.data[name]))
+        _describe(values, "hdmf-common", "VectorData", meanings.get(name, name))
+        if f"{name}_index" in table.data:
+            # The schema asks for unsigned row ends.
+            index = group.create_dataset(f"{name}_index", data=table.ends(name).astype(np.uint32))
+            _describe(index, "hdmf-common", "VectorIndex", f"Index for VectorData '{name}'")
+            index.attrs["target"] = values.ref
+
+
+def _write_events(group: h5py.Group, series: Series) -> None:
+    """Write a series of coded events at its timestamps (s)."""
+    group.attrs["comments"] = "no comments"
+    data = group.create_dataset("data", data=series.data)
+    data.attrs.update({"conversion": np.float32(1), "resolution": np.float32(-1), "unit": "code"})
+    stamps = _write_array(group, "timestamps", series.timestamps)
+    stamps.attrs.update({"interval": np.int32(1), "unit": "seconds"})
+
+
+def _group(file: h5py.File, path: str, kind: str, description: str) -> h5py.Group:
+    """Make a group, and the processing module around it if it is the first there."""
+    root, _, rest = path.partition("/")
+    module = rest.partition("/")[0]
+    if root == "processing" and f"{root}/{module}" not in file:
+        _describe(file.create_group(f"{root}/{module}"), "core", "ProcessingModule", f"Module {module}.")
+    group = file.create_group(path)
+    _describe(group, "core", kind, description)
+    return group
+
+
+def _write_array(group: h5py.Group, name: str, values: NDArray[Any]) -> h5py.Dataset:
+    import h5py
+
+    if values.dtype.kind in "UO":
+        return group.create_dataset(name, data=values.astype(object), dtype=h5py.string_dtype())
+    packed = {"compression": "gzip", "compression_opts": 4, "shuffle": True} if values.size > 1000 else {}
+    return group.create_dataset(name, data=values, **packed)
+
+
+def _describe(item: h5py.Group | h5py.Dataset, namespace: str, kind: str, description: str = "") -> None:
+    item.attrs.update({"namespace": namespace, "neurodata_type": kind})
+    if description:
+        item.attrs["description"] = description
+
+
+def _identify(item: h5py.Group | h5py.Dataset, identifier: str) -> None:
+    """Derive the identifier of an NWB object from that of the file and the object's path."""
+    if "neurodata_type" in item.attrs:
+        item.attrs["object_id"] = str(uuid.uuid5(_SPACE, f"{identifier}{item.name}"))

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import h5py
 import numpy as np
 
 from brainbench.datasets import write_recordings
-from brainbench.datasets.nwb_writer import NwbWriter
-from brainbench.datasets.sessions import make_session
+from brainbench.datasets.nwb_writer import write_nwb as save_nwb
+from brainbench.datasets.sessions import SPIKES, Session, SessionTable, make_session, ragged
 
 HUMAN = "pynapple_sub-4_ses-4_ecephys+image.nwb"
 """A file of human recordings among the private reference data."""
@@ -17,29 +19,27 @@ ROWS = 14
 
 def write_nwb(path, *, subject="m1", session="s1", keywords=("touch",), units=True, identifier=None, description="d"):
     """A small NWB file: six trials of two textures, one unit, and a table inside a processing module."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with h5py.File(path, "w") as file:
-        writer = NwbWriter(
-            file,
-            identifier=identifier or path.name,
-            description=description,
-            start="2020-01-01T00:00:00+00:00",
-            general={"session_id": session, "keywords": list(keywords)} if session else {"keywords": list(keywords)},
-            subject={"subject_id": subject} if subject else {"species": "Mus musculus"},
-        )
-        start = np.arange(6.0)
-        columns = {
-            "start_time": ("s", start),
-            "stop_time": ("s", start + 0.5),
-            "texture": ("P", np.resize(np.array(["P100", "P20"]), 6)),
-            "tags": ("list", [np.array([1.0, 2.0])] * 6),
-        }
-        writer.table("intervals/trials", "TimeIntervals", "trials", np.arange(6) * 2, columns)
-        side = {**columns, "side": ("s", np.resize(np.array([1, 2]), 6))}
-        writer.table("processing/behavior/pokes", "TimeIntervals", "pokes", np.arange(6), side)
-        if units:
-            spikes = [np.arange(0.0, 6.0, 0.05)]
-            writer.table("units", "Units", "units", np.array([17]), {"spike_times": ("s", spikes)})
+    start = np.arange(6.0)
+    columns = {
+        "start_time": start,
+        "stop_time": start + 0.5,
+        "texture": np.resize(np.array(["P100", "P20"]), 6),
+        **ragged("tags", [np.array([1.0, 2.0])] * 6),
+    }
+    pokes = {**columns, "id": np.arange(6), "side": np.resize(np.array([1, 2]), 6)}
+    tables = {
+        name: SessionTable(name, data)
+        for name, data in (("trials", {"id": np.arange(6) * 2, **columns}), ("behavior/pokes", pokes))
+    }
+    spikes = SessionTable("units", {"id": np.array([17]), **ragged(SPIKES, [np.arange(0.0, 6.0, 0.05)])})
+    made = Session(subject or "", session or "", spikes, tables, identifier=identifier or path.name)
+    made = replace(made, start="2020-01-01T00:00:00+00:00")
+    stated = {"keywords": list(keywords)}
+    save_nwb(path, made, description=description, general=stated, subject={"species": "Mus musculus"})
+    with h5py.File(path, "a") as file:
+        for name, there in (("general/subject/subject_id", subject), ("general/session_id", session), ("units", units)):
+            if not there:
+                del file[name]
     return path
 
 

@@ -23,6 +23,7 @@ from brainbench.core.files import content_hash
 from brainbench.core.progress import Progress
 from brainbench.core.reading.ranges import check_number
 from brainbench.datasets.layouts import rodgers
+from brainbench.datasets.sessions import Session
 from brainbench.datasets.synthetic.geometry import ResponseGeometry
 from brainbench.datasets.synthetic.populations import expected_rates
 from brainbench.datasets.synthetic.rodgers_task import (
@@ -34,7 +35,6 @@ from brainbench.datasets.synthetic.rodgers_task import (
     tracked_contacts,
 )
 from brainbench.datasets.synthetic.truth import (
-    SyntheticSession,
     correlation_rdm,
     ensure_recordings,
     write_synthetic_nwb,
@@ -89,7 +89,7 @@ def make_rodgers_demo(
     for plan in (plan for own in plans for plan in own):
         first_contacts(contacts, rodgers.LABELS, plan.lost_whisker)
 
-    def draw() -> Iterator[SyntheticSession]:
+    def draw() -> Iterator[tuple[Session, NDArray[np.float64]]]:
         done, total = 0, sum(map(len, plans))
         for index, own in enumerate(plans):
             for number, plan in enumerate(own):
@@ -97,7 +97,7 @@ def make_rodgers_demo(
                 # Begun anew for every session: all sessions of an animal draw the same traits (expected_rates).
                 animal = np.random.default_rng([seed, VERSION, index])
                 expected = expected_rates(geometry, plan.design, animal, random)
-                yield SyntheticSession(draw_session(random, plan, geometry, expected, contacts), expected)
+                yield draw_session(random, plan, geometry, expected, contacts), expected
                 done += 1
                 if progress is not None:
                     progress(done, total, f"demo recordings {plan.subject}")

@@ -18,7 +18,7 @@ from brainbench.datasets.sessions import Session, make_session
 from brainbench.datasets.synthetic.geometry import ResponseGeometry
 from brainbench.datasets.synthetic.populations import DrawnSession, PopulationDesign, draw_sessions
 from brainbench.datasets.synthetic.spikes import spike_trains
-from brainbench.datasets.synthetic.truth import SyntheticSession, correlation_rdm, write_synthetic_nwb, write_with_truth
+from brainbench.datasets.synthetic.truth import correlation_rdm, write_synthetic_nwb, write_with_truth
 
 _BEFORE = 0.5
 """From trial start to contact, s."""
@@ -57,9 +57,9 @@ def write_files(
     check_name("format", format, writers)
     design = design or PopulationDesign()
 
-    def draw() -> Iterator[SyntheticSession]:
+    def draw() -> Iterator[tuple[Session, NDArray[np.float64]]]:
         for done, drawn in enumerate(draw_sessions(geometry, design, seed), start=1):
-            yield SyntheticSession(replace(spike_session(geometry, drawn), stimuli=stimuli), drawn.expected)
+            yield replace(spike_session(geometry, drawn), stimuli=stimuli), drawn.expected
             if progress is not None:
                 progress(done, design.animals * design.sessions, f"synthetic recordings {drawn.subject}")
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -45,18 +44,9 @@ write_synthetic_nwb = partial(
 """Writes a session as NWB that says in every description that it is synthetic."""
 
 
-@dataclass(frozen=True)
-class SyntheticSession:
-    """One session of spike times and the rates behind it."""
-
-    session: Session
-    expected: NDArray[np.float64]
-    """[K, U] expected response to each stimulus in the window that is counted, Hz."""
-
-
 def write_with_truth(
     folder: str | os.PathLike[str],
-    sessions: Iterable[SyntheticSession],
+    sessions: Iterable[tuple[Session, NDArray[np.float64]]],
     *,
     write: Callable[[Path, Session], Path],
     suffix: str,
@@ -65,24 +55,24 @@ def write_with_truth(
 ) -> list[Path]:
     """Write sessions as files ``sub-…_ses-…SUFFIX``, and last their truth.
 
-    Sessions of one subject come together. ``write`` writes one of them atomically, ``distance`` makes the RDM [P] of
+    A session comes with its units' expected responses [K, U] (Hz) to each stimulus in the window that is counted, and
+    sessions of one subject come together. ``write`` writes one of them atomically, ``distance`` makes the RDM [P] of
     expected responses [K, U], and ``about`` is what else the truth holds: ``labels``, and ``shared``, the RDM [P] of
     the shared geometry. Returns the files of the sessions.
     """
     folder = Path(folder)
     expected: dict[str, list[NDArray[np.float64]]] = {}
     paths = []
-    for item in sessions:
-        name = f"sub-{item.session.subject}_ses-{item.session.session}{suffix}"
-        paths.append(write(folder / name, item.session))
-        expected.setdefault(item.session.subject, []).append(item.expected)
+    for session, rates in sessions:
+        paths.append(write(folder / f"sub-{session.subject}_ses-{session.session}{suffix}", session))
+        expected.setdefault(session.subject, []).append(rates)
     write_json(
         folder / TRUTH,
         {
             "note": NOTE,
             "synthetic": True,
             **about,
-            "subjects": {name: distance(np.concatenate(rates, axis=1)) for name, rates in expected.items()},
+            "subjects": {name: distance(np.concatenate(own, axis=1)) for name, own in expected.items()},
             "files": {path.name: {"bytes": path.stat().st_size, "hash": file_hash(path)} for path in paths},
         },
     )

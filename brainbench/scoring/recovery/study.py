@@ -6,17 +6,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from brainbench.core.errors import UsageError
-from brainbench.core.files import read_json, read_mapping, to_plain, write_json
+from brainbench.core.files import read_json, to_plain, write_json
 from brainbench.core.jobs import run_jobs
 from brainbench.core.progress import Progress
 from brainbench.core.reading.ranges import check_number
 from brainbench.core.reading.regular import readable
-from brainbench.core.writing.same_run import check_same
+from brainbench.core.writing.same_run import begin_run
 from brainbench.metrics.measures.registry import get_metric
 from brainbench.scoring.recovery.boards import RecoveryBoard, make_board
 from brainbench.scoring.recovery.candidates import Candidate
@@ -26,7 +25,6 @@ from brainbench.scoring.recovery.design import RecoveryDesign
 BOARDS = 10
 _TOGETHER = 5
 """Boards that one job makes and one file keeps."""
-_CONFIG = "config.json"
 
 
 @dataclass(frozen=True)
@@ -74,7 +72,9 @@ def recover(
     ]
     found: dict[_Job, list[RecoveryBoard]] = {}
     if folder is not None:
-        _begin(folder, {"candidates": [item.identity for item in candidates], "design": to_plain(design)})
+        folder.mkdir(parents=True, exist_ok=True)
+        config = {"candidates": [item.identity for item in candidates], "design": design}
+        begin_run(folder, config, "recovery", made="boards-*.json")
         for job in jobs:
             if (folder / job.file).is_file():
                 with readable(folder / job.file, "part of a recovery", "Delete it to make it again."):
@@ -119,15 +119,3 @@ def check_candidates(candidates: Sequence[Candidate], design: RecoveryDesign, bo
     if design.layer not in ("any", "last"):
         for item in candidates:
             item.choose(design.layer, np.random.default_rng(0))
-
-
-def _begin(folder: Path, config: dict[str, Any]) -> None:
-    """Refuse to go on with what was begun otherwise; note what is begun."""
-    folder.mkdir(parents=True, exist_ok=True)
-    path = folder / _CONFIG
-    if not path.exists():
-        if any(folder.iterdir()):
-            raise UsageError(f"{str(folder)!r} is not empty and holds no recovery; choose a new folder.")
-        write_json(path, config)
-    else:
-        check_same(folder, read_mapping(path), config, "recovery")

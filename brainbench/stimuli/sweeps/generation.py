@@ -13,11 +13,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from brainbench.core.errors import DataError, UsageError
-from brainbench.core.files import read_mapping, to_plain, write_json
+from brainbench.core.files import write_json
 from brainbench.core.progress import Progress
 from brainbench.core.reading.ranges import check_number
 from brainbench.core.writing.locks import lock_folder
-from brainbench.core.writing.same_run import check_same
+from brainbench.core.writing.same_run import begin_run
 from brainbench.core.writing.temporaries import is_temporary
 from brainbench.stimuli.engines import get_engine
 from brainbench.stimuli.sweeps import running
@@ -29,7 +29,6 @@ if TYPE_CHECKING:
 
 _LOG = logging.getLogger(__name__)
 
-CONFIG = "config.json"
 _SPARE = 64e6
 """Bytes of disk that are left free."""
 
@@ -93,7 +92,7 @@ def write_data_set(
     """
     folder = Path(out).absolute()
     with lock_folder(folder, wait=False):
-        _check_config(plan, folder)
+        begin_run(folder, plan.config, "data set", made="*.h5")
         _clean(folder)
         missing = [task for task in plan.shards if not is_complete(folder / task.name, task)]
         _check_space(missing, folder)
@@ -125,25 +124,6 @@ def _reporter(total: int, what: str, progress: Progress | None) -> Callable[[int
             _LOG.info("%d of %d sweeps, %.3g sweeps/s, about %s left", done, total, rate, rest)
 
     return report
-
-
-def _check_config(plan: GenerationPlan | SweepTable, folder: Path) -> None:
-    """Refuse to go on with what was begun otherwise; note what is begun."""
-    path, config = folder / CONFIG, to_plain(plan.config)
-    if not path.exists():
-        if strange := [item.name for item in folder.iterdir() if not is_temporary(item.name)]:
-            raise UsageError(
-                f"{str(folder)!r} is not empty and holds no data set of sweeps (it has {sorted(strange)[0]!r}); choose "
-                "a new folder."
-            )
-        write_json(path, config)
-        return
-    found = read_mapping(path)
-    if any(folder.glob("*.h5")):
-        check_same(folder, found, config, "data set")
-    elif found != config:
-        # Begun, but nothing was made: a failed first try must not stand in the way.
-        write_json(path, config)
 
 
 def _clean(folder: Path) -> None:

@@ -50,6 +50,12 @@ def test_a_folder_of_another_recovery_is_refused(tmp_path):
     recover(candidates, DESIGN, boards=1, workers=1, folder=tmp_path)
     with pytest.raises(UsageError, match=r"another recovery: design\.seed 0 \(now 1\)"):
         recover(candidates, replace(DESIGN, seed=1), boards=1, workers=1, folder=tmp_path)
+    for made in tmp_path.glob("boards-*"):
+        made.unlink()
+    recover(candidates, replace(DESIGN, seed=1), boards=1, workers=1, folder=tmp_path)
+    (tmp_path / "config.json").unlink()
+    with pytest.raises(UsageError, match=r"holds no recovery \(it has 'boards-"):
+        recover(candidates, DESIGN, boards=1, workers=1, folder=tmp_path)
 
 
 @pytest.mark.parametrize(
