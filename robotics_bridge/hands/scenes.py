@@ -12,7 +12,7 @@ from brainbench.core.devices import mujoco_module
 from brainbench.core.errors import UsageError
 from brainbench.core.reading.ranges import check_number
 from brainbench.core.rotations import from_matrices, from_z_axis, to_matrices
-from robotics_bridge.hands.facing import half_open, link_middle, palmar_directions, slide_of
+from robotics_bridge.hands.facing import half_open, link_middle, opens, palmar_directions, slide_of
 from robotics_bridge.hands.hand import Hand
 from robotics_bridge.hands.spec import add_servo
 
@@ -160,8 +160,11 @@ def flexed(hand: Hand, share: float) -> NDArray[np.float64]:
     """
     check_number("share by which a hand closes", share, least=0, most=1)
     low, high = hand.model.jnt_range.T
-    # Flexion is the longer side of a joint's range.
-    target = np.where(np.abs(high) >= np.abs(low), high, low) * share
+    # Flexion is the longer side of a joint's range, where a gripper may be open.
+    longer = np.abs(high) >= np.abs(low)
+    target = np.where(longer, high, low) * share
+    if opens(hand.model, hand.fingers):
+        target = np.where(longer, high - share * (high - low), low + share * (high - low))
     # Joints that spread the fingers stay in their middle.
     target = np.where(np.abs(high + low) < 0.5 * (high - low), 0.0, target)
     for joint, (opened, closed) in jaw_ends(hand).items():

@@ -14,6 +14,7 @@ import trimesh
 from brainbench.core.errors import UsageError
 from robotics_bridge import hands
 from robotics_bridge.hands import Hand
+from robotics_bridge.hands.scenes import closing
 from robotics_bridge.physics import MujocoEngine
 from robotics_bridge.sensors import ContactDepthProbe, SensorSuite
 
@@ -115,6 +116,33 @@ def test_pads_of_a_four_bar_gripper_face_each_other(tmp_path: Path) -> None:
     normals = _normals(_load(tmp_path, FOUR_BAR))
     np.testing.assert_allclose(normals["right_pad"], [0, -1, 0], atol=1e-6)
     np.testing.assert_allclose(normals["left_pad"], [0, 1, 0], atol=1e-6)
+
+
+@pytest.mark.parametrize("side", [1, -1])
+def test_jaws_that_their_joints_open_face_each_other_and_close_to_zero(tmp_path: Path, side: int) -> None:
+    """As of the PR2: closed at 0, and open at the other end of the range."""
+    span, edge = ("0 .5", 1) if side == 1 else ("-.5 0", -1)
+    jaw = (
+        '<body name="{0}" pos="0 {1} .03"><joint axis="{2} 0 0" range="{3}"/>'
+        '<geom type="box" size=".01 .004 .03" pos="0 {1} .04"/></body>'
+    )
+    jaws = jaw.format("left", ".006", -edge, span) + jaw.format("right", "-.006", edge, span)
+    base = '<body name="base"><geom type="box" size=".03 .03 .02"/>'
+    text = f'<mujoco><compiler angle="radian" autolimits="true"/><worldbody>{base}{jaws}</body></worldbody></mujoco>'
+    hand = _load(tmp_path, text)
+    normals = _normals(hand, "hand")
+    np.testing.assert_allclose(normals["base"], [0, 0, 1], atol=1e-6)
+    np.testing.assert_allclose(normals["left"], [0, -1, 0], atol=1e-6)
+    np.testing.assert_allclose(normals["right"], [0, 1, 0], atol=1e-6)
+    np.testing.assert_allclose([closing(hand, share) for share in (0, 0.5, 1)], np.outer([0.5, 0.25, 0], [side, side]))
+
+
+def test_the_palm_of_jaws_that_lean_faces_what_lies_between_them(tmp_path: Path) -> None:
+    """As of a Robotiq 2F-85: where its pads go leads a little back to the base."""
+    leaning = FOUR_BAR.replace("-.6 .6", "-.1 .6").replace('"0 -.004 .04"', '"0 -.014 .04"')
+    leaning = leaning.replace('"0 .004 .04"', '"0 .014 .04"')
+    leaning = leaning.replace('pos="0 -.03 .03"><joint axis="1', 'pos="0 -.03 .03"><joint axis="-1')
+    np.testing.assert_allclose(_normals(_load(tmp_path, leaning), "palm")["base"], [0, 0, 1], atol=1e-6)
 
 
 def test_a_single_jaw_and_the_fixed_one_face_each_other(tmp_path: Path) -> None:
