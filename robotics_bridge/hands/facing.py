@@ -28,8 +28,9 @@ def palmar_directions(model: Any, palm: str, fingers: Mapping[str, tuple[str, ..
 
     A link's palmar side is where it moves when its joint flexes (of two crossed joints, the one with more range
     counts), or where it comes from if that opens a gripper (:func:`opens`). A joint that swings as far to both sides
-    spreads or twists the finger and tells nothing: such links face as the next one towards the tip does. What slides, and tips of which no joint tells, face the other fingers.
-    The palm faces where the finger tips go, along the nearest axis of its frame, or the tips of jaws.
+    spreads or twists the finger and tells nothing: such links face as the next one towards the tip does. What slides,
+    and tips of which no joint tells, face the other fingers. The palm faces where the finger tips go, along the nearest
+    axis of its frame, or the tips of jaws.
     """
     data = half_open(model)
     sign = -1.0 if opens(model, fingers) else 1.0

@@ -35,7 +35,9 @@ _AUTO_GRIDS = {
 _NAMES = {"name", "class", "childclass", "joint", "body", "link", "geom", "site", "mesh", "material", "file"}
 """Attributes of URDF and MJCF that hold words."""
 UNKNOWN_SPEED = 5.0
-"""Speed (rad/s or m/s) that counts as the largest of a joint whose data states none."""
+"""Speed (rad/s) that counts as the largest of a hinge whose data states none."""
+LEVER = 0.05
+"""Length of a finger (m) whose tip moves as a slide, where a number is stated for hinges alone: 1 rad is .05 m."""
 _LARGEST = 1e15
 """Magnitude of numbers in a hand's file that no hand has."""
 
@@ -87,14 +89,18 @@ class Hand:
     def rated_speeds(self, joints: Iterable[str]) -> NDArray[np.float64]:
         """Return the largest speeds [J] (rad/s or m/s) of joints.
 
-        Where none is stated (as in any URDF or MJCF file), it is taken to be :data:`UNKNOWN_SPEED`, with a warning.
+        Where none is stated (as in any MJCF file), it is taken to be :data:`UNKNOWN_SPEED`, with a warning; of slides
+        :data:`LEVER` times that.
         """
         names = list(joints)
-        known = {joint.name: joint.velocity for joint in self.spec.joints} if self.spec is not None else {}
+        known = _stated_speeds(self.path) if self.spec is None else {one.name: one.velocity for one in self.spec.joints}
         if assumed := [name for name in names if name not in known]:
-            told = f"{UNKNOWN_SPEED:g} rad/s (or m/s) counts as the largest of {listing(assumed)}"
+            slow = UNKNOWN_SPEED * LEVER
+            told = f"{UNKNOWN_SPEED:g} rad/s (slides: {slow:g} m/s) counts as the largest of {listing(assumed)}"
             _log.warning("Hand %s states no speed for %d joints: %s.", shown(self.name), len(assumed), told)
-        return np.array([known.get(name, UNKNOWN_SPEED) for name in names])
+            slides = {name: self.model.joint(name).type[0] == mujoco_module().mjtJoint.mjJNT_SLIDE for name in assumed}
+            known |= {name: slow if slides[name] else UNKNOWN_SPEED for name in assumed}
+        return np.array([known[name] for name in names])
 
     @property
     def tips(self) -> tuple[str, ...]:
@@ -227,6 +233,17 @@ def _check_xml(path: Path) -> None:
                             f"{key!r} of <{shown(element.tag, quoted=False)}> in {shown(str(path))} is {shown(value)}; "
                             f"finite numbers of at most {_LARGEST:g} are needed."
                         )
+
+
+def _stated_speeds(path: Path | None) -> dict[str, float]:
+    """Return joint → largest speed (rad/s or m/s) of a URDF file, which MuJoCo does not keep; 0 states none."""
+    if path is None or path.suffix.lower() != ".urdf":
+        return {}
+    with readable(path, "URDF or MJCF file"):
+        root = ElementTree.fromstring(read_text(path, "hand file (URDF or MJCF)"))
+        limits = {joint.get("name", ""): joint.find("limit") for joint in root.iter("joint")}
+        speeds = {name: float(limit.get("velocity", 0)) for name, limit in limits.items() if limit is not None}
+    return {name: speed for name, speed in speeds.items() if speed > 0}
 
 
 def _is_absurd(word: str) -> bool:

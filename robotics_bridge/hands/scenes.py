@@ -20,10 +20,9 @@ mujoco = mujoco_module()
 
 OBJECT = "object"
 """Name of the free body and of its geometry."""
-_STIFFNESS, _DAMPING, _ARMATURE = 2.0, 0.2, 0.01
-"""Servo of a hinge without a drive: N·m/rad, N·m·s/rad, kg·m² (kg for a slide)."""
-_PUSH, _DRAG = 300.0, 10.0
-"""Servo of a slide without a drive: N/m, N·s/m."""
+WEAK_SERVO, WEAK_PUSH, ARMATURE = (2.0, 0.2), (300.0, 10.0), 0.01
+"""Stiffness and damping of a hinge without a servo (N·m/rad, N·m·s/rad) and of such a slide (N/m, N·s/m); inertia of
+their drives (kg·m², kg for a slide)."""
 
 
 def holding(hand: Hand, **settings: float) -> Any:
@@ -188,9 +187,8 @@ def replace_drives(spec: Any) -> None:
     for joint in spec.joints:
         slides = joint.type == mujoco.mjtJoint.mjJNT_SLIDE
         if slides or joint.type == mujoco.mjtJoint.mjJNT_HINGE:
-            stiffness, damping = (_PUSH, _DRAG) if slides else (_STIFFNESS, _DAMPING)
-            joint.armature = max(joint.armature, _ARMATURE)
-            add_servo(spec, joint.name, stiffness, damping)
+            joint.armature = max(joint.armature, ARMATURE)
+            add_servo(spec, joint.name, *(WEAK_PUSH if slides else WEAK_SERVO))
 
 
 def palm_surface(hand: Hand) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
@@ -11,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.devices import mujoco_module
-from brainbench.core.errors import UsageError, check_each
-from robotics_bridge.hands.hand import Hand
-from robotics_bridge.hands.scenes import palm_surface, place_palm
+from brainbench.core.errors import UsageError, check_each, listing, shown
+from robotics_bridge.hands.hand import LEVER, Hand
+from robotics_bridge.hands.scenes import ARMATURE, WEAK_PUSH, WEAK_SERVO, flexed, palm_surface, place_palm
 from robotics_bridge.physics.scene import excluded_links
 from robotics_bridge.tasks.contact_model import ContactModel, set_contacts
 from robotics_bridge.tasks.objects import ObjectShape, add_object, slots, with_sizes
@@ -21,8 +22,9 @@ from robotics_bridge.tasks.task import Pose, Task
 
 mujoco = mujoco_module()
 
-_STIFFNESS, _DAMPING, _ARMATURE, _EFFORT = 2.0, 0.2, 0.01, 2.0
-"""Drive of a joint for which the hand's file names none: N·m/rad, N·m·s/rad, kg·m², N·m."""
+_log = logging.getLogger(__name__)
+_EFFORT = 2.0
+"""Effort of a hinge for which the hand's file names none (N·m)."""
 _PALM_TOP = 0.4975
 """Height of an upturned palm below objects that start at 0.5 m."""
 _ROUNDED = 1e-3
@@ -65,6 +67,8 @@ class TaskModel:
     """[J] upper limits (rad or m)."""
     tips: Mapping[str, tuple[float, float, float]]
     """Finger tip → point (m, link frame)."""
+    lever: NDArray[np.float64]
+    """[J] factor on imperfections and noise that a task states for hinges: :data:`LEVER` of the hand's slides."""
 
 
 def build(task: Task, hand: Hand) -> TaskModel:
@@ -90,7 +94,7 @@ def build(task: Task, hand: Hand) -> TaskModel:
             set_contacts(models[-1], task.contacts)
     first = models[0]
     joints = tuple(drives)
-    ids = [first.joint(name).id for name in joints]
+    ids, own = [first.joint(name).id for name in joints], [not name.startswith("carriage_") for name in joints]
     # Joints without limits get a full turn: actions are scaled by ranges.
     limited = first.jnt_limited[ids].astype(bool)
     low = np.where(limited, first.jnt_range[ids, 0], -np.pi)
@@ -104,13 +108,16 @@ def build(task: Task, hand: Hand) -> TaskModel:
                 f"Joint {name!r} of hand {hand.name!r} rests within {least:g} and {most:g} (rad or m) in task "
                 f"{task.name!r}; received {position:g}."
             )
-    # Of joints that the task does not name, 0 may lie beyond the limits.
-    rest = np.array([given.get(name, 0.0) for name in joints])
+    # Joints that the task does not name are open: 0 but for jaws, between which the object may lie. 0 may lie beyond
+    # the limits.
+    opened = dict(zip(hand.joints, (flexed(hand, 0.0)[hand.joint_numbers] + 0.0).tolist(), strict=True))
+    rest = np.array([given.get(name, opened.get(name, 0.0)) for name in joints])
     stiffness, damping, effort = (np.array([drives[name][column] for name in joints]) for column in range(3))
     return TaskModel(
         models=models, shapes=shapes, objects=names, joints=joints, moved=_moved(task, hand, joints),
         stiffness=stiffness, damping=damping, effort=effort, rest=np.clip(rest, low, high), low=low, high=high,
         tips=_tips(hand),
+        lever=np.where((first.jnt_type[ids] == mujoco.mjtJoint.mjJNT_SLIDE) & own, LEVER, 1.0),
     )  # fmt: skip
 
 
@@ -128,7 +135,7 @@ def _hand_spec(task: Task, hand: Hand) -> tuple[Any, dict[str, tuple[float, floa
         spec.delete(spec.actuators[0])
     for joint in spec.joints:
         if joint.name in drives:
-            joint.armature = scale * (joint.armature or _ARMATURE)
+            joint.armature = scale * (joint.armature or ARMATURE)
     slides = {}
     for axis, ((low, high), stiffness, damping, effort) in task.carriage.items():
         # The carriage moves along world axes, while a joint's axis is given in the frame of its body: rows of Rᵀ.
@@ -165,11 +172,19 @@ def _drives(hand: Hand) -> dict[str, tuple[float, float, float]]:
     for index in range(model.nu):
         if int(model.actuator_trntype[index]) == 0 and model.actuator_biasprm[index, 1] < 0:
             servos.setdefault(int(model.actuator_trnid[index, 0]), index)
-    order = [*servos, *(joint for joint in hand.joint_numbers.tolist() if joint not in servos)]
+    # Of two coupled joints one is driven: a mimic joint of a robot takes no commands.
+    pairs = [(follower, leader) for follower, leader, _ in coupled(model) if not {follower, leader} <= set(servos)]
+    follow = {leader if follower in servos else follower for follower, leader in pairs}
+    if left := [model.actuator(index).name for index in range(model.nu) if index not in servos.values()]:
+        told = "are no position servo of one joint and are left out; joints without a servo get a weak one"
+        _log.warning("Of hand %s the drives %s %s.", shown(hand.name), listing(left), told)
+    order = [*servos, *(joint for joint in hand.joint_numbers.tolist() if joint not in {*servos, *follow})]
     found = {}
     for joint in order:
-        effort = float(model.jnt_actfrcrange[joint, 1]) if model.jnt_actfrclimited[joint] else _EFFORT
-        stiffness, damping = _STIFFNESS, _DAMPING
+        slides = model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE
+        (stiffness, damping), effort = (WEAK_PUSH, _EFFORT / LEVER) if slides else (WEAK_SERVO, _EFFORT)
+        if model.jnt_actfrclimited[joint]:
+            effort = float(model.jnt_actfrcrange[joint, 1])
         if joint in servos:
             index = servos[joint]
             # Behind a gear, the servo's length and force are those of the motor.
@@ -180,6 +195,16 @@ def _drives(hand: Hand) -> dict[str, tuple[float, float, float]]:
             effort = float(model.actuator_forcerange[index, 1]) * gear if limited else 10 * stiffness
         found[model.joint(joint).name] = (stiffness, damping, effort)
     return found
+
+
+def coupled(model: Any) -> list[tuple[int, int, NDArray[np.float64]]]:
+    """Return (joint, the one that it follows, coefficients [5] of its law) of the equality constraints of two joints.
+
+    The law is MuJoCo's: y − y₀ = a₀ + a₁ (x − x₀) + … + a₄ (x − x₀)⁴.
+    """
+    joints = (model.eq_type == mujoco.mjtEq.mjEQ_JOINT) & (model.eq_obj2id >= 0) & (model.eq_active0 != 0)
+    rows = np.flatnonzero(joints).tolist()
+    return [(int(model.eq_obj1id[row]), int(model.eq_obj2id[row]), model.eq_data[row, :5]) for row in rows]
 
 
 def _moved(task: Task, hand: Hand, joints: Sequence[str]) -> tuple[str, ...]:

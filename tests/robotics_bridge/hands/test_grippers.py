@@ -3,20 +3,24 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import mujoco
 import numpy as np
 import pytest
+import torch
 import trimesh
 
 from brainbench.core.errors import UsageError
-from robotics_bridge import hands
+from robotics_bridge import hands, tasks
 from robotics_bridge.hands import Hand
+from robotics_bridge.hands.hand import LEVER
 from robotics_bridge.hands.scenes import closing
 from robotics_bridge.physics import MujocoEngine
 from robotics_bridge.sensors import ContactDepthProbe, SensorSuite
+from robotics_bridge.tasks.task import Placement
 
 PANDA_LIKE = """<mujoco model="gripper"><compiler angle="radian" autolimits="true"/><asset>{asset}</asset><worldbody>
 <body name="base"><geom type="box" size=".03 .06 .02"/>
@@ -31,6 +35,7 @@ URDF = """<robot name="jaws">{links}
 <joint name="r" type="prismatic"><parent link="base"/><child link="right"/><origin xyz="0 -.02 .06"/>
 <axis xyz="0 -1 0"/><limit lower="0" upper=".03" effort="10" velocity="1"/><mimic joint="l" multiplier="1"/></joint>
 </robot>"""
+JAWS = (("base", ".06 .12 .04"), ("left", ".02 .01 .04"), ("right", ".02 .01 .04"))
 LINK = """<link name="{}"><inertial><mass value=".1"/>
 <inertia ixx="1e-4" iyy="1e-4" izz="1e-4" ixy="0" ixz="0" iyz="0"/>
 </inertial><collision><geometry><box size="{}"/></geometry></collision></link>"""
@@ -94,9 +99,7 @@ def test_soft_tips_of_mesh_get_taxels_beside_the_jaw_that_carries_them(tmp_path:
 
 
 def test_jaws_of_a_urdf_file_with_a_mimic_joint_face_each_other(tmp_path: Path) -> None:
-    links = "".join(
-        LINK.format(n, s) for n, s in (("base", ".06 .12 .04"), ("left", ".02 .01 .04"), ("right", ".02 .01 .04"))
-    )
+    links = "".join(LINK.format(n, s) for n, s in JAWS)
     hand = _load(tmp_path, URDF.format(links=links), "jaws.urdf")
     assert (hand.palm, set(hand.tips), hand.joints) == ("base", {"left", "right"}, ("l", "r"))
     normals = _normals(hand)
@@ -110,6 +113,39 @@ def test_jaws_of_a_urdf_file_with_a_mimic_joint_face_each_other(tmp_path: Path) 
         mujoco.mj_step(hand.model, data)
     assert data.qpos[0] > 0.02
     assert data.qpos[1] == pytest.approx(data.qpos[0], abs=2e-3)
+
+
+def test_a_task_drives_the_leading_jaw_of_a_urdf_file_at_its_own_speed_from_open_jaws(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    text = URDF.format(links="".join(LINK.format(n, s) for n, s in JAWS)).replace('velocity="1"', 'velocity=".2"')
+    (tmp_path / "jaws.urdf").write_text(text)
+    task = replace(tasks.load("in_hand_repose"), placement=Placement(height=0.5))
+    env = tasks.make(task, hand=tmp_path / "jaws.urdf", num_envs=4)
+    # What mimics takes no commands; jaws that are closed at 0 would begin inside the object.
+    assert env.action_names == env.joint_names == ("l",)
+    qpos, noise = env.simulation.qpos, env.task.actuators
+    np.testing.assert_allclose(qpos[:, :2].numpy(), 0.03, atol=1e-6)
+    assert env.state.target_step is not None
+    assert noise is not None
+    np.testing.assert_allclose(env.state.target_step.numpy(), 0.2 * env.step_dt, rtol=1e-6)
+    assert "speed" not in caplog.text
+    # Imperfections in radians are those of the tip of a finger of 5 cm.
+    assert float(env.state.actuators.values["backlash"].max()) <= LEVER * noise.backlash[1]
+    for _ in range(60):
+        env.step(-torch.ones(4, 1))
+    # As far as it was told, half of the way, but for play, noise and the bias of its sensor.
+    np.testing.assert_allclose(qpos[:, :2].numpy(), 0.015, atol=3e-3)
+
+
+def test_joints_that_follow_others_start_where_their_law_has_them(tmp_path: Path) -> None:
+    text = PANDA_LIKE.format(asset="", tip="", range="0 .04").replace(
+        '<joint joint1="l" joint2="r"/>', '<joint joint1="l" joint2="r" polycoef=".01 .5 0 0 0"/>'
+    )
+    (tmp_path / "gripper.xml").write_text(text)
+    env = tasks.make("in_hand_repose", hand=tmp_path / "gripper.xml")
+    assert env.joint_names == ("r",)
+    np.testing.assert_allclose(env.simulation.qpos[0, :2].numpy(), [0.03, 0.04], atol=1e-6)
 
 
 def test_pads_of_a_four_bar_gripper_face_each_other(tmp_path: Path) -> None:
