@@ -23,6 +23,8 @@ from robotics_bridge.tasks.task import Pose, Task
 mujoco = mujoco_module()
 
 _log = logging.getLogger(__name__)
+_INSIDE = 5e-3
+"""Depth of an object in the hand at the start that is told (m)."""
 _EFFORT = 2.0
 """Effort of a hinge for which the hand's file names none (N·m)."""
 _PALM_TOP = 0.4975
@@ -113,12 +115,34 @@ def build(task: Task, hand: Hand) -> TaskModel:
     opened = dict(zip(hand.joints, (flexed(hand, 0.0)[hand.joint_numbers] + 0.0).tolist(), strict=True))
     rest = np.array([given.get(name, opened.get(name, 0.0)) for name in joints])
     stiffness, damping, effort = (np.array([drives[name][column] for name in joints]) for column in range(3))
-    return TaskModel(
+    made = TaskModel(
         models=models, shapes=shapes, objects=names, joints=joints, moved=_moved(task, hand, joints),
         stiffness=stiffness, damping=damping, effort=effort, rest=np.clip(rest, low, high), low=low, high=high,
         tips=_tips(hand),
         lever=np.where((first.jnt_type[ids] == mujoco.mjtJoint.mjJNT_SLIDE) & own, LEVER, 1.0),
     )  # fmt: skip
+    if task.starts is None:
+        _warn_inside(task, hand, made)
+    return made
+
+
+def _warn_inside(task: Task, hand: Hand, made: TaskModel) -> None:
+    """Say where the first object begins inside the hand, which would throw it out."""
+    model, place = made.models[0], task.placement
+    data, name = mujoco.MjData(model), made.objects[0]
+    data.qpos[[model.joint(joint).qposadr[0] for joint in made.joints]] = made.rest
+    column, site = int(model.joint(name).qposadr[0]), place.sites[0] if place.sites else (0.0, 0.0, 0.0)
+    data.qpos[column : column + 3] = np.add(site, (0.0, 0.0, place.height + made.shapes[0].bottom))
+    data.qpos[column + 3 : column + 7] = place.quaternion
+    mujoco.mj_forward(model, data)
+    for pair, distance in zip(model.geom_bodyid[data.contact.geom], data.contact.dist.tolist(), strict=True):
+        links = [model.body(body).name for body in pair]
+        if name in links and distance < -_INSIDE and (link := links[links[0] == name]) not in made.objects:
+            _log.warning(
+                "The object begins %.0f mm inside %s of hand %s: place the hand (Task.hand_poses) or its joints "
+                "(Task.joints) elsewhere in a task of your own.", -1e3 * distance, shown(link), shown(hand.name),
+            )  # fmt: skip
+            return
 
 
 def _hand_spec(task: Task, hand: Hand) -> tuple[Any, dict[str, tuple[float, float, float]]]:

@@ -138,6 +138,13 @@ def test_a_task_drives_the_leading_jaw_of_a_urdf_file_at_its_own_speed_from_open
     np.testing.assert_allclose(qpos[:, :2].numpy(), 0.015, atol=3e-3)
 
 
+def test_a_task_tells_where_its_object_begins_inside_the_hand(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    text = PANDA_LIKE.format(asset="", tip='<geom type="box" size=".06 .06 .004"/>', range="0 .04")
+    (tmp_path / "gripper.xml").write_text(text)
+    tasks.make("in_hand_repose", hand=tmp_path / "gripper.xml")
+    assert "inside 'left' of hand 'gripper'" in caplog.text
+
+
 def test_joints_that_follow_others_start_where_their_law_has_them(tmp_path: Path) -> None:
     text = PANDA_LIKE.format(asset="", tip="", range="0 .04").replace(
         '<joint joint1="l" joint2="r"/>', '<joint joint1="l" joint2="r" polycoef=".01 .5 0 0 0"/>'
