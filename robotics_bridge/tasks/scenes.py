@@ -282,7 +282,9 @@ def palm_up(hand: Hand) -> Pose:
         UsageError: the joints do not tell which side the palm is.
     """
     up, surface, step = palm_surface(hand)
-    forward = step / np.linalg.norm(step)
+    length = float(np.linalg.norm(step))
+    # Fingers around the middle of the palm, as of a gripper, point nowhere along it: then an axis of the palm.
+    forward = step / length if length > 1e-6 else -np.eye(3)[np.argmin(np.abs(up))]
     # Columns: where the palm's own directions (forward, up × forward, up) go in the world.
     own = np.stack([forward, np.cross(up, forward), up], axis=1)
     world = np.stack([[-1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 1.0]], axis=1)

@@ -20,6 +20,7 @@ from robotics_bridge.hands.hand import LEVER
 from robotics_bridge.hands.scenes import closing
 from robotics_bridge.physics import MujocoEngine
 from robotics_bridge.sensors import ContactDepthProbe, SensorSuite
+from robotics_bridge.tasks.scenes import palm_up
 from robotics_bridge.tasks.task import Placement
 
 PANDA_LIKE = """<mujoco model="gripper"><compiler angle="radian" autolimits="true"/><asset>{asset}</asset><worldbody>
@@ -136,6 +137,25 @@ def test_a_task_drives_the_leading_jaw_of_a_urdf_file_at_its_own_speed_from_open
         env.step(-torch.ones(4, 1))
     # As far as it was told, half of the way, but for play, noise and the bias of its sensor.
     np.testing.assert_allclose(qpos[:, :2].numpy(), 0.015, atol=3e-3)
+
+
+@pytest.mark.parametrize("scale", [1, 8, 40])
+def test_a_gripper_whose_jaws_stand_around_its_middle_is_placed_palm_up_at_any_size(tmp_path: Path, scale: int) -> None:
+    """The middle of the palm is that of its jaws but for rounding, so that no direction leads to them."""
+    sizes = {"size": (0.03, 0.06, 0.02), "jaw": (0.01, 0.005, 0.02), "root": (0.02, 0.06), "way": (0.03,)}
+    words = {name: " ".join(f"{scale * one:g}" for one in numbers) for name, numbers in sizes.items()}
+    jaw = (
+        '<body name="{0}" pos="0 {1}{2}"><joint type="slide" axis="0 {1}1 0" range="0 {3}"/>'
+        '<geom type="box" size="{4}"/></body>'
+    )
+    jaws = "".join(
+        jaw.format(name, sign, words["root"], words["way"], words["jaw"]) for name, sign in (("a", ""), ("b", "-"))
+    )
+    text = f'<body name="base"><geom type="box" size="{words["size"]}"/>{jaws}</body>'
+    hand = _load(tmp_path, f'<mujoco><compiler autolimits="true"/><worldbody>{text}</worldbody></mujoco>')
+    place, quaternion = palm_up(hand)
+    np.testing.assert_allclose(quaternion, [1, 0, 0, 0], atol=1e-9)
+    np.testing.assert_allclose(place, [0, 0, 0.4975 - scale * 0.02], atol=1e-9)
 
 
 def test_a_task_tells_where_its_object_begins_inside_the_hand(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
