@@ -134,12 +134,20 @@ def test_shapes_share_their_slots_and_scale_in_all_lengths() -> None:
     sizes = with_sizes(shapes, (0.5, 2.0))
     assert len(sizes) == 16
     assert sizes[0].extent == pytest.approx((0.02, 0.025, 0.03))
-    assert sizes[-1].solids[0].position == pytest.approx((0.0, 0.3, 0.0))
+    assert max(shape.solids[0].position for shape in sizes) == pytest.approx((0.0, 0.3, 0.0))
     assert with_sizes(shapes, (1.0, 1.0)) == shapes
     with pytest.raises(UsageError, match=r"size .*received \(0\.0, 1\.0\)"):
         with_sizes(shapes, (0.0, 1.0))
     with pytest.raises(UsageError, match=r"received 0\.2 m of 0\.1 m"):
         screwdriver(0.1, 0.2, 0.02, 0.004)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 6, 8, 17])
+def test_a_few_environments_have_objects_of_all_sizes(count: int) -> None:
+    shapes = tuple(box(0.01 * (index + 1), 0.02, 0.02) for index in range(count))
+    edges = np.array([shape.extent for shape in with_sizes(shapes, (0.5, 1.5))])
+    np.testing.assert_allclose(np.sort(edges[:8, 1]), 0.02 * np.linspace(0.5, 1.5, 8))
+    assert len(np.unique(edges.round(9), axis=0)) == 8 * count
 
 
 def test_blocks_weigh_what_their_density_says() -> None:
