@@ -186,7 +186,8 @@ def read_mjspec(path: Path) -> Any:
     """Read a URDF or MJCF file.
 
     Meshes for display only are dropped (their files are often absent), degenerate inertias are bounded, mesh paths
-    given from the file's own folder are found too, and bodies and joints without a name are numbered.
+    given from the file's own folder are found too, bodies and joints without a name are numbered, and a hand that
+    floats is fixed.
 
     Raises:
         DataFileNotFoundError: the file is missing.
@@ -210,6 +211,11 @@ def read_mjspec(path: Path) -> Any:
         root = spec.worldbody.first_body()
         kinds = {"type": mujoco.mjtSensor.mjSENS_FRAMEPOS, "objtype": mujoco.mjtObj.mjOBJ_BODY}
         spec.add_sensor(name="palm_pose", objname=root.name, **kinds)
+    for joint in [joint for joint in spec.joints if joint.type == mujoco.mjtJoint.mjJNT_FREE]:
+        # A hand that floats in its file is held by what it is put on; its keyframes would have other sizes.
+        if len(joint.parent.find_all(mujoco.mjtObj.mjOBJ_JOINT)) > 1:
+            for item in (joint, *spec.keys):
+                spec.delete(item)
     for kind, items in (("link", spec.bodies), ("joint", spec.joints)):
         for number, item in enumerate(items):
             item.name = item.name or f"{kind}{number}"
