@@ -235,19 +235,22 @@ def _moved(task: Task, hand: Hand, joints: Sequence[str]) -> tuple[str, ...]:
     """Return the joints of the fingers that a task moves, in the drives' order, and the carriage."""
     if not task.moves:
         return tuple(joints)
-    chosen = [name for name in hand.fingers if name.lower().startswith(task.moves)]
-    missing = [part for part in task.moves if not any(name.lower().startswith(part) for name in hand.fingers)]
-    if missing:
-        # Fingers of a hand from a file are named by their tips, in whatever language.
-        chosen = [
-            n for n in hand.fingers if any(part in link.lower() for part in task.moves for link in hand.fingers[n])
-        ]
-        if not chosen:
+    chosen: set[str] = set()
+    for part in task.moves:
+        found = [name for name in hand.fingers if name.lower().startswith(part)]
+        # Fingers of a hand from a file are named by their tips, with the word in any place, or in another link.
+        found = found or [name for name in hand.fingers if part in name.lower()]
+        if not found:
+            found = [n for n, chain in hand.fingers.items() if any(part in link.lower() for link in chain)]
+            # A word that all fingers have, such as that of a middle phalanx, names none.
+            found = found if len(found) < len(hand.fingers) else []
+        if not found:
             raise UsageError(
                 f"Task {task.name!r} moves {', '.join(task.moves)}; the fingers of hand {hand.name!r} are "
                 f"{', '.join(hand.fingers)}. Register a task with moves={tuple(hand.fingers)} in a file of your own; "
                 "on the command line --task-file names it (docs/tasks.md, 'Another hand, a task of your own')."
             )
+        chosen |= set(found)
     links = {link for name in chosen for link in hand.fingers[name]}
     others = {link for name in hand.fingers if name not in chosen for link in hand.fingers[name]}
     model = hand.model

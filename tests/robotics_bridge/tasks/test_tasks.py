@@ -184,6 +184,26 @@ def test_a_finger_that_the_hand_lacks_is_named() -> None:
         build(replace(tasks.load("in_palm_rotate"), joints={"xhand1": {"elbow": 1.0}}), hands.load("xhand1"))
 
 
+def test_a_word_of_every_fingers_links_names_no_finger(tmp_path: Path) -> None:
+    """Middle phalanges, as of the Shadow hand, are no middle fingers; a part that is missing is not passed over."""
+    finger = (
+        '<body name="{0}proximal" pos="0 {1} .05"><joint name="{0}1" axis="0 1 0" range="0 1.6"/><geom type="capsule" '
+        'size=".01" fromto="0 0 0 0 0 .04"/><body name="{0}middle" pos="0 0 .05"><joint name="{0}2" axis="0 1 0" '
+        'range="0 1.6"/><geom type="capsule" size=".01" fromto="0 0 0 0 0 .04"/><body name="{0}distal" pos="0 0 .05">'
+        '<geom type="sphere" size=".01"/></body></body></body>'
+    )
+    fingers = "".join(finger.format(name, y) for name, y in (("th", -0.05), ("mf", 0.0), ("ff", 0.05)))
+    text = f'<body name="palm"><geom type="box" size=".02 .06 .04"/>{fingers}</body>'
+    (tmp_path / "hand.xml").write_text(
+        f'<mujoco><compiler angle="radian" autolimits="true"/><worldbody>{text}</worldbody></mujoco>'
+    )
+    hand, task = hands.load(tmp_path / "hand.xml"), tasks.load("in_palm_rotate")
+    assert build(replace(task, moves=("th", "mf")), hand).moved == ("th1", "th2", "mf1", "mf2")
+    for moves in (("thumb", "mid"), ("th", "mid")):
+        with pytest.raises(UsageError, match=r"thdistal, mfdistal, ffdistal.*moves="):
+            build(replace(task, moves=moves), hand)
+
+
 def test_sampled_grasps_hold_without_any_action() -> None:
     task = replace(tasks.load("screwdriver"), push=None, object_changes=ObjectRandomisation())
     env = tasks.make(task, num_envs=8, threads=1)
