@@ -86,6 +86,11 @@ class Hand:
         """Numbers of the hinges and slides among the model's joints."""
         return np.flatnonzero(np.isin(self.model.jnt_type, (2, 3)))
 
+    def lever(self, joints: Iterable[str]) -> NDArray[np.float64]:
+        """Return the factors [J] on what is stated in rad: 1 of hinges, :data:`LEVER` (m per rad) of slides."""
+        slide = mujoco_module().mjtJoint.mjJNT_SLIDE
+        return np.array([LEVER if self.model.joint(name).type[0] == slide else 1.0 for name in joints])
+
     def rated_speeds(self, joints: Iterable[str]) -> NDArray[np.float64]:
         """Return the largest speeds [J] (rad/s or m/s) of joints.
 
@@ -95,11 +100,10 @@ class Hand:
         names = list(joints)
         known = _stated_speeds(self.path) if self.spec is None else {one.name: one.velocity for one in self.spec.joints}
         if assumed := [name for name in names if name not in known]:
-            slow = UNKNOWN_SPEED * LEVER
-            told = f"{UNKNOWN_SPEED:g} rad/s (slides: {slow:g} m/s) counts as the largest of {listing(assumed)}"
+            slow = f"slides: {UNKNOWN_SPEED * LEVER:g} m/s"
+            told = f"{UNKNOWN_SPEED:g} rad/s ({slow}) counts as the largest of {listing(assumed)}"
             _log.warning("Hand %s states no speed for %d joints: %s.", shown(self.name), len(assumed), told)
-            slides = {name: self.model.joint(name).type[0] == mujoco_module().mjtJoint.mjJNT_SLIDE for name in assumed}
-            known |= {name: slow if slides[name] else UNKNOWN_SPEED for name in assumed}
+            known |= dict(zip(assumed, UNKNOWN_SPEED * self.lever(assumed), strict=True))
         return np.array([known[name] for name in names])
 
     @property

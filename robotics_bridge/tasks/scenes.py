@@ -96,7 +96,7 @@ def build(task: Task, hand: Hand) -> TaskModel:
             set_contacts(models[-1], task.contacts)
     first = models[0]
     joints = tuple(drives)
-    ids, own = [first.joint(name).id for name in joints], [not name.startswith("carriage_") for name in joints]
+    ids, own = [first.joint(name).id for name in joints], [n for n in joints if not n.startswith("carriage_")]
     # Joints without limits get a full turn: actions are scaled by ranges.
     limited = first.jnt_limited[ids].astype(bool)
     low = np.where(limited, first.jnt_range[ids, 0], -np.pi)
@@ -119,7 +119,7 @@ def build(task: Task, hand: Hand) -> TaskModel:
         models=models, shapes=shapes, objects=names, joints=joints, moved=_moved(task, hand, joints),
         stiffness=stiffness, damping=damping, effort=effort, rest=np.clip(rest, low, high), low=low, high=high,
         tips=_tips(hand),
-        lever=np.where((first.jnt_type[ids] == mujoco.mjtJoint.mjJNT_SLIDE) & own, LEVER, 1.0),
+        lever=np.array([*hand.lever(own), *np.ones(len(joints) - len(own))]),
     )  # fmt: skip
     if task.starts is None:
         _warn_inside(task, hand, made)

@@ -15,6 +15,8 @@ import trimesh
 
 from brainbench.core.errors import UsageError
 from robotics_bridge import hands, tasks
+from robotics_bridge.deploy.driver import HandReading
+from robotics_bridge.deploy.safety import SafetyLimits
 from robotics_bridge.hands import Hand
 from robotics_bridge.hands.hand import LEVER
 from robotics_bridge.hands.scenes import closing
@@ -137,6 +139,14 @@ def test_a_task_drives_the_leading_jaw_of_a_urdf_file_at_its_own_speed_from_open
         env.step(-torch.ones(4, 1))
     # As far as it was told, half of the way, but for play, noise and the bias of its sensor.
     np.testing.assert_allclose(qpos[:, :2].numpy(), 0.015, atol=3e-3)
+
+
+def test_a_jaw_that_is_reported_far_beyond_its_way_stops_the_hand(tmp_path: Path) -> None:
+    (tmp_path / "jaws.urdf").write_text(URDF.format(links="".join(LINK.format(n, s) for n, s in JAWS)))
+    limits = SafetyLimits.of_hand(hands.load(tmp_path / "jaws.urdf"), ("l", "r"))
+    for place, stops in ((0.036, False), (0.045, True)):
+        reading = HandReading(0, 0.0, 0.0, np.array([place, 0.0]), np.zeros(2), np.zeros((2, 3)))
+        assert (limits.fault(reading, 0.0) is not None) is stops
 
 
 @pytest.mark.parametrize("scale", [1, 8, 40])
