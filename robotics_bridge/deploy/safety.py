@@ -36,7 +36,7 @@ class SafetyLimits:
     pressure: float = 30.0
     """Largest reading of a finger tip, in the maker's unit."""
     margin: float = 0.15
-    """Distance beyond its limits at which a joint may be measured (rad)."""
+    """Distance beyond its limits at which a joint may be measured (rad; of a slide by its lever)."""
     timeout: float = 0.1
     """Oldest report to act upon (s)."""
     start_timeout: float = 3.0
@@ -45,6 +45,8 @@ class SafetyLimits:
     """Smallest share of the nominal control rate over the window."""
     rate_window: float = 1.0
     """Seconds over which the rate is judged."""
+    lever: NDArray[np.float64] | float = 1.0
+    """[J] factor on the margin (:meth:`~robotics_bridge.hands.hand.Hand.lever`)."""
 
     def __post_init__(self) -> None:
         if not (len(self.low) == len(self.high) == len(self.speed)):
@@ -68,7 +70,7 @@ class SafetyLimits:
             raise UsageError(f"The hand {hand.name!r} has no joint {missing[0]!r}.")
         ranges = np.array([model.jnt_range[names[name]] for name in joints])
         check_each("safety limit", changes, LIMITS)
-        return cls(ranges[:, 0], ranges[:, 1], hand.rated_speeds(joints), **changes)
+        return cls(ranges[:, 0], ranges[:, 1], hand.rated_speeds(joints), lever=hand.lever(joints), **changes)
 
     def fault(self, reading: HandReading, age: float) -> str | None:
         """Return why a report must not be acted upon, in words; None if it may."""
@@ -79,7 +81,7 @@ class SafetyLimits:
             return "the hand reports values that are no numbers"
         if age > self.timeout:
             return f"the newest report is {1e3 * age:.0f} ms old (allowed {1e3 * self.timeout:.0f} ms)"
-        beyond = np.maximum(self.low - reading.position, reading.position - self.high) - self.margin
+        beyond = np.maximum(self.low - reading.position, reading.position - self.high) - self.margin * self.lever
         if (beyond > 0).any():
             joint = int(beyond.argmax())
             return f"joint {joint} is reported at {reading.position[joint]:.3g} rad, beyond its limits"

@@ -127,7 +127,11 @@ class SimulatedHand:
         model = self.engine.model
         self._positions = [int(model.joint(name).qposadr[0]) for name in self.joints]
         self._speeds = [int(model.joint(name).dofadr[0]) for name in self.joints]
-        self._drives = [model.actuator(name).id for name in self.joints]
+        # A file may name its servos as it likes, and leave joints without one.
+        servos = {int(joint): servo for servo, joint in enumerate(model.actuator_trnid[:, 0])}
+        driven = [(row, servos[model.joint(name).id]) for row, name in enumerate(self.joints)
+                  if model.joint(name).id in servos]  # fmt: skip
+        self._driven, self._drives = (list(part) for part in zip(*driven, strict=True))
         self._rows = [self.hand.tips.index(link) for link in self.layout if link in self.hand.tips]
         # The first step and reading load what later ones use; real time begins after them.
         self.step()
@@ -146,7 +150,7 @@ class SimulatedHand:
         """
         if np.shape(targets) != (len(self.joints),) or not np.isfinite(targets).all():
             raise UsageError(f"A hand takes {len(self.joints)} finite targets (rad); received {str(targets)[:80]}.")
-        self.engine.data[0].ctrl[self._drives] = targets
+        self.engine.data[0].ctrl[self._drives] = np.asarray(targets)[self._driven]
 
     @property
     def position(self) -> NDArray[np.float64]:

@@ -37,6 +37,9 @@ class Actuators:
             for name in ("stiffness", "damping", "effort")
         }
 
+        self.lever = torch.as_tensor(model.lever, dtype=torch.float32, device=device)
+        """[J] factor on imperfections and noise that are stated for hinges."""
+
         def zeros() -> torch.Tensor:
             return torch.zeros(simulation.num_envs, len(ids), device=device)
 
@@ -72,12 +75,14 @@ class Actuators:
         values = {name: self.nominal[name] for name in ("stiffness", "damping")}
         values |= {"play": torch.zeros_like(self.target), "before": position, "strength": torch.ones_like(self.target)}
         if c is not None:
+            # Stated for hinges; a slide moves as the tip of a finger would.
+            lever = self.lever
             values |= {
                 "stiffness": self.nominal["stiffness"] * draw(joints, *c.stiffness),
                 "damping": self.nominal["damping"] * draw(joints, *c.damping),
-                "strength": draw(joints, *c.strength), "bias": draw(joints, *c.position_bias),
-                "deadband": draw(joints, *c.deadband), "backlash": draw(joints, *c.backlash),
-                "kick": c.kick * draw(joints, *c.kick_ratio),
+                "strength": draw(joints, *c.strength), "bias": lever * draw(joints, *c.position_bias),
+                "deadband": lever * draw(joints, *c.deadband), "backlash": lever * draw(joints, *c.backlash),
+                "kick": c.kick * draw(joints, *c.kick_ratio) / lever,
             }  # fmt: skip
         for name, value in values.items():
             own = self.values[name]

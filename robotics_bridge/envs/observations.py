@@ -27,7 +27,7 @@ def _joints(state: EnvState, *, noisy: bool) -> torch.Tensor:
     position = simulation.qpos[:, state.actuators.qpos_columns]
     velocity = VELOCITY * simulation.qvel[:, state.actuators.qvel_columns]
     if noisy:
-        drawn = torch.randn(2, *position.shape, generator=state.generator, device=state.device)
+        drawn = torch.randn(2, *position.shape, generator=state.generator, device=state.device) * state.actuators.lever
         # White noise of encoders in every control step; the privileged groups read the same joints without it.
         position = position + noise.position * drawn[0]
         velocity = velocity + noise.velocity * drawn[1]

@@ -21,7 +21,7 @@ from robotics_bridge.envs.options import EnvOptions
 from robotics_bridge.envs.simulation import Simulation
 from robotics_bridge.envs.tactile import TactileObservation
 from robotics_bridge.hands import Hand
-from robotics_bridge.tasks.scenes import TaskModel, build
+from robotics_bridge.tasks.scenes import TaskModel, build, coupled
 from robotics_bridge.tasks.step_context import TaskState
 from robotics_bridge.tasks.task import Task
 
@@ -139,6 +139,13 @@ class EnvState:
         """[A] numbers of the joints that actions move."""
         self.low, self.high, self.rest = floats(model.low), floats(model.high), floats(model.rest)
         """[J] limits and positions at rest (rad)."""
+        for follower, leader, law in coupled(first):
+            # Joints that follow others start where their law has them; of joints at 0 that is mostly 0.
+            columns = [int(first.jnt_qposadr[joint]) for joint in (follower, leader)]
+            own, other = (float(first.qpos0[column]) for column in columns)
+            if (name := first.joint(leader).name) in model.joints:
+                other = float(model.rest[model.joints.index(name)]) - other
+                self.simulation.start[:, columns[0]] = own + float(np.polynomial.Polynomial(law)(other))
         # An action of 1 is the same share of every joint's range.
         self.action_scale = self.task.action_ratio * (self.high - self.low)[self.moved]
         """[A] change of a target per unit of action (rad)."""

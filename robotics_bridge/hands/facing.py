@@ -17,17 +17,23 @@ _CROSSED = 0.012
 """Joints nearer to each other (m) act on a link together."""
 _SNAP = 0.9
 """Cosine from which a direction counts as that of an axis of its link: jaws have flat faces."""
+_JAWS = 0.4
+"""Length of the mean direction of finger tips up to which they go towards each other: .8 and more of hands."""
+_APART = -0.5
+"""Cosine to the other tips below which a tip goes away from them."""
 
 
 def palmar_directions(model: Any, palm: str, fingers: Mapping[str, tuple[str, ...]]) -> dict[str, np.ndarray]:
     """Return link → the direction [3] of its palmar side, in the link's frame.
 
     A link's palmar side is where it moves when its joint flexes (of two crossed joints, the one with more range
-    counts). A joint that swings as far to both sides spreads or twists the finger and tells nothing: such links
-    face as the next one towards the tip does. What slides, and tips of which no joint tells, face the other fingers.
-    The palm faces where the finger tips go, along the nearest axis of its frame, or the tips of jaws.
+    counts), or where it comes from if that opens a gripper (:func:`opens`). A joint that swings as far to both sides
+    spreads or twists the finger and tells nothing: such links face as the next one towards the tip does. What slides,
+    and tips of which no joint tells, face the other fingers. The palm faces where the finger tips go, along the nearest
+    axis of its frame, or the tips of jaws.
     """
     data = half_open(model)
+    sign = -1.0 if opens(model, fingers) else 1.0
     towards: dict[str, np.ndarray] = {}
     tips = []
     for name, chain in fingers.items():
@@ -41,13 +47,13 @@ def palmar_directions(model: Any, palm: str, fingers: Mapping[str, tuple[str, ..
                 world = _opposite(model, data, body, [model.body(other).id for other in others])
                 if world is None:
                     world = _flexed(model, data, body, following, symmetric=True)
-            known = known if world is None else world
+            known = known if world is None else sign * world
             if known is not None:
                 towards[chain[place]] = data.xmat[body].reshape(3, 3).T @ known
                 tips += [known] if place + 1 == len(chain) else []
     if tips:
         mean, body = np.mean(tips, axis=0), model.body(palm).id
-        if np.linalg.norm(mean) <= 0.1:
+        if np.linalg.norm(mean) <= _JAWS:
             # Jaws go towards each other: the palm faces what lies between them.
             ends = [link_middle(model, data, model.body(chain[-1]).id) for chain in fingers.values()]
             mean = np.mean(ends, axis=0) - link_middle(model, data, body)
@@ -60,6 +66,20 @@ def palmar_directions(model: Any, palm: str, fingers: Mapping[str, tuple[str, ..
             face = np.argmax(np.abs(turned))
             towards[palm] = np.sign(turned[face]) * np.eye(3)[face]
     return towards
+
+
+def opens(model: Any, fingers: Mapping[str, tuple[str, ...]]) -> bool:
+    """Return whether flexion, the longer side of the ranges, parts the finger tips: a gripper that is closed at 0."""
+    data, tips = half_open(model), [model.body(chain[-1]).id for chain in fingers.values()]
+    middles = np.array([link_middle(model, data, tip) for tip in tips])
+    for place, tip in enumerate(tips):
+        way = _flexed(model, data, tip, None)
+        if way is None or len(tips) < 2:
+            return False
+        away = np.delete(middles, place, axis=0).mean(axis=0) - middles[place]
+        if not way @ away < _APART * np.linalg.norm(away):
+            return False
+    return True
 
 
 def half_open(model: Any) -> Any:

@@ -35,7 +35,9 @@ _AUTO_GRIDS = {
 _NAMES = {"name", "class", "childclass", "joint", "body", "link", "geom", "site", "mesh", "material", "file"}
 """Attributes of URDF and MJCF that hold words."""
 UNKNOWN_SPEED = 5.0
-"""Speed (rad/s or m/s) that counts as the largest of a joint whose data states none."""
+"""Speed (rad/s) that counts as the largest of a hinge whose data states none."""
+LEVER = 0.05
+"""Length of a finger (m) whose tip moves as a slide, where a number is stated for hinges alone: 1 rad is .05 m."""
 _LARGEST = 1e15
 """Magnitude of numbers in a hand's file that no hand has."""
 
@@ -84,17 +86,25 @@ class Hand:
         """Numbers of the hinges and slides among the model's joints."""
         return np.flatnonzero(np.isin(self.model.jnt_type, (2, 3)))
 
+    def lever(self, joints: Iterable[str]) -> NDArray[np.float64]:
+        """Return the factors [J] on what is stated in rad: 1 of hinges, :data:`LEVER` (m per rad) of slides."""
+        slide = mujoco_module().mjtJoint.mjJNT_SLIDE
+        return np.array([LEVER if self.model.joint(name).type[0] == slide else 1.0 for name in joints])
+
     def rated_speeds(self, joints: Iterable[str]) -> NDArray[np.float64]:
         """Return the largest speeds [J] (rad/s or m/s) of joints.
 
-        Where none is stated (as in any URDF or MJCF file), it is taken to be :data:`UNKNOWN_SPEED`, with a warning.
+        Where none is stated (as in any MJCF file), it is taken to be :data:`UNKNOWN_SPEED`, with a warning; of slides
+        :data:`LEVER` times that.
         """
         names = list(joints)
-        known = {joint.name: joint.velocity for joint in self.spec.joints} if self.spec is not None else {}
+        known = _stated_speeds(self.path) if self.spec is None else {one.name: one.velocity for one in self.spec.joints}
         if assumed := [name for name in names if name not in known]:
-            told = f"{UNKNOWN_SPEED:g} rad/s (or m/s) counts as the largest of {listing(assumed)}"
+            slow = f"slides: {UNKNOWN_SPEED * LEVER:g} m/s"
+            told = f"{UNKNOWN_SPEED:g} rad/s ({slow}) counts as the largest of {listing(assumed)}"
             _log.warning("Hand %s states no speed for %d joints: %s.", shown(self.name), len(assumed), told)
-        return np.array([known.get(name, UNKNOWN_SPEED) for name in names])
+            known |= dict(zip(assumed, UNKNOWN_SPEED * self.lever(assumed), strict=True))
+        return np.array([known[name] for name in names])
 
     @property
     def tips(self) -> tuple[str, ...]:
@@ -180,7 +190,8 @@ def read_mjspec(path: Path) -> Any:
     """Read a URDF or MJCF file.
 
     Meshes for display only are dropped (their files are often absent), degenerate inertias are bounded, mesh paths
-    given from the file's own folder are found too, and bodies and joints without a name are numbered.
+    given from the file's own folder are found too, bodies and joints without a name are numbered, and a hand that
+    floats is fixed.
 
     Raises:
         DataFileNotFoundError: the file is missing.
@@ -204,6 +215,11 @@ def read_mjspec(path: Path) -> Any:
         root = spec.worldbody.first_body()
         kinds = {"type": mujoco.mjtSensor.mjSENS_FRAMEPOS, "objtype": mujoco.mjtObj.mjOBJ_BODY}
         spec.add_sensor(name="palm_pose", objname=root.name, **kinds)
+    for joint in [joint for joint in spec.joints if joint.type == mujoco.mjtJoint.mjJNT_FREE]:
+        # A hand that floats in its file is held by what it is put on; its keyframes would have other sizes.
+        if len(joint.parent.find_all(mujoco.mjtObj.mjOBJ_JOINT)) > 1:
+            for item in (joint, *spec.keys):
+                spec.delete(item)
     for kind, items in (("link", spec.bodies), ("joint", spec.joints)):
         for number, item in enumerate(items):
             item.name = item.name or f"{kind}{number}"
@@ -227,6 +243,17 @@ def _check_xml(path: Path) -> None:
                             f"{key!r} of <{shown(element.tag, quoted=False)}> in {shown(str(path))} is {shown(value)}; "
                             f"finite numbers of at most {_LARGEST:g} are needed."
                         )
+
+
+def _stated_speeds(path: Path | None) -> dict[str, float]:
+    """Return joint → largest speed (rad/s or m/s) of a URDF file, which MuJoCo does not keep; 0 states none."""
+    if path is None or path.suffix.lower() != ".urdf":
+        return {}
+    with readable(path, "URDF or MJCF file"):
+        root = ElementTree.fromstring(read_text(path, "hand file (URDF or MJCF)"))
+        limits = {joint.get("name", ""): joint.find("limit") for joint in root.iter("joint")}
+        speeds = {name: float(limit.get("velocity", 0)) for name, limit in limits.items() if limit is not None}
+    return {name: speed for name, speed in speeds.items() if speed > 0}
 
 
 def _is_absurd(word: str) -> bool:

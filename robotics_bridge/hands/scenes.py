@@ -12,7 +12,7 @@ from brainbench.core.devices import mujoco_module
 from brainbench.core.errors import UsageError
 from brainbench.core.reading.ranges import check_number
 from brainbench.core.rotations import from_matrices, from_z_axis, to_matrices
-from robotics_bridge.hands.facing import half_open, link_middle, palmar_directions, slide_of
+from robotics_bridge.hands.facing import half_open, link_middle, opens, palmar_directions, slide_of
 from robotics_bridge.hands.hand import Hand
 from robotics_bridge.hands.spec import add_servo
 
@@ -20,10 +20,9 @@ mujoco = mujoco_module()
 
 OBJECT = "object"
 """Name of the free body and of its geometry."""
-_STIFFNESS, _DAMPING, _ARMATURE = 2.0, 0.2, 0.01
-"""Servo of a hinge without a drive: N·m/rad, N·m·s/rad, kg·m² (kg for a slide)."""
-_PUSH, _DRAG = 300.0, 10.0
-"""Servo of a slide without a drive: N/m, N·s/m."""
+WEAK_SERVO, WEAK_PUSH, ARMATURE = (2.0, 0.2), (300.0, 10.0), 0.01
+"""Stiffness and damping of a hinge without a servo (N·m/rad, N·m·s/rad) and of such a slide (N/m, N·s/m); inertia of
+their drives (kg·m², kg for a slide)."""
 
 
 def holding(hand: Hand, **settings: float) -> Any:
@@ -160,8 +159,11 @@ def flexed(hand: Hand, share: float) -> NDArray[np.float64]:
     """
     check_number("share by which a hand closes", share, least=0, most=1)
     low, high = hand.model.jnt_range.T
-    # Flexion is the longer side of a joint's range.
-    target = np.where(np.abs(high) >= np.abs(low), high, low) * share
+    # Flexion is the longer side of a joint's range, where a gripper may be open.
+    longer = np.abs(high) >= np.abs(low)
+    target = np.where(longer, high, low) * share
+    if opens(hand.model, hand.fingers):
+        target = np.where(longer, high - share * (high - low), low + share * (high - low))
     # Joints that spread the fingers stay in their middle.
     target = np.where(np.abs(high + low) < 0.5 * (high - low), 0.0, target)
     for joint, (opened, closed) in jaw_ends(hand).items():
@@ -185,9 +187,8 @@ def replace_drives(spec: Any) -> None:
     for joint in spec.joints:
         slides = joint.type == mujoco.mjtJoint.mjJNT_SLIDE
         if slides or joint.type == mujoco.mjtJoint.mjJNT_HINGE:
-            stiffness, damping = (_PUSH, _DRAG) if slides else (_STIFFNESS, _DAMPING)
-            joint.armature = max(joint.armature, _ARMATURE)
-            add_servo(spec, joint.name, stiffness, damping)
+            joint.armature = max(joint.armature, ARMATURE)
+            add_servo(spec, joint.name, *(WEAK_PUSH if slides else WEAK_SERVO))
 
 
 def palm_surface(hand: Hand) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:

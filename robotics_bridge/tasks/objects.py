@@ -141,6 +141,8 @@ def screwdriver(length: float, handle_length: float, handle_radius: float, shaft
 def with_sizes(shapes: Sequence[ObjectShape], span: tuple[float, float]) -> tuple[ObjectShape, ...]:
     """Return every shape at eight sizes, evenly from the smallest to the largest factor of a span.
 
+    Neighbours differ in both, so that a few environments, which take them in turn, have all sizes and shapes.
+
     Raises:
         UsageError: the range is not positive or falls.
     """
@@ -149,7 +151,10 @@ def with_sizes(shapes: Sequence[ObjectShape], span: tuple[float, float]) -> tupl
     if not 0 < span[0] <= span[1]:
         raise UsageError(f"Factors of size are a positive range (low, high); received {span}.")
     factors = [span[0] + (span[1] - span[0]) * index / 7 for index in range(8)]
-    return tuple(shape.scaled(factor) for factor in factors for shape in shapes)
+    count, round_ = len(shapes), math.lcm(len(shapes), 8)
+    # Every pair once: after as many as repeat the first pair, sizes go one further.
+    order = [(index % count, (index + index // round_) % 8) for index in range(8 * count)]
+    return tuple(shapes[shape].scaled(factors[size]) for shape, size in order)
 
 
 def slots(shapes: Sequence[ObjectShape]) -> tuple[str, ...]:

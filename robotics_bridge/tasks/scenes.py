@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
@@ -11,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.devices import mujoco_module
-from brainbench.core.errors import UsageError, check_each
-from robotics_bridge.hands.hand import Hand
-from robotics_bridge.hands.scenes import palm_surface, place_palm
+from brainbench.core.errors import UsageError, check_each, listing, shown
+from robotics_bridge.hands.hand import LEVER, Hand
+from robotics_bridge.hands.scenes import ARMATURE, WEAK_PUSH, WEAK_SERVO, flexed, palm_surface, place_palm
 from robotics_bridge.physics.scene import excluded_links
 from robotics_bridge.tasks.contact_model import ContactModel, set_contacts
 from robotics_bridge.tasks.objects import ObjectShape, add_object, slots, with_sizes
@@ -21,8 +22,11 @@ from robotics_bridge.tasks.task import Pose, Task
 
 mujoco = mujoco_module()
 
-_STIFFNESS, _DAMPING, _ARMATURE, _EFFORT = 2.0, 0.2, 0.01, 2.0
-"""Drive of a joint for which the hand's file names none: N·m/rad, N·m·s/rad, kg·m², N·m."""
+_log = logging.getLogger(__name__)
+_INSIDE = 5e-3
+"""Depth of an object in the hand at the start that is told (m)."""
+_EFFORT = 2.0
+"""Effort of a hinge for which the hand's file names none (N·m)."""
 _PALM_TOP = 0.4975
 """Height of an upturned palm below objects that start at 0.5 m."""
 _ROUNDED = 1e-3
@@ -65,6 +69,8 @@ class TaskModel:
     """[J] upper limits (rad or m)."""
     tips: Mapping[str, tuple[float, float, float]]
     """Finger tip → point (m, link frame)."""
+    lever: NDArray[np.float64]
+    """[J] factor on imperfections and noise that a task states for hinges: :data:`LEVER` of the hand's slides."""
 
 
 def build(task: Task, hand: Hand) -> TaskModel:
@@ -90,7 +96,7 @@ def build(task: Task, hand: Hand) -> TaskModel:
             set_contacts(models[-1], task.contacts)
     first = models[0]
     joints = tuple(drives)
-    ids = [first.joint(name).id for name in joints]
+    ids, own = [first.joint(name).id for name in joints], [n for n in joints if not n.startswith("carriage_")]
     # Joints without limits get a full turn: actions are scaled by ranges.
     limited = first.jnt_limited[ids].astype(bool)
     low = np.where(limited, first.jnt_range[ids, 0], -np.pi)
@@ -104,14 +110,39 @@ def build(task: Task, hand: Hand) -> TaskModel:
                 f"Joint {name!r} of hand {hand.name!r} rests within {least:g} and {most:g} (rad or m) in task "
                 f"{task.name!r}; received {position:g}."
             )
-    # Of joints that the task does not name, 0 may lie beyond the limits.
-    rest = np.array([given.get(name, 0.0) for name in joints])
+    # Joints that the task does not name are open: 0 but for jaws, between which the object may lie. 0 may lie beyond
+    # the limits.
+    opened = dict(zip(hand.joints, (flexed(hand, 0.0)[hand.joint_numbers] + 0.0).tolist(), strict=True))
+    rest = np.array([given.get(name, opened.get(name, 0.0)) for name in joints])
     stiffness, damping, effort = (np.array([drives[name][column] for name in joints]) for column in range(3))
-    return TaskModel(
+    made = TaskModel(
         models=models, shapes=shapes, objects=names, joints=joints, moved=_moved(task, hand, joints),
         stiffness=stiffness, damping=damping, effort=effort, rest=np.clip(rest, low, high), low=low, high=high,
         tips=_tips(hand),
+        lever=np.array([*hand.lever(own), *np.ones(len(joints) - len(own))]),
     )  # fmt: skip
+    if task.starts is None:
+        _warn_inside(task, hand, made)
+    return made
+
+
+def _warn_inside(task: Task, hand: Hand, made: TaskModel) -> None:
+    """Say where the first object begins inside the hand, which would throw it out."""
+    model, place = made.models[0], task.placement
+    data, name = mujoco.MjData(model), made.objects[0]
+    data.qpos[[model.joint(joint).qposadr[0] for joint in made.joints]] = made.rest
+    column, site = int(model.joint(name).qposadr[0]), place.sites[0] if place.sites else (0.0, 0.0, 0.0)
+    data.qpos[column : column + 3] = np.add(site, (0.0, 0.0, place.height + made.shapes[0].bottom))
+    data.qpos[column + 3 : column + 7] = place.quaternion
+    mujoco.mj_forward(model, data)
+    for pair, distance in zip(model.geom_bodyid[data.contact.geom], data.contact.dist.tolist(), strict=True):
+        links = [model.body(body).name for body in pair]
+        if name in links and distance < -_INSIDE and (link := links[links[0] == name]) not in made.objects:
+            _log.warning(
+                "The object begins %.0f mm inside %s of hand %s: place the hand (Task.hand_poses) or its joints "
+                "(Task.joints) elsewhere in a task of your own.", -1e3 * distance, shown(link), shown(hand.name),
+            )  # fmt: skip
+            return
 
 
 def _hand_spec(task: Task, hand: Hand) -> tuple[Any, dict[str, tuple[float, float, float]]]:
@@ -128,7 +159,7 @@ def _hand_spec(task: Task, hand: Hand) -> tuple[Any, dict[str, tuple[float, floa
         spec.delete(spec.actuators[0])
     for joint in spec.joints:
         if joint.name in drives:
-            joint.armature = scale * (joint.armature or _ARMATURE)
+            joint.armature = scale * (joint.armature or ARMATURE)
     slides = {}
     for axis, ((low, high), stiffness, damping, effort) in task.carriage.items():
         # The carriage moves along world axes, while a joint's axis is given in the frame of its body: rows of Rᵀ.
@@ -165,11 +196,19 @@ def _drives(hand: Hand) -> dict[str, tuple[float, float, float]]:
     for index in range(model.nu):
         if int(model.actuator_trntype[index]) == 0 and model.actuator_biasprm[index, 1] < 0:
             servos.setdefault(int(model.actuator_trnid[index, 0]), index)
-    order = [*servos, *(joint for joint in hand.joint_numbers.tolist() if joint not in servos)]
+    # Of two coupled joints one is driven: a mimic joint of a robot takes no commands.
+    pairs = [(follower, leader) for follower, leader, _ in coupled(model) if not {follower, leader} <= set(servos)]
+    follow = {leader if follower in servos else follower for follower, leader in pairs}
+    if left := [model.actuator(index).name for index in range(model.nu) if index not in servos.values()]:
+        told = "are no position servo of one joint and are left out; joints without a servo get a weak one"
+        _log.warning("Of hand %s the drives %s %s.", shown(hand.name), listing(left), told)
+    order = [*servos, *(joint for joint in hand.joint_numbers.tolist() if joint not in {*servos, *follow})]
     found = {}
     for joint in order:
-        effort = float(model.jnt_actfrcrange[joint, 1]) if model.jnt_actfrclimited[joint] else _EFFORT
-        stiffness, damping = _STIFFNESS, _DAMPING
+        slides = model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE
+        (stiffness, damping), effort = (WEAK_PUSH, _EFFORT / LEVER) if slides else (WEAK_SERVO, _EFFORT)
+        if model.jnt_actfrclimited[joint]:
+            effort = float(model.jnt_actfrcrange[joint, 1])
         if joint in servos:
             index = servos[joint]
             # Behind a gear, the servo's length and force are those of the motor.
@@ -182,23 +221,36 @@ def _drives(hand: Hand) -> dict[str, tuple[float, float, float]]:
     return found
 
 
+def coupled(model: Any) -> list[tuple[int, int, NDArray[np.float64]]]:
+    """Return (joint, the one that it follows, coefficients [5] of its law) of the equality constraints of two joints.
+
+    The law is MuJoCo's: y − y₀ = a₀ + a₁ (x − x₀) + … + a₄ (x − x₀)⁴.
+    """
+    joints = (model.eq_type == mujoco.mjtEq.mjEQ_JOINT) & (model.eq_obj2id >= 0) & (model.eq_active0 != 0)
+    rows = np.flatnonzero(joints).tolist()
+    return [(int(model.eq_obj1id[row]), int(model.eq_obj2id[row]), model.eq_data[row, :5]) for row in rows]
+
+
 def _moved(task: Task, hand: Hand, joints: Sequence[str]) -> tuple[str, ...]:
     """Return the joints of the fingers that a task moves, in the drives' order, and the carriage."""
     if not task.moves:
         return tuple(joints)
-    chosen = [name for name in hand.fingers if name.lower().startswith(task.moves)]
-    missing = [part for part in task.moves if not any(name.lower().startswith(part) for name in hand.fingers)]
-    if missing:
-        # Fingers of a hand from a file are named by their tips, in whatever language.
-        chosen = [
-            n for n in hand.fingers if any(part in link.lower() for part in task.moves for link in hand.fingers[n])
-        ]
-        if not chosen:
+    chosen: set[str] = set()
+    for part in task.moves:
+        found = [name for name in hand.fingers if name.lower().startswith(part)]
+        # Fingers of a hand from a file are named by their tips, with the word in any place, or in another link.
+        found = found or [name for name in hand.fingers if part in name.lower()]
+        if not found:
+            found = [n for n, chain in hand.fingers.items() if any(part in link.lower() for link in chain)]
+            # A word that all fingers have, such as that of a middle phalanx, names none.
+            found = found if len(found) < len(hand.fingers) else []
+        if not found:
             raise UsageError(
                 f"Task {task.name!r} moves {', '.join(task.moves)}; the fingers of hand {hand.name!r} are "
                 f"{', '.join(hand.fingers)}. Register a task with moves={tuple(hand.fingers)} in a file of your own; "
                 "on the command line --task-file names it (docs/tasks.md, 'Another hand, a task of your own')."
             )
+        chosen |= set(found)
     links = {link for name in chosen for link in hand.fingers[name]}
     others = {link for name in hand.fingers if name not in chosen for link in hand.fingers[name]}
     model = hand.model
@@ -233,7 +285,9 @@ def palm_up(hand: Hand) -> Pose:
         UsageError: the joints do not tell which side the palm is.
     """
     up, surface, step = palm_surface(hand)
-    forward = step / np.linalg.norm(step)
+    length = float(np.linalg.norm(step))
+    # Fingers around the middle of the palm, as of a gripper, point nowhere along it: then an axis of the palm.
+    forward = step / length if length > 1e-6 else -np.eye(3)[np.argmin(np.abs(up))]
     # Columns: where the palm's own directions (forward, up × forward, up) go in the world.
     own = np.stack([forward, np.cross(up, forward), up], axis=1)
     world = np.stack([[-1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 1.0]], axis=1)

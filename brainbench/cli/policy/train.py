@@ -144,8 +144,7 @@ def sweep(
     as_json: JsonOption = False,
 ) -> None:
     """Distil every student of a sweep that is not finished yet; what was interrupted goes on."""
-    from robotics_bridge.policies.report.results import EVALUATION
-    from robotics_bridge.policies.training.students import train_student
+    from robotics_bridge.policies.training.students import is_done, train_student
     from robotics_bridge.policies.training.sweep import PUBLISHED, read_sweep
 
     found = read_sweep(file or PUBLISHED)
@@ -167,7 +166,7 @@ def sweep(
     results = []
     for student in students:
         folder = out / student.name
-        if (folder / EVALUATION).is_file():
+        if is_done(student, folder):
             results.append({"student": student.name, "status": "there already"})
             continue
         with progress_bar() as progress:

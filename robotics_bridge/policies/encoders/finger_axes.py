@@ -51,7 +51,8 @@ def finger_rows(fingers: Mapping[str, Sequence[str]]) -> dict[str, int]:
         raise UsageError(f"The grid has rows for {GRID_SHAPE[0]} fingers; this hand has {len(fingers)}.")
     rows: dict[str, int] = {}
     for finger in fingers:
-        parts = re.findall("[a-z]+", finger.lower())
+        # Fingers of files are named by their tips: rh_ffdistal, thumbtip.
+        parts = [part.removesuffix("distal").removesuffix("tip") for part in re.findall("[a-z]+", finger.lower())]
         found = [row for row, name in enumerate(FINGERS) if any(word in parts for word in _WORDS[name])]
         if len(found) != 1 or found[0] in rows.values():
             return {name: row for row, name in enumerate(fingers)}

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 
 from brainbench.core.errors import DataError, UsageError
-from brainbench.core.files import read_mapping, write_json
+from brainbench.core.files import read_json, read_mapping, write_json
 from brainbench.core.progress import Progress, track
 from robotics_bridge import tasks
 from robotics_bridge.policies.encoders.arms import ARMS, EncoderConfig
@@ -100,6 +100,19 @@ def train_student(
     if result.status == "diverged" or not episodes:
         return Student(out, result, ())
     return Student(out, result, evaluate_student(out, env, episodes, result.iterations, progress, evaluations))
+
+
+def is_done(config: DistillConfig, out: Path) -> bool:
+    """Return whether a folder holds this very student, evaluated after its last iteration."""
+    if not (out / EVALUATION).is_file():
+        return False
+    mine = config.resolved(tasks.load(config.task, config.variant).student)
+    known = DistillConfig.of(read_mapping(out / CONFIG).get("distill", {}))
+    # Contacts and calibration that a student does not state are chosen when it begins.
+    settings = {**known.encoder_settings, **mine.encoder_settings}
+    mine = replace(mine, encoder_settings=settings, contacts=mine.contacts or known.contacts)
+    total = known.iterations or 0
+    return mine == known and all(item.get("iterations", total) >= total for item in read_json(out / EVALUATION))
 
 
 def calibrated(config: DistillConfig, env: Any, teacher: Any, out: Path) -> DistillConfig:

@@ -44,6 +44,24 @@ def test_it_follows_the_reported_joints_whatever_their_order_and_feels_the_ball(
     assert np.abs(shadow.hand.position - reported[order]).mean() < 0.2
 
 
+def test_servos_of_a_file_drive_their_joints_whatever_they_are_called(tmp_path) -> None:
+    jaw = (
+        '<body pos="0 {1} .05"><joint name="{0}" axis="{2} 0 0" range="0 1" armature=".01"/>'
+        '<geom type="capsule" size=".01" fromto="0 0 0 0 0 .05"/></body>'
+    )
+    jaws = jaw.format("a", 0.2, 1) + jaw.format("b", -0.2, -1) + jaw.format("passive", 0.4, 1)
+    (tmp_path / "hand.xml").write_text(
+        f'<mujoco><compiler angle="radian"/><worldbody><body name="palm"><geom type="box" size=".05 .05 .01"/>{jaws}'
+        '</body></worldbody><actuator><position name="servo b" joint="b" kp="5" kv=".5"/>'
+        '<position name="servo a" joint="a" kp="5" kv=".5"/></actuator></mujoco>'
+    )
+    hand = SimulatedHand(str(tmp_path / "hand.xml"))
+    hand.drive(np.array([0.1, 0.2, 0.3]))
+    for _ in range(200):
+        hand.step()
+    assert hand.position[:2] == pytest.approx([0.1, 0.2], abs=0.02)
+
+
 def test_its_contacts_are_those_of_the_policy() -> None:
     """A ball on the palm sinks in less under firm contacts, and drives of a scaled strength move the fingers alike."""
     depth, way = {}, {}

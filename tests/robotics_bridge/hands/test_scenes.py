@@ -104,6 +104,21 @@ def test_a_palm_is_up_wherever_its_forearm_lies_in_the_file_and_stays_on_it(tmp_
         assert forearm.xmat.reshape(3, 3).T @ (palm.xpos - forearm.xpos) == pytest.approx([0, 0, 0.1], abs=1e-6)
 
 
+def test_a_hand_that_floats_in_its_file_does_not_fall(tmp_path):
+    fixed = FOREARM.format("").replace('<joint name="wrist" axis="0 1 0" range="-.5 .5"/>', "")
+    floating = fixed.replace('<body name="forearm" >', '<body name="forearm"><freejoint/>').replace(
+        "</worldbody>", '</worldbody><keyframe><key qpos="0 0 1 1 0 0 0 .1 .1"/></keyframe>'
+    )
+    states = []
+    for name, text in {"fixed": fixed, "floating": floating}.items():
+        (tmp_path / f"{name}.xml").write_text(text)
+        hand = hands.load(tmp_path / f"{name}.xml")
+        data = mujoco.MjData(model := holding(hand))
+        mujoco.mj_step(model, data, 50)
+        states.append(data.body("palm").xpos.copy())
+    assert states[1] == pytest.approx(states[0], abs=1e-12)
+
+
 def test_a_palm_whose_orientation_the_file_gives_in_angles_is_up_too(tmp_path):
     bodies = FOREARM[: FOREARM.index("<body")] + FOREARM[FOREARM.index('<body name="palm"') :]
     text = bodies.replace('pos="0 0 .1"><joint name="wrist" axis="0 1 0" range="-.5 .5"/>', 'euler=".3 .2 1">')

@@ -134,12 +134,20 @@ def test_shapes_share_their_slots_and_scale_in_all_lengths() -> None:
     sizes = with_sizes(shapes, (0.5, 2.0))
     assert len(sizes) == 16
     assert sizes[0].extent == pytest.approx((0.02, 0.025, 0.03))
-    assert sizes[-1].solids[0].position == pytest.approx((0.0, 0.3, 0.0))
+    assert max(shape.solids[0].position for shape in sizes) == pytest.approx((0.0, 0.3, 0.0))
     assert with_sizes(shapes, (1.0, 1.0)) == shapes
     with pytest.raises(UsageError, match=r"size .*received \(0\.0, 1\.0\)"):
         with_sizes(shapes, (0.0, 1.0))
     with pytest.raises(UsageError, match=r"received 0\.2 m of 0\.1 m"):
         screwdriver(0.1, 0.2, 0.02, 0.004)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 6, 8, 17])
+def test_a_few_environments_have_objects_of_all_sizes(count: int) -> None:
+    shapes = tuple(box(0.01 * (index + 1), 0.02, 0.02) for index in range(count))
+    edges = np.array([shape.extent for shape in with_sizes(shapes, (0.5, 1.5))])
+    np.testing.assert_allclose(np.sort(edges[:8, 1]), 0.02 * np.linspace(0.5, 1.5, 8))
+    assert len(np.unique(edges.round(9), axis=0)) == 8 * count
 
 
 def test_blocks_weigh_what_their_density_says() -> None:
@@ -174,6 +182,26 @@ def test_a_finger_that_the_hand_lacks_is_named() -> None:
         build(task, hands.load("xhand1"))
     with pytest.raises(UsageError, match=r"'xhand1': 'elbow'.*thumb"):
         build(replace(tasks.load("in_palm_rotate"), joints={"xhand1": {"elbow": 1.0}}), hands.load("xhand1"))
+
+
+def test_a_word_of_every_fingers_links_names_no_finger(tmp_path: Path) -> None:
+    """Middle phalanges, as of the Shadow hand, are no middle fingers; a part that is missing is not passed over."""
+    finger = (
+        '<body name="{0}proximal" pos="0 {1} .05"><joint name="{0}1" axis="0 1 0" range="0 1.6"/><geom type="capsule" '
+        'size=".01" fromto="0 0 0 0 0 .04"/><body name="{0}middle" pos="0 0 .05"><joint name="{0}2" axis="0 1 0" '
+        'range="0 1.6"/><geom type="capsule" size=".01" fromto="0 0 0 0 0 .04"/><body name="{0}distal" pos="0 0 .05">'
+        '<geom type="sphere" size=".01"/></body></body></body>'
+    )
+    fingers = "".join(finger.format(name, y) for name, y in (("th", -0.05), ("mf", 0.0), ("ff", 0.05)))
+    text = f'<body name="palm"><geom type="box" size=".02 .06 .04"/>{fingers}</body>'
+    (tmp_path / "hand.xml").write_text(
+        f'<mujoco><compiler angle="radian" autolimits="true"/><worldbody>{text}</worldbody></mujoco>'
+    )
+    hand, task = hands.load(tmp_path / "hand.xml"), tasks.load("in_palm_rotate")
+    assert build(replace(task, moves=("th", "mf")), hand).moved == ("th1", "th2", "mf1", "mf2")
+    for moves in (("thumb", "mid"), ("th", "mid")):
+        with pytest.raises(UsageError, match=r"thdistal, mfdistal, ffdistal.*moves="):
+            build(replace(task, moves=moves), hand)
 
 
 def test_sampled_grasps_hold_without_any_action() -> None:

@@ -12,7 +12,7 @@ from brainbench.core.files import read_json, write_json
 from robotics_bridge import tasks
 from robotics_bridge.policies.contract import trained_contacts
 from robotics_bridge.policies.training.distill_config import DistillConfig
-from robotics_bridge.policies.training.students import calibrated, train_student
+from robotics_bridge.policies.training.students import calibrated, is_done, train_student
 from robotics_bridge.tasks.contact_model import CONTACTS
 from tests.factories.policies import teacher_in
 from tests.factories.task_worlds import Follower, TouchWorld
@@ -81,6 +81,20 @@ def test_a_student_is_taught_in_the_contacts_of_its_teacher_unless_told_otherwis
     described = read_json(tmp_path / "run" / "config.json")
     assert described["distill"]["contacts"] == contacts
     assert trained_contacts(described) == trained_contacts(described["deployment"]) == CONTACTS[contacts]
+
+
+def test_a_student_is_done_once_the_very_one_was_evaluated_after_its_last_iteration(tmp_path) -> None:
+    config = DistillConfig(task="in_palm_rotate", teacher="in_palm_rotate.teacher", observe="none", num_envs=2)
+    stored = replace(config.resolved(tasks.load("in_palm_rotate").student), contacts="firm")
+    assert not is_done(config, tmp_path)
+    write_json(tmp_path / "config.json", {"distill": asdict(stored)})
+    for iterations, done in ((stored.iterations, True), (3, False)):
+        write_json(tmp_path / "evaluation.json", [{"seed": 1000, "success": [0.0], "iterations": iterations}])
+        assert is_done(config, tmp_path) is done
+    write_json(tmp_path / "evaluation.json", [{"seed": 1000, "success": [0.0]}])
+    assert is_done(config, tmp_path)
+    changes = ({"iterations": 3}, {"steps_per_env": 3}, {"contacts": "published"}, {"teacher": "runs/other"})
+    assert not any(is_done(replace(config, **change), tmp_path) for change in changes)
 
 
 def test_resampled_time_is_for_readings_as_often_as_the_encoder_assumes(tmp_path, monkeypatch) -> None:
