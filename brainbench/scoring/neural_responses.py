@@ -39,6 +39,9 @@ class NeuralResponses:
     definition: str = ""
     """Hash of how demo recordings were made (:func:`brainbench.scoring.demo.demo_identity`); empty for all others."""
 
+    covariates: bool = False
+    """True for a metric whose scores depend on contacts, licks and choices too."""
+
     @property
     def vocabulary(self) -> tuple[str, ...]:
         """Ordered condition labels."""
@@ -56,13 +59,19 @@ class NeuralResponses:
 
     @cached_property
     def content_hash(self) -> str:
-        """Hash of the recordings: the one that they state, or another one for a part that was taken of them."""
-        stated, whole = str(self.dataset.attrs["content_hash"]), self.dataset.attrs.get("sizes")
-        if whole is None or whole == dict(self.dataset.sizes):
-            return stated
-        arrays = [self.dataset[name].values for name in ("counts", "duration")]
-        names = ("stimulus", "subject", "session", "unit_subject", "unit_session")
-        return content_hash(stated, *arrays, *(self.dataset[name].values.astype(str).tolist() for name in names))
+        """Hash of the recordings: the one that they state, or another one for a part or an edited copy of them.
+
+        That of covariates is part of it where the metric takes them.
+        """
+        from brainbench.datasets.trials.covariates import COVARIATES
+        from brainbench.datasets.trials.session_trials import NAMES, fingerprint
+
+        data, found = self.dataset, str(self.dataset.attrs["content_hash"])
+        if data.attrs.get("fingerprint") not in (None, fingerprint(data)):
+            arrays = [data[name].values for name in ("counts", "duration")]
+            found = content_hash(found, *arrays, *(data[name].values.astype(str).tolist() for name in NAMES))
+        known = {name: data[name].values.tolist() for name in COVARIATES if name in data.coords}
+        return content_hash(found, known) if self.covariates and known else found
 
     @property
     def origin(self) -> dict[str, Any]:

@@ -159,6 +159,7 @@ class PartialRSA(PatternMetric):
 
     brain_method = "correlation"
     comparison = "pearson"
+    of_covariates = True
 
     def animal(self, subject: str, blocks: Sequence[Trials], n_stimuli: int, **options: Any) -> SubjectRDM:
         """Return the animal with its nuisance RDMs; without any it cannot be used."""
