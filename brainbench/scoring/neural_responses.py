@@ -148,10 +148,12 @@ class NeuralResponses:
         """Prepare every animal by a metric over the labels ``kept``, in that order."""
         from brainbench.metrics.reliability.units import reliable_units
 
-        animals = []
-        for subject, sessions in self.trials(kept, averaged=options.time == "mean").items():
+        animals, how = [], {"least": options.units_reliability, "seed": options.seed}
+        whole = self.trials(kept, averaged=True)
+        given = whole if options.time == "mean" else self.trials(kept)
+        for subject, sessions in given.items():
             # Units are chosen over the whole window, before their bins become features.
-            chosen, note = reliable_units(sessions, len(kept), least=options.units_reliability, seed=options.seed)
+            chosen, note = reliable_units(sessions, len(kept), whole=whole[subject], **how)
             trials = tuple(replace(item, responses=_flat(item.responses)) for item in chosen)
             animal = metric.animal(subject, trials, len(kept), stimuli=kept, seed=options.seed)
             bins = max((item.responses.shape[1] for item in chosen), default=1)

@@ -58,12 +58,13 @@ def time_course(
         # The last bin may be shorter than the others, and a single trial longer than the others.
         window, whole = float(np.median(brain.dataset["duration"].values.sum(axis=1))), width * len(begins)
         seconds = whole if math.isclose(window, whole, rel_tol=1e-6) else window
-    sessions = brain.trials(kept)
+    sessions, whole = brain.trials(kept), brain.trials(kept, averaged=True)
     how: dict[str, Any] = {"method": metric.brain_method, "noise": metric.noise, "comparison": metric.comparison}
     stage_done = stages(len(sessions) + len(network.activations), "RDMs over time", progress)
     animals, layers = [], {}
     for subject, blocks in sessions.items():
-        blocks, note = reliable_units(blocks, len(kept), least=options.units_reliability, seed=options.seed)
+        chosen = {"least": options.units_reliability, "seed": options.seed, "whole": whole[subject]}
+        blocks, note = reliable_units(blocks, len(kept), **chosen)
         if blocks:
             animals.append(animal_movie(subject, blocks, len(kept), stimuli=kept, seed=options.seed, **how))
         else:
