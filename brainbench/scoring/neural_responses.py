@@ -151,10 +151,12 @@ class NeuralResponses:
         animals, how = [], {"least": options.units_reliability, "seed": options.seed}
         whole = self.trials(kept, averaged=True)
         given = whole if options.time == "mean" else self.trials(kept)
+        longest = self.dataset["duration"].values.max(axis=0)
+        share = np.where(longest > (1 - 1e-6) * longest.max(), 1.0, longest / longest.max())
         for subject, sessions in given.items():
             # Units are chosen over the whole window, before their bins become features.
             chosen, note = reliable_units(sessions, len(kept), whole=whole[subject], **how)
-            trials = tuple(replace(item, responses=_flat(item.responses)) for item in chosen)
+            trials = tuple(replace(item, responses=_flat(item.responses, share)) for item in chosen)
             animal = metric.animal(subject, trials, len(kept), stimuli=kept, seed=options.seed)
             bins = max((item.responses.shape[1] for item in chosen), default=1)
             animal = replace(animal, units=-(-animal.units // bins))
@@ -200,9 +202,12 @@ def open_neural_responses(recordings: Any, *, progress: Progress | None, **selec
     return NeuralResponses(open_recordings(recordings, **selection, progress=progress), name)
 
 
-def _flat(responses: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return responses [R, T, U] as [R, T·U]: bins are features like units."""
+def _flat(responses: NDArray[np.float64], share: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return responses [R, T, U] as [R, T·U]: bins are features like units, each with its share of a whole bin [T]."""
     trials, bins, units = responses.shape
+    if bins > 1 and (share < 1).any():
+        # Squared distances add up over time; the rates of a bin that every window cuts short are mostly noise.
+        responses = responses * np.sqrt(share)[:, None]
     # Without a trial (all had labels that were dropped) numpy cannot tell the second size.
     return responses.reshape(trials, bins * units)
 
