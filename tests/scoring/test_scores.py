@@ -178,8 +178,8 @@ def test_recordings_in_memory_that_are_a_part_have_another_hash(truth: Path, rec
 
 
 def test_recordings_that_were_edited_in_memory_have_another_hash(truth: Path, recordings: xr.Dataset, tmp_path: Path):
-    def told(dataset, **options):
-        return score_record(truth, recordings=dataset, baselines=False, **options).score.provenance.recordings_hash
+    def told(dataset):
+        return score_record(truth, recordings=dataset, baselines=False).score.provenance.recordings_hash
 
     turned = recordings.assign_coords(stimulus=("trial", recordings["stimulus"].values[::-1]))
     for edited in (turned, recordings.assign(counts=recordings["counts"] * 2)):
