@@ -221,6 +221,8 @@ def _kind(record: ResultRecord) -> tuple[object, ...]:
     if card is None or card.seed is None:  # nobody can know what else differs
         return (record.score.name, card.weights if card else None, record.identity if card is None else None)
     other = (str(asked),) if (asked := _asked(record)) else ()
+    # The name of somebody's file or folder says little: what stands there now may be another network.
+    other += (card.parameters,) if not_repeatable(record) else ()
     return (record.score.name, card.objective, card.augmentation, str(card.training.get("masking")), *other)
 
 

@@ -68,7 +68,7 @@ def rdm(
     brain = replace(brain, dataset=pooled(brain.dataset, pool))
     labels = brain.vocabulary
     animals = brain.animals(labels, measure, ScoreOptions(seed=seed))
-    told = ("subject", "units", "trials", "reliability", "problem", "rdm")
+    told = ("subject", "units", "trials", "reliability", "problem", "notes", "rdm")
     shown = [{name: getattr(item, name) for name in told} for item in animals]
     data = {"labels": labels, "recordings": brain.origin, "animals": shown}
     text = table_of(
@@ -165,9 +165,9 @@ def _verdict(animal: SubjectRDM) -> str:
 
     if animal.problem:
         return f"undefined: {animal.problem}"
-    if not animal.reliability >= RELIABILITY_GATE:
-        return f"unreliable: below {RELIABILITY_GATE}, where no correction for noise can be trusted"
-    return "ok"
+    trusted = animal.reliability >= RELIABILITY_GATE
+    verdict = "ok" if trusted else f"unreliable: below {RELIABILITY_GATE}, where no correction for noise can be trusted"
+    return "; ".join((verdict, *animal.notes))
 
 
 def _matrix(title: str, labels: tuple[str, ...], rdm: NDArray[np.float64]) -> str:

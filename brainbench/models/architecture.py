@@ -47,7 +47,8 @@ class Architecture:
         if is_path(name):
             raise UsageError(
                 f"{name!r} looks like a path, not a model's name; a model of your own is given as "
-                "path/to/file.py:make_model (load_user_model in Python)."
+                "path/to/file.py:make_model (load_user_model in Python), a folder of trained weights as "
+                "local-dir:FOLDER."
             )
         parts = re.fullmatch(_NAME, name)
         assert parts is not None, name

@@ -39,6 +39,9 @@ class NeuralResponses:
     definition: str = ""
     """Hash of how demo recordings were made (:func:`brainbench.scoring.demo.demo_identity`); empty for all others."""
 
+    covariates: bool = False
+    """True for a metric whose scores depend on contacts, licks and choices too."""
+
     @property
     def vocabulary(self) -> tuple[str, ...]:
         """Ordered condition labels."""
@@ -56,13 +59,19 @@ class NeuralResponses:
 
     @cached_property
     def content_hash(self) -> str:
-        """Hash of the recordings: the one that they state, or another one for a part that was taken of them."""
-        stated, whole = str(self.dataset.attrs["content_hash"]), self.dataset.attrs.get("sizes")
-        if whole is None or whole == dict(self.dataset.sizes):
-            return stated
-        arrays = [self.dataset[name].values for name in ("counts", "duration")]
-        names = ("stimulus", "subject", "session", "unit_subject", "unit_session")
-        return content_hash(stated, *arrays, *(self.dataset[name].values.astype(str).tolist() for name in names))
+        """Hash of the recordings: the one that they state, or another one for a part or an edited copy of them.
+
+        That of covariates is part of it where the metric takes them.
+        """
+        from brainbench.datasets.trials.covariates import COVARIATES
+        from brainbench.datasets.trials.session_trials import NAMES, fingerprint
+
+        data, found = self.dataset, str(self.dataset.attrs["content_hash"])
+        if data.attrs.get("fingerprint") not in (None, fingerprint(data)):
+            arrays = [data[name].values for name in ("counts", "duration")]
+            found = content_hash(found, *arrays, *(data[name].values.astype(str).tolist() for name in NAMES))
+        known = {name: data[name].values.tolist() for name in COVARIATES if name in data.coords}
+        return content_hash(found, known) if self.covariates and known else found
 
     @property
     def origin(self) -> dict[str, Any]:
@@ -139,11 +148,15 @@ class NeuralResponses:
         """Prepare every animal by a metric over the labels ``kept``, in that order."""
         from brainbench.metrics.reliability.units import reliable_units
 
-        animals = []
-        for subject, sessions in self.trials(kept, averaged=options.time == "mean").items():
+        animals, how = [], {"least": options.units_reliability, "seed": options.seed}
+        whole = self.trials(kept, averaged=True)
+        given = whole if options.time == "mean" else self.trials(kept)
+        longest = self.dataset["duration"].values.max(axis=0)
+        share = np.where(longest > (1 - 1e-6) * longest.max(), 1.0, longest / longest.max())
+        for subject, sessions in given.items():
             # Units are chosen over the whole window, before their bins become features.
-            chosen, note = reliable_units(sessions, len(kept), least=options.units_reliability, seed=options.seed)
-            trials = tuple(replace(item, responses=_flat(item.responses)) for item in chosen)
+            chosen, note = reliable_units(sessions, len(kept), whole=whole[subject], **how)
+            trials = tuple(replace(item, responses=_flat(item.responses, share)) for item in chosen)
             animal = metric.animal(subject, trials, len(kept), stimuli=kept, seed=options.seed)
             bins = max((item.responses.shape[1] for item in chosen), default=1)
             animal = replace(animal, units=-(-animal.units // bins))
@@ -189,9 +202,12 @@ def open_neural_responses(recordings: Any, *, progress: Progress | None, **selec
     return NeuralResponses(open_recordings(recordings, **selection, progress=progress), name)
 
 
-def _flat(responses: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return responses [R, T, U] as [R, T·U]: bins are features like units."""
+def _flat(responses: NDArray[np.float64], share: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return responses [R, T, U] as [R, T·U]: bins are features like units, each with its share of a whole bin [T]."""
     trials, bins, units = responses.shape
+    if bins > 1 and (share < 1).any():
+        # Squared distances add up over time; the rates of a bin that every window cuts short are mostly noise.
+        responses = responses * np.sqrt(share)[:, None]
     # Without a trial (all had labels that were dropped) numpy cannot tell the second size.
     return responses.reshape(trials, bins * units)
 

@@ -30,8 +30,9 @@ def time_course(
     """Return the score over time of a model against recordings in bins.
 
     The window of the recordings begins when the stimuli do. Where the stimuli do not state their duration, they last as
-    long as the window. Recordings have bins of one width; ``kept`` are the labels that are scored, in order, and
-    ``rows`` those of the activations. The options hold the seed, and the reliability that units must have.
+    long as the window of most trials (the median). Recordings have bins of one width; ``kept`` are the labels that are
+    scored, in order, and ``rows`` those of the activations. The options hold the seed, and the reliability that units
+    must have.
 
     Raises:
         DataError: the recordings have no bins of time.
@@ -52,13 +53,18 @@ def time_course(
             f"recordings begin at {listing(f'{begin:g}' for begin in begins[:4])} … s: take the whole recordings, or "
             "another window (--window)."
         )
-    seconds = width * len(begins) if network.seconds is None else network.seconds
-    sessions = brain.trials(kept)
+    seconds = network.seconds
+    if seconds is None:
+        # The last bin may be shorter than the others, and a single trial longer than the others.
+        window, whole = float(np.median(brain.dataset["duration"].values.sum(axis=1))), width * len(begins)
+        seconds = whole if math.isclose(window, whole, rel_tol=1e-6) else window
+    sessions, whole = brain.trials(kept), brain.trials(kept, averaged=True)
     how: dict[str, Any] = {"method": metric.brain_method, "noise": metric.noise, "comparison": metric.comparison}
     stage_done = stages(len(sessions) + len(network.activations), "RDMs over time", progress)
     animals, layers = [], {}
     for subject, blocks in sessions.items():
-        blocks, note = reliable_units(blocks, len(kept), least=options.units_reliability, seed=options.seed)
+        chosen = {"least": options.units_reliability, "seed": options.seed, "whole": whole[subject]}
+        blocks, note = reliable_units(blocks, len(kept), **chosen)
         if blocks:
             animals.append(animal_movie(subject, blocks, len(kept), stimuli=kept, seed=options.seed, **how))
         else:

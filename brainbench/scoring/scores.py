@@ -93,7 +93,7 @@ def score_record(
     resolved = resolve_model(model, seed=options.model_seed)
     stage_done()
     brain = open_neural_responses(options.recordings, progress=progress, **options.selection)
-    brain = replace(brain, title=options.title)
+    brain = replace(brain, title=options.title, covariates=metric.of_covariates)
     stage_done()
     # Recordings name the stimuli that the animals felt; the caller's choice goes first.
     options = replace(options, stimuli=brain.stimuli if options.stimuli is None else options.stimuli)

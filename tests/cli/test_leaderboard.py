@@ -11,6 +11,7 @@ import pytest
 from brainbench.cli.leaderboard.scoring import find_models, parse_seeds, read_batch
 from brainbench.core.errors import DataError, UsageError
 from brainbench.core.records import ResultRecord
+from brainbench.datasets import open_recordings, write_recordings
 from brainbench.scoring import score
 from leaderboards.store import read_record
 
@@ -170,6 +171,20 @@ def test_only_a_score_of_the_same_question_is_known_or_replaced(run, files, tmp_
     assert len(list(to.glob("*.json"))) == 6
     copied = run("leaderboard", "add", str(to), "--to", str(tmp_path / "copy"), "--json")
     assert {item["state"] for item in json.loads(copied.out)["results"]} == {"added"}
+
+
+def test_recordings_of_other_animals_in_a_folder_of_the_same_name_replace_nothing(run, files, tmp_path):
+    whole = open_recordings(files["recordings"], conditions="trials:texture")
+    to, states = tmp_path / "board", []
+    for animal in sorted(set(whole["subject"].values.tolist())):
+        part = whole.isel(trial=whole["subject"].values == animal, unit=whole["unit_subject"].values == animal)
+        (tmp_path / animal).mkdir()
+        path = write_recordings(tmp_path / animal / "data.h5", part)
+        given = ("--recordings", str(path), "--model", files["features"], "--to", str(to), "--prune")
+        result = run("leaderboard", "add", *given, "--json")
+        states += [item["state"] + item["note"] for item in json.loads(result.out)["results"]]
+    assert states == ["scored", "scored"]
+    assert len(list(to.glob("*.json"))) == 2
 
 
 def test_features_with_labels_of_their_own_are_scored_once(run, files, tmp_path):

@@ -5,6 +5,8 @@ import json
 import numpy as np
 import pytest
 
+from brainbench.datasets import write_recordings
+from brainbench.datasets.sessions import make_session
 from brainbench.datasets.synthetic import ResponseGeometry, write_files
 from brainbench.metrics import get_metric
 from brainbench.scoring.neural_responses import open_neural_responses
@@ -54,6 +56,17 @@ def test_sessions_and_animals_are_pooled_on_request(run, folder, pool, names):
     result = run("recordings", "rdm", str(folder), "--conditions", "trials:stimulus", "--pool", pool, "--json")
     assert len(json.loads(result.out)["animals"]) == names
     assert run("recordings", "rdm", str(folder), "--conditions", "trials:stimulus", "--pool", "al").status == 2
+
+
+def test_a_session_that_an_rdm_leaves_out_is_named(run, tmp_path):
+    for name, labels in (("1", "abc"), ("2", "ab")):
+        table = {"start_time": np.arange(1.0, 31), "stop_time": np.arange(1.5, 31), "stimulus": [*labels * 15][:30]}
+        spikes = [np.sort(np.random.default_rng(unit).uniform(0, 32, 900)) for unit in range(9)]
+        write_recordings(tmp_path / f"{name}.h5", make_session("m", name, spikes, {"trials": table}))
+    given = ("recordings", "rdm", str(tmp_path), "--conditions", "trials:stimulus")
+    assert "1 of 2 sessions left out: fewer than 2 trials of c (0)" in " ".join(run(*given).out.split())
+    (animal,) = json.loads(run(*given, "--json").out)["animals"]
+    assert (animal["units"], len(animal["notes"])) == (9, 1)
 
 
 def test_the_reliability_of_scores_is_shown_before_scoring(run, folder):

@@ -99,6 +99,13 @@ def test_scores_that_were_asked_for_otherwise_are_no_seeds_of_one_entry(asked):
     )
 
 
+def test_another_network_under_the_path_of_an_earlier_one_is_no_seed_of_it():
+    (record,) = draw_board({"mine.py:make": 0.6})
+    given = {"objective": "simclr", "family": "user module"}
+    one, two, wider = (_run(record, seed, **given, parameters=count) for seed, count in enumerate((1000, 1000, 2000)))
+    assert sorted(entry.seeds for entry in _entries(one, two, wider)) == [1, 2]
+
+
 def test_one_seed_without_a_trusted_score_keeps_the_entry_from_being_ranked():
     (record,) = draw_board({"net": 0.6})
     bad = _run(record, 1)

@@ -55,6 +55,7 @@ def test_listing_models_imports_no_framework():
         ("zhuang.supervized", r"did you mean 'supervised'\? Allowed: 'supervised', 'simclr', 'simsiam', 'ae'"),
         ("models/mine.py:make", "looks like a path, not a model's name; .* path/to/file.py:make_model"),
         ("mine.py", "looks like a path"),
+        ("runs/best", "a folder of trained weights as local-dir:"),
         ("zhuang+gpt.simclr", r"train them with: brainbench train zhuang\+gpt --objective simclr; or load"),
     ],
 )

@@ -1,5 +1,8 @@
 """Scores over time through files, as a user would run them."""
 
+import shutil
+
+import h5py
 import numpy as np
 import pytest
 
@@ -46,11 +49,14 @@ def moving(tmp_path_factory):
     return folder
 
 
-def _score(moving, **changes):
-    files = str(moving / "m*.h5")
-    return score_record(
-        str(moving / "layers.hdf5"), recordings=files, conditions="trials:stimulus", over_time=True, **changes
-    )
+def _score(folder, **changes):
+    files, layers = str(folder / "m*.h5"), folder / "layers.hdf5"
+    return score_record(str(layers), recordings=files, conditions="trials:stimulus", over_time=True, **changes)
+
+
+def _latency(folder, **changes):
+    course = _score(folder, baselines=False, **changes).score.provenance.statistics["time_course"]
+    return next(item["latency"] for item in course["latencies"] if item["layer"] == "followed")
 
 
 def test_a_score_over_time_is_in_the_record_and_in_its_report(moving, tmp_path):
@@ -67,6 +73,18 @@ def test_a_score_over_time_is_in_the_record_and_in_its_report(moving, tmp_path):
     assert "followed: " in page
     again = brainbench.ResultRecord.from_json(record.to_json())
     assert again.score.provenance.statistics["time_course"] == course
+
+
+def test_one_longer_trial_does_not_stretch_features_without_a_duration(moving, tmp_path):
+    shutil.copytree(moving, tmp_path, dirs_exist_ok=True)
+    with h5py.File(tmp_path / "m0.h5", "r+") as file:
+        file["sessions/m0-s/tables/trials/stop_time"][5] += 0.8 * BINS * BIN
+    assert _latency(tmp_path) == pytest.approx(_latency(moving), abs=0.01 * BIN)
+
+
+@pytest.mark.parametrize("bins", [0.7, 1.5])
+def test_a_last_bin_that_the_window_cuts_does_not_stretch_them_either(moving, bins):
+    assert _latency(moving, bin=bins * BIN) == pytest.approx(LAG * BIN, abs=0.2 * BIN)
 
 
 def test_the_command_prints_latencies(moving, tmp_path, monkeypatch, capsys):

@@ -15,6 +15,7 @@ from brainbench.cli.leaderboard.scoring import score_again
 from brainbench.core.errors import UsageError
 from brainbench.datasets import open_recordings, write_recordings
 from brainbench.datasets.sessions import make_session
+from brainbench.datasets.trials.session_trials import pooled
 from brainbench.models.features import write_features
 from brainbench.models.registry import load_model
 from brainbench.scoring.model_responses import resolve_model
@@ -174,6 +175,28 @@ def test_recordings_in_memory_that_are_a_part_have_another_hash(truth: Path, rec
     assert len({whole, *hashes}) == 4
     assert told(write_recordings(tmp_path / "part.h5", parts[0])) == hashes[0]
     assert told(write_recordings(tmp_path / "whole.h5", recordings)) == whole
+
+
+def test_recordings_that_were_edited_in_memory_have_another_hash(truth: Path, recordings: xr.Dataset, tmp_path: Path):
+    def told(dataset):
+        return score_record(truth, recordings=dataset, baselines=False).score.provenance.recordings_hash
+
+    turned = recordings.assign_coords(stimulus=("trial", recordings["stimulus"].values[::-1]))
+    for edited in (turned, recordings.assign(counts=recordings["counts"] * 2)):
+        assert told(edited) != told(recordings)
+        assert told(pooled(edited, "session")) != told(pooled(recordings, "session"))
+    assert told(write_recordings(tmp_path / "turned.h5", turned)) == told(turned)
+    assert told(pooled(recordings, "session")) == pooled(recordings, "session").attrs["content_hash"]
+
+
+def test_contacts_are_hashed_where_the_metric_takes_them(truth: Path, recordings: xr.Dataset):
+    def told(contacts, metric):
+        dataset = recordings.assign_coords(contacts=("trial", contacts.astype(float)))
+        return score_record(truth, recordings=dataset, baselines=False, metric=metric).score.provenance.recordings_hash
+
+    contacts = np.arange(recordings.sizes["trial"])
+    assert told(contacts, "rsa-partial") != told(contacts[::-1], "rsa-partial")
+    assert told(contacts, "rsa") == told(contacts[::-1], "rsa") == recordings.attrs["content_hash"]
 
 
 def test_doubts_about_recordings_are_reasons_of_every_score(truth: Path, recordings: xr.Dataset):

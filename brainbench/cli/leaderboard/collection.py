@@ -71,7 +71,9 @@ def _question(record: ResultRecord) -> str:
     """Return what two records share when they answer the same question, the old one with what has since changed."""
     origin = record.score.provenance
     named = [origin.recordings.get(name) for name in ("source", "title")]
-    return to_json([record.score.name, *named, origin.pairing, full_settings(origin.settings)])
+    # The source is the last part of a path: folders of one name are told apart by their animals.
+    animals = sorted(item.subject for item in record.score.subjects)
+    return to_json([record.score.name, *named, animals, origin.pairing, full_settings(origin.settings)])
 
 
 def score_jobs(

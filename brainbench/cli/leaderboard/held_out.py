@@ -80,13 +80,15 @@ def hold_out(
 
 def split(whole: xr.Dataset, kind: str, names: list[str]) -> xr.Dataset:
     """Return the trials, and of animals also the units, of some animals or stimuli of a recordings data set."""
+    from brainbench.datasets.trials.session_trials import fingerprint
+
     if kind == "animals":
         part = whole.isel(trial=whole["subject"].isin(names).values, unit=whole["unit_subject"].isin(names).values)
     else:
         part = whole.isel(trial=whole["stimulus"].isin(names).values)
     labels = [label for label in whole.attrs["vocabulary"] if kind == "animals" or label in names]
     named = content_hash(whole.attrs["content_hash"], kind, names)
-    return part.assign_attrs(vocabulary=labels, content_hash=named, sizes=dict(part.sizes))
+    return part.assign_attrs(vocabulary=labels, content_hash=named, fingerprint=fingerprint(part))
 
 
 def score_held_out(record: ResultRecord, told: Commitment, secret: Path) -> dict[str, Any]:

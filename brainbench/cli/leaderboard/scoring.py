@@ -171,6 +171,7 @@ def missing(jobs: Sequence[ScoringJob], records: Iterable[ResultRecord]) -> list
         UsageError: the labels of recordings and stimuli do not match.
     """
     from brainbench import __version__
+    from brainbench.metrics import get_metric
     from brainbench.scoring.model_responses import DEFAULT_STIMULI, resolve_model
     from brainbench.scoring.neural_responses import open_neural_responses
     from brainbench.stimuli import load_stimuli
@@ -180,6 +181,7 @@ def missing(jobs: Sequence[ScoringJob], records: Iterable[ResultRecord]) -> list
     for options in (job.options for job in jobs):
         if (key := _asked_for(options)) not in inputs:
             brain = open_neural_responses(options.recordings, progress=None, **options.selection)
+            brain = replace(brain, covariates=get_metric(options.metric).of_covariates)
             source = options.stimuli or brain.stimuli or DEFAULT_STIMULI
             inputs[key] = brain, load_stimuli(source, whiskers=options.whiskers, fidelity=options.fidelity)
     known = set()
@@ -207,8 +209,8 @@ def missing(jobs: Sequence[ScoringJob], records: Iterable[ResultRecord]) -> list
 
 
 def _asked_for(options: ScoreOptions) -> str:
-    """Return the words that ask for the recordings and the stimuli."""
-    return str([options.recordings, *(options.settings[name] for name in _IN_HASHES)])
+    """Return the words that ask for the recordings, the stimuli, and what the metric takes of them."""
+    return str([options.recordings, *(options.settings[name] for name in (*_IN_HASHES, "metric"))])
 
 
 def full_settings(stated: Mapping[str, Any], *, without: Sequence[str] = ()) -> dict[str, Any]:

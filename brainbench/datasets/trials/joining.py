@@ -16,7 +16,7 @@ from brainbench.datasets.trials.conditions import natural_vocabulary
 from brainbench.datasets.trials.counting import UNIT_COLUMNS, ReadingOptions, SessionCounts
 from brainbench.datasets.trials.covariates import COVARIATES
 from brainbench.datasets.trials.selection import check_values
-from brainbench.datasets.trials.session_trials import missing_labels
+from brainbench.datasets.trials.session_trials import fingerprint, missing_labels
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -113,8 +113,8 @@ def join_sessions(
         # The recipe that all sessions name; "" where they name none, or different ones.
         "stimuli": recipes.pop() if len(recipes) == 1 else "",
         "content_hash": content_hash(vocabulary, *content),
-        # By which a part that somebody takes is known from the whole that the hash names.
-        "sizes": {str(name): size for name, size in dataset.sizes.items()},
+        # By which a part or an edited copy is known from the data that the hash names.
+        "fingerprint": fingerprint(dataset),
     }
     dataset.attrs["missing"] = missing_labels(dataset)
     return dataset

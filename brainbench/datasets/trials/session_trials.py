@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from brainbench.core.contracts import check_recordings
 from brainbench.core.errors import check_name
-from brainbench.core.files import content_hash
+from brainbench.core.files import content_hash, hash_arrays
 from brainbench.core.trials import Trials
 from brainbench.datasets.trials.covariates import COVARIATES
 
@@ -23,6 +23,14 @@ Floats = NDArray[np.float64]
 POOLS = ("subject", "session", "all")
 ALL = "all"
 """Name of the one subject that pooling all animals makes."""
+NAMES = ("stimulus", "subject", "session", "unit_subject", "unit_session")
+"""Coordinates that decide which counts are compared."""
+
+
+def fingerprint(dataset: xr.Dataset) -> str:
+    """Return a hash of counts and names as they stand in memory, by which a part or an edited copy is told."""
+    names = (dataset[name].values.astype(str).tolist() for name in NAMES)
+    return content_hash(hash_arrays({name: dataset[name].values for name in ("counts", "duration")}), *names)
 
 
 def pooled(dataset: xr.Dataset, by: str = "subject") -> xr.Dataset:
@@ -58,6 +66,8 @@ def pooled(dataset: xr.Dataset, by: str = "subject") -> xr.Dataset:
         "missing": missing_labels(result),
         "content_hash": content_hash(dataset.attrs["content_hash"], by),
     }
+    if dataset.attrs.get("fingerprint") == fingerprint(dataset):  # else it was edited, which must still show
+        result.attrs["fingerprint"] = fingerprint(result)
     return result
 
 

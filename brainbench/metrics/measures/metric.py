@@ -60,6 +60,8 @@ class Metric:
     """True when layers and animals are compared by RDMs [P], which a record then shows."""
     of_model_alone = False
     """True when a comparison says nothing of the animal."""
+    of_covariates = False
+    """True when a comparison also takes what else was measured in the trials: contacts, licks and choices."""
     reasons: tuple[str, ...] = ()
     """Remarks for a reader of every score, in words."""
 

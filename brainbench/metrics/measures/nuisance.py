@@ -159,6 +159,7 @@ class PartialRSA(PatternMetric):
 
     brain_method = "correlation"
     comparison = "pearson"
+    of_covariates = True
 
     def animal(self, subject: str, blocks: Sequence[Trials], n_stimuli: int, **options: Any) -> SubjectRDM:
         """Return the animal with its nuisance RDMs; without any it cannot be used."""
@@ -193,6 +194,8 @@ class PartialRSA(PatternMetric):
 
 def _nuisances(blocks: Sequence[Trials], count: int) -> tuple[dict[str, Floats], list[str]]:
     """Return the RDM of every covariate with a value for all stimuli and a difference between some, and the others."""
+    # Sessions without two trials of each stimulus are no part of the animal's RDM either.
+    blocks = [block for block in blocks if np.bincount(block.labels, minlength=count).min() > 1]
     labels = [stimulus_codes(block.labels, count)[0] for block in blocks]
     found, lacking = {}, []
     for name in dict.fromkeys(name for block in blocks for name in block.covariates):

@@ -149,9 +149,11 @@ class RSA(Metric):
         return np.concatenate(found)
 
     def describe(self, animals: Sequence[SubjectRDM]) -> str:
-        """Name the RDMs and their comparison."""
+        """Name the RDMs, the noise that they are divided by, and their comparison."""
         methods = sorted({animal.method for animal in animals})
-        return f"RSA: {'/'.join(methods)} RDM, {self.comparison} comparison"
+        # Boards and audits tell metrics apart by these words.
+        noise = "" if self.noise == "none" else f" divided by noise ({self.noise})"
+        return f"RSA: {'/'.join(methods)} RDM{noise}, {self.comparison} comparison"
 
 
 def score_rdms(

@@ -65,18 +65,24 @@ def unit_reliability(blocks: Sequence[Trials], n_stimuli: int, *, seed: int = 0)
 
 
 def reliable_units(
-    blocks: Sequence[Trials], n_stimuli: int, *, least: float | None = UNIT_GATE, seed: int = 0
+    blocks: Sequence[Trials],
+    n_stimuli: int,
+    *,
+    least: float | None = UNIT_GATE,
+    seed: int = 0,
+    whole: Sequence[Trials] | None = None,
 ) -> tuple[tuple[Trials, ...], str]:
     """Return the sessions with the units whose reliability is at least ``least``, and what was left out in words.
 
-    A session without such a unit is left out; without a ``least`` none is, and the words are empty.
+    A session without such a unit is left out; without a ``least`` none is, and the words are empty. ``whole`` are the
+    same trials with rates of the whole window, of which bins of unequal length have no plain mean.
 
     Raises:
         UsageError: as :func:`unit_reliability`.
     """
     if least is None:
         return tuple(blocks), ""
-    values = unit_reliability(blocks, n_stimuli, seed=seed)
+    values = unit_reliability(blocks if whole is None else whole, n_stimuli, seed=seed)
     kept = []
     for block, value in zip(blocks, values, strict=True):
         good = value >= least

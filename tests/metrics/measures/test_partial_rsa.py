@@ -99,6 +99,14 @@ def test_recordings_without_covariates_are_undefined_in_words():
         assert told in score.reasons[-1]
 
 
+def test_contacts_of_a_session_that_is_left_out_do_not_count():
+    (block,) = _make_blocks(np.random.default_rng(1).normal(size=(7, 3)), number=1)
+    short = Trials(block.responses[7:], LABELS[7:], None, {"contacts": 100.0 * (LABELS[7:] == 3)}).take(LABELS[7:] != 6)
+    one, two = (get_metric("rsa-partial").animal("m", given, 7, stimuli=STIMULI) for given in ([block], [block, short]))
+    np.testing.assert_array_equal(two.rdm, one.rdm)
+    np.testing.assert_array_equal(two.nuisances["contacts"], one.nuisances["contacts"])
+
+
 def test_a_layer_that_the_nuisances_explain_wholly_is_not_called_constant():
     metric, latent = get_metric("rsa-partial"), np.random.default_rng(4).normal(size=(7, 3))
     animals = _animals("rsa-partial", _make_blocks(latent, number=3))

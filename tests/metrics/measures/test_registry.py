@@ -3,7 +3,7 @@
 import pytest
 
 from brainbench.core.errors import UsageError
-from brainbench.metrics import get_metric
+from brainbench.metrics import get_metric, list_metrics
 
 CODE = "class Mine:\n    name, title = {name!r}, 'mine'\n    animal = score = score_animals = None\n"
 
@@ -18,3 +18,8 @@ def test_a_metric_of_a_file_may_not_take_a_built_in_name(tmp_path):
     path.write_text(CODE.format(name="mine"))
     (tmp_path / "other.py").write_text(CODE.format(name="mine"))
     assert get_metric(f"{tmp_path / 'other.py'}:Mine").name == "mine"
+
+
+def test_every_metric_has_words_of_its_own():
+    words = [get_metric(name).describe(()) for name in list_metrics()]
+    assert len(set(words)) == len(words)  # boards and audits take scores of equal words for comparable
