@@ -56,7 +56,7 @@ LARGEST_CHANGE = 0.2
 LARGEST_STRUCK_CHANGE = 0.1
 """The same in rigid contacts with a :data:`BLOW`, when the step is cut to a fifth: contacts may cut a step and its half
 to the same. Of 555 whiskers it finds 99 of the 105 that err by more than a fifth, and 48 others; nothing that a single
-run tells does."""
+run tells does (benchmarks/whiskers/struck.py)."""
 BLOW = 1.0
 """Speed (m/s) of an object against the base from which it counts as a blow."""
 HARD_BLOW = 3.0
