@@ -24,6 +24,8 @@ from brainbench.stimuli.objects.primitives import box, capsule, sphere
 from brainbench.stimuli.validation.contact_scenes import FRICTIONS, contact_jobs, difference
 from brainbench.stimuli.whiskers.array import SPECIES, WhiskerArray
 
+Array = np.ndarray
+
 
 def struck_jobs(seed: int, count: int, speed: float) -> list[Job]:
     """Return whiskers at rest that a post, a ball or a box strikes from a random side, with and without friction."""
