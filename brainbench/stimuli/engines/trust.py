@@ -39,7 +39,15 @@ LARGEST_STRAIN = 0.01
 error than any preset has, and keratin yields at some 2 %. Whiskers that brush past objects reach .0001
 (benchmarks/RESULTS.md)."""
 SUSPICIOUS_SHARE = 0.4
-"""Share of the largest overlap, residual and base force from which a reliable whisker is suspicious."""
+"""Share of the largest overlap and residual from which a reliable whisker is suspicious."""
+SUSPICIOUS_STRAIN = 1.5e-4
+"""Stretch of the base from which the base force is suspicious; in right simulations whiskers that brush past objects
+stay below it."""
+SUSPICIOUS_PEAK = 2.0
+"""Largest over third largest base force of the readings from which it is suspicious: a thin tip that gets deeper than
+its radius into an edge in one step is thrown out along the whisker, with up to a thousand times the force."""
+FEWEST_READINGS = 20
+"""Readings from which a peak is told from a force that grows."""
 SUSPICIOUS_ROUGHNESS = 0.05
 """Roughness of the base force (:func:`roughness`) from which a whisker in soft contacts is suspicious. Whiskers that
 follow what they touch stay below .01; those that are thrown off and caught again have .1 to 2."""
@@ -48,7 +56,7 @@ LARGEST_CHANGE = 0.2
 LARGEST_STRUCK_CHANGE = 0.1
 """The same in rigid contacts with a :data:`BLOW`, when the step is cut to a fifth: contacts may cut a step and its half
 to the same. Of 555 whiskers it finds 99 of the 105 that err by more than a fifth, and 48 others; nothing that a single
-run tells does."""
+run tells does (benchmarks/whiskers/struck.py)."""
 BLOW = 1.0
 """Speed (m/s) of an object against the base from which it counts as a blow."""
 HARD_BLOW = 3.0
@@ -105,6 +113,8 @@ class RunFacts:
     """Deepest overlap with an object (m)."""
     peak: NDArray[np.floating]
     """Largest base force (N)."""
+    third: NDArray[np.floating]
+    """Third largest base force (N) of the readings; the largest below :data:`FEWEST_READINGS`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,7 +195,8 @@ def judge(facts: RunFacts) -> Verdict:
     bad = unsolved | crowded
     until = np.where(bad, -np.inf, until)
     doubtful = (
-        (facts.peak > SUSPICIOUS_SHARE * facts.strongest)
+        (facts.peak > SUSPICIOUS_STRAIN / LARGEST_STRAIN * facts.strongest)
+        | (facts.peak > SUSPICIOUS_PEAK * facts.third)
         | (facts.depth > SUSPICIOUS_SHARE * LARGEST_OVERLAP)
         | (facts.residual > SUSPICIOUS_SHARE * LARGEST_RESIDUAL)
         | facts.struck

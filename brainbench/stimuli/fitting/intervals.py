@@ -65,9 +65,13 @@ class Profile:
     scale: float
     """Variance of a whitened residual."""
 
-    def interval(self, free: FreeParameters, index: int, level: float, t: float) -> Interval:
-        """Return where (S − S_min)/s² stays below t² along a parameter; a side that reaches its bound ends there."""
-        low, high = (self._end(index, side, t) for side in (-1, 1))
+    def interval(self, free: FreeParameters, index: int, level: float, t: float, error: float = 0.0) -> Interval:
+        """Return where (S − S_min)/s² stays below t² along a parameter; a side that reaches its bound ends there.
+
+        ``error`` is another standard deviation of the coordinate, which does not depend on the data's.
+        """
+        best = self.best[index]
+        low, high = (best + side * math.hypot(self._end(index, side, t) - best, t * error) for side in (-1, 1))
         return _interval(free, index, low, high, level, "profile likelihood")
 
     def _end(self, index: int, side: int, t: float) -> float:

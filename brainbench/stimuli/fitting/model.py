@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from brainbench.core.errors import DataError
 from brainbench.stimuli.engines import get_engine
-from brainbench.stimuli.engines.fidelity import Fidelity
+from brainbench.stimuli.engines.fidelity import MOST_LINKS, Fidelity
 from brainbench.stimuli.engines.protocol import Job, Trace
 from brainbench.stimuli.fitting.options import FitOptions
 from brainbench.stimuli.fitting.parameters import Condition, FreeParameters
@@ -26,6 +26,8 @@ from brainbench.stimuli.validation import references
 Array = NDArray[np.float64]
 SCALE = 5e-3
 """Size of a small change of a coordinate."""
+SHORTER = 2.5
+"""Divisor of the time step of the simulations that show how far an estimate is from that of a finer simulation."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,11 +167,18 @@ class FitModel:
         """Return the whitened residuals [m] at coordinates u [p]; NaN where a simulation cannot be trusted."""
         return self._residual(u, self._traces(u))
 
-    def scan(self, points: Sequence[Array]) -> list[Array]:
+    def refined(self, u: Array) -> list[Array]:
+        """Return by how much the residuals [m] at coordinates u [p] change in shorter steps, and with more links."""
+        shorter = replace(self.fidelity, time_step=max(self.fidelity.time_step / SHORTER, 1e-7))
+        finer = replace(shorter, links=min(2 * shorter.links, MOST_LINKS))
+        own, *others = (self.scan([u], fidelity)[0] for fidelity in (self.fidelity, shorter, finer))
+        return [other - own for other in others]
+
+    def scan(self, points: Sequence[Array], fidelity: Fidelity | None = None) -> list[Array]:
         """Return the residuals [m] at each of many coordinates [p], simulated in one run of the engine."""
         jobs = [self._jobs(u) for u in points]
         shapes = any(trial.of_shapes for trial in self.trials)
-        found = iter(get_engine("rod").run(list(chain(*jobs)), self.fidelity, record_shape=shapes))
+        found = iter(get_engine("rod").run(list(chain(*jobs)), fidelity or self.fidelity, record_shape=shapes))
         self.simulated += len(points) * len(self.trials)
         return [self._residual(u, list(islice(found, len(self.trials)))) for u in points]
 

@@ -26,11 +26,15 @@ class FittedParameter:
     start: float
     """Value that the fit began with."""
     relative_deviation: float
-    """Standard deviation of its coordinate: relative for positive parameters; inf when the data do not tell it."""
+    """Standard deviation of its coordinate by noise: relative for positive parameters; inf when the data do not tell
+    it."""
+    relative_error: float
+    """Standard deviation of its coordinate by links and steps: how far finer simulations move the estimate."""
     laplace: Interval
-    """From the curvature of the likelihood at the best fit."""
+    """From the curvature of the likelihood at the best fit, and the error of the simulation."""
     profile: Interval | None = None
-    """Where the likelihood, maximised over the other parameters, falls; None when it was not asked for."""
+    """Where the likelihood, maximised over the other parameters, falls, and the error of the simulation; None when it
+    was not asked for."""
     prior: Prior | None = None
     status: Status = "ok"
     """``undefined``: the data do not tell this parameter; ``unreliable``: at a bound, or known by its prior only."""

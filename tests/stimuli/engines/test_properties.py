@@ -58,7 +58,11 @@ def _job(curvature, kind, at, size, lift, *, side=1.0, friction=0.0, turn=None, 
 
 
 def _run(*jobs, **options):
-    return RodEngine(retry=1).run(list(jobs), Fidelity(links=8, time_step=5e-4, **options), record_shape=True)
+    return RodEngine(retry=1).run(list(jobs), Fidelity(links=8, **({"time_step": 5e-4} | options)), record_shape=True)
+
+
+FINE = {"time_step": 2e-5, "precision": "double", "contact_tolerance": 1e-9}
+"""At an edge longer steps make as much of rounding as the force itself: in 3 % of these scenes with steps of .5 ms."""
 
 
 def _peak(trace):
@@ -68,12 +72,12 @@ def _peak(trace):
 @FEW_OR_MANY
 def test_a_mirrored_scene_gives_the_mirrored_wrench(examples):
     def check(scene):
-        a, b = _run(_job(**scene), _job(**scene, side=-1.0))
+        a, b = _run(_job(**scene), _job(**scene, side=-1.0), **FINE)
         assert a.status == b.status
         if a.status == "ok":
             # Forces mirror in y, moments as pseudo-vectors.
             miss = np.abs(b.wrench - a.wrench * [1, -1, 1, -1, 1, -1])
-            assert (miss <= 1e-3 * _peak(a) + 1e-12).all()
+            assert (miss <= 1e-6 * _peak(a) + 1e-12).all()
 
     _for_all(examples, check)
 
@@ -81,14 +85,25 @@ def test_a_mirrored_scene_gives_the_mirrored_wrench(examples):
 @FEW_OR_MANY
 def test_a_scene_turned_and_moved_gives_the_turned_wrench(examples):
     def check(scene, turn, place):
-        here, there = _run(_job(**scene), _job(**scene, turn=turn, place=place))
+        here, there = _run(_job(**scene), _job(**scene, turn=turn, place=place), **FINE)
         assert here.status == there.status
         if here.status == "ok":
             turned = (here.wrench.reshape(-1, 2, 3) @ base_rotation(turn).T).reshape(-1, 6)
-            assert (np.abs(there.wrench - turned) <= 5e-3 * _peak(here) + 1e-12).all()
+            assert (np.abs(there.wrench - turned) <= 1e-6 * _peak(here) + 1e-12).all()
 
     angle, shift = st.floats(-3, 3), st.floats(-0.02, 0.02)
     _for_all(examples, check, st.tuples(angle, st.floats(-1.2, 1.2), angle), st.tuples(shift, shift, shift))
+
+
+def test_a_tip_at_an_edge_is_not_thrown_out_along_the_whisker_by_a_hundred_times_the_force():
+    tip = {"curvature": -19.333, "kind": "box", "at": 0.009239, "size": 0.0019467, "lift": -0.00041778}
+    job = replace(_job(**tip), times=np.arange(1, 401) * 2e-4)
+    coarse = Fidelity(links=8, time_step=5e-4, twist=True)
+    (alone,), (checked,) = (RodEngine(retry=retry).run([job], coarse) for retry in (1, 5))
+    (fine,) = _run(job, **FINE)
+    assert np.abs(alone.wrench[:, :3]).max() > 50 * np.abs(fine.wrench[:, :3]).max()
+    assert checked.status == "ok"
+    assert np.abs(checked.wrench[:, :3]).max() < 1.1 * np.abs(fine.wrench[:, :3]).max()
 
 
 @FEW_OR_MANY

@@ -133,7 +133,9 @@ def test_the_residual_is_what_changed_last_over_the_forces():
     ("changed", "suspicious"),
     [
         ({}, False),
-        ({"peak": 13.0}, True),
+        ({"peak": 0.46, "third": 0.45}, True),
+        ({"peak": 0.44, "third": 0.43}, False),
+        ({"third": 4e-4}, True),
         ({"depth": 2.1e-4}, True),
         ({"residual": 0.021}, True),
         ({"residual": 0.06}, False),

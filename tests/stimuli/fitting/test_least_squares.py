@@ -162,7 +162,8 @@ def test_two_trials_are_more_certain_than_one(rung, pulled):
     assert ratio == pytest.approx(np.sqrt(0.5), rel=0.15)
 
 
-def test_a_pole_is_found_by_the_forces_on_the_base():
+def _pole():
+    """Return a scene of a whisker that whisks against a pole, and the trial of it that is still to be simulated."""
     from brainbench.stimuli import Frames, PlacedObject, Scene, Whisking
     from brainbench.stimuli.objects.primitives import cylinder
 
@@ -172,7 +173,23 @@ def test_a_pole_is_found_by_the_forces_on_the_base():
         "pole", array, (pole,), whisking=Whisking(frequency=10, onset=0.05), frames=Frames(count=30, interval=2e-3)
     )
     times = 0.01 + np.arange(30) * 2e-3
-    trial = Trial.of_scene(scene, blank_wrenches(times), "C2")
+    return scene, Trial.of_scene(scene, blank_wrenches(times), "C2")
+
+
+def test_intervals_contain_the_error_of_links_and_steps():
+    scene, trial = _pole()
+    trace = simulate_trial(trial)
+    for seed in range(2):
+        measured = measure_wrenches(trial, trace, 0.003, np.random.default_rng(seed)).measured
+        result = fit(Trial.of_scene(scene, measured, "C2"), ["young_modulus", "object_y"], options=QUICK)
+        one = result["young_modulus"]
+        assert abs(np.log(one.value / 5e9)) > 4 * one.relative_deviation
+        for name, truth in (("young_modulus", 5e9), ("object_y", 0.0)):
+            assert result[name].interval.low <= truth <= result[name].interval.high, (name, seed)
+
+
+def test_a_pole_is_found_by_the_forces_on_the_base():
+    scene, trial = _pole()
     trace = simulate_trial(trial, options=QUICK)
     assert trace.contact.any()
     measured = measure_wrenches(trial, trace, 0.01, np.random.default_rng(0))

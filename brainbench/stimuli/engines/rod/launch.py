@@ -18,7 +18,16 @@ from brainbench.stimuli.engines.rod.packing import PackedJobs, PackedMotions, ca
 from brainbench.stimuli.engines.rod.scheduling import Slices, allocate, make_problems
 from brainbench.stimuli.engines.rod.shapes import PackedShapes
 from brainbench.stimuli.engines.rod.streams import download, turn
-from brainbench.stimuli.engines.trust import RunFacts, Verdict, force_change, halved, judge, residual, strongest_force
+from brainbench.stimuli.engines.trust import (
+    FEWEST_READINGS,
+    RunFacts,
+    Verdict,
+    force_change,
+    halved,
+    judge,
+    residual,
+    strongest_force,
+)
 from brainbench.stimuli.engines.units import MILLI
 from brainbench.stimuli.whiskers.chain import Chain
 
@@ -217,6 +226,7 @@ class WhiskerSolver:
             steps=counts["steps"],
             depth=depth,
             peak=force.max(axis=1),
+            third=np.partition(force, -3, axis=1)[:, -3] if len(readings) >= FEWEST_READINGS else force.max(axis=1),
         )
         result = LaunchResult(wrench, found["contact"], counts, depth, missed, judge(facts), np.zeros(size, dtype=bool))
         result.seconds = dict(zip(("upload", "kernel", "download"), np.diff(clock).tolist(), strict=True))
@@ -248,10 +258,13 @@ class WhiskerSolver:
         options.gravity = structs.vec3(*np.divide(gravity, MILLI * weight).tolist())
         options.axes = structs.mat33(*(np.eye(3) if axes is None else axes).ravel().tolist())
         options.shape = int(record_shape)
+        # Readings end a step: where they are nearer than a step, a part of it could be the same step once more.
+        steps, between = self.steps[jobs.whisker], float(np.median(np.diff(readings, prepend=start))) * MILLI
+        steps = np.where(jobs.finer > 1, np.minimum(steps, max(between, 1e-4)), steps)
         given = (
             (structs.MotionArrays, motions.arrays()),
             (structs.ShapeArrays, shapes.arrays()),
-            (structs.JobArrays, jobs.arrays(self.chains, self.steps[jobs.whisker], start)),
+            (structs.JobArrays, jobs.arrays(self.chains, steps, start)),
             (structs.ReadingArrays, _readings(readings - start)),
         )
         shapes_of = dict.fromkeys((*_NUMBERS, *_COUNTS), count) | {
