@@ -26,6 +26,7 @@ def poles(tmp_path):
     return str(path)
 
 
+@pytest.mark.slow
 def test_two_networks_are_told_apart_on_held_out_objects(run, poles):
     arguments = ("stimuli", "design", poles, "--variables", "object_y", "--networks", NETWORKS, *QUICK)
     data = json.loads(run(*arguments, "--json").out)

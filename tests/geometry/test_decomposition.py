@@ -88,6 +88,7 @@ def test_the_limit_of_memory_is_kept_in_words():
         decompose(_angle_bracket("big"), DecompositionSettings(memory=1e8, seed=7))
 
 
+@pytest.mark.slow
 def test_a_mesh_of_too_many_triangles_is_simplified_and_says_by_how_much(monkeypatch):
     ball = trimesh.creation.icosphere(subdivisions=4)
     seen = []

@@ -110,6 +110,7 @@ def test_additions_killed_at_many_instants_go_on_to_the_same_bytes(source, tmp_p
     _check_add(source, tmp_path, kills=20)
 
 
+@pytest.mark.slow
 def test_two_processes_build_one_site_and_fill_one_folder(source, tmp_path):
     halves = [sorted(source.iterdir())[part::2] for part in (0, 1)]
     site, board = tmp_path / "site", tmp_path / "board"

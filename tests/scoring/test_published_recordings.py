@@ -59,7 +59,7 @@ def test_published_estimators_take_no_choice_of_units(file, features):
         brainbench.score(features, recordings=file, estimator="thesis", units_reliability=0.5)
 
 
-@pytest.mark.parametrize("estimator", ["thesis", "thesis-input"])
+@pytest.mark.parametrize("estimator", ["thesis", pytest.param("thesis-input", marks=pytest.mark.slow)])
 def test_published_estimators_take_the_array_as_it_is(file, arrays, features, estimator):
     found = brainbench.score(features, recordings=file, estimator=estimator)
     expected = score_published(

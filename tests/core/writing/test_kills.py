@@ -29,6 +29,7 @@ def _check(found: dict[str, Any]) -> None:
     }  # fmt: skip
 
 
+@pytest.mark.slow
 def test_a_killed_addition_is_repeated(tmp_path):
     found = _killed("leaderboard add", tmp_path, "--kills", "1")
     _check(found)

@@ -13,8 +13,8 @@ from brainbench.models.published.names import stored_readout
 from brainbench.models.published.recognition import recognise
 from brainbench.models.registry import load_model
 
-QUICK = ("zhuang-gru_ln/mlp3-last", "s4+gpt/linear-last", "resnet18/mlp3-all", "zhuang+mamba/linear-last")
-_CELLS = ("", "-ugrnn", "-inter_ln", "-gru", "-lstm", "-ugrnn_ln", "-inter", "-lstm_ln")
+QUICK = ("s4+gpt/linear-last", "resnet18/mlp3-all", "zhuang+mamba/linear-last")
+_CELLS = ("", "-gru_ln", "-ugrnn", "-inter_ln", "-gru", "-lstm", "-ugrnn_ln", "-inter", "-lstm_ln")
 REST = (
     *(f"zhuang{cell}/mlp3-last" for cell in _CELLS),
     *(f"{name}/linear-last" for name in ("zhuang", "zhuang+gpt", "zhuang-inter_ln+gpt", "s4+mamba")),

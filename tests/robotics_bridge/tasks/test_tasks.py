@@ -234,6 +234,7 @@ def test_the_latch_needs_the_heat_of_the_hot_ball() -> None:
         ThermalSettings(hot=10.0)
 
 
+@pytest.mark.slow
 def test_a_hand_that_holds_the_hot_ball_succeeds_by_default_alone() -> None:
     from robotics_bridge.tasks.thermometers import ThermalSettings, Thermometers
 

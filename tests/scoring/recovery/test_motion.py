@@ -70,6 +70,7 @@ def test_the_slope_is_that_of_small_differences(networks):
         assert slope[index] == pytest.approx((ends[0] - ends[1]) / (2 * change), rel=0.1)
 
 
+@pytest.mark.slow
 def test_a_chosen_motion_is_compared_with_the_given_one_on_other_objects():
     found = design_for_networks(_scenes(), NAMES, ["object_y"], options=QUICK, study=FEW, boards=3)
     assert found.search == "gradient"

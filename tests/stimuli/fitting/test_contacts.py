@@ -71,6 +71,7 @@ def test_a_known_contact_point_makes_the_force_more_certain():
     assert np.median(np.abs(held["force"] / force - 1)) < 0.05
 
 
+@pytest.mark.slow
 def test_neighbouring_frames_of_one_contact_make_a_small_force_more_certain():
     truths = [_press(MOUSE, 0.5, depth) for depth in 0.045 * np.linspace(0.9, 1.1, 7)]
     points = np.stack([_shape(MOUSE, *truth)[0] for truth in truths])
@@ -143,7 +144,10 @@ def test_few_points_are_refused_in_words():
     assert "4 points" in str(found["reason"].values[0])
 
 
-@pytest.mark.parametrize(("end", "options"), [(0, ContactOptions(noise=2e-5)), (-1, ContactOptions(2e-5, None, True))])
+@pytest.mark.parametrize(
+    ("end", "options"),
+    [(0, ContactOptions(noise=2e-5)), pytest.param(-1, ContactOptions(2e-5, None, True), marks=pytest.mark.slow)],
+)
 def test_a_frame_without_its_first_or_last_point_takes_no_other_for_it(end, options):
     arc, force = _press(MOUSE, 0.5, 0.15)
     points, place = _shape(MOUSE, arc, force, points=12, traced=1.0)

@@ -145,6 +145,7 @@ def test_gaps_are_left_out(rung):
     assert np.isnan(result.residuals[0][10:15]).all()
 
 
+@pytest.mark.slow
 def test_an_outlier_pulls_a_robust_fit_less(rung):
     measured = _wrenches(rung).copy(deep=True)
     measured["wrench"].values[::9] *= -2

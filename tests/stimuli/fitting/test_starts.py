@@ -27,7 +27,7 @@ def _trial(young_modulus: float, times, noise: float = 0.01) -> Trial:
     return Trial.ringdown(KNOWN, measured, 8e-4)
 
 
-@pytest.mark.parametrize(("share", "step"), [(0.2, 0.1), (0.4, 0.6), (0.4, 1.3)])
+@pytest.mark.parametrize(("share", "step"), [(0.2, 0.1), pytest.param(0.4, 0.6, marks=pytest.mark.slow), (0.4, 1.3)])
 def test_a_softer_whisker_is_found_though_readings_are_rare(share: float, step: float):
     # From the start value alone the fit went to 1.05, 2.0 or 0.8 times the published stiffness, mostly with status ok.
     truth = share * KNOWN.young_modulus
@@ -36,6 +36,7 @@ def test_a_softer_whisker_is_found_though_readings_are_rare(share: float, step: 
     assert found["young_modulus"].value == pytest.approx(truth, rel=0.01)
 
 
+@pytest.mark.slow
 def test_two_stiffnesses_that_fit_alike_are_said_also_with_a_prior():
     # Six readings, three periods apart: noise leaves several numbers of swings between them. A prior takes part in the
     # comparison and leaves them, so that it does not make the stiffness known.

@@ -161,6 +161,7 @@ def test_shards_at_once_on_a_gpu_are_those_one_after_the_other(tmp_path, monkeyp
     assert files_of(tmp_path / "together") == files_of(tmp_path / "alone")
 
 
+@pytest.mark.slow
 def test_several_gpus_share_the_shards_and_write_the_same_bytes(plan, unbroken, tmp_path, monkeypatch):
     monkeypatch.setattr(running, "gpus", lambda: ["0", "1"])
     done = []

@@ -100,6 +100,7 @@ def test_a_curved_whisker_touched_at_its_rest_shape_feels_nothing():
     assert references.elastica(curved, at, 20.0 * at**2).moment == pytest.approx(0, abs=1e-12)
 
 
+@pytest.mark.slow
 def test_beyond_the_slip_off_offset_there_is_no_equilibrium():
     at = 0.7 * C2.arc_length
     limit = 0.005336

@@ -57,7 +57,7 @@ def test_a_policy_of_joints_and_touch_learns_goes_on_and_acts_as_a_student(tmp_p
     assert not list((tmp_path / "whole").glob("events*"))
 
 
-@pytest.mark.parametrize("encoder", ["rnn", "auto"])
+@pytest.mark.parametrize("encoder", [pytest.param("rnn", marks=pytest.mark.slow), "auto"])
 def test_forces_of_all_taxels_are_learned_from_or_the_run_says_that_it_diverged(tmp_path: Path, encoder: str) -> None:
     env = tasks.make("in_palm_rotate", num_envs=4, observe="force_torque", threads=1)
     options = TeacherRun(iterations=2, observe=("proprio", "touch"), encoder=encoder, loggers=())

@@ -62,6 +62,7 @@ def test_a_scene_far_from_the_origin_feels_the_same(distance):
     assert max(_far(there.wrench, here.wrench)) < 1e-3
 
 
+@pytest.mark.slow
 def test_a_scene_that_travels_ten_metres_feels_the_same():
     """Whisker and post move on together at 1 m/s, for .25 s and for 10.25 s."""
     velocity = (0.8, -0.5, 0.33)
