@@ -33,7 +33,7 @@ class PolicyEvaluation:
     task: str
     seeds: tuple[int, ...]
     success: tuple[bool, ...]
-    """Success of each episode."""
+    """Success of each episode; one that diverged has none, whatever it reached before."""
     metric: tuple[float, ...]
     """Success metric of each episode: goals reached, rotation (rad) or seconds of contact."""
     returns: tuple[float, ...]
@@ -168,7 +168,8 @@ def evaluate(
             observations, _, terminated, truncated, info = env.step(policy(observations))
             done = terminated | truncated
             forget(policy, done)
-            columns = [info[name].float() for name in ("metric", "return", "steps", "diverged", "goals", "turned")]
+            names = ("success", "metric", "return", "steps", "diverged", "goals", "turned")
+            columns = [info[name].float() for name in names]
             full = info["goals"] >= (limit or math.inf)
             dropped = terminated & ~info["diverged"] & ~full
             table = torch.stack((*columns, dropped.float(), env.state.shape_of.float()), dim=1)
@@ -176,13 +177,13 @@ def evaluate(
             # Episodes beyond an environment's share are not counted: fast failures would otherwise be counted more
             # often.
             left -= done.long()
-        rates.append(sum(row[0] >= env.task.success.threshold for row in found) / len(found))
+        rates.append(sum(row[0] for row in found) / len(found))
         rows += found
-    metric, returns, lengths, diverged, goals, turned, dropped, shapes = zip(*rows, strict=True)
+    success, metric, returns, lengths, diverged, goals, turned, dropped, shapes = zip(*rows, strict=True)
     seconds = tuple(n * env.step_dt for n in lengths)
     return PolicyEvaluation(
-        agent=name, task=env.task.name, seeds=seeds, success=tuple(m >= env.task.success.threshold for m in metric),
-        metric=metric, returns=returns, lengths=tuple(int(n) for n in lengths), diverged=int(sum(diverged)),
+        agent=name, task=env.task.name, seeds=seeds, success=tuple(map(bool, success)), metric=metric,
+        returns=returns, lengths=tuple(int(n) for n in lengths), diverged=int(sum(diverged)),
         per_seed=tuple(rates), goals=goals, seconds=seconds, dropped=tuple(map(bool, dropped)),
         turn_rate=tuple(angle / time for angle, time in zip(turned, seconds, strict=True)),
         objects=tuple(env.model.shapes[int(shape)].name for shape in shapes),

@@ -36,6 +36,24 @@ def test_every_environment_contributes_equally_many_episodes_of_every_seed() -> 
     assert found.summary()["episodes"] == 18
 
 
+def test_an_episode_that_diverged_is_no_success_whatever_it_reached() -> None:
+    env = _env()
+
+    def act(_: object) -> torch.Tensor:
+        env.goals.count.fill_(2.0)
+        actions = torch.zeros(3, 5)
+        actions[1] = torch.nan
+        return actions
+
+    found = evaluate(env, act, episodes=3, seed=0)
+    assert found.diverged == 1
+    assert sorted(zip(found.lengths, found.success, found.dropped, strict=True)) == [
+        (1, False, False), (4, True, False), (4, True, False),
+    ]  # fmt: skip
+    assert found.per_seed == pytest.approx((2 / 3,))
+    assert env.statistics()["success"] < 0.5
+
+
 def test_success_is_told_for_each_object() -> None:
     names = ("a", "b", "a", "a")
     found = replace(_made(2, 4), goals=(3.0, 1.0, 0.0, 0.0), dropped=(True, False, False, True), objects=names)
