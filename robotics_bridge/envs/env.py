@@ -166,8 +166,9 @@ class Env:
         Returns:
             Observations by group (the next step overwrites ``tactile``), reward [B], terminated [B] and truncated [B]
             (bool), and a dictionary with ``time_outs`` (truncated), ``diverged`` [B], of ended episodes ``success``
-            (none that diverged), ``metric``, ``return``, ``steps``, ``goals`` reached and ``turned`` [B] (rotation
-            about the commanded axis while anything touched the object, rad), and ``final_observations`` if asked for.
+            (none that diverged), ``dropped`` (by an ending that is not the last goal), ``metric``, ``return``,
+            ``steps``, ``goals`` reached and ``turned`` [B] (rotation about the commanded axis while anything touched
+            the object, rad), and ``final_observations`` if asked for.
 
         Raises:
             UsageError: the action is no tensor of numbers, or has another shape.

@@ -14,6 +14,7 @@ import torch
 from robotics_bridge.envs.observations import observe
 from robotics_bridge.envs.reset import EpisodeReset
 from robotics_bridge.envs.state import EnvState
+from robotics_bridge.tasks import terms
 from robotics_bridge.tasks.step_context import StepContext
 
 StepResult = tuple[dict[str, torch.Tensor], torch.Tensor, torch.Tensor, torch.Tensor, dict[str, Any]]
@@ -103,6 +104,8 @@ def compute_step(state: EnvState, reset: EpisodeReset) -> StepResult:
     done = terminated | truncated
     log, won = _count_episodes(state, parts, done, diverged)
     info = {"time_outs": truncated, "diverged": diverged, "log": log, "success": won}
+    full = [endings[name] for name, ending in task.endings.items() if ending.condition is terms.enough_goals]
+    info["dropped"] = terminated & ~diverged & ~sum(full, torch.zeros_like(diverged))
     info |= {"goals": goals.count.clone(), "turned": goals.turned_held.clone()}
     info |= {"metric": episode.metric.clone(), "return": episode.returns.clone(), "steps": episode.steps.clone()}
     goals.count_episodes(done)

@@ -154,7 +154,6 @@ def evaluate(
     if episodes < 1 or not seeds:
         raise UsageError(f"An evaluation needs at least one episode and one seed; received {episodes} and {seeds}.")
     each = math.ceil(episodes / env.num_envs)
-    limit = None if env.task.goal is None else env.task.goal.limit
     rows: list[list[Any]] = []
     rates = []
     for number in track(seeds, f"evaluating {name}", progress):
@@ -168,11 +167,9 @@ def evaluate(
             observations, _, terminated, truncated, info = env.step(policy(observations))
             done = terminated | truncated
             forget(policy, done)
-            names = ("success", "metric", "return", "steps", "diverged", "goals", "turned")
+            names = ("success", "metric", "return", "steps", "diverged", "goals", "turned", "dropped")
             columns = [info[name].float() for name in names]
-            full = info["goals"] >= (limit or math.inf)
-            dropped = terminated & ~info["diverged"] & ~full
-            table = torch.stack((*columns, dropped.float(), env.state.shape_of.float()), dim=1)
+            table = torch.stack((*columns, env.state.shape_of.float()), dim=1)
             found += table[done & (left > 0)].tolist()
             # Episodes beyond an environment's share are not counted: fast failures would otherwise be counted more
             # often.
