@@ -63,10 +63,8 @@ class Hands(Clock):
         _, _, terminated, truncated, info = self.env.step(self.actions)
         self.steps += 1
         ended = (terminated | truncated) & self.open
-        assert self.env.task.goal is not None
-        dropped = terminated & ~info["diverged"] & (info["goals"] < self.env.task.goal.limit)
-        for name, values in (("metric", info["metric"]), ("goals", info["goals"]), ("dropped", dropped)):
-            self.found[name][ended] = values[ended].float()
+        for name in ("metric", "goals", "dropped"):
+            self.found[name][ended] = info[name][ended].float()
         self.open &= ~ended
 
 

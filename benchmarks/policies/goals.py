@@ -40,7 +40,7 @@ def run(agent: str, envs: int, kind: str) -> dict[str, NDArray]:
     while left.any():
         observations, _, terminated, truncated, info = env.step(policy(observations))
         goals[left] = info["goals"][left]
-        dropped |= left & terminated & (info["goals"] < (task.goal.limit if task.goal and task.goal.limit else np.inf))
+        dropped |= left & info["dropped"]
         left &= ~(terminated | truncated)
     shapes = [env.model.shapes[shape].round_about is not None for shape in env.state.shape_of.tolist()]
     yaw = 2 * torch.atan2(quat[:, 3], quat[:, 0])

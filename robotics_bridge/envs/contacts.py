@@ -87,5 +87,5 @@ class Contacts:
 
     @property
     def surface_distance(self) -> torch.Tensor:
-        """Distance [B, F] from each finger tip to the object (m), at most 0.5."""
+        """Distance [B, F] from each finger tip to the nearest object (m), at most 0.5."""
         return self.planes[0].nan_to_num(_REACH)

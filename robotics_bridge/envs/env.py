@@ -165,9 +165,10 @@ class Env:
 
         Returns:
             Observations by group (the next step overwrites ``tactile``), reward [B], terminated [B] and truncated [B]
-            (bool), and a dictionary with ``time_outs`` (truncated), ``diverged`` [B], of ended episodes ``metric``,
-            ``return``, ``steps``, ``goals`` reached and ``turned`` [B] (rotation about the commanded axis while
-            anything touched the object, rad), and ``final_observations`` if asked for.
+            (bool), and a dictionary with ``time_outs`` (truncated), ``diverged`` [B], of ended episodes ``success``
+            (none that diverged), ``dropped`` (by an ending that is not the last goal), ``metric``, ``return``,
+            ``steps``, ``goals`` reached and ``turned`` [B] (rotation about the commanded axis while anything touched
+            the object, rad), and ``final_observations`` if asked for.
 
         Raises:
             UsageError: the action is no tensor of numbers, or has another shape.

@@ -20,7 +20,7 @@ from brainbench.core.files import cache_dir, content_hash
 from brainbench.core.reading.sealed import read_sealed, write_sealed
 from robotics_bridge.hands import Hand
 from robotics_bridge.tasks.scenes import TaskModel
-from robotics_bridge.tasks.task import Task
+from robotics_bridge.tasks.task import Solver, Task
 
 mujoco = mujoco_module()
 
@@ -68,7 +68,10 @@ def grasps_for(task: Task, hand: Hand, model: TaskModel, *, seed: int = 0) -> di
     settings = SETTINGS.get(hand.name, SETTINGS["xhand1"])
     fields = ("geom_size", "geom_pos", "body_pos", "body_quat", "body_mass")
     numbers = [np.round(getattr(m, name), 6).tolist() for m in model.models for name in fields]
-    key = content_hash(asdict(settings), asdict(task.contacts), task.name, seed, *numbers, model.rest.tolist())
+    # By these a grasp holds too. Usual values are left out, since keys of earlier versions do not have them.
+    usual = ((task.friction, 1.0), (asdict(task.solver), asdict(Solver())), (hand.physics, None))
+    numbers += [model.rest.tolist(), *(own for own, other in usual if own != other)]
+    key = content_hash(asdict(settings), asdict(task.contacts), task.name, seed, *numbers)
     path = cache_dir("grasps") / f"{hand.name}-{key}.npz"
     if (found := read_sealed(path, "grasps")) is not None:
         return found

@@ -14,6 +14,7 @@ import torch
 from robotics_bridge.envs.observations import observe
 from robotics_bridge.envs.reset import EpisodeReset
 from robotics_bridge.envs.state import EnvState
+from robotics_bridge.tasks import terms
 from robotics_bridge.tasks.step_context import StepContext
 
 StepResult = tuple[dict[str, torch.Tensor], torch.Tensor, torch.Tensor, torch.Tensor, dict[str, Any]]
@@ -101,7 +102,10 @@ def compute_step(state: EnvState, reset: EpisodeReset) -> StepResult:
     # Episodes cut by time are told apart from ended ones: learners go on with the value of the last state there.
     truncated = (episode.age >= task.max_episode_length) & ~terminated
     done = terminated | truncated
-    info = {"time_outs": truncated, "diverged": diverged, "log": _count_episodes(state, parts, done, diverged)}
+    log, won = _count_episodes(state, parts, done, diverged)
+    info = {"time_outs": truncated, "diverged": diverged, "log": log, "success": won}
+    full = [endings[name] for name, ending in task.endings.items() if ending.condition is terms.enough_goals]
+    info["dropped"] = terminated & ~diverged & ~sum(full, torch.zeros_like(diverged))
     info |= {"goals": goals.count.clone(), "turned": goals.turned_held.clone()}
     info |= {"metric": episode.metric.clone(), "return": episode.returns.clone(), "steps": episode.steps.clone()}
     goals.count_episodes(done)
@@ -161,8 +165,12 @@ def _reward(state: EnvState, context: StepContext, diverged: torch.Tensor) -> tu
 
 def _count_episodes(
     state: EnvState, parts: torch.Tensor, done: torch.Tensor, diverged: torch.Tensor
-) -> dict[str, torch.Tensor]:
-    """Add rewards and metric to the running episodes and ended ones to the totals; return means over these."""
+) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
+    """Add rewards and metric to the running episodes and ended ones to the totals.
+
+    Returns:
+        Means over these, and the success [B] bool so far.
+    """
     episode, success = state.episode, state.task.success
     episode.reward_sums += parts
     episode.returns += parts.sum(dim=1)
@@ -172,12 +180,13 @@ def _count_episodes(
         episode.metric.copy_(state.goals.turned)
     elif state.task_state is not None:
         episode.metric.copy_(state.task_state.metric())
-    won = episode.metric >= success.threshold
+    # What an object reached while the physics broke down is no success.
+    won = (episode.metric >= success.threshold) & ~diverged
     columns = [torch.ones_like(episode.metric), won.float(), episode.metric, episode.returns, episode.steps.float()]
     table = torch.cat((torch.stack([*columns, diverged.float()], dim=1), episode.reward_sums), dim=1)
     episode.totals += (table * done.unsqueeze(1)).sum(dim=0)
     episodes = episode.totals[0].clamp(min=1)
-    return {f"/episode/{name}": episode.totals[index + 1] / episodes for index, name in enumerate(STATISTICS)}
+    return {f"/episode/{name}": episode.totals[index + 1] / episodes for index, name in enumerate(STATISTICS)}, won
 
 
 STATISTICS = ("success", "metric", "return", "length", "diverged")

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from brainbench.core.devices import mujoco_module
 from brainbench.core.errors import DataError, UsageError, check_each, check_kind, listing, shown
+from brainbench.core.files import content_hash
 from brainbench.core.reading.regular import check_file, readable
 from brainbench.core.reading.texts import read_text
 from robotics_bridge.hands.facing import palmar_directions
@@ -38,6 +39,12 @@ UNKNOWN_SPEED = 5.0
 """Speed (rad/s) that counts as the largest of a hinge whose data states none."""
 LEVER = 0.05
 """Length of a finger (m) whose tip moves as a slide, where a number is stated for hinges alone: 1 rad is .05 m."""
+_PHYSICS = (
+    "body_mass", "body_inertia", "body_pos", "body_ipos", "jnt_axis", "jnt_pos", "jnt_range", "jnt_stiffness",
+    "dof_armature", "dof_damping", "dof_frictionloss", "geom_friction", "geom_pos", "geom_size",
+    "actuator_gainprm", "actuator_biasprm", "actuator_forcerange",
+)  # fmt: skip
+"""Numbers of a compiled hand by which it moves and feels."""
 _LARGEST = 1e15
 """Magnitude of numbers in a hand's file that no hand has."""
 
@@ -75,6 +82,14 @@ class Hand:
     def model(self) -> Any:
         """The compiled ``mujoco.MjModel`` of the hand alone."""
         return self.mjspec().compile()
+
+    @cached_property
+    def physics(self) -> str | None:
+        """Hash of the masses, drives, frictions and places of a hand of a file; None for our own hands."""
+        if self.path is None:
+            return None
+        # Six digits: what compilers of other machines make of the rest is no other hand.
+        return content_hash(*([f"{x:.6g}" for x in getattr(self.model, name).ravel()] for name in _PHYSICS))
 
     @property
     def joints(self) -> tuple[str, ...]:

@@ -33,7 +33,7 @@ class PolicyEvaluation:
     task: str
     seeds: tuple[int, ...]
     success: tuple[bool, ...]
-    """Success of each episode."""
+    """Success of each episode; one that diverged has none, whatever it reached before."""
     metric: tuple[float, ...]
     """Success metric of each episode: goals reached, rotation (rad) or seconds of contact."""
     returns: tuple[float, ...]
@@ -154,7 +154,6 @@ def evaluate(
     if episodes < 1 or not seeds:
         raise UsageError(f"An evaluation needs at least one episode and one seed; received {episodes} and {seeds}.")
     each = math.ceil(episodes / env.num_envs)
-    limit = None if env.task.goal is None else env.task.goal.limit
     rows: list[list[Any]] = []
     rates = []
     for number in track(seeds, f"evaluating {name}", progress):
@@ -168,21 +167,20 @@ def evaluate(
             observations, _, terminated, truncated, info = env.step(policy(observations))
             done = terminated | truncated
             forget(policy, done)
-            columns = [info[name].float() for name in ("metric", "return", "steps", "diverged", "goals", "turned")]
-            full = info["goals"] >= (limit or math.inf)
-            dropped = terminated & ~info["diverged"] & ~full
-            table = torch.stack((*columns, dropped.float(), env.state.shape_of.float()), dim=1)
+            names = ("success", "metric", "return", "steps", "diverged", "goals", "turned", "dropped")
+            columns = [info[name].float() for name in names]
+            table = torch.stack((*columns, env.state.shape_of.float()), dim=1)
             found += table[done & (left > 0)].tolist()
             # Episodes beyond an environment's share are not counted: fast failures would otherwise be counted more
             # often.
             left -= done.long()
-        rates.append(sum(row[0] >= env.task.success.threshold for row in found) / len(found))
+        rates.append(sum(row[0] for row in found) / len(found))
         rows += found
-    metric, returns, lengths, diverged, goals, turned, dropped, shapes = zip(*rows, strict=True)
+    success, metric, returns, lengths, diverged, goals, turned, dropped, shapes = zip(*rows, strict=True)
     seconds = tuple(n * env.step_dt for n in lengths)
     return PolicyEvaluation(
-        agent=name, task=env.task.name, seeds=seeds, success=tuple(m >= env.task.success.threshold for m in metric),
-        metric=metric, returns=returns, lengths=tuple(int(n) for n in lengths), diverged=int(sum(diverged)),
+        agent=name, task=env.task.name, seeds=seeds, success=tuple(map(bool, success)), metric=metric,
+        returns=returns, lengths=tuple(int(n) for n in lengths), diverged=int(sum(diverged)),
         per_seed=tuple(rates), goals=goals, seconds=seconds, dropped=tuple(map(bool, dropped)),
         turn_rate=tuple(angle / time for angle, time in zip(turned, seconds, strict=True)),
         objects=tuple(env.model.shapes[int(shape)].name for shape in shapes),

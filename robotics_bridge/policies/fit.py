@@ -87,11 +87,20 @@ def check_actions(described: Mapping[str, Any], env: Env, name: str) -> None:
         )
 
 
+def check_hand(described: Mapping[str, Any], env: Env, name: str) -> None:
+    """Warn where the file of the hand of a policy is no longer what it was in training; earlier runs do not tell."""
+    if (trained := described.get("hand_physics")) and trained != env.hand.physics:
+        _LOG.warning(
+            "The file of the hand %s has changed since the policy %r was trained: masses, drives, frictions or places "
+            "differ. Bring back that file, or train again.", env.hand.name, name,
+        )  # fmt: skip
+
+
 def check_fit(described: Mapping[str, Any], env: Env, name: str) -> None:
     """Check what the ``config.json`` of a teacher or student says against an environment.
 
     Other contacts than those of training are told as a warning: how a policy bears them is a question one may ask. So
-    is a student that reads the goal, as published ones do.
+    are a hand whose file was changed, and a student that reads the goal, as published ones do.
 
     Raises:
         DataError: the policy is of another version of the tasks.
@@ -105,6 +114,7 @@ def check_fit(described: Mapping[str, Any], env: Env, name: str) -> None:
             f"The policy {name!r} was trained for the hand {hand[:80]!r}; received {env.hand.name!r}: make the "
             "environment with that hand."
         )
+    check_hand(described, env, name)
     check_actions(described, env, name)
     # Encoders that look up taxels by their number would read other taxels.
     groups = described.get("groups", ())

@@ -31,7 +31,7 @@ class Goal(abc.ABC):
     threshold: float = 0.1
     """Angle below which the goal counts as reached [rad]."""
     limit: int | None = None
-    """Reached goals that end an episode; None goes on."""
+    """Goals of a complete episode, for who reads the task; what ends it is an ending (``terms.enough_goals``)."""
     deadline: tuple[float, float] | None = None
     """Range of the time after which another goal is proposed [s]; None waits for ever."""
     axis: tuple[float, float, float] | None = None

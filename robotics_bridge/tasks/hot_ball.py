@@ -107,9 +107,10 @@ def default() -> Task:
     The area of a contact follows from its overlap and a radius, which is not published: here it is that of the balls.
     With the 5 mm of the published task the latch cannot close under firm contacts, which overlap less: after 10 s on
     the hot ball fingers have 27 °C. The carriage moves at .5 m/s at most, and the hand begins 8 cm lower, because
-    random actions from higher up do not meet a ball. The way is paid by the distance between surfaces, which is 0 in a
-    touch, and which teachers read; touching the hot ball is paid before it is warm. Actions begin smaller. Contacts,
-    actions and taxels are those of :func:`~robotics_bridge.tasks.registry.bounded`.
+    random actions from higher up do not meet a ball. The way is paid by the distance to the surface of the nearest
+    ball, hot or not, which is 0 in a touch, and which teachers read; touching the hot ball is paid before it is warm.
+    Actions begin smaller. Contacts, actions and taxels are those of
+    :func:`~robotics_bridge.tasks.registry.bounded`.
     """
     task = bounded(with_thermal(ThermalSettings(contact_radius=DIAMETER / 2)))
     x, y, z = (task.carriage[axis] for axis in "xyz")

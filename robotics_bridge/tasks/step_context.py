@@ -49,7 +49,7 @@ class StepContext:
     tip_force: torch.Tensor
     """[B, F, 3] net normal contact force on finger tips, link frame (N)."""
     surface_distance: torch.Tensor
-    """[B, F] from finger tips to the object (m)."""
+    """[B, F] from finger tips to the nearest object, whichever counts (m)."""
     goal_angle: torch.Tensor
     """[B] angle to the goal (rad)."""
     previous_goal_angle: torch.Tensor

@@ -57,7 +57,7 @@ def approach(m: StepContext, *, clip: tuple[float, float], negative_scale: float
 
 
 def near_surface(m: StepContext, *, nearest_k: int, sigma: float) -> torch.Tensor:
-    """Return the mean of exp(−d/σ) over the k finger tips that are nearest to the object, or over all if fewer."""
+    """Return the mean of exp(−d/σ) over the k finger tips that are nearest to an object, or over all if fewer."""
     # Overlap counts as distance zero: pressing harder must not pay.
     distance = m.surface_distance.clamp(min=0)
     nearest = distance.topk(min(nearest_k, distance.shape[1]), dim=1, largest=False).values

@@ -22,6 +22,7 @@ class TouchWorld:
         self.step_dt, self.decimation, self.max_episode_length = 0.025, 5, 8
         self.joint_names, self.frozen = ("a", "b"), {"c": 0.5}
         self.action_map = ActionMap(("a", "b"), np.zeros(2), np.ones(2), -np.ones(2), np.ones(2))
+        self.hand = SimpleNamespace(physics=None)
         self.touch: Any = None
         if observation_type(observe).sensor is not None:
             self.touch = SimpleNamespace(links=tuple(f"tip{i}" for i in range(5)))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
@@ -91,7 +90,6 @@ def play(
     steps = max(round(seconds / env.step_dt), 1)
     rewards: list[float] = []
     ended, dropped, goals, turned = 0, 0, 0, 0.0
-    limit = (env.task.goal.limit if env.task.goal is not None else None) or math.inf
     with progress_bar() as progress:
         size = (width, round(width * 5 / 6))
         stage = drawing.Stage(env, size) if pictures else None
@@ -112,7 +110,7 @@ def play(
             ended += over
             if over:
                 forget(act, terminated | truncated)
-            dropped += bool(terminated) and not bool(info["diverged"]) and float(info["goals"]) < limit
+            dropped += bool(info["dropped"])
             if over or step == steps - 1:
                 goals, turned = goals + int(info["goals"]), turned + float(info["turned"])
             progress(step + 1, steps, "playing")
@@ -146,7 +144,7 @@ def evaluate(
     ] = None,
     episodes: Annotated[int, typer.Option(help="Per agent and seed.")] = 100,
     seeds: Annotated[int, typer.Option(help="Evaluation seeds.")] = 3,
-    envs: EnvsOption = 32,
+    envs: EnvsOption = 34,  # as in our records: every object of in_palm_rotate twice
     device: DeviceOption = "cpu",
     out: Annotated[Path | None, out_file_option("Write the result as JSON here too.")] = None,
     as_json: JsonOption = False,

@@ -10,7 +10,7 @@ import typer
 from brainbench.cli.destinations import out_file, out_file_option
 from brainbench.cli.options import with_options
 from brainbench.cli.output import JsonOption, emit, progress_bar, table_of
-from brainbench.cli.policy.options import DeviceOption, EnvsOption, World, agent_of, in_world
+from brainbench.cli.policy.options import DeviceOption, EnvsOption, World, agent_of, in_world, touch_of
 
 
 @with_options(
@@ -52,9 +52,12 @@ def probe(
     if layout is not None and options.place is None:
         raise UsageError("--layout takes the taxels that --place NUMBER chooses; received none.")
     world.check([agent])
-    env = world.make([agent], num_envs=envs, device=device, observe="force_torque", seed=options.seed)
+    touch = touch_of([agent])  # A student acts on what it feels; one that feels nothing is asked what it could feel.
+    touch = touch if touch.get("observe", "none") != "none" else {"observe": "force_torque"}
+    env = world.make([agent], num_envs=envs, device=device, seed=options.seed, **touch)
     told: dict[str, Any] = {"task": world.task, "config": world.config, "change": world.change or [], "agent": agent}
     told |= {"contacts": contacts_name(env.task.contacts), "environments": envs, "seconds": options.seconds}
+    told["noisy"] = env.options.noisy
     with progress_bar() as progress:
         policy = agent_of(agent, env)
         if options.place is None:

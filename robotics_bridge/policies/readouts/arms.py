@@ -54,7 +54,7 @@ def force(rollout: TouchRollout) -> Features:
 
 def bits(rollout: TouchRollout, links: Sequence[int]) -> Features:
     """Return one bit per link and sub-step: more than two taxels touch (table 4.6)."""
-    touch = (rollout.taxels != 0).any(-1).float()
+    touch = (rollout.taxels.abs().amax(-1) > rollout.floor).float()
     parts = [part.sum(-1) > TAXELS_IN_CONTACT for part in touch.split(list(links), dim=-1)]
     return torch.stack(parts, -1).float().flatten(2)
 

@@ -16,6 +16,7 @@ from robotics_bridge.envs.env import Env
 from robotics_bridge.policies.encoders.calibration import HandCalibration
 from robotics_bridge.policies.encoders.taxel_grid import TaxelGrid
 from robotics_bridge.policies.evaluate import Acting, forget
+from robotics_bridge.sensors.noise.model import PRESETS
 
 TARGETS = ("position", "velocity", "spin", "contact")
 """Object (m, m/s, rad/s), and the centre of the contact forces on it (m), [3] each, world axes."""
@@ -41,6 +42,8 @@ class TouchRollout:
     """[T, B] bool: past the settling of its episode."""
     link_pose: torch.Tensor
     """[T, B, L, 7] of the tactile links in the palm's frame (m, quaternion)."""
+    floor: float = 0.0
+    """Largest reading of a taxel that touches nothing (N, N·m)."""
 
     @property
     def wanted(self) -> torch.Tensor:
@@ -76,7 +79,9 @@ def collect(env: Env, policy: Acting, seconds: float) -> TouchRollout:
         age = torch.where(done, 0, age + 1)
     stacked = {name: torch.stack(rows) for name, rows in kept.items()}
     targets = {name: stacked.pop(name) for name in TARGETS}
-    return TouchRollout(targets=targets, **stacked)
+    # Six standard deviations of white noise, which is 0 where taxels have none.
+    floor = 6 * PRESETS["published-force_torque"].white * env.options.noisy
+    return TouchRollout(targets=targets, floor=floor, **stacked)
 
 
 @torch.no_grad()

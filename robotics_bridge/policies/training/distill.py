@@ -33,7 +33,7 @@ from brainbench.models.training.run_folder import RunLog, load_state, save_state
 from robotics_bridge.hands.layouts import check_probes, is_probe_file
 from robotics_bridge.policies.encoders.arms import perceptron
 from robotics_bridge.policies.evaluate import Policy
-from robotics_bridge.policies.fit import check_version
+from robotics_bridge.policies.fit import check_hand, check_version
 from robotics_bridge.policies.student import TACTILE, TactilePolicy
 from robotics_bridge.policies.training.cuda_graph_step import ChunkStep
 from robotics_bridge.policies.training.distill_config import DistillConfig
@@ -300,6 +300,7 @@ class _Run:
             known = read_mapping(path)
             check_version(known, str(self.out))
             check_same(self.out, known.get("distill"), mine, "student")
+            check_hand(known, self.env, str(self.out))
             check_probes(self.config.resolution, known.get("deployment", {}).get("probes"))
         else:
             write_json(path, describe_run(self.config, self.student, self.env))
@@ -351,6 +352,7 @@ def describe_run(config: DistillConfig, student: TactilePolicy, env: Any) -> dic
         "brainbench_student": 1,
         "task_version": TASK_VERSION,
         "contacts": asdict(env.task.contacts),
+        "hand_physics": env.hand.physics,
         "distill": asdict(config),
         "network": student.config,
         # A list: the order counts, and JSON keeps that of lists alone.

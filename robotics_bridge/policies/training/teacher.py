@@ -312,6 +312,7 @@ def _train(
         origin = {"file": str(start), "hash": file_hash(start)}
     facts = {
         "kind": "teacher", "task": env.task.name, "hand": env.hand.name, "hand_path": str(env.hand.path or ""),
+        "hand_physics": env.hand.physics,
         "num_envs": env.num_envs, "seed": options.seed, "settings": asdict(settings), "rsl_rl": trainer.config,
         "observation_shapes": {name: list(shape) for name, shape in env.observation_shapes.items()},
         "action_names": list(env.action_names), "action_map": env.action_map.plain(), "start": origin,
@@ -350,7 +351,7 @@ def _resume(trainer: Trainer, run: Path, facts: dict[str, Any]) -> None:
     known["settings"] = asdict(from_json(TeacherSettings, known.get("settings"), f"settings of {config}"))
     names = ["task", "hand", "num_envs", "seed", "settings", "observe", "contacts"]
     # Earlier runs do not state these.
-    names += [name for name in ("rate", "world", "sensing") if name in known]
+    names += [name for name in ("rate", "world", "sensing", "hand_physics") if name in known]
     check_same(run, json.loads(json.dumps(known)), {name: json.loads(json.dumps(facts[name])) for name in names})
     if not (run / RESUME).exists():
         trim_log(run / LOG, "iteration", 0)

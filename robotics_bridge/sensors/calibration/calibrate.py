@@ -90,12 +90,12 @@ def calibrate(log: Log, *, max_delay: float = 0.5) -> Calibration:
             f"The readings come later after the reference than the longest delay that was tried ({max_delay:g} s, "
             f"{longest} readings); allow a longer one (max_delay)."
         )
-    fit = fit_dynamics(align(living, *guess), log.step, quantum, moving=moving)
+    fit = fit_dynamics(align(living, *guess, longest), log.step, quantum, moving=moving)
     lags = np.zeros(0, int)
     if moving and guess[1]:
         # Hysteresis can stand for a part of a delay that varies, so lags are also sought without it.
         starts = [fit] + [replace(fit, dynamics=fit.dynamics._replace(hysteresis=0.0))] * bool(fit.dynamics.hysteresis)
-        settled = [_settle(living, guess, log.step, quantum, start) for start in starts]
+        settled = [_settle(living, guess, log.step, quantum, start, longest) for start in starts]
         fit, lags = min(settled, key=lambda found: _spread(found[0]))
         rest = [calm(fit.dynamics.response(x, log.step), y, 2 * guess[1]) for x, y in living]
         if _spread(fit) > 2 * np.median(rest):
@@ -125,12 +125,12 @@ def _spread(fit: Fit) -> float:
 
 
 def _settle(
-    living: list[Episode], guess: tuple[int, int], step: float, quantum: float, fit: Fit
+    living: list[Episode], guess: tuple[int, int], step: float, quantum: float, fit: Fit, longest: int
 ) -> tuple[Fit, NDArray[np.int64]]:
     """Return dynamics and certain lags: each is simple where the other is known, so they are fitted in turn."""
     lags = np.zeros(0, int)
     for _ in range(_ROUNDS):
-        aligned, found = find_lags(living, guess, step, fit)
+        aligned, found = find_lags(living, guess, step, fit, longest)
         settled, lags = np.array_equal(found, lags), found
         if settled or (guess[0] == guess[1] and np.all(lags == guess[0])):
             break

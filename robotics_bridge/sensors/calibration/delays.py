@@ -14,6 +14,8 @@ from robotics_bridge.sensors.calibration.log import Episode
 
 _SURE = 25.0
 """Difference of the misfit, in units of the noise's variance, at which one lag beats the next."""
+_LOAD = 0.01
+"""Share of the largest load above which an episode begins under load."""
 _WINDOW = 40
 """Readings to either side over which drift counts as a level."""
 
@@ -55,13 +57,20 @@ def find_delays(parts: list[Episode], longest: int) -> tuple[int, int]:
         best = found
 
 
-def align(parts: list[Episode], first: int, last: int) -> list[Aligned]:
-    """Return the parts with the signal blurred over a range of lags."""
-    return [(blur(x, first, last), y, np.arange(len(x))) for x, y in parts]
+def unknown_past(x: NDArray[np.float64], longest: int) -> int:
+    """Return how many readings of an episode may show what came before it: ``longest``, or none if that was no load."""
+    # What a device under load felt before, or whether it crept when it was reset, stands in no log.
+    return min(longest, len(x) // 2) if abs(x[0]) > _LOAD * np.abs(x).max() else 0
+
+
+def align(parts: list[Episode], first: int, last: int, longest: int) -> list[Aligned]:
+    """Return the parts with the signal blurred over a range of lags, from where their past is known."""
+    starts = [unknown_past(x, longest) for x, _y in parts]
+    return [(blur(x, first, last), y[at:], np.arange(at, len(x))) for (x, y), at in zip(parts, starts, strict=True)]
 
 
 def find_lags(
-    parts: list[Episode], guess: tuple[int, int], dt: float, fit: Fit
+    parts: list[Episode], guess: tuple[int, int], dt: float, fit: Fit, longest: int
 ) -> tuple[list[Aligned], NDArray[np.int64]]:
     """Return the parts with each reading aligned by itself, and the lags [n] that could be told, in readings.
 
@@ -76,7 +85,7 @@ def find_lags(
         model = dynamics.response(x, dt)
         gain = fit.gains[place : place + n]
         place += n
-        rows = np.arange(lags[-1], len(x))
+        rows = np.arange(max(lags[-1], unknown_past(x, longest)), len(x))
         if not len(rows):
             raise DataError(
                 f"An episode of the log has {len(x)} readings, no more than twice the delay that would explain it "

@@ -255,7 +255,7 @@ def _bias(
         band = np.zeros((2, count))
         band[0, 1:] = -(white**2)
         band[1] = walk**2 + 2 * white**2
-        band[1, 0] = walk**2 + white**2
+        band[1, 0] = (at[0] + 1) * walk**2 + white**2
         unit = np.zeros(count)
         unit[0] = 1
         solved = solveh_banded(band, unit)

@@ -12,6 +12,7 @@ from brainbench.core.rotations import about, multiply
 from robotics_bridge import tasks
 from robotics_bridge.envs import Env
 from robotics_bridge.policies.evaluate import PolicyEvaluation, agent, evaluate
+from robotics_bridge.tasks.overrides import apply_overrides
 from robotics_bridge.tasks.task import Placement
 
 
@@ -34,6 +35,38 @@ def test_every_environment_contributes_equally_many_episodes_of_every_seed() -> 
     assert found.success_rate == 0.0
     assert len(found.per_seed) == 3
     assert found.summary()["episodes"] == 18
+
+
+def test_an_episode_that_diverged_is_no_success_whatever_it_reached() -> None:
+    env = _env()
+
+    def act(_: object) -> torch.Tensor:
+        env.goals.count.fill_(2.0)
+        actions = torch.zeros(3, 5)
+        actions[1] = torch.nan
+        return actions
+
+    found = evaluate(env, act, episodes=3, seed=0)
+    assert found.diverged == 1
+    assert sorted(zip(found.lengths, found.success, found.dropped, strict=True)) == [
+        (1, False, False), (4, True, False), (4, True, False),
+    ]  # fmt: skip
+    assert found.per_seed == pytest.approx((2 / 3,))
+    assert env.statistics()["success"] < 0.5
+
+
+def test_an_episode_that_ends_with_its_last_goal_is_no_drop() -> None:
+    changes = ["episode=0.1", "reached_max_consecutive_successes.count=2", "obj_dropped.height=-1"]
+    for task, dropped in ((changes, False), ([*changes[:2], "obj_dropped.height=2"], True)):
+        env = tasks.make(apply_overrides(tasks.load("in_palm_rotate"), task), num_envs=2, threads=1)
+
+        def act(_: object, env: Env = env, count: float = 2.0 - dropped) -> torch.Tensor:
+            env.goals.count.fill_(count)
+            return torch.zeros(2, 5)
+
+        found = evaluate(env, act, episodes=2, seed=0)
+        assert found.lengths == (1, 1)
+        assert found.dropped == (dropped,) * 2
 
 
 def test_success_is_told_for_each_object() -> None:

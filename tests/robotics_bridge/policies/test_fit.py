@@ -12,14 +12,15 @@ import pytest
 
 from brainbench.core.errors import DataError, UsageError
 from brainbench.core.files import to_plain, write_json
-from robotics_bridge import tasks
+from robotics_bridge import hands, tasks
 from robotics_bridge.policies.contract import trained_contacts
-from robotics_bridge.policies.fit import check_fit, with_contacts_of
+from robotics_bridge.policies.fit import check_fit, check_hand, with_contacts_of
 from robotics_bridge.policies.shipped import stored
 from robotics_bridge.tasks.contact_model import CONTACTS, ContactModel
 from robotics_bridge.tasks.overrides import apply_overrides
 from robotics_bridge.tasks.task import TASK_VERSION
 from tests.factories.policies import teacher_in
+from tests.factories.robot_surfaces import MJCF
 
 
 def _env(contacts: str = "published") -> Any:
@@ -110,3 +111,29 @@ def test_a_student_that_reads_other_taxels_is_refused() -> None:
         env = tasks.make("in_palm_rotate", num_envs=1, threads=1, **senses)
         with pytest.raises(UsageError, match=rf"tactile \[5, 199, 6\], and the environment gives .*{told}"):
             check_fit(described, env, "student")
+
+
+def test_a_hand_whose_file_was_changed_is_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    file = tmp_path / "hand.xml"
+
+    def env(text: str) -> Any:
+        file.write_text(text)
+        return SimpleNamespace(hand=hands.load(str(file)))
+
+    described = {"hand_physics": env(MJCF).hand.physics}
+    with caplog.at_level(logging.WARNING):
+        check_hand(described, env(f"<!-- a remark -->{MJCF.strip()}"), "mine")
+        check_hand({}, env(MJCF), "earlier")
+    assert described["hand_physics"]
+    assert not caplog.records
+    for old, new in (
+        ('damping="0', 'damping="1'),
+        ('kp="', 'kp="1'),
+        ('mass="0.05', 'mass="0.06'),
+        ('on="0.8', 'on="0.9'),
+    ):
+        assert old in MJCF
+        with caplog.at_level(logging.WARNING):
+            check_hand(described, env(MJCF.replace(old, new)), "mine")
+        assert "'mine' was trained" in caplog.text
+        caplog.clear()

@@ -97,6 +97,15 @@ def test_bits_say_that_more_than_two_taxels_of_a_link_touch() -> None:
     assert arms.bits(rollout, [4, 3]).flatten().tolist() == [0.0, 1.0]
 
 
+def test_noise_is_no_touch() -> None:
+    senses = {"observe": "force_torque", "placement": "tips", "resolution": "low", "threads": 1}
+    env = tasks.make("in_palm_rotate", num_envs=4, noisy=True, **senses)
+    felt = collect(env, agent("zero", env), 0.25)
+    links = [int(probes.active.sum()) for probes in env.hand.layout("low", "tips").values()]
+    assert float((felt.taxels != 0).any(-1).float().mean()) > 0.5
+    assert float(arms.bits(felt, links).mean()) < 0.1
+
+
 def test_a_rollout_in_a_task_is_read_from_every_arm_of_a_probe() -> None:
     env = tasks.make(
         "in_palm_rotate", num_envs=10, observe="force_torque", placement="tips", resolution="low", threads=1

@@ -13,12 +13,14 @@ import torch
 from brainbench.core.errors import UsageError
 from brainbench.core.rotations import about, angle_of, conjugate, multiply, rotate, six_numbers, twist_and_swing
 from robotics_bridge import hands, tasks
+from robotics_bridge.envs import grasps
 from robotics_bridge.envs.step import step_context
 from robotics_bridge.tasks import terms
 from robotics_bridge.tasks.goals import SteppingRotation, TimedRotation
 from robotics_bridge.tasks.objects import CUBES, box, cylinder, screwdriver, slots, with_sizes
+from robotics_bridge.tasks.overrides import apply_overrides
 from robotics_bridge.tasks.scenes import build, palm_up
-from robotics_bridge.tasks.task import ObjectRandomisation
+from robotics_bridge.tasks.task import ObjectRandomisation, Task
 
 MY_TASK = """
 from dataclasses import replace
@@ -215,6 +217,21 @@ def test_sampled_grasps_hold_without_any_action() -> None:
     moved = (env.object_pose[:, 0, :3] - start).norm(dim=1)
     assert float(moved.quantile(0.8)) < 0.01
     assert float(terms.alignment(step_context(env.state), (0.0, 1.0, 0.0)).median()) > 0.98
+
+
+def test_grasps_of_another_friction_or_solver_are_sampled_anew(tmp_path, monkeypatch) -> None:
+    monkeypatch.setenv("BRAINBENCH_CACHE", str(tmp_path))
+    task, hand, sampled = tasks.load("screwdriver"), hands.load("xhand1"), []
+
+    def sample(task: Task, *others: Any) -> dict[str, np.ndarray]:
+        sampled.append((task.friction, task.solver.timestep))
+        return {"joints": np.zeros((16, 12)), "target": np.zeros((16, 12)), "object": np.zeros((16, 7))}
+
+    monkeypatch.setattr(grasps, "sample", sample)
+    for changes in ([], ["friction=0.8"], ["solver.timestep=0.004"], [], ["friction=0.8"]):
+        changed = apply_overrides(task, changes)
+        grasps.grasps_for(changed, hand, build(changed, hand))
+    assert sampled == [(1.0, 0.005)] * 4 + [(0.8, 0.005)] * 4 + [(1.0, 0.004)] * 4
 
 
 def test_the_latch_needs_the_heat_of_the_hot_ball() -> None:

@@ -100,6 +100,32 @@ def test_a_log_may_begin_under_load():
     assert (found.hysteresis, found.hysteresis_tau) == pytest.approx((0.4, 0.06), rel=0.05)
 
 
+def test_a_sensor_may_be_reset_under_load():
+    noise = Noise(white=0.02, hysteresis=0.4, hysteresis_tau=0.06, gain=(0.8, 1.2), read_delay=0.03)
+    parts = []
+    for seed in range(4):
+        x = _presses(1000, seed)
+        x = x[np.flatnonzero((x > 0.5) & (np.arange(1000) >= 200))[0] + 15 :][:600]
+        y = simulate(noise, np.broadcast_to(x[:, None, None, None], (600, 1, 12, 1)), dt=DT, seed=seed)
+        parts.append(np.column_stack([np.full(600, seed), x, y[:, 0, :, 0]]))
+    table = np.concatenate(parts)
+    found = calibrate(Log(np.arange(len(table)) * DT, table[:, 2:], table[:, 1], table[:, 0].astype(int))).noise
+    assert (found.read_delay, found.jitter) == pytest.approx((0.03, 0.0), abs=1e-9)
+    assert found.walk < 5e-4
+    assert (found.hysteresis, found.hysteresis_tau) == pytest.approx((0.4, 0.06), rel=0.05)
+
+
+def test_the_bias_of_a_drifting_probe_under_load_lies_within_its_interval():
+    x = _presses(1200, 0)[200:]
+    hits = 0
+    for seed in range(8):
+        y = simulate(Noise(white=0.02, walk=0.003, bias=0.05), x[:, None, None, None], dt=DT, seed=seed)
+        bias = calibrate(Log(np.arange(1000) * DT, y[:, 0, :, 0].astype(float), x)).estimates["bias"]
+        hits += bias.low <= 0.05 <= bias.high
+    assert x[0] > 0.5
+    assert hits >= 6
+
+
 def test_a_delay_beyond_the_longest_that_is_tried_is_refused():
     log = _log(Noise(white=0.02, read_delay=0.03), 1500, 6)
     assert calibrate(log, max_delay=0.03).noise.read_delay == pytest.approx(0.03)
