@@ -5,7 +5,8 @@ Units differ between sessions, so every session stands for itself.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -99,7 +100,9 @@ def trials_by_subject(dataset: xr.Dataset, *, averaged: bool = False) -> dict[st
         dataset[name].values.astype(str) for name in ("trial_id", "subject", "session", "unit_subject", "unit_session")
     )
     known = [name for name in COVARIATES if name in dataset.coords]
+    start = dataset["window_start"].values if "window_start" in dataset.coords else np.full(len(labels), np.nan)
     found: dict[str, list[Trials]] = {}
+    before: dict[str, list[tuple[NDArray[np.int64], Sequence[str]]]] = {}
     for subject, session in dict.fromkeys(zip(subjects.tolist(), sessions.tolist(), strict=True)):
         rows = np.flatnonzero((subjects == subject) & (sessions == session))
         columns = np.flatnonzero((unit_subjects == subject) & (unit_sessions == session))
@@ -115,15 +118,34 @@ def trials_by_subject(dataset: xr.Dataset, *, averaged: bool = False) -> dict[st
         own = own if keep.all() and units.all() else own[np.ix_(keep, np.arange(own.shape[1]), units)]
         # Bins past a window's end have NaN counts and duration 0; NaN seconds avoid the division by zero.
         seconds = np.where(duration[rows] > 0, duration[rows], np.nan)
+        keys = [f"{subject}/{session}/{ids[row]}" for row in rows]
+        for earlier, names in before.setdefault(subject, []):
+            # Probes of one session in files of their own share the noise of their trials, so the same trials must go
+            # into the same half: noise in both halves would pass for what is reliable.
+            same = _same_trials(start[rows], labels[rows], start[earlier], labels[earlier])
+            if 2 * len(same) > min(len(rows), len(earlier)):
+                keys = [names[same[index]] if index in same else key for index, key in enumerate(keys)]
+                break
+        unique = _unique(keys)
+        before[subject].append((rows, unique))
         found.setdefault(subject, []).append(
             Trials(
                 responses=_average(own / seconds[:, :, None], seconds) if averaged else own / seconds[:, :, None],
                 labels=labels[rows],
-                keys=_unique([f"{subject}/{session}/{ids[row]}" for row in rows]),
+                keys=unique,
                 covariates={name: dataset[name].values[rows].astype(np.float64) for name in known},
             )
         )
     return {subject: tuple(items) for subject, items in found.items()}
+
+
+def _same_trials(start: Floats, labels: Any, earlier: Floats, others: Any) -> dict[int, int]:
+    """Return the trials that begin with one of an earlier session, within 1 ms, and have its label: trial → its."""
+    order = np.argsort(earlier, kind="stable")
+    place = np.searchsorted(earlier[order], start - 1e-3)
+    near = order[np.minimum(place, len(order) - 1)]
+    same = (np.abs(earlier[near] - start) <= 1e-3) & (others[near] == labels)
+    return {int(index): int(near[index]) for index in np.flatnonzero(same)}
 
 
 def _average(rates: Floats, seconds: Floats) -> Floats:

@@ -1,10 +1,14 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import xarray as xr
 
 from brainbench.core.errors import DataError, UsageError
 from brainbench.datasets import open_recordings, write_recordings
+from brainbench.datasets.sessions import make_session
 from brainbench.datasets.trials.session_trials import pooled, trials_by_subject
+from brainbench.metrics.reliability.subject_rdm import subject_rdm
 from tests.factories.recordings import make_simple_session
 
 
@@ -64,6 +68,36 @@ def test_bins_that_were_not_recorded_do_not_count_in_the_average(tmp_path):
     assert np.isfinite(found[:, 2]).all()
 
 
+def test_probes_of_one_session_in_files_of_their_own_share_the_halves_of_their_trials(tmp_path):
+    random = np.random.default_rng(0)
+    start = np.cumsum(random.uniform(2, 3, 96))
+    table = {
+        "start_time": start,
+        "stop_time": start + 1,
+        "stimulus": random.permutation(np.resize(list("abcdefgh"), 96)),
+    }
+    # Trial noise that all units share, and no tuning.
+    loud = np.exp(random.normal(size=(96, 2)) @ random.normal(size=(2, 20)))
+    spikes = [
+        np.sort(np.concatenate([[0.0, 500.0], *(s + random.uniform(size=random.poisson(9 * n)) for s, n in trials)]))
+        for trials in (zip(start, unit, strict=True) for unit in loud.T)
+    ]
+    # The clock of the second file is off by less than a millisecond, and it began later.
+    late = {name: values[8:] + 3e-4 if name != "stimulus" else values[8:] for name, values in table.items()}
+
+    def animal(*sessions):
+        dataset = open_recordings(write_recordings(tmp_path / "a.h5", sessions), conditions="trials:stimulus")
+        blocks = [replace(block, responses=block.responses[:, 0]) for block in trials_by_subject(dataset)["m"]]
+        return subject_rdm("m", blocks, 8, method="crossnobis", comparison="whitened-cosine", splits=50)
+
+    one = animal(make_session("m", "a", spikes, {"trials": table}))
+    probes = [make_session("m", name, part, {"trials": table}) for name, part in (("a", spikes[:9]), ("b", spikes[9:]))]
+    two = animal(*probes)
+    np.testing.assert_allclose(two.split_half_r, one.split_half_r)
+    three = animal(probes[0], make_session("m", "b", spikes[9:], {"trials": late}))
+    assert abs(three.reliability - one.reliability) < 0.15
+
+
 def test_other_data_sets_are_refused():
     with pytest.raises(DataError, match="variable 'counts'"):
         trials_by_subject(xr.Dataset())
@@ -100,7 +134,7 @@ def test_all_animals_can_be_one_subject_with_their_sessions_apart(dataset):
     ((name, sessions),) = trials_by_subject(pooled(dataset, "all")).items()
     assert name == "all"
     assert [block.responses.shape for block in sessions] == [(12, 1, 3)] * 3
-    assert len({key for block in sessions for key in block.keys}) == 36
+    assert [len(set(block.keys)) for block in sessions] == [12] * 3
 
 
 def test_pools_of_the_same_recordings_are_told_apart(dataset):
