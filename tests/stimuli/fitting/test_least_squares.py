@@ -145,6 +145,16 @@ def test_gaps_are_left_out(rung):
     assert np.isnan(result.residuals[0][10:15]).all()
 
 
+@pytest.mark.parametrize(("instants", "own"), [(3, False), (30, True)])
+def test_a_channel_that_a_fit_could_follow_exactly_does_not_seem_free_of_noise(rung, instants, own):
+    trial = Trial.ringdown(KNOWN, _wrenches(rung).isel(time=slice(instants)), 8e-4)
+    model = FitModel([trial], FreeParameters(("young_modulus", "damping_ratio", "deflection"), trial.condition), QUICK)
+    exact = model.readings.group == model.readings.groups.index("Mz")
+    model.update_noise(np.where(exact, 1e-6, 0.1), model.sigma.copy())
+    noise = dict(zip(model.readings.groups, model.sigma / model.readings.size, strict=True))
+    assert (noise["Mz"] < 1e-4) == own
+
+
 @pytest.mark.slow
 def test_an_outlier_pulls_a_robust_fit_less(rung):
     measured = _wrenches(rung).copy(deep=True)
