@@ -170,7 +170,8 @@ def main() -> None:
             f"{np.median([item['seconds'] for item in found]):.2f} s of processor time (median)."
         )
     if options.only is None:
-        write_section(TITLE, "python -m benchmarks.whiskers.fitting", "\n\n".join(parts), subject="whiskers")
+        command = f"python -m benchmarks.whiskers.fitting --simulations {options.simulations}"
+        write_section(TITLE, command, "\n\n".join(parts), subject="whiskers")
 
 
 if __name__ == "__main__":
