@@ -65,7 +65,7 @@ def others(files: dict[str, Path], curves: dict[str, Path]) -> str:
             way.append([name, steps, f"{won:.3f}", f"{metric:.2f}", seconds, width, spread])
     columns = ["task", "engine", "agent", "episodes", "success", "goals, or rad turned", "s", "dropped"]
     moments = ["run", "control steps", "success in training", "goals, or rad turned", "s", "goal, rad", "action std"]
-    return f"{table(columns, found)}\n\n{table(moments, way)}"
+    return "\n\n".join([table(columns, found), *([table(moments, way)] if way else [])])
 
 
 def evaluated(files: dict[str, Path]) -> str:
