@@ -8,6 +8,10 @@ the Jacobian's columns, so mean and variance of S under white noise are known ex
     E S = −σ² tr(QᵀWQ),   var S = 2 σ⁴ (tr W² − 2 tr(QᵀW²Q) + tr((QᵀWQ)²))
 
 where S = rᵀ W r. The test is one-sided: agreement counts, and a normal law is taken for S.
+
+Residuals that swing have no sum S where eight readings make a swing, and a negative one below. So the squares of the
+deviates of single lags over time are also added up, as by Ljung & Box (1978, Biometrika 65, 297-303), and compared with
+the chi-square law.
 """
 
 from __future__ import annotations
@@ -28,6 +32,8 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 LAGS = 3
 """Places up to which readings are neighbours."""
+SWING_LAGS = 4
+"""Places up to which residuals that swing are looked for."""
 ALPHA = 0.01
 """Chance that noise alone fails any of the tests of a fit."""
 FEWEST = 20
@@ -39,9 +45,10 @@ class ResidualTest:
     """One test of the residuals."""
 
     what: str
-    """``time``, ``arc`` (serial correlation over time, along the whisker) or ``size`` (against repeat noise)."""
+    """``time``, ``arc`` (serial correlation over time, along the whisker), ``swing`` (of any sign, over time) or
+    ``size`` (against repeat noise)."""
     statistic: float
-    """Standard normal deviate under noise alone."""
+    """Deviation from what noise alone gives, in standard deviations."""
     p: float
     """Chance of a larger one under noise alone."""
     readings: int
@@ -57,11 +64,16 @@ def check_residuals(residual: Array, jacobian: Array, readings: Readings) -> tup
     variance = float(residual @ residual) / free
     found: list[tuple[str, float, float, int]] = []
     for what, column in (("time", 0), ("arc", 1)):
-        weights = _neighbours(readings, column)
+        weights = _neighbours(readings, column, range(1, LAGS + 1))
         pairs = weights.nnz // 2
         if pairs >= FEWEST:
             z = _deviate(residual, basis, weights, variance)
             found.append((what, z, float(ndtr(-z)), pairs))
+    lags = [_neighbours(readings, 0, [lag]) for lag in range(1, SWING_LAGS + 1)]
+    if min(one.nnz // 2 for one in lags) >= FEWEST:
+        square = sum(_deviate(residual, basis, one, variance) ** 2 for one in lags)
+        p = float(chdtrc(SWING_LAGS, square))
+        found.append(("swing", (square - SWING_LAGS) / math.sqrt(2 * SWING_LAGS), p, len(residual)))
     known = np.isfinite(readings.noise[readings.group])
     if known.sum() > jacobian.shape[1] + 1:
         # Sum of squares over repeat noise is chi-square with n − p degrees of freedom.
@@ -81,8 +93,8 @@ def _deviate(residual: Array, basis: Array, weights: coo_array, variance: float)
     return (float(residual @ (weights @ residual)) - mean) / max(variance * math.sqrt(2 * max(spread, 0.0)), 1e-300)
 
 
-def _neighbours(readings: Readings, column: int) -> coo_array:
-    """Return W [m, m], ½ where two readings differ by up to :data:`LAGS` in one place and agree in all else."""
+def _neighbours(readings: Readings, column: int, lags: Sequence[int]) -> coo_array:
+    """Return W [m, m], ½ where two readings differ by one of some lags in one place and agree in all else."""
     from scipy.sparse import coo_array
 
     count = len(readings)
@@ -91,7 +103,7 @@ def _neighbours(readings: Readings, column: int) -> coo_array:
     order = np.lexsort((readings.place[:, column], *fixed[::-1]))
     rows: list[NDArray[np.int_]] = []
     columns: list[NDArray[np.int_]] = []
-    for lag in range(1, LAGS + 1):
+    for lag in lags:
         first, second = order[:-lag], order[lag:]
         near = readings.place[second, column] - readings.place[first, column] == lag
         for values in fixed:
@@ -107,6 +119,7 @@ def failed_words(tests: Sequence[ResidualTest]) -> tuple[str, ...]:
     told = {
         "time": "neighbouring instants leave residuals of the same sign",
         "arc": "neighbouring points along the whisker leave residuals of the same sign",
+        "swing": "the residuals swing",
         "size": "the residuals are larger than the noise of repeats",
     }
     return tuple(

@@ -44,6 +44,15 @@ def test_a_signal_below_the_noise_that_all_points_share_is_found():
     assert "same sign" in failed_words(found[0])[0]
 
 
+@pytest.mark.parametrize("each", [3, 4, 8])
+def test_residuals_that_swing_are_found_however_few_readings_a_swing_has(each):
+    rng, readings = np.random.default_rng(3), _readings(60, 1)
+    residual, jacobian = _fitted(rng, readings)
+    swing = np.cos(2 * np.pi * np.arange(60) / each + 0.5)
+    tests = {test.what: test.passed for test in check_residuals(residual + 1.5 * swing, jacobian, readings)}
+    assert tests == {"time": True, "swing": False}
+
+
 def test_residuals_beyond_repeat_noise_are_found_and_within_it_are_not():
     rng, readings = np.random.default_rng(2), _readings(100, 1, noise=1.0)
     residual, jacobian = _fitted(rng, readings)
