@@ -88,17 +88,20 @@ def methods(records: Sequence[ResultRecord]) -> str:
         f"({plural(len(score.subjects), 'animal')}, {plural(len(score.stimuli), 'stimulus', 'stimuli')})"
         f"{f' by {score.metric}' if score.metric else ''}, with noise correction by the estimator '{score.estimator}'."
     )
+    scores = [record.score for record in records]
     stated = {
-        "Stimuli": origin.stimuli_name.rstrip("."),
-        "Fidelity of the simulation": str(origin.settings.get("fidelity") or ""),
-        "Time axis": origin.time_rule,
-        "Layer": score.layer_rule,
-        "Interval": level(score.interval) if score.interval else "",
+        "Stimuli": [one.provenance.stimuli_name.rstrip(".") for one in scores],
+        "Fidelity of the simulation": [str(one.provenance.settings.get("fidelity") or "") for one in scores],
+        "Time axis": [origin.time_rule],
+        "Layer": [one.layer_rule for one in scores],
+        "Interval": [level(one.interval) if one.interval else "" for one in scores],
         # The mean under permutation is one record's own.
-        "Significance": re.sub(r"; mean score under permutation [−\-.\d]+", "", score.p_method),
-        "Noise ceiling": score.ceiling.method if score.ceiling else "",
+        "Significance": [re.sub(r"; mean score under permutation [−\-.\d]+", "", one.p_method) for one in scores],
+        "Noise ceiling": [one.ceiling.method if one.ceiling else "" for one in scores],
     }
-    text += "".join(f" {label}: {value}." for label, value in stated.items() if value)
+    # Records of one board may differ in these, such as a model with one layer beside others.
+    told = {label: " / ".join(dict.fromkeys(filter(None, values))) for label, values in stated.items()}
+    text += "".join(f" {label}: {value}." for label, value in told.items() if value)
     if len(names) < len(records):
         text += (
             " Networks that differ in the seed of their weights are one model: its score is the mean over seeds, the "

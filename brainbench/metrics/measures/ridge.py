@@ -40,10 +40,6 @@ class RidgeEncoding(PatternMetric):
     title = "share of explainable variance that ridge regression predicts for stimuli left out"
     orders_between = 39
 
-    def compare(self, model: Floats, brain: SubjectRDM) -> float:
-        """Return the share of variance that features [K, F] predict, raw."""
-        return float(self.compare_orders(model, [brain], np.arange(len(model))[None])[0, 0])
-
     def correction(self, animal: SubjectRDM, estimator: str) -> Corrected:
         """Return the ratio of all variance to that without noise."""
         share = _explainable(animal)

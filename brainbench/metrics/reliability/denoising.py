@@ -43,6 +43,10 @@ def denoised(patterns: Floats, noise: Floats) -> Floats:
 
 def simulated_animals(animal: SubjectRDM, seed: int) -> tuple[Floats, list[SubjectRDM]]:
     """Return an animal's responses without noise [K, U], and copies of the animal with new noise on them."""
+    # Sorted by their responses, units draw the same noise in whatever order they were listed; rounding makes no order.
+    scale = np.abs(animal.patterns).max(initial=0.0) or 1.0
+    units = np.lexsort(np.round(np.concatenate([animal.noise / scale**2, animal.patterns / scale]), 9))
+    animal = replace(animal, patterns=animal.patterns[:, units], noise=animal.noise[:, units])
     truth = denoised(animal.patterns, animal.noise)
     generator = np.random.default_rng(seed)
     spread = np.sqrt(np.maximum(animal.noise, 0.0))

@@ -17,7 +17,8 @@ def _records(make_record):
     zhuang = "Zhuang, Kubilius, Hartmann & Yamins 2017, Toward goal-driven"
     first = make_record("net.simclr", 0.7, metric="RSA: correlation RDM, pearson comparison")
     first = replace(first, card=replace(first.card, citation=zhuang, objective="simclr"))
-    return [first, make_record("other | one", 0.3, metric="RSA: correlation RDM, pearson comparison")]
+    other = make_record("other | one", 0.3, metric="RSA: correlation RDM, pearson comparison", layer_rule="only layer")
+    return [first, other]
 
 
 def test_markdown_holds_methods_tables_figures_and_references(make_record, tmp_path):
@@ -25,6 +26,7 @@ def test_markdown_holds_methods_tables_figures_and_references(make_record, tmp_p
     text = main.read_text()
     assert text.startswith("# A \\*report\\*\n")
     assert "2 models (2 records) were compared with demo (2 animals, 6 stimuli)" in text
+    assert "Layer: chosen on the other animals / only layer. Interval: 95 % interval" in text
     assert "| net.simclr | 0.700 | \\[0.600, 0.800\\]" in text
     assert "| other \\| one | 0.300 |" in text
     assert "ranks need at least 4 animals (here 1)" in text  # of two, one is reliable

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -143,6 +145,16 @@ def test_folds_of_ridge_do_not_depend_on_the_order_of_stimuli():
     assert (second.value, second.p) == (pytest.approx(first.value, abs=1e-9), first.p)
     assert second.attainable == pytest.approx(first.attainable, abs=1e-9)
     np.testing.assert_allclose(second.without_stimulus, np.array(first.without_stimulus)[order], atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["cka", "procrustes", "ridge", "rsa-partial"])
+def test_what_is_attainable_does_not_depend_on_the_order_of_units(name):
+    names, features, blocks = _make(8)
+    rng = np.random.default_rng(6)
+    units = (rng.permutation(block.responses.shape[1]) for block in blocks)
+    moved = [replace(block, responses=block.responses[:, order]) for block, order in zip(blocks, units, strict=True)]
+    first, second = (_score(get_metric(name), names, each, {"a": features}) for each in (blocks, moved))
+    assert second.attainable == pytest.approx(first.attainable, abs=1e-12)
 
 
 @pytest.mark.parametrize("name", METRICS)

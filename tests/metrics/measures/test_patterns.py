@@ -122,7 +122,8 @@ def test_ridge_is_nested_cross_validation_done_by_hand(count):
         base += ((animal.patterns[test] - animal.patterns[train].mean(axis=0)) ** 2).sum()
     noise = animal.noise.sum()
     factor = RidgeEncoding().correction(animal, "default").value
-    assert RidgeEncoding().compare(x, animal) * factor == pytest.approx(1 - (error - noise) / (base - noise), rel=1e-8)
+    found = RidgeEncoding().compare_orders(x, [animal], np.arange(count)[None])[0, 0]
+    assert found * factor == pytest.approx(1 - (error - noise) / (base - noise), rel=1e-8)
     total = animal.patterns.var(axis=0).sum() * count
     assert factor == pytest.approx(total / (total - noise * (count - 1) / count), rel=1e-8)
 
@@ -145,7 +146,7 @@ def test_a_perfect_encoder_of_noisy_trials_is_worth_one_and_raw_variance_is_not(
     for _ in range(8):
         responses = (latent @ rng.normal(size=(2, 30)))[labels] + 2.5 * rng.normal(size=(120, 30))
         animal = subject_rdm("a", [Trials(responses, labels)], 20)
-        raw.append(metric.compare(latent, animal))
+        raw.append(metric.compare_orders(latent, [animal], np.arange(20)[None])[0, 0])
         values.append(raw[-1] * metric.correction(animal, "default").value)
     assert np.mean(values) == pytest.approx(1, abs=0.15)
     assert np.mean(raw) < 0.75
