@@ -144,18 +144,26 @@ class NeuralResponses:
         arrays, _ = read_arrays(Path(self.dataset.attrs["source"]))
         return {name: array[:, slots] for name, array in arrays.items()}
 
-    def animals(self, kept: tuple[str, ...], metric: Metric, options: ScoreOptions) -> tuple[Any, ...]:
-        """Prepare every animal by a metric over the labels ``kept``, in that order."""
+    def reliable_trials(
+        self, kept: tuple[str, ...], options: ScoreOptions, *, averaged: bool = False
+    ) -> dict[str, tuple[tuple[Trials, ...], str]]:
+        """Return each animal's :meth:`trials` with its reliable units, and what was left out in words.
+
+        Units are chosen over the whole window, before their bins become features.
+        """
         from brainbench.metrics.reliability.units import reliable_units
 
-        animals, how = [], {"least": options.units_reliability, "seed": options.seed}
-        whole = self.trials(kept, averaged=True)
-        given = whole if options.time == "mean" else self.trials(kept)
+        given, how = self.trials(kept, averaged=averaged), {"least": options.units_reliability, "seed": options.seed}
+        # Without a gate no unit is judged.
+        whole = given if averaged or options.units_reliability is None else self.trials(kept, averaged=True)
+        return {name: reliable_units(own, len(kept), whole=whole[name], **how) for name, own in given.items()}
+
+    def animals(self, kept: tuple[str, ...], metric: Metric, options: ScoreOptions) -> tuple[Any, ...]:
+        """Prepare every animal by a metric over the labels ``kept``, in that order."""
+        animals = []
         longest = self.dataset["duration"].values.max(axis=0)
         share = np.where(longest > (1 - 1e-6) * longest.max(), 1.0, longest / longest.max())
-        for subject, sessions in given.items():
-            # Units are chosen over the whole window, before their bins become features.
-            chosen, note = reliable_units(sessions, len(kept), whole=whole[subject], **how)
+        for subject, (chosen, note) in self.reliable_trials(kept, options, averaged=options.time == "mean").items():
             trials = tuple(replace(item, responses=_flat(item.responses, share)) for item in chosen)
             animal = metric.animal(subject, trials, len(kept), stimuli=kept, seed=options.seed)
             bins = max((item.responses.shape[1] for item in chosen), default=1)

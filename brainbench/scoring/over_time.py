@@ -10,7 +10,6 @@ import numpy as np
 from brainbench.core.errors import DataError, UsageError, listing
 from brainbench.core.progress import Progress, stages
 from brainbench.metrics.measures.rsa import RSA
-from brainbench.metrics.reliability.units import reliable_units
 from brainbench.metrics.time import AnimalMovie, TimeCourse, animal_movie, layer_movie, score_over_time
 from brainbench.scoring.model_responses import ModelResponses
 from brainbench.scoring.neural_responses import NeuralResponses
@@ -58,13 +57,11 @@ def time_course(
         # The last bin may be shorter than the others, and a single trial longer than the others.
         window, whole = float(np.median(brain.dataset["duration"].values.sum(axis=1))), width * len(begins)
         seconds = whole if math.isclose(window, whole, rel_tol=1e-6) else window
-    sessions, whole = brain.trials(kept), brain.trials(kept, averaged=True)
+    sessions = brain.reliable_trials(kept, options)
     how: dict[str, Any] = {"method": metric.brain_method, "noise": metric.noise, "comparison": metric.comparison}
     stage_done = stages(len(sessions) + len(network.activations), "RDMs over time", progress)
     animals, layers = [], {}
-    for subject, blocks in sessions.items():
-        chosen = {"least": options.units_reliability, "seed": options.seed, "whole": whole[subject]}
-        blocks, note = reliable_units(blocks, len(kept), **chosen)
+    for subject, (blocks, note) in sessions.items():
         if blocks:
             animals.append(animal_movie(subject, blocks, len(kept), stimuli=kept, seed=options.seed, **how))
         else:

@@ -24,10 +24,9 @@ from brainbench.stimuli.engines.trust import (
     GOT_INSIDE,
     LARGEST_CHANGE,
     LARGEST_OVERLAP,
-    LARGEST_STRAIN,
+    SUSPICIOUS_FORCE,
     SUSPICIOUS_ROUGHNESS,
     SUSPICIOUS_SHARE,
-    SUSPICIOUS_STRAIN,
     changes_words,
     check_jobs,
     fault,
@@ -192,7 +191,7 @@ class SteppedJob:
             seconds=time.thread_time() - self.started,
             link_positions=np.where(good[:, None, None], shape, np.nan) if self.record_shape else None,
         )
-        strongest = SUSPICIOUS_STRAIN / LARGEST_STRAIN * strongest_force(self.job.whisker)
+        strongest = SUSPICIOUS_FORCE * strongest_force(self.job.whisker)
         strong = np.linalg.norm(forces, axis=1).max(initial=0.0) > strongest
         deep = penetration > SUSPICIOUS_SHARE * 2 * LARGEST_OVERLAP
         return trace, not reason and bool(strong or deep or roughness(forces) > SUSPICIOUS_ROUGHNESS)

@@ -40,9 +40,9 @@ error than any preset has, and keratin yields at some 2 %. Whiskers that brush p
 (benchmarks/RESULTS.md)."""
 SUSPICIOUS_SHARE = 0.4
 """Share of the largest overlap and residual from which a reliable whisker is suspicious."""
-SUSPICIOUS_STRAIN = 1.5e-4
-"""Stretch of the base from which the base force is suspicious; in right simulations whiskers that brush past objects
-stay below it."""
+SUSPICIOUS_FORCE = 1.5e-4 / LARGEST_STRAIN
+"""Share of the largest base force from which it is suspicious: a stretch of the base of 1.5e-4. In right simulations
+whiskers that brush past objects stay below it."""
 SUSPICIOUS_PEAK = 2.0
 """Largest over third largest base force of the readings from which it is suspicious: a thin tip that gets deeper than
 its radius into an edge in one step is thrown out along the whisker, with up to a thousand times the force."""
@@ -195,7 +195,7 @@ def judge(facts: RunFacts) -> Verdict:
     bad = unsolved | crowded
     until = np.where(bad, -np.inf, until)
     doubtful = (
-        (facts.peak > SUSPICIOUS_STRAIN / LARGEST_STRAIN * facts.strongest)
+        (facts.peak > SUSPICIOUS_FORCE * facts.strongest)
         | (facts.peak > SUSPICIOUS_PEAK * facts.third)
         | (facts.depth > SUSPICIOUS_SHARE * LARGEST_OVERLAP)
         | (facts.residual > SUSPICIOUS_SHARE * LARGEST_RESIDUAL)

@@ -138,7 +138,7 @@ class Trainer:
             self._check_weights(error)
             raise
         self._check_weights()
-        if self.sensing is not None and torch.cuda.is_available():
+        if self.sensing is not None:
             # Trajectories of a policy with memory have other sizes each time, so that PyTorch keeps ever more freed
             # blocks; Warp, which needs some for the next step, ran out of 80 GB after 69 iterations.
             torch.cuda.empty_cache()

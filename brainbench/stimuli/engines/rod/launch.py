@@ -206,7 +206,7 @@ class WhiskerSolver:
         wrench, missed = found["wrench"], table(residual(found["miss"], found["load"]))
         depth = table(found["depth"].astype(float)) / MILLI
         force = np.sqrt(np.einsum("...d,...d", wrench[..., :3], wrench[..., :3]))
-        strongest = table(self.strongest[jobs.whisker])
+        peak, strongest = force.max(axis=1), table(self.strongest[jobs.whisker])
         strength, strong_at = _first_beyond(strongest, force, readings)
         never = np.array([0.0, np.inf, np.inf, 0.0])
         travel, farthest, fast_at, struck = np.multiply.outer(never, np.ones(size)) if fast is None else fast
@@ -225,8 +225,8 @@ class WhiskerSolver:
             crowded=counts["crowded"],
             steps=counts["steps"],
             depth=depth,
-            peak=force.max(axis=1),
-            third=np.partition(force, -3, axis=1)[:, -3] if len(readings) >= FEWEST_READINGS else force.max(axis=1),
+            peak=peak,
+            third=np.partition(force, -3, axis=1)[:, -3] if len(readings) >= FEWEST_READINGS else peak,
         )
         result = LaunchResult(wrench, found["contact"], counts, depth, missed, judge(facts), np.zeros(size, dtype=bool))
         result.seconds = dict(zip(("upload", "kernel", "download"), np.diff(clock).tolist(), strict=True))
