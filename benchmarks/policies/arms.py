@@ -25,6 +25,7 @@ ARMS: dict[str, dict[str, Any]] = {
     "ead_untrained": {"observe": "force_torque", "placement": "hand", "encoder": NETWORK},
     "reservoir": {"observe": "force_torque", "placement": "hand", "encoder": "reservoir"},
     "reservoir_50": {"observe": "force_torque", "placement": "hand", "encoder": "reservoir", "resolution": CHOSEN},
+    "reservoir_graph": {"observe": "force_torque", "placement": "hand", "encoder": "reservoir_graph"},
     "raw_rnn": {"observe": "force_torque", "placement": "hand", "encoder": "rnn"},
     # As many parameters as ft_hand; and those that have as many as raw_rnn.
     "raw_rnn_small": {

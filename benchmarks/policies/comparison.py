@@ -43,7 +43,7 @@ CONTRASTS = (
     ("ead_finetuned", "ead_scratch"), ("ead_finetuned", "ead_simclr"), ("ead_finetuned", "reservoir_large"),
     ("ft_hand_large", "ead_finetuned"), ("raw_rnn", "ead_finetuned"),
     ("raw_rnn_small", "ft_hand"), ("raw_rnn", "ft_hand_large"), ("raw_rnn", "reservoir_large"),
-    ("ft_hand_large", "ft_hand"), ("reservoir_large", "reservoir"),
+    ("ft_hand_large", "ft_hand"), ("reservoir_large", "reservoir"), ("reservoir_graph", "reservoir"),
 )  # fmt: skip
 """Arms whose differences are tested."""
 JUDGED: dict[str, tuple[str, ...]] = {

@@ -27,6 +27,7 @@ from robotics_bridge.policies.encoders.calibration import HandCalibration
 from robotics_bridge.policies.encoders.conv_gru import MOST_CELLS, ConvGRUProducts
 from robotics_bridge.policies.encoders.front_end import LEARNING, FrontEnd, Learning
 from robotics_bridge.policies.encoders.reservoir import UNITS, EchoState, FeatureNorm
+from robotics_bridge.policies.encoders.taxel_graph import TaxelGraph
 from robotics_bridge.policies.encoders.taxel_grid import TaxelGrid
 from robotics_bridge.policies.encoders.timing import TIMES, Time
 
@@ -120,6 +121,10 @@ class EncoderConfig:
     def grid(self) -> TaxelGrid:
         """Return the map from these readings to the grid of the hand."""
         return TaxelGrid(self.hand, placement=self.placement, resolution=self.resolution, observe=self.observe)
+
+    def graph(self) -> TaxelGraph:
+        """Return the map from these readings to the patterns of the graph of taxels."""
+        return TaxelGraph(hands.load(self.hand).layout(self.resolution, self.placement), self.observe)
 
     def build(self) -> TactileEncoder:
         """Return the encoder with new weights (the global random state), or a network's own.
@@ -397,10 +402,10 @@ class _Reservoir(TactileEncoder):
 
     state_size = UNITS
 
-    def __init__(self, config: EncoderConfig) -> None:
+    def __init__(self, config: EncoderConfig, *, graph: bool = False) -> None:
         super().__init__(config)
-        self.grid, self.scale = config.grid(), RunningScale(6)
-        self.echo = EchoState(6 * config.slots * GRID_SHAPE[0] * GRID_SHAPE[1], seed=config.seed)
+        self.grid, self.scale = config.graph() if graph else config.grid(), RunningScale(6)
+        self.echo = EchoState(6 * config.slots * self.grid.cells, seed=config.seed)
         self.norm, self.project = FeatureNorm(UNITS), nn.Linear(UNITS, self.features)
 
     def observe_scale(self, taxels: torch.Tensor) -> None:
@@ -420,6 +425,7 @@ ARMS: Mapping[str, Callable[[EncoderConfig], TactileEncoder]] = {
     "tactile_canvas_cnn": partial(_Convolution, canvas=True),
     "tactile_canvas_convrnn": partial(_ConvRecurrent, canvas=True),
     "reservoir": _Reservoir,
+    "reservoir_graph": partial(_Reservoir, graph=True),
 }
 """Encoders that are learned with the policy, by their published names (``canvas``: on the 5 × 7 grid of the hand), and
-``reservoir``, a random one to hold the others against."""
+``reservoir``, a random one to hold the others against; ``reservoir_graph`` reads the graph of taxels for the grid."""

@@ -52,6 +52,7 @@ class TaxelGrid(nn.Module):
 
     matrix: torch.Tensor
     """[SITES·6, N·C]."""
+    cells: int = SITES
 
     def __init__(
         self,

@@ -18,6 +18,7 @@ from robotics_bridge.policies.encoders.calibration import HandCalibration
 from robotics_bridge.policies.encoders.front_end import FrontEnd
 from robotics_bridge.policies.encoders.posture import PostureTurn
 from robotics_bridge.policies.encoders.reservoir import EchoState
+from robotics_bridge.policies.encoders.taxel_graph import TaxelGraph
 from robotics_bridge.policies.encoders.taxel_grid import TaxelGrid
 from robotics_bridge.policies.encoders.timing import Time
 from robotics_bridge.policies.readouts.rollout import TouchRollout
@@ -82,11 +83,13 @@ def network(
     return torch.stack(found)
 
 
-def reservoir(rollout: TouchRollout, grid: TaxelGrid, calibration: HandCalibration, *, seed: int) -> Features:
-    """Return the state of a random recurrent network on the grid (echo state: leak .5, spectral radius .9)."""
-    slots = rollout.taxels.shape[2]
-    unit = [calibration.force if name.startswith("F") else calibration.moment for name in CHANNELS] * slots
-    felt = (grid(rollout.taxels.flatten(0, 1)).cpu() / torch.tensor(unit).view(-1, 1, 1)).flatten(1)
+def reservoir(
+    rollout: TouchRollout, grid: TaxelGrid | TaxelGraph, calibration: HandCalibration, *, seed: int
+) -> Features:
+    """Return the state of a random recurrent network on a map (echo state: leak .5, spectral radius .9)."""
+    unit = [calibration.force if name.startswith("F") else calibration.moment for name in CHANNELS]
+    # The places last, as the units of a seed were drawn for.
+    felt = (grid.wrenches(rollout.taxels.flatten(0, 1)).cpu() / torch.tensor(unit)).flatten(2, -2).mT.flatten(1)
     echo = EchoState(felt.shape[1], seed=seed)
     drive = echo.drive(felt).unflatten(0, rollout.taxels.shape[:2])
     state, found = drive.new_zeros(drive.shape[1:]), []
@@ -102,6 +105,7 @@ class Subject:
 
     rollout: TouchRollout
     grid: TaxelGrid
+    graph: TaxelGraph
     calibration: HandCalibration
     """Of other episodes (:func:`~robotics_bridge.policies.readouts.rollout.calibrate`)."""
     links: tuple[int, ...]
@@ -119,10 +123,10 @@ def networks(time: Time, name: str, one: Subject, seeds: Sequence[int] = (0,)) -
     return [network(one.rollout, one.grid, one.calibration, model=name, time=time, seed=seed) for seed in seeds]
 
 
-def grid(one: Subject) -> Features:
-    """Return the networks' input [T, B, 6·35], averaged over the sub-steps."""
-    felt = one.grid(one.rollout.taxels.mean(2, keepdim=True).flatten(0, 1))
-    return felt.flatten(1).unflatten(0, one.rollout.taxels.shape[:2])
+def mapped(rollout: TouchRollout, grid: TaxelGrid | TaxelGraph) -> Features:
+    """Return a map of the touch [T, B, 6·35], averaged over the sub-steps."""
+    felt = grid.wrenches(rollout.taxels.mean(2, keepdim=True).flatten(0, 1))
+    return felt.flatten(1).unflatten(0, rollout.taxels.shape[:2])
 
 
 def bent(one: Subject) -> Subject:
@@ -132,9 +136,9 @@ def bent(one: Subject) -> Subject:
     return replace(one, rollout=replace(rollout, taxels=torch.stack([turn(*step) for step in steps])))
 
 
-def _reservoirs(one: Subject) -> list[Features]:
+def _reservoirs(one: Subject, grid: TaxelGrid | TaxelGraph) -> list[Features]:
     seeds = range(one.seed, one.seed + one.reservoirs)
-    return [reservoir(one.rollout, one.grid, one.calibration, seed=seed) for seed in seeds]
+    return [reservoir(one.rollout, grid, one.calibration, seed=seed) for seed in seeds]
 
 
 def _with_traces(features: Callable[[Subject], Features]) -> Callable[[Subject], list[Features]]:
@@ -150,10 +154,12 @@ ARMS: Mapping[str, Callable[[Subject], list[Features]]] = {
     "force, memory": _with_traces(lambda one: force(one.rollout)),
     "taxels": lambda one: [raw(one.rollout)],
     "taxels, memory": _with_traces(lambda one: raw(one.rollout)),
-    "grid, memory": _with_traces(grid),
-    "grid, posture, memory": _with_traces(lambda one: grid(bent(one))),
-    "reservoir": _reservoirs,
-    "reservoir, posture": lambda one: _reservoirs(bent(one)),
+    "grid, memory": _with_traces(lambda one: mapped(one.rollout, one.grid)),
+    "grid, posture, memory": _with_traces(lambda one: mapped(bent(one).rollout, one.grid)),
+    "graph, memory": _with_traces(lambda one: mapped(one.rollout, one.graph)),
+    "reservoir": lambda one: _reservoirs(one, one.grid),
+    "reservoir, posture": lambda one: _reservoirs(bent(one), one.grid),
+    "reservoir, graph": lambda one: _reservoirs(one, one.graph),
     "untrained": lambda one: networks("native", NETWORK, one, range(one.untrained)),
     "simclr": lambda one: networks("native", f"{NETWORK}.simclr", one),
     "simclr, posture": lambda one: networks("native", f"{NETWORK}.simclr", bent(one)),
@@ -164,5 +170,6 @@ ARMS: Mapping[str, Callable[[Subject], list[Features]]] = {
 }
 """Arm → its features, once for each draw; every arm has the joints beside them. ``none`` feels nothing, ``bits`` has
 one bit per link, ``force`` and ``taxels`` every taxel's force, and force with torque; ``memory`` adds two leaky
-averages. ``grid`` is the input of the networks, with ``posture`` along the fingers as they are
-bent. ``45 ms``: at the pace of training, else a step per control step."""
+averages. ``grid`` is the input of the networks, with ``posture`` along the fingers as they are bent; ``graph`` has as
+many numbers, from the graph of taxels of each link. ``45 ms``: at the pace of training, else a step per control step.
+"""

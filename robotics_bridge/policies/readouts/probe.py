@@ -17,6 +17,7 @@ from brainbench.core.progress import Progress
 from robotics_bridge.envs.env import Env
 from robotics_bridge.hands.layouts import PLACEMENTS, Layout
 from robotics_bridge.policies.encoders.front_end import FrontEnd
+from robotics_bridge.policies.encoders.taxel_graph import TaxelGraph
 from robotics_bridge.policies.encoders.taxel_grid import TaxelGrid
 from robotics_bridge.policies.evaluate import Acting
 from robotics_bridge.policies.readouts.arms import ARMS, Features, Subject, networks
@@ -108,12 +109,13 @@ def probe(env: Env, policy: Acting, options: ProbeOptions, progress: Progress | 
     calibration = calibrate(env, policy, grid, options.seed)
     rollout = roll_out(env, policy, options)
     links = tuple(int(probes.active.sum()) for probes in layout.values())
-    subject = Subject(rollout, grid, calibration, links, options.reservoirs, options.untrained, options.seed)
+    draws = (options.reservoirs, options.untrained, options.seed)
+    subject = Subject(rollout, grid, TaxelGraph(layout), calibration, links, *draws)
     found = []
     for index, name in enumerate(names):
         say(index + 1, len(names) + 1, f"reading {name}")
-        draws = ARMS[name](subject) if name in ARMS else networks("native", name, subject)
-        found.append(read_arm(name, rollout, draws))
+        features = ARMS[name](subject) if name in ARMS else networks("native", name, subject)
+        found.append(read_arm(name, rollout, features))
     return found
 
 
@@ -158,6 +160,7 @@ CONTRASTS = (
     ("simclr, 45 ms", "untrained, 45 ms"), ("supervised, 45 ms", "untrained, 45 ms"), ("reservoir", "none, memory"),
     ("simclr", "taxels, memory"), ("simclr", "bits, memory"), ("grid, posture, memory", "grid, memory"),
     ("reservoir, posture", "reservoir"), ("simclr, posture", "simclr"),
+    ("graph, memory", "grid, memory"), ("reservoir, graph", "reservoir"),
 )  # fmt: skip
 """Arms that are compared."""
 

@@ -144,7 +144,7 @@ class DistillConfig:
     def draw(self) -> str | None:
         """What was drawn for the encoder: weights, or a seed; None for encoders that are learned with the policy."""
         tactile = self.tactile
-        if tactile is None or (tactile.arm in ARMS and tactile.arm != "reservoir"):
+        if tactile is None or (tactile.arm in ARMS and not tactile.arm.startswith("reservoir")):
             return None
         tagged = tactile.arm if ":" in tactile.arm or Architecture.parse(tactile.arm).tag else None
         return tactile.pretrained or tagged or f"seed {tactile.seed}"

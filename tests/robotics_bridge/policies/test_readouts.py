@@ -110,7 +110,7 @@ def test_a_rollout_in_a_task_is_read_from_every_arm_of_a_probe() -> None:
     env = tasks.make(
         "in_palm_rotate", num_envs=10, observe="force_torque", placement="tips", resolution="low", threads=1
     )
-    names = ("none", "bits", "taxels, memory", "reservoir", "simclr")
+    names = ("none", "bits", "graph, memory", "reservoir", "simclr")
     own = f"local-dir:{shipped()[f'{arms.NETWORK}.simclr']}"
     options = ProbeOptions(seconds=1.0, arms=names, reservoirs=2, networks=("s4-small", own))
     read = probe(env, agent("random", env), options)

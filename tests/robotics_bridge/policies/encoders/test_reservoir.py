@@ -36,10 +36,12 @@ def test_constant_energy_is_taken_away_and_small_features_count_as_much_as_large
     assert float(norm.count) == 4000
 
 
-def test_the_arm_steps_remembers_and_takes_its_draw_from_the_student() -> None:
-    config = DistillConfig(task="in_palm_rotate", encoder="reservoir", placement="tips", resolution="low", seed=4)
+@pytest.mark.parametrize("name", ["reservoir", "reservoir_graph"])
+def test_the_arm_steps_remembers_and_takes_its_draw_from_the_student(name: str) -> None:
+    config = DistillConfig(task="in_palm_rotate", encoder=name, placement="tips", resolution="low", seed=4)
     assert config.tactile is not None
     assert config.tactile.seed == 4
+    assert config.draw == "seed 4"
     with torch.random.fork_rng():
         torch.manual_seed(0)
         arm = config.tactile.build()
