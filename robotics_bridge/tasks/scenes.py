@@ -154,7 +154,7 @@ def _hand_spec(task: Task, hand: Hand) -> tuple[Any, dict[str, tuple[float, floa
     option.tolerance, option.integrator = solver.tolerance, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     body = place_palm(hand, spec, *(task.hand_poses.get(hand.name) or palm_up(hand)))
     scale = task.contacts.drive_scale
-    drives = {name: (scale * k, scale * d, scale * most) for name, (k, d, most) in _drives(hand).items()}
+    drives = {name: (scale * k, scale * d, scale * most) for name, (k, d, most) in drives_of(hand).items()}
     while spec.actuators:
         spec.delete(spec.actuators[0])
     for joint in spec.joints:
@@ -189,8 +189,11 @@ def _hand_spec(task: Task, hand: Hand) -> tuple[Any, dict[str, tuple[float, floa
     return spec, drives
 
 
-def _drives(hand: Hand) -> dict[str, tuple[float, float, float]]:
-    """Return joint → stiffness, damping and effort: those of its position servo, or a weak drive of ours."""
+def drives_of(hand: Hand) -> dict[str, tuple[float, float, float]]:
+    """Return joint → stiffness, damping and effort: those of its position servo, or a weak drive of ours.
+
+    A joint that mimics another is not driven.
+    """
     model = hand.model
     servos: dict[int, int] = {}
     for index in range(model.nu):
