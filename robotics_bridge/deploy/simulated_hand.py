@@ -32,6 +32,7 @@ from robotics_bridge.policies.contract import PolicyContract
 from robotics_bridge.sensors import SensorSuite
 from robotics_bridge.tasks.contact_model import CONTACTS, ContactModel, set_contacts
 from robotics_bridge.tasks.overrides import set_field
+from robotics_bridge.tasks.scenes import drives_of
 
 HOLD_AFTER = 0.25
 """Seconds without a command after which the hand holds by itself."""
@@ -113,7 +114,14 @@ class SimulatedHand:
         self.hand, self.rate, self._substeps = hands.load(hand), rate, contacts.substeps
         body = holding(self.hand, timestep=1 / rate / contacts.substeps)
         set_contacts(body, contacts)
-        # Drives as in the tasks: stiffness, damping, effort and armature together.
+        # Drives as in the tasks: stiffness, damping, effort and armature together. A file may name its servos as it
+        # likes, and leave joints without one.
+        servos = {body.joint(int(joint)).name: servo for servo, joint in enumerate(body.actuator_trnid[:, 0])}
+        drives = drives_of(self.hand)
+        for name, servo in servos.items():
+            stiffness, damping, effort = drives.get(name, (0.0, 0.0, 0.0))
+            body.actuator_gainprm[servo, 0], body.actuator_biasprm[servo, 1:3] = stiffness, (-stiffness, -damping)
+            body.actuator_forcelimited[servo], body.actuator_forcerange[servo] = 1, (-effort, effort)
         for numbers in (body.actuator_gainprm, body.actuator_biasprm, body.actuator_forcerange, body.dof_armature):
             numbers *= contacts.drive_scale
         self.engine = MujocoEngine(body, 1, threads=1)
@@ -127,11 +135,7 @@ class SimulatedHand:
         model = self.engine.model
         self._positions = [int(model.joint(name).qposadr[0]) for name in self.joints]
         self._speeds = [int(model.joint(name).dofadr[0]) for name in self.joints]
-        # A file may name its servos as it likes, and leave joints without one.
-        servos = {int(joint): servo for servo, joint in enumerate(model.actuator_trnid[:, 0])}
-        driven = [(row, servos[model.joint(name).id]) for row, name in enumerate(self.joints)
-                  if model.joint(name).id in servos]  # fmt: skip
-        self._driven, self._drives = (list(part) for part in zip(*driven, strict=True))
+        self._driven, self._drives = [self.joints.index(name) for name in servos], [*servos.values()]
         self._rows = [self.hand.tips.index(link) for link in self.layout if link in self.hand.tips]
         # The first step and reading load what later ones use; real time begins after them.
         self.step()
@@ -199,11 +203,15 @@ class ShadowTouch:
         self.sub_steps: int = more["sub_steps"]
         senses = {name: more[name] for name in ("placement", "resolution", "twist", "contacts")}
         self.hand = SimulatedHand(contract.hand, contract.rate * self.sub_steps, observe=contract.observe, **senses)
-        self._order = [joints.index(name) for name in self.hand.joints]
+        # A hand need not report a joint that mimics another; the coupling moves it here too.
+        reported = [(own, joints.index(name)) for own, name in enumerate(self.hand.joints) if name in joints]
+        self._own, self._reported = (list(part) for part in zip(*reported, strict=True))
 
     def __call__(self, reading: HandReading) -> NDArray[np.float32]:
         """Advance by one control step towards the reported joints and return what is felt on the way."""
-        self.hand.drive(reading.position[self._order])
+        targets = self.hand.position
+        targets[self._own] = reading.position[self._reported]
+        self.hand.drive(targets)
         felt = []
         for _ in range(self.sub_steps):
             self.hand.step()

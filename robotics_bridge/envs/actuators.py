@@ -51,7 +51,7 @@ class Actuators:
         self.power = zeros()
         """[B, J] mean |torque · speed| over the last control step (W)."""
         self._noise_state = torch.zeros(2, dtype=torch.int32, device=device)
-        """[2] launches so far, and the seed of the torque noise."""
+        """[2] launches so far, and where the torque noise of the seed begins."""
         self.seed(seed)
         self._noise = self.nominal["effort"] * (task.actuators.torque_noise if task.actuators else 0.0)
         wp = warp()
@@ -92,7 +92,9 @@ class Actuators:
     def seed(self, seed: int) -> None:
         """Begin the torque noise anew."""
         self._noise_state[0].fill_(0)
-        self._noise_state[1].fill_(seed & 0x3FFFFFFF)
+        # The kernel adds the launch to it. An odd multiplier, 2³² over the golden ratio, keeps streams of neighbouring
+        # seeds apart, which would be the same ones a launch later.
+        self._noise_state[1].fill_(seed * 0x9E3779B1 & 0x3FFFFFFF)
 
     def launch(self, substep: int) -> None:
         """Write the torques of one physics step to the simulation's ``ctrl``."""

@@ -95,7 +95,9 @@ def compile_variants(spec: Any, geometry: str, shapes: Sequence[Geometry], *, de
             raise unknown_name("geometry", geometry, [g.name for g in copy.geoms if g.name])
         target.type = getattr(mujoco.mjtGeom, f"mjGEOM_{shape.kind.upper()}")
         target.size = [*shape.size, 0.0, 0.0, 0.0][:3]
-        target.density = density
+        # A mass or an inertia that the spec states would come before the density.
+        target.density, target.mass = density, np.nan
+        target.parent.explicitinertial, target.parent.ipos = False, [np.nan] * 3
         if shape.mesh is not None:
             target.meshname = f"variant{number}"
         models.append(copy.compile())

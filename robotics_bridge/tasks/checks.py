@@ -11,12 +11,12 @@ from brainbench.core.errors import UsageError, check_each, shown
 from brainbench.core.reading.ranges import check_number, check_numbers
 
 
-def check_range(name: str, value: Any, *, least: float = -math.inf) -> None:
-    """Raise UsageError unless a value is a range (low, high) of finite numbers in order, none below ``least``."""
+def check_range(name: str, value: Any, **bounds: Any) -> None:
+    """Raise UsageError unless a value is a range (low, high) of numbers in order that :func:`check_number` takes."""
     fits = isinstance(value, Sequence) and not isinstance(value, str) and len(value) == 2
     if fits:
         for end in value:
-            check_number(f"An end of {name}", end, least=least)
+            check_number(f"An end of {name}", end, **bounds)
     if not fits or value[0] > value[1]:
         raise UsageError(f"{name} is a range (low, high); received {shown(value)}.")
 

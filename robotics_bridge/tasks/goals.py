@@ -52,13 +52,14 @@ class Goal(abc.ABC):
     """Factor by which it narrows."""
 
     def __post_init__(self) -> None:
-        check_number("The threshold of a goal (rad)", self.threshold, above=0)
+        # No two orientations are further apart than π: every one would count as reached.
+        check_number("The threshold of a goal (rad)", self.threshold, above=0, below=math.pi)
         check_fields(self, "limit", least=1, whole=True, of="{} of a goal")
         if self.deadline is not None:
             check_range("deadline of a goal (s)", self.deadline, least=0)
         if self.axis is not None:
             object.__setattr__(self, "axis", unit_vector("axis of a goal", self.axis, 3))
-        check_fields(self, "start_threshold", of="{} of a goal")
+        check_fields(self, "start_threshold", below=math.pi, of="{} of a goal (rad)")
         if self.start_threshold is not None and not self.threshold <= self.start_threshold:
             raise UsageError(
                 f"Learning begins with a wider threshold than {self.threshold:g} rad; received start_threshold = "
@@ -92,7 +93,7 @@ class SteppingRotation(Goal):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_fields(self, "step", of="{} of a goal (rad)")
+        check_fields(self, "step", least=-2 * math.pi, most=2 * math.pi, of="{} of a goal (rad)")
         check_fields(self, "allowed_off_axis", least=0, of="{} of a goal (rad)")
 
     def first(self, quat: torch.Tensor, draw: torch.Tensor) -> torch.Tensor:
@@ -120,7 +121,7 @@ class TimedRotation(Goal):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_range("tilt of a goal (rad)", self.tilt)
+        check_range("tilt of a goal (rad)", self.tilt, least=-math.pi, most=math.pi)
 
     def following(self, quat: torch.Tensor, goal: torch.Tensor, draw: torch.Tensor) -> torch.Tensor:
         """Return tilted orientations of the object."""

@@ -74,7 +74,7 @@ def load(name: str, config: str = "default") -> Task:
     if name in _OWN:
         import_module(f"robotics_bridge.tasks.{name}")
     if name not in _MADE:
-        hint = "A task of your own: import its file first (policy play, train, evaluate and probe: --task-file FILE)."
+        hint = "A task of your own: import its file first (brainbench policy: --task-file FILE)."
         raise unknown_name("task", name, list_tasks(), hint=hint)
     check_name(f"configuration of task {name}", config, _MADE[name])
     return _MADE[name][config]()

@@ -154,7 +154,7 @@ def _hand_spec(task: Task, hand: Hand) -> tuple[Any, dict[str, tuple[float, floa
     option.tolerance, option.integrator = solver.tolerance, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     body = place_palm(hand, spec, *(task.hand_poses.get(hand.name) or palm_up(hand)))
     scale = task.contacts.drive_scale
-    drives = {name: (scale * k, scale * d, scale * most) for name, (k, d, most) in _drives(hand).items()}
+    drives = {name: (scale * k, scale * d, scale * most) for name, (k, d, most) in drives_of(hand).items()}
     while spec.actuators:
         spec.delete(spec.actuators[0])
     for joint in spec.joints:
@@ -189,8 +189,11 @@ def _hand_spec(task: Task, hand: Hand) -> tuple[Any, dict[str, tuple[float, floa
     return spec, drives
 
 
-def _drives(hand: Hand) -> dict[str, tuple[float, float, float]]:
-    """Return joint → stiffness, damping and effort: those of its position servo, or a weak drive of ours."""
+def drives_of(hand: Hand) -> dict[str, tuple[float, float, float]]:
+    """Return joint → stiffness, damping and effort: those of its position servo, or a weak drive of ours.
+
+    A joint that mimics another is not driven.
+    """
     model = hand.model
     servos: dict[int, int] = {}
     for index in range(model.nu):
@@ -207,16 +210,19 @@ def _drives(hand: Hand) -> dict[str, tuple[float, float, float]]:
     for joint in order:
         slides = model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE
         (stiffness, damping), effort = (WEAK_PUSH, _EFFORT / LEVER) if slides else (WEAK_SERVO, _EFFORT)
-        if model.jnt_actfrclimited[joint]:
-            effort = float(model.jnt_actfrcrange[joint, 1])
         if joint in servos:
             index = servos[joint]
             # Behind a gear, the servo's length and force are those of the motor.
             gear = abs(float(model.actuator_gear[index, 0]))
             stiffness = float(-model.actuator_biasprm[index, 1]) * gear**2
             damping = float(-model.actuator_biasprm[index, 2]) * gear**2
+            # Without a limit, what the largest error of a target calls for; noise is stated in units of it.
+            span = float(np.ptp(model.jnt_range[joint])) if model.jnt_limited[joint] else 2 * np.pi
             limited = bool(model.actuator_forcelimited[index])
-            effort = float(model.actuator_forcerange[index, 1]) * gear if limited else 10 * stiffness
+            effort = float(model.actuator_forcerange[index, 1]) * gear if limited else stiffness * span
+        if model.jnt_actfrclimited[joint]:
+            stated = float(model.jnt_actfrcrange[joint, 1])
+            effort = min(effort, stated) if joint in servos else stated
         found[model.joint(joint).name] = (stiffness, damping, effort)
     return found
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 from brainbench.core.errors import UsageError, check_name
 from brainbench.core.reading.ranges import check_fields, check_number
+from robotics_bridge.tasks.checks import check_range
 
 SCHEDULES = ("adaptive", "fixed")
 BOUNDED = "robotics_bridge.policies.training.bounded_ppo:BoundedPPO"
@@ -82,6 +82,8 @@ class TeacherSettings:
 
     def __post_init__(self) -> None:
         check_name("schedule of the learning rate", self.schedule, SCHEDULES)
+        for name in ("learning_rate_range", "std_range"):
+            check_range(name, getattr(self, name), above=0)
         low, high = self.learning_rate_range
         if not _WIDEST[0] <= low <= self.learning_rate <= high <= _WIDEST[1]:
             raise UsageError(
@@ -94,8 +96,6 @@ class TeacherSettings:
         check_fields(self, "discount", "gae_lambda", least=0, most=1)
         check_fields(self, "clip", "desired_kl", "max_grad_norm", "initial_std", above=0)
         check_fields(self, "entropy", "value_loss", "rnd_weight", "rnd_learning_rate", least=0)
-        if not 0 < self.std_range[0] <= self.std_range[1] < math.inf:
-            raise UsageError(f"std_range is a range of positive numbers; received {self.std_range!r}.")
 
     def config(self, groups: dict[str, tuple[str, ...]], actor: dict[str, Any] | None = None) -> dict[str, Any]:
         """Return the configuration of rsl_rl 5 (``PPO.construct_algorithm``), given observation set → groups.

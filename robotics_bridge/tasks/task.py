@@ -72,7 +72,7 @@ class ActuatorRandomisation:
     def __post_init__(self) -> None:
         for name in ("stiffness", "damping", "strength", "deadband", "backlash", "kick_ratio"):
             check_range(f"actuators.{name}", getattr(self, name), least=0)
-        check_range("actuators.position_bias", self.position_bias)
+        check_range("actuators.position_bias (rad)", self.position_bias, least=-math.pi / 2, most=math.pi / 2)
         check_fields(self, "kick", of="actuators.{}")
         check_fields(self, "torque_noise", least=0, of="actuators.{}")
 
@@ -134,8 +134,9 @@ class Placement:
 
     def __post_init__(self) -> None:
         check_fields(self, "height", of="placement.{}")
-        for name in ("x", "y", "yaw"):
+        for name in ("x", "y"):
             check_range(f"placement.{name}", getattr(self, name))
+        check_range("placement.yaw (rad)", self.yaw, least=-2 * math.pi, most=2 * math.pi)
         for site in self.sites:
             check_numbers("A site of placement.sites", site, 3)
         object.__setattr__(self, "quaternion", unit_vector("placement.quaternion", self.quaternion, 4))
@@ -270,7 +271,8 @@ class Task:
     def __post_init__(self) -> None:
         of = f"of task {self.name!r}"
         own = f"{{}} {of}"
-        check_fields(self, "episode", "density", "action_limit", "carriage_speed", above=0, of=own)
+        check_fields(self, "episode", "action_limit", "carriage_speed", above=0, of=own)
+        check_fields(self, "density", least=1, of=f"{own} (kg/m³)")
         check_fields(self, "copies", "turn_window", least=1, whole=True, of=own)
         check_fields(self, "friction", "action_ratio", least=0, of=own)
         check_fields(self.noise, "position", "velocity", least=0, of=f"noise.{own}")

@@ -191,6 +191,11 @@ def test_a_task_of_ones_own_is_trained_and_evaluated(tmp_path: Path, quick: Path
     assert [row["agent"] for row in found] == ["zero", "random", str(run)]
     assert {row["contacts"] for row in found} == {"firm"}
     assert all(row["episodes"] == 2 for row in found)
+    tasks.forget("quick")
+    student = ("--task-file", str(quick), "--envs", "2", "--iterations", "1", "--episodes", "0", "--json")
+    senses = ("--observe", "agg_bool", "--placement", "tips", "--encoder", "mlp")
+    words = ("--teacher", str(run), *senses, *student, "--out", str(tmp_path / "student"))
+    assert json.loads(_run("distill", "quick", *words))["iterations"] == 1
 
 
 @pytest.mark.parametrize(

@@ -19,6 +19,7 @@ TaskArgument = Annotated[str, typer.Argument(help="A task: in_palm_rotate, in_ha
 HandOption = Annotated[str, typer.Option(help="xhand1, sharpa, or a URDF or MJCF file.")]
 EnvsOption = Annotated[int, typer.Option("--envs", help="Environments at once.")]
 DeviceOption = Annotated[str, typer.Option(help="cpu, or cuda for MuJoCo Warp.")]
+TaskFileOption = Annotated[Path | None, typer.Option(help="Python file that registers a task of your own.")]
 ENV = "robotics_bridge.envs.options:EnvOptions"
 TOUCH = ("observe", "placement", "resolution", "noisy")
 """Fields of the options of an environment that a student fixes."""
@@ -34,7 +35,7 @@ class World:
     change: Annotated[
         list[str] | None, typer.Option(help="Another number of the task: contacts=firm, is_dropped=-300, entropy=0, …")
     ] = None
-    task_file: Annotated[Path | None, typer.Option(help="Python file that registers a task of your own.")] = None
+    task_file: TaskFileOption = None
 
     def check(self, agents: Iterable[str]) -> None:
         """Raise UsageError for an unknown task or agent, before anything slow is imported.
@@ -59,17 +60,23 @@ class World:
         Trained ``agents`` find the contacts in which they were trained, unless ``change`` names others or ``config`` is
         ``published``, which defines them.
         """
-        from brainbench.core.plugins import load_module
         from robotics_bridge import tasks
         from robotics_bridge.policies.fit import with_contacts_of
         from robotics_bridge.tasks.overrides import apply_overrides
 
-        if self.task_file is not None:
-            load_module(str(self.task_file.absolute()))
+        read_task_file(self.task_file)
         task, change = tasks.load(self.task, self.config), self.change or []
         if self.config != "published" and not any(word.startswith("contacts") for word in change):
             task = with_contacts_of(task, agents)
         return tasks.make(apply_overrides(task, change), hand=self.hand, **options)
+
+
+def read_task_file(file: Path | None) -> None:
+    """Run a file that registers a task, if one is given."""
+    from brainbench.core.plugins import load_module
+
+    if file is not None:
+        load_module(str(file.absolute()))
 
 
 def in_world(command: Callable[..., None]) -> Callable[..., None]:

@@ -11,7 +11,7 @@ import typer
 from brainbench.cli.destinations import out_folder, out_folder_option
 from brainbench.cli.options import part_of, with_options
 from brainbench.cli.output import JsonOption, emit, facts, progress_bar, table
-from brainbench.cli.policy.options import DeviceOption, TaskArgument, World, in_world
+from brainbench.cli.policy.options import DeviceOption, TaskArgument, TaskFileOption, World, in_world, read_task_file
 
 
 @with_options(
@@ -96,6 +96,7 @@ def distill(
     device: DeviceOption = "cpu",
     stop_after: Annotated[float | None, typer.Option(help="Save, stop and evaluate after so many seconds.")] = None,
     stop_at: Annotated[int | None, typer.Option(help="Likewise after so many iterations in all.")] = None,
+    task_file: TaskFileOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Distil a teacher into a student that feels; a run that was interrupted goes on when it is started again."""
@@ -110,6 +111,7 @@ def distill(
     # The learning of a network is stated in the names and tables of students.
     settings: dict[str, Any] = {} if encoder in (AUTO, *ARMS) else {"learning": "frozen", "time": "native"}
     settings |= {name: value for name, value in given.items() if value is not None}
+    read_task_file(task_file)
     config = DistillConfig(task=task, teacher=str(teacher), encoder=encoder, encoder_settings=settings, **options)
     folder = out or Path("students") / config.name
     with progress_bar() as progress:
@@ -141,12 +143,14 @@ def sweep(
     iterations: Annotated[int | None, typer.Option(help="In place of the file's.")] = None,
     episodes: Annotated[int, typer.Option(help="Of the evaluation, per seed.")] = 100,
     device: DeviceOption = "cpu",
+    task_file: TaskFileOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Distil every student of a sweep that is not finished yet; what was interrupted goes on."""
     from robotics_bridge.policies.training.students import is_done, train_student
     from robotics_bridge.policies.training.sweep import PUBLISHED, read_sweep
 
+    read_task_file(task_file)
     found = read_sweep(file or PUBLISHED)
     if count:
         numbers = found.count(subset)

@@ -97,7 +97,8 @@ def calibrate(log: Log, *, max_delay: float = 0.5) -> Calibration:
         starts = [fit] + [replace(fit, dynamics=fit.dynamics._replace(hysteresis=0.0))] * bool(fit.dynamics.hysteresis)
         settled = [_settle(living, guess, log.step, quantum, start, longest) for start in starts]
         fit, lags = min(settled, key=lambda found: _spread(found[0]))
-        rest = [calm(fit.dynamics.response(x, log.step), y, 2 * guess[1]) for x, y in living]
+        models = [fit.dynamics.response(x, log.step, own) for (x, _y), own in zip(living, fit.creep, strict=True)]
+        rest = [calm(model, y, 2 * guess[1]) for model, (_x, y) in zip(models, living, strict=True)]
         if _spread(fit) > 2 * np.median(rest):
             notes.append(
                 "Where the reference moves, readings differ more from the model than where it rests: delay, jitter, "

@@ -9,13 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.errors import DataError
-from robotics_bridge.sensors.calibration.likelihood import Aligned, Fit
+from robotics_bridge.sensors.calibration.likelihood import Aligned, Fit, begins_loaded
 from robotics_bridge.sensors.calibration.log import Episode
 
 _SURE = 25.0
 """Difference of the misfit, in units of the noise's variance, at which one lag beats the next."""
-_LOAD = 0.01
-"""Share of the largest load above which an episode begins under load."""
 _WINDOW = 40
 """Readings to either side over which drift counts as a level."""
 
@@ -59,8 +57,7 @@ def find_delays(parts: list[Episode], longest: int) -> tuple[int, int]:
 
 def unknown_past(x: NDArray[np.float64], longest: int) -> int:
     """Return how many readings of an episode may show what came before it: ``longest``, or none if that was no load."""
-    # What a device under load felt before, or whether it crept when it was reset, stands in no log.
-    return min(longest, len(x) // 2) if abs(x[0]) > _LOAD * np.abs(x).max() else 0
+    return min(longest, len(x) // 2) if begins_loaded(x) else 0
 
 
 def align(parts: list[Episode], first: int, last: int, longest: int) -> list[Aligned]:
@@ -80,9 +77,9 @@ def find_lags(
     middle = sum(guess) // 2
     lags = np.arange(2 * guess[1] + 1)
     found, told, place = [], [], 0
-    for x, y in parts:
+    for (x, y), creep in zip(parts, fit.creep, strict=True):
         n = y.shape[1]
-        model = dynamics.response(x, dt)
+        model = dynamics.response(x, dt, creep)
         gain = fit.gains[place : place + n]
         place += n
         rows = np.arange(max(lags[-1], unknown_past(x, longest)), len(x))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,7 @@ from scipy.fft import dst
 from scipy.linalg import solveh_banded
 from scipy.optimize import minimize
 from scipy.signal import lfilter
+from scipy.stats import chi2
 
 Aligned = tuple["NDArray[np.float64]", "NDArray[np.float64]", "NDArray[np.int64]"]
 """x [T'] from the start of the episode, readings y [T, N], and for each reading the index of x that it shows."""
@@ -23,6 +24,8 @@ _SIGNIFICANT = 6.63
 """Twice the gain in log-likelihood (χ², one degree, 1 %) that drift or hysteresis must bring to be kept."""
 _UNTOLD = 7.0
 """Half width of the interval of a logarithm, a factor of a thousand, at which a log does not tell a number."""
+_LOAD = 0.01
+"""Share of the largest load above which an episode begins under load."""
 
 
 @dataclass(frozen=True)
@@ -61,9 +64,10 @@ class Dynamics(NamedTuple):
         """Time constant of the hysteresis [s]."""
         return math.exp(self.log_tau)
 
-    def response(self, x: NDArray[np.float64], dt: float) -> NDArray[np.float64]:
-        """Return x + β ξ (4.26, 4.27) for a signal that had its first value before."""
-        return x + self.hysteresis * maxwell(x, math.exp(-dt / self.tau))
+    def response(self, x: NDArray[np.float64], dt: float, creep: float) -> NDArray[np.float64]:
+        """Return x + β ξ (4.26, 4.27) for a signal before which ξ was ``creep``."""
+        keep = math.exp(-dt / self.tau)
+        return x + self.hysteresis * (maxwell(x, keep) + creep * keep ** np.arange(len(x)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,6 +79,13 @@ class Fit:
     """[probes × episodes]."""
     gain_errors: NDArray[np.float64]
     dynamics: Dynamics
+    creep: list[float]
+    """ξ before each episode [unit of the sensor]; 0 of those that begin without load."""
+
+
+def begins_loaded(x: NDArray[np.float64]) -> bool:
+    """Return whether an episode with the signal ``x`` begins under load."""
+    return bool(abs(x[0]) > _LOAD * np.abs(x).max())
 
 
 def maxwell(x: NDArray[np.float64], keep: float) -> NDArray[np.float64]:
@@ -100,26 +111,44 @@ class _Likelihood:
         self.y = [_sine(y) for _x, y, _at in parts]
         self.signal = [_sine(x[at]) for x, at in zip(self.x, self.at, strict=True)]
         self.rate = [2 - 2 * np.cos(np.pi * np.arange(1, len(y) + 1) / (len(y) + 1)) for y in self.y]
-        self._cached: tuple[float, list[NDArray[np.float64]]] = (math.nan, [])
+        self.loaded = [moving and begins_loaded(x) for x in self.x]
+        self._cached: tuple[float, list[tuple[Any, Any]]] = (math.nan, [])
 
-    def lagged(self, tau: float) -> list[NDArray[np.float64]]:
-        """Return the transformed ξ of each part."""
+    def lagged(self, tau: float) -> list[tuple[Any, Any]]:
+        """Return the transformed ξ of each part, and how a ξ of 1 before it dies away where it begins under load."""
         if self._cached[0] != tau:
             keep = math.exp(-self.dt / tau)
-            self._cached = (tau, [_sine(maxwell(x, keep)[at]) for x, at in zip(self.x, self.at, strict=True)])
+            self._cached = (tau, [
+                (_sine(maxwell(x, keep)[at]), _sine(keep ** at.astype(float)) if loaded else 0.0)
+                for x, at, loaded in zip(self.x, self.at, self.loaded, strict=True)
+            ])  # fmt: skip
         return self._cached[1]
+
+    def models(self, d: Dynamics) -> list[tuple[NDArray[np.float64], float]]:
+        """Return the transformed signal of each part with its hysteresis, and ξ before the part."""
+        extra = self.lagged(d.tau) if d.hysteresis else [(0.0, 0.0)] * len(self.x)
+        found = []
+        for x, y, s, (e, k), rate, loaded in zip(
+            self.x, self.y, self.signal, extra, self.rate, self.loaded, strict=True
+        ):
+            model, creep = s + d.hysteresis * e, 0.0
+            if loaded and d.hysteresis:
+                # What the sensor felt before a load, or whether it crept when it was reset, stands in no log.
+                creep = _creep(y, model, d.hysteresis * k, d.walk**2 + d.white**2 * rate, most=float(np.abs(x).max()))
+                model = model + creep * d.hysteresis * k
+            found.append((model, creep))
+        return found
 
     def __call__(self, d: Dynamics) -> float:
         total = 0.0
-        extra = self.lagged(d.tau) if d.hysteresis else [0.0] * len(self.x)
-        for y, s, e, rate in zip(self.y, self.signal, extra, self.rate, strict=True):
+        models = self.models(d) if self.moving else [(0.0, 0.0)] * len(self.x)
+        for y, (model, _), rate in zip(self.y, models, self.rate, strict=True):
             # Gaussian likelihood in the sine basis, where differences are independent: no matrix has to be inverted.
             variance = d.walk**2 + d.white**2 * rate
             rest = y
             if self.moving:
                 # Gains are profiled out: for given dynamics the best one of each probe is a weighted projection on the
                 # signal.
-                model = s + d.hysteresis * e
                 weight = model / variance
                 rest = y - np.outer(model, (weight @ y) / max(float(weight @ model), 1e-300))
             total += 0.5 * float(y.shape[1] * np.log(variance).sum() + (rest**2 / variance[:, None]).sum())
@@ -128,13 +157,24 @@ class _Likelihood:
     def gains(self, d: Dynamics) -> tuple[NDArray, NDArray]:
         """Return gains and their standard errors, of all probes and episodes."""
         found, errors = [], []
-        for y, s, e, rate in zip(self.y, self.signal, self.lagged(d.tau), self.rate, strict=True):
-            model = s + d.hysteresis * e
+        for y, (model, _), rate in zip(self.y, self.models(d), self.rate, strict=True):
             weight = model / (d.walk**2 + d.white**2 * rate)
             power = max(float(weight @ model), 1e-300)
             found.append((weight @ y) / power)
             errors.append(np.full(y.shape[1], 1 / math.sqrt(power)))
         return np.concatenate(found), np.concatenate(errors)
+
+
+def _creep(y: NDArray, model: NDArray, fading: NDArray, variance: NDArray, *, most: float) -> float:
+    """Return the c within ±``most`` for which ``model`` + c ``fading``, by a gain each, explains y [T, N] best."""
+    basis = np.stack([model, fading])
+    share, gram = (basis / variance) @ y, (basis / variance) @ basis.T
+    power = share @ share.T
+    (p, q), (_, r), (u, v), (_, w) = *power.tolist(), *gram.tolist()
+    # What is explained is (p + 2 q c + r c²) / (u + 2 v c + w c²): its slope is 0, or the range ends.
+    turns = np.real(np.roots([r * v - q * w, r * u - p * w, q * u - p * v])).tolist()
+    choices = [0.0, *(c for c in turns if abs(c) < most), -most, most]
+    return max(choices, key=lambda c: (p + c * (2 * q + c * r)) / max(u + c * (2 * v + c * w), 1e-300))
 
 
 def fit_dynamics(parts: list[Aligned], dt: float, quantum: float, *, moving: bool, known: Fit | None = None) -> Fit:
@@ -170,7 +210,9 @@ def fit_dynamics(parts: list[Aligned], dt: float, quantum: float, *, moving: boo
             if value < cost - 1e-9:
                 best, cost = dynamics_of(*found), value
     # Likelihood-ratio tests: a knob must earn its place, or every log would have a little drift and hysteresis.
-    hysteresis = moving and 2 * (plain_cost - cost) > _SIGNIFICANT + 2.6
+    # Each unknown ξ before an episode under load is one number more.
+    more = float(chi2.isf(0.01, 2 + sum(target.loaded)) - chi2.isf(0.01, 2))
+    hysteresis = moving and 2 * (plain_cost - cost) > _SIGNIFICANT + 2.6 + more
     if not hysteresis:
         best, cost = plain, plain_cost
     tiny = math.log(1e-6) + best.log_white
@@ -185,9 +227,10 @@ def fit_dynamics(parts: list[Aligned], dt: float, quantum: float, *, moving: boo
     free = ["log_white"] + ["log_walk"] * drifts + ["hysteresis", "log_tau"] * hysteresis
     estimates = _estimates(best, _errors(target, best, free), quantum)
     gains, gain_errors = target.gains(best) if moving else (np.ones(1), np.ones(1))
-    bias, error = _bias(parts, dt, best, drifts, gains, moving)
+    creep = [own for _, own in target.models(best)] if moving else [0.0] * len(parts)
+    bias, error = _bias(parts, dt, best, creep, drifts, gains, moving)
     estimates["bias"] = Estimate(bias, bias - Z95 * error, bias + Z95 * error, "level of the residuals")
-    return Fit(estimates, gains, gain_errors, best)
+    return Fit(estimates, gains, gain_errors, best, creep)
 
 
 def _errors(target: _Likelihood, best: Dynamics, free: list[str]) -> dict[str, float]:
@@ -239,14 +282,14 @@ def _estimates(best: Dynamics, errors: dict[str, float], quantum: float) -> dict
 
 
 def _bias(
-    parts: list[Aligned], dt: float, best: Dynamics, drifts: bool, gains: NDArray, moving: bool
+    parts: list[Aligned], dt: float, best: Dynamics, creep: list[float], drifts: bool, gains: NDArray, moving: bool
 ) -> tuple[float, float]:
     """Return the common offset and its error: the best linear estimate under drift that starts at zero."""
     estimates, precisions, place = [], [], 0
     white, walk = best.white, best.walk if drifts else 0.0
-    for x, y, at in parts:
+    for (x, y, at), own in zip(parts, creep, strict=True):
         count, n = y.shape
-        model = best.response(x, dt)[at] if moving else np.zeros(count)
+        model = best.response(x, dt, own)[at] if moving else np.zeros(count)
         rest = y - np.outer(model, gains[place : place + n] if moving else np.ones(n))
         place += n
         # Differences, with the first reading in front: its drift is one step.

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -13,6 +15,7 @@ from robotics_bridge.deploy.touch import RealTouch
 from robotics_bridge.hands.scenes import closing
 from robotics_bridge.policies.contract import PolicyContract
 from robotics_bridge.tasks.contact_model import CONTACTS
+from tests.robotics_bridge.hands.test_grippers import JAWS, LINK, URDF
 
 HAND = hands.load("xhand1")
 
@@ -60,6 +63,17 @@ def test_servos_of_a_file_drive_their_joints_whatever_they_are_called(tmp_path) 
     for _ in range(200):
         hand.step()
     assert hand.position[:2] == pytest.approx([0.1, 0.2], abs=0.02)
+
+
+def test_a_joint_that_mimics_another_need_not_be_reported_and_drives_are_those_of_the_tasks(tmp_path) -> None:
+    (tmp_path / "jaws.urdf").write_text(URDF.format(links="".join(LINK.format(*jaw) for jaw in JAWS)))
+    contract = replace(_contract("agg_force", ("l",)), hand=str(tmp_path / "jaws.urdf"))
+    shadow = ShadowTouch(replace(contract, inputs={"tactile": (5, 3, 3)}), ("l",))
+    model, data = shadow.hand.engine.model, shadow.hand.engine.data[0]
+    for _ in range(40):
+        shadow(_reading([0.02], np.zeros((2, 3))))
+        assert np.abs(data.actuator_force).max() <= 0.8 + 1e-9  # 8 % of the 10 N that the file states
+    assert data.qpos[[model.joint(name).qposadr[0] for name in "lr"]] == pytest.approx([0.02, 0.02], abs=2e-3)
 
 
 def test_its_contacts_are_those_of_the_policy() -> None:

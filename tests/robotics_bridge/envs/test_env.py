@@ -100,6 +100,21 @@ def test_an_environment_does_not_notice_how_many_others_there_are_in_its_physics
     assert torch.equal(env.simulation.qpos[0], alone.simulation.qpos[0])
 
 
+def test_torque_noise_of_one_seed_is_not_that_of_the_next_a_step_later() -> None:
+    streams = {}
+    for seed in (0, 1, 2):
+        actuators = (env := _make(1, seed=seed)).state.actuators
+        for name in ("stiffness", "damping", "kick"):
+            actuators.values[name].zero_()
+        torques = []
+        for _ in range(6):
+            actuators.launch(0)
+            torques.append(env.simulation.ctrl.flatten().tolist())
+        streams[seed] = torques
+    for one, other in ((0, 1), (1, 2), (0, 2)):
+        assert not any(torque in streams[other] for torque in streams[one])
+
+
 def test_an_environment_that_diverges_is_reset_and_counted_and_the_others_are_unharmed() -> None:
     one, two = _make(3, seed=5), _make(3, seed=5)
     for env in (one, two):

@@ -300,3 +300,19 @@ def test_a_hand_that_does_not_hang_together_is_refused():
         build(HandSpec("broken", "a", links, (joint,), {}))
     with pytest.raises(UsageError, match="has no link 'd'"):
         HandSpec("broken", "a", links, (joint,), {"finger": ("d",)})
+
+
+@pytest.mark.parametrize(("unit", "upper", "told"), [("", 1.57, True), ("", 90, False), ("radian", 90, True)])
+def test_degrees_for_radians_and_the_reverse_are_told(tmp_path, caplog, unit, upper, told) -> None:
+    angle = f'<compiler angle="{unit}"/>' if unit else ""
+    jaws = "".join(
+        f'<body pos="0 {y} .05"><joint axis="{turn} 0 0" limited="true" range="0 {upper}"/>'
+        '<geom type="capsule" size=".01" fromto="0 0 0 0 0 .05"/></body>'
+        for y, turn in ((0.2, 1), (-0.2, -1))
+    )
+    (tmp_path / "claw.xml").write_text(
+        f'<mujoco>{angle}<worldbody><body name="palm"><geom type="box" size=".05 .05 .01"/>{jaws}</body></worldbody>'
+        "</mujoco>"
+    )
+    hands.load(str(tmp_path / "claw.xml"))
+    assert ("unit of the angles" in caplog.text) == told

@@ -76,6 +76,20 @@ def test_compiled_variants_differ_where_they_should() -> None:
             MujocoEngine(heavy, 2, assignment=assignment)
 
 
+@pytest.mark.parametrize("inertial", ["", '<inertial pos=".1 0 0" mass=".7" diaginertia="1 1 1"/>'])
+def test_density_decides_the_mass_of_variants_whatever_the_spec_states(inertial) -> None:
+    spec = mujoco.MjSpec.from_string(
+        f'<mujoco><worldbody><body name="o"><freejoint/>{inertial}<geom name="g" size=".1" mass=".1"/></body>'
+        "</worldbody></mujoco>"
+    )
+    ball = Geometry(name="g", link="o", kind="sphere", size=(0.03,))
+    body = compile_variants(spec, "g", [ball], density=200)[0].body("o")
+    mass = 200 * 4 / 3 * np.pi * 0.03**3
+    np.testing.assert_allclose(body.mass, mass, rtol=1e-6)
+    np.testing.assert_allclose(body.inertia, 0.4 * mass * 0.03**2, rtol=1e-6)
+    np.testing.assert_allclose(body.ipos, 0, atol=1e-12)
+
+
 @pytest.mark.parametrize(
     ("make", "message"),
     [

@@ -56,7 +56,7 @@ def test_words_reach_rewards_their_parameters_endings_learning_and_the_task() ->
         ("goal.start_threshold=0.05", "wider threshold than 0.1 rad"),
         ("goal.narrowing=1.5", "above 0 and below 1; received 1.5"),
         ("schedule=adptive", "did you mean 'adaptive'"),
-        ("learning_rate_range=1e-2,1e-3", "lies within its range"),
+        ("learning_rate_range=1e-2,1e-3", "is a range"),
     ],
 )
 def test_words_that_name_nothing_or_hold_no_such_value_are_refused(word: str, message: str) -> None:

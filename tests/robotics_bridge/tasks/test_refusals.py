@@ -15,7 +15,7 @@ from robotics_bridge.tasks import terms
 from robotics_bridge.tasks.goals import SteppingRotation, TimedRotation
 from robotics_bridge.tasks.objects import ObjectPrimitive, ObjectShape, ball
 from robotics_bridge.tasks.scenes import build
-from robotics_bridge.tasks.settings import StudentSettings
+from robotics_bridge.tasks.settings import StudentSettings, TeacherSettings
 from robotics_bridge.tasks.task import ActuatorRandomisation, Ending, ObjectRandomisation, Placement, Push, Success
 from robotics_bridge.tasks.thermometers import ThermalSettings
 
@@ -114,6 +114,11 @@ def test_ranges_are_two_numbers_in_order(kind, name, value) -> None:
         (ThermalSettings, "hot", np.inf), (ThermalSettings, "emissivity", 3.0), (ThermalSettings, "cells", (0, 1, 1)),
         (ThermalSettings, "ball", "aluminum"), (ThermalSettings, "conduction", "thesi"),
         (StudentSettings, "learning_rate", np.nan), (StudentSettings, "iterations", -1),
+        # Degrees in place of radians; one number in place of a range.
+        (SteppingRotation, "start_threshold", 30.0), (SteppingRotation, "step", 90.0),
+        (Placement, "yaw", (-15.0, 15.0)), (TimedRotation, "tilt", (-45.0, 45.0)),
+        (ActuatorRandomisation, "position_bias", (-2.0, 2.0)),
+        (TeacherSettings, "std_range", (1.0,)), (TeacherSettings, "learning_rate_range", (1e-3,)),
         (StudentSettings, "gradient_length", 0), (StudentSettings, "loss", "mae"),
     ],
 )  # fmt: skip

@@ -19,7 +19,7 @@ from robotics_bridge.tasks import terms
 from robotics_bridge.tasks.goals import SteppingRotation, TimedRotation
 from robotics_bridge.tasks.objects import CUBES, box, cylinder, screwdriver, slots, with_sizes
 from robotics_bridge.tasks.overrides import apply_overrides
-from robotics_bridge.tasks.scenes import build, palm_up
+from robotics_bridge.tasks.scenes import build, drives_of, palm_up
 from robotics_bridge.tasks.task import ObjectRandomisation, Task
 
 MY_TASK = """
@@ -293,3 +293,22 @@ def test_the_carriage_moves_no_faster_than_an_arm() -> None:
     published = tasks.load("hot_ball", "published")
     reach = [t.hand_poses["xhand1"][0][2] + np.array(t.carriage["z"][0]) for t in (task, published)]
     assert reach[0] == pytest.approx(reach[1])
+
+
+@pytest.mark.parametrize(("joint", "servo", "effort"), [
+    ("", "", 1.57), ("", 'forcerange="-.7 .7"', 0.7), ('actuatorfrcrange="-.5 .5"', "", 0.5),
+    ('actuatorfrcrange="-.5 .5"', 'forcerange="-.7 .7"', 0.5),
+])  # fmt: skip
+def test_drives_are_no_stronger_than_a_file_says_and_noise_is_in_units_of_that(tmp_path, joint, servo, effort) -> None:
+    jaws = "".join(
+        f'<body pos="0 {y} .05"><joint name="{name}" axis="1 0 0" range="0 1.57" {joint}/>'
+        '<geom type="capsule" size=".01" fromto="0 0 0 0 0 .05"/></body>'
+        for name, y in (("a", 0.2), ("b", -0.2))
+    )
+    servos = "".join(f'<position joint="{name}" kp="1" kv=".1" {servo}/>' for name in "ab")
+    (tmp_path / "hand.xml").write_text(
+        '<mujoco><compiler angle="radian" autolimits="true"/><worldbody><body name="palm">'
+        f'<geom type="box" size=".05 .05 .01"/>{jaws}</body></worldbody><actuator>{servos}</actuator></mujoco>'
+    )
+    found = drives_of(hands.load(str(tmp_path / "hand.xml")))
+    assert found == {name: pytest.approx((1.0, 0.1, effort)) for name in "ab"}

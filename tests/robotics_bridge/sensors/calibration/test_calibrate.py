@@ -115,6 +115,22 @@ def test_a_sensor_may_be_reset_under_load():
     assert (found.hysteresis, found.hysteresis_tau) == pytest.approx((0.4, 0.06), rel=0.05)
 
 
+@pytest.mark.parametrize("rested", [True, False])
+def test_creep_that_outlasts_the_delay_is_no_drift_and_no_gain(rested):
+    x = np.where(np.arange(1200) * DT % 2 < 1, 1.0, 0.2)
+    rest = np.ones(4000 if rested else 0)
+    noise = Noise(white=0.02, hysteresis=0.5, hysteresis_tau=2.0)
+    parts = []
+    for seed in range(3):
+        y = simulate(noise, np.concatenate([rest, x])[:, None, None, None].repeat(4, 2), dt=DT, seed=seed)
+        parts.append(np.column_stack([np.full(1200, seed), x, y[len(rest) :, 0, :, 0]]))
+    table = np.concatenate(parts)
+    found = calibrate(Log(np.arange(len(table)) * DT, table[:, 2:], table[:, 1], table[:, 0].astype(int))).noise
+    assert (found.hysteresis, found.hysteresis_tau) == pytest.approx((0.5, 2.0), rel=0.06)
+    assert found.gain == pytest.approx((1.0, 1.0), rel=0.02)
+    assert found.walk < 5e-4
+
+
 def test_the_bias_of_a_drifting_probe_under_load_lies_within_its_interval():
     x = _presses(1200, 0)[200:]
     hits = 0
