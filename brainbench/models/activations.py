@@ -114,9 +114,9 @@ def extract(
                         f"{list(rows.shape[1:])}; give stimuli of one length or leave this layer out."
                     )
                 result[name][start:stop] = rows
-        if named is None:
-            # In another batch, after others: what depends on these is no answer to a stimulus.
-            _check_repeated(result, read(0, min(len(values), 3 if values.shape[1] == 2 else 2)), model)
+        # In another batch, after others: what depends on these is no answer to a stimulus. Ours do not.
+        first = 3 if values.shape[1] == 2 else 2
+        _check_repeated(result, read(0, min(len(values), first)) if named is None else iter(()), model)
     if not result:
         raise UsageError(
             f"Nothing in {type(model).__name__} gives an activation per stimulus: no output of it or of its parts has "
