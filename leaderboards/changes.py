@@ -37,12 +37,12 @@ class Change:
     """A change of one model between two builds."""
 
     kind: Literal["added", "removed", "changed", "moved", "restated"]
-    """``moved``: the record is the same, its rank is not, because of others. ``restated``: another record with the
-    same inputs and numbers, which says more or less beside them."""
+    """``moved``: the record is the same, its rank or standing is not, because of others. ``restated``: another record
+    with the same inputs and numbers, which says more or less beside them."""
     board: str
     name: str
     before: str
-    """Value and rank before; empty for an added one."""
+    """Value, standing and rank before; empty for an added one."""
     after: str
     causes: tuple[str, ...] = ()
     """Other differences between the records, such as the package's version or the stimuli."""
@@ -82,7 +82,7 @@ def open_build(*sources: str | os.PathLike[str]) -> list[StoredRecord]:
 
 
 def compare_builds(before: Iterable[StoredRecord], after: Iterable[StoredRecord]) -> list[Change]:
-    """Return what changed between two sets of records: added, removed, changed, and ranks moved by others.
+    """Return what changed between two sets of records: added, removed, changed, and ranks or standings moved by others.
 
     A model is the same when its name, weights seed, recordings' name, metric, estimator and time rule are.
     """
@@ -114,7 +114,8 @@ def _by_model(stored: Iterable[StoredRecord]) -> dict[tuple[Any, ...], dict[str,
         for entry, record in ((one, record) for one in board.entries for record in one.records):
             seed, value = record.card.seed if record.card else None, record.score.value
             shown = f"{entry.name} (seed {seed})" if seed is not None else entry.name
-            told = f"{record.score.status if math.isnan(value) else f'{value:.3f}'}, rank {entry.rank}"
+            # What a score is worth may change with the other records, though neither score nor rank does.
+            told = f"{'' if math.isnan(value) else f'{value:.3f}, '}{entry.standing}, rank {entry.rank}"
             key = (entry.name, seed, board.recordings, board.metric, board.estimator, board.time)
             found[key][record.identity] = (label, shown, told, record)
     return found

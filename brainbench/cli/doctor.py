@@ -7,28 +7,23 @@ from typing import Any
 from brainbench.cli.output import JsonOption, emit, table
 from brainbench.core.errors import install_command
 
-OPTIONAL = {
-    "pynwb": ("nwb", "checking NWB files against the schema"),
-    "nwbinspector": ("nwb", "best-practice checks of NWB files"),
-    "dandi": ("dandi", "brainbench recordings fetch: public data from the DANDI archive"),
-    "pybullet": ("bullet", "the whisker engine of WHISKiT as a second backend (Python < 3.12)"),
-    "coacd": ("mesh", "convex decomposition of concave objects"),
-    "fast-simplification": ("mesh", "decomposition of meshes above 50,000 triangles"),
-    "mujoco-warp": ("gpu", "simulation of robot hands on CUDA"),
-    "rsl-rl-lib": ("policies", "training of teachers and students (brainbench policy train | distill)"),
-    "gymnasium": ("policies", "the dexterous tasks as gymnasium environments"),
-    "scikit-fem": ("tactile", "modes of struck bodies: contact sound from their shape and material"),
-    "distributed": ("cluster", "data sets made by a Dask cluster (brainbench stimuli sweep --scheduler)"),
-    "scikit-learn": ("learn", "support vector machines (brainbench stimuli separability)"),
-    "tensorboard": ("train", "training curves in TensorBoard, beside the run's log"),
-    "onnxscript": ("export", "brainbench export --format onnx"),
-    "onnxruntime": ("export", "the check of exported ONNX files"),
-    "huggingface_hub": ("hub", "models by hf-hub:OWNER/NAME"),
-    "matplotlib": ("report", "pictures and plots of stimuli (brainbench stimuli render | plot)"),
-    "pyarrow": ("board", "LeRobot data sets of robot episodes"),
-    "weasyprint": ("board", "reports as PDF (brainbench leaderboard report --format pdf)"),
-    "imageio-ffmpeg": ("report", "films of stimuli as MP4 (GIF needs matplotlib alone)"),
+ENABLES = {
+    "nwb": "checks of NWB files against the schema and best practice",
+    "dandi": "brainbench recordings fetch: public data from the DANDI archive",
+    "bullet": "the whisker engine of WHISKiT as a second backend (Python < 3.12)",
+    "mesh": "convex decomposition of concave objects",
+    "gpu": "simulation of robot hands on CUDA",
+    "tactile": "modes of struck bodies: contact sound from their shape and material",
+    "train": "training curves in TensorBoard, beside the run's log",
+    "policies": "dexterous tasks in gymnasium, and training of teachers and students",
+    "cluster": "data sets made by a Dask cluster (brainbench stimuli sweep --scheduler)",
+    "learn": "support vector machines (brainbench stimuli separability)",
+    "export": "brainbench export --format onnx, with a check of the file",
+    "hub": "models by hf-hub:OWNER/NAME",
+    "report": "pictures, plots and films",
+    "board": "reports as PDF, and LeRobot data sets of robot episodes",
 }
+"""Extra → what it enables; a package of several extras stands with the first."""
 
 
 def doctor(as_json: JsonOption = False) -> None:
@@ -36,7 +31,7 @@ def doctor(as_json: JsonOption = False) -> None:
     data = diagnose()
     rows = [[name, version or "missing: reinstall brainbench", "", ""] for name, version in data["required"].items()]
     for name, part in data["optional"].items():
-        note = ["", ""] if part["version"] else [OPTIONAL[name][0], part["enables"]]
+        note = ["", ""] if part["version"] else [part["extra"], part["enables"]]
         rows.append([name, part["version"] or "not installed", *note])
     head = [
         f"brainbench {data['version']}, Python {data['python']}, {data['machine']}",
@@ -62,23 +57,27 @@ def diagnose() -> dict[str, Any]:
         "cuda": [torch.cuda.get_device_name(index) for index in range(torch.cuda.device_count())],
         "cache": str(cache),
         "cache_bytes": sum(item.stat().st_size for item in cache.rglob("*") if item.is_file()),
-        "required": {name: _version(name) for name in _required()},
+        "required": {name: _version(name) for name in _packages("")},
         "optional": {
-            name: {"version": _version(name), "enables": purpose, "install": install_command(extra)}
-            for name, (extra, purpose) in OPTIONAL.items()
+            name: {"version": _version(name), "extra": extra, "enables": purpose, "install": install_command(extra)}
+            for extra, purpose in reversed(ENABLES.items())
+            for name in _packages(extra)
         },
     }
 
 
-def _required() -> list[str]:
-    """Return the packages that this one cannot do without, as its own metadata states them."""
+def _packages(extra: str) -> list[str]:
+    """Return the packages of an extra, or those this one cannot do without, as its own metadata states them."""
     from importlib import metadata  # 30 ms that no other command needs
 
+    from packaging.requirements import Requirement
+
     try:
-        stated = metadata.requires("brainbench") or []
+        stated = map(Requirement, metadata.requires("brainbench") or [])
     except metadata.PackageNotFoundError:  # a checkout that runs without being installed
         return []
-    return [line.split(">")[0].split("<")[0] for line in stated if "extra ==" not in line]
+    mark = f'extra == "{extra}"' if extra else ""
+    return [item.name for item in stated if (mark in str(item.marker) if mark else "extra ==" not in str(item.marker))]
 
 
 def _version(package: str) -> str | None:

@@ -26,6 +26,8 @@ _log = logging.getLogger(__name__)
 
 OUTPUT = "output"
 """Layer name of a user model's own output."""
+_REPEATED = 0.05
+"""Difference of repeated activations, as a share of their size, that neither rounding nor half precision makes."""
 
 
 class Activations(dict[str, np.ndarray]):
@@ -51,8 +53,9 @@ def extract(
     A model with ``layers`` and ``activations`` (all of ours) gives its named layers. Any other module is
     read by hooks at its leaf modules, and at its output under the name ``output``. A hooked layer that is
     called once has the time axis of the stimuli if its tensor is [B, T, ...], [T, B, ...], [B·T, ...] or
-    [T·B, ...], else T = 1; one called several times per sweep is stacked over calls as time (over calls of unequal
-    shape: ``name[0]``, ``name[1]``, …). Of a tuple or mapping the first tensor counts.
+    [T·B, ...], else T = 1; one called several times per sweep is stacked over calls as time (calls of unequal shape, or
+    calls that have the time axis and are not T: ``name[0]``, ``name[1]``, …). Of a tuple or mapping the first tensor
+    counts.
 
     The model runs in evaluation mode without gradients; modes are put back and no hook stays. Memory
     beyond the result is that of ``chunk`` stimuli; with ``folder`` the result lies on disk, and so may the
@@ -69,8 +72,9 @@ def extract(
             then what was scored (:mod:`brainbench.models.published.readout`).
 
     Raises:
-        UsageError: a layer does not exist or gives nothing per stimulus, no layer does, or the model cannot
-            process the stimuli; the message says what it was given and what it failed with.
+        UsageError: a layer does not exist or gives nothing per stimulus, no layer does, the model cannot
+            process the stimuli (the message says what it was given and what it failed with), or it answers the same
+            stimuli otherwise when it is run again.
     """
     import torch
 
@@ -86,18 +90,22 @@ def extract(
     if readout == "published":
         from brainbench.models.published.readout import published_activations
 
-        reader = partial(published_activations, model, layers=layers)
+        named = reader = partial(published_activations, model, layers=layers)
     else:
-        reader = named_reader(model, layers)
-        reader = reader or partial(_hooked_run, model, _hooked(model, layers), layers is not None, {})
+        named = named_reader(model, layers)
+        reader = named or partial(_hooked_run, model, _hooked(model, layers), layers is not None, {})
     result = Activations()
     with evaluating(model), torch.no_grad():
-        for start, stop in _chunks(len(values), chunk, avoid=values.shape[1]):
+
+        def read(start: int, stop: int) -> Iterator[tuple[str, np.ndarray]]:
             part = torch.as_tensor(_writable(values[start:stop])).to(device=like.device, dtype=like.dtype)
             for name, activity in _run(reader, part, model, values).items():
                 # Real and imaginary parts are features of their own.
                 real = torch.view_as_real(activity.resolve_conj()) if activity.is_complex() else activity
-                rows = real.detach().to("cpu", dtype=torch.float32).reshape(*real.shape[:2], -1).numpy()
+                yield name, real.detach().to("cpu", dtype=torch.float32).reshape(*real.shape[:2], -1).numpy()
+
+        for start, stop in _chunks(len(values), chunk, avoid=values.shape[1]):
+            for name, rows in read(start, stop):
                 if name not in result:
                     result[name] = _room(name, (len(values), *rows.shape[1:]), folder)
                 elif result[name].shape[1:] != rows.shape[1:]:
@@ -106,6 +114,9 @@ def extract(
                         f"{list(rows.shape[1:])}; give stimuli of one length or leave this layer out."
                     )
                 result[name][start:stop] = rows
+        # In another batch, after others: what depends on these is no answer to a stimulus. Ours do not.
+        first = 3 if values.shape[1] == 2 else 2
+        _check_repeated(result, read(0, min(len(values), first)) if named is None else iter(()), model)
     if not result:
         raise UsageError(
             f"Nothing in {type(model).__name__} gives an activation per stimulus: no output of it or of its parts has "
@@ -118,6 +129,24 @@ def extract(
             result.nonfinite[name] = count
             _log.warning("%d of %d activations of layer %r are not finite.", count, activity.size, name)
     return result
+
+
+def _check_repeated(result: Activations, again: Iterator[tuple[str, np.ndarray]], model: nn.Module) -> None:
+    """Raise UsageError if the first stimuli give other activations than before."""
+    try:
+        found = dict(again)
+    except UsageError:  # a model may be made for batches of one size
+        return
+    for name, rows in found.items():
+        before = result[name][: len(rows)]
+        known = np.isfinite(before) & np.isfinite(rows)
+        one, two = before[known].astype(np.float64), rows[known].astype(np.float64)
+        if np.linalg.norm(two - one) > _REPEATED * np.linalg.norm(one):
+            raise UsageError(
+                f"{type(model).__name__} answers the same stimuli otherwise when it is run again (layer {name!r}): it "
+                "keeps a state between calls, draws random numbers or normalises over the batch. Begin anew in "
+                "forward, and give functional.dropout and functional.batch_norm training=self.training."
+            )
 
 
 def _writable(values: Any) -> Any:
@@ -270,12 +299,13 @@ def _over_calls(name: str, outputs: list[torch.Tensor], batch: int, steps: int) 
     """Return named activations [B, T, ...]; none if the outputs do not belong to the stimuli."""
     import torch
 
-    if len(outputs) == 1:
-        activity = _with_time(outputs[0], batch, steps)
-        return {} if activity is None else {name: activity}
-    if len({output.shape for output in outputs}) == 1:
-        return {name: torch.stack(outputs, 1)} if outputs[0].shape[:1] == (batch,) else {}
     timed = [_with_time(output, batch, steps) for output in outputs]
+    if len(outputs) == 1:
+        return {} if timed[0] is None else {name: timed[0]}
+    # A part that stands in several places of a network gives all steps each time; only a loop's calls are steps.
+    whole = len(outputs) != steps and all(item is not None and item.shape[1] == steps > 1 for item in timed)
+    if len({output.shape for output in outputs}) == 1 and not whole:
+        return {name: torch.stack(outputs, 1)} if outputs[0].shape[:1] == (batch,) else {}
     return {f"{name}[{index}]": activity for index, activity in enumerate(timed) if activity is not None}
 
 

@@ -198,7 +198,8 @@ def _trained(config: Mapping[str, Any] | None) -> dict[str, Any]:
     if config is None:
         return {}
     found, twin = config.get("evaluation") or {}, config.get("twin_evaluation") or {}
-    stated = {name: config.get(name) for name in ("epochs", "published_epochs", "best_epoch", "licence", "version")}
+    facts = ("epochs", "published_epochs", "best_epoch", "licence", "version", "evaluated_split")
+    stated = {name: config.get(name) for name in facts}
     stated |= {f"{name} top-1": item.get("top1") for name, item in (config.get("baselines") or {}).items()}
     options = {name: value for name, value in (config.get("training") or {}).items() if name not in ("model", "seed")}
     return {

@@ -122,6 +122,17 @@ def test_doctor_says_what_each_missing_part_would_enable(run, monkeypatch):
     data = json.loads(run("doctor", "--json").out)
     assert data["optional"]["pynwb"]["version"] is None
     assert data["required"]["torch"]
+    # A package of several extras stands with the one that is about it.
+    extras = {"onnx": "export", "tensordict": "policies", "pillow": "report", "scikit-fem": "tactile"}
+    assert {name: data["optional"][name]["extra"] for name in extras} == extras
+
+
+def test_doctor_says_what_each_extra_of_users_enables():
+    from brainbench.cli.doctor import ENABLES
+    from tests.factories.installations import EXTRAS
+
+    # "rod" has no packages.
+    assert {*ENABLES} == {*EXTRAS} - {"rod", "docs", "test", "dev"}
 
 
 @pytest.mark.shared

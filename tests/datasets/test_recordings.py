@@ -215,6 +215,15 @@ def test_files_of_animals_that_may_be_one_are_told(tmp_path):
     assert all(name in told for name in names if name != "m2")
 
 
+def test_one_session_under_the_names_of_two_animals_is_told(tmp_path):
+    start = np.cumsum(np.random.default_rng(0).uniform(2, 3, 12))
+    for name, begin in (("m1", start), ("m2", start), ("m3", start[::-1].max() + 3 - start[::-1])):
+        columns = {"start_time": begin, "stop_time": begin + 1}
+        write(tmp_path / f"{name}.h5", subject=name, session=name, columns=columns)
+    told = open_recordings(tmp_path, conditions="trials:stimulus").attrs["doubts"]
+    assert [("m1" in doubt, "m2" in doubt, "m3" in doubt) for doubt in told] == [(True, True, False)]
+
+
 def test_trials_whose_windows_overlap_are_told(tmp_path):
     # Twelve trials of 1 s every 2 s, with the labels a, b and c by turns.
     path = write(tmp_path / "a.h5")

@@ -83,6 +83,15 @@ def test_builds_show_what_came_went_changed_and_moved(tmp_path):
     assert compare_builds(new, new) == []
 
 
+def test_a_standing_that_changes_alone_is_told(make_record, tmp_path):
+    record = make_record("net")
+    chance = replace(record, score=replace(record.score, p=0.4))
+    (change,) = compare_builds(_build([record], tmp_path / "old"), _build([chance], tmp_path / "new"))
+    assert change.before.partition(",")[0] == change.after.partition(",")[0]
+    assert "not told apart from chance" in change.after
+    assert "not told apart from chance" not in change.before
+
+
 def test_a_site_is_read_by_the_records_it_holds(make_record, tmp_path):
     site = build_leaderboard([make_record()], tmp_path / "site").parent
     (stored,) = open_build(site)

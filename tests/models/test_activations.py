@@ -9,6 +9,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import nn
+from torch.nn import functional
 
 from brainbench.core.errors import UsageError
 from brainbench.models.activations import extract
@@ -321,3 +322,43 @@ def test_on_disk_memory_stays_that_of_a_chunk(tmp_path):
         tracemalloc.stop()
     assert found["1"].nbytes == count * 2 * features * 4  # 32 MB
     assert peaks[0] > found["1"].nbytes > 8 * peaks[1]
+
+
+class _Unsteady(nn.Module):
+    def __init__(self, kind):
+        super().__init__()
+        self.kind, self.linear, self.state = kind, nn.Linear(6 * 35, 8), 0.0
+
+    def forward(self, x):
+        y = self.linear(x.flatten(2))
+        if self.kind == "dropout":
+            return functional.dropout(y, 0.1)
+        if self.kind == "batch norm":
+            return functional.batch_norm(y.flatten(1), None, None, training=True)
+        self.state = self.state + y.mean().detach()
+        return y + self.state
+
+
+@pytest.mark.parametrize("kind", ["dropout", "batch norm", "state"])
+def test_a_model_that_answers_otherwise_when_it_is_run_again_is_refused(kind):
+    x = torch.randn(21, 4, 6, 5, 7, generator=torch.Generator().manual_seed(0))
+    with pytest.raises(UsageError, match="_Unsteady answers the same stimuli otherwise"):
+        extract(_Unsteady(kind), x)
+
+
+@pytest.mark.parametrize("join", [False, True])
+def test_a_part_in_two_places_gives_time_in_each(join):
+    class Shared(nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.one, self.two, self.act = nn.Linear(210, 8), nn.Linear(8, 8), nn.ReLU()
+
+        def forward(self, x):
+            y = x.flatten(0, 1).flatten(1) if join else x.flatten(2)
+            return self.act(self.two(self.act(self.one(y)))).reshape(*x.shape[:2], -1)
+
+    found = extract(Shared(), torch.randn(5, 4, 6, 5, 7))
+    assert {name: values.shape for name, values in found.items()} == {
+        name: (5, 4, 8) for name in ("one", "two", "act[0]", "act[1]", "output")
+    }
+    np.testing.assert_array_equal(found["act[1]"], found["output"])

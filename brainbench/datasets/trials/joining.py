@@ -16,7 +16,7 @@ from brainbench.datasets.trials.conditions import natural_vocabulary
 from brainbench.datasets.trials.counting import UNIT_COLUMNS, ReadingOptions, SessionCounts
 from brainbench.datasets.trials.covariates import COVARIATES
 from brainbench.datasets.trials.selection import check_values
-from brainbench.datasets.trials.session_trials import fingerprint, missing_labels
+from brainbench.datasets.trials.session_trials import fingerprint, missing_labels, same_trials
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -133,6 +133,19 @@ def _doubtful_names(parts: list[SessionCounts]) -> Iterator[str]:
     for names in folded.values():
         if len(names) > 1:
             yield f"animals whose names differ only in case or blanks count as different ones: {listing(names)}"
+    # Equal intervals are those of a fixed protocol; unequal ones at equal times are those of one session.
+    uneven = [part for part in parts if len(part.labels) > 2 and np.ptp(np.diff(part.edges[:, 0])) > 0.01]
+    for index, part in enumerate(uneven):
+        for other in uneven[:index]:
+            same = other.subject != part.subject and same_trials(
+                part.edges[:, 0], np.array(part.labels), other.edges[:, 0], np.array(other.labels), clocks=False
+            )
+            if same:
+                yield (
+                    f"session {other.session} of {other.subject} and {part.session} of {part.subject} have the same "
+                    f"labels at the same times in {len(same)} trials, as two probes or two copies of one session have, "
+                    "and count as two animals"
+                )
 
 
 def _overlaps(part: SessionCounts) -> tuple[int, int]:

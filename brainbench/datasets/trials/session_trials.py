@@ -122,8 +122,7 @@ def trials_by_subject(dataset: xr.Dataset, *, averaged: bool = False) -> dict[st
         for earlier, names in before.setdefault(subject, []):
             # Probes of one session in files of their own share the noise of their trials, so the same trials must go
             # into the same half: noise in both halves would pass for what is reliable.
-            same = _same_trials(start[rows], labels[rows], start[earlier], labels[earlier])
-            if 2 * len(same) > min(len(rows), len(earlier)):
+            if same := same_trials(start[rows], labels[rows], start[earlier], labels[earlier]):
                 keys = [names[same[index]] if index in same else key for index, key in enumerate(keys)]
                 break
         unique = _unique(keys)
@@ -139,12 +138,33 @@ def trials_by_subject(dataset: xr.Dataset, *, averaged: bool = False) -> dict[st
     return {subject: tuple(items) for subject, items in found.items()}
 
 
-def _same_trials(start: Floats, labels: Any, earlier: Floats, others: Any) -> dict[int, int]:
-    """Return the trials that begin with one of an earlier session, within 1 ms, and have its label: trial → its."""
+def same_trials(start: Floats, labels: Any, earlier: Floats, others: Any, *, clocks: bool = True) -> dict[int, int]:
+    """Return the trials that are those of an earlier session, by start (s) and label: trial → its; none if few are.
+
+    With ``clocks`` the times of both may differ by any offset, and by a drift of 200 ppm.
+    """
+    if not (np.isfinite(start).all() and np.isfinite(earlier).all()):
+        return {}
+    least = min(len(start), len(earlier)) / 2
+    same = _coincident(start, labels, earlier, others, 1e-3)
+    if len(same) <= least and clocks:
+        # Trials of one session have one offset, at which the most pairs of one label agree. Chance agrees less often
+        # than in three of four trials, also where all intervals are equal.
+        gaps = [np.subtract.outer(start[labels == one], earlier[others == one]).ravel() for one in np.unique(labels)]
+        gap, width, least = np.sort(np.concatenate(gaps)), 1e-3 + 2e-4 * float(np.ptp(start)), 1.5 * least
+        number = np.searchsorted(gap, gap + width, side="right") - np.arange(len(gap))
+        if len(gap) and number.max() > least:
+            best = int(number.argmax())
+            same = _coincident(start - np.median(gap[best : best + number[best]]), labels, earlier, others, width)
+    return same if len(same) > least else {}
+
+
+def _coincident(start: Floats, labels: Any, earlier: Floats, others: Any, within: float) -> dict[int, int]:
+    """Return the trials that begin with one of an earlier session, and have its label: trial → its."""
     order = np.argsort(earlier, kind="stable")
-    place = np.searchsorted(earlier[order], start - 1e-3)
+    place = np.searchsorted(earlier[order], start - within)
     near = order[np.minimum(place, len(order) - 1)]
-    same = (np.abs(earlier[near] - start) <= 1e-3) & (others[near] == labels)
+    same = (np.abs(earlier[near] - start) <= within) & (others[near] == labels)
     return {int(index): int(near[index]) for index in np.flatnonzero(same)}
 
 

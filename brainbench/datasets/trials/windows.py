@@ -163,7 +163,8 @@ WHOLE = Window("start", stop="stop")
 def _event(table: SessionTable, anchor: str) -> NDArray[np.float64]:
     column = _ANCHORS.get(anchor, anchor)
     if column not in table:
-        raise unknown_name(f"event of a window in {table.label}", anchor, (*_ANCHORS, FIRST_CONTACT, *table.columns))
+        known = [name for name, other in _ANCHORS.items() if other in table]
+        raise unknown_name(f"event of a window in {table.label}", anchor, (*known, FIRST_CONTACT, *table.columns))
     return table.times(column)
 
 

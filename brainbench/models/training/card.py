@@ -22,12 +22,14 @@ def checkpoint_info(
     twin: Mapping[str, Any],
     controls: Mapping[str, Evaluation] | None = None,
     data: Mapping[str, Any] | None = None,
+    split: str = "test",
 ) -> dict[str, Any]:
     """Return what a checkpoint's configuration says beside the architecture, in plain values.
 
     ``twin`` is what :func:`~brainbench.models.training.twins.describe_twin` told of the network before its training,
     ``controls`` are evaluations of :data:`~brainbench.models.training.evaluation.CONTROLS`, ``data`` the
-    :attr:`~brainbench.models.training.batches.Data.summary` of the sweeps.
+    :attr:`~brainbench.models.training.batches.Data.summary` of the sweeps, ``split`` the part of them that the
+    evaluation is of.
     """
     compared = {name: to_plain(found) for name, found in (controls or {}).items()}
     return {
@@ -44,6 +46,7 @@ def checkpoint_info(
         "licence": "MIT",
         "provenance": provenance(),
         **({"data": dict(data)} if data else {}),
+        **({"evaluated_split": split} if split != "test" else {}),
     } | ({"twin_evaluation": compared.pop(TWIN, None), "baselines": compared} if compared else {})
 
 
@@ -67,8 +70,10 @@ def model_card(config: TrainingConfig, info: Mapping[str, Any]) -> str:
     if found is not None:
         low, high = found["interval"]["low"], found["interval"]["high"]
         read = "linear probe on the frozen network" if config.objective != "supervised" else "its own decoder"
+        split = info.get("evaluated_split")
         rows |= {
             "top-1": f"{found['top1']:.3f} [{low:.3f}, {high:.3f}] on {found['count']} sweeps ({read})",
+            "beware": split and f"these accuracies are of the {split} sweeps, which chose the weights",
             "top-5": f"{found['top5']:.3f}",
             "test data": found["data"],
             "collapsed": f"yes: {found['reason']}" if found["collapsed"] else "no",

@@ -324,7 +324,7 @@ class _Run:
         return mean if math.isfinite(mean) else math.inf
 
     def _finish(self) -> TrainingResult:
-        result = None
+        result, split = None, "test"
         if self.where.first:
             told = read_mapping(self.out / RUN)
             self.controls = _evaluations(told.get("controls") or {})
@@ -351,7 +351,11 @@ class _Run:
                     result = evaluate(self.model, batches, device=self.where.device)
                     self.controls = self._compare(result, batches)
                     break
-            self._publish(result)
+            if result is not None and split != "test":
+                _log.warning(
+                    "There is no split 'test': the accuracy is that of %s sweeps, which chose the weights.", split
+                )
+            self._publish(result, split)
             if result is not None:
                 self.log.write("test", self.at.step, top1=result.top1, top5=result.top5, spread=result.spread)
                 if result.collapsed:
@@ -390,9 +394,9 @@ class _Run:
     def _probe(self) -> dict[str, Any]:
         return {"epochs": self.config.probe_epochs, "seed": self.config.seed}
 
-    def _publish(self, result: Evaluation | None) -> None:
+    def _publish(self, result: Evaluation | None, split: str = "test") -> None:
         config, reached = self.config, {"epochs_done": self.at.epoch, "best_epoch": self.at.best_epoch}
-        told = {"twin": self.twin, "controls": self.controls, "data": self.data.summary}
+        told = {"twin": self.twin, "controls": self.controls, "data": self.data.summary, "split": split}
         info = checkpoint_info(config, self.data.classes, evaluation=result, **reached, **told)
         kept = {"options": self.options, "info": info, "card": model_card(config, info), "dtype": config.stored_dtype}
         save_checkpoint(self.out / BEST, self.model, architecture=config.model, **kept)

@@ -7,7 +7,7 @@ import xarray as xr
 from brainbench.core.errors import DataError, UsageError
 from brainbench.datasets import open_recordings, write_recordings
 from brainbench.datasets.sessions import make_session
-from brainbench.datasets.trials.session_trials import pooled, trials_by_subject
+from brainbench.datasets.trials.session_trials import pooled, same_trials, trials_by_subject
 from brainbench.metrics.reliability.subject_rdm import subject_rdm
 from tests.factories.recordings import make_simple_session
 
@@ -94,8 +94,21 @@ def test_probes_of_one_session_in_files_of_their_own_share_the_halves_of_their_t
     probes = [make_session("m", name, part, {"trials": table}) for name, part in (("a", spikes[:9]), ("b", spikes[9:]))]
     two = animal(*probes)
     np.testing.assert_allclose(two.split_half_r, one.split_half_r)
+    # A clock of its own, with another zero and a drift.
+    other = {name: values * 1.00005 + 7 if name != "stimulus" else values for name, values in table.items()}
+    apart = animal(probes[0], make_session("m", "b", [times * 1.00005 + 7 for times in spikes[9:]], {"trials": other}))
+    np.testing.assert_allclose(apart.split_half_r, one.split_half_r, atol=1e-3)
     three = animal(probes[0], make_session("m", "b", spikes[9:], {"trials": late}))
     assert abs(three.reliability - one.reliability) < 0.15
+
+
+@pytest.mark.parametrize("even", [True, False])
+def test_sessions_of_different_days_share_no_trials(even):
+    random = np.random.default_rng(0)
+    for number in range(50):
+        start, earlier = (1.0 + np.cumsum(random.uniform(2, 2 if even else 3, 96)) for _ in range(2))
+        labels, others = (random.permutation(np.resize(np.arange(4), 96)) for _ in range(2))
+        assert not same_trials(start + number, labels, earlier, others)
 
 
 def test_other_data_sets_are_refused():

@@ -126,6 +126,13 @@ def test_an_unknown_anchor_suggests_the_nearest_column():
         edges(Window("choice_tim", length=1.0), make_contacts())
 
 
+def test_an_event_without_its_column_does_not_suggest_itself():
+    session = make_session("m", "s", [np.zeros(0)], {"trials": {"start_time": [0.0], "texture": ["a"]}})
+    with pytest.raises(UsageError, match="'stop'") as found:
+        Window("start", stop="stop").edges(session, session.tables["trials"], [])
+    assert "did you mean 'stop'" not in str(found.value)
+
+
 @pytest.mark.parametrize(
     ("options", "told"),
     [

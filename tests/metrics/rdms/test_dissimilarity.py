@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from fractions import Fraction
+from itertools import combinations, permutations
 
 import numpy as np
 import pytest
@@ -274,3 +275,21 @@ def test_a_single_unit_has_distances_but_no_correlations():
 def test_a_noise_precision_is_symmetric_and_positive(wrong) -> None:
     with pytest.raises(UsageError, match="noise precision is a symmetric"):
         rdm(np.arange(6.0).reshape(3, 2), method="mahalanobis", precision=wrong)
+
+
+@pytest.mark.parametrize("missing", [0.0, 0.1])
+def test_crossnobis_of_unequal_folds_is_the_mean_over_pairs_of_folds(missing):
+    random = np.random.default_rng(0)
+    labels, folds = np.append(np.arange(5), random.integers(0, 5, 45)), random.integers(0, 4, 50)
+    trials = random.normal(size=(50, 7)) + 100
+    trials[random.random(trials.shape) < missing] = np.nan
+    expected = []
+    for i, j in combinations(range(5), 2):
+        found = []
+        for m, n in permutations(range(4), 2):
+            cells = [trials[(folds == fold) & (labels == label)] for fold in (m, n) for label in (i, j)]
+            if all(map(len, cells)):
+                means = [np.ma.masked_invalid(cell).mean(axis=0) for cell in cells]
+                found.append(((means[0] - means[1]) * (means[2] - means[3])).mean())
+        expected.append(np.mean(found))
+    np.testing.assert_allclose(rdm(trials, labels, method="crossnobis", folds=folds), expected)

@@ -20,6 +20,7 @@ from brainbench.models.training.evaluation import evaluate, fit_probe
 from brainbench.models.training.objectives import make_learner
 from brainbench.models.training.run_folder import read_log
 from brainbench.models.training.trainer import train
+from brainbench.scoring.model_responses import resolve_model
 from tests.factories.training_sweeps import CLASSES, sweeps, tiny
 
 MODEL = "zhuang-small"
@@ -66,6 +67,16 @@ def test_a_run_learns_what_can_be_learned_and_leaves_a_model_to_load(tmp_path):
     assert "5 (published: 100)" in card
     losses = [line["loss"] for line in read_log(tmp_path, "epoch")]
     assert losses[-1] < losses[0]
+
+
+@pytest.mark.parametrize("split", ["train", "validation", "test"])
+def test_accuracy_on_sweeps_that_chose_the_weights_is_told(tmp_path, caplog, split):
+    data = tiny(validation=9 * (split != "train"), test=9 * (split == "test"))
+    result = train(_config(epochs=1, probe_epochs=0), data, out=tmp_path, device="cpu")
+    told = [text for text in (caplog.text, (result.folder / "README.md").read_text()) if f"{split} sweeps" in text]
+    assert len(told) == (0 if split == "test" else 2)
+    stated = resolve_model(f"local-dir:{result.folder}").card.training
+    assert stated.get("evaluated_split") == (None if split == "test" else split)
 
 
 def test_on_the_cpu_precision_is_single_unless_asked_otherwise(tmp_path):
@@ -292,6 +303,7 @@ import sys
 import torch
 from brainbench.models.training.config import TrainingConfig
 from brainbench.models.training.trainer import train
+from brainbench.scoring.model_responses import resolve_model
 from tests.factories.training_sweeps import tiny
 
 torch.set_num_threads(1)
