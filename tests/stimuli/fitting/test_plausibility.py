@@ -1,4 +1,4 @@
-"""Wrenches with a wrong clock, unit or sign are refused in a sentence, or make a fit unreliable, as a dead channel does."""
+"""Wrenches of a wrong clock, unit or sign are refused or make a fit unreliable, as a dead channel does."""
 
 from __future__ import annotations
 
