@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import math
+from contextlib import ExitStack
 from dataclasses import replace
 from unittest.mock import patch
 
@@ -82,7 +83,10 @@ def soft(each: int, fidelity: Fidelity) -> list[list[str]]:
     fine = replace(fidelity, time_step=2e-5, steps_per_period=120, precision="double", contact_tolerance=1e-9)
     reference, judged = RodEngine().run(jobs, fine), engine.run(jobs, fidelity)
     home = "brainbench.stimuli.engines"
-    with patch(f"{home}.mujoco.engine.LARGEST_CHANGE", 9.0), patch(f"{home}.stepping.LARGEST_CHANGE", 9.0):
+    limits = "mujoco.engine.LARGEST_CHANGE", "stepping.LARGEST_CHANGE", "stepping.LARGEST_CREEP_CHANGE"
+    with ExitStack() as stack:
+        for limit in limits:
+            stack.enter_context(patch(f"{home}.{limit}", 9.0))
         every = engine.run(jobs, fidelity)
     rows = []
     for friction in FRICTIONS:

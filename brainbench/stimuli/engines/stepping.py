@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
@@ -23,6 +24,7 @@ from brainbench.stimuli.engines.reach import Reach, reachable
 from brainbench.stimuli.engines.trust import (
     GOT_INSIDE,
     LARGEST_CHANGE,
+    LARGEST_CREEP_CHANGE,
     LARGEST_OVERLAP,
     SUSPICIOUS_FORCE,
     SUSPICIOUS_ROUGHNESS,
@@ -168,11 +170,13 @@ class SteppedJob:
         reason: str,
         forces: NDArray[np.float64],
         doubt: str = "",
-    ) -> tuple[Trace, bool]:
-        """Return the trace of values at the frames, NaN where they cannot be trusted, and whether it is suspicious.
+        creeps: bool = False,
+    ) -> tuple[Trace, float]:
+        """Return the trace of values at the frames, NaN where not trusted, and the largest change at half the step.
 
         ``shape`` is in m; ``forces`` [s, 3] (N) are those on the base before the steps that can be trusted;
-        ``doubt`` is a fault without a time.
+        ``doubt`` is a fault without a time; ``creeps`` says that soft contacts hold too little friction. The change is
+        infinite without a suspicion.
         """
         good, penetration = frames.good, max(penetration, self.overlap[2])
         if not reason and penetration > 2 * LARGEST_OVERLAP:
@@ -194,7 +198,9 @@ class SteppedJob:
         strongest = SUSPICIOUS_FORCE * strongest_force(self.job.whisker)
         strong = np.linalg.norm(forces, axis=1).max(initial=0.0) > strongest
         deep = penetration > SUSPICIOUS_SHARE * 2 * LARGEST_OVERLAP
-        return trace, not reason and bool(strong or deep or roughness(forces) > SUSPICIOUS_ROUGHNESS)
+        suspicious = strong or deep or creeps or roughness(forces) > SUSPICIOUS_ROUGHNESS
+        allowed = LARGEST_CREEP_CHANGE if creeps else LARGEST_CHANGE
+        return trace, math.inf if reason or not suspicious else allowed
 
     def halved(self) -> SteppedJob:
         """Return the job in half the step; its processor time counts on."""
@@ -212,7 +218,7 @@ class SteppedEngine(WhiskerEngine):
         """Return what surrounds a run; without the engine's package it is a :class:`MissingDependencyError`."""
 
     @abstractmethod
-    def simulate(self, stepped: SteppedJob) -> tuple[Trace, bool]:
+    def simulate(self, stepped: SteppedJob) -> tuple[Trace, float]:
         """Simulate one job that is not silent; return what :meth:`SteppedJob.trace` does."""
 
     def _trusted(self, stepped: SteppedJob) -> Trace:
@@ -220,13 +226,13 @@ class SteppedEngine(WhiskerEngine):
         if is_silent(stepped.job, stepped.reach, *stepped.pose):
             seconds = time.thread_time() - stepped.started
             return silent_trace(stepped.job, stepped.fidelity, stepped.record_shape, seconds)
-        trace, suspicious = self.simulate(stepped)
-        if not suspicious:
+        trace, allowed = self.simulate(stepped)
+        if math.isinf(allowed):
             return trace
         half, _ = self.simulate(stepped.halved())
         trace = replace(trace, steps=trace.steps + half.steps, seconds=half.seconds)
         change = float(force_change(*(one.wrench[None, :, None, :3] for one in (trace, half)))[0, 0])
-        if change <= LARGEST_CHANGE:
+        if change <= allowed:
             return trace
         lost = {
             "wrench": np.full_like(trace.wrench, np.nan),

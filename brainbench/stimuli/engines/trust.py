@@ -53,12 +53,15 @@ SUSPICIOUS_ROUGHNESS = 0.05
 follow what they touch stay below .01; those that are thrown off and caught again have .1 to 2."""
 LARGEST_CHANGE = 0.2
 """Share by which the base force (root mean square over the readings) may change when the step is halved."""
+LARGEST_CREEP_CHANGE = 0.1
+"""The same in soft contacts that hold too little friction, whose force follows the step slowly."""
 LARGEST_STRUCK_CHANGE = 0.1
 """The same in rigid contacts with a :data:`BLOW`, when the step is cut to a fifth: contacts may cut a step and its half
 to the same. Of 555 whiskers it finds 99 of the 105 that err by more than a fifth, and 48 others; nothing that a single
 run tells does (benchmarks/whiskers/struck.py)."""
-BLOW = 1.0
-"""Speed (m/s) of an object against the base from which it counts as a blow."""
+BLOW = 0.15
+"""Speed (m/s) of an object against the base from which it counts as a blow. At .2 to .7 m/s 4 to 11 % of the whiskers
+err by more than a fifth with ``balanced``, at .1 m/s 2 %."""
 HARD_BLOW = 3.0
 """Speed of a blow beyond which the presets err by 20 to 90 %."""
 BLOW_STRIDE = 0.25

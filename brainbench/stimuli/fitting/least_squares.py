@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 
 from brainbench.core.errors import DataError, UsageError, check_each
 from brainbench.core.files import provenance
-from brainbench.core.records import Status
+from brainbench.core.records import Interval, Status
 from brainbench.stimuli.fitting.identifiability import directions, unknown_parameters
 from brainbench.stimuli.fitting.intervals import Profile, laplace_interval, quantile
 from brainbench.stimuli.fitting.model import FitModel
 from brainbench.stimuli.fitting.options import FitOptions
 from brainbench.stimuli.fitting.parameters import PARAMETERS, PUBLISHED, FreeParameters, Prior
-from brainbench.stimuli.fitting.plausibility import check_wrenches, dead_channels
+from brainbench.stimuli.fitting.plausibility import check_wrenches, dead_channels, other_sizes
 from brainbench.stimuli.fitting.residual_tests import check_residuals, failed_words
 from brainbench.stimuli.fitting.result import FitResult, FittedParameter
 from brainbench.stimuli.fitting.starts import find_starts, scanned
@@ -28,6 +28,8 @@ from brainbench.stimuli.fitting.trials import Trial
 Array = NDArray[np.float64]
 _ROUNDS = 3
 """Fits with the noise of each channel estimated anew; it settles in two."""
+STATED = 5.0
+"""Fitted over stated deflection of a plucked whisker, or its inverse, from which a unit is wrong."""
 ALIKE = 16.0
 """Difference of the deviance (−2 log likelihood) up to which two minima fit alike: odds of 3,000 to one."""
 
@@ -181,7 +183,12 @@ def _judge(problem: _Problem, solutions: Sequence[_Solution], began: float) -> F
         deviation = math.sqrt(covariance[index, index]) if covariance[index, index] >= 0 else math.inf
         error = float(errors[index])
         rival = rivals.get(name)
-        status, reason = ("undefined", rival) if rival else _judge_one(problem, index, u, unknown.get(name), error)
+        interval = laplace_interval(free, index, u, math.hypot(deviation, error), options.level, t)
+        status, reason = _judge_one(problem, index, u, unknown.get(name), error)
+        if rival:
+            status, reason = "undefined", rival
+        elif status == "ok" and (reason := _unlikely(free, index, value, interval)):
+            status = "unreliable"
         estimates.append(
             FittedParameter(
                 name,
@@ -190,7 +197,7 @@ def _judge(problem: _Problem, solutions: Sequence[_Solution], began: float) -> F
                 free.start[name],
                 deviation,
                 error,
-                laplace_interval(free, index, u, math.hypot(deviation, error), options.level, t),
+                interval,
                 profile.interval(free, index, options.level, t, error) if profile and status != "undefined" else None,
                 problem.priors.get(index),
                 status,
@@ -204,6 +211,7 @@ def _judge(problem: _Problem, solutions: Sequence[_Solution], began: float) -> F
         *dict.fromkeys(one.reason for one in estimates if one.reason),
         *failed_words(tests),
         *dead_channels(model.trials, traces),
+        *other_sizes(model.trials, traces),
     ]
     worst = {one.status for one in estimates} | ({"unreliable"} if reasons else {"ok"})
     status: Status = "undefined" if not best.converged or "undefined" in worst else "unreliable" if reasons else "ok"
@@ -289,6 +297,23 @@ def _judge_one(problem: _Problem, index: int, u: Array, unknown: str | None, err
             "simulation; fit with more links or steps_per_period."
         )
     return "ok", ""
+
+
+def _unlikely(free: FreeParameters, index: int, value: float, interval: Interval) -> str:
+    """Return why a value can hardly be right though the data tell it; empty for nothing.
+
+    A value that the user began beyond the usual ones, such as that of a steel wire, is meant.
+    """
+    name, start = free.names[index], free.start[free.names[index]]
+    parameter = PARAMETERS[name]
+    low, high = (start / STATED, start * STATED) if name == "deflection" else parameter.real
+    if not (low <= start <= high and (interval.high < low or interval.low > high)):
+        return ""
+    known = f"about {start:.3g} was stated" if name == "deflection" else f"whiskers have {low:g} to {high:g}"
+    return (
+        f"{name} is {value:.3g} {parameter.unit}, and {known}: a unit, the frame rate or a property that was taken as "
+        "known is wrong. If it is right, start near it."
+    )
 
 
 def _wrench(trial: Trial, trace: Any) -> Array:

@@ -69,6 +69,8 @@ class Parameter:
     """Power of the arc length that ``scale`` is multiplied by."""
     of_job: str = ""
     """Displacement of :class:`brainbench.stimuli.gradients.JobParameters` that it is."""
+    real: tuple[float, float] = (-math.inf, math.inf)
+    """Smallest and largest value of real whiskers, a little wider than what was published."""
 
     def unit_of(self, whisker: Whisker) -> float:
         """Return what one unit of u is worth, in the parameter's unit; of ``log`` parameters 1."""
@@ -83,8 +85,8 @@ class Parameter:
         return math.log(value / start) if self.kind == "log" else (value - start) / self.unit_of(whisker)
 
 
-def _positive(name: str, unit: str, what: str, low: float = 0.1, high: float = 10.0) -> Parameter:
-    return Parameter(name, unit, "log", low, high, what)
+def _positive(name: str, unit: str, what: str, low: float = 0.1, high: float = 10.0, **others: Any) -> Parameter:
+    return Parameter(name, unit, "log", low, high, what, **others)
 
 
 def _shift(name: str, what: str, of_job: str) -> Parameter:
@@ -94,9 +96,11 @@ def _shift(name: str, what: str, of_job: str) -> Parameter:
 PARAMETERS: Mapping[str, Parameter] = {
     item.name: item
     for item in (
-        _positive("young_modulus", "Pa", "Young's modulus"),
-        _positive("density", "kg/m³", "density at the base; the ratio of tip to base is kept", 0.2, 5.0),
-        _positive("damping_ratio", "", "damping ratio of the first mode"),
+        _positive("young_modulus", "Pa", "Young's modulus", real=(1e9, 1e10)),
+        _positive(
+            "density", "kg/m³", "density at the base; the ratio of tip to base is kept", 0.2, 5.0, real=(800.0, 2000.0)
+        ),
+        _positive("damping_ratio", "", "damping ratio of the first mode", real=(0.01, 1.0)),
         _positive("base_radius", "m", "radius at the base", 0.2, 5.0),
         _positive("tip_radius", "m", "radius at the tip, which sets the taper", 0.05, 20.0),
         _positive("arc_length", "m", "length along the whisker", 0.5, 2.0),

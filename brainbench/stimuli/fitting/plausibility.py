@@ -29,6 +29,11 @@ SHORT = 0.02
 """Share of a period of the first mode that the readings last from which the clock or the whisker is wrong."""
 SPENT = 25.0
 """Decay times of the first mode after which nothing is left of a swing: e⁻²⁵."""
+MULTIPLE = 1.5
+"""Size of the forces (moments) over that of the fitted whisker, or its inverse, from which one of the kinds has another
+unit: where they disagree, a fit follows the one and takes the other for noise."""
+SURE = 5.0
+"""Standard deviations by which such a size is known to differ."""
 DEAD = 0.05
 """Share of the largest predicted component of its kind from which one that reads zero throughout is doubtful."""
 
@@ -103,6 +108,24 @@ def dead_channels(trials: Sequence[Trial], traces: Sequence[Trace]) -> tuple[str
         f"{listing(dict.fromkeys(doubtful))} is zero throughout and was left out, although the fitted whisker acts "
         "there: leave out the column if it was not measured.",
     )
+
+
+def other_sizes(trials: Sequence[Trial], traces: Sequence[Trace]) -> tuple[str, ...]:
+    """Return one sentence where forces, or moments, are a multiple of those of the fitted whisker."""
+    for trial, trace in zip(trials, traces, strict=True):
+        for kind, what in (("F", "forces"), ("M", "moments")):
+            measured, expected = _of_kind(trial, trace, kind)
+            square = float(expected @ expected)
+            if measured.size < 3 or not square > 0:
+                continue
+            ratio = float(measured @ expected) / square
+            spread = float(np.sqrt(np.sum((measured - ratio * expected) ** 2) / (measured.size - 1) / square))
+            if not 1 / MULTIPLE < ratio < MULTIPLE and abs(ratio - 1) > SURE * spread:
+                return (
+                    f"The measured {what} are {ratio:.2g} times those of the fitted whisker: forces and moments do not "
+                    "belong together; check their units and about which point moments are taken.",
+                )
+    return ()
 
 
 def _of_kind(trial: Trial, trace: Trace, kind: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -37,7 +37,8 @@ class FittedParameter:
     was not asked for."""
     prior: Prior | None = None
     status: Status = "ok"
-    """``undefined``: the data do not tell this parameter; ``unreliable``: at a bound, or known by its prior only."""
+    """``undefined``: the data do not tell this parameter; ``unreliable``: at a bound, known by its prior only, or
+    far from any whisker."""
     reason: str = ""
 
     @property
@@ -51,7 +52,8 @@ class FitResult:
     """Everything that a fit found."""
 
     status: Status
-    """``ok``; ``unreliable``: the model does not fit, or a parameter is at a bound or known by its prior only;
+    """``ok``; ``unreliable``: the model does not fit, or a parameter is at a bound, known by its prior only or far
+    from any whisker;
     ``undefined``: it did not converge, or a parameter cannot be told."""
     reasons: tuple[str, ...]
     """One sentence for each thing that is wrong."""

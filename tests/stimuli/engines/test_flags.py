@@ -166,7 +166,12 @@ def test_the_blow_that_mujoco_cannot_follow_is_followed_by_rod_in_short_steps():
 
 @pytest.mark.parametrize(
     ("speed", "place", "friction", "fidelity", "before"),
-    [(1.2, 0.012, 0.4, "fast", 148), (2.8, 0.009, 0.0, "balanced", 0.42)],
+    [
+        (1.2, 0.012, 0.4, "fast", 148),
+        (2.8, 0.009, 0.0, "balanced", 0.42),
+        (0.7, 0.0125, 0.4, "fast", 2.07),
+        (0.35, 0.0135, 0.0, "balanced", 0.77),
+    ],
 )
 def test_a_whisker_that_a_face_strikes_is_right_in_rod(speed, place, friction, fidelity, before):
     moving = _moving((place, -0.002, 0), (0, speed, 0), Box((0.0, 0.0, 0.0), (2e-3, 1e-3, 5e-3)))

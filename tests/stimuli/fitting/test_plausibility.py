@@ -1,4 +1,4 @@
-"""Wrenches with a wrong clock, unit or sign are refused in a sentence; a dead channel makes a fit unreliable."""
+"""Wrenches of a wrong clock, unit or sign are refused or make a fit unreliable, as a dead channel does."""
 
 from __future__ import annotations
 
@@ -68,3 +68,37 @@ def test_a_component_that_reads_zero_though_the_whisker_acts_there_is_said(measu
     assert (good.status, bad.status) == ("ok", "unreliable")
     assert any("'Fy' is zero throughout" in reason for reason in bad.reasons)
     assert bad["young_modulus"].value == pytest.approx(good["young_modulus"].value, rel=0.02)
+
+
+def test_moments_of_another_unit_than_the_forces_are_said(measured):
+    """Of 20 readings the forces tell the parameters, and the moments were taken for noise, with status ok."""
+    few = measured.isel(time=slice(1, None, 2)).copy(deep=True)
+    few["wrench"].values[:, [name[0] == "M" for name in few["channel"].values]] *= 10
+    result = _fit(few)
+    assert result.status == "unreliable"
+    assert any("moments are" in reason and "units" in reason for reason in result.reasons)
+
+
+@pytest.mark.parametrize(
+    ("forces", "clock", "names", "told"),
+    [
+        (1 / 9.81, 1.0, (*FREE, "deflection"), "deflection"),
+        (1.0, 0.5, (*FREE, "deflection"), "young_modulus"),
+        (1.0, 2.0, ("density", "deflection"), "density"),
+    ],
+    ids=["kilograms", "half the frame rate", "twice the frame rate"],
+)
+def test_parameters_of_no_whisker_are_said(measured, forces, clock, names, told):
+    changed = new_wrenches(
+        clock * measured["time"].values, forces * measured["wrench"].values, measured["channel"].values
+    )
+    result = fit(Trial.ringdown(WHISKER, changed, 1e-3), names, options=QUICK)
+    assert result.status == result[told].status == "unreliable"
+    assert told in result[told].reason
+
+
+def test_a_wire_whose_stiffness_is_beyond_whiskers_is_fitted(measured):
+    wire = replace(WHISKER, young_modulus=4 * WHISKER.young_modulus)
+    blank = Trial.ringdown(wire, blank_wrenches(measured["time"].values / 2), 1e-3)
+    trial = measure_wrenches(blank, simulate_trial(blank, options=QUICK), 0.01, np.random.default_rng(0))
+    assert fit(trial, FREE, options=QUICK).status == "ok"

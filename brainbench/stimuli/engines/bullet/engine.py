@@ -49,7 +49,7 @@ class BulletEngine(SteppedEngine):
         """See :meth:`SteppedEngine.session`."""
         return nullcontext(engine())
 
-    def simulate(self, stepped: SteppedJob) -> tuple[Trace, bool]:
+    def simulate(self, stepped: SteppedJob) -> tuple[Trace, float]:
         """See :meth:`SteppedEngine.simulate`."""
         gravity = np.asarray(stepped.job.gravity, float)
         shown = stepped.frames(len(stepped.times)).nearest.tolist() if stepped.record_shape else []

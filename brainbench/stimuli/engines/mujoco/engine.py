@@ -29,6 +29,9 @@ from brainbench.stimuli.whiskers.chain import Chain
 
 logger = logging.getLogger(__name__)
 
+CREEPS = 0.9
+"""Share of the friction that contacts hold below which a whisker is compared with half the step. It lets go too early
+or too late, and at another time in half the step."""
 CHUNK = 250
 """Steps per native call: bounds the memory of a job, and the drift of prescribed joints between resets."""
 
@@ -52,7 +55,7 @@ class MujocoWhiskerEngine(SteppedEngine):
         finally:
             mujoco.set_mju_user_warning(before)
 
-    def simulate(self, stepped: SteppedJob) -> tuple[Trace, bool]:
+    def simulate(self, stepped: SteppedJob) -> tuple[Trace, float]:
         """See :meth:`SteppedEngine.simulate`."""
         job, chain = stepped.job, stepped.chain
         free = stepped.fidelity.twist is not False
@@ -70,6 +73,7 @@ class MujocoWhiskerEngine(SteppedEngine):
         if stepped.record_shape:
             # As the wrench: between steps a whisking follicle turns by more than its whisker bends.
             shape = frames.interpolate(lambda steps: _shape(built, chain, hinges[steps], steps))
+        friction, held = _friction(sensors[:failed, 6:], job, stepped.reach)
         return stepped.trace(
             frames,
             frames.interpolate(lambda steps: _wrench(built, sensors, steps)),
@@ -79,7 +83,8 @@ class MujocoWhiskerEngine(SteppedEngine):
             penetration=_penetration(sensors[: failed + 1, 6:], hinges[: failed + 1], built, chain),
             reason=reason,
             forces=sensors[:failed, :3] / MILLI,
-            doubt=_lost_friction(sensors[:failed, 6:], job, stepped.reach),
+            doubt=_lost_friction(friction, held),
+            creeps=held < CREEPS * friction,
         )
 
 
@@ -220,17 +225,19 @@ def _nearest_arcs(points: NDArray, joints: NDArray, chain: Chain) -> NDArray[np.
     return chain.nodes[link] + share * np.diff(chain.nodes)[link]
 
 
-def _lost_friction(slots: NDArray, job: Job, reach: Reach) -> str:
-    """Return in words that soft contacts hold too little friction, from the contacts of all steps; empty if enough.
+def _friction(slots: NDArray, job: Job, reach: Reach) -> tuple[float, float]:
+    """Return the friction of the objects, and what contacts hold of it (root mean square); 0 and 0 without contact."""
+    friction = min((item.friction_beside(job.whisker.friction) for item in reach.obstacles), default=0.0)
+    squares = np.sum(slots.reshape(-1, SLOT_WIDTH)[:, 1:4] ** 2, axis=0)
+    return (friction, float(np.sqrt(squares[1:].sum() / squares[0]))) if squares[0] > 0 else (0.0, 0.0)
+
+
+def _lost_friction(friction: float, held: float) -> str:
+    """Return in words that soft contacts hold too little friction; empty if enough.
 
     A whisker against an object creeps along it, so that Coulomb's law asks for almost all of the friction. Soft
     friction is viscous below some cm/s and lets go.
     """
-    friction = min((item.friction_beside(job.whisker.friction) for item in reach.obstacles), default=0.0)
-    squares = np.sum(slots.reshape(-1, SLOT_WIDTH)[:, 1:4] ** 2, axis=0)
-    if friction == 0.0 or squares[0] == 0.0:
-        return ""
-    held = float(np.sqrt(squares[1:].sum() / squares[0]))
     # What is missing, as a share of the whole force of a contact that slips.
     if friction - held <= LARGEST_CHANGE * np.hypot(1, friction):
         return ""

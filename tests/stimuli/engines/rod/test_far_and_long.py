@@ -109,7 +109,7 @@ def test_a_step_is_split_only_for_what_is_about_to_be_touched():
     beside = [Obstacle((Sphere((x, 0.0, z), 4e-4),)) for x in (0.006, 0.009, 0.012) for z in (-1.1e-3, 1.1e-3)]
 
     def motion(times):
-        return times[:, None] * np.array([0.0, 0.5, 0.0]), np.tile([1.0, 0.0, 0.0, 0.0], (len(times), 1))
+        return times[:, None] * np.array([0.0, 0.14, 0.0]), np.tile([1.0, 0.0, 0.0, 0.0], (len(times), 1))
 
     flying = Obstacle((Sphere((0.012, -0.02, 0.006), 1e-3),), motion)
     touched = [post(0.01, 0.003)]
