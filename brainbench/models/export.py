@@ -6,6 +6,7 @@ normaliser is inside. Beside it stands a JSON contract: channels, units, frame, 
 
 from __future__ import annotations
 
+import logging
 import warnings
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
@@ -100,6 +101,8 @@ def require_onnx() -> None:
             __import__(package)
         except ImportError as error:
             raise missing_dependency(package, extra="export", purpose="Exporting to ONNX") from error
+    # The exporter warns that torchvision, which nothing here has a layer of, is not installed.
+    logging.getLogger("torch.onnx").setLevel(logging.ERROR)
 
 
 def _write(step: Any, path: Path, format: str) -> None:
