@@ -22,6 +22,17 @@ FELT = 2e-7
 """Peak force (N) from which a whisker counts."""
 
 
+def pick_sweeps(objects: list[str], recipe: str, each: int) -> tuple[SweepScenes, dict[str, list[Any]]]:
+    """Make the objects of a recipe and pick so many sweeps of each, evenly and none of the first or last three."""
+    found = resolve_objects(objects, surfaces=True)
+    scenes, picked = SweepScenes(GRIDS[recipe], {name: item.load for name, item in found.items()}), {}
+    for name in scenes.objects:
+        sweeps = scenes.grid.sweeps(name)
+        picked[name] = [sweeps[k] for k in np.linspace(3, len(sweeps) - 4, each).astype(int)]
+        scenes.solid(name)
+    return scenes, picked
+
+
 def run(scenes: SweepScenes, picked: dict[str, list[Any]], fidelity: Fidelity) -> dict[str, Any]:
     """All picked sweeps at one fidelity: wrench, what was flagged, and processor seconds."""
     launcher = SweepLauncher(scenes, fidelity, "cpu")
@@ -60,13 +71,7 @@ def main() -> None:
     parser.add_argument("--links", type=int, default=12)
     parser.add_argument("--write", action="store_true")
     args = parser.parse_args()
-    objects = resolve_objects(args.objects.split(","), surfaces=True)
-    scenes = SweepScenes(GRIDS[args.recipe], {name: item.load for name, item in objects.items()})
-    picked = {}
-    for name in scenes.objects:
-        sweeps = scenes.grid.sweeps(name)
-        picked[name] = [sweeps[k] for k in np.linspace(3, len(sweeps) - 4, args.each).astype(int)]
-        scenes.solid(name)
+    scenes, picked = pick_sweeps(args.objects.split(","), args.recipe, args.each)
     count = sum(map(len, picked.values()))
     rows, reference = [], None
     for step in STEPS:
