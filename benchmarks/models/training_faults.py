@@ -7,14 +7,13 @@
 
 from __future__ import annotations
 
-import argparse
 from contextlib import nullcontext
 from pathlib import Path
 from unittest.mock import patch
 
 import torch
 
-from benchmarks.report import table, write_section
+from benchmarks.report import publish, script_parser, table
 from brainbench.datasets import WhiskingDataset
 from brainbench.models.ops.seeding import seeded
 from brainbench.models.registry import load_model
@@ -57,16 +56,12 @@ def silence(folder: Path) -> str:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser = script_parser(__doc__)
     parser.add_argument("part", choices=("silence",))
     parser.add_argument("sweeps", type=Path)
-    parser.add_argument("--write", action="store_true")
     args = parser.parse_args()
     text = silence(args.sweeps)
-    print(text)
-    if args.write:
-        command = "python -m benchmarks.models.training_faults silence SWEEPS --write"
-        write_section("First gradients and silence", command, text, subject="models")
+    publish(args, "First gradients and silence", text, "silence SWEEPS")
 
 
 if __name__ == "__main__":

@@ -20,7 +20,7 @@ from typing import Any
 
 import torch
 
-from benchmarks.report import table, write_section
+from benchmarks.report import publish, script_parser, table
 from robotics_bridge import tasks
 from robotics_bridge.envs import Env
 from robotics_bridge.policies.training import teacher
@@ -174,16 +174,13 @@ def tables(options: argparse.Namespace, out: Path) -> None:
     splits = [[f"{r[k]:.3g}" for k in shown] for r in rows if r["part"] == "split"]
     if splits:
         parts.append(table([name.replace("_", " ") for name in shown], splits))
-    body = "\n\n".join(parts)
-    print(body)
-    if options.write:
-        devices = sorted({r["device"] for r in rows if "device" in r})
-        title = f"Dexterous tasks: speed ({', '.join(devices) or 'processors'})"
-        write_section(title, f"python -m benchmarks.policies.tasks --device {options.device}", body, subject="policies")
+    devices = sorted({r["device"] for r in rows if "device" in r})
+    title = f"Dexterous tasks: speed ({', '.join(devices) or 'processors'})"
+    publish(options, title, "\n\n".join(parts), f"--part tables --device {options.device}")
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = script_parser(__doc__)
     parser.add_argument("--part", choices=["speed", "split", "tables"], required=True)
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--out", type=Path, default=Path("policy-bench"))
@@ -192,7 +189,6 @@ def main() -> None:
     parser.add_argument("--envs", nargs="+", type=int, default=None)
     parser.add_argument("--eager", action="store_true", help="speed and split without CUDA graphs")
     parser.add_argument("--repeats", type=int, default=20)
-    parser.add_argument("--write", action="store_true")
     options = parser.parse_args()
     options.envs = options.envs or ([1024, 8192] if options.device != "cpu" else [16, 64])
     options.out.mkdir(parents=True, exist_ok=True)

@@ -22,7 +22,7 @@ from typing import Literal
 
 import numpy as np
 
-from benchmarks.report import table, write_section
+from benchmarks.report import publish, script_parser, table
 from benchmarks.whiskers.rod_steps import FELT, Fidelity, errors, pick_sweeps, run
 
 FIXED = (1e-3, 5e-4, 2e-4, 1e-4)
@@ -118,8 +118,7 @@ def speed_gains(fixed: np.ndarray, trial: np.ndarray) -> list[float]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--write", action="store_true")
+    parser = script_parser(__doc__)
     parser.add_argument("--step", type=float, help=argparse.SUPPRESS)
     parser.add_argument("--precision", default="single", help=argparse.SUPPRESS)
     parser.add_argument("--folder", type=Path, help=argparse.SUPPRESS)
@@ -164,14 +163,7 @@ def main() -> None:
         "equal steps with the same error, between these rows (beyond them, over the nearest). A trial: the engine has "
         "no such option.\n\n" + table(head, rows)
     )
-    print(text)
-    if args.write:
-        write_section(
-            "A trial of adaptive time steps in rod",
-            "python -m benchmarks.whiskers.adaptive_steps --write",
-            text,
-            subject="whiskers",
-        )
+    publish(args, "A trial of adaptive time steps in rod", text)
 
 
 if __name__ == "__main__":

@@ -5,13 +5,12 @@ python -m benchmarks.whiskers.rod_steps [--objects procedural-24:1] [--each 3] [
 
 from __future__ import annotations
 
-import argparse
 import time
 from typing import Any
 
 import numpy as np
 
-from benchmarks.report import table, write_section
+from benchmarks.report import publish, script_parser, table
 from brainbench.stimuli import Fidelity
 from brainbench.stimuli.engines.rod.sweeps import SweepLauncher
 from brainbench.stimuli.objects.collections import resolve_objects
@@ -64,12 +63,11 @@ def errors(found: dict[str, Any], reference: dict[str, Any]) -> dict[str, np.nda
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = script_parser(__doc__)
     parser.add_argument("--objects", default="procedural-24:1")
     parser.add_argument("--recipe", default="thesis-high")
     parser.add_argument("--each", type=int, default=3, help="sweeps of each object")
     parser.add_argument("--links", type=int, default=12)
-    parser.add_argument("--write", action="store_true")
     args = parser.parse_args()
     scenes, picked = pick_sweeps(args.objects.split(","), args.recipe, args.each)
     count = sum(map(len, picked.values()))
@@ -99,11 +97,7 @@ def main() -> None:
         f"square of what differs from the first row, of each whisker's own peak, whiskers of more than {FELT * 1e6:g} "
         "µN.\n\n" + table(head, rows)
     )
-    print(text)
-    if args.write:
-        write_section(
-            "Time steps of the rod backend", "python -m benchmarks.whiskers.rod_steps --write", text, subject="whiskers"
-        )
+    publish(args, "Time steps of the rod backend", text)
 
 
 if __name__ == "__main__":

@@ -7,13 +7,12 @@ Each slice is measured by itself, kernel after kernel, so that the sum is longer
 
 from __future__ import annotations
 
-import argparse
 import time
 from typing import Any
 
 import numpy as np
 
-from benchmarks.report import table, write_section
+from benchmarks.report import publish, script_parser, table
 from benchmarks.whiskers.throughput import load_objects
 from brainbench.core.devices import pick_device, warp
 from brainbench.stimuli import Fidelity
@@ -52,12 +51,11 @@ class Watched:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = script_parser(__doc__)
     parser.add_argument("--objects", default="procedural-24:2", help="208 sweeps of thesis-high each")
     parser.add_argument("--every", type=int, default=1, help="only every n-th sweep of an object")
     parser.add_argument("--fidelity", default="fast,links=12,time_step=1e-3,steps_per_period=none")
     parser.add_argument("--device", default="cuda")
-    parser.add_argument("--write", action="store_true")
     args = parser.parse_args()
     wp, device = warp(), pick_device(args.device)
     scenes = SweepScenes(GRIDS["thesis-high"], load_objects([args.objects]))
@@ -71,12 +69,8 @@ def main() -> None:
         steps = int(launcher.launch(groups).steps.sum())
     finally:
         wp.launch = watched.launch
-    text = report(watched, steps)
-    print(text)
-    if args.write:
-        name = device.name if device.is_cuda else "processor"
-        command = f"python -m benchmarks.whiskers.slices --objects {args.objects} --every {args.every} --write"
-        write_section(f"Slices of sweeps on a {name}", command, text, subject="whiskers", where=f"one {name}")
+    name, words = device.name if device.is_cuda else "processor", f"--objects {args.objects} --every {args.every}"
+    publish(args, f"Slices of sweeps on a {name}", report(watched, steps), words, where=f"one {name}")
 
 
 def report(watched: Watched, steps: int) -> str:
