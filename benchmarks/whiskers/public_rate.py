@@ -131,7 +131,7 @@ def processor_seconds() -> float:
 
 def kernels(args: argparse.Namespace) -> None:
     """Print the rate of the kernels: all sweeps in one launch, then those that are simulated again."""
-    from benchmarks.whiskers.throughput import load_objects
+    from benchmarks.whiskers.slices import load_objects
     from brainbench.core.files import content_hash
     from brainbench.stimuli import Fidelity
     from brainbench.stimuli.engines.rod.sweeps import SweepLauncher

@@ -7,17 +7,24 @@ Each slice is measured by itself, kernel after kernel, so that the sum is longer
 
 from __future__ import annotations
 
+import multiprocessing
+import os
 import time
-from typing import Any
+from concurrent.futures import ProcessPoolExecutor
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from benchmarks.report import publish, script_parser, table
-from benchmarks.whiskers.throughput import load_objects
 from brainbench.core.devices import pick_device, warp
 from brainbench.stimuli import Fidelity
 from brainbench.stimuli.engines.rod.sweeps import SweepLauncher
+from brainbench.stimuli.objects.collections import resolve_objects
 from brainbench.stimuli.sweeps.sweep_scenes import GRIDS, SweepScenes
+
+if TYPE_CHECKING:
+    from brainbench.stimuli.objects.collections import NamedObject
+    from brainbench.stimuli.objects.solid import Solid
 
 PARTS = {"run": "steps", "solve_queue": "contact forces", "measure_distances": "distances", "swap_queues": "queues"}
 """Kernels by the first word of their names, and what they do."""
@@ -48,6 +55,20 @@ class Watched:
         if name == "swap_queues":
             self.problems += int(paused.problem_size.numpy().sum())
             self.queries += int(paused.query_count.numpy()[0])
+
+
+def _load(item: NamedObject) -> Solid:
+    return item.load()
+
+
+def load_objects(words: list[str]) -> dict[str, Solid]:
+    """Make objects, many of them on all processors as data generation does."""
+    objects = resolve_objects(words, surfaces=True)
+    processors = len(os.sched_getaffinity(0))
+    if len(objects) < 64 or processors < 4:
+        return {name: item.load() for name, item in objects.items()}
+    with ProcessPoolExecutor(processors, mp_context=multiprocessing.get_context("spawn")) as pool:
+        return dict(zip(objects, pool.map(_load, objects.values(), chunksize=4), strict=True))
 
 
 def main() -> None:
