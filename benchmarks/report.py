@@ -118,9 +118,10 @@ def publish(
     body = with_notes(body, getattr(options, "notes", None))
     print(body)
     if options.write:
-        script = sys.modules["__main__"].__spec__.name
-        command = " ".join(filter(None, ("python -m", script, words, "--write")))
-        write_section(title, command, body, subject=subject or script.split(".")[1], where=where)
+        script = sys.modules["__main__"].__spec__
+        assert script is not None, "a script is run as python -m benchmarks.SUBJECT.NAME"
+        command = " ".join(filter(None, ("python -m", script.name, words, "--write")))
+        write_section(title, command, body, subject=subject or script.name.split(".")[1], where=where)
 
 
 def write_section(title: str, command: str, body: str, *, subject: str, where: str = "") -> None:
