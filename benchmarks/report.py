@@ -6,10 +6,12 @@ the machine, and a body in Markdown.
 
 from __future__ import annotations
 
+import argparse
 import datetime
 import os
 import platform
 import re
+import sys
 from collections.abc import Callable, Container, Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -89,6 +91,37 @@ def measure_once(
 def with_notes(text: str, notes: Path | None) -> str:
     """Return the body of a section and, below it, the text of a file that was written by hand."""
     return text if notes is None else f"{text}\n\n{notes.read_text(encoding='utf-8').strip()}"
+
+
+def script_parser(doc: str | None, *, notes: bool = False) -> argparse.ArgumentParser:
+    """Return a parser whose help is a script's docstring, with ``--write`` and, where asked for, ``--notes``."""
+    parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--write", action="store_true", help="keep the section and write RESULTS.md anew")
+    if notes:
+        parser.add_argument("--notes", type=Path, help="text that follows the tables")
+    return parser
+
+
+def publish(
+    options: argparse.Namespace, title: str, body: str, words: str = "", *, subject: str = "", where: str = ""
+) -> None:
+    """Print the body of a section, with the notes that were given, and keep it with ``--write``.
+
+    Args:
+        options: what a parser of :func:`script_parser` understood.
+        title: heading, which names the section.
+        body: Markdown without a heading.
+        words: options of the command that made it, other than ``--write``; the script is the one that runs.
+        subject: one of :data:`SUBJECTS`; that of the script's folder if empty.
+        where: what measured it, if not this machine.
+    """
+    body = with_notes(body, getattr(options, "notes", None))
+    print(body)
+    if options.write:
+        script = sys.modules["__main__"].__spec__
+        assert script is not None, "a script is run as python -m benchmarks.SUBJECT.NAME"
+        command = " ".join(filter(None, ("python -m", script.name, words, "--write")))
+        write_section(title, command, body, subject=subject or script.name.split(".")[1], where=where)
 
 
 def write_section(title: str, command: str, body: str, *, subject: str, where: str = "") -> None:

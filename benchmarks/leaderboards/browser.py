@@ -18,7 +18,7 @@ from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
 
-from benchmarks.report import write_section
+from benchmarks.report import publish, script_parser
 from brainbench.core.records import Ceiling, Interval, LayerScore, ModelCard, ResultRecord, Score, SubjectScore
 from leaderboards import build_leaderboard
 
@@ -71,12 +71,11 @@ def make_record(index: int, layers: int, draw: random.Random) -> ResultRecord:
 
 
 def main() -> None:
-    options = argparse.ArgumentParser(description=__doc__)
+    options = script_parser(__doc__)
     options.add_argument("--records", type=int, default=1000)
     options.add_argument("--layers", type=int, default=20)
     options.add_argument("--repeats", type=int, default=7)
     options.add_argument("--chromium", default=shutil.which("chromium"))
-    options.add_argument("--write", action="store_true", help="Write the section of RESULTS.md.")
     asked = options.parse_args()
     draw = random.Random(0)
     records = [make_record(index, asked.layers, draw) for index in range(asked.records)]
@@ -95,11 +94,8 @@ def main() -> None:
         targets = {"index.html": site / "index.html", "figures.html": site / "figures.html", "a model": pages[0]}
         for name, path in targets.items():
             lines.append(_measure(name, path, asked))
-    print("\n".join(lines))
-    if asked.write:
-        lines += ["", COMPARED]
-        command = f"python -m benchmarks.leaderboards.browser --records {asked.records} --layers {asked.layers} --write"
-        write_section("The leaderboard in a browser", command, "\n".join(lines), subject="leaderboards")
+    words = f"--records {asked.records} --layers {asked.layers}"
+    publish(asked, "The leaderboard in a browser", "\n".join([*lines, "", COMPARED]), words)
 
 
 def _measure(name: str, path: Path, asked: argparse.Namespace) -> str:

@@ -68,7 +68,6 @@ def parser() -> argparse.ArgumentParser:
     told.add_argument("--install", type=Path, help="enter the results of tar files into the repository")
     told.add_argument("--score", type=Path, help="score the networks of a folder that --install unpacked")
     told.add_argument("--worker", type=int, help=argparse.SUPPRESS)
-    told.add_argument("--shards", help=argparse.SUPPRESS)
     return told
 
 
@@ -81,8 +80,6 @@ def main() -> None:
         score(args)
     elif args.pack is not None:
         pack(args)
-    elif args.shards:
-        make_shards(args)
     elif args.worker is not None:
         Worker(args).run()
     else:
@@ -144,39 +141,23 @@ def start(args: argparse.Namespace, gpu: int | None, **changes: Any) -> subproce
     return subprocess.Popen(words, env={**os.environ, "OMP_NUM_THREADS": threads, "CUDA_VISIBLE_DEVICES": seen})
 
 
-def plan(args: argparse.Namespace, *, gpu: bool) -> Any:
-    """Return the plan of the data: the low-variation grid of the thesis on procedural objects."""
+def make_data(args: argparse.Namespace, gpus: int) -> None:
+    """Generate the sweeps, on every GPU: the low-variation grid of the thesis on procedural objects."""
     from brainbench.stimuli import Fidelity
     from brainbench.stimuli.objects.collections import resolve_objects
+    from brainbench.stimuli.sweeps.generation import generate
     from brainbench.stimuli.sweeps.plan import GenerationPlan, GenerationSettings
     from brainbench.stimuli.sweeps.sweep_scenes import GRIDS
 
-    settings = GenerationSettings(
-        fidelity=Fidelity(links=12, time_step=1e-3), device="cuda" if gpu else "cpu", shard_size=3120 if gpu else None
-    )
-    objects = resolve_objects([f"procedural:{args.members}"], surfaces=True)
-    return GenerationPlan("thesis-low", GRIDS["thesis-low"], objects, settings)
-
-
-def make_data(args: argparse.Namespace, gpus: int) -> None:
-    """Generate the sweeps, every GPU its share of the shards."""
-    from brainbench.core.files import to_plain, write_json
-    from brainbench.core.writing.same_run import CONFIG
-    from brainbench.stimuli.sweeps.generation import generate
-
     folder = args.work / "data"
-    folder.mkdir(parents=True, exist_ok=True)
     if (folder / MANIFEST).is_file():
         return
-    wanted = plan(args, gpu=gpus > 0)
-    if gpus > 1:
-        write_json(folder / CONFIG, to_plain(wanted.config))
-        # Placing sweeps takes the processor as long as simulating them takes the GPU.
-        count = args.places * gpus
-        makers = [start(args, index % gpus, shards=f"{index}/{count}") for index in range(count)]
-        if any([maker.wait() for maker in makers]):
-            _log.error("a process could not make its shards; this one makes them")
-    manifest = generate(wanted, folder)
+    settings = GenerationSettings(
+        fidelity=Fidelity(links=12, time_step=1e-3), device="cuda" if gpus else "cpu", shard_size=3120 if gpus else None
+    )
+    objects = resolve_objects([f"procedural:{args.members}"], surfaces=True)
+    plan = GenerationPlan("thesis-low", GRIDS["thesis-low"], objects, settings)
+    manifest = generate(plan, folder)
     _log.info("%d sweeps, hash %s, %d unstable", manifest["sweeps"], manifest["content_hash"], manifest["unstable"])
     used = {line["data"]["hash"] for line in finished().values()} - {manifest["content_hash"]}
     if used and gpus and not args.again:
@@ -184,19 +165,6 @@ def make_data(args: argparse.Namespace, gpus: int) -> None:
             f"These sweeps are not those of the trainings done so far ({', '.join(used)}): train with the code of the "
             f"commit {SOLVER}, whose solver made them."
         )
-
-
-def make_shards(args: argparse.Namespace) -> None:
-    """Make every n-th shard of the data set."""
-    from brainbench.stimuli.sweeps.manifest import is_complete
-    from brainbench.stimuli.sweeps.running import run_here
-
-    index, count = map(int, args.shards.split("/"))
-    folder = args.work / "data"
-    mine = plan(args, gpu=args.device != "cpu").shards[index::count]
-    missing = [task for task in mine if not is_complete(folder / task.name, task)]
-    if missing:
-        run_here(missing, folder, max(1, (os.cpu_count() or 1) // count), lambda done: None)
 
 
 class Worker:

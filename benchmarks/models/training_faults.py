@@ -1,43 +1,30 @@
-"""What goes wrong in training, and what becomes of it: silence under layer norm, and kills.
+"""First gradients of training on sweeps that are silent for a time, under layer norm and without it.
 
     python -m benchmarks.models.training_faults silence SWEEPS [--write]
-    python -m benchmarks.models.training_faults kills SWEEPS [--write]
 
 ``SWEEPS`` is a folder of ``brainbench stimuli sweep``.
 """
 
 from __future__ import annotations
 
-import argparse
-import os
-import random
-import signal
-import subprocess
-import sys
-import tempfile
-import time
 from contextlib import nullcontext
 from pathlib import Path
 from unittest.mock import patch
 
 import torch
-from safetensors.torch import load_file
 
-from benchmarks.report import table, write_section
+from benchmarks.report import publish, script_parser, table
 from brainbench.datasets import WhiskingDataset
 from brainbench.models.ops.seeding import seeded
 from brainbench.models.registry import load_model
 from brainbench.models.training.objectives import make_learner
 
 BATCH = 24
-MODEL = "resnet18-small"
 SMALL = (
     "zhuang-intersection-ln-small", "zhuang-small", "resnet18-small", "s4-small+gpt", "zhuang-small+mamba",
     "resnet18-small+gpt",
 )  # fmt: skip
 """Encoders with memory of three kinds and none; attenders GPT, Mamba and none."""
-MOMENTS = (0.15, 0.85)
-"""Kills fall between these shares of what an unbroken run takes."""
 
 
 def first_gradient(name: str, objective: str, x: torch.Tensor, labels: torch.Tensor, *, drawn: bool) -> float:
@@ -68,59 +55,13 @@ def silence(folder: Path) -> str:
     )
 
 
-def run(folder: Path, out: Path, kill_after: float | None) -> bool:
-    """Start training; kill it after some seconds. Return whether it came to its end."""
-    words = [sys.executable, "-m", "brainbench", "train", MODEL, "--data", str(folder), "--out", str(out), "--epochs"]
-    words += ["3", "--batch-size", "32", "--device", "cpu", "--json"]
-    process = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True)
-    try:
-        return process.wait(kill_after) == 0
-    except subprocess.TimeoutExpired:
-        os.killpg(process.pid, signal.SIGKILL)
-        process.wait()
-        return False
-
-
-def kills(folder: Path, count: int) -> str:
-    """The same run unbroken, and killed at random moments and started again."""
-    rows = []
-    with tempfile.TemporaryDirectory() as place:
-        whole, broken = Path(place) / "whole", Path(place) / "broken"
-        started = time.perf_counter()
-        if not run(folder, whole, None):
-            raise SystemExit("The unbroken run failed.")
-        seconds = time.perf_counter() - started
-        moments = random.Random(0)
-        for _ in range(count):
-            after = seconds * moments.uniform(*MOMENTS)
-            rows.append([f"{after:.1f} s", "ended before" if run(folder, broken, after) else "killed"])
-            print(rows[-1], flush=True)
-        if not run(folder, broken, None):
-            raise SystemExit("The killed run cannot be gone on with.")
-        first, second = (load_file(path / "best" / "model.safetensors") for path in (whole, broken))
-        apart = max(float((first[name] - second[name]).abs().max()) for name in first)
-        equal = all(torch.equal(first[name], second[name]) for name in first)
-    return (
-        f"`brainbench train {MODEL}` (3 epochs, batch 32, CPU), {seconds:.0f} s unbroken; killed with SIGKILL after\n\n"
-        f"{table(['after start', ''], rows)}\n\nand started once more: weights "
-        f"{'equal to the bit' if equal else 'differ'} (largest difference {apart:g})."
-    )
-
-
 def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("part", choices=("silence", "kills"))
+    parser = script_parser(__doc__)
+    parser.add_argument("part", choices=("silence",))
     parser.add_argument("sweeps", type=Path)
-    parser.add_argument("--count", type=int, default=3, help="kills")
-    parser.add_argument("--write", action="store_true")
     args = parser.parse_args()
-    text = silence(args.sweeps) if args.part == "silence" else kills(args.sweeps, args.count)
-    print(text)
-    if args.write:
-        title = "First gradients and silence" if args.part == "silence" else "Training killed and resumed"
-        write_section(
-            title, f"python -m benchmarks.models.training_faults {args.part} SWEEPS --write", text, subject="models"
-        )
+    text = silence(args.sweeps)
+    publish(args, "First gradients and silence", text, "silence SWEEPS")
 
 
 if __name__ == "__main__":

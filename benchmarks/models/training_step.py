@@ -28,7 +28,7 @@ import numpy as np
 import torch
 
 from benchmarks.models.recorded_optimizer import make_capturable
-from benchmarks.report import table, write_section
+from benchmarks.report import publish, script_parser, table
 from brainbench.core.cuda_graphs import record_step
 from brainbench.models.activations import evaluating
 from brainbench.models.export import export_model, read_onnx
@@ -329,10 +329,11 @@ def length_part(options: argparse.Namespace, device: torch.device) -> str:
 
 
 PARTS = {"train": train_part, "forward": forward_part, "stream": stream_part, "length": length_part}
+TITLES = {"train": "Training step", "forward": "Forward pass", "stream": "Streaming step", "length": "Long sweeps"}
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = script_parser(__doc__)
     parser.add_argument("--part", choices=PARTS, default="train")
     parser.add_argument("--model", default="zhuang-intersection-ln-small")
     parser.add_argument("--batch", type=int, default=32)
@@ -346,7 +347,6 @@ def main() -> None:
     )
     parser.add_argument("--limit", type=float, default=240.0, help="seconds that one row may take")
     parser.add_argument("--one", help=argparse.SUPPRESS)
-    parser.add_argument("--write", action="store_true", help="write the section into RESULTS.md")
     options = parser.parse_args()
     device = torch.device(options.device)
     if options.one:
@@ -357,17 +357,9 @@ def main() -> None:
         return
     name = torch.cuda.get_device_name(device) if device.type == "cuda" else f"{torch.get_num_threads()} threads"
     body = f"{name}. " + PARTS[options.part](options, device)
-    print(f"\n{body}")
-    if options.write:
-        command = f"python -m benchmarks.models.training_step --part {options.part} --model {options.model}"
-        command += f" --batch {options.batch}" if options.part in ("train", "forward") else ""
-        title = {
-            "train": "Training step",
-            "forward": "Forward pass",
-            "stream": "Streaming step",
-            "length": "Long sweeps",
-        }[options.part]
-        write_section(f"{title} ({options.model}, {device.type})", command, body, subject="models")
+    words = f"--part {options.part} --model {options.model}"
+    words += f" --batch {options.batch}" if options.part in ("train", "forward") else ""
+    publish(options, f"{TITLES[options.part]} ({options.model}, {device.type})", body, words)
 
 
 if __name__ == "__main__":

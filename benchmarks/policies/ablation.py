@@ -8,13 +8,12 @@ hand's object. None is that nothing touches anything, at any time.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Mapping
 from pathlib import Path
 
 import torch
 
-from benchmarks.report import table, with_notes, write_section
+from benchmarks.report import publish, script_parser, table
 from brainbench.cli.policy.options import World, agent_of, touch_of
 from brainbench.core.statistics import newcombe_interval
 from robotics_bridge.policies.evaluate import Policy, evaluate
@@ -55,22 +54,16 @@ def measure(name: str, task: str, config: str, episodes: int) -> list[list[str]]
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = script_parser(__doc__, notes=True)
     parser.add_argument("agents", nargs="+", help="shipped students, or runs whose policy feels")
     parser.add_argument("--task", default="in_palm_rotate")
     parser.add_argument("--config", default="careful")
     parser.add_argument("--episodes", type=int, default=102, help="for each of three seeds")
-    parser.add_argument("--notes", type=Path, help="text that follows the table")
-    parser.add_argument("--write", action="store_true")
     options = parser.parse_args()
     rows = [row for name in options.agents for row in measure(name, options.task, options.config, options.episodes)]
     columns = ["policy", "touch", "episodes", "success", "difference", "goals", "dropped"]
-    text = with_notes(table(columns, rows), options.notes)
-    print(text)
-    if options.write:
-        names = " ".join(Path(name).name for name in options.agents)
-        command = f"python -m benchmarks.policies.ablation {names} --episodes {options.episodes} --write"
-        write_section("Policies without their touch", command, text, subject="policies")
+    words = " ".join(Path(name).name for name in options.agents) + f" --episodes {options.episodes}"
+    publish(options, "Policies without their touch", table(columns, rows), words)
 
 
 if __name__ == "__main__":

@@ -23,7 +23,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.stats import rankdata
 
-from benchmarks.report import measure_once, table, with_notes, write_section
+from benchmarks.report import measure_once, publish, script_parser, table
 from brainbench.cli.policy.options import World, agent_of
 from brainbench.core.figures.style import COLORS, PALE, panels, save_figure
 from brainbench.core.files import read_json, write_json
@@ -248,7 +248,7 @@ def draw(found: list[dict[str, Any]]) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = script_parser(__doc__, notes=True)
     parser.add_argument("--sweeps", type=Path, help="folder of brainbench stimuli sweep")
     parser.add_argument("--known", action="store_true", help="lay out what stands in the folder, measure nothing")
     parser.add_argument("--out", type=Path, required=True)
@@ -256,8 +256,6 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=8.0)
     parser.add_argument("--seeds", type=int, default=3, help="initial states of each untrained network, at most")
     parser.add_argument("--large", action="store_true", help="networks of published size too")
-    parser.add_argument("--notes", type=Path, help="text that follows the tables")
-    parser.add_argument("--write", action="store_true")
     options = parser.parse_args()
     if options.sweeps is None and not options.known:
         parser.error("--sweeps names the folder of sweeps on which the whisker accuracy is measured")
@@ -277,14 +275,11 @@ def main() -> None:
         "Trained networks less their untrained twins:",
         table(["network", *heads], gains(found)),
     ]
-    body = with_notes("\n\n".join(parts), options.notes)
-    print(body)
     if options.write:
         draw(found)
         write_json(RECORD, found)
-        more = f"--envs {options.envs} --seeds {options.seeds}{' --large' * options.large}"
-        command = f"python -m benchmarks.policies.alignment --sweeps SWEEPS --out FOLDER {more} --write"
-        write_section("Scores of networks and read-outs of touch", command, body, subject="policies")
+    words = f"--sweeps SWEEPS --out FOLDER --envs {options.envs} --seeds {options.seeds}{' --large' * options.large}"
+    publish(options, "Scores of networks and read-outs of touch", "\n\n".join(parts), words)
 
 
 if __name__ == "__main__":

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from benchmarks.report import measure_once, table, with_notes, write_section
+from benchmarks.report import measure_once, publish, script_parser, table
 from brainbench.core.devices import mujoco_module
 from brainbench.core.figures.style import COLORS, panels, save_figure
 from robotics_bridge import tasks
@@ -156,23 +156,17 @@ def draw(rows: Mapping[str, dict[str, Any]]) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = script_parser(__doc__, notes=True)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--policy", default="in_palm_rotate.teacher")
     parser.add_argument("--envs", type=int, default=96)
-    parser.add_argument("--notes", type=Path, help="text that follows the table")
-    parser.add_argument("--write", action="store_true")
     options = parser.parse_args()
     rows = measure_once(options.out, MODELS, lambda name: measure(name, options), known=options.write)
-    body = lay_out(rows, cost(rows))
-    print(body)
     if options.write:
         draw(rows)
-        body = f"Block of in_palm_rotate (13 g and more) under `{options.policy}`.\n\n{body}"
-        body = with_notes(body, options.notes)
-        words = f"--policy {options.policy} --envs {options.envs}"
-        command = f"python -m benchmarks.policies.contacts {words} --out FOLDER --write"
-        write_section("Contacts of a block in the hand", command, body, subject="policies")
+    body = f"Block of in_palm_rotate (13 g and more) under `{options.policy}`.\n\n{lay_out(rows, cost(rows))}"
+    words = f"--policy {options.policy} --envs {options.envs} --out FOLDER"
+    publish(options, "Contacts of a block in the hand", body, words)
 
 
 if __name__ == "__main__":

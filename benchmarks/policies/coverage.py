@@ -9,7 +9,6 @@ Beside it the pooled t interval over policy seeds, which takes seeds of one netw
 
 from __future__ import annotations
 
-import argparse
 import itertools
 import math
 from typing import Any
@@ -17,7 +16,7 @@ from typing import Any
 import numpy as np
 from scipy.special import stdtrit
 
-from benchmarks.report import table, write_section
+from benchmarks.report import publish, script_parser, table
 from robotics_bridge.policies.contrasts import MixedModel, TrainedPolicy
 
 SEED_SPREAD = 0.03
@@ -89,9 +88,8 @@ def measure(simulations: int) -> list[list[str]]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = script_parser(__doc__)
     parser.add_argument("--simulations", type=int, default=1000)
-    parser.add_argument("--write", action="store_true")
     options = parser.parse_args()
     rows = measure(options.simulations)
     heads = ["design", "draw / seed(arm) / seed, of the residual", "difference", "held by the mixed model",
@@ -103,10 +101,7 @@ def main() -> None:
         f"of 95 % hold 0 in {min(share):.3f} to {max(share):.3f} (chance of the simulations: ± {1.96 * low:.3f}). "
         "“Said to help”: by .05 over the best random arm and the interval above 0.\n\n" + table(heads, rows)
     )
-    print(body)
-    if options.write:
-        command = f"python -m benchmarks.policies.coverage --simulations {options.simulations} --write"
-        write_section("Intervals of students with random networks", command, body, subject="policies")
+    publish(options, "Intervals of students with random networks", body, f"--simulations {options.simulations}")
 
 
 if __name__ == "__main__":

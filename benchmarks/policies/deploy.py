@@ -6,7 +6,6 @@ Quiet link, then faults one by one: what the controller did about each.
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import os
 import tempfile
@@ -15,7 +14,7 @@ from pathlib import Path
 import torch
 from tensordict import TensorDict
 
-from benchmarks.report import table, write_section
+from benchmarks.report import publish, script_parser, table
 from robotics_bridge import hands
 from robotics_bridge.deploy.session import read_deployed
 from robotics_bridge.deploy.simulated_hand import Faults, simulated_hand
@@ -58,11 +57,10 @@ def export(model: str, folder: Path) -> Path:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser()
+    parser = script_parser(__doc__)
     parser.add_argument("--models", nargs="+", default=["zhuang-intersection-ln-small", "zhuang-intersection-ln"])
     parser.add_argument("--seconds", type=float, default=20.0)
     parser.add_argument("--threads", type=int, default=1)
-    parser.add_argument("--write", action="store_true")
     options = parser.parse_args()
     lines, told = [], []
     # Models as they are, then the first one ahead of all other work; faults of the first one.
@@ -91,39 +89,16 @@ def main() -> None:
                 what = f"{report.status}: {report.reason}" if report.reason else report.status
                 told.append([fault, f"{report.seconds:.1f}", what])
                 print(*told[-1], flush=True)
-    if options.write:
-        body = (
-            "Reading, checking, deciding (ONNX Runtime, one thread), limiting and sending; 40 Hz. Goal: p50 under "
-            "5 ms, p99 under 20 ms with the `-small` encoder. The machine was shared: its load stands beside each "
-            "run, and the loop's own processor time beside the clock's. `ahead`: with `--realtime`, before all "
-            "ordinary work of the computer (the simulated hand remains ordinary work); the faults were run so.\n\n"
-            + table(
-                [
-                    "encoder",
-                    "ahead",
-                    "load",
-                    "ticks",
-                    "Hz",
-                    "p50 ms",
-                    "p90",
-                    "p99",
-                    "max",
-                    "processor p50",
-                    "p99",
-                    "over 25 ms",
-                    "stopped",
-                ],
-                lines,
-            )
-            + "\n\n"
-            + table(["fault (5 s asked for)", "seconds", "what happened"], told)
-        )
-        write_section(
-            "Control tick of a deployed policy",
-            "python -m benchmarks.policies.deploy --write",
-            body,
-            subject="policies",
-        )
+    columns = ["encoder", "ahead", "load", "ticks", "Hz", "p50 ms", "p90", "p99", "max", "processor p50", "p99"]
+    columns += ["over 25 ms", "stopped"]
+    body = (
+        "Reading, checking, deciding (ONNX Runtime, one thread), limiting and sending; 40 Hz. Goal: p50 under "
+        "5 ms, p99 under 20 ms with the `-small` encoder. The machine was shared: its load stands beside each "
+        "run, and the loop's own processor time beside the clock's. `ahead`: with `--realtime`, before all "
+        "ordinary work of the computer (the simulated hand remains ordinary work); the faults were run so.\n\n"
+        f"{table(columns, lines)}\n\n{table(['fault (5 s asked for)', 'seconds', 'what happened'], told)}"
+    )
+    publish(options, "Control tick of a deployed policy", body)
 
 
 if __name__ == "__main__":

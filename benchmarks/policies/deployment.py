@@ -10,7 +10,6 @@ move, as the environment does (``rated_speed``); both also run without.
 
 from __future__ import annotations
 
-import argparse
 import tempfile
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -23,7 +22,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from benchmarks.report import table, with_notes, write_section
+from benchmarks.report import publish, script_parser, table
 from brainbench.core.statistics import wilson_interval
 from robotics_bridge import tasks
 from robotics_bridge.deploy.controller import Clock, Report
@@ -133,12 +132,10 @@ def deploy(
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = script_parser(__doc__, notes=True)
     parser.add_argument("--student", default="in_palm_rotate.student")
     parser.add_argument("--envs", type=int, default=102)
     parser.add_argument("--seeds", type=int, default=3)
-    parser.add_argument("--notes", type=Path, help="text that follows the table")
-    parser.add_argument("--write", action="store_true")
     options = parser.parse_args()
     student, described = load_student(options.student)
     config = described["distill"]
@@ -165,11 +162,7 @@ def main() -> None:
     text = (
         body(options.student, task, ways, reports) + f" What the policy reads: {', '.join(deployed.contract.inputs)}."
     )
-    text = with_notes(text, options.notes)
-    print(text)
-    if options.write:
-        command = "python -m benchmarks.policies.deployment --write"
-        write_section("Evaluation and deployment of a student", command, text, subject="policies")
+    publish(options, "Evaluation and deployment of a student", text)
 
 
 def body(student: str, task: Task, ways: dict[str, dict[str, Any]], reports: list[Report]) -> str:

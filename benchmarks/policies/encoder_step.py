@@ -8,7 +8,6 @@ printed and written when it is measured, small sizes first.
 
 from __future__ import annotations
 
-import argparse
 import json
 import statistics
 import time
@@ -17,6 +16,7 @@ from typing import Any
 
 import torch
 
+from benchmarks.report import publish, script_parser, table
 from brainbench import load_model
 from brainbench.models.streaming import StreamingStep
 
@@ -107,14 +107,13 @@ def timed(run: Any, device: str, graph: bool, repeats: int) -> dict[str, float]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser()
+    parser = script_parser(__doc__)
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--models", nargs="+", default=list(MODELS))
     parser.add_argument("--batches", nargs="+", type=int, default=[1024, 8192])
     parser.add_argument("--repeats", type=int, default=20)
     parser.add_argument("--out", type=Path)
     parser.add_argument("--compile", action="store_true", help="Also with torch.compile; takes minutes.")
-    parser.add_argument("--write", action="store_true")
     options = parser.parse_args()
     cuda = options.device == "cuda"
     kinds = ("float32", "bf16") if not cuda else ("bf16", "float32")
@@ -150,19 +149,15 @@ def main() -> None:
                         if options.out is not None:
                             with options.out.open("a", encoding="utf-8") as stream:
                                 stream.write(json.dumps(row) + "\n")
-    if options.write:
-        from benchmarks.report import table, write_section
-
-        lines = [
-            [
-                row["model"], str(row["batch"]), row["precision"], row["state"], row["way"],
-                f"{row.get('ms', float('nan')):.3g}", f"{row.get('p90', float('nan')):.3g}",
-            ]
-            for row in rows
-        ]  # fmt: skip
-        columns = ["model", "environments", "precision", "state", "way", "ms per step", "90th percentile"]
-        command = f"python -m benchmarks.policies.encoder_step --device {options.device} --batches … --write"
-        write_section("Streaming step of encoders", command, table(columns, lines), subject="policies")
+    lines = [
+        [
+            row["model"], str(row["batch"]), row["precision"], row["state"], row["way"],
+            f"{row.get('ms', float('nan')):.3g}", f"{row.get('p90', float('nan')):.3g}",
+        ]
+        for row in rows
+    ]  # fmt: skip
+    columns = ["model", "environments", "precision", "state", "way", "ms per step", "90th percentile"]
+    publish(options, "Streaming step of encoders", table(columns, lines), f"--device {options.device} --batches …")
 
 
 if __name__ == "__main__":

@@ -5,7 +5,6 @@ PYTHONPATH=. OMP_NUM_THREADS=1 python -m benchmarks.policies.exports [--write]
 
 from __future__ import annotations
 
-import argparse
 import statistics
 import tempfile
 import time
@@ -15,7 +14,7 @@ import numpy as np
 import torch
 from tensordict import TensorDict
 
-from benchmarks.report import table, write_section
+from benchmarks.report import publish, script_parser, table
 from robotics_bridge.policies.encoders.arms import ARMS, EncoderConfig
 from robotics_bridge.policies.export import STEPS, TOLERANCE, export_policy
 from robotics_bridge.policies.runners import read_policy
@@ -40,9 +39,7 @@ def student(name: str | None) -> TactilePolicy:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--write", action="store_true")
-    options = parser.parse_args()
+    options = script_parser(__doc__).parse_args()
     torch.set_num_threads(1)
     lines = []
     with tempfile.TemporaryDirectory() as folder:
@@ -67,8 +64,7 @@ def main() -> None:
         "normalisers, taxel grid, encoder, head and memory in one file.\n\n"
     )
     body = text + table(["encoder", "difference", "memory", "MB", "processor ms a step"], lines)
-    if options.write:
-        write_section("Exported policies", "python -m benchmarks.policies.exports --write", body, subject="policies")
+    publish(options, "Exported policies", body)
 
 
 if __name__ == "__main__":

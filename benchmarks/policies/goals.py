@@ -7,7 +7,6 @@ Every environment has one episode, on C MuJoCo; both kinds of goals have the sam
 
 from __future__ import annotations
 
-import argparse
 from dataclasses import replace
 from itertools import pairwise
 
@@ -15,7 +14,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from benchmarks.report import table, write_section
+from benchmarks.report import publish, script_parser, table
 from brainbench.core.statistics import wilson_interval
 from robotics_bridge import tasks
 from robotics_bridge.policies.fit import with_contacts_of
@@ -65,10 +64,9 @@ def rows(kind: str, found: dict[str, NDArray]) -> list[list[str]]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = script_parser(__doc__)
     parser.add_argument("--agent", default="in_palm_rotate.teacher")
     parser.add_argument("--envs", type=int, default=340)
-    parser.add_argument("--write", action="store_true")
     options = parser.parse_args()
     found = [row for kind in GOALS for row in rows(kind, run(options.agent, options.envs, kind))]
     text = f"Episodes of `{options.agent}` in in_palm_rotate, one per environment, the same starts for both goals.\n\n"
@@ -82,10 +80,7 @@ def main() -> None:
         "with published ones, and did better with flat ones too: .69 [.64, .74] and .84 [.80, .88] of the same 340 "
         "starts."
     )
-    print(text)
-    if options.write:
-        write_section("Goals at which an object can lie", "python -m benchmarks.policies.goals --write", text,
-                      subject="policies")  # fmt: skip
+    publish(options, "Goals at which an object can lie", text)
 
 
 if __name__ == "__main__":

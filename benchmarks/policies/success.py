@@ -11,7 +11,6 @@ that :mod:`benchmarks.policies.alignment` measured.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -22,7 +21,7 @@ from scipy.stats import norm
 from benchmarks.policies.alignment import RECORD, board, partial_spearman
 from benchmarks.policies.arms import NETWORKS, arm_of
 from benchmarks.policies.comparison import found_logs, seen
-from benchmarks.report import table, with_notes, write_section
+from benchmarks.report import publish, script_parser, table
 from brainbench.core.errors import UsageError
 from brainbench.core.figures.style import COLORS, PALE, panels, save_figure
 from brainbench.core.files import read_json
@@ -117,12 +116,10 @@ def draw(found: Sequence[Mapping[str, Any]]) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = script_parser(__doc__, notes=True)
     parser.add_argument("--students", type=Path, nargs="+", required=True)
     parser.add_argument("--at-least", type=int, default=0, help="iterations; what learned fewer is left out")
-    parser.add_argument("--notes", type=Path, help="text that follows the tables")
     parser.add_argument("--device", default="", help="what trained the students")
-    parser.add_argument("--write", action="store_true")
     options = parser.parse_args()
     results = read_results(options.students, at_least=options.at_least)
     found = networks(results, options.students)
@@ -145,12 +142,10 @@ def main() -> None:
         "networks; `given` is partialled out of the ranks:",
         table(["networks", "count", "quantity", "given", *OUTCOMES.values()], correlations(found)),
     ]
-    body = with_notes("\n\n".join(parts), options.notes)
-    print(body)
     if options.write:
         draw(found)
-        command = f"python -m benchmarks.policies.success --students STUDENTS … --at-least {options.at_least} --write"
-        write_section("Scores of networks and students", command, body, where=options.device, subject="policies")
+    words = f"--students STUDENTS … --at-least {options.at_least}"
+    publish(options, "Scores of networks and students", "\n\n".join(parts), words, where=options.device)
 
 
 if __name__ == "__main__":

@@ -1,9 +1,7 @@
-"""Speed of the dexterous tasks, of their teachers and students, on one GPU or on processors.
+"""Speed of the dexterous tasks and of their teachers, on one GPU or on processors.
 
     python -m benchmarks.policies.tasks --part speed --device cuda --out $OUT  # environment steps/s per task and sense
     python -m benchmarks.policies.tasks --part split --device cuda --out $OUT       # a PPO iteration in its parts
-    # an iteration of a student in its parts
-    python -m benchmarks.policies.tasks --part student --device cuda --out $OUT
     python -m benchmarks.policies.tasks --part tables --out FOLDER --write          # lay out what was measured
 
 Every row is printed and appended to ``$OUT/policy.jsonl`` when it is measured; small sizes come first. Needs torch,
@@ -14,7 +12,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -23,7 +20,7 @@ from typing import Any
 
 import torch
 
-from benchmarks.report import table, write_section
+from benchmarks.report import publish, script_parser, table
 from robotics_bridge import tasks
 from robotics_bridge.envs import Env
 from robotics_bridge.policies.training import teacher
@@ -159,76 +156,6 @@ def split(options: argparse.Namespace, out: Path) -> None:
         put(out, row)
 
 
-FELT = {
-    "none": {"observe": "none"},
-    "tips": {"observe": "force_torque", "placement": "tips"},
-    "hand": {"observe": "force_torque", "placement": "hand"},
-    "ead": {"observe": "force_torque", "placement": "hand", "encoder": "zhuang-intersection-ln-small"},
-}
-
-
-def student(options: argparse.Namespace, out: Path) -> None:
-    """An iteration of a student: acting and learning, for what it feels, in single and mixed precision."""
-    envs, task = options.envs[-1], tasks.load(options.tasks[0], options.config)
-    worlds: dict[tuple[str, str], Env] = {}
-    for felt in options.felt:
-        place = FELT[felt]["observe"], FELT[felt].get("placement", "hand")
-        if place not in worlds:
-            worlds.clear()
-            worlds[place] = tasks.make(
-                task, num_envs=envs, device=options.device, observe=place[0], placement=place[1]
-            )  # fmt: skip
-        for precision in ("float32",) if felt == "none" or options.device == "cpu" else ("float32", "bf16"):
-            for graphs in (True, False) if precision == "float32" else (True,):
-                try:
-                    put(out, one_student(felt, worlds[place], options, precision=precision, graphs=graphs))
-                except RuntimeError as error:
-                    put(out, {"part": "student", "felt": felt, "precision": precision, "error": str(error)[:300]})
-
-
-def one_student(felt: str, env: Env, options: argparse.Namespace, *, precision: str, graphs: bool) -> dict[str, Any]:
-    from robotics_bridge.policies.training.distill import _Run
-    from robotics_bridge.policies.training.distill_config import DistillConfig
-
-    settings: dict[str, Any] = FELT[felt]
-    config = DistillConfig(task=env.task.name, num_envs=env.num_envs, precision=precision, **settings)
-    known = teacher.Trainer(env, env.task.teacher).policy()
-    found = []
-    torch.set_float32_matmul_precision("high")
-    with tempfile.TemporaryDirectory() as folder:
-        run = _Run(config.resolved(env.task.student), Path(folder), env, known, graphs=graphs)
-        for _ in range(options.repeats):
-            begun = wait(env.device)
-            rollout = run._act(0.0)
-            acted = wait(env.device)
-            losses = run._learn(rollout)
-            found.append((acted - begun, wait(env.device) - acted))
-        run.log.close()
-        if felt == options.profile and not graphs:
-            profiled(lambda: run._learn(rollout), options.device)
-            profiled(lambda: run._act(0.0), options.device)
-    acting, learning = (min(item[part] for item in found[1:]) for part in range(2))
-    row = {"part": "student", "felt": felt, "precision": precision, "graphs": graphs, "envs": env.num_envs}
-    row |= {"device": options.device, "acting_s": acting, "learning_s": learning, "iteration_s": acting + learning}
-    row |= {"loss": losses["behaviour"]}
-    if env.device.type == "cuda":
-        row["memory_gb"] = torch.cuda.max_memory_allocated(env.device) / 2**30
-        torch.cuda.reset_peak_memory_stats(env.device)
-        torch.cuda.empty_cache()
-    return row
-
-
-def profiled(work: Callable[[], Any], device: str) -> None:
-    """Print what a piece of work spends its time on."""
-    from torch.profiler import ProfilerActivity, profile
-
-    kinds = [ProfilerActivity.CPU, *([ProfilerActivity.CUDA] if device != "cpu" else [])]
-    with profile(activities=kinds) as found:
-        work()
-    by = "self_cuda_time_total" if device != "cpu" else "self_cpu_time_total"
-    print(found.key_averages().table(sort_by=by, row_limit=24, max_name_column_width=70), flush=True)
-
-
 def tables(options: argparse.Namespace, out: Path) -> None:
     """Print tables of the rows in a folder; ``--write`` puts them into RESULTS.md."""
     rows = [json.loads(line) for line in (out / "policy.jsonl").read_text(encoding="utf-8").splitlines()]
@@ -247,25 +174,14 @@ def tables(options: argparse.Namespace, out: Path) -> None:
     splits = [[f"{r[k]:.3g}" for k in shown] for r in rows if r["part"] == "split"]
     if splits:
         parts.append(table([name.replace("_", " ") for name in shown], splits))
-    columns = ("felt", "precision", "graphs", "acting_s", "learning_s", "iteration_s", "memory_gb")
-    learned = [
-        [f"{r[k]:.3g}" if isinstance(r.get(k), float) else str(r.get(k, "")) for k in columns]
-        for r in rows
-        if r["part"] == "student" and "error" not in r
-    ]
-    if learned:
-        parts.append(table([name.replace("_", " ") for name in columns], learned))
-    body = "\n\n".join(parts)
-    print(body)
-    if options.write:
-        devices = sorted({r["device"] for r in rows if "device" in r})
-        title = f"Dexterous tasks: speed ({', '.join(devices) or 'processors'})"
-        write_section(title, f"python -m benchmarks.policies.tasks --device {options.device}", body, subject="policies")
+    devices = sorted({r["device"] for r in rows if "device" in r})
+    title = f"Dexterous tasks: speed ({', '.join(devices) or 'processors'})"
+    publish(options, title, "\n\n".join(parts), f"--part tables --device {options.device}")
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--part", choices=["speed", "split", "student", "tables"], required=True)
+    parser = script_parser(__doc__)
+    parser.add_argument("--part", choices=["speed", "split", "tables"], required=True)
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--out", type=Path, default=Path("policy-bench"))
     parser.add_argument("--tasks", nargs="+", default=["in_palm_rotate", "in_hand_repose", "screwdriver"])
@@ -273,16 +189,12 @@ def main() -> None:
     parser.add_argument("--envs", nargs="+", type=int, default=None)
     parser.add_argument("--eager", action="store_true", help="speed and split without CUDA graphs")
     parser.add_argument("--repeats", type=int, default=20)
-    parser.add_argument("--felt", nargs="+", default=list(FELT), choices=list(FELT), help="of students")
-    parser.add_argument("--profile", choices=list(FELT), help="also print what this student's time goes into")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--write", action="store_true")
     options = parser.parse_args()
     options.envs = options.envs or ([1024, 8192] if options.device != "cpu" else [16, 64])
     options.out.mkdir(parents=True, exist_ok=True)
     if options.device == "cpu":
         torch.set_num_threads(1)
-    {"speed": speed, "split": split, "student": student, "tables": tables}[options.part](options, options.out)
+    {"speed": speed, "split": split, "tables": tables}[options.part](options, options.out)
 
 
 if __name__ == "__main__":

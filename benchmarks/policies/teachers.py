@@ -9,7 +9,6 @@ is the section of the teacher of in_palm_rotate: its evaluations, kept in ``reco
 
 from __future__ import annotations
 
-import argparse
 import csv
 import json
 from pathlib import Path
@@ -17,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.report import table, with_notes, write_section
+from benchmarks.report import script_parser, table, with_notes, write_section
 from brainbench.core.figures.style import COLORS, panels, save_figure
 
 PICTURE = Path(__file__).resolve().parents[2] / "docs" / "images" / "policy-teachers.png"
@@ -114,13 +113,11 @@ def draw(curves: dict[str, Path]) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = script_parser(__doc__, notes=True)
     parser.add_argument("--evaluated", nargs="+", required=True)
     parser.add_argument("--others", help="title of the section of other policies than the teacher of in_palm_rotate")
     parser.add_argument("--curves", nargs="*", default=[], help="log.csv of each run")
-    parser.add_argument("--notes", type=Path, help="text that follows the table")
     parser.add_argument("--device", default="one NVIDIA H200 per run")
-    parser.add_argument("--write", action="store_true")
     options = parser.parse_args()
     files, curves = ({name: Path(path) for name, path in pairs(words).items()} for words in
                      (options.evaluated, options.curves))  # fmt: skip

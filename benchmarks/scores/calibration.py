@@ -8,7 +8,6 @@ default. ``--write`` puts the tables into RESULTS.md and docs/calibration.md, an
 
 from __future__ import annotations
 
-import argparse
 import math
 import os
 import time
@@ -21,7 +20,7 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
-from benchmarks.report import table, write_section
+from benchmarks.report import publish, script_parser, table
 from benchmarks.scores import simulated_boards
 from benchmarks.scores.simulated_boards import BIN, BOARDS, RULES, Study
 from brainbench.core.figures.style import COLORS, INK, PALE, panels, save_figure
@@ -465,12 +464,11 @@ def write_docs(name: str, body: str) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = script_parser(__doc__)
     parser.add_argument("names", nargs="*", choices=[*JOBS, []])
     parser.add_argument("--simulations", type=int, default=1000)
     parser.add_argument("--workers", type=int, default=None, help="processes; all processors by default")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--write", action="store_true")
     options = parser.parse_args()
     run = Run(options.simulations, options.seed, options.workers)
     # Workers inherit this; threads of their own would only be in each other's way.
@@ -481,11 +479,10 @@ def main() -> None:
         seconds = time.perf_counter() - start
         heading = f"{result.title}; {options.simulations:,} simulations, seed {options.seed}, {seconds:.0f} s."
         body = f"{heading}\n\n{table(result.columns, result.rows)}"
-        print(f"\n## {name}\n\n{body}", flush=True)
+        print(f"\n## {name}\n", flush=True)
+        words = f"{name} --simulations {options.simulations} --seed {options.seed}"
+        publish(options, f"Calibration: {name}", body, words)
         if options.write:
-            counts = f"--simulations {options.simulations} --seed {options.seed}"
-            command = f"python -m benchmarks.scores.calibration {name} {counts} --write"
-            write_section(f"Calibration: {name}", command, body, subject="scores")
             write_docs(name, body)
             if result.picture:
                 result.picture()

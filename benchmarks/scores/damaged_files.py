@@ -9,7 +9,6 @@ counted before the reading layer is taken from the kept section.
 
 from __future__ import annotations
 
-import argparse
 import re
 import signal
 import subprocess
@@ -19,7 +18,7 @@ import threading
 from collections import Counter
 from pathlib import Path
 
-from benchmarks.report import measure_once, read_sections, table, write_section
+from benchmarks.report import measure_once, publish, read_sections, script_parser, table
 from tests.factories.reading_surfaces import SURFACES
 from tests.factories.reading_trials import attempt
 
@@ -86,13 +85,12 @@ def rows(counts: dict[str, dict[str, int]]) -> list[list[str]]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = script_parser(__doc__)
     parser.add_argument("--cases", type=int, default=500)
     parser.add_argument("--only", help="name of one reader: print its outcomes")
     parser.add_argument("--first", type=int, default=0, help="seed of the first case")
     parser.add_argument("--out", type=Path, default=Path("damaged"), help="folder for the counts of each reader")
     parser.add_argument("--known", action="store_true", help="measure nothing that does not stand in --out")
-    parser.add_argument("--write", action="store_true", help="write the section of RESULTS.md")
     chosen = parser.parse_args()
     if chosen.only:
         attempts(chosen.only, chosen.first, chosen.cases)
@@ -100,10 +98,7 @@ def main() -> None:
     names = [surface.name for surface in SURFACES]
     counts = measure_once(chosen.out, names, lambda name: dict(count(name, chosen.cases)), known=chosen.known)
     body = f"{NOTE}\n\n{table(['surface', 'cases', *FAILURES], rows(counts))}"
-    print(body)
-    if chosen.write:
-        command = f"python -m benchmarks.scores.damaged_files --cases {chosen.cases} --out damaged --write"
-        write_section(TITLE, command, body, subject="commands")
+    publish(chosen, TITLE, body, f"--cases {chosen.cases} --out damaged", subject="commands")
 
 
 NOTE = (

@@ -9,7 +9,6 @@ Only what the README's installation holds can be imported: xarray would also loa
 
 from __future__ import annotations
 
-import argparse
 import os
 import re
 import statistics
@@ -18,7 +17,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-from benchmarks.report import table, write_section
+from benchmarks.report import publish, script_parser, table
 from tests.factories.installations import ROOT, link_installation
 
 TITLE = "The first minute"
@@ -50,9 +49,8 @@ def imports(words: list[str], **environment: str) -> str:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = script_parser(__doc__)
     parser.add_argument("--rounds", type=int, default=5)
-    parser.add_argument("--write", action="store_true")
     options = parser.parse_args()
     spent: dict[str, list[float]] = {}
     with tempfile.TemporaryDirectory() as name:
@@ -91,9 +89,7 @@ def main() -> None:
         f"{table(['command', '× import torch'], rows)}\n\n"
         f"Imports of the score of another network, by package:\n\n{packages}"
     )
-    print(body)
-    if options.write:
-        write_section(TITLE, "python -m benchmarks.scores.first_minute --write", body, subject="commands")
+    publish(options, TITLE, body, subject="commands")
 
 
 if __name__ == "__main__":

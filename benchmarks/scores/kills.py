@@ -8,7 +8,6 @@ again.
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import subprocess
@@ -17,7 +16,7 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from benchmarks.report import measure_once, table, write_section
+from benchmarks.report import measure_once, publish, script_parser, table
 from tests.factories.kill_jobs import JOBS, TIMES
 
 TITLE = "Kills"
@@ -43,10 +42,9 @@ def row(found: dict[str, Any]) -> list[str]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser = script_parser(__doc__)
     parser.add_argument("--out", type=Path, required=True, help="Folder for the outcome of each command.")
     parser.add_argument("--known", action="store_true", help="Measure nothing that does not stand in --out.")
-    parser.add_argument("--write", action="store_true", help="Write the section of RESULTS.md.")
     chosen = parser.parse_args()
     names, cache = [job.name for job in JOBS], chosen.out / "cache"
     found = list(measure_once(chosen.out, names, lambda name: kill(name, cache), known=chosen.known).values())
@@ -54,9 +52,7 @@ def main() -> None:
     total = [str(sum(item[name] for item in found)) for name in ("kills", "resumed", "repeated")]
     faults = [str(sum(len(item[name]) for item in found)) for name in ("different", "left", "failed")]
     text = f"{NOTE}\n\n{table(HEAD, [*rows, ['all', '', *total, *faults, '']])}"
-    print(text)
-    if chosen.write:
-        write_section(TITLE, "python -m benchmarks.scores.kills --out kills --write", text, subject="commands")
+    publish(chosen, TITLE, text, "--out kills", subject="commands")
 
 
 NOTE = (

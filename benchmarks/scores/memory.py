@@ -5,7 +5,6 @@ python -m benchmarks.scores.memory --out memory [--write]
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import resource
@@ -19,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.report import measure_once, table, write_section
+from benchmarks.report import measure_once, publish, script_parser, table
 from tests.factories.recordings import LABELS
 
 TITLE = "Memory per job"
@@ -128,12 +127,11 @@ def measure(name: str) -> dict[str, Any]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser = script_parser(__doc__)
     parser.add_argument("--out", type=Path, default=Path("memory"), help="Folder; jobs measured there are kept.")
     parser.add_argument("--job", help="Run one job here and print its memory.")
     parser.add_argument("--prepare", nargs=3, help="Write a recording: file, seconds, least share of them.")
     parser.add_argument("--known", action="store_true", help="Measure nothing that does not stand in --out.")
-    parser.add_argument("--write", action="store_true", help="Write the section of RESULTS.md.")
     chosen = parser.parse_args()
     if chosen.prepare:
         path, seconds, least = chosen.prepare
@@ -147,9 +145,7 @@ def main() -> None:
     found = measure_once(chosen.out, JOBS, measure, known=chosen.known)
     rows = [[name, f"{item['gigabytes']:.2f}", f"{item['seconds']:.0f}"] for name, item in found.items()]
     text = f"{NOTE}\n\n{table(['job', 'largest memory [GB]', 'duration [s]'], rows)}"
-    print(text)
-    if chosen.write:
-        write_section(TITLE, "python -m benchmarks.scores.memory --out memory --write", text, subject="commands")
+    publish(chosen, TITLE, text, "--out memory", subject="commands")
 
 
 NOTE = (

@@ -11,7 +11,6 @@ rsatoolbox on balanced data; ``--write`` puts the tables into RESULTS.md.
 
 from __future__ import annotations
 
-import argparse
 import resource
 import statistics
 import time
@@ -21,7 +20,7 @@ from functools import partial
 
 import numpy as np
 
-from benchmarks.report import table, write_section
+from benchmarks.report import publish, script_parser, table
 from brainbench.core.trials import Trials
 from brainbench.metrics import compare_models, noise_precision, permutation_test, rdm
 from brainbench.metrics.measures.rsa import RSA, score_rdms
@@ -277,9 +276,8 @@ def device_rows(device: str) -> Iterator[list[str]]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = script_parser(__doc__)
     parser.add_argument("--large", action="store_true")
-    parser.add_argument("--write", action="store_true")
     parser.add_argument("--parity", action="store_true")
     parser.add_argument("--device")
     options = parser.parse_args()
@@ -287,10 +285,7 @@ def main() -> None:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             body = table(["quantity", "largest relative difference"], parity_rows())
-        print(body)
-        if options.write:
-            command = "python -m benchmarks.scores.metrics --parity --write"
-            write_section("Metrics: parity with rsatoolbox", command, body, subject="scores")
+        publish(options, "Metrics: parity with rsatoolbox", body, "--parity")
         return
     if options.device:
         columns = ["job", "numpy ms", f"{options.device} ms", "already there ms", "ratio", "largest difference"]
@@ -299,11 +294,9 @@ def main() -> None:
         for row in device_rows(options.device):
             print(table(columns, [row]).splitlines()[-1], flush=True)
             rows.append(row)
-        if options.write:
-            command = f"python -m benchmarks.scores.metrics --device {options.device} --write"
-            write_section(
-                f"Metrics on a torch device ({options.device})", command, table(columns, rows), subject="scores"
-            )
+        publish(
+            options, f"Metrics on a torch device ({options.device})", table(columns, rows), f"--device {options.device}"
+        )
         return
     large = [large_row()] if options.large else []
     with warnings.catch_warnings():
@@ -311,11 +304,7 @@ def main() -> None:
         first = table(["job", "rsatoolbox ms", "ours ms", "ratio", "goal", "largest difference"], rsatoolbox_rows())
     second = table(["job", "s", "processor s", "goal"], score_rows() + large)
     body = f"{first}\n\n{second}"
-    print(body)
-    if options.write:
-        write_section(
-            "Metrics beside rsatoolbox", "python -m benchmarks.scores.metrics --large --write", body, subject="scores"
-        )
+    publish(options, "Metrics beside rsatoolbox", body, "--large")
 
 
 if __name__ == "__main__":

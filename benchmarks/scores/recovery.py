@@ -7,7 +7,6 @@ are picked beside random ones. Wins in ``choice`` are by mean raw comparisons, l
 
 from __future__ import annotations
 
-import argparse
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
@@ -17,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.report import write_section
+from benchmarks.report import publish, script_parser
 from brainbench.core.jobs import run_jobs
 from brainbench.core.statistics import wilson_interval
 from brainbench.datasets.synthetic import PopulationDesign, ResponseGeometry, draw_animals
@@ -212,19 +211,17 @@ JOBS: dict[str, tuple[str, Callable[[Sequence[Candidate], int], str], int]] = {
 
 def main() -> None:
     """Run the named parts."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = script_parser(__doc__)
     parser.add_argument("names", nargs="*", choices=[*JOBS, []])
     parser.add_argument("--boards", type=int, help="boards of each network")
     parser.add_argument("--stimuli", default="objects")
-    parser.add_argument("--write", action="store_true")
     options = parser.parse_args()
     candidates, _ = open_candidates(list(shipped()), ScoreOptions(stimuli=options.stimuli))
     for name in options.names or JOBS:
         title, job, boards = JOBS[name]
         body = job(candidates, options.boards or boards)
-        print(f"{title}\n\n{body}\n", flush=True)
-        if options.write:
-            write_section(title, f"python -m benchmarks.scores.recovery {name}", body, subject="scores")
+        print(title, flush=True)
+        publish(options, title, body, name)
 
 
 if __name__ == "__main__":

@@ -5,14 +5,13 @@ python -m benchmarks.tactile.closed_forms [--write]
 
 from __future__ import annotations
 
-import argparse
 import math
 
 import mujoco
 import numpy as np
 from scipy.special import erf
 
-from benchmarks.report import table, write_section
+from benchmarks.report import publish, script_parser, table
 from robotics_bridge.physics import Geometry, HandState, MujocoEngine, TouchScene
 from robotics_bridge.sensors import ContactAudio, Noise, SensorSuite, TemperatureGrid
 from robotics_bridge.sensors.audio.materials import ElasticMaterial
@@ -172,9 +171,7 @@ def classifier() -> list[list[str]]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--write", action="store_true", help="put the tables into RESULTS.md")
-    options = parser.parse_args()
+    options = script_parser(__doc__).parse_args()
     parts = [
         ("Modes by quadratic tetrahedra", ["body", "elements along it", "truth", "found", "error"], modes()),
         (
@@ -195,14 +192,7 @@ def main() -> None:
         ),
     ]
     body = "\n\n".join(f"{title}:\n\n{table(columns, rows)}" for title, columns, rows in parts)
-    print(body)
-    if options.write:
-        write_section(
-            "Tactile: noise, temperature, sound",
-            "python -m benchmarks.tactile.closed_forms --write",
-            body,
-            subject="tactile",
-        )
+    publish(options, "Tactile: noise, temperature, sound", body)
 
 
 if __name__ == "__main__":

@@ -5,7 +5,6 @@ python -m benchmarks.tactile.extremes [--device cpu] [--write]
 
 from __future__ import annotations
 
-import argparse
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -15,7 +14,7 @@ from typing import Any
 import numpy as np
 from scipy.integrate import dblquad
 
-from benchmarks.report import table, write_section
+from benchmarks.report import publish, script_parser, table
 from benchmarks.tactile.scene import bumpy_box
 from robotics_bridge.physics import Geometry, HandState, TouchScene
 from robotics_bridge.sensors import (
@@ -243,9 +242,8 @@ EXTREMES: dict[str, Callable[[str], Row]] = {
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser = script_parser(__doc__)
     parser.add_argument("--device", default="cpu")
-    parser.add_argument("--write", action="store_true")
     options = parser.parse_args()
     known, edges = [], []
     for row in truth(options.device):
@@ -254,12 +252,10 @@ def main() -> None:
     for name, extreme in EXTREMES.items():
         edges.append([name, *extreme(options.device)])
         print(*edges[-1], sep=" | ", flush=True)
-    if options.write:
-        command = "python -m benchmarks.tactile.extremes"
-        note = "A bed of springs presses along its normal; a taxel along the normal of what it meets, by its distance."
-        body = note + "\n\n" + table(["case", "exact", "read", "off"], known)
-        write_section("Tactile readings against closed forms", command, body, subject="tactile")
-        write_section("Tactile extremes", command, table(["extreme", "expected", "read", ""], edges), subject="tactile")
+    note = "A bed of springs presses along its normal; a taxel along the normal of what it meets, by its distance."
+    body = note + "\n\n" + table(["case", "exact", "read", "off"], known)
+    publish(options, "Tactile readings against closed forms", body)
+    publish(options, "Tactile extremes", table(["extreme", "expected", "read", ""], edges))
 
 
 if __name__ == "__main__":

@@ -5,7 +5,6 @@ python -m benchmarks.tactile.first_update --write
 
 from __future__ import annotations
 
-import argparse
 import os
 import subprocess
 import sys
@@ -13,15 +12,14 @@ import tempfile
 import time
 from dataclasses import replace
 
-from benchmarks.report import table, write_section
+from benchmarks.report import publish, script_parser, table
 from benchmarks.tactile.scene import CLASSES, FULL, engine_of, scene_of, sensors
 from robotics_bridge.sensors import SensorSuite
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser = script_parser(__doc__)
     parser.add_argument("--measure", choices=["clean", "noisy"], help="print it for the caches as they are")
-    parser.add_argument("--write", action="store_true")
     args = parser.parse_args()
     if args.measure:
         print(*seconds(noisy=args.measure == "noisy"))
@@ -40,9 +38,7 @@ def main() -> None:
         "empty caches.\n\n"
     )
     body += table(["sensors", "caches", "suite built (processor s)", "first update (processor s)"], rows)
-    if args.write:
-        command = "python -m benchmarks.tactile.first_update --write"
-        write_section("First update of nine sensors", command, body, subject="tactile")
+    publish(args, "First update of nine sensors", body)
 
 
 def seconds(*, noisy: bool) -> tuple[str, str]:

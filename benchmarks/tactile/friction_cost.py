@@ -8,14 +8,13 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from benchmarks.report import table, write_section
+from benchmarks.report import publish, script_parser, table
 from benchmarks.tactile.scene import restore, snapshot
 from benchmarks.tactile.throughput import measure
 from brainbench.cli.tactile.scenes import Grip
@@ -37,9 +36,8 @@ ROUNDS = {"cpu": 15, "cuda": 5}
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser = script_parser(__doc__)
     parser.add_argument("--device", choices=list(CASES), default="cpu")
-    parser.add_argument("--write", action="store_true", help="put the table into RESULTS.md")
     parser.add_argument("--from", type=Path, dest="records")
     parser.add_argument("--out", type=Path)
     args = parser.parse_args()
@@ -55,14 +53,10 @@ def main() -> None:
     time = "time on the device" if found["device"] else "processor time"
     body = f"{HAND} holds a ball; {time} of an update, least of {found['rounds']} rounds, settings in turn.\n\n"
     body += table(["taxels × environments", "forces", "µs", "× law"], found["rows"])
-    print(body)
-    if args.write:
-        title, flag = ("What friction at rest costs", "") if not found["device"] else (
-            f"What friction at rest costs ({found['device']})", "--device cuda "
-        )  # fmt: skip
-        where = f"one {found['device']}" if found["device"] else ""
-        command = f"python -m benchmarks.tactile.friction_cost {flag}--write"
-        write_section(title, command, body, where=where, subject="tactile")
+    title, words, where = "What friction at rest costs", "", ""
+    if device := found["device"]:
+        title, words, where = f"{title} ({device})", "--device cuda", f"one {device}"
+    publish(args, title, body, words, where=where)
 
 
 def settled(device: str) -> dict[str, np.ndarray]:

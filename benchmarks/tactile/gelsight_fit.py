@@ -11,14 +11,13 @@ are tracked here anew, below a pixel (``picture``). Printed: relative RMSE |mode
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 from scipy.optimize import least_squares
 
-from benchmarks.report import table, write_section
+from benchmarks.report import publish, script_parser, table
 from robotics_bridge.physics import Geometry, HandState, TouchScene
 from robotics_bridge.sensors import ElastomerTaxel, Probes, SensorSuite
 from robotics_bridge.sensors.elastomer.taxel import Layer
@@ -186,9 +185,8 @@ def smooth_bound(x: np.ndarray, y: np.ndarray) -> float:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser()
+    parser = script_parser(__doc__)
     parser.add_argument("--data", type=Path, required=True)
-    parser.add_argument("--write", action="store_true")
     parser.add_argument("--picture", type=Path)
     options = parser.parse_args()
     fields, fitted, rows = {}, {}, []
@@ -207,13 +205,7 @@ def main() -> None:
     print(f"sensor against closed form: {by_sensor(x, fitted['picture', 'dilate']):.1e}", flush=True)
     columns = ["field", "tracked in", "markers", "parameters", "in-sample", "5-fold", "rounding alone"]
     columns += ["best smooth field, leave-one-out", "published"]
-    if options.write:
-        write_section(
-            "Elastomer on real GelSight fields",
-            "python -m benchmarks.tactile.gelsight_fit",
-            table(columns, rows),
-            subject="tactile",
-        )
+    publish(options, "Elastomer on real GelSight fields", table(columns, rows), "--data FOLDER")
     if options.picture:
         draw(options.picture, {name: fields["picture", name] for name in MODELS}, rows[2:])
 

@@ -135,7 +135,7 @@ def main() -> None:
         return
     if not options.input:
         parser.error("give --record FILE, which needs Genesis, or --input FILE")
-    from benchmarks.report import table, write_section
+    from benchmarks.report import publish, table
 
     columns = ["sensor", "unit", "numbers", "largest", "largest difference", "of the largest", "taxels at the rim"]
     body = (
@@ -145,10 +145,7 @@ def main() -> None:
         "and elastomer taxels draw their points at random in both.\n\n"
     )
     body += table(columns, compare(options.input))
-    print(body)
-    if options.write:
-        command = "python -m benchmarks.tactile.genesis_values --input states.npz --write"
-        write_section("Touch: values beside Genesis 1.4.5", command, body, subject="tactile")
+    publish(options, "Touch: values beside Genesis 1.4.5", body, "--input states.npz")
 
 
 if __name__ == "__main__":

@@ -5,13 +5,12 @@ python -m benchmarks.tactile.hand_stimuli [--model zhuang-intersection-ln-small]
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from benchmarks.report import table, write_section
+from benchmarks.report import publish, script_parser, table
 from brainbench import load_model
 from brainbench.cli.stimuli.hand import objects_of
 from brainbench.core.figures.style import panels, save_figure
@@ -62,9 +61,8 @@ def draw(rdms: dict[tuple[str, str], np.ndarray], labels: list[str], columns: li
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser()
+    parser = script_parser(__doc__)
     parser.add_argument("--model", default="zhuang-intersection-ln-small")
-    parser.add_argument("--write", action="store_true")
     options = parser.parse_args()
     whiskers = load_stimuli("rodgers", backend="rod")
     inputs = {"whiskers": whiskers.input}
@@ -81,15 +79,12 @@ def main() -> None:
         lines.append([column, *found])
         print(*lines[-1], flush=True)
     draw(rdms, list(whiskers.labels), list(inputs), rows)
-    if options.write:
-        body = (
-            f"Six Rodgers stimuli (convex or concave, three distances), untrained `{options.model}`, all time steps, "
-            "1 − Pearson; Pearson of the hand's dissimilarities with the whiskers' (15 pairs: |r| < .45 is chance).\n\n"
-            + table(["stimuli", "input", "encoder"], lines)
-        )
-        write_section(
-            "Hand and whisker stimuli", "python -m benchmarks.tactile.hand_stimuli --write", body, subject="tactile"
-        )
+    body = (
+        f"Six Rodgers stimuli (convex or concave, three distances), untrained `{options.model}`, all time steps, "
+        "1 − Pearson; Pearson of the hand's dissimilarities with the whiskers' (15 pairs: |r| < .45 is chance).\n\n"
+        + table(["stimuli", "input", "encoder"], lines)
+    )
+    publish(options, "Hand and whisker stimuli", body)
 
 
 if __name__ == "__main__":

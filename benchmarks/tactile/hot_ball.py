@@ -10,14 +10,13 @@ with both laws of contact conduction.
 
 from __future__ import annotations
 
-import argparse
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from benchmarks.report import table, write_section
+from benchmarks.report import publish, script_parser, table
 from robotics_bridge import tasks
 from robotics_bridge.envs import Env
 from robotics_bridge.policies.training.teacher import load_teacher
@@ -162,13 +161,12 @@ def draw(records: list[dict[str, Any]], step: float) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = script_parser(__doc__)
     parser.add_argument("--envs", type=int, default=6)
     parser.add_argument("--seconds", type=float, default=20.0)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--config", choices=("published", "default"), default="published")
     parser.add_argument("--agent", help="a shipped teacher or the folder of a run, in place of the script")
-    parser.add_argument("--write", action="store_true", help="table in RESULTS.md and the figure")
     options = parser.parse_args()
     records = run(options.envs, options.seconds, options.seed, options.config, options.agent)
     rows = []
@@ -179,39 +177,22 @@ def main() -> None:
             "✓" if cell in PUBLISHED else "–", f"{r['warmest']:.1f}", f"{r['latched']:.2f}",
             "–" if r["latch_s"] is None else f"{r['latch_s']:.1f}", f"{r['S']:.1f}", "✓" if r["success"] > 0.5 else "–",
         ])  # fmt: skip
-    columns = [
-        "conduction",
-        "k (W/(m·K))",
-        "ε",
-        "heat (W/m²)",
-        "published",
-        "warmest (°C)",
-        "latched",
-        "after (s)",
-        "S (s)",
-        "ours",
-    ]
-    body = table(columns, rows)
-    print(body)
-    print(f"touching the ball for {records[0]['touched_s']:.1f} s (median)")
-    if options.write:
-        own = ["--config default"] if options.config == "default" else []
-        own += [f"--agent {options.agent}"] if options.agent else []
-        if not own:
-            draw(records, 0.025)
-        note = (
-            f"Medians over {options.envs} episodes of {options.seconds:g} s by {options.agent or 'a script'}, which "
-            f"knows the hot ball and touches it for {records[0]['touched_s']:.1f} s, in the {options.config} task; "
-            "thermometers step with the control (25 ms). A finger whose warmest cell reaches 42.24 °C latches; S "
-            "counts seconds of contact after that. Density, heat capacity, cells, the radius of contacts and the "
-            "balls' material are not published (aluminium throughout).\n\n"
-        )
-        by = f" ({options.agent or 'script'}, {options.config} task)" if own else ""
-        write_section(
-            f"hot_ball: the cells of figure 4.8 by touch and hold{by}",
-            " ".join([f"python -m benchmarks.tactile.hot_ball --envs {options.envs}", *own, "--write"]), note + body,
-            subject="tactile",
-        )  # fmt: skip
+    columns = ["conduction", "k (W/(m·K))", "ε", "heat (W/m²)", "published"]
+    columns += ["warmest (°C)", "latched", "after (s)", "S (s)", "ours"]
+    own = ["--config default"] if options.config == "default" else []
+    own += [f"--agent {options.agent}"] if options.agent else []
+    if options.write and not own:
+        draw(records, 0.025)
+    body = (
+        f"Medians over {options.envs} episodes of {options.seconds:g} s by {options.agent or 'a script'}, which "
+        f"knows the hot ball and touches it for {records[0]['touched_s']:.1f} s, in the {options.config} task; "
+        "thermometers step with the control (25 ms). A finger whose warmest cell reaches 42.24 °C latches; S "
+        "counts seconds of contact after that. Density, heat capacity, cells, the radius of contacts and the "
+        f"balls' material are not published (aluminium throughout).\n\n{table(columns, rows)}"
+    )
+    by = f" ({options.agent or 'script'}, {options.config} task)" if own else ""
+    title = f"hot_ball: the cells of figure 4.8 by touch and hold{by}"
+    publish(options, title, body, " ".join([f"--envs {options.envs}", *own]))
 
 
 if __name__ == "__main__":

@@ -25,7 +25,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.report import write_section
+from benchmarks.report import script_parser, write_section
 from benchmarks.tactile.scene import (
     CELLS,
     CLASSES,
@@ -276,7 +276,7 @@ def lay_out(rows: list[Row], options: argparse.Namespace) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser = script_parser(__doc__)
     parser.add_argument("--part", choices=[*PARTS, "all"], default="all")
     parser.add_argument("--device", default="cuda")
     parser.add_argument("--envs", type=int)
@@ -289,7 +289,6 @@ def main() -> None:
     parser.add_argument("--input", type=Path)
     parser.add_argument("--from", type=Path, nargs="+", dest="records")
     parser.add_argument("--out", type=Path)
-    parser.add_argument("--write", action="store_true", help="put tables into RESULTS.md")
     parser.add_argument("--figure", type=Path, help="draw the figure of scaling")
     options = parser.parse_args()
     if options.write_input:

@@ -22,8 +22,8 @@ from typing import Literal
 
 import numpy as np
 
-from benchmarks.report import table, write_section
-from benchmarks.whiskers.rod_steps import FELT, GRIDS, Fidelity, SweepScenes, errors, resolve_objects, run
+from benchmarks.report import publish, script_parser, table
+from benchmarks.whiskers.rod_steps import FELT, Fidelity, errors, pick_sweeps, run
 
 FIXED = (1e-3, 5e-4, 2e-4, 1e-4)
 """Steps (s) without the trial."""
@@ -74,21 +74,9 @@ CHANGES = {
 """Text of the kernels and what stands in its place."""
 
 
-def picked_sweeps() -> tuple[SweepScenes, dict]:
-    """Return the sweeps of benchmarks/whiskers/rod_steps.py."""
-    objects = resolve_objects(["procedural-24:1"], surfaces=True)
-    scenes = SweepScenes(GRIDS["thesis-high"], {name: item.load for name, item in objects.items()})
-    picked = {}
-    for name in scenes.objects:
-        sweeps = scenes.grid.sweeps(name)
-        picked[name] = [sweeps[k] for k in np.linspace(3, len(sweeps) - 4, 3).astype(int)]
-        scenes.solid(name)
-    return scenes, picked
-
-
 def measure(step: float, precision: Literal["single", "double"], folder: Path) -> None:
     """Simulate the sweeps in this process and keep what was found in a file of ``folder``."""
-    scenes, picked = picked_sweeps()
+    scenes, picked = pick_sweeps(["procedural-24:1"], "thesis-high", 3)
     found = run(scenes, picked, Fidelity(links=12, time_step=step, precision=precision))
     arrays = {name: found.pop(name) for name in ("wrench", "flagged")}
     np.savez(folder / "found.npz", **arrays)
@@ -130,8 +118,7 @@ def speed_gains(fixed: np.ndarray, trial: np.ndarray) -> list[float]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--write", action="store_true")
+    parser = script_parser(__doc__)
     parser.add_argument("--step", type=float, help=argparse.SUPPRESS)
     parser.add_argument("--precision", default="single", help=argparse.SUPPRESS)
     parser.add_argument("--folder", type=Path, help=argparse.SUPPRESS)
@@ -176,14 +163,7 @@ def main() -> None:
         "equal steps with the same error, between these rows (beyond them, over the nearest). A trial: the engine has "
         "no such option.\n\n" + table(head, rows)
     )
-    print(text)
-    if args.write:
-        write_section(
-            "A trial of adaptive time steps in rod",
-            "python -m benchmarks.whiskers.adaptive_steps --write",
-            text,
-            subject="whiskers",
-        )
+    publish(args, "A trial of adaptive time steps in rod", text)
 
 
 if __name__ == "__main__":

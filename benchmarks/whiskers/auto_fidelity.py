@@ -16,7 +16,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from benchmarks.report import table, write_section
+from benchmarks.report import publish, script_parser, table
 from brainbench.core.statistics import wilson_interval
 from brainbench.stimuli.engines import get_engine
 from brainbench.stimuli.engines.fidelity import Fidelity
@@ -32,14 +32,13 @@ FINER = (
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser = script_parser(__doc__)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--finer", action="store_true", help="compare finer settings with the converged simulation")
-    parser.add_argument("--write", action="store_true")
     parser.add_argument("--engines", action="store_true", help="compare engines, by friction, in place of settings")
     args = parser.parse_args()
     if args.engines or args.finer:
-        (engines if args.engines else finer)(args.write)
+        (engines if args.engines else finer)(args)
         return
     jobs = contact_jobs(args.seed)
     found = get_engine(REFERENCE.backend).run(jobs, REFERENCE.fidelity.resolved(True))
@@ -64,13 +63,10 @@ def main() -> None:
         "(40 links, 10 µs, double precision, contact forces solved to 1e-9).\n\n"
         + table(["asked for", "`Fidelity.auto`", "whiskers below it", "median error", "processor s / whisker-s"], rows)
     )
-    print(body)
-    if args.write:
-        command = "python -m benchmarks.whiskers.auto_fidelity --write"
-        write_section("Settings chosen for an error", command, body, subject="whiskers")
+    publish(args, "Settings chosen for an error", body)
 
 
-def finer(write: bool) -> None:
+def finer(args: argparse.Namespace) -> None:
     """Compare finer settings with the converged simulation, in every sixth of the scenes."""
     jobs, rows = contact_jobs(1)[::6], []
     references = get_engine(REFERENCE.backend).run(jobs, REFERENCE.fidelity.resolved(True))
@@ -84,12 +80,10 @@ def finer(write: bool) -> None:
         f"{len(jobs)} whiskers beside the converged simulation (40 links, 10 µs, double precision); so many per cent "
         "of them stay below.\n\n" + table(["setting", "50 %", "90 %", "95 %", "processor s / whisker-s"], rows)
     )
-    if write:
-        command = "python -m benchmarks.whiskers.auto_fidelity --finer --write"
-        write_section("Settings finer than the converged simulation", command, body, subject="whiskers")
+    publish(args, "Settings finer than the converged simulation", body, "--finer")
 
 
-def engines(write: bool) -> None:
+def engines(args: argparse.Namespace) -> None:
     """Compare ``mujoco`` and, in some short scenes, ``bullet`` with ``rod`` in double precision, by friction."""
     accurate, rows = Fidelity.preset("accurate"), []
     for friction in FRICTIONS:
@@ -106,9 +100,7 @@ def engines(write: bool) -> None:
         "Difference from `rod` (`accurate`, double precision): base force or moment, root mean square, the larger.\n\n"
     )
     body += table(["friction", "engine", "whiskers", "median", "90 % below", "processor s / whisker-s"], rows)
-    if write:
-        command = "python -m benchmarks.whiskers.auto_fidelity --engines --write"
-        write_section("Engines in random scenes of contact", command, body, subject="whiskers")
+    publish(args, "Engines in random scenes of contact", body, "--engines")
 
 
 def compare(setting: SimulationSetting, jobs: Sequence[Job], references: Sequence[Trace]) -> tuple[np.ndarray, float]:

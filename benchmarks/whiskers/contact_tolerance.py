@@ -7,12 +7,11 @@ Random scenes of contact at the same links and steps, beside the same engine wit
 
 from __future__ import annotations
 
-import argparse
 from dataclasses import replace
 
 import numpy as np
 
-from benchmarks.report import table, write_section
+from benchmarks.report import publish, script_parser, table
 from brainbench.stimuli import Fidelity
 from brainbench.stimuli.engines import get_engine
 from brainbench.stimuli.tradeoff import SimulationSetting, run_for_cost
@@ -25,9 +24,8 @@ SHARES = {"median": 0.5, "90 %": 0.9, "95 %": 0.95}
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = script_parser(__doc__)
     parser.add_argument("--each", type=int, default=1, help="scenes of each of the 72 combinations")
-    parser.add_argument("--write", action="store_true")
     args = parser.parse_args()
     jobs = contact_jobs(5, each=args.each)
     friction = np.array([job.obstacles[0].friction for job in jobs])
@@ -63,13 +61,7 @@ def main() -> None:
         "direction in which a contact slips. Steps that were not solved are those in which either did not suffice. "
         "Cost is that of all frictions together.\n\n" + table(head, rows)
     )
-    if args.write:
-        write_section(
-            "Contact forces solved to a tolerance",
-            "python -m benchmarks.whiskers.contact_tolerance --write",
-            text,
-            subject="whiskers",
-        )
+    publish(args, "Contact forces solved to a tolerance", text)
 
 
 if __name__ == "__main__":

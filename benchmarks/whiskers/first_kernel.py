@@ -7,7 +7,6 @@ For a GPU the kernels are compiled here (``precompile``), which launches nothing
 
 from __future__ import annotations
 
-import argparse
 import os
 import subprocess
 import sys
@@ -19,7 +18,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from benchmarks.report import table, write_section
+from benchmarks.report import publish, script_parser, table
 from benchmarks.whiskers.precompile import pretend
 from brainbench.core.devices import pick_device, warp
 from brainbench.stimuli.engines import get_engine
@@ -34,10 +33,9 @@ LINKS = (8, 12, 24, 40)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser = script_parser(__doc__)
     parser.add_argument("--links", type=int, help="measure these here, with the cache of kernels as it is")
     parser.add_argument("--device", choices=list(MEASURES), default="processor", help="with --links: for what")
-    parser.add_argument("--write", action="store_true")
     args = parser.parse_args()
     if args.links:
         print(MEASURES[args.device](args.links))
@@ -58,9 +56,7 @@ def main() -> None:
         "and the six kernels of sweeps.\n\n"
     )
     body += table(["links", *MEASURES], rows)
-    if args.write:
-        command = "python -m benchmarks.whiskers.first_kernel --write"
-        write_section("First kernel on a new machine", command, body, subject="whiskers")
+    publish(args, "First kernel on a new machine", body)
 
 
 def on_a_processor(links: int) -> float:

@@ -5,13 +5,12 @@
 
 from __future__ import annotations
 
-import argparse
 from dataclasses import replace
 from unittest.mock import patch
 
 import numpy as np
 
-from benchmarks.report import table, write_section
+from benchmarks.report import publish, script_parser, table
 from brainbench.stimuli.fitting import FitOptions, Trial, fit, least_squares
 from brainbench.stimuli.fitting.synthetic import blank_wrenches, measure_wrenches, simulate_trial
 from brainbench.stimuli.validation import references
@@ -35,9 +34,7 @@ def measured(share: float, gap: float) -> Trial:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--write", action="store_true")
-    options = parser.parse_args()
+    options = script_parser(__doc__).parse_args()
     rows, wrong = [], {"start alone": [0, 0], "scan": [0, 0]}
     for share in TRUTHS:
         for gap in GAPS:
@@ -62,9 +59,7 @@ def main() -> None:
     )
     head = ["truth / start", "periods a reading", "start alone", "status", "scan", "status"]
     print(told)
-    if options.write:
-        command = "python -m benchmarks.whiskers.fitting_starts --write"
-        write_section(TITLE, command, text + table(head, rows), subject="whiskers")
+    publish(options, TITLE, text + table(head, rows))
 
 
 if __name__ == "__main__":

@@ -8,12 +8,11 @@ The reference is that of ``tests/factories/friction_reference.py``. Per cent of 
 
 from __future__ import annotations
 
-import argparse
 import time
 
 import numpy as np
 
-from benchmarks.report import table, write_section
+from benchmarks.report import publish, script_parser, table
 from benchmarks.whiskers.rod_agreement import HOW
 from brainbench.stimuli import Fidelity
 from brainbench.stimuli.engines import get_engine
@@ -24,11 +23,10 @@ ENGINES = ("rod", 50), ("rod", 100), ("rod", 500), ("mujoco", 50), ("mujoco", 10
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = script_parser(__doc__)
     parser.add_argument("--whiskers", default="C2,B1,D3")
     parser.add_argument("--links", type=int, default=12)
     parser.add_argument("--duration", type=float, default=0.4)
-    parser.add_argument("--write", action="store_true")
     args = parser.parse_args()
     rows: list[list[str]] = []
     for friction in (0.0, 0.48):
@@ -65,14 +63,7 @@ def main() -> None:
         f"{2 * len(args.whiskers.split(','))} passings and in brackets the worst. The reference: BDF, contact "
         f"{STIFFNESS:g} N/m, friction viscous below {1e6 * CREEP:g} µm/s.\n\n" + table(head, rows)
     )
-    print(text)
-    if args.write:
-        write_section(
-            "Friction beside an independent reference",
-            "python -m benchmarks.whiskers.friction_reference --write",
-            text,
-            subject="whiskers",
-        )
+    publish(args, "Friction beside an independent reference", text)
 
 
 if __name__ == "__main__":

@@ -14,7 +14,6 @@ Times are those of the second round, when kernels are compiled; the first round 
 
 from __future__ import annotations
 
-import argparse
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -23,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.report import table, write_section
+from benchmarks.report import publish, script_parser, table
 from benchmarks.whiskers.gradients import BASE, FIDELITY, OBJECT
 from brainbench.core.devices import pick_device
 from brainbench.stimuli.engines import get_engine
@@ -98,7 +97,7 @@ def measure(
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = script_parser(__doc__)
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--each", type=int, default=1, help="scenes of each of the 72 combinations")
     parser.add_argument("--links", type=int, default=FIDELITY.links)
@@ -106,7 +105,6 @@ def main() -> None:
     parser.add_argument("--compile-only", action="store_true")
     parser.add_argument("--write-input", type=Path)
     parser.add_argument("--input", type=Path)
-    parser.add_argument("--write", action="store_true")
     args = parser.parse_args()
     jobs = [replace(job, times=job.times[: args.readings]) for job in contact_jobs(11, each=args.each)]
     fidelity = replace(FIDELITY, links=args.links)
@@ -136,12 +134,10 @@ def main() -> None:
             f"\n\n{both.sum()} whiskers are smooth here and on a processor; their gradients differ by "
             f"{np.median(error.max(axis=1)):.2g} of the largest component in the median, {error.max():.2g} at most."
         )
-    print(text)
-    if args.write:
-        command = f"python -m benchmarks.whiskers.gradient_cost --device {args.device} --each {args.each} --write"
-        command += f" --links {args.links}" * (args.links != FIDELITY.links)
-        command += f" --readings {args.readings}" * bool(args.readings)
-        write_section(f"Gradients of many whiskers on a {name}", command, text, subject="whiskers", where=f"one {name}")
+    words = f"--device {args.device} --each {args.each}"
+    words += f" --links {args.links}" * (args.links != FIDELITY.links)
+    words += f" --readings {args.readings}" * bool(args.readings)
+    publish(args, f"Gradients of many whiskers on a {name}", text, words, where=f"one {name}")
 
 
 if __name__ == "__main__":

@@ -11,7 +11,6 @@ event for this parameter, and no error is taken.
 
 from __future__ import annotations
 
-import argparse
 import os
 import time
 from collections import Counter
@@ -21,7 +20,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.report import table, write_section
+from benchmarks.report import publish, script_parser, table
 from brainbench.stimuli import Fidelity, Whisker
 from brainbench.stimuli.engines import get_engine
 from brainbench.stimuli.engines.protocol import Job, Load, StillFollicle, Trace
@@ -176,10 +175,9 @@ def contact_names(friction: float) -> tuple[str, ...]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = script_parser(__doc__)
     parser.add_argument("--scenes", type=int, default=50)
     parser.add_argument("--seed", type=int, default=11)
-    parser.add_argument("--write", action="store_true")
     args = parser.parse_args()
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     results: dict[str, Comparison] = {}
@@ -199,9 +197,7 @@ def main() -> None:
         results[f"random {drawn}"] = found
         print(f"random {drawn}", _worst(found), found.status, found.events, flush=True)
     text = report(results, refused)
-    print(text)
-    if args.write:
-        write_section("Gradients", "python -m benchmarks.whiskers.gradients --write", text, subject="whiskers")
+    publish(args, "Gradients", text)
 
 
 def _worst(found: Comparison) -> float:

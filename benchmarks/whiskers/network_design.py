@@ -5,11 +5,10 @@
 
 from __future__ import annotations
 
-import argparse
 import math
 import time
 
-from benchmarks.report import table, write_section
+from benchmarks.report import publish, script_parser, table
 from brainbench.scoring.recovery import design_for_networks
 from brainbench.stimuli import PlacedObject, Scene, WhiskerArray, Whisking
 from brainbench.stimuli.design import DesignOptions
@@ -31,9 +30,7 @@ OPTIONS = DesignOptions(fidelity="fast", check="balanced", iterations=5, starts=
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--write", action="store_true")
-    args = parser.parse_args()
+    args = script_parser(__doc__).parse_args()
     array = WhiskerArray.of("mouse", whiskers="C1-C3")
     scenes = [
         Scene(name, array, (PlacedObject(solid, position=PLACE),), Whisking(frequency=10), frames=FRAMES)
@@ -66,9 +63,7 @@ def main() -> None:
     )
     head = ["networks", "chosen", "motion", "contrast", "held-out posts", "lead", "growth", "won", "status", "s"]
     text += table(head, rows)
-    print(text)
-    if args.write:
-        write_section(TITLE, "python -m benchmarks.whiskers.network_design --write", text, subject="whiskers")
+    publish(args, TITLE, text)
 
 
 if __name__ == "__main__":

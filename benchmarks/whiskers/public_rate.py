@@ -28,7 +28,7 @@ from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Any
 
-from benchmarks.report import table, write_section
+from benchmarks.report import script_parser, table, write_section
 
 STARTED = time.time()
 PARTS = ("kernels", "stages")
@@ -36,7 +36,7 @@ TITLE = "Sweeps on {}, by the public command"
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser = script_parser(__doc__)
     parser.add_argument("--recipe", default="thesis-high")
     parser.add_argument("--objects", default="procedural-24:2", help="208 sweeps of thesis-high each")
     parser.add_argument("--fidelity", action="append", help="can be repeated")
@@ -52,7 +52,6 @@ def main() -> None:
         help="of kernels and stages: tries ahead as '1:24' (a digit a try); for the kernels several, by commas",
     )
     parser.add_argument("--inside", choices=PARTS, help=argparse.SUPPRESS)
-    parser.add_argument("--write", action="store_true", help="write the section of RESULTS.md")
     args = parser.parse_args()
     args.fidelity = args.fidelity or ["fast,links=12,time_step=1e-3"]
     if args.inside:
@@ -132,7 +131,7 @@ def processor_seconds() -> float:
 
 def kernels(args: argparse.Namespace) -> None:
     """Print the rate of the kernels: all sweeps in one launch, then those that are simulated again."""
-    from benchmarks.whiskers.throughput import load_objects
+    from benchmarks.whiskers.slices import load_objects
     from brainbench.core.files import content_hash
     from brainbench.stimuli import Fidelity
     from brainbench.stimuli.engines.rod.sweeps import SweepLauncher

@@ -11,14 +11,13 @@ whose error a difference is.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from benchmarks.report import table, write_section
+from benchmarks.report import publish, script_parser, table
 from brainbench.stimuli import Fidelity, Frames, Scene, simulate
 from brainbench.stimuli.objects.collections import resolve_objects
 from brainbench.stimuli.sweeps.sweep_scenes import GRIDS, SweepScenes
@@ -75,12 +74,11 @@ def compare(found: np.ndarray, truth: np.ndarray) -> list[str]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = script_parser(__doc__)
     parser.add_argument("--sweeps", type=int, default=50)
     parser.add_argument("--whiskers", type=int, default=6)
     parser.add_argument("--shapes", default=SHAPES)
     parser.add_argument("--bullet", action="store_true", help="a third engine, which takes some 17 minutes")
-    parser.add_argument("--write", action="store_true")
     args = parser.parse_args()
     objects = resolve_objects(args.shapes.split(","), collision="hull")
     rows = []
@@ -116,14 +114,7 @@ def main() -> None:
         f"{args.whiskers} whiskers drawn for each. Per cent of the whisker's own peak, median over whiskers; in "
         f"brackets the share of whiskers within {GOAL:.0%}.\n\n" + table(head, rows)
     )
-    print(text)
-    if args.write:
-        write_section(
-            "Agreement of rod and mujoco",
-            "python -m benchmarks.whiskers.rod_agreement --write",
-            text,
-            subject="whiskers",
-        )
+    publish(args, "Agreement of rod and mujoco", text)
 
 
 HOW = "peak", "reading", "rms"

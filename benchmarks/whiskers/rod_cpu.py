@@ -10,12 +10,11 @@ sweep, of the whisker's own peak, median over the whiskers that are bent.
 
 from __future__ import annotations
 
-import argparse
 import time
 
 import numpy as np
 
-from benchmarks.report import table, write_section
+from benchmarks.report import publish, script_parser, table
 from benchmarks.whiskers.rod_agreement import FELT, FINER, SHAPES, draw, wrenches
 from brainbench.stimuli import Fidelity, simulate
 from brainbench.stimuli.objects.collections import resolve_objects
@@ -39,10 +38,9 @@ FEW = 2
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = script_parser(__doc__)
     parser.add_argument("--sweeps", type=int, default=10)
     parser.add_argument("--whiskers", type=int, default=6)
-    parser.add_argument("--write", action="store_true")
     args = parser.parse_args()
     objects = resolve_objects(SHAPES.split(","), collision="hull")
     drawn = draw(objects, args.sweeps, args.whiskers, None, 0.48)
@@ -73,14 +71,7 @@ def main() -> None:
         "is against 10 links at 20 µs); compiling left out.\n\n"
         + table([*head, "sweeps of 30 whiskers / processor s"], rows)
     )
-    print(text)
-    if args.write:
-        write_section(
-            "rod, mujoco and bullet on a processor",
-            "python -m benchmarks.whiskers.rod_cpu --write",
-            text,
-            subject="whiskers",
-        )
+    publish(args, "rod, mujoco and bullet on a processor", text)
 
 
 if __name__ == "__main__":

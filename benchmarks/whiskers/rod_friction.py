@@ -9,7 +9,6 @@ iterations of the solver take creep out after the fact. Random sweeps as in ``ro
 
 from __future__ import annotations
 
-import argparse
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -18,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.report import table, write_section
+from benchmarks.report import publish, script_parser, table
 from benchmarks.whiskers.rod_agreement import ACCURATE, FINER, HOW, SHAPES, compare, draw, wrenches
 from brainbench.stimuli.engines.mujoco import engine as backend
 from brainbench.stimuli.engines.mujoco.model import FRICTION_STIFFNESS, engine
@@ -48,11 +47,10 @@ def friction(cone: str, impratio: float, noslip: int) -> Iterator[None]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = script_parser(__doc__)
     parser.add_argument("--scenes", type=int, default=8)
     parser.add_argument("--whiskers", type=int, default=4)
     parser.add_argument("--settings", default=SETTINGS, help="step (µs):cone:impratio:noslip iterations, by commas")
-    parser.add_argument("--write", action="store_true")
     args = parser.parse_args()
     objects = resolve_objects(SHAPES.split(","), collision="hull")
     scenes = draw(objects, args.scenes, args.whiskers, None, 0.48)
@@ -93,14 +91,7 @@ def main() -> None:
         '`rod` at `accurate` (finer steps against its 10 µs). Columns as in "Agreement of rod and mujoco".\n\n'
     )
     text += table(head, rows)
-    print(text)
-    if args.write:
-        write_section(
-            "Friction of mujoco beside rod",
-            "python -m benchmarks.whiskers.rod_friction --write",
-            text,
-            subject="whiskers",
-        )
+    publish(args, "Friction of mujoco beside rod", text)
 
 
 if __name__ == "__main__":

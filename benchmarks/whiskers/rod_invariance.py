@@ -7,7 +7,6 @@ A mouse whisker whisks at 20 Hz (±20°) for 200 ms against three small balls, o
 
 from __future__ import annotations
 
-import argparse
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.report import table, write_section
+from benchmarks.report import publish, script_parser, table
 from brainbench.stimuli import Fidelity
 from brainbench.stimuli.engines.protocol import Job, Trace
 from brainbench.stimuli.engines.rod.engine import RodEngine
@@ -81,9 +80,7 @@ def change(found: NDArray[np.float64], expected: NDArray[np.float64]) -> str:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--write", action="store_true")
-    arguments = parser.parse_args()
+    arguments = script_parser(__doc__).parse_args()
     balanced = Fidelity.preset("balanced")
     alone, least = run(touched(), balanced, tries=TRIES)
     rows = [["three balls", f"{1e3 * least:.1f}", "1", "0 / 0"]]
@@ -116,10 +113,7 @@ def main() -> None:
         "cadence makes other steps; nothing else may change them but what is touched."
     )
     body = "\n".join(text)
-    print(body)
-    if arguments.write:
-        command = "python -m benchmarks.whiskers.rod_invariance --write"
-        write_section("What changes nothing in rod, and what it costs", command, body, subject="whiskers")
+    publish(arguments, "What changes nothing in rod, and what it costs", body)
 
 
 if __name__ == "__main__":

@@ -5,13 +5,12 @@ python -m benchmarks.whiskers.rod_steps [--objects procedural-24:1] [--each 3] [
 
 from __future__ import annotations
 
-import argparse
 import time
 from typing import Any
 
 import numpy as np
 
-from benchmarks.report import table, write_section
+from benchmarks.report import publish, script_parser, table
 from brainbench.stimuli import Fidelity
 from brainbench.stimuli.engines.rod.sweeps import SweepLauncher
 from brainbench.stimuli.objects.collections import resolve_objects
@@ -20,6 +19,17 @@ from brainbench.stimuli.sweeps.sweep_scenes import GRIDS, SweepScenes
 STEPS = (5e-5, 1e-4, 2e-4, 5e-4, 1e-3)
 FELT = 2e-7
 """Peak force (N) from which a whisker counts."""
+
+
+def pick_sweeps(objects: list[str], recipe: str, each: int) -> tuple[SweepScenes, dict[str, list[Any]]]:
+    """Make the objects of a recipe and pick so many sweeps of each, evenly and none of the first or last three."""
+    found = resolve_objects(objects, surfaces=True)
+    scenes, picked = SweepScenes(GRIDS[recipe], {name: item.load for name, item in found.items()}), {}
+    for name in scenes.objects:
+        sweeps = scenes.grid.sweeps(name)
+        picked[name] = [sweeps[k] for k in np.linspace(3, len(sweeps) - 4, each).astype(int)]
+        scenes.solid(name)
+    return scenes, picked
 
 
 def run(scenes: SweepScenes, picked: dict[str, list[Any]], fidelity: Fidelity) -> dict[str, Any]:
@@ -53,20 +63,13 @@ def errors(found: dict[str, Any], reference: dict[str, Any]) -> dict[str, np.nda
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = script_parser(__doc__)
     parser.add_argument("--objects", default="procedural-24:1")
     parser.add_argument("--recipe", default="thesis-high")
     parser.add_argument("--each", type=int, default=3, help="sweeps of each object")
     parser.add_argument("--links", type=int, default=12)
-    parser.add_argument("--write", action="store_true")
     args = parser.parse_args()
-    objects = resolve_objects(args.objects.split(","), surfaces=True)
-    scenes = SweepScenes(GRIDS[args.recipe], {name: item.load for name, item in objects.items()})
-    picked = {}
-    for name in scenes.objects:
-        sweeps = scenes.grid.sweeps(name)
-        picked[name] = [sweeps[k] for k in np.linspace(3, len(sweeps) - 4, args.each).astype(int)]
-        scenes.solid(name)
+    scenes, picked = pick_sweeps(args.objects.split(","), args.recipe, args.each)
     count = sum(map(len, picked.values()))
     rows, reference = [], None
     for step in STEPS:
@@ -94,11 +97,7 @@ def main() -> None:
         f"square of what differs from the first row, of each whisker's own peak, whiskers of more than {FELT * 1e6:g} "
         "µN.\n\n" + table(head, rows)
     )
-    print(text)
-    if args.write:
-        write_section(
-            "Time steps of the rod backend", "python -m benchmarks.whiskers.rod_steps --write", text, subject="whiskers"
-        )
+    publish(args, "Time steps of the rod backend", text)
 
 
 if __name__ == "__main__":

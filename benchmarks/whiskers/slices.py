@@ -7,18 +7,24 @@ Each slice is measured by itself, kernel after kernel, so that the sum is longer
 
 from __future__ import annotations
 
-import argparse
+import multiprocessing
+import os
 import time
-from typing import Any
+from concurrent.futures import ProcessPoolExecutor
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from benchmarks.report import table, write_section
-from benchmarks.whiskers.throughput import load_objects
+from benchmarks.report import publish, script_parser, table
 from brainbench.core.devices import pick_device, warp
 from brainbench.stimuli import Fidelity
 from brainbench.stimuli.engines.rod.sweeps import SweepLauncher
+from brainbench.stimuli.objects.collections import resolve_objects
 from brainbench.stimuli.sweeps.sweep_scenes import GRIDS, SweepScenes
+
+if TYPE_CHECKING:
+    from brainbench.stimuli.objects.collections import NamedObject
+    from brainbench.stimuli.objects.solid import Solid
 
 PARTS = {"run": "steps", "solve_queue": "contact forces", "measure_distances": "distances", "swap_queues": "queues"}
 """Kernels by the first word of their names, and what they do."""
@@ -51,13 +57,26 @@ class Watched:
             self.queries += int(paused.query_count.numpy()[0])
 
 
+def _load(item: NamedObject) -> Solid:
+    return item.load()
+
+
+def load_objects(words: list[str]) -> dict[str, Solid]:
+    """Make objects, many of them on all processors as data generation does."""
+    objects = resolve_objects(words, surfaces=True)
+    processors = len(os.sched_getaffinity(0))
+    if len(objects) < 64 or processors < 4:
+        return {name: item.load() for name, item in objects.items()}
+    with ProcessPoolExecutor(processors, mp_context=multiprocessing.get_context("spawn")) as pool:
+        return dict(zip(objects, pool.map(_load, objects.values(), chunksize=4), strict=True))
+
+
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = script_parser(__doc__)
     parser.add_argument("--objects", default="procedural-24:2", help="208 sweeps of thesis-high each")
     parser.add_argument("--every", type=int, default=1, help="only every n-th sweep of an object")
     parser.add_argument("--fidelity", default="fast,links=12,time_step=1e-3,steps_per_period=none")
     parser.add_argument("--device", default="cuda")
-    parser.add_argument("--write", action="store_true")
     args = parser.parse_args()
     wp, device = warp(), pick_device(args.device)
     scenes = SweepScenes(GRIDS["thesis-high"], load_objects([args.objects]))
@@ -71,12 +90,8 @@ def main() -> None:
         steps = int(launcher.launch(groups).steps.sum())
     finally:
         wp.launch = watched.launch
-    text = report(watched, steps)
-    print(text)
-    if args.write:
-        name = device.name if device.is_cuda else "processor"
-        command = f"python -m benchmarks.whiskers.slices --objects {args.objects} --every {args.every} --write"
-        write_section(f"Slices of sweeps on a {name}", command, text, subject="whiskers", where=f"one {name}")
+    name, words = device.name if device.is_cuda else "processor", f"--objects {args.objects} --every {args.every}"
+    publish(args, f"Slices of sweeps on a {name}", report(watched, steps), words, where=f"one {name}")
 
 
 def report(watched: Watched, steps: int) -> str:

@@ -6,7 +6,6 @@ python -m benchmarks.whiskers.trust [--objects 8] [--each 6] [--write]
 
 from __future__ import annotations
 
-import argparse
 import time
 from collections import Counter
 from dataclasses import replace
@@ -14,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.report import table, write_section
+from benchmarks.report import publish, script_parser, table
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.rod.sweeps import SweepLauncher
 from brainbench.stimuli.engines.trust import LARGEST_CHANGE, LARGEST_STRAIN, force_change
@@ -85,10 +84,9 @@ def run(recipe: str, placing: str, fidelity: str, objects: int, each: int) -> li
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = script_parser(__doc__)
     parser.add_argument("--objects", type=int, default=8)
     parser.add_argument("--each", type=int, default=6, help="sweeps of each object")
-    parser.add_argument("--write", action="store_true")
     args = parser.parse_args()
     rows = [run(*case, args.objects, args.each) for case in CASES]
     head = [
@@ -103,10 +101,9 @@ def main() -> None:
         " readings) at half the step, when every touching whisker is simulated so, and how many of them are suspicious,"
         " so that the rule compares them.\n\n" + table(head, rows)
     )
-    print(text)
-    if args.write:
-        command = f"python -m benchmarks.whiskers.trust --objects {args.objects} --each {args.each} --write"
-        write_section("What the rule of trust finds, and what it costs", command, text, subject="whiskers")
+    publish(
+        args, "What the rule of trust finds, and what it costs", text, f"--objects {args.objects} --each {args.each}"
+    )
 
 
 if __name__ == "__main__":

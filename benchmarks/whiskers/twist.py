@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import statistics
 import time
 from collections.abc import Callable
@@ -10,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from benchmarks.report import table, write_section
+from benchmarks.report import publish, script_parser, table
 from brainbench.stimuli import Fidelity, get_recipe
 from brainbench.stimuli.engines import get_engine
 from brainbench.stimuli.objects.collections import resolve_objects
@@ -36,10 +35,9 @@ def cost(run: Callable[[Fidelity], object], repeats: int) -> tuple[float, float]
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = script_parser(__doc__)
     parser.add_argument("--sweeps", type=int, default=8)
     parser.add_argument("--repeats", type=int, default=3)
-    parser.add_argument("--write", action="store_true")
     args = parser.parse_args()
     recipe, engine = get_recipe("rodgers").scenes, get_engine("rod")
     jobs = recipe[0].select("C1-C3").jobs()
@@ -78,10 +76,7 @@ def main() -> None:
     )
     heads = [f"{name} %" for part in ("force", "moment") for name in (f"{part} rms/rms", f"{part} largest/largest")]
     text += table(["stimulus", *heads], changes)
-    if args.write:
-        write_section(
-            "What twist costs and changes", "python -m benchmarks.whiskers.twist --write", text, subject="whiskers"
-        )
+    publish(args, "What twist costs and changes", text)
 
 
 if __name__ == "__main__":
