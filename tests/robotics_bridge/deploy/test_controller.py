@@ -200,7 +200,6 @@ def test_ages_are_told_without_a_common_clock() -> None:
     assert offset.age(5.2, 105.31, 105.35) == pytest.approx(0.14, abs=1e-3)
 
 
-
 def test_a_clock_that_runs_slow_makes_no_report_old() -> None:
     offset = ClockOffset()
     ages = [offset.age(0.9999 * t, t, t) for t in np.arange(0.0, 7200.0, 0.1)]  # 100 ppm
