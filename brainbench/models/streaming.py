@@ -156,10 +156,9 @@ class _S4Part(nn.Module):
     def forward(self, x: torch.Tensor, state: _Tensors) -> tuple[torch.Tensor, _Tensors]:
         # Weights that learn are discretised in every step, so that gradients reach them.
         learns = self.training or (torch.is_grad_enabled() and self.part.fc.weight.requires_grad)
-        if not (learns or torch.compiler.is_compiling() or torch.compiler.is_exporting()):
-            # Weights that were loaded since.
-            if self._versions != [weight._version for weight in self._weights]:
-                self._discretise()
+        traced = torch.compiler.is_compiling() or torch.compiler.is_exporting()
+        if not (learns or traced) and self._versions != [weight._version for weight in self._weights]:
+            self._discretise()  # weights were loaded since
         systems = [block.memory.system() for block in self.part.blocks] if learns else self._kept()
         y, after = self.part.step(x, tuple(zip(state, systems, strict=True)))
         return y, [memory for memory, _ in after]

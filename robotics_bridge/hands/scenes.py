@@ -41,8 +41,8 @@ def holding_spec(
     """Return the ``mujoco.MjSpec`` behind :func:`holding`: the palm's surface below the ball is at z = 0.
 
     A hand gets a weak position servo on every hinge and slide unless all drives of its file are position servos of one
-    joint each, and each of the joints ``servos`` has one. The ball of 100 g has a ``radius`` [m] and lies between the middle of the palm (``reach`` 0) and the
-    roots of the fingers (1).
+    joint each, and each of the joints ``servos`` has one. The ball of 100 g has a ``radius`` [m] and lies between the
+    middle of the palm (``reach`` 0) and the roots of the fingers (1).
 
     Raises:
         UsageError: the palm's side is unknown, or the radius is not positive.
