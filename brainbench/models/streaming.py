@@ -131,17 +131,23 @@ class _S4Part(nn.Module):
         for number, (_, system) in enumerate(empty):
             for name, value in system._asdict().items():
                 self.register_buffer(f"{name}{number}", value, persistent=False)
+        self._weights = [*encoder.parameters()]
+        self._versions: list[int] = []
         super().train(encoder.training)
 
     def train(self, mode: bool = True) -> _S4Part:
         """Set training mode; for evaluation, keep the systems of the weights as they are now."""
         super().train(mode)
         if not mode:
-            with torch.no_grad():
-                for kept, block in zip(self._kept(), self.part.blocks, strict=True):
-                    for old, new in zip(kept, block.memory.system(), strict=True):
-                        old.copy_(new)
+            self._discretise()
         return self
+
+    @torch.no_grad()
+    def _discretise(self) -> None:
+        self._versions = [weight._version for weight in self._weights]
+        for kept, block in zip(self._kept(), self.part.blocks, strict=True):
+            for old, new in zip(kept, block.memory.system(), strict=True):
+                old.copy_(new)
 
     def _kept(self) -> list[System]:
         numbers = range(len(self.part.blocks))
@@ -150,6 +156,9 @@ class _S4Part(nn.Module):
     def forward(self, x: torch.Tensor, state: _Tensors) -> tuple[torch.Tensor, _Tensors]:
         # Weights that learn are discretised in every step, so that gradients reach them.
         learns = self.training or (torch.is_grad_enabled() and self.part.fc.weight.requires_grad)
+        traced = torch.compiler.is_compiling() or torch.compiler.is_exporting()
+        if not (learns or traced) and self._versions != [weight._version for weight in self._weights]:
+            self._discretise()  # weights were loaded since
         systems = [block.memory.system() for block in self.part.blocks] if learns else self._kept()
         y, after = self.part.step(x, tuple(zip(state, systems, strict=True)))
         return y, [memory for memory, _ in after]

@@ -22,6 +22,7 @@ from brainbench.core.errors import DataError, UsageError, missing_dependency
 from brainbench.core.files import atomic_path, write_json
 from robotics_bridge import hands
 from robotics_bridge.deploy.driver import HandReading
+from robotics_bridge.deploy.touch import PressureCalibration
 from robotics_bridge.policies.contract import PolicyContract
 from robotics_bridge.policies.encoders.finger_axes import FingerAxes, finger_axes_of
 
@@ -58,16 +59,20 @@ def total_wrench(points: NDArray[np.floating], links: Sequence[str], axes: Finge
 class SessionRecorder:
     """Keeps a session of a deployed policy; touch is one point per finger tip, where the hand senses it.
 
-    Forces stay in the unit in which the hand reports pressure.
+    Forces stay in the unit in which the hand reports pressure. ``fingers`` are those that the hand senses, in the order
+    of its reports; all of the contract's hand by default.
     """
 
-    def __init__(self, contract: PolicyContract) -> None:
+    def __init__(self, contract: PolicyContract, fingers: Sequence[str] | None = None) -> None:
         self.hand, self.contract = hands.load(contract.hand), contract
-        layout = self.hand.layout("med", "tips")
+        sensed = tuple(self.hand.fingers) if fingers is None else tuple(fingers)
+        finger_of = dict(zip(self.hand.tips, self.hand.fingers, strict=True))
+        tips = self.hand.layout("med", "tips")
+        layout = {link: probes for link, probes in tips.items() if finger_of[link] in sensed}
         self.axes = finger_axes_of(self.hand, self.hand.layout("med", "hand"))
-        self.rows = [self.hand.tips.index(link) for link in layout]
+        self.rows = [sensed.index(finger_of[link]) for link in layout]
         position, normal = (
-            np.stack([getattr(probes, name)[probes.active].mean(axis=0) for probes in layout.values()])
+            np.array([getattr(probes, name)[probes.active].mean(axis=0) for probes in layout.values()]).reshape(-1, 3)
             for name in ("position", "normal")
         )
         self.points = TactilePoints(tuple(layout), position, normal)
@@ -77,8 +82,9 @@ class SessionRecorder:
     def __call__(self, reading: HandReading, obs: Any, action: Any, targets: NDArray[np.floating]) -> None:
         """Keep a tick, as a :class:`~robotics_bridge.deploy.controller.Controller` reports it."""
         del obs, action
-        # The maker's pressure is about outward normals with axes z, y, x; a force on the skin points inward.
-        force = -reading.pressure[self.rows][:, ::-1]
+        # With the signs of the simulator, pressure is along outward normals with axes z, y, x (4.29); a force on the
+        # skin points inward.
+        force = -(reading.pressure[self.rows] * PressureCalibration.axes)[:, ::-1]
         torque = np.cross(self.points.position, force).astype(float)
         points = np.concatenate([force, torque], axis=1)
         wrench = total_wrench(points, self.points.links, self.axes)

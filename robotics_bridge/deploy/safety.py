@@ -17,6 +17,9 @@ LIMITS = {
     "pressure": 1000.0, "margin": 1.0, "timeout": 2.0, "start_timeout": 60.0, "rate_share": 1.0, "rate_window": 60.0,
 }  # fmt: skip
 """Largest value of each limit: a hand must not run on for longer, or press harder, because of a slip of the keys."""
+DRIFT = 2e-4
+"""Largest difference of the rates of two clocks (s/s): quartz is right to 50 ppm, and the system's time service adds
+its own. A delay that grows more slowly than this is not seen."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,14 +113,16 @@ class SafetyLimits:
 class ClockOffset:
     """Lateness of reports, although the hand's clock and ours have different zeros.
 
-    The smallest difference between arrival and measurement seen so far counts as no delay.
+    The smallest difference between arrival and measurement seen so far counts as no delay; it may grow by
+    :data:`DRIFT`, because the clocks of two computers run at different rates.
     """
 
     def __init__(self) -> None:
-        self._least = math.inf
+        self._least, self._asked = math.inf, 0.0
 
     def age(self, stamp: float, arrived: float, now: float) -> float:
         """Return how long ago something was sent (s, ``stamp`` by the sender's clock), beyond the shortest way seen."""
         # The offset of the clocks is not known. Least of all differences: the way of the fastest report counts as none.
-        self._least = min(self._least, arrived - stamp)
+        self._least = min(self._least + DRIFT * max(0.0, now - self._asked), arrived - stamp)
+        self._asked = now
         return now - stamp - self._least

@@ -26,7 +26,7 @@ from robotics_bridge.deploy.touch import PressureCalibration
 from robotics_bridge.deploy.udp import LOOPBACK
 from robotics_bridge.hands.layouts import check_probes
 from robotics_bridge.hands.observations import observation_type, observe, sensors_for
-from robotics_bridge.hands.scenes import OBJECT, holding
+from robotics_bridge.hands.scenes import ARMATURE, OBJECT, holding
 from robotics_bridge.physics import MujocoEngine
 from robotics_bridge.policies.contract import PolicyContract
 from robotics_bridge.sensors import SensorSuite
@@ -112,16 +112,18 @@ class SimulatedHand:
     ) -> None:
         check_number("reports per second of a simulated hand", rate, least=10)
         self.hand, self.rate, self._substeps = hands.load(hand), rate, contacts.substeps
-        body = holding(self.hand, timestep=1 / rate / contacts.substeps)
-        set_contacts(body, contacts)
         # Drives as in the tasks: stiffness, damping, effort and armature together. A file may name its servos as it
         # likes, and leave joints without one.
-        servos = {body.joint(int(joint)).name: servo for servo, joint in enumerate(body.actuator_trnid[:, 0])}
         drives = drives_of(self.hand)
+        body = holding(self.hand, timestep=1 / rate / contacts.substeps, servos=drives)
+        set_contacts(body, contacts)
+        servos = {body.joint(int(joint)).name: servo for servo, joint in enumerate(body.actuator_trnid[:, 0])}
         for name, servo in servos.items():
             stiffness, damping, effort = drives.get(name, (0.0, 0.0, 0.0))
             body.actuator_gainprm[servo, 0], body.actuator_biasprm[servo, 1:3] = stiffness, (-stiffness, -damping)
             body.actuator_forcelimited[servo], body.actuator_forcerange[servo] = 1, (-effort, effort)
+            inertia = float(self.hand.model.joint(name).armature[0])
+            body.dof_armature[body.joint(name).dofadr] = inertia or (ARMATURE if name in drives else 0.0)
         for numbers in (body.actuator_gainprm, body.actuator_biasprm, body.actuator_forcerange, body.dof_armature):
             numbers *= contacts.drive_scale
         self.engine = MujocoEngine(body, 1, threads=1)

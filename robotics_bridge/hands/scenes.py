@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Collection
 from typing import Any
 
 import numpy as np
@@ -25,7 +26,7 @@ WEAK_SERVO, WEAK_PUSH, ARMATURE = (2.0, 0.2), (300.0, 10.0), 0.01
 their drives (kg·m², kg for a slide)."""
 
 
-def holding(hand: Hand, **settings: float) -> Any:
+def holding(hand: Hand, **settings: Any) -> Any:
     """Return the ``mujoco.MjModel`` of a hand, palm up, with a ball just above the palm; see :func:`holding_spec`.
 
     Jaws that slide start with the ball between them, which is made smaller where it does not fit.
@@ -34,12 +35,14 @@ def holding(hand: Hand, **settings: float) -> Any:
     return _between(hand, spec, jaws) if jaws else _raised(spec.compile())
 
 
-def holding_spec(hand: Hand, *, radius: float = 0.03, timestep: float = 0.002, reach: float = 0.6) -> Any:
+def holding_spec(
+    hand: Hand, *, radius: float = 0.03, timestep: float = 0.002, reach: float = 0.6, servos: Collection[str] = ()
+) -> Any:
     """Return the ``mujoco.MjSpec`` behind :func:`holding`: the palm's surface below the ball is at z = 0.
 
     A hand gets a weak position servo on every hinge and slide unless all drives of its file are position servos of one
-    joint each. The ball of 100 g has a ``radius`` [m] and lies between the middle of the palm (``reach`` 0) and the
-    roots of the fingers (1).
+    joint each, and each of the joints ``servos`` has one. The ball of 100 g has a ``radius`` [m] and lies between the
+    middle of the palm (``reach`` 0) and the roots of the fingers (1).
 
     Raises:
         UsageError: the palm's side is unknown, or the radius is not positive.
@@ -51,7 +54,8 @@ def holding_spec(hand: Hand, *, radius: float = 0.03, timestep: float = 0.002, r
     surface = surface + reach * step
     spec = hand.mjspec()
     spec.option.timestep = timestep
-    if _servoed(hand) is None:
+    driven = _servoed(hand)
+    if driven is None or not {*servos} <= {hand.model.joint(joint).name for joint in driven.tolist()}:
         replace_drives(spec)
     # The shortest turn onto z is that of z onto the direction mirrored at z.
     turn = from_z_axis(up * (-1.0, -1.0, 1.0))

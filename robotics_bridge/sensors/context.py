@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from robotics_bridge.sensors.noise.model import Noise
     from robotics_bridge.sensors.queries.pairs import PairTable
     from robotics_bridge.sensors.queries.solids import Solids
+    from robotics_bridge.sensors.sensor import Sensor
 
 
 _MOST = 512
@@ -95,6 +96,8 @@ class SuiteContext(LaunchContext):
 
     scene: TouchScene
     solids: Solids
+    sensors: Sequence[Sensor]
+    """Of the whole suite."""
     pairs: PairTable = field(init=False)
 
 

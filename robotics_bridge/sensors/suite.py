@@ -101,7 +101,8 @@ class SensorSuite:
         queries = frozenset().union(*(sensor.queries(scene) for sensor in self.sensors.values()))
         with wp.ScopedDevice(self.device):
             self.solids = Solids(scene, num_envs, self.device, queries, resolution=resolution)
-            self.context = context = SuiteContext(num_envs, self.device, seed, env_offset, scene, self.solids)
+            shared = (num_envs, self.device, seed, env_offset, scene, self.solids, [*self.sensors.values()])
+            self.context = context = SuiteContext(*shared)
             context.pairs = self.pairs = PairTable(context, listed)
             self.runtimes: list[Runtime] = [
                 load_object(next(iter(members.values())).runtime, "runtime")(members, context)

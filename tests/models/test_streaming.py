@@ -57,16 +57,18 @@ def test_a_full_context_gives_nan_until_it_is_reset():
 
 
 @torch.no_grad()
-def test_a_state_space_follows_its_weights_and_their_precision():
+@pytest.mark.parametrize("turn", [lambda step: step, lambda step: step.eval().double()])
+def test_a_state_space_follows_its_weights_and_their_precision(turn):
     model, other, x = load_model("s4-small"), load_model("s4-small", seed=1), random_sweeps(2, 4)
     step = StreamingStep(model)
     model.load_state_dict(other.state_dict())
-    step.eval().double()
+    turn(step)
     h = step.init_state(2)
+    x, other = x.to(h.dtype), other.to(h.dtype)
     for t in range(4):
-        features, h = step(x[:, t].double(), h)
-    assert features.dtype == torch.float64
-    torch.testing.assert_close(features, other.double().encode(x.double())[:, 3], atol=1e-4, rtol=1e-4)
+        features, h = step(x[:, t], h)
+    assert features.dtype == h.dtype
+    torch.testing.assert_close(features, other.encode(x)[:, 3], atol=1e-4, rtol=1e-4)
 
 
 def test_a_state_space_learns_through_its_stream():

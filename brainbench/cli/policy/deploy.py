@@ -103,7 +103,7 @@ def deploy(
         simulated = simulated_hand(contract.hand, contacts=contacts, faults=faults, seconds=seconds + 60)
         address, joints, fingers, secret = remote or stack.enter_context(simulated)
         link = stack.enter_context(UdpDriver(address, joints, fingers, secret))
-        recorder = SessionRecorder(contract) if record is not None else None
+        recorder = SessionRecorder(contract, fingers) if record is not None else None
         fallback = ShadowTouch(contract, joints) if shadow else given.pop("tactile", None)
         controller = deployed.controller(
             link, limits={"timeout": timeout, "pressure": pressure}, sources=given, fallback=fallback,

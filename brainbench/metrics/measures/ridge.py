@@ -42,7 +42,7 @@ class RidgeEncoding(PatternMetric):
 
     def correction(self, animal: SubjectRDM, estimator: str) -> Corrected:
         """Return the ratio of all variance to that without noise."""
-        share = _explainable(animal)
+        share = float(_explainable([animal])[0])
         if not share > 0:
             reason = "the variance between stimuli is no larger than trial noise explains"
             return Corrected(np.nan, "undefined", reason, reliability=animal.reliability)
@@ -50,45 +50,47 @@ class RidgeEncoding(PatternMetric):
 
     def compare_orders(self, model: Floats, animals: Sequence[SubjectRDM], orders: Ints) -> Floats:
         """Return raw values [N, A] with the model's stimuli in each order [N, K]."""
-        error, base = _errors(model, animals, orders)
-        return _share(error.sum(axis=-1), base.sum(axis=-1), animals)
+        error, base = _errors(model, animals, orders, _folds(len(model)))
+        return _share(error, base, animals) * _explainable(animals)
 
     def compare_without(self, layers: Sequence[Floats], animals: Sequence[SubjectRDM]) -> Floats:
-        """Return raw values [K, L, A] without the predictions of each stimulus in turn."""
-        # A stimulus is taken out of the sums of squares and stays in the training of the others: its part in the
-        # variance of a prediction is of the order of 1/K of that in the sums.
-        found = []
-        noise = np.stack([animal.noise.sum(axis=1) for animal in animals], axis=1)
-        for layer in layers:
-            error, base = (sums[0].T for sums in _errors(layer, animals, np.arange(len(layer))[None]))
-            without = [part.sum(axis=0) - part for part in (error, base, noise)]
-            found.append(_share(without[0], without[1], animals, noise=without[2]))
-        return np.stack(found, axis=1)
+        """Return raw values [K, L, A] without each stimulus in turn; the others stay in their folds."""
+        count, found = animals[0].count, []
+        for stimulus in range(count):
+            kept = np.delete(np.arange(count), stimulus)
+            others, order = [animal.take(kept) for animal in animals], np.arange(count - 1)[None]
+            # Its part in the training of the others must go too: without that, intervals of 14 stimuli were a quarter
+            # too narrow.
+            sums = [_errors(layer[kept], others, order, _folds(count)[kept]) for layer in layers]
+            found.append([_share(error[0], base[0], others) for error, base in sums])
+        return np.array(found) * _explainable(animals)
 
 
-def _share(error: Floats, base: Floats, animals: Sequence[SubjectRDM], noise: Floats | None = None) -> Floats:
-    """Return the share [..., A] of the explainable variance that is predicted, over each animal's correction."""
-    total = np.array([animal.noise.sum() for animal in animals])
-    noise = total if noise is None else noise
+def _share(error: Floats, base: Floats, animals: Sequence[SubjectRDM]) -> Floats:
+    """Return the share [..., A] of the explainable variance that is predicted, of squared errors [..., A, K]."""
+    noise = np.array([animal.noise.sum() for animal in animals])
     with np.errstate(invalid="ignore", divide="ignore"):
-        explainable = base - noise
-        value = 1 - (error - noise) / np.where(explainable > 0, explainable, np.nan)
-        return value * np.array([_explainable(animal) for animal in animals])
+        explainable = base.sum(axis=-1) - noise
+        return 1 - (error.sum(axis=-1) - noise) / np.where(explainable > 0, explainable, np.nan)
 
 
-def _explainable(animal: SubjectRDM) -> float:
-    """Return the share of an animal's variance between stimuli that is not noise, whatever the folds."""
+def _explainable(animals: Sequence[SubjectRDM]) -> Floats:
+    """Return the share [A] of each animal's variance between stimuli that is not noise, whatever the folds."""
     # Deviations from the mean of the K − 1 other stimuli are K/(K − 1) of those from the mean of all.
-    count = len(animal.patterns)
-    total = float(np.trace(centred_products(animal.patterns))) * (count / (count - 1)) ** 2
-    return 1 - float(animal.noise.sum()) * count / (count - 1) / total if total > 0 else np.nan
+    count = animals[0].count
+    total = np.array([np.trace(centred_products(animal.patterns)) for animal in animals]) * (count / (count - 1)) ** 2
+    noise = np.array([animal.noise.sum() for animal in animals])
+    return 1 - noise * count / (count - 1) / np.where(total > 0, total, np.nan)
 
 
-def _errors(model: Floats, animals: Sequence[SubjectRDM], orders: Ints) -> tuple[Floats, Floats]:
+def _folds(count: int) -> Ints:
+    """Return the fold [K] of each stimulus: every tenth, in the order that the animals give them, is of one fold."""
+    return np.arange(count) % min(count, FOLDS)
+
+
+def _errors(model: Floats, animals: Sequence[SubjectRDM], orders: Ints, folds: Ints) -> tuple[Floats, Floats]:
     """Return squared errors of the prediction and of the training mean [N, A, K], by the stimulus of the model."""
-    count = len(model)
-    # Every tenth stimulus, in the order that the animals give them, is of one fold.
-    folds, kernel = np.arange(count) % min(count, FOLDS), centred_products(model)
+    count, kernel = len(model), centred_products(model)
     # Brain stimulus i stands at the model's stimulus order[i]: products are moved to the model's places.
     place = np.argsort(orders, axis=1)
     products = np.stack([centred_products(animal.patterns) for animal in animals])

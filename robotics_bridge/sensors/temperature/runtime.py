@@ -46,7 +46,9 @@ class TemperatureRuntime(Runtime):
             source.append((np.broadcast_to(np.asarray(sensor.source, float), sensor.cells) * edges.prod()).ravel())
         for name in self._sensors[0].bodies:
             scene.link_index(name)
-        links = [_body(self._sensors, name) for name in scene.links]
+        # Grids that know other bodies have another runtime, and are touched all the same.
+        grids = [sensor for sensor in context.sensors if isinstance(sensor, TemperatureGrid)]
+        links = [_body(self._sensors[0], grids, name) for name in scene.links]
         materials = [material(body.material) for body in links]
         temperatures = np.tile([body.temperature for body in links], (context.num_envs, 1))
         shape, many = (context.num_envs, self.count), (context.num_envs, len(structures))
@@ -150,12 +152,12 @@ def diffusion(cells: int, edge: float, spread: float) -> NDArray[np.float64]:
     return np.maximum((modes * np.exp(-spread * rate)) @ modes.T, 0.0)
 
 
-def _body(sensors: list[TemperatureGrid], link: str) -> ThermalBody:
-    """Return the body of a link: as the configuration says, as a grid on it says, or the default."""
-    if link in sensors[0].bodies:
-        return sensors[0].bodies[link]
-    own = next((sensor for sensor in sensors if sensor.link == link), None)
-    return sensors[0].other if own is None else ThermalBody(own.material, own.base_temperature)
+def _body(sensor: TemperatureGrid, grids: list[TemperatureGrid], link: str) -> ThermalBody:
+    """Return the body of a link: as a grid's configuration says, as a grid on the link says, or the default."""
+    if link in sensor.bodies:
+        return sensor.bodies[link]
+    own = next((grid for grid in grids if grid.link == link), None)
+    return sensor.other if own is None else ThermalBody(own.material, own.base_temperature)
 
 
 def _exposed(cells: tuple[int, int, int], edges: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -36,6 +36,20 @@ def test_the_registry_lists_what_there_is():
         register_metric(get_metric("ridge"))
 
 
+def test_ridge_without_a_stimulus_is_ridge_on_the_data_without_it():
+    """Also the predictions of the other stimuli change: the shares are those of data that never had it."""
+    metric = RidgeEncoding()
+    latent, animals = _make(metric, count=2)
+    found = metric.compare_without([latent], animals)[:, 0]
+    factors = [metric.correction(animal, "default").value for animal in animals]
+    for stimulus in range(6):
+        kept = np.delete(np.arange(6), stimulus)
+        others = [animal.take(kept) for animal in animals]
+        alone = metric.compare_orders(latent[kept], others, np.arange(5)[None])[0]
+        scale = [metric.correction(animal, "default").value for animal in others]
+        np.testing.assert_allclose(found[stimulus] * factors, alone * scale, rtol=1e-9)
+
+
 @pytest.mark.parametrize("name", OTHERS)
 def test_the_shared_geometry_is_found_and_an_unrelated_model_is_not(name):
     metric = get_metric(name)

@@ -197,7 +197,14 @@ def test_ages_are_told_without_a_common_clock() -> None:
     offset = ClockOffset()
     assert offset.age(5.0, 105.02, 105.02) == pytest.approx(0.0)
     assert offset.age(5.1, 105.11, 105.11) == pytest.approx(0.0)  # came faster: the new zero
-    assert offset.age(5.2, 105.31, 105.35) == pytest.approx(0.14)
+    assert offset.age(5.2, 105.31, 105.35) == pytest.approx(0.14, abs=1e-3)
+
+
+def test_a_clock_that_runs_slow_makes_no_report_old() -> None:
+    offset = ClockOffset()
+    ages = [offset.age(0.9999 * t, t, t) for t in np.arange(0.0, 7200.0, 0.1)]  # 100 ppm
+    assert max(ages) < 1e-4
+    assert offset.age(0.9999 * 7200, 7200.15, 7200.15) == pytest.approx(0.15, abs=1e-3)
 
 
 def _touching(observe: str, shape: tuple[int, ...]) -> PolicyContract:

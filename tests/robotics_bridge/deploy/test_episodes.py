@@ -7,17 +7,21 @@ import json
 import numpy as np
 import pandas as pd
 import pytest
+import torch
 from pyarrow import parquet
 
 from brainbench.core.errors import DataError, UsageError
 from robotics_bridge import hands
 from robotics_bridge.deploy.driver import HandReading
 from robotics_bridge.deploy.episodes import PARTS, SessionRecorder, TactilePoints, total_wrench, write_lerobot
+from robotics_bridge.deploy.touch import PressureCalibration
+from robotics_bridge.hands.observations import observe
 from robotics_bridge.policies.contract import PolicyContract
 from robotics_bridge.policies.encoders.finger_axes import finger_axes_of
 from robotics_bridge.policies.encoders.taxel_grid import TaxelGrid
 
 HAND = hands.load("xhand1")
+TIPS = HAND.tips
 PROBES = HAND.layout("low", "tips")
 PLACES = [[getattr(probes, name)[probes.active] for probes in PROBES.values()] for name in ("position", "normal")]
 LINKS = tuple(np.repeat(list(PROBES), list(map(len, PLACES[0]))).tolist())
@@ -88,13 +92,28 @@ def test_a_session_states_forces_in_the_unit_of_the_hand(tmp_path) -> None:
     assert all("pressure" in unit for unit in points["units"])
 
 
+@pytest.mark.parametrize("fingers", [None, ("thumb", "pinky", "index"), ()])
+def test_recorded_forces_are_those_of_pressed_skin(fingers) -> None:
+    """Pressed along its normal, each tip is pushed inward, whatever the order of the fingers in the reports."""
+    recorder = SessionRecorder(PolicyContract({}, 40.0, "xhand1", HAND.joints, HAND.joints, {}, {}), fingers)
+    layout, order = HAND.layout("med", "tips"), tuple(HAND.fingers) if fingers is None else fingers
+    depth = {link: torch.rand(1, *layout[link].shape) for link in TIPS}
+    felt = observe("agg_force", depth, {link: layout[link] for link in TIPS})
+    pressure = PressureCalibration().pressure(tuple(HAND.fingers), felt.reshape(-1, 3).numpy())
+    rows = [list(HAND.fingers).index(finger) for finger in order]
+    recorder(HandReading(1, 0.0, 0.0, np.zeros(12), np.zeros(12), pressure[rows]), None, None, np.zeros(12))
+    weighed = {link: d.numpy().reshape(-1, 1) * layout[link].normal for link, d in depth.items()}
+    inward = {link: -10.0 * each[layout[link].active].sum(0) for link, each in weighed.items()}
+    assert {*recorder.points.links} == {TIPS[row] for row in rows}
+    for link, point in zip(recorder.points.links, recorder.frames[0][3], strict=True):
+        np.testing.assert_allclose(point[:3], inward[link], rtol=1e-4)
+
+
 def test_the_wrench_is_the_sum_of_the_points() -> None:
     axes = finger_axes_of(HAND, HAND.layout("med", "hand"))
     rng = np.random.default_rng(2)
     points = rng.normal(size=(45, 6))
     total = total_wrench(points, POINTS.links, axes)
-    import torch
-
     grid = TaxelGrid("xhand1", placement="tips", resolution="low")
     image = grid(torch.from_numpy(points).float()[None, None])[0].numpy().astype(float)
     force = image[:3].sum((1, 2))

@@ -47,12 +47,14 @@ def test_it_follows_the_reported_joints_whatever_their_order_and_feels_the_ball(
     assert np.abs(shadow.hand.position - reported[order]).mean() < 0.2
 
 
-def test_servos_of_a_file_drive_their_joints_whatever_they_are_called(tmp_path) -> None:
+@pytest.mark.parametrize("armature", ["", 'armature=".01"'])
+def test_a_file_drives_joints_as_the_tasks_do_whatever_its_servos_are_called(tmp_path, armature) -> None:
+    """A joint without a servo gets the weak one of the tasks: a policy moves it too."""
     jaw = (
-        '<body pos="0 {1} .05"><joint name="{0}" axis="{2} 0 0" range="0 1" armature=".01"/>'
+        '<body pos="0 {1} .05"><joint name="{0}" axis="{2} 0 0" range="0 1" {3}/>'
         '<geom type="capsule" size=".01" fromto="0 0 0 0 0 .05"/></body>'
     )
-    jaws = jaw.format("a", 0.2, 1) + jaw.format("b", -0.2, -1) + jaw.format("passive", 0.4, 1)
+    jaws = "".join(jaw.format(*each, armature) for each in (("a", 0.2, 1), ("b", -0.2, -1), ("free", 0.4, 1)))
     (tmp_path / "hand.xml").write_text(
         f'<mujoco><compiler angle="radian"/><worldbody><body name="palm"><geom type="box" size=".05 .05 .01"/>{jaws}'
         '</body></worldbody><actuator><position name="servo b" joint="b" kp="5" kv=".5"/>'
@@ -62,7 +64,9 @@ def test_servos_of_a_file_drive_their_joints_whatever_they_are_called(tmp_path) 
     hand.drive(np.array([0.1, 0.2, 0.3]))
     for _ in range(200):
         hand.step()
-    assert hand.position[:2] == pytest.approx([0.1, 0.2], abs=0.02)
+    assert hand.position == pytest.approx([0.1, 0.2, 0.3], abs=0.05)  # the weak one sags
+    model, scale = hand.engine.model, CONTACTS["firm"].drive_scale
+    assert model.dof_armature[[model.joint(name).dofadr[0] for name in hand.joints]] == pytest.approx(0.01 * scale)
 
 
 def test_a_joint_that_mimics_another_need_not_be_reported_and_drives_are_those_of_the_tasks(tmp_path) -> None:

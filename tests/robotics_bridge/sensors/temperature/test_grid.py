@@ -226,6 +226,23 @@ def test_metal_feels_colder_than_wood_at_the_same_temperature():
     assert 33 - felt["aluminium"] > 1.5 * (33 - felt["wood"])
 
 
+@pytest.mark.parametrize("bodies", [{}, {"world": ThermalBody("steel", 30.0)}])
+def test_a_grid_that_touches_another_feels_its_material_and_temperature(bodies):
+    boxes = [Geometry(name=name, link=name, kind="box", size=(0.01, 0.01, 0.01)) for name in ("hot", "cold")]
+    still = {"convection": 0.0, "radiates": False}
+    grids = {
+        "hot": TemperatureGrid(link="hot", material="steel", base_temperature=40.0, **still),
+        "cold": TemperatureGrid(link="cold", material="silicone", base_temperature=20.0, bodies=bodies, **still),
+    }
+    suite = SensorSuite(TouchScene(("world", "hot", "cold"), boxes), grids, num_envs=1)
+    state = HandState.empty(1, 3, 4)
+    _face(state, 0.01, height=0.01)
+    for _ in range(200):
+        suite.update(state, 0.05)
+    means = [float(suite.read(name).mean()) for name in grids]
+    assert means == pytest.approx([39.43, 21.42], abs=0.01)
+
+
 def test_the_published_conduction_is_available_with_its_length_and_area():
     suite, state = _make(
         contacts=4,
