@@ -7,10 +7,11 @@ import math
 import numpy as np
 import pytest
 
+from brainbench.core.statistics import two_factor_interval
 from brainbench.core.trials import Trials
 from brainbench.metrics import get_metric
 from brainbench.metrics.measures.classifier import decode
-from brainbench.metrics.measures.decoding import LabelDecoding, label_properties
+from brainbench.metrics.measures.decoding import LabelDecoding, LabelledFeatures, label_properties
 
 LABELS = [f"{shape}-{place}" for shape in ("concave", "convex") for place in ("close", "far", "medium")]
 
@@ -77,3 +78,21 @@ def test_labels_without_a_shared_property_are_undefined_in_words():
     assert metric.score_animals(_make_animals(metric), stimuli=stimuli).status == "undefined"
     broken = metric.score({"l": np.full((6, 2), np.nan)}, _make_animals(metric), name="x", stimuli=LABELS)
     assert broken.reasons[0] == "activations of every layer are constant or not finite"
+
+
+def test_intervals_over_stimuli_hold_the_mean_accuracy_as_often_as_they_say():
+    shape, place = np.repeat([0, 1], 6), np.tile([0, 1], 6)
+    metric, rng, values, intervals = get_metric("decoding"), np.random.default_rng(0), [], []
+    for _ in range(150):
+        features = (
+            rng.normal(size=(12, 12)) + 1.6 * np.outer(shape, np.eye(12)[0]) + 1.6 * np.outer(place, np.eye(12)[1])
+        )
+        layer = LabelledFeatures(features, {"shape": shape, "place": place})
+        values.append(layer.right(np.arange(12)).mean())
+        without = metric.compare_without([layer], [None])[:, 0, 0]
+        intervals.append(two_factor_interval(values[-1], [values[-1]] * 2, without))
+    mean = np.mean(values)
+    # 83 to 89 % before the correction.
+    assert np.mean([one.low <= mean <= one.high for one in intervals]) > 0.91
+    widths = [one.high - one.low for one in intervals]
+    assert np.mean(widths) < 1.4 * 3.92 * np.std(values)
