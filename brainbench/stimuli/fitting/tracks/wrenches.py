@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -122,7 +123,7 @@ def _read_hdf5(file: Any, path: str | os.PathLike[str]) -> xr.Dataset:
     return new_wrenches(times, values * factor, channels, source=os.fspath(path))
 
 
-def _factors(unit: Any, channels: list[str], path: str | os.PathLike[str]) -> Array:
+def _factors(unit: Any, channels: Sequence[str], path: str | os.PathLike[str]) -> Array:
     """Return the factors [channel] from a unit in words, such as "mN, mN·mm" or "newtons", to N and N·m."""
     text = unit.decode() if isinstance(unit, bytes) else "N" if unit is None else str(unit)
     short = text
