@@ -136,7 +136,7 @@ def find_contacts(
     if alike.sum() > ALIKE * math.sqrt(len(alike)):
         _LOG.warning(
             "Neighbouring points lie on the same side of the fitted shapes: the rest curvature, the taper or the arc "
-            "of the first point is wrong, there is more than one contact, or the tracker smooths its curves. Forces may "
+            "of the first point is wrong, there are several contacts, or the tracker smooths its curves. Forces may "
             "then be wrong by much more than their standard deviations."
         )
     if options.frames > 1:
