@@ -6,6 +6,7 @@ batches as torch tensors, without copies to or from a device.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from functools import cache
 from typing import TYPE_CHECKING, Any
@@ -15,6 +16,9 @@ import numpy as np
 if TYPE_CHECKING:
     import torch
     from numpy.typing import ArrayLike, NDArray
+
+TURN = 2 * math.pi
+"""A full turn [rad]: poses with larger angles are taken for degrees and refused."""
 
 
 def to_matrices(quaternions: ArrayLike) -> NDArray[np.float64]:

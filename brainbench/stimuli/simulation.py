@@ -310,6 +310,6 @@ def cache_path(
     """
     from importlib import metadata
 
-    library = metadata.version(engine.package) if engine.package else ""
+    library = metadata.version(engine.package) + engine.revision if engine.package else ""
     key = content_hash(config_hash(scenes, fidelity, engine.name), library, PHYSICS_VERSION, *more, length=24)
     return cache_dir(folder) / f"{key}.h5"

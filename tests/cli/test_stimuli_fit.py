@@ -47,6 +47,10 @@ def test_contacts_of_a_track_are_printed(run, tmp_path):
     assert [one["status"] for one in data["frames"]] == ["ok"] * 3
     assert data["frames"][0]["force"] == pytest.approx(8e-5, rel=0.02)
     assert "force µN" in run(*words).out
+    late = write_points(tmp_path / "late.csv", np.repeat(shape.place[:, 8::2], 3, axis=0))
+    start = 1e3 * 0.009 * 8 / 48
+    data = json.loads(run(*words[:2], str(late), *words[3:], "--first-arc", str(start), "--json").out)
+    assert data["frames"][0]["force"] == pytest.approx(8e-5, rel=0.02)
 
 
 @pytest.mark.parametrize(
@@ -67,6 +71,7 @@ def test_contacts_of_a_track_are_printed(run, tmp_path):
         (["--scene", "x.toml", "--deflection", "2"], "--deflection cannot be used with --scene"),
         (["--frame-rate", "500", "--parts", "a,b"], "--frame-rate and --parts cannot be used with wrenches"),
         (["--frames", "3"], "--frames cannot be used without --contacts"),
+        (["--first-arc", "3"], "--first-arc cannot be used without --contacts"),
         (["--noise", "20"], "--noise cannot be used with wrenches"),
         (["--intervals", "laplac"], "laplace"),
     ],

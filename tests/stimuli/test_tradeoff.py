@@ -23,7 +23,7 @@ def quick(monkeypatch):
     monkeypatch.setattr(tradeoff, "PEGS", ((0.5, 0.1),))
     monkeypatch.setattr(contact_scenes, "SPECIES", ("mouse",))
     monkeypatch.setattr(contact_scenes, "FREQUENCIES", (20.0,))
-    monkeypatch.setattr(contact_scenes, "FRICTIONS", (0.4,))
+    monkeypatch.setattr(contact_scenes, "FRICTIONS", (0.0,))
 
 
 COARSE = SimulationSetting(Fidelity(links=6, time_step=2e-4, steps_per_period=10), "mujoco")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -63,6 +64,9 @@ def fit(
         float | None, typer.Option(help="Standard deviation of a traced coordinate, µm, when repeats tell it.")
     ] = None,
     frames: Annotated[int, option(_CONTACTS, "frames")] = 1,
+    first_arc: Annotated[
+        float | None, typer.Option(help="Arc length of the first traced point, mm; nan for anywhere. [default: 0]")
+    ] = None,
     out: Annotated[
         Path | None, typer.Option("--out", "-o", callback=out_file, help="Write the result as JSON.")
     ] = None,
@@ -80,7 +84,7 @@ def fit(
         of_fits = {"--parameters": parameters != _PARAMETERS, "--bounds": bounds, "--picture": picture}
         refuse({**of_fits, "--deflection": deflection, **changed(_FIT, vars(options))}, "with --contacts")
     else:
-        refuse({"--frames": frames != 1}, "without --contacts")
+        refuse({"--frames": frames != 1, "--first-arc": first_arc is not None}, "without --contacts")
     refuse({"--deflection": deflection} if scene else {}, "with --scene")
     chosen = None if scene is None else scenes.choose_scene(scenes.open_recipe(scene, "all"), stimulus)
     start = _whisker(whisker, chosen, _pairs(known, "--known"))
@@ -94,7 +98,7 @@ def fit(
         refuse(of_tracks, f"with wrenches, which {shown(str(file))} holds")
         measured = read_wrenches(file, whisker=None if scene is None else whisker, stimulus=stimulus)
     if contacts:
-        data, text = _contacts(measured, start, noise, frames)
+        data, text = _contacts(measured, start, noise, frames, first_arc or 0.0)
     else:
         from brainbench.stimuli.fitting import Trial
         from brainbench.stimuli.fitting import fit as run
@@ -114,11 +118,14 @@ def fit(
     emit(data, text, as_json=as_json, out=out)
 
 
-def _contacts(measured: xr.Dataset, whisker: Whisker, noise: float | None, frames: int) -> tuple[dict[str, Any], str]:
+def _contacts(
+    measured: xr.Dataset, whisker: Whisker, noise: float | None, frames: int, first_arc: float
+) -> tuple[dict[str, Any], str]:
     """Return the contacts of a track as data and as a table."""
     from brainbench.stimuli.fitting import ContactOptions, find_contacts
 
-    options = ContactOptions(noise=None if noise is None else 1e-6 * noise, frames=frames)
+    known = {"noise": None if noise is None else 1e-6 * noise, "frames": frames}
+    options = ContactOptions(**known, first_arc=None if math.isnan(first_arc) else 1e-3 * first_arc)
     with progress_bar("finding contacts"):
         found = find_contacts(measured, whisker, options=options)
     rows = [

@@ -158,6 +158,8 @@ class WhiskerEngine(ABC):
     """Name under which :func:`brainbench.stimuli.engines.get_engine` finds it."""
     package: ClassVar[str] = ""
     """Distribution whose version belongs to its results; empty for none."""
+    revision: ClassVar[str] = ""
+    """Changes where this engine alone gives other numbers than before; :data:`PHYSICS_VERSION` counts for all."""
     devices: ClassVar[tuple[str, ...]] = ("cpu",)
     """Kinds of devices it runs on."""
     solvers: ClassVar[tuple[str, ...]] = ("dynamic",)

@@ -8,6 +8,7 @@ proportional to the bending stiffness that is assumed.
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -26,6 +27,7 @@ from brainbench.stimuli.whiskers.whisker import Whisker
 if TYPE_CHECKING:
     import xarray as xr
 
+_LOG = logging.getLogger(__name__)
 Array = NDArray[np.float64]
 NEAREST, FARTHEST = 0.05, 0.995
 """Contact arcs that are looked for, as shares of the whisker's length."""
@@ -35,6 +37,8 @@ VAGUE = 0.15
 """Relative standard deviation of the force from which it is unreliable."""
 MISFIT = 1.5
 """Residuals over the stated noise from which the model does not fit."""
+ALIKE = 4.0
+"""Deviations of the serial correlation along the whisker, over all frames, from which residuals are no white noise."""
 FEWEST_POINTS = 6
 _STEP = 1e-5
 _ARCS = (0.15, 0.3, 0.45, 0.6, 0.75, 0.9)
@@ -82,6 +86,8 @@ class ShapeFit:
     """Root mean square distance of them [m]."""
     reason: str = ""
     """Why there is no fit, if so."""
+    alike: float = 0.0
+    """Correlation of neighbouring residuals, over its standard deviation under white noise."""
     lacks: str = ""
     """What the frame lacks of what is known along the whisker, in a sentence."""
 
@@ -126,6 +132,13 @@ def find_contacts(
     for frame, place in zip(points, known, strict=True):
         fits.append(solver.solve(frame, place, before))
         before = fits[-1].unknowns if solver.estimate(fits[-1])["status"] == "ok" else None
+    alike = np.array([one.alike for one in fits if not one.reason])
+    if alike.sum() > ALIKE * math.sqrt(len(alike)):
+        _LOG.warning(
+            "Neighbouring points lie on the same side of the fitted shapes: the rest curvature, the taper or the arc "
+            "of the first point is wrong, there are several contacts, or the tracker smooths its curves. Forces may "
+            "then be wrong by much more than their standard deviations."
+        )
     if options.frames > 1:
         fits = solver.even_out(fits, shapes["time"].values.astype(float))
     found = [solver.estimate(one) for one in fits]
@@ -217,12 +230,13 @@ class ContactSolver:
         spread = math.sqrt(float(np.sum(across**2)) / max(len(points) - 4, 1))
         matrix = jacobian(best.x) * (1.0 if self.options.noise else noise / spread)
         covariance: Any = np.linalg.pinv(matrix.T @ matrix, rcond=1e-14)
+        alike = math.sqrt(len(across)) * float(across[1:] @ across[:-1]) / max(float(across @ across), 1e-300)
         reason = "" if best.status > 0 else "The fit of the shape did not converge."
         known = (self.options.first_arc is not None, self.options.tip_traced)
         lost = [end for end, use, point in zip(("first", "last"), known, frame[[0, -1]], strict=True)
                 if use and not np.isfinite(point).all()]  # fmt: skip
         lacks = f" The {' and the '.join(lost)} point was not traced in this frame." if lost else ""
-        return ShapeFit(best.x, covariance, spread, math.sqrt(float(np.mean(across**2))), reason, lacks)
+        return ShapeFit(best.x, covariance, spread, math.sqrt(float(np.mean(across**2))), reason, alike, lacks)
 
     def _starts(self, frame: Array, place: Array, noise: float, before: Array | None) -> Sequence[Array]:
         """Return unknowns [5] to start from: the three best of a grid of arcs and forces, turned onto the points."""

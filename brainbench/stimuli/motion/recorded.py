@@ -26,8 +26,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.errors import DataError, UsageError, check_name, listing
-from brainbench.core.reading.ranges import check_fields
+from brainbench.core.reading.ranges import check_fields, check_numbers
 from brainbench.core.reading.tables import read_numbers
+from brainbench.core.rotations import TURN
 from brainbench.stimuli.engines.protocol import base_rotation
 from brainbench.stimuli.motion.hinge_angles import follow_angles
 from brainbench.stimuli.motion.trajectories import ROTATIONS, Rotations, Vector
@@ -166,6 +167,11 @@ class Recorded:
     rotations: Rotations = field(default_factory=lambda: ROTATIONS["knutsen"])
     initial: Mapping[str, Vector] = field(default_factory=dict)
     """Starting angles (θ, φ, ζ) [rad] by side and name (``RC2``), as :func:`load_initial_angles` reads them."""
+
+    def __post_init__(self) -> None:
+        check_fields(self, "start", least=-math.pi / 2, most=math.pi / 2, of="{} of recorded whisking (rad)")
+        for name, angles in self.initial.items():
+            check_numbers(f"starting angles of {name} (rad)", angles, 3, least=-TURN, most=TURN)
 
     @property
     def finest(self) -> float:

@@ -21,6 +21,10 @@ touched by the backend ``rod`` only, because ``mujoco`` and ``bullet`` collide c
 hull. ``pieces``: the hull of each connected piece, for files that bring a convex decomposition along.
 ``decomposition``: convex pieces cut by CoACD or V-HACD."""
 
+SIZES = 1e-3, 1.0
+"""Diagonals [m] of objects beyond which the unit of a mesh file is doubtful: metres and millimetres taken for each
+other make an object of 20 mm one of 20 µm, which touches nothing, or of 20 m."""
+
 
 def mesh_solid(
     path: str | os.PathLike[str],
@@ -49,7 +53,12 @@ def mesh_solid(
     solid = replace(solid, notes=(*repaired.done, *solid.notes, *(() if expected else repaired.remaining)))
     for note in solid.notes:
         _LOG.warning("%s: %s", os.fspath(path), note)
-    return solid if diagonal is None else solid.to_diagonal(diagonal)
+    if diagonal is not None:
+        return solid.to_diagonal(diagonal)
+    if not SIZES[0] <= solid.diagonal <= SIZES[1]:
+        told = f"the object is {solid.diagonal * 1e3:.3g} mm across: are its lengths in {unit}?"
+        _LOG.warning("%s: %s", os.fspath(path), told)
+    return solid
 
 
 def shape_solid(

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.reading.ranges import check_fields
-from brainbench.core.rotations import euler_matrix, from_matrices
+from brainbench.core.rotations import TURN, euler_matrix, from_matrices
 from brainbench.stimuli.motion.trajectories import Path, Spin, Still, Translation
 from brainbench.stimuli.objects.obstacle import Obstacle, Vector
 from brainbench.stimuli.objects.solid import Solid
@@ -53,7 +53,7 @@ class PlacedObject:
 
     def __post_init__(self) -> None:
         check_fields(self, "position", items=3, of="{} of an object (m)")
-        check_fields(self, "rotation", items=3, of="{} of an object (rad)")
+        check_fields(self, "rotation", items=3, least=-TURN, most=TURN, of="{} of an object (rad)")
         check_fields(self, "friction", least=0, of="The {} of an object")
 
     def obstacle(self, frame: tuple[ArrayLike, ArrayLike] | None = None) -> Obstacle:

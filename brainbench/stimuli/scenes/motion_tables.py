@@ -38,7 +38,10 @@ _SINUSOID: Keys = {
 
 def read_head_motion(table: TomlTable) -> Still | Translation | trajectories.Path:
     """Return how a head moves: a velocity, keyframes, or not at all; both are a :class:`UsageError`."""
-    return _only(table, "a velocity or keyframes", _smooth(table, Translation, _TRANSLATION), _keyframes(table))
+    given = table.read(_TRANSLATION)
+    # The keys of several tables are joined here: an onset for all scenes moves nothing in a scene without velocity.
+    steady = Translation(**given) if "velocity" in given else None
+    return _only(table, "a velocity or keyframes", steady, _keyframes(table))
 
 
 def read_object_motion(table: TomlTable) -> Still | Translation | Spin | trajectories.Path:
@@ -55,9 +58,11 @@ def _only(table: TomlTable, choice: str, *motions: Moving | None) -> Moving | St
 
 
 def _smooth(table: TomlTable, make: Callable[..., Moving], keys: Keys) -> Moving | None:
-    """Return a motion that reaches a velocity; an onset without a velocity moves nothing."""
+    """Return a motion that reaches a velocity; its onset alone is a :class:`UsageError`."""
     given = table.read(keys)
-    return make(**given) if "velocity" in given else None
+    if given and "velocity" not in given:
+        raise UsageError(f"{table.name} needs the key {keys['velocity'][0]!r} beside {keys['onset'][0]!r}.")
+    return make(**given) if given else None
 
 
 def _keyframes(table: TomlTable) -> trajectories.Path | None:

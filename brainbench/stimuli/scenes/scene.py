@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from brainbench.core.errors import UsageError
 from brainbench.core.reading.ranges import check_fields
-from brainbench.core.rotations import euler_matrix
+from brainbench.core.rotations import TURN, euler_matrix
 from brainbench.stimuli.engines.protocol import Job, base_rotation
 from brainbench.stimuli.motion.recorded import Recorded
 from brainbench.stimuli.motion.trajectories import ArrayFollicle, Path, Still, Translation, Vector, Whisking
@@ -36,7 +36,7 @@ class Head:
 
     def __post_init__(self) -> None:
         check_fields(self, "position", items=3, of="{} of a head (m)")
-        check_fields(self, "rotation", items=3, of="{} of a head (rad)")
+        check_fields(self, "rotation", items=3, least=-TURN, most=TURN, of="{} of a head (rad)")
 
     @property
     def matrix(self) -> NDArray[np.float64]:

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from brainbench.core.errors import UsageError, check_name
 from brainbench.core.files import content_hash
-from brainbench.core.reading.ranges import check_fields
-from brainbench.core.rotations import euler_matrix
+from brainbench.core.reading.ranges import check_fields, check_numbers
+from brainbench.core.rotations import TURN, euler_matrix
 from brainbench.stimuli.motion.trajectories import Still, Translation
 from brainbench.stimuli.objects.obstacle import Obstacle
 from brainbench.stimuli.objects.placed_object import PlacedObject
@@ -134,6 +134,10 @@ class SweepGrid:
                 object.__setattr__(self, name, tuple(map(float, values)))
                 if not values or not all(map(math.isfinite, values)):
                     raise UsageError(f"{name} of a sweep grid needs at least one finite value; received {values!r}.")
+        for name in ("rotation", "turns"):
+            values = getattr(self, name)
+            ends = (values.low, values.high) if isinstance(values, Span) else values
+            check_numbers(f"{name} of a sweep grid (rad)", ends, len(ends), least=-TURN, most=TURN)
         for name in ("speed", "size"):
             values = getattr(self, name)
             if (values.low if isinstance(values, Span) else min(values)) <= 0:

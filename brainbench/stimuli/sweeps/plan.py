@@ -148,7 +148,7 @@ class GenerationPlan:
     def config(self) -> dict[str, Any]:
         """Plain values that determine every byte of the data set."""
         grid = {item.name: getattr(self.grid, item.name) for item in fields(self.grid) if item.name != "published"}
-        package = get_engine(self.settings.backend).package
+        engine = get_engine(self.settings.backend)
         return {
             "format": SWEEPS_FORMAT,
             "schema": SWEEPS_SCHEMA,
@@ -164,7 +164,7 @@ class GenerationPlan:
             "shard_size": self.settings.sweeps_per_shard,
             "version": __version__,
             "physics": PHYSICS_VERSION,
-            "engine": f"{package} {metadata.version(package)}" if package else self.settings.backend,
+            "engine": f"{engine.package} {metadata.version(engine.package)}{engine.revision}",
         }
 
     @cached_property

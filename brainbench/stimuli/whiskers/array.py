@@ -16,6 +16,8 @@ from importlib import resources
 from typing import Any, Literal
 
 from brainbench.core.errors import UsageError, check_each, check_name, unknown_name
+from brainbench.core.reading.ranges import check_numbers
+from brainbench.core.rotations import TURN
 from brainbench.stimuli.whiskers.selection import match_whiskers
 from brainbench.stimuli.whiskers.whisker import Whisker
 
@@ -166,6 +168,7 @@ class WhiskerArray:
         allowed = own | {field.name for field in dataclasses.fields(Whisker)}
         check_each("whisker property", changes, sorted(allowed))
         mounted = {key: tuple(map(float, value)) for key, value in changes.items() if key in own}
+        check_numbers("angles of a whisker (rad)", mounted.get("angles", (0, 0, 0)), 3, least=-TURN, most=TURN)
         rod = {key: value for key, value in changes.items() if key not in own}
         chosen = set(self.select(pattern).mounts)
         mounts = tuple(

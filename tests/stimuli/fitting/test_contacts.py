@@ -100,6 +100,15 @@ def test_a_free_whisker_shows_no_contact_also_in_neighbouring_frames():
     assert "No sign of a contact" in str(found["reason"].values[0])
 
 
+@pytest.mark.parametrize("bend", [0.7, 1.0, 1.3])
+def test_a_wrong_rest_curvature_is_told(caplog, bend):
+    rat = WhiskerArray.rat()["C1"].whisker
+    line = replace(rat, curvature=bend * rat.curvature).centre_line(np.linspace(0, 0.98 * rat.arc_length, 60))
+    noisy = line + np.random.default_rng(5).normal(size=(5, *line.shape)) * 20e-6
+    find_contacts(new_shapes(np.arange(5) / 500, noisy), rat)
+    assert ("same side" in caplog.text) == (bend != 1)
+
+
 def test_another_whiskers_stiffness_or_taper_is_noticed_or_scales_the_force():
     arc, force = _press(MOUSE, 0.6, 0.2)
     points, _ = _shape(MOUSE, arc, force)

@@ -67,6 +67,45 @@ def test_hdf5_and_time_series_are_read(tmp_path):
     np.testing.assert_allclose(found["time"].values, 0.5 + TIMES)
 
 
+def _write_series(path, *, unit=None, names=("base",), **attributes):
+    with h5py.File(path, "w") as file:
+        for name in names:
+            series = file.create_group(f"acquisition/{name}")
+            series["data"], series["timestamps"] = VALUES, TIMES
+            series["data"].attrs.update(attributes | ({} if unit is None else {"unit": unit}))
+    return path
+
+
+def test_the_offset_of_a_time_series_is_added(tmp_path):
+    path = _write_series(tmp_path / "a.nwb", conversion=2.0, offset=1e-6)
+    np.testing.assert_allclose(read_wrenches(path)["wrench"].values, 2 * VALUES + 1e-6)
+
+
+@pytest.mark.parametrize(
+    ("unit", "force", "moment"),
+    [
+        ("newtons", 1, 1),
+        ("N (F), N m (M)", 1, 1),
+        ("mN, µN·m", 1e-3, 1e-6),
+        ("millinewtons, millinewton millimeters", 1e-3, 1e-6),
+    ],
+)
+def test_the_unit_of_a_time_series_counts(tmp_path, unit, force, moment):
+    found = read_wrenches(_write_series(tmp_path / "a.nwb", unit=unit))["wrench"].values
+    np.testing.assert_allclose(found, VALUES * np.repeat([force, moment], 3))
+
+
+@pytest.mark.parametrize("unit", ["volts", "mN", "n/a", "N/m"])
+def test_a_unit_that_does_not_tell_forces_and_moments_is_refused(tmp_path, unit):
+    with pytest.raises(DataError, match=unit):
+        read_wrenches(_write_series(tmp_path / "a.nwb", unit=unit))
+
+
+def test_several_time_series_are_not_chosen_by_the_alphabet(tmp_path):
+    with pytest.raises(DataError, match=r"/acquisition/base.*/acquisition/lfp"):
+        read_wrenches(_write_series(tmp_path / "a.nwb", names=("lfp", "base")))
+
+
 def test_one_whisker_of_a_stimulus_set_is_read(tmp_path):
     from brainbench.stimuli import Frames, Scene, WhiskerArray, simulate, write_stimulus_set
 

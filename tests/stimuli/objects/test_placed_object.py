@@ -166,6 +166,16 @@ def test_a_mesh_is_touched_at_its_hull_and_says_when_that_fills_a_concavity(tmp_
     assert mesh_solid(cube, unit="mm").notes == ()
 
 
+@pytest.mark.parametrize(("size", "unit", "told"), [(20, "mm", False), (0.02, "mm", True), (20, "m", True)])
+def test_a_mesh_in_another_unit_than_said_is_told(tmp_path, caplog, size, unit, told):
+    trimesh.creation.box((size, size, size)).export(tmp_path / "cube.stl")
+    mesh_solid(tmp_path / "cube.stl", unit=unit)
+    assert ("mm across" in caplog.text) == told
+    caplog.clear()
+    mesh_solid(tmp_path / "cube.stl", unit=unit, diagonal=0.02)
+    assert "mm across" not in caplog.text
+
+
 def test_a_file_that_brings_its_convex_pieces_keeps_its_concavity(tmp_path):
     path = tmp_path / "pieces.obj"
     parts = [trimesh.convex.convex_hull(part.vertices * 1e3) for part in rodgers_solid(segments=6).parts]

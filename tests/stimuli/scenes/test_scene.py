@@ -3,10 +3,12 @@ import pytest
 
 from brainbench.core.errors import UsageError
 from brainbench.core.rotations import euler_matrix
+from brainbench.stimuli.motion.recorded import Recorded, Trajectory
 from brainbench.stimuli.motion.trajectories import Still, Translation
 from brainbench.stimuli.objects.placed_object import PlacedObject
 from brainbench.stimuli.objects.primitives import sphere
 from brainbench.stimuli.scenes.scene import Frames, Head, Scene
+from brainbench.stimuli.sweeps.grid import Span, SweepGrid
 from brainbench.stimuli.whiskers.array import WhiskerArray
 
 PAIR = WhiskerArray.mouse(whiskers="C1,C2")
@@ -77,3 +79,21 @@ def test_the_configuration_holds_everything_but_the_array():
     assert scene.config() == scene.select("C1").config()
     assert scene.config() != Scene("one", PAIR, whisking=Still()).config()
     assert scene.config() != Scene("one", PAIR, head=Head((0.0, 0.0, 1e-9))).config()
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: PlacedObject(sphere(1e-3), rotation=(0, 0, 30)),
+        lambda: Head(rotation=(0, 15, 0)),
+        lambda: SweepGrid(rotation=(0, 30, 90)),
+        lambda: SweepGrid(turns=(0, 90)),
+        lambda: SweepGrid(rotation=Span(0, 89, 1)),
+        lambda: WhiskerArray.mouse().replace("C2", angles=(80, 10, -30)),
+        lambda: Recorded(Trajectory(("RC2",), np.zeros((1, 2, 3))), start=-10),
+        lambda: Recorded(Trajectory(("RC2",), np.zeros((1, 2, 3))), initial={"RC2": (80, 10, -30)}),
+    ],
+)
+def test_degrees_are_not_taken_for_radians(make):
+    with pytest.raises(UsageError, match=r"\(rad\)"):
+        make()

@@ -239,6 +239,8 @@ def test_an_object_turns_or_follows_keyframes(tmp_path):
     spin = _object_motion(tmp_path, "spin_deg_s = [0, 0, 180]\nspin_onset_ms = 20")
     assert spin == Spin((0.0, 0.0, math.pi), 0.02)
     assert _object_motion(tmp_path, "spin_deg_s = [0, 0, 180]").onset == Spin((0, 0, 1)).onset
+    with pytest.raises(UsageError, match="'spin_deg_s' beside 'spin_onset_ms'"):
+        _object_motion(tmp_path, "velocity_mm_s = [0, 1, 0]\nspin_onset_ms = 20")
     path = _object_motion(
         tmp_path, "times_ms = [0, 50]\npath_mm = [[0, 0, 0], [1, 0, 0]]\npath_deg = [[0, 0, 0], [0, 0, 90]]"
     )

@@ -43,6 +43,7 @@ class MujocoWhiskerEngine(SteppedEngine):
     name = "mujoco"
     twists = True
     package = "mujoco-core"
+    revision = "+1"  # one contact for a pair of convex bodies
 
     @contextlib.contextmanager
     def session(self) -> Iterator[None]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,6 +26,9 @@ TIMES = {"time": 1.0, "time_s": 1.0, "t": 1.0, "timestamps": 1.0, "time_ms": 1e-
 _SCALES = {"N": 1.0, "mN": 1e-3, "uN": 1e-6, "nN": 1e-9, "Nm": 1.0, "mNm": 1e-3, "uNm": 1e-6, "nNm": 1e-9, "Nmm": 1e-3,
            "mNmm": 1e-6, "uNmm": 1e-9}  # fmt: skip
 # The micro sign and the Greek letter are two characters that look alike.
+_UNIT = re.compile(r"(?<![A-Za-z])[mun]?N(?:[.·* ]?m{1,2})?(?![A-Za-z/])")
+_WORDS = {"[µμ]": "u", "(?i)milli": "m", "(?i)micro": "u", "(?i)nano": "n", "(?i)newtons?": "N",
+          "(?i)[- ·*]*met(?:er|re)s?": "m", "⋅": "·", "mmm": "mm"}  # fmt: skip
 _COLUMN = re.compile(r"([FM][xyz])(?:[_ \[(]+([munµμ]?N(?:[.·* ]?m{1,2})?)[\])]?)?")
 
 
@@ -104,7 +108,9 @@ def _read_hdf5(file: Any, path: str | os.PathLike[str]) -> xr.Dataset:
                 "'channels', or give all six (Fx, Fy, Fz, Mx, My, Mz)."
             )
         channels = list(CHANNELS)
-    factor = float(data.attrs.get("conversion", 1.0))
+    # A time series of NWB: the values are data · conversion + offset, in its unit.
+    values = values * float(data.attrs.get("conversion", 1.0)) + float(data.attrs.get("offset", 0.0))
+    factor = _factors(data.attrs.get("unit", data.attrs.get("units")), channels, path)
     for name in ("time", "timestamps", "time_s"):
         if name in group:
             times = np.asarray(group[name][()], dtype=float)
@@ -117,20 +123,45 @@ def _read_hdf5(file: Any, path: str | os.PathLike[str]) -> xr.Dataset:
     return new_wrenches(times, values * factor, channels, source=os.fspath(path))
 
 
+def _factors(unit: Any, channels: Sequence[str], path: str | os.PathLike[str]) -> Array:
+    """Return the factors [channel] from a unit in words, such as "mN, mN·mm" or "newtons", to N and N·m."""
+    text = unit.decode() if isinstance(unit, bytes) else "N" if unit is None else str(unit)
+    short = text
+    for words, sign in _WORDS.items():
+        short = re.sub(words, sign, short)
+    found = [re.sub("[.·* ]", "", one) for one in _UNIT.findall(short)]
+    kinds = {"FM"["m" in one.partition("N")[2]]: _SCALES[one] for one in found}
+    if kinds == {"F": 1.0}:  # the unit of the forces alone, and moments in the same system
+        kinds["M"] = 1.0
+    if len(kinds) < len(found) or not {name[0] for name in channels} <= set(kinds):
+        raise DataError(
+            f"The wrenches of {shown(os.fspath(path))} have the unit {shown(text)}, which does not tell forces and "
+            f"moments; write the units of both, as in 'mN, mN·mm': {', '.join(_SCALES)}."
+        )
+    return np.array([kinds[name[0]] for name in channels])
+
+
 def _find_series(file: Any) -> tuple[Any, Any] | None:
     """Return the data set of wrenches and the group that holds its times."""
     if "wrench" in file:
         return file["wrench"], file
-    found: list[tuple[Any, Any]] = []
+    found: list[Any] = []
 
     def look(name: str, item: Any) -> None:
-        if name.rpartition("/")[2] == "data" and getattr(item, "ndim", 0) == 2:
-            named = item.attrs.get("channels") is not None
-            if named or item.shape[1] == len(CHANNELS):
-                found.append((item, item.parent))
+        six = getattr(item, "ndim", 0) == 2 and (item.shape[1] == len(CHANNELS) or "channels" in item.attrs)
+        if name.rpartition("/")[2] == "data" and six:
+            found.append(item)
 
     file.visititems(look)
-    return found[0] if found else None
+    # Six columns may be anything; those that name their channels are wrenches.
+    found = [item for item in found if "channels" in item.attrs] or found
+    if len(found) > 1:
+        raise DataError(
+            f"{shown(file.filename)} has several time series that may be wrenches, "
+            f"{listing(item.parent.name for item in found)}; keep one, or name the channels of one in the attribute "
+            "'channels' of its data."
+        )
+    return (found[0], found[0].parent) if found else None
 
 
 def _read_stimulus_set(path: str | os.PathLike[str], whisker: str | None, stimulus: str | None) -> xr.Dataset:

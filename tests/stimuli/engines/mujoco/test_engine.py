@@ -9,10 +9,13 @@ import numpy as np
 import pytest
 
 from brainbench.core.errors import UsageError
+from brainbench.stimuli import Frames, PlacedObject, Scene, Solid, WhiskerArray, simulate
 from brainbench.stimuli.engines import get_engine, list_engines
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.protocol import Job, Load, StillFollicle
 from brainbench.stimuli.engines.reach import reachable
+from brainbench.stimuli.motion.trajectories import Still, Translation
+from brainbench.stimuli.objects.obstacle import ConvexPart
 from brainbench.stimuli.whiskers.chain import build_chain
 from tests.factories.obstacles import post
 from tests.factories.swing import Oscillation
@@ -139,3 +142,19 @@ def test_unknown_backends_and_bad_jobs_are_refused():
         Job(C2, StillFollicle(), (), np.array([0.1]), loads=(Load(0.02, (0, 0, 1e-6)),))
     with pytest.raises(UsageError, match=r"workers .*received 0"):
         _run(Job(C2, StillFollicle(), (), np.array([0.1])), workers=0)
+
+
+def test_a_polygonal_post_is_felt_as_the_rod_engine_feels_it():
+    angle = 2 * np.pi * np.arange(64) / 64
+    ring = 4e-3 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    ends = [np.column_stack([ring, np.full(64, height)]) for height in (-6e-3, 6e-3)]
+    solid, passing = Solid("prism", (ConvexPart(np.vstack(ends)),)), Translation((0, -0.08, 0), 0.005)
+    placed = PlacedObject(solid, (13e-3, 6.5e-3, 1e-3), (0.3, 0.2, 0.5), passing, friction=0.0)
+    array, frames = WhiskerArray.mouse(whiskers="C1,D2"), Frames(first=0.002, interval=0.004, count=40)
+    scene = Scene("post", array, (placed,), Still(), frames=frames)
+    # MuJoCo's several contacts of one pair of bodies lay too far apart: moments erred by 39 and 42 % with status ok.
+    found, truth = (simulate(scene, backend=name, cache=False) for name in ("mujoco", "rod"))
+    assert (found["status"] == "ok").all()
+    moments = found["wrench"].values[0, ..., 3:], truth["wrench"].values[0, ..., 3:]
+    miss = np.sqrt(np.mean((moments[0] - moments[1]) ** 2, axis=(0, 2)) / np.mean(moments[1] ** 2, axis=(0, 2)))
+    assert (miss < 0.1).all()
