@@ -76,17 +76,17 @@ def nearest(name: str, options: Iterable[str]) -> str | None:
     return None
 
 
-def listing(options: Iterable[str], *, limit: int = 12) -> str:
-    """Join options for a message and say how many were left out.
+def listing(options: Iterable[str], *, limit: int = 12, quoted: bool = True) -> str:
+    """Join options for a message and say how many were left out; unquoted ones are shown whole.
 
     >>> listing(["a", "b", "c"], limit=2)
     "'a', 'b' and 1 more"
     """
     choices = list(options)
-    text = ", ".join(shown(choice) for choice in choices[:limit])
+    text = ", ".join(shown(choice) if quoted else choice for choice in choices[:limit])
     if len(choices) > limit:
         text += f" and {len(choices) - limit} more"
-    return text or "none"
+    return text if choices else "none"
 
 
 def unknown_name(kind: str, name: object, options: Iterable[str], *, hint: str = "") -> UsageError:
