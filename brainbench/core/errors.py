@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import difflib
 from collections import Counter
-from collections.abc import Hashable, Iterable
+from collections.abc import Hashable, Iterable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 
@@ -175,3 +176,12 @@ def missing_dependency(*packages: str, extra: str, purpose: str) -> MissingDepen
         f"{purpose} needs the {words[0]} {names}, which {words[1]} not installed; "
         f"install {words[2]}, in the checkout of brainbench, with: {install_command(extra)}"
     )
+
+
+@contextmanager
+def needing(package: str, *, extra: str, purpose: str) -> Iterator[None]:
+    """Make the error of :func:`missing_dependency` from an import that fails within."""
+    try:
+        yield
+    except ImportError as error:
+        raise missing_dependency(package, extra=extra, purpose=purpose) from error
