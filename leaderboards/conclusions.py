@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from brainbench.core.errors import listing
 from leaderboards.boards import RAW_INPUT, Board
 from leaderboards.entries import Entry
 from leaderboards.text import number, plural, span
-
-_NAMED = 4
-"""Most models that one sentence names."""
 
 
 def conclusions(board: Board) -> list[str]:
@@ -71,5 +69,4 @@ def _computation(entry: Entry) -> str:
 
 
 def _names(entries: Sequence[Entry]) -> str:
-    names = [entry.name for entry in entries]
-    return ", ".join(names[:_NAMED]) + (f" and {len(names) - _NAMED} more" if len(names) > _NAMED else "")
+    return listing((entry.name for entry in entries), limit=4, quoted=False)

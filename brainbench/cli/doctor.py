@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from brainbench.cli.output import JsonOption, emit, table
+from brainbench.cli.output import Output, table
 from brainbench.core.errors import install_command
 
 ENABLES = {
@@ -26,7 +26,7 @@ ENABLES = {
 """Extra → what it enables; a package of several extras stands with the first."""
 
 
-def doctor(as_json: JsonOption = False) -> None:
+def doctor() -> Output:
     """Show versions, devices, folders and optional parts."""
     data = diagnose()
     rows = [[name, version or "missing: reinstall brainbench", "", ""] for name, version in data["required"].items()]
@@ -40,7 +40,7 @@ def doctor(as_json: JsonOption = False) -> None:
     ]
     told = f"\n\nAn extra is installed, in the checkout of brainbench, with: {install_command('EXTRA')}"
     text = "\n".join(head) + "\n\n" + table("", ["part", "version", "extra", "enables"], rows) + told
-    emit(data, text, as_json=as_json)
+    return Output(data, text)
 
 
 def diagnose() -> dict[str, Any]:

@@ -9,7 +9,7 @@ import typer
 
 from brainbench.cli.destinations import out_file_option, out_folder_option
 from brainbench.cli.model_card import model_card
-from brainbench.cli.output import JsonOption, emit, facts, list_without_command, progress_bar, table, table_of, tracked
+from brainbench.cli.output import Output, facts, list_without_command, progress_bar, table, table_of, tracked
 from brainbench.core.files import to_plain
 
 if TYPE_CHECKING:
@@ -19,9 +19,7 @@ app = typer.Typer(help="List and describe the registered models; add your own.")
 
 
 @app.command("list")
-def list_(
-    pattern: Annotated[str, typer.Argument(help="Shell pattern, e.g. '*-ln*'.")] = "*", as_json: JsonOption = False
-) -> None:
+def list_(pattern: Annotated[str, typer.Argument(help="Shell pattern, e.g. '*-ln*'.")] = "*") -> Output:
     """List the models by name, with their sizes and what their weights are (also: brainbench models)."""
     from fnmatch import fnmatchcase
 
@@ -34,10 +32,8 @@ def list_(
     here = shipped()
     names = [*list_models(pattern), *(name for name in here if fnmatchcase(name, pattern))]
     records = [describe_model(name) for name in tracked(names, "measuring models")]
-    if as_json:
-        tags = {name: [str(Architecture.parse(one).tag) for one in list_recipes(f"{name}.*")] for name in names}
-        emit([{**to_plain(item), "recipes": tags[item.name]} for item in records], "", as_json=True)
-        return
+    tags = {name: [str(Architecture.parse(one).tag) for one in list_recipes(f"{name}.*")] for name in names}
+    data = [{**to_plain(item), "recipes": tags[item.name]} for item in records]
     rows = [
         [item.name, "trained" if item.trained else "your code" if item.family == FAMILY else "untrained", *_size(item)]
         for item in records
@@ -49,22 +45,22 @@ def list_(
             sizes[plain] = sizes.get(plain) or _size(describe_model(plain))
             rows.append([name, "needs training", *sizes[plain]])
     if not rows:
-        print(f"No model has a name like {pattern!r}; see them all with: brainbench models")
-        return
+        return Output(data, f"No model has a name like {pattern!r}; see them all with: brainbench models")
     rows.sort(key=lambda row: ("trained", "your code", "untrained", "needs training").index(row[1]))
-    print(table("", ["model", "weights", "parameters", "MACs/step"], rows, right=(2, 3)))
-    print("\ntrained: weights come with the package; untrained: random weights, drawn from --seed;")
-    print("needs training: published, to be trained with brainbench train.")
-    print("MACs/step: multiply-adds per time step.")
+    legend = (
+        "trained: weights come with the package; untrained: random weights, drawn from --seed;\n"
+        "needs training: published, to be trained with brainbench train.\n"
+        "MACs/step: multiply-adds per time step."
+    )
+    shown = table("", ["model", "weights", "parameters", "MACs/step"], rows, right=(2, 3))
+    return Output(data, f"{shown}\n\n{legend}")
 
 
 list_without_command(app, list_)
 
 
 @app.command("recipes")
-def recipes(
-    pattern: Annotated[str, typer.Argument(help="Shell pattern, e.g. '*.simclr'.")] = "*", as_json: JsonOption = False
-) -> None:
+def recipes(pattern: Annotated[str, typer.Argument(help="Shell pattern, e.g. '*.simclr'.")] = "*") -> Output:
     """List the published combinations of architecture and objective, with their training settings."""
     from brainbench.models.recipes import find_recipe, list_recipes
     from brainbench.models.registry import describe_model
@@ -80,14 +76,13 @@ def recipes(
         ">settings in the search": lambda item: len(item.search),
     }
     data = [{"name": item.name, **to_plain(item)} for item in found]
-    emit(data, table_of("", found, columns), as_json=as_json)
+    return Output(data, table_of("", found, columns))
 
 
 @app.command("show")
 def show(
     name: Annotated[str, typer.Argument(help="A registry name, a recipe's name or a folder of trained weights.")],
-    as_json: JsonOption = False,
-) -> None:
+) -> Output:
     """Describe one model: size, layers, citation and, with an objective, how it is trained."""
     from brainbench.models.recipes import find_recipe, list_recipes
     from brainbench.models.registry import describe_model
@@ -103,35 +98,32 @@ def show(
 
         _, told = draw_twin(twin, data["trained"]["options"])
         data["twin"] = told or f"{twin['name']} with seed {twin['seed']}, drawn here to the last bit"
-    text = "" if as_json else model_card(name, record, recipe, data.get("twin"))
-    emit(data, text, as_json=as_json)
+    return Output(data, model_card(name, record, recipe, data.get("twin")))
 
 
 @app.command("add")
 def add(
     target: Annotated[str, typer.Argument(help="FILE.py:NAME or package.module:NAME, which gives a torch module.")],
     name: Annotated[str, typer.Option(help="What to call it on the command line.")],
-    as_json: JsonOption = False,
-) -> None:
+) -> Output:
     """Give a model of your own a name; it is kept in your settings, and the code stays where it is."""
     from brainbench.models.registry import list_models
     from brainbench.models.user_models import add_user_model, settings_file
 
     made = add_user_model(target, name, taken=list_models())
     shown = {"model": made.name, "code": made.target, "kept in": settings_file()}
-    emit(made, f"{facts(shown)}\n\nscore it: brainbench score {made.name}", as_json=as_json)
+    return Output(made, f"{facts(shown)}\n\nscore it: brainbench score {made.name}")
 
 
 @app.command("remove")
 def remove(
     name: Annotated[str, typer.Argument(help="A name that brainbench models add was given.")],
-    as_json: JsonOption = False,
-) -> None:
+) -> Output:
     """Take the name of a model of your own away; its code stays."""
     from brainbench.models.user_models import remove_user_model
 
     made = remove_user_model(name)
-    emit(made, f"{made.name} is no longer a name of {made.target}; the code was not touched.", as_json=as_json)
+    return Output(made, f"{made.name} is no longer a name of {made.target}; the code was not touched.")
 
 
 @app.command("import")
@@ -140,8 +132,7 @@ def import_(
     architecture: Annotated[str | None, typer.Option(help="Registry name, where the file leaves a choice.")] = None,
     config: Annotated[Path | None, typer.Option(help="The run's settings: config.yaml, or its graph in JSON.")] = None,
     out: Annotated[Path | None, out_folder_option("Folder to write.")] = None,
-    as_json: JsonOption = False,
-) -> None:
+) -> Output:
     """Turn weights of the published study into a model that can be scored; nothing in the file is executed."""
     from brainbench.models.published.importing import import_checkpoint
 
@@ -156,7 +147,7 @@ def import_(
         "not part of the network": left or "nothing",
         "score it with": f"brainbench score {made.name}",
     }
-    emit(made, facts(shown), as_json=as_json)
+    return Output(made, facts(shown))
 
 
 def export(
@@ -164,8 +155,7 @@ def export(
     format: Annotated[str, typer.Option(help="onnx, or torch (an exported program).")] = "onnx",
     out: Annotated[Path | None, out_file_option("File to write.")] = None,
     seed: Annotated[int, typer.Option(help="Seed of untrained weights.")] = 0,
-    as_json: JsonOption = False,
-) -> None:
+) -> Output:
     """Export one step, obs and h_in to features and h_out, with its contract, and check the written file."""
     from brainbench.models.export import SUFFIXES, export_model
     from brainbench.models.registry import load_model
@@ -179,7 +169,7 @@ def export(
         f"{model}: {made.features} features, {made.state_size:,} numbers of state; the file agrees with the network "
         f"to {made.difference:.1e}\n\nfile      {made.path}\ncontract  {made.contract}"
     )
-    emit(made, text, as_json=as_json)
+    return Output(made, text)
 
 
 def _size(model: ModelDescription) -> tuple[str, str]:

@@ -21,6 +21,7 @@ from typing import Annotated, Any
 
 import typer
 
+from brainbench.cli.output import Output
 from brainbench.core.errors import UsageError, shown
 
 WorkersOption = Annotated[int | None, typer.Option(min=1, help="Processes. [default: as many as there are processors]")]
@@ -96,7 +97,7 @@ def with_options(
     build: bool = True,
     given: bool = False,
     help: str | None = None,
-) -> Callable[[Callable[..., None]], Callable[..., None]]:
+) -> Callable[[Callable[..., Output]], Callable[..., Output]]:
     """Decorate a command so that one parameter of it is filled from flags.
 
     Args:
@@ -130,12 +131,12 @@ def with_options(
 
 
 def filled_from(
-    command: Callable[..., None],
+    command: Callable[..., Output],
     parameter: str,
     options: Sequence[inspect.Parameter],
     make: Callable[[dict[str, Any]], Any],
     **unloaded: Any,
-) -> Callable[..., None]:
+) -> Callable[..., Output]:
     """Return a command that has options in place of one parameter, which ``make`` makes of their values.
 
     ``unloaded`` stand for names of its annotations that are not imported.
@@ -144,9 +145,9 @@ def filled_from(
     every = [item for one in own for item in (options if one.name == parameter else [one])]
     every = [item.replace(kind=inspect.Parameter.KEYWORD_ONLY) for item in every]
 
-    def run(**values: Any) -> None:
+    def run(**values: Any) -> Output:
         made = make({item.name: values.pop(item.name) for item in options})
-        command(**{parameter: made}, **values)
+        return command(**{parameter: made}, **values)
 
     run.__doc__, run.__name__ = command.__doc__, command.__name__
     run.__signature__ = inspect.Signature(every)  # pyright: ignore[reportFunctionMemberAccess]

@@ -1,14 +1,16 @@
-"""Output of every command: the ``--json`` option, tables, and progress that vanishes off a terminal."""
+"""Output of every command: printing, the ``--json`` option, tables, and progress that vanishes off a terminal."""
 
 from __future__ import annotations
 
 import contextlib
+import functools
+import inspect
 import sys
 import threading
 import time as clock
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import typer
 
@@ -18,20 +20,46 @@ from brainbench.core.progress import Item, Progress, track
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout, nothing else.")]
 
 
-def list_without_command(app: typer.Typer, command: Callable[[], None]) -> None:
+class Output(NamedTuple):
+    """What a command returns."""
+
+    data: Any
+    """Printed as JSON with ``--json``."""
+    text: str
+    """Printed for people without it."""
+    out: Path | None = None
+    """File that the JSON is written into too."""
+    failure: Exception | None = None
+    """Raised after all is printed: the exit status, or an error."""
+
+
+def printed(command: Callable[..., Output]) -> Callable[..., None]:
+    """Return a command that prints its output, with the option ``--json`` behind its own."""
+
+    @functools.wraps(command)
+    def run(*, as_json: bool = False, **values: Any) -> None:
+        data, text, out, failure = command(**values)
+        if out is not None:
+            write_json(out, data)
+        print(to_json(data) if as_json else text)
+        if failure is not None:
+            raise failure
+
+    own = inspect.signature(command, eval_str=True).parameters.values()
+    option = inspect.Parameter("as_json", inspect.Parameter.KEYWORD_ONLY, default=False, annotation=JsonOption)
+    every = [*(item.replace(kind=inspect.Parameter.KEYWORD_ONLY) for item in own), option]
+    run.__signature__ = inspect.Signature(every)  # pyright: ignore[reportAttributeAccessIssue]
+    run.__annotations__ = {item.name: item.annotation for item in every}
+    return run
+
+
+def list_without_command(app: typer.Typer, command: Callable[[], Output]) -> None:
     """Let a group of commands run its listing when no command is named."""
 
     @app.callback(invoke_without_command=True)
     def run(context: typer.Context) -> None:
         if context.invoked_subcommand is None:
-            command()
-
-
-def emit(data: Any, text: str, *, as_json: bool, out: Path | None = None) -> None:
-    """Print ``data`` as JSON, or ``text`` for people, on stdout; write the JSON into a file too if there is one."""
-    if out is not None:
-        write_json(out, data)
-    print(to_json(data) if as_json else text)
+            print(command().text)
 
 
 def table_of(title: str, items: Iterable[Any], columns: Mapping[str, str | Callable[[Any], object]]) -> str:

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from brainbench.cli.options import option_fields, with_options
-from brainbench.cli.output import JsonOption, emit, progress_bar, table_of, tracked
+from brainbench.cli.output import Output, progress_bar, table_of, tracked
 from brainbench.core.errors import UsageError
 from brainbench.core.files import to_plain
 
@@ -38,8 +38,7 @@ def power(
     target: Annotated[float, typer.Option(help="Power that is wanted.")] = 0.8,
     simulations: Annotated[int, typer.Option(help="Simulated experiments per number.")] = 500,
     seed: Annotated[int, typer.Option(help="Seed of the experiments.")] = 0,
-    as_json: JsonOption = False,
-) -> None:
+) -> Output:
     """Say how often a true effect would be found, and how many stimuli or animals are needed.
 
     Correlation, consistency and reliability of your own recordings: 'brainbench score' and
@@ -86,7 +85,7 @@ def power(
         "dimensions": {"number": number, "origin": origin},
         "results": [{**to_plain(result), "needed": enough, "target": target} for result, enough in found],
     }
-    emit(data, f"{title}\n\n{table_of('', found, columns)}\n\n{note}", as_json=as_json)
+    return Output(data, f"{title}\n\n{table_of('', found, columns)}\n\n{note}")
 
 
 def _dimensions(asked: str, recordings: str | None, conditions: str | None, model: str | None) -> tuple[int, str]:

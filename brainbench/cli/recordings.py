@@ -10,7 +10,7 @@ import typer
 
 from brainbench.cli.destinations import beside, out_folder_option
 from brainbench.cli.options import SCORE, option, with_options
-from brainbench.cli.output import JsonOption, emit, progress_bar, table, table_of
+from brainbench.cli.output import Output, progress_bar, table, table_of
 from brainbench.cli.score_text import left_out
 
 if TYPE_CHECKING:
@@ -29,15 +29,14 @@ app = typer.Typer(no_args_is_help=True, help="Inspect, check, copy and fetch neu
 def inspect(
     path: Annotated[str, typer.Argument(help="'demo', an NWB, HDF5 or published .npz file, a folder, or a glob.")],
     strict: Annotated[bool, option(SCORE, "strict", "--strict")] = False,
-    as_json: JsonOption = False,
-) -> None:
+) -> Output:
     """Show what a file holds and which --conditions could label its trials."""
     from brainbench.datasets import inspect as inspect_file
 
     found = _found(path)
     with progress_bar() as progress:
         inspection = inspect_file(found, strict=strict, progress=progress)
-    emit(inspection, str(inspection), as_json=as_json)
+    return Output(inspection, str(inspection))
 
 
 @app.command("rdm")
@@ -48,8 +47,7 @@ def rdm(
     pool: Annotated[str, typer.Option(help="One RDM per 'subject', per 'session', or of 'all' together.")] = "subject",
     seed: Annotated[int, typer.Option(help="Seed of the split halves.")] = 0,
     metric: Annotated[str, typer.Option(help="RSA metric of the RDMs; 'rsa' is that of scores.")] = "rsa-correlation",
-    as_json: JsonOption = False,
-) -> None:
+) -> Output:
     """Compute every animal's RDM and its split-half reliability."""
     from dataclasses import replace
 
@@ -86,7 +84,7 @@ def rdm(
     if len(labels) <= _LARGEST_SHOWN:
         for item in animals:
             text += "\n\n" + _matrix(f"RDM of animal {item.subject}", labels, item.rdm)
-    emit(data, text, as_json=as_json)
+    return Output(data, text)
 
 
 @app.command("check")
@@ -98,8 +96,7 @@ def check(
         str | None, typer.Option(help="TABLE:COLUMN[,COLUMN] whose labels are checked; the layout's by default.")
     ] = None,
     strict: Annotated[bool, typer.Option("--strict", help="Fail on warnings too.")] = False,
-    as_json: JsonOption = False,
-) -> None:
+) -> Output:
     """Look for what would make scores wrong: clock, coverage, labels, units, tables, times. Worst first.
 
     Exit status: 0 nothing wrong (notes and warnings may be there), 1 errors (or warnings with --strict),
@@ -111,9 +108,9 @@ def check(
     with progress_bar() as progress:
         checkup = check_files(found, conditions=conditions, progress=progress)
     told = ("verdict", "source", "sessions", "findings")
-    emit({name: getattr(checkup, name) for name in told}, str(checkup), as_json=as_json)
-    if checkup.count("error") or (strict and checkup.count("warning")):
-        raise typer.Exit(1)
+    failed = checkup.count("error") or (strict and checkup.count("warning"))
+    failure = typer.Exit(1) if failed else None
+    return Output({name: getattr(checkup, name) for name in told}, str(checkup), failure=failure)
 
 
 @app.command("export")
@@ -123,8 +120,7 @@ def export(
         Path, typer.Argument(callback=beside, help="*.h5 (any number of sessions), *.nwb (one), or a folder of NWB.")
     ],
     select: Annotated[str | None, option(SCORE, "select")] = None,
-    as_json: JsonOption = False,
-) -> None:
+) -> Output:
     """Write a small copy without raw data: spike times and tables. Scores of the copy are identical."""
     from brainbench.datasets import export as export_files
 
@@ -132,7 +128,7 @@ def export(
     with progress_bar("copying the recordings"):
         files = export_files(found, target, select=select)
     columns = {"file": "{0}", ">": lambda path: f"{path.stat().st_size / 1e6:.2f} MB"}
-    emit({"files": files}, table_of("", files, columns), as_json=as_json)
+    return Output({"files": files}, table_of("", files, columns))
 
 
 @app.command("fetch")
@@ -140,14 +136,13 @@ def fetch(
     name: Annotated[str, typer.Argument(help="A layout ('rodgers') or the six digits of a dandiset.")],
     out: Annotated[Path, out_folder_option("Folder to put it in.")] = Path(),
     assets: Annotated[str | None, typer.Option(help="Glob of the files wanted, e.g. 'sub-231CR/*'.")] = None,
-    as_json: JsonOption = False,
-) -> None:
+) -> Output:
     """Download a public data set with the dandi client; without a network or that client, nothing is tried."""
     from brainbench.datasets import fetch as fetch_files
 
     with progress_bar("downloading"):
         folder = fetch_files(name, out, assets=assets)
-    emit({"folder": folder}, str(folder), as_json=as_json)
+    return Output({"folder": folder}, str(folder))
 
 
 def _found(source: str) -> str:
@@ -181,14 +176,12 @@ def _matrix(title: str, labels: tuple[str, ...], rdm: NDArray[np.float64]) -> st
 @app.command("recipe")
 def recipe(
     name: Annotated[str | None, typer.Argument(help="A recording layout; all are listed without one.")] = None,
-    as_json: JsonOption = False,
-) -> None:
+) -> Output:
     """Print every rule by which a recording layout selects trials and units and cuts windows."""
     from brainbench.datasets.layouts.registry import get_layout, list_layouts
 
     if name is None:
         known = {item: get_layout(item).title for item in list_layouts()}
-        emit(known, table("", ["layout", ""], [[key, text] for key, text in known.items()]), as_json=as_json)
-        return
+        return Output(known, table("", ["layout", ""], [[key, text] for key, text in known.items()]))
     found = get_layout(name)
-    emit({"name": found.name, "rules": found.describe().splitlines()}, found.describe(), as_json=as_json)
+    return Output({"name": found.name, "rules": found.describe().splitlines()}, found.describe())

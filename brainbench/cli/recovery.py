@@ -14,7 +14,7 @@ import typer
 
 from brainbench.cli.destinations import out_folder_option
 from brainbench.cli.options import SCORE, SchedulerOption, WorkersOption, option, with_options
-from brainbench.cli.output import JsonOption, emit, progress_bar, table_of
+from brainbench.cli.output import Output, progress_bar, table_of
 from brainbench.core.errors import UsageError
 from brainbench.core.files import provenance, to_plain, write_json
 from brainbench.core.reading.ranges import check_number
@@ -64,8 +64,7 @@ def recovery(
     ] = None,
     workers: WorkersOption = None,
     scheduler: SchedulerOption = None,
-    as_json: JsonOption = False,
-) -> None:
+) -> Output:
     """Say whether an experiment could tell networks apart: each network in turn makes the animals.
 
     Animals are drawn from each network, and all networks are scored on them. Run again with the same --out, an
@@ -113,7 +112,7 @@ def recovery(
     if out is not None:
         text += f"\n\nresult   {write_json(out / 'recovery.json', data)}"
         text += f"\npicture  {plot_confusion(found, out / 'recovery.png')}"
-    emit(data, text, as_json=as_json)
+    return Output(data, text)
 
 
 def _find(patterns: Sequence[str] | None) -> list[str]:

@@ -15,6 +15,7 @@ from typing import Any
 
 import typer
 
+from brainbench.cli.output import printed
 from brainbench.core.errors import FileWriteError, UsageError, missing_dependency, shown
 from brainbench.core.files import CACHE_VARIABLE, cache_dir
 
@@ -127,7 +128,7 @@ def guard(app: typer.Typer) -> None:
     for name, command in commands(app):
         if command.callback is not None and not hasattr(command, "guarded"):
             command.guarded = True
-            command.callback = _checked(name, command.callback)
+            command.callback = printed(_checked(name, command.callback))
 
 
 def commands(app: typer.Typer, path: str = "") -> Iterator[tuple[str, Any]]:

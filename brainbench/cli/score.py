@@ -13,7 +13,7 @@ import typer
 from brainbench.cli import destinations
 from brainbench.cli.destinations import out_folder_option
 from brainbench.cli.options import SCORE, SCORE_FLAGS, with_options
-from brainbench.cli.output import JsonOption, emit, progress_bar
+from brainbench.cli.output import Output, progress_bar
 from brainbench.core.errors import UsageError
 
 if TYPE_CHECKING:
@@ -46,8 +46,7 @@ def score(
             help="Also write a report for a paper: FILE.md, FILE.html or FILE.pdf.",
         ),
     ] = None,
-    as_json: JsonOption = False,
-) -> None:
+) -> Output:
     """Score a model against neural recordings and write a result record and an HTML report."""
     from brainbench.cli.score_text import score_text, walk_text
     from brainbench.core.files import to_plain
@@ -61,8 +60,7 @@ def score(
         if options != replace(type(options)(), explain=True) or report_file is not None:
             raise UsageError("A file of stored splits is explained by itself; leave out all options but --json.")
         steps = to_plain(explain_file(model))
-        emit({"estimator_walk": steps}, walk_text(steps), as_json=as_json)
-        return
+        return Output({"estimator_walk": steps}, walk_text(steps))
     command = _command()
     kept = record_path(model, options, command)
     record, note = read_kept(kept), "  (as scored before: nothing has changed since)"
@@ -81,7 +79,7 @@ def score(
 
         data["paper_paths"] = write_paper([record], report_file, title=f"{record.score.name}: brainbench score")
         text += f"\npaper   {', '.join(map(str, data['paper_paths'][:2]))}"
-    emit(data, text, as_json=as_json)
+    return Output(data, text)
 
 
 def _command() -> str:

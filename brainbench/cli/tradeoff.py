@@ -9,7 +9,7 @@ import typer
 
 from brainbench.cli.destinations import out_file, out_file_option, picture_file
 from brainbench.cli.options import items, numbers
-from brainbench.cli.output import JsonOption, emit, progress_bar, table_of
+from brainbench.cli.output import Output, progress_bar, table_of
 from brainbench.stimuli.engines import DEFAULT_ENGINE
 
 _PLOT = typer.Option(callback=picture_file, help="Also draw error against cost (.png, .svg, .pdf).")
@@ -32,8 +32,7 @@ def whisker(
     ] = "dynamic",
     csv: Annotated[Path | None, typer.Option(callback=out_file, help="Also write the table as CSV.")] = None,
     plot: PlotOption = None,
-    as_json: JsonOption = False,
-) -> None:
+) -> Output:
     """Measure error and cost of whisker simulations over links, time step, solver, backend and collision geometry.
 
     The table that ships with the package (brainbench/stimuli/fidelity_table.json) is made by this command.
@@ -83,7 +82,7 @@ def whisker(
             "note": "{0[note]}",
         }
         text += "\n\n" + table_of("whisking into the hollow of concave objects:", hollow, columns)
-    emit({"points": points, "front": best, "path": out}, f"{text}\n\ntable  {out}", as_json=as_json)
+    return Output({"points": points, "front": best, "path": out}, f"{text}\n\ntable  {out}")
 
 
 @app.command("score")
@@ -92,8 +91,7 @@ def score(
     units: Annotated[int, typer.Option(help="Units of each.")] = 40,
     trials: Annotated[int, typer.Option(help="Trials of each stimulus.")] = 20,
     repeats: Annotated[int, typer.Option(help="Seeds per setting; their spread is the error.")] = 8,
-    as_json: JsonOption = False,
-) -> None:
+) -> Output:
     """Measure the Monte-Carlo error of a score against its time: split halves and permutations."""
     from brainbench.metrics.tradeoff import measure_tradeoff
 
@@ -110,7 +108,7 @@ def score(
             ">s": "{0.seconds:.2f}",
         },
     )
-    emit({"points": points}, text, as_json=as_json)
+    return Output({"points": points}, text)
 
 
 @app.command("model")
@@ -122,8 +120,7 @@ def model(
     score: Annotated[bool, typer.Option(help="Also score every setting on the demo recordings.")] = False,
     data: Annotated[Path | None, typer.Option(help="Folder of sweeps: also measure test accuracy.")] = None,
     seed: Annotated[int, typer.Option(help="Seed of untrained weights.")] = 0,
-    as_json: JsonOption = False,
-) -> None:
+) -> Output:
     """Measure error, latency, score and accuracy of a network over precision, unrolling and number of steps."""
     from brainbench.models import tradeoff
     from brainbench.stimuli import load_stimuli
@@ -159,15 +156,14 @@ def model(
         ">score": lambda item: _known(item.get("score"), ".3f"),
         ">top-1": lambda item: _known(item.get("top1"), ".3f"),
     }
-    emit(results, table_of(f"{name}, batch 1:", results, columns), as_json=as_json)
+    return Output(results, table_of(f"{name}, batch 1:", results, columns))
 
 
 @app.command("tactile")
 def tactile(
     out: Annotated[Path, out_file_option("Table (.json).")] = Path("tactile-tradeoff.json"),
     plot: PlotOption = None,
-    as_json: JsonOption = False,
-) -> None:
+) -> Output:
     """Measure error and cost of tactile queries over backend, resolution, surface points and taxels.
 
     The table that ships with the package (robotics_bridge/sensors/fidelity_table.json) is made by this command.
@@ -186,7 +182,7 @@ def tactile(
         ">µs / environment": "{0[cost]:.2f}",
     }
     text = table_of("relative force errors against double precision", points, columns)
-    emit({"points": points, "path": out}, f"{text}\n\ntable  {out}", as_json=as_json)
+    return Output({"points": points, "path": out}, f"{text}\n\ntable  {out}")
 
 
 def _known(value: float | None, form: str) -> str:

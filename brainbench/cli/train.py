@@ -11,7 +11,7 @@ import typer
 
 from brainbench.cli.destinations import out_folder_option
 from brainbench.cli.options import part_of, with_options
-from brainbench.cli.output import JsonOption, emit, progress_bar, table_of
+from brainbench.cli.output import Output, progress_bar, table_of
 from brainbench.core.errors import DataError, UsageError
 from brainbench.core.files import read_mapping
 from brainbench.core.progress import Progress
@@ -47,8 +47,7 @@ def train(
         str | None,
         typer.Option(help="Train the whole published search space: 'all', or NUMBER/COUNT for one job's share."),
     ] = None,
-    as_json: JsonOption = False,
-) -> None:
+) -> Output:
     """Train a model with its published recipe, or go on with a run that was interrupted.
 
     Several GPUs: torchrun --nproc-per-node N -m brainbench train …
@@ -79,7 +78,7 @@ def train(
                 controls=where if sweep is not None else None,
             )  # fmt: skip
     if os.environ.get("RANK", "0") != "0":
-        return
+        raise typer.Exit
     columns = {
         "run": "{0[0]}",
         "status": "{0[1].status}",
@@ -104,10 +103,9 @@ def train(
         best = winner / BEST
     if done:
         text += f"\n\nscore it: brainbench score local-dir:{best}"
-    emit(payload, text, as_json=as_json)
     diverged = [folder for folder, result in results.items() if result.status == "diverged"]
-    if diverged:
-        raise DataError(f"Training diverged in {', '.join(diverged)}.")
+    failure = DataError(f"Training diverged in {', '.join(diverged)}.") if diverged else None
+    return Output(payload, text, failure=failure)
 
 
 class SweepFolder:

@@ -26,6 +26,9 @@ CHANNELS = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
 GRID_SHAPE = (5, 7)
 """Rows A–E and columns 0–6 of the whisker grid; whisker (row, col) sits at flat index row·7 + col."""
 
+SUB_STEPS, SUB_STEP_SECONDS = 5, 0.009
+"""Frames within a time step of the networks, and the time between frames [s]."""
+
 LONGEST_LABEL = 200
 """Characters of the name of a stimulus or whisker; names become those of files."""
 

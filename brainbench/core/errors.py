@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import difflib
 from collections import Counter
-from collections.abc import Hashable, Iterable
+from collections.abc import Hashable, Iterable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 
@@ -76,17 +77,17 @@ def nearest(name: str, options: Iterable[str]) -> str | None:
     return None
 
 
-def listing(options: Iterable[str], *, limit: int = 12) -> str:
-    """Join options for a message and say how many were left out.
+def listing(options: Iterable[str], *, limit: int = 12, quoted: bool = True) -> str:
+    """Join options for a message and say how many were left out; unquoted ones are shown whole.
 
     >>> listing(["a", "b", "c"], limit=2)
     "'a', 'b' and 1 more"
     """
     choices = list(options)
-    text = ", ".join(shown(choice) for choice in choices[:limit])
+    text = ", ".join(shown(choice) if quoted else choice for choice in choices[:limit])
     if len(choices) > limit:
         text += f" and {len(choices) - limit} more"
-    return text or "none"
+    return text if choices else "none"
 
 
 def unknown_name(kind: str, name: object, options: Iterable[str], *, hint: str = "") -> UsageError:
@@ -175,3 +176,12 @@ def missing_dependency(*packages: str, extra: str, purpose: str) -> MissingDepen
         f"{purpose} needs the {words[0]} {names}, which {words[1]} not installed; "
         f"install {words[2]}, in the checkout of brainbench, with: {install_command(extra)}"
     )
+
+
+@contextmanager
+def needing(package: str, *, extra: str, purpose: str) -> Iterator[None]:
+    """Make the error of :func:`missing_dependency` from an import that fails within."""
+    try:
+        yield
+    except ImportError as error:
+        raise missing_dependency(package, extra=extra, purpose=purpose) from error

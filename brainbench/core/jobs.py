@@ -12,7 +12,7 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from typing import Any
 
-from brainbench.core.errors import DataError, UsageError, missing_dependency
+from brainbench.core.errors import DataError, UsageError, needing
 from brainbench.core.reading.ranges import check_number
 
 TIMEOUT = 30
@@ -85,11 +85,9 @@ def run_on_cluster(
         UsageError: no scheduler answers at this address, or it has no workers.
         DataError: several workers died of one job.
     """
-    try:
+    with needing("distributed", extra="cluster", purpose="A --scheduler"):
         from distributed import Client, as_completed
         from distributed.scheduler import KilledWorker
-    except ImportError as error:
-        raise missing_dependency("distributed", extra="cluster", purpose="A --scheduler") from error
     try:
         client: Any = Client(scheduler, timeout=TIMEOUT, set_as_default=False)
     except (OSError, TimeoutError, ValueError) as error:

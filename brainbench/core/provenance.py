@@ -58,8 +58,7 @@ class Provenance(Mapping[str, Any]):
         source = self.recordings.get("source")
         sources = source if isinstance(source, (list, tuple)) else [source] if source else []
         names = [str(item).replace("\\", "/").rstrip("/").rpartition("/")[2] for item in sources]
-        more = f" and {len(names) - 3} more" if len(names) > 3 else ""
-        return ", ".join(names[:3]) + more or "unnamed recordings"
+        return listing(names, limit=3, quoted=False) if any(names) else "unnamed recordings"
 
     @property
     def recordings_hash(self) -> str | None:

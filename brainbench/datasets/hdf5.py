@@ -153,10 +153,10 @@ def read_counts(file: h5py.File, path: Path) -> xr.Dataset:
 def _write_counts(file: h5py.File, dataset: xr.Dataset) -> None:
     file.attrs["kind"] = "counts"
     for name in ("counts", "duration", "time"):
-        file.create_dataset(name, data=dataset[name].values, **_compression(dataset[name].values))
+        write_array(file, name, dataset[name].values)
     for name, coordinate in dataset.coords.items():
         if coordinate.dims in (("trial",), ("unit",)):
-            _write_column(file.require_group(str(coordinate.dims[0])), str(name), coordinate.values)
+            write_array(file.require_group(str(coordinate.dims[0])), str(name), coordinate.values)
     file.create_dataset("attributes", data=to_json(dataset.attrs))
 
 
@@ -188,21 +188,18 @@ def _write_table(group: h5py.Group, table: SessionTable) -> None:
         array = decode(values[...])
         # References and compound types point into the source file and mean nothing outside it.
         if array.dtype.kind in "biufU":
-            _write_column(group, name, array)
+            write_array(group, name, array)
 
 
-def _write_column(group: h5py.Group, name: str, values: Any) -> None:
+def write_array(group: h5py.Group, name: str, values: Any) -> h5py.Dataset:
+    """Write numbers, compressed if they are many, or text."""
     import h5py
 
     array = np.asarray(values)
     if array.dtype.kind in "UO":
-        group.create_dataset(name, data=array.astype(object), dtype=h5py.string_dtype())
-    else:
-        group.create_dataset(name, data=array, **_compression(array))
-
-
-def _compression(array: Any) -> dict[str, Any]:
-    return {"compression": "gzip", "shuffle": True} if array.size > 1000 else {}
+        return group.create_dataset(name, data=array.astype(object), dtype=h5py.string_dtype())
+    packed = {"compression": "gzip", "shuffle": True} if array.size > 1000 else {}
+    return group.create_dataset(name, data=array, **packed)
 
 
 def _need(group: h5py.Group, name: str, path: Path) -> Any:

@@ -13,10 +13,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from brainbench.core.errors import DataError
 from brainbench.core.files import atomic_path
+from brainbench.datasets.hdf5 import write_array
 from brainbench.datasets.nwb import STIMULI
 from brainbench.datasets.sessions import SPIKES, Series, Session, SessionTable, as_labels
 
@@ -109,7 +109,7 @@ def _write_table(group: h5py.Group, table: SessionTable, meanings: Mapping[str, 
         raise DataError(f"{table.label} has ids that are no integers, which NWB needs; export to .h5.") from error
     _describe(group.create_dataset("id", data=ids), "hdmf-common", "ElementIdentifiers")
     for name in names:
-        values = _write_array(group, name, np.asarray(table.data[name]))
+        values = write_array(group, name, np.asarray(table.data[name]))
         _describe(values, "hdmf-common", "VectorData", meanings.get(name, name))
         if f"{name}_index" in table.data:
             # The schema asks for unsigned row ends.
@@ -123,7 +123,7 @@ def _write_events(group: h5py.Group, series: Series) -> None:
     group.attrs["comments"] = "no comments"
     data = group.create_dataset("data", data=series.data)
     data.attrs.update({"conversion": np.float32(1), "resolution": np.float32(-1), "unit": "code"})
-    stamps = _write_array(group, "timestamps", series.timestamps)
+    stamps = write_array(group, "timestamps", series.timestamps)
     stamps.attrs.update({"interval": np.int32(1), "unit": "seconds"})
 
 
@@ -136,15 +136,6 @@ def _group(file: h5py.File, path: str, kind: str, description: str) -> h5py.Grou
     group = file.create_group(path)
     _describe(group, "core", kind, description)
     return group
-
-
-def _write_array(group: h5py.Group, name: str, values: NDArray[Any]) -> h5py.Dataset:
-    import h5py
-
-    if values.dtype.kind in "UO":
-        return group.create_dataset(name, data=values.astype(object), dtype=h5py.string_dtype())
-    packed = {"compression": "gzip", "compression_opts": 4, "shuffle": True} if values.size > 1000 else {}
-    return group.create_dataset(name, data=values, **packed)
 
 
 def _describe(item: h5py.Group | h5py.Dataset, namespace: str, kind: str, description: str = "") -> None:

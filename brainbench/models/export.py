@@ -13,7 +13,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from brainbench.core.errors import DataError, check_name, missing_dependency
+from brainbench.core.errors import DataError, check_name, needing
 
 if TYPE_CHECKING:
     from torch import nn
@@ -97,10 +97,8 @@ def export_model(model: nn.Module, path: str | Path, *, format: str = "onnx", na
 def require_onnx() -> None:
     """Raise :class:`MissingDependencyError` unless files of ONNX can be written and read."""
     for package in ("onnx", "onnxscript", "onnxruntime"):
-        try:
+        with needing(package, extra="export", purpose="Exporting to ONNX"):
             __import__(package)
-        except ImportError as error:
-            raise missing_dependency(package, extra="export", purpose="Exporting to ONNX") from error
     # The exporter warns that torchvision, which nothing here has a layer of, is not installed.
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)
 

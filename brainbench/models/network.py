@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import nn
 
-from brainbench.core.contracts import CHANNELS
+from brainbench.core.contracts import CHANNELS, SUB_STEP_SECONDS, SUB_STEPS
 from brainbench.core.errors import UsageError, check_each, check_name
 from brainbench.core.reading.ranges import check_number
 from brainbench.models.graph.spec import UNROLLS, Unroll
@@ -21,9 +21,6 @@ from brainbench.models.graph.temporal_graph import TemporalGraph
 from brainbench.models.heads.decoders import AllStepsDecoder, make_decoder
 from brainbench.models.normaliser import Normaliser
 from brainbench.models.parts import Attender, Encoder
-
-SUB_STEPS = 5
-SUB_STEP_SECONDS = 0.009
 
 
 @dataclass(frozen=True)

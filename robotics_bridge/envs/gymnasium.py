@@ -11,16 +11,14 @@ from typing import Any
 import numpy as np
 import torch
 
-from brainbench.core.errors import UsageError, check_each, missing_dependency
+from brainbench.core.errors import UsageError, check_each, needing
 from robotics_bridge import tasks
 from robotics_bridge.envs.env import Env
 from robotics_bridge.tasks.task import ACTION_LIMIT, MEASURED, check_measured
 
-try:
+with needing("gymnasium", extra="policies", purpose="The gymnasium adapter"):
     import gymnasium
     from gymnasium.vector import AutoresetMode, VectorEnv
-except ImportError as error:
-    raise missing_dependency("gymnasium", extra="policies", purpose="The gymnasium adapter") from error
 
 
 IDS = {

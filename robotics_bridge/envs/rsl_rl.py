@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from brainbench.core.errors import missing_dependency
+from brainbench.core.errors import needing
 
 if TYPE_CHECKING:
     from tensordict import TensorDict
@@ -24,10 +24,8 @@ class RslRlEnv:
     """
 
     def __init__(self, env: Env) -> None:
-        try:
+        with needing("tensordict", extra="policies", purpose="Learning with rsl_rl"):
             import tensordict  # noqa: F401
-        except ImportError as error:
-            raise missing_dependency("tensordict", extra="policies", purpose="Learning with rsl_rl") from error
         self.unwrapped = env
         """The native environment."""
         self.num_envs, self.num_actions, self.device = env.num_envs, env.num_actions, env.device

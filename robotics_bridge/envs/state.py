@@ -5,7 +5,7 @@ Letters: B environment, A action, J joint, F finger tip, K object, L tactile lin
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -78,10 +78,6 @@ class EpisodeState:
             rest_targets=rest.repeat(num_envs, 1), target=zeros(dtype=torch.long),
             totals=torch.zeros(6 + terms, device=device),
         )  # fmt: skip
-
-    def tensors(self) -> dict[str, torch.Tensor]:
-        """Return the tensors themselves by name."""
-        return {item.name: getattr(self, item.name) for item in fields(self)}
 
 
 class EnvState:
@@ -179,7 +175,7 @@ class EnvState:
         parts["simulation"] = self.simulation
         if self.task_state is not None:
             parts["task_state"] = self.task_state
-        found = self.episode.tensors()
+        found: dict[str, torch.Tensor] = dict(vars(self.episode))
         found |= {f"{part}.{name}": value for part, owner in parts.items() for name, value in owner.memory().items()}
         if self.touch is not None:
             clock, wp = self.touch.suite.context, warp()

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from brainbench.core.cuda_graphs import record_launches
 from brainbench.core.devices import mujoco_module, pick_device, warp
-from brainbench.core.errors import UsageError, missing_dependency, unknown_name
+from brainbench.core.errors import UsageError, needing, unknown_name
 from brainbench.core.reading.ranges import check_number
 from robotics_bridge.physics.kernels.state import fill_contacts, fill_links
 from robotics_bridge.physics.scene import TouchScene
@@ -200,10 +200,8 @@ class MujocoWarpEngine:
 
 def _mujoco_warp() -> Any:
     warp()
-    try:
+    with needing("mujoco-warp", extra="gpu", purpose="Simulation on a GPU"):
         import mujoco_warp
-    except ImportError as error:
-        raise missing_dependency("mujoco-warp", extra="gpu", purpose="Simulation on a GPU") from error
     return mujoco_warp
 
 

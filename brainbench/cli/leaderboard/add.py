@@ -9,7 +9,7 @@ import typer
 
 from brainbench.cli.destinations import out_folder
 from brainbench.cli.options import SCORE, SCORE_FLAGS, SchedulerOption, with_options
-from brainbench.cli.output import JsonOption, emit
+from brainbench.cli.output import Output
 from brainbench.core.errors import UsageError
 
 OFFERED = (
@@ -41,8 +41,7 @@ def add(
     ] = False,
     workers: Annotated[int, typer.Option(min=1, help="Processes that score.")] = 1,
     scheduler: SchedulerOption = None,
-    as_json: JsonOption = False,
-) -> None:
+) -> Output:
     """Add records to a folder: files that somebody sends, or scores computed now.
 
     A file is checked (layout, content hash, contradictions) and refused if it was edited, or if a record there
@@ -72,6 +71,5 @@ def add(
     states = [item["state"] for item in done]
     summary = ", ".join(f"{states.count(state)} {state}" for state in dict.fromkeys(states)) or "nothing to do"
     lines = [f"{item['state']:9} {item['record'] or item['model']}{item['note']}" for item in done]
-    emit({"folder": to, "results": done}, "\n".join([*lines, f"{to}: {summary}"]), as_json=as_json)
-    if "refused" in states:
-        raise typer.Exit(1)
+    failure = typer.Exit(1) if "refused" in states else None
+    return Output({"folder": to, "results": done}, "\n".join([*lines, f"{to}: {summary}"]), failure=failure)

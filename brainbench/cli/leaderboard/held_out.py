@@ -11,7 +11,7 @@ import typer
 
 from brainbench.cli.destinations import out_folder, out_folder_option
 from brainbench.cli.options import SCORE, with_options
-from brainbench.cli.output import JsonOption, emit, progress_bar
+from brainbench.cli.output import Output, progress_bar
 from brainbench.core.errors import UsageError
 from brainbench.core.files import content_hash, write_json
 from brainbench.core.reading.ranges import check_number
@@ -38,8 +38,7 @@ def hold_out(
         Path, typer.Option(callback=out_folder, help="Folder of what is kept back; never publish it.")
     ] = Path("held-out-secret"),
     options: Any = None,
-    as_json: JsonOption = False,
-) -> None:
+) -> Output:
     """Split recordings into a public part and a held-out part, drawn at random, and publish a hash of the latter.
 
     Anybody can score models on the public part; ``leaderboard verify --held-out`` scores a submission on the rest.
@@ -75,7 +74,7 @@ def hold_out(
         write_json(out / "held-out.json", commitment),
     ]
     text = f"published  {out}: {', '.join(path.name for path in files)}\nkept back  {secret}: {held_count} {kind}"
-    emit({"published": files, "secret": secret, "commitment": commitment}, text, as_json=as_json)
+    return Output({"published": files, "secret": secret, "commitment": commitment}, text)
 
 
 def split(whole: xr.Dataset, kind: str, names: list[str]) -> xr.Dataset:

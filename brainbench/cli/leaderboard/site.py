@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from brainbench.cli.destinations import out_file_option, out_folder_option
-from brainbench.cli.output import JsonOption, emit, progress_bar, table_of
+from brainbench.cli.output import Output, progress_bar, table_of
 
 if TYPE_CHECKING:
     from leaderboards.store import StoredRecord
@@ -25,8 +25,7 @@ def build(
     out: Annotated[Path, out_folder_option("Folder of the site.")] = Path("leaderboard"),
     title: Annotated[str, typer.Option(help="Title of the page.")] = "Which networks process touch like a brain?",
     show: Annotated[bool, typer.Option("--open", help="Open the site in a browser.")] = False,
-    as_json: JsonOption = False,
-) -> None:
+) -> Output:
     """Write the static site of a leaderboard: a folder of pages that need no server and no network."""
     from leaderboards.site.build import build_leaderboard
     from leaderboards.store import read_records
@@ -37,9 +36,9 @@ def build(
     problems = _problems(stored)
     good = len(stored) - len(problems)
     text = f"{page}  ({good} records, {len(problems)} with problems){_left_out(problems)}"
-    emit({"page": page, "records": good, "problems": problems}, text, as_json=as_json)
     if show and not webbrowser.open(page.resolve().as_uri()):
         typer.echo("No browser could be opened here; open the file above.", err=True)
+    return Output({"page": page, "records": good, "problems": problems}, text)
 
 
 def report(
@@ -51,8 +50,7 @@ def report(
         str | None, typer.Option("--format", "-f", help="md, html or pdf; by the suffix of --out, else html.")
     ] = None,
     title: Annotated[str, typer.Option(help="Heading of the report.")] = "Leaderboard report",
-    as_json: JsonOption = False,
-) -> None:
+) -> Output:
     """Write a report of result records as Markdown, HTML or PDF, with the citations as BibTeX beside it."""
     from leaderboards.changes import open_build
     from leaderboards.report.paper import write_paper
@@ -62,14 +60,13 @@ def report(
     with progress_bar("writing the report"):
         files = write_paper(stored, out or Path(f"leaderboard-report.{kind}"), format=kind, title=title)
     problems = _problems(stored)
-    emit({"files": files, "problems": problems}, "\n".join(map(str, files)) + _left_out(problems), as_json=as_json)
+    return Output({"files": files, "problems": problems}, "\n".join(map(str, files)) + _left_out(problems))
 
 
 def diff(
     before: Annotated[Path, typer.Argument(help="A folder of records, a record, or a built site.")],
     after: Annotated[Path, typer.Argument(help="The same, later.")],
-    as_json: JsonOption = False,
-) -> None:
+) -> Output:
     """Show which models were added, removed or changed, which ranks moved, and what caused it."""
     from leaderboards.changes import compare_builds, open_build
 
@@ -87,7 +84,7 @@ def diff(
     text = table_of("", told, columns) if told else "No difference."
     if restated := len(changes) - len(told):
         text += f"\n{restated} restated: other records with the same inputs and numbers."
-    emit({"changes": changes, "problems": problems}, text + _left_out(problems), as_json=as_json)
+    return Output({"changes": changes, "problems": problems}, text + _left_out(problems))
 
 
 def _problems(stored: list[StoredRecord]) -> list[dict[str, Any]]:

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from brainbench.cli.output import JsonOption, emit, table_of, tracked
+from brainbench.cli.output import Output, table_of, tracked
 from brainbench.core.errors import BrainbenchError
 
 
@@ -27,8 +27,7 @@ def verify(
         Path | None, typer.Option("--held-out", help="Published commitment; also score on what it holds back.")
     ] = None,
     secret: Annotated[Path, typer.Option(help="Folder of the held-out recordings.")] = Path("held-out-secret"),
-    as_json: JsonOption = False,
-) -> None:
+) -> Output:
     """Check records: the file against its hash, the records against one another, the numbers against a repetition.
 
     Only models of the registry and weights that come with the package are repeated: code that a record names could do
@@ -65,9 +64,9 @@ def verify(
             except BrainbenchError as error:
                 result |= {"verdict": "not repeated", "problem": str(error)}
         results.append(result)
-    emit(results, "\n".join(_verdict(result) for result in results), as_json=as_json)
-    if any(result["verdict"] in ("refused", "differs", "not repeated") for result in results):
-        raise typer.Exit(1)
+    failed = any(result["verdict"] in ("refused", "differs", "not repeated") for result in results)
+    text = "\n".join(_verdict(result) for result in results)
+    return Output(results, text, failure=typer.Exit(1) if failed else None)
 
 
 def _verdict(result: dict[str, Any]) -> str:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from brainbench.cli.destinations import out_file
-from brainbench.cli.output import JsonOption, emit, progress_bar
+from brainbench.cli.output import Output, progress_bar
 
 if TYPE_CHECKING:
     from robotics_bridge.deploy.session import DeployedPolicy
@@ -23,8 +23,7 @@ def export(
             callback=out_file, help="File to write; by default policy.onnx in the folder of the run, or here."
         ),
     ] = None,
-    as_json: JsonOption = False,
-) -> None:
+) -> Output:
     """Write a student with normalisers, taxel grid, encoder and head in one file, and compare it step by step."""
     from robotics_bridge.policies.export import STEPS, export_policy
     from robotics_bridge.policies.training.student_files import load_student
@@ -37,7 +36,7 @@ def export(
         f"{found.path}: {found.state_size:,} numbers of memory; {STEPS} steps with resets differ by at most "
         f"{found.difference:.1e} of the largest action\n{found.contract}"
     )
-    emit(found, text, as_json=as_json)
+    return Output(found, text)
 
 
 def deploy(
@@ -67,8 +66,7 @@ def deploy(
         bool, typer.Option("--realtime", help="Run the loop ahead of all other work of the computer (SCHED_FIFO).")
     ] = False,
     record: Annotated[Path | None, typer.Option(help="Folder to write the session to, as a LeRobot data set.")] = None,
-    as_json: JsonOption = False,
-) -> None:
+) -> Output:
     """Run a policy at its rate with watchdog, limits and safe stop; print latencies and why it stopped, if it did.
 
     Exit status 1: it was stopped for safety.
@@ -126,9 +124,7 @@ def deploy(
         f"or forged; targets limited in {report.limited} ticks\n"
         f"{controller.latency.text()}"
     )
-    emit(facts, text, as_json=as_json)
-    if report.status == "stopped":
-        raise typer.Exit(1)
+    return Output(facts, text, failure=typer.Exit(1) if report.status == "stopped" else None)
 
 
 def _inputs(deployed: DeployedPolicy, words: list[str]) -> dict[str, Any]:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from brainbench.cli.options import filled_from
+from brainbench.cli.output import Output
 
 if TYPE_CHECKING:
     from robotics_bridge.envs import Env
@@ -79,7 +80,7 @@ def read_task_file(file: Path | None) -> None:
         load_module(str(file.absolute()))
 
 
-def in_world(command: Callable[..., None]) -> Callable[..., None]:
+def in_world(command: Callable[..., Output]) -> Callable[..., Output]:
     """Decorate a command so that its parameter ``world`` is filled from an argument and options."""
     own = list(inspect.signature(World, eval_str=True).parameters.values())
     return filled_from(command, "world", own, lambda values: World(**values))

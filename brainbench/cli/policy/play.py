@@ -10,11 +10,11 @@ import typer
 
 from brainbench.cli.destinations import out_file, out_file_option
 from brainbench.cli.options import with_options
-from brainbench.cli.output import JsonOption, emit, facts, progress_bar, table_of
+from brainbench.cli.output import Output, facts, progress_bar, table_of
 from brainbench.cli.policy.options import ENV, TOUCH, DeviceOption, EnvsOption, World, agent_of, in_world, touch_of
 
 
-def list_tasks(as_json: JsonOption = False) -> None:
+def list_tasks() -> Output:
     """List the tasks with their success, length, observation groups, and the policies that come with the package."""
     from robotics_bridge import tasks
     from robotics_bridge.policies.contract import trained_contacts
@@ -49,7 +49,7 @@ def list_tasks(as_json: JsonOption = False) -> None:
     policies = [(name, row["task"], row["contacts"][name]) for row in found for name in row["shipped"]]
     heads = ("trained policy", "task", "contacts")
     trained = table_of("", policies, {head: f"{{0[{index}]}}" for index, head in enumerate(heads)})
-    emit(found, f"{table_of('', found, columns)}\n\n{trained}", as_json=as_json)
+    return Output(found, f"{table_of('', found, columns)}\n\n{trained}")
 
 
 @with_options(ENV, (*TOUCH, "device", "seed"), build=False)
@@ -65,8 +65,7 @@ def play(
     seconds: Annotated[float, typer.Option(help="Simulated time.")] = 4.0,
     rate: Annotated[float, typer.Option(help="Frames per simulated second of a film.")] = 20.0,
     width: Annotated[int, typer.Option(help="Of a frame [pixels].")] = 480,
-    as_json: JsonOption = False,
-) -> None:
+) -> Output:
     """Run an agent in one environment of a task and show what happens, as numbers and as a film."""
     from brainbench.core.figures.style import check_format
     from brainbench.core.reading.ranges import check_number
@@ -132,7 +131,7 @@ def play(
         "dropped": f"{dropped} times", "episodes ended": ended, "reward": f"{sum(rewards):.3g}",
     }  # fmt: skip
     shown |= {"files": ", ".join(map(str, pictures))} if pictures else {}
-    emit(told, f"{env.task.text}\n\n{facts(shown)}", as_json=as_json)
+    return Output(told, f"{env.task.text}\n\n{facts(shown)}")
 
 
 @in_world
@@ -147,8 +146,7 @@ def evaluate(
     envs: EnvsOption = 34,  # as in our records: every object of in_palm_rotate twice
     device: DeviceOption = "cpu",
     out: Annotated[Path | None, out_file_option("Write the result as JSON here too.")] = None,
-    as_json: JsonOption = False,
-) -> None:
+) -> Output:
     """Compare agents over whole episodes: success rate with its 95 % interval, and what it does not tell.
 
     The last column is the success by kind of object; ``--out`` and ``--json`` say it for each object.
@@ -186,7 +184,7 @@ def evaluate(
         ">diverged": "{0[diverged]}",
         ">by object": lambda item: _by_kind(item["objects"]),
     }
-    emit(found, table_of(f"{env.task.text}; contacts: {contacts}", found, columns), as_json=as_json, out=out)
+    return Output(found, table_of(f"{env.task.text}; contacts: {contacts}", found, columns), out=out)
 
 
 def _by_kind(objects: Mapping[str, Mapping[str, float]]) -> str:

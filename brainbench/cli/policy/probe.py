@@ -9,7 +9,7 @@ import typer
 
 from brainbench.cli.destinations import out_file, out_file_option
 from brainbench.cli.options import with_options
-from brainbench.cli.output import JsonOption, emit, progress_bar, table_of
+from brainbench.cli.output import Output, progress_bar, table_of
 from brainbench.cli.policy.options import DeviceOption, EnvsOption, World, agent_of, in_world, touch_of
 
 
@@ -32,8 +32,7 @@ def probe(
         Path | None, typer.Option(callback=out_file, help="Write the taxels that --place chose here, as a probe file.")
     ] = None,
     out: Annotated[Path | None, out_file_option("Write the result as JSON here too.")] = None,
-    as_json: JsonOption = False,
-) -> None:
+) -> Output:
     """Read object position, velocity, spin and contact linearly from what encoders make of one rollout's touch.
 
     Prints R² on environments left out, with 95 % intervals over environments and draws, and the differences of trained
@@ -72,7 +71,7 @@ def probe(
     text = _table("R² on environments left out, by object quantity", told["arms"], size, "draws")
     if told["differences"]:
         text += "\n" + _table("Differences of R²", told["differences"], "less", sign="+")
-    emit(told, text, as_json=as_json, out=out)
+    return Output(told, text, out=out)
 
 
 def _table(title: str, rows: list[dict[str, Any]], *more: str, sign: str = "") -> str:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from brainbench.cli.destinations import out_folder, picture_file
-from brainbench.cli.output import JsonOption, emit, table, table_of
+from brainbench.cli.output import Output, table, table_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -30,8 +30,7 @@ def report(
     differences: Annotated[
         bool, typer.Option("--differences", help="Test every pair of students of a task and hand against each other.")
     ] = False,
-    as_json: JsonOption = False,
-) -> None:
+) -> Output:
     """Print success and its 95 % interval per task, observation type and encoder, and the gain over no touch.
 
     Goals reached, rotation about the commanded axis (rad/s, while anything touched the object), seconds until the
@@ -84,7 +83,7 @@ def report(
         }
         lines.append("\n" + table_of("First less second", pairs, shown))
     data = {"students": data, "agents": agents, "records": written, "differences": pairs}
-    emit(data, "\n".join([*lines, *written]), as_json=as_json)
+    return Output(data, "\n".join([*lines, *written]))
 
 
 def _pairs(results: Sequence[StudentResult]) -> list[dict[str, Any]]:

@@ -10,7 +10,7 @@ import typer
 
 from brainbench.cli.destinations import out_folder, out_folder_option
 from brainbench.cli.options import part_of, with_options
-from brainbench.cli.output import JsonOption, emit, facts, progress_bar, table
+from brainbench.cli.output import Output, facts, progress_bar, table
 from brainbench.cli.policy.options import DeviceOption, TaskArgument, TaskFileOption, World, in_world, read_task_file
 
 
@@ -31,8 +31,7 @@ def train(
     resolution: Annotated[str, typer.Option(help="Number of taxels: low, med or high.")] = "med",
     initial_std: Annotated[float | None, typer.Option(help="Of the first policy's actions (published: 1).")] = None,
     device: DeviceOption = "cpu",
-    as_json: JsonOption = False,
-) -> None:
+) -> Output:
     """Train the teacher of a task by PPO, or go on with a run.
 
     With --observe proprio,touch the policy reads what a hand has, and remembers (recurrent PPO); the folder ``policy``
@@ -56,7 +55,7 @@ def train(
         "reward": last.get("reward"), "success": last.get("episode/success"),
     }  # fmt: skip
     shown = {key: f"{value:.4g}" if isinstance(value, float) else value for key, value in told.items()}
-    emit(told | {"last": last}, facts(shown), as_json=as_json)
+    return Output(told | {"last": last}, facts(shown))
 
 
 DISTILL = "robotics_bridge.policies.training.distill_config:DistillConfig"
@@ -97,8 +96,7 @@ def distill(
     stop_after: Annotated[float | None, typer.Option(help="Save, stop and evaluate after so many seconds.")] = None,
     stop_at: Annotated[int | None, typer.Option(help="Likewise after so many iterations in all.")] = None,
     task_file: TaskFileOption = None,
-    as_json: JsonOption = False,
-) -> None:
+) -> Output:
     """Distil a teacher into a student that feels; a run that was interrupted goes on when it is started again."""
     from robotics_bridge.policies.encoders.arms import ARMS, AUTO
     from robotics_bridge.policies.training.distill_config import DistillConfig
@@ -127,9 +125,8 @@ def distill(
         "seconds": round(student.result.seconds, 1),
     }
     lines = [f"{key}: {value}" for key, value in told.items() if value not in ("", None)]
-    emit(told, "\n".join(lines), as_json=as_json)
-    if student.result.status == "diverged":
-        raise typer.Exit(1)
+    failure = typer.Exit(1) if student.result.status == "diverged" else None
+    return Output(told, "\n".join(lines), failure=failure)
 
 
 def sweep(
@@ -144,8 +141,7 @@ def sweep(
     episodes: Annotated[int, typer.Option(help="Of the evaluation, per seed.")] = 100,
     device: DeviceOption = "cpu",
     task_file: TaskFileOption = None,
-    as_json: JsonOption = False,
-) -> None:
+) -> Output:
     """Distil every student of a sweep that is not finished yet; what was interrupted goes on."""
     from robotics_bridge.policies.training.students import is_done, train_student
     from robotics_bridge.policies.training.sweep import PUBLISHED, read_sweep
@@ -158,15 +154,13 @@ def sweep(
         more = numbers["students"] - numbers["published"]
         extra = f" ({numbers['published']} without {', '.join(found.extra_types)})" if more else ""
         text = table("", ["entry or type", "students"], rows, right=(1,))
-        emit(numbers, f"{text}\n\n{numbers['students']} students in {found.name}, {subset}{extra}", as_json=as_json)
-        return
+        return Output(numbers, f"{text}\n\n{numbers['students']} students in {found.name}, {subset}{extra}")
     part, parts = part_of(shard, "--shard takes")
     changes: dict[str, Any] = {"num_envs": envs, "iterations": iterations}
     changes = {name: value for name, value in changes.items() if value is not None}
     students = [replace(student, **changes) for student in found.students(subset)][part::parts]
     if names:
-        emit([student.name for student in students], "\n".join(student.name for student in students), as_json=as_json)
-        return
+        return Output([student.name for student in students], "\n".join(student.name for student in students))
     results = []
     for student in students:
         folder = out / student.name
@@ -176,4 +170,4 @@ def sweep(
         with progress_bar() as progress:
             done = train_student(student, folder, device=device, episodes=episodes, progress=progress)
         results.append({"student": student.name, "status": done.result.status})
-    emit(results, "\n".join(f"{item['student']}: {item['status']}" for item in results), as_json=as_json)
+    return Output(results, "\n".join(f"{item['student']}: {item['status']}" for item in results))

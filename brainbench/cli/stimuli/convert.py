@@ -13,7 +13,7 @@ import typer
 
 from brainbench.cli.destinations import beside
 from brainbench.cli.options import refuse
-from brainbench.cli.output import JsonOption, emit, facts, progress_bar
+from brainbench.cli.output import Output, facts, progress_bar
 from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, listing
 from brainbench.core.writing.temporaries import temporary_path
 
@@ -50,8 +50,7 @@ def convert(
     dialect: Annotated[
         str | None, typer.Option(help="Of a written run: thesis (default), or sense-lab, where commas end lines.")
     ] = None,
-    as_json: JsonOption = False,
-) -> None:
+) -> Output:
     """Convert published sweeps to a data set, sweeps and WHISKiT runs to a stimulus set, or a stimulus set to a run.
 
     Numbers become N and N·m, or mN and µN·m in a run; axes and signs are alike. What cannot be trusted is counted.
@@ -86,7 +85,7 @@ def convert(
         )
     made = {"source": source, "out": out, **made}
     text = {name.replace("_", " "): _told(value) for name, value in made.items()}
-    emit(made, facts(text), as_json=as_json)
+    return Output(made, facts(text))
 
 
 _SET = "a stimulus set, a file that ends in .h5, .hdf5 or .nc"

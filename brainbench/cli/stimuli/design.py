@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from brainbench.cli.options import items, with_options
-from brainbench.cli.output import JsonOption, emit, progress_bar, table_of
+from brainbench.cli.output import Output, progress_bar, table_of
 from brainbench.cli.stimuli import scenes
 from brainbench.cli.stimuli.scenes import BackendOption, WhiskersOption
 from brainbench.stimuli.engines import DEFAULT_ENGINE
@@ -33,8 +33,7 @@ def design(
     ] = "",
     whiskers: WhiskersOption = "all",
     backend: BackendOption = DEFAULT_ENGINE,
-    as_json: JsonOption = False,
-) -> None:
+) -> Output:
     """Choose the whisking, or the place of the objects, that tells the objects, or two networks, apart best."""
     from brainbench.stimuli.design import design as run
     from brainbench.stimuli.design_variables import VARIABLES
@@ -55,7 +54,7 @@ def design(
     chosen = table_of("", rows, {"variable": "{0[0]}", ">given": "{0[1]:.4g}", ">chosen": "{0[2]:.4g} {0[3]}"})
     status = f"status  {result.status} {result.reason}".rstrip()
     data = {name: value for name, value in vars(result).items() if name != "scenes"}
-    emit({**data, "options": options}, f"{chosen}\n\n{told}\n{status}", as_json=as_json)
+    return Output({**data, "options": options}, f"{chosen}\n\n{told}\n{status}")
 
 
 def _of_objects(result: DesignResult) -> str:

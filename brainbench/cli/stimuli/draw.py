@@ -9,7 +9,7 @@ import typer
 
 from brainbench.cli.destinations import out_file_option
 from brainbench.cli.options import numbers, refuse
-from brainbench.cli.output import JsonOption, emit, progress_bar
+from brainbench.cli.output import Output, progress_bar
 from brainbench.cli.stimuli import scenes
 from brainbench.cli.stimuli.scenes import BackendOption, FidelityOption, StimulusOption, WhiskersOption
 from brainbench.stimuli.engines import DEFAULT_ENGINE
@@ -42,8 +42,7 @@ def render(
     whiskers: WhiskersOption = "all",
     fidelity: FidelityOption = "balanced",
     backend: BackendOption = DEFAULT_ENGINE,
-    as_json: JsonOption = False,
-) -> None:
+) -> Output:
     """Draw a scene: whiskers bent by its objects, as a picture or a film; no display is needed."""
     from brainbench.core.figures.style import check_format
     from brainbench.stimuli.figures import scenes as drawing
@@ -79,7 +78,7 @@ def render(
         path = drawing.render(scene, out, **how, fidelity=fidelity, backend=backend, progress=progress)
     data = {"path": path, "stimulus": scene.label, "times_s": times, "camera": camera, "style": style}
     what = f"{times[0] * 1e3:g}" if len(times) == 1 else f"{len(times)} frames, {times[0] * 1e3:g}–{times[-1] * 1e3:g}"
-    emit(data, f"{scene.label} ({what} ms)  {path}", as_json=as_json)
+    return Output(data, f"{scene.label} ({what} ms)  {path}")
 
 
 def plot(
@@ -95,8 +94,7 @@ def plot(
     whiskers: WhiskersOption = "all",
     fidelity: FidelityOption = "balanced",
     backend: BackendOption = DEFAULT_ENGINE,
-    as_json: JsonOption = False,
-) -> None:
+) -> Output:
     """Plot forces or moments of every whisker on the 5 × 7 layout, to one scale, contacts shaded."""
     import math
 
@@ -115,4 +113,4 @@ def plot(
     width, height = numbers(size, "--size", count=2)
     chosen = {"channel": channel, "stimulus": stimulus, "window": (low, high)}
     paths = draw(dataset, out, **chosen, size=(width, height))
-    emit({"paths": paths, "channel": channel}, "\n".join(map(str, paths)), as_json=as_json)
+    return Output({"paths": paths, "channel": channel}, "\n".join(map(str, paths)))

@@ -10,7 +10,7 @@ import typer
 
 from brainbench.cli.destinations import out_file, picture_file
 from brainbench.cli.options import changed, items, option, refuse, with_options
-from brainbench.cli.output import JsonOption, emit, progress_bar, table_of
+from brainbench.cli.output import Output, progress_bar, table_of
 from brainbench.cli.stimuli import scenes
 from brainbench.cli.stimuli.scenes import StimulusOption
 from brainbench.core.errors import UsageError, check_once, shown
@@ -73,8 +73,7 @@ def fit(
     picture: Annotated[
         Path | None, typer.Option(callback=picture_file, help="Draw fit and residuals (.png, .svg or .pdf).")
     ] = None,
-    as_json: JsonOption = False,
-) -> None:
+) -> Output:
     """Estimate parameters of a whisker, with intervals, from traced shapes or base wrenches."""
     from brainbench.stimuli.fitting.tracks.options import TrackOptions
     from brainbench.stimuli.fitting.tracks.readers import holds_shapes, read_shapes
@@ -115,7 +114,7 @@ def fit(
         if picture is not None:
             draw_fit(trial, result, picture)
         data, text = result.summary(), _text(result, measured)
-    emit(data, text, as_json=as_json, out=out)
+    return Output(data, text, out=out)
 
 
 def _contacts(

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from brainbench.cli.destinations import out_file_option
-from brainbench.cli.output import JsonOption, emit, progress_bar, table_of
+from brainbench.cli.output import Output, progress_bar, table_of
 
 if TYPE_CHECKING:
     from robotics_bridge.exploration.record import Explored
@@ -38,8 +38,7 @@ def hand(
     noisy: Annotated[bool, typer.Option("--noisy", help="Taxels with the published imperfections.")] = False,
     frames: Annotated[int, typer.Option(help="Frames of 9 ms; a multiple of 5.")] = 110,
     seed: Annotated[int, typer.Option(help="Of the noise.")] = 0,
-    as_json: JsonOption = False,
-) -> None:
+) -> Output:
     """Record exploratory procedures of a robot hand as a stimulus set that any model can be scored or probed on.
 
     Sites of the hand stand in for whiskers (5 fingers × 7 sites); forces are scaled to a whisker's.
@@ -87,7 +86,7 @@ def hand(
     if silent:
         text += f"\n\n{len(silent)} never touch a taxel: {', '.join(silent)}."
     result = {"stimuli": data, "calibration": calibration, "content_hash": dataset.attrs["content_hash"], "path": out}
-    emit(result, text + ("" if out is None else f"\n\nstimuli  {out}"), as_json=as_json)
+    return Output(result, text + ("" if out is None else f"\n\nstimuli  {out}"))
 
 
 def objects_of(text: str, diagonal: float, unit: str | None = None) -> list[Explored]:

@@ -9,7 +9,7 @@ import typer
 
 from brainbench.cli.destinations import out_file
 from brainbench.cli.options import refuse
-from brainbench.cli.output import JsonOption, emit, facts, progress_bar, table
+from brainbench.cli.output import Output, facts, progress_bar, table
 
 if TYPE_CHECKING:
     from brainbench.geometry import DecompositionSettings, Mesh
@@ -39,8 +39,7 @@ def objects(
     export: Annotated[
         Path | None, typer.Option(callback=out_file, help="Write the repaired mesh, in mm (.obj .stl .ply .glb .off).")
     ] = None,
-    as_json: JsonOption = False,
-) -> None:
+) -> Output:
     """List the shape families, or describe one object: its size, its faults, and what whiskers touch of it."""
     from brainbench.geometry import DecompositionSettings, save_mesh
 
@@ -50,8 +49,7 @@ def objects(
         one = {"--unit": unit, "--diagonal-mm": diagonal_mm, "--collision": collision, "--export": export}
         refuse(one, "without a family or a mesh file")
         data, text = _families() if source is None else _folder(source, ids, categories)
-        emit(data, text, as_json=as_json)
-        return
+        return Output(data, text)
     refuse({"--ids": ids, "--categories": categories}, "for one object")
     with progress_bar("preparing the object"):
         if Path(source).is_file():
@@ -62,7 +60,7 @@ def objects(
             data, solid = _member(source, seed, detail, diagonal, collision, settings)
     if export is not None and solid.mesh is not None:
         data["export"] = save_mesh(export, solid.mesh, unit="mm")
-    emit(data, _text(data), as_json=as_json)
+    return Output(data, _text(data))
 
 
 def _families() -> tuple[dict[str, Any], str]:

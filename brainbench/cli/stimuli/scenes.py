@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from brainbench.cli.options import SCORE, option
-from brainbench.cli.output import JsonOption, emit, table
+from brainbench.cli.output import Output, table
 from brainbench.core.errors import UsageError, check_name, choose_name
 from brainbench.core.reading.regular import readable
 
@@ -65,21 +65,20 @@ def choose_scene(recipe: Recipe, stimulus: str | None) -> Scene:
     return recipe.scenes[recipe.labels.index(chosen)]
 
 
-def list_(as_json: JsonOption = False) -> None:
+def list_() -> Output:
     """List the stimulus recipes."""
     from brainbench.stimuli import list_recipes
     from brainbench.stimuli.scenes.recipes import describe_recipe
 
     recipes = {name: describe_recipe(name).strip() for name in list_recipes()}
-    emit(recipes, table("", ["recipe", ""], [list(item) for item in recipes.items()]), as_json=as_json)
+    return Output(recipes, table("", ["recipe", ""], [list(item) for item in recipes.items()]))
 
 
 def show(
     source: Annotated[str, typer.Argument(help="A recipe name, a scene file (.toml) or a stimulus-set file (.h5).")],
     stimulus: StimulusOption = None,
     whiskers: Annotated[str, typer.Option(help="Show the scenes with these whiskers only.")] = "all",
-    as_json: JsonOption = False,
-) -> None:
+) -> Output:
     """Print what stands in the scenes: whiskers, objects, poses, motion and frames."""
     if Path(source).suffix in (".h5", ".hdf5", ".nc"):
         from brainbench.stimuli import read_stimulus_set
@@ -93,7 +92,7 @@ def show(
         recipe = open_recipe(source, whiskers)
         data = _of_recipe(recipe, list(recipe.scenes) if stimulus is None else [choose_scene(recipe, stimulus)])
         text = _text(data)
-    emit(data, text, as_json=as_json)
+    return Output(data, text)
 
 
 def _of_recipe(recipe: Recipe, scenes: list[Scene]) -> dict[str, Any]:

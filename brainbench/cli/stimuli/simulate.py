@@ -9,7 +9,7 @@ import typer
 
 from brainbench.cli.destinations import out_file_option
 from brainbench.cli.options import items, numbers
-from brainbench.cli.output import JsonOption, emit, progress_bar, table_of
+from brainbench.cli.output import Output, progress_bar, table_of
 from brainbench.cli.stimuli.scenes import BackendOption, FidelityOption, WhiskersOption
 from brainbench.stimuli.engines import DEFAULT_ENGINE
 
@@ -24,8 +24,7 @@ def simulate(
         bool, typer.Option("--explain", help="Tell what was simulated, shared and left out, and what that saved.")
     ] = False,
     cache: Annotated[bool, typer.Option("--cache/--no-cache", help="Read kept results and keep new ones.")] = True,
-    as_json: JsonOption = False,
-) -> None:
+) -> Output:
     """Simulate a recipe or a scene file and report which whiskers touched what, and how hard."""
     from brainbench.stimuli import write_stimulus_set
     from brainbench.stimuli.explain import Explanation
@@ -58,7 +57,7 @@ def simulate(
     if told is not None:
         data["explanation"] = told
         text += f"\n\n{told}"
-    emit(data, text + ("" if out is None else f"\n\nstimuli  {out}"), as_json=as_json)
+    return Output(data, text + ("" if out is None else f"\n\nstimuli  {out}"))
 
 
 def _unstable(dataset: Any) -> list[dict[str, str]]:
@@ -107,8 +106,7 @@ def separability(
     sweeps_per_class: Annotated[int, typer.Option(min=2, help="Sweeps drawn of each class.")] = 400,
     split: Annotated[str, typer.Option(help="all, train, validation or test.")] = "all",
     seed: Annotated[int, typer.Option(help="Of the draw, the folds and the resampling.")] = 0,
-    as_json: JsonOption = False,
-) -> None:
+) -> Output:
     """Train support vector machines on 2, 3 and 4 classes; print their accuracy on new objects against chance."""
     from brainbench.datasets.whisking.dataset import WhiskingDataset
     from brainbench.datasets.whisking.separability import separability as measure
@@ -138,4 +136,4 @@ def separability(
         "unstable": data.skipped,
         "results": [{**vars(item), "above_chance": item.above_chance} for item in found],
     }
-    emit(result, text, as_json=as_json)
+    return Output(result, text)

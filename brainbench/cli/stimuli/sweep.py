@@ -11,7 +11,7 @@ import typer
 
 from brainbench.cli.destinations import out_folder_option
 from brainbench.cli.options import SchedulerOption, WorkersOption, with_options
-from brainbench.cli.output import JsonOption, emit, facts, progress_bar
+from brainbench.cli.output import Output, facts, progress_bar
 from brainbench.cli.stimuli.scenes import BackendOption, FidelityOption, WhiskersOption
 from brainbench.core.errors import UsageError, check_name, listing
 from brainbench.stimuli.engines import DEFAULT_ENGINE
@@ -48,8 +48,7 @@ def sweep(
     whiskers: WhiskersOption = "all",
     fidelity: FidelityOption = "balanced",
     backend: BackendOption = DEFAULT_ENGINE,
-    as_json: JsonOption = False,
-) -> None:
+) -> Output:
     """Count the sweeps of a grid beside the published counts; with --out make a data set of them.
 
     A run that was interrupted or killed goes on where it stopped when the same command is given again.
@@ -87,7 +86,7 @@ def sweep(
         made, told = _generate(plan, out, workers, scheduler)
         data |= made
         text += f"\n\n{told}"
-    emit(data, text, as_json=as_json)
+    return Output(data, text)
 
 
 def _describe(plan: GenerationPlan) -> str:

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from brainbench.cli.destinations import out_file_option, out_folder_option
-from brainbench.cli.output import JsonOption, emit, table, table_of, tracked
+from brainbench.cli.output import Output, table, table_of, tracked
 from brainbench.cli.policy.options import HandOption
 
 
@@ -18,8 +18,7 @@ def demo(
     hand: HandOption = "xhand1",
     resolution: Annotated[str, typer.Option(help="low, med or high.")] = "high",
     noisy: Annotated[bool, typer.Option("--noisy", help="Draw measured readings with the published noise.")] = False,
-    as_json: JsonOption = False,
-) -> None:
+) -> Output:
     """Let a hand close around a warm ball and draw what it feels.
 
     Four pictures: forces on the taxels, marker motion of an elastomer, temperature of the finger tips, and the sound
@@ -45,7 +44,7 @@ def demo(
     if not made["forces"]["in contact"]:
         text += f"\n\nNo taxel of {hand} touched the ball: closed, its fingers do not reach it. "
         text += f"Its probes are listed by: brainbench tactile layouts --hand {hand}"
-    emit(made, text, as_json=as_json)
+    return Output(made, text)
 
 
 def layouts(
@@ -53,8 +52,7 @@ def layouts(
     probes: Annotated[Path | None, typer.Option(help="Probe file (published JSON form) to show instead.")] = None,
     links: Annotated[bool, typer.Option("--links", help="Also list every link.")] = False,
     out: Annotated[Path | None, out_folder_option("Write the layouts as probe files here.")] = None,
-    as_json: JsonOption = False,
-) -> None:
+) -> Output:
     """Count the probes of a hand by resolution and placement, as table 4.11 of the thesis does."""
     from robotics_bridge import hands
     from robotics_bridge.hands import layouts
@@ -81,7 +79,7 @@ def layouts(
         text += "\n\n" + table("", ["resolution", "link", "grid", "active", "radius (mm)"], detail, right=(3,))
     told = {name: getattr(chosen, name) for name in ("palm", "joints", "fingers")}
     data = {"hand": chosen.name, **told, "counts": counts}
-    emit(data, text, as_json=as_json)
+    return Output(data, text)
 
 
 def bench(
@@ -92,8 +90,7 @@ def bench(
     device: Annotated[str, typer.Option(help="cpu or cuda.")] = "cpu",
     noisy: Annotated[bool, typer.Option("--noisy", help="With the published noise of each sensor.")] = False,
     repeats: Annotated[int, typer.Option(help="Timed updates; the median counts.")] = 20,
-    as_json: JsonOption = False,
-) -> None:
+) -> Output:
     """Time one update of each sensor class on a hand that holds a ball, with the memory per environment.
 
     The benchmark against peers and rooflines is benchmarks/tactile/throughput.py in the repository.
@@ -119,10 +116,10 @@ def bench(
         ">bytes/environment": "{0[state_bytes]:,}",
     }
     text = table_of(f"{hand}, {resolution} {placement}, {envs} environments on {device}{noise}", results, columns)
-    emit({"results": results, "envs": envs, "device": device}, text, as_json=as_json)
+    return Output({"results": results, "envs": envs, "device": device}, text)
 
 
-def check(device: Annotated[str, typer.Option(help="cpu or cuda.")] = "cpu", as_json: JsonOption = False) -> None:
+def check(device: Annotated[str, typer.Option(help="cpu or cuda.")] = "cpu") -> Output:
     """Compare sensors with closed forms on this machine; exit status 1 if one is off."""
     from robotics_bridge.sensors.checks import CHECKS
 
@@ -138,17 +135,16 @@ def check(device: Annotated[str, typer.Option(help="cpu or cuda.")] = "cpu", as_
         ">relative error": "{0[error]:.1e}",
         "": lambda item: "ok" if item["passed"] else "OFF",
     }
-    emit({"device": device, "checks": results}, table_of(f"Checks on {device}", results, columns), as_json=as_json)
-    if not all(result["passed"] for result in results):
-        raise typer.Exit(1)
+    failure = None if all(result["passed"] for result in results) else typer.Exit(1)
+    text = table_of(f"Checks on {device}", results, columns)
+    return Output({"device": device, "checks": results}, text, failure=failure)
 
 
 def calibrate(
     log: Annotated[Path, typer.Argument(help="CSV with 'time' (s), probes, and optionally 'reference' and 'episode'.")],
     out: Annotated[Path | None, out_file_option("Write the preset here (.json).")] = None,
     max_delay: Annotated[float, typer.Option(help="Longest read delay that is tried (s).")] = 0.5,
-    as_json: JsonOption = False,
-) -> None:
+) -> Output:
     """Fit the noise model to a recording of a real device, with 95 % intervals, and write a preset.
 
     'reference' holds the true signal in the sensor's unit (a load cell, a stage); without it the device was at rest.
@@ -175,4 +171,4 @@ def calibrate(
     text = table_of(title, list(found.estimates.items()), columns)
     text += "\n\n" + "\n".join(found.notes) + (f"\nWrote {out}." if out is not None else "")
     data = {"noise": found.noise, "estimates": found.estimates, "notes": found.notes, "about": about}
-    emit({**data, "preset": out}, text, as_json=as_json)
+    return Output({**data, "preset": out}, text)

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from brainbench.core.errors import UsageError, listing, missing_dependency, nearest
+from brainbench.core.errors import UsageError, listing, nearest, needing
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -22,11 +22,9 @@ def new_figure(width: int, height: int) -> Figure:
 
     Without matplotlib it is a :class:`MissingDependencyError`.
     """
-    try:
+    with needing("matplotlib", extra="report", purpose="Drawing pictures"):
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
-    except ImportError as error:
-        raise missing_dependency("matplotlib", extra="report", purpose="Drawing pictures") from error
     figure = Figure(figsize=(width / DOTS_PER_INCH, height / DOTS_PER_INCH), dpi=DOTS_PER_INCH, facecolor="white")
     FigureCanvasAgg(figure)
     return figure

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from brainbench.core.errors import DataError, listing, missing_dependency, repeats, shown
+from brainbench.core.errors import DataError, listing, needing, repeats, shown
 from brainbench.core.reading.regular import MOST_TEXT, check_file, readable, reason
 
 MOST_LEVELS = 64
@@ -85,10 +85,8 @@ def read_yaml(path: str | os.PathLike[str], kind: str = "file") -> Any:
         DataError: it cannot be parsed, repeats values by alias or names, or see :func:`parse_json`.
         MissingDependencyError: no reader of YAML is installed.
     """
-    try:
+    with needing("pyyaml", extra="hub", purpose="Reading YAML settings"):
         import yaml
-    except ImportError as error:
-        raise missing_dependency("pyyaml", extra="hub", purpose="Reading YAML settings") from error
     text, name = read_text(path, kind), os.fspath(path)
     with readable(path, "YAML"):
         try:

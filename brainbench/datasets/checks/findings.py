@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+from brainbench.core.errors import listing
+
 Severity = Literal["error", "warning", "note"]
 SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
 """Worst first."""
@@ -35,4 +37,4 @@ def share(part: int, whole: int) -> str:
 
 def some(names: list[str], limit: int = 5) -> str:
     """Return the first few names and how many more there are."""
-    return ", ".join(names[:limit]) + (f" and {len(names) - limit} more" if len(names) > limit else "")
+    return listing(names, limit=limit, quoted=False)

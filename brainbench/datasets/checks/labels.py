@@ -23,7 +23,7 @@ def check_labels(session: Session, layout: RecordingLayout | None, conditions: C
     if conditions is None:
         proposals = [item.conditions for item in propose(session)]
         if session.tables:
-            message = f"no layout fits, so labels were not checked; columns to try: {some(proposals, 3) or 'none'}"
+            message = f"no layout fits, so labels were not checked; columns to try: {some(proposals, 3)}"
             yield Finding("note", "labels", message, "Pass --conditions TABLE:COLUMN to check them.")
         return
     try:

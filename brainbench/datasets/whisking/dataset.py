@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
-from brainbench.core.contracts import CHANNELS, GRID_SHAPE
+from brainbench.core.contracts import CHANNELS, GRID_SHAPE, SUB_STEP_SECONDS, SUB_STEPS
 from brainbench.core.errors import DataError, UsageError, check_name, listing
 from brainbench.core.files import cache_dir, content_hash
 from brainbench.core.progress import Progress, track
@@ -38,8 +38,6 @@ SPLITS = ("train", "validation", "test", "all")
 """Values of ``split``; ``all`` is the three together."""
 
 _AHEAD = 2
-_STEP = 0.045
-"""Usual time step [s]: five frames, 9 ms apart."""
 _BLOCK = 64
 
 
@@ -205,8 +203,8 @@ class WhiskingDataset:
 
         Time steps [s] and axes are told where they are not the usual ones.
         """
-        step = self.substeps * self._shards[0].interval
-        unusual: dict[str, Any] = {} if np.isclose(step, _STEP, rtol=1e-6) else {"time_step": step}
+        step, usual = self.substeps * self._shards[0].interval, SUB_STEPS * SUB_STEP_SECONDS
+        unusual: dict[str, Any] = {} if np.isclose(step, usual, rtol=1e-6) else {"time_step": step}
         if self.axes != "world":
             unusual["axes"] = self.axes
         used = self._splits[self._where].tolist()

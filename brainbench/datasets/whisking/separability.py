@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from brainbench.core.errors import DataError, UsageError, check_each, check_once, missing_dependency
+from brainbench.core.errors import DataError, UsageError, check_each, check_once, needing
 from brainbench.core.progress import Progress
 from brainbench.core.reading.ranges import check_number
 from brainbench.core.records import Interval, Status
@@ -114,12 +114,10 @@ def separate(
         DataError: a class has fewer than two objects.
         MissingDependencyError: scikit-learn is not installed.
     """
-    try:
+    with needing("scikit-learn", extra="learn", purpose="Separability"):
         from sklearn.metrics.pairwise import rbf_kernel
         from sklearn.model_selection import StratifiedGroupKFold, cross_val_predict
         from sklearn.svm import SVC
-    except ImportError as error:
-        raise missing_dependency("scikit-learn", extra="learn", purpose="Separability") from error
     check_number("number of classes to tell apart", count, least=2, most=len(names), whole=True)
     members = [np.unique(objects[labels == number]) for number in range(len(names))]
     fewest = min(map(len, members))

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.errors import DataError, missing_dependency
+from brainbench.core.errors import DataError, needing
 from brainbench.core.files import atomic_path
 
 if TYPE_CHECKING:
@@ -46,10 +46,8 @@ def require_writer(suffix: str) -> None:
     if suffix == ".mp4":
         needed.append(("imageio_ffmpeg", "imageio-ffmpeg", "Writing an MP4"))
     for module, package, purpose in needed:
-        try:
+        with needing(package, extra="report", purpose=purpose):
             import_module(module)
-        except ImportError as error:
-            raise missing_dependency(package, extra="report", purpose=purpose) from error
 
 
 def _write_gif(path: Path, frames: Iterable[NDArray[np.uint8]], style: Style, palette_from: Sequence[Any]) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import KDTree
 
-from brainbench.core.errors import UsageError, missing_dependency
+from brainbench.core.errors import UsageError, needing
 from brainbench.geometry import Mesh, winding_number
 from robotics_bridge.physics.scene import Geometry
 from robotics_bridge.sensors.probes.placement import face_areas, spread_over
@@ -20,10 +20,8 @@ SMALLEST = 0.05
 
 def skfem() -> Any:
     """Return the module ``skfem``."""
-    try:
+    with needing("scikit-fem", extra="tactile", purpose="Modal analysis"):
         return import_module("skfem")
-    except ImportError as error:
-        raise missing_dependency("scikit-fem", extra="tactile", purpose="Modal analysis") from error
 
 
 def fill(solid: Geometry, cells: int) -> Any:
