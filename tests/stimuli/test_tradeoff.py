@@ -63,6 +63,7 @@ def test_an_unknown_backend_is_refused_before_anything_is_measured(tmp_path):
         tradeoff.measure_tradeoff(tmp_path / "table.json", [SimulationSetting(COARSE.fidelity, "mujocco")])
 
 
+@pytest.mark.slow
 def test_collision_geometries_of_a_concave_object_are_measured_beside_the_bench_tests(quick, tmp_path):
     path = tmp_path / "table.json"
     chosen = [FINE, *(replace(FINE, collision=name) for name in ("exact", "decomposition-0.02", "hull"))]

@@ -80,6 +80,7 @@ def test_labels_without_a_shared_property_are_undefined_in_words():
     assert broken.reasons[0] == "activations of every layer are constant or not finite"
 
 
+@pytest.mark.slow
 def test_intervals_over_stimuli_hold_the_mean_accuracy_as_often_as_they_say():
     shape, place = np.repeat([0, 1], 6), np.tile([0, 1], 6)
     metric, rng, values, intervals = get_metric("decoding"), np.random.default_rng(0), [], []

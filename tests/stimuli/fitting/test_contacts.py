@@ -91,6 +91,7 @@ def test_neighbouring_frames_of_one_contact_make_a_small_force_more_certain():
         ContactOptions(frames=4)
 
 
+@pytest.mark.slow
 def test_a_free_whisker_shows_no_contact_also_in_neighbouring_frames():
     points = np.tile(MOUSE.centre_line(np.linspace(0, 0.95 * MOUSE.arc_length, 50)), (6, 1, 1))
     noisy = points + np.random.default_rng(1).normal(size=points.shape) * 20e-6

@@ -187,6 +187,7 @@ def _pole():
     return scene, Trial.of_scene(scene, blank_wrenches(times), "C2")
 
 
+@pytest.mark.slow
 def test_intervals_contain_the_error_of_links_and_steps():
     scene, trial = _pole()
     trace = simulate_trial(trial)

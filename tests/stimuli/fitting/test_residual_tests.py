@@ -26,6 +26,7 @@ def _fitted(rng, readings, signal=0.0):
     return noise - basis @ (basis.T @ noise), jacobian
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("instants", "points"), [(40, 1), (30, 8)])
 def test_white_noise_fails_no_more_often_than_asked_for(instants, points):
     rng, readings = np.random.default_rng(0), _readings(instants, points)

@@ -171,6 +171,7 @@ def test_several_gpus_share_the_shards_and_write_the_same_bytes(plan, unbroken, 
     assert files_of(tmp_path) == expected
 
 
+@pytest.mark.slow
 def test_what_went_wrong_on_one_of_several_gpus_is_told(plan, tmp_path, monkeypatch):
     monkeypatch.setattr(running, "gpus", lambda: ["0", "1"])
     (tmp_path / "file").write_text("")

@@ -55,6 +55,7 @@ def unbroken(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_a_killed_run_goes_on_and_ends_with_the_same_bytes(unbroken, tmp_path):
     folder = tmp_path / "set"
     assert _kill_after(_start(folder, 1), 0.2)

@@ -40,6 +40,7 @@ def test_a_peg_that_pushes_it_aside_is_felt_as_by_the_rod():
     assert test.moment_error < 0.005
 
 
+@pytest.mark.slow
 def test_poissons_ratio_softens_twist():
     at = 0.8 * RAT.arc_length
     force = _force(RAT, at, 0.05)

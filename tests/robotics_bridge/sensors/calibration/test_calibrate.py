@@ -100,6 +100,7 @@ def test_a_log_may_begin_under_load():
     assert (found.hysteresis, found.hysteresis_tau) == pytest.approx((0.4, 0.06), rel=0.05)
 
 
+@pytest.mark.slow
 def test_a_sensor_may_be_reset_under_load():
     noise = Noise(white=0.02, hysteresis=0.4, hysteresis_tau=0.06, gain=(0.8, 1.2), read_delay=0.03)
     parts = []
@@ -115,6 +116,7 @@ def test_a_sensor_may_be_reset_under_load():
     assert (found.hysteresis, found.hysteresis_tau) == pytest.approx((0.4, 0.06), rel=0.05)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rested", [True, False])
 def test_creep_that_outlasts_the_delay_is_no_drift_and_no_gain(rested):
     x = np.where(np.arange(1200) * DT % 2 < 1, 1.0, 0.2)
@@ -131,6 +133,7 @@ def test_creep_that_outlasts_the_delay_is_no_drift_and_no_gain(rested):
     assert found.walk < 5e-4
 
 
+@pytest.mark.slow
 def test_the_bias_of_a_drifting_probe_under_load_lies_within_its_interval():
     x = _presses(1200, 0)[200:]
     hits = 0
