@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from brainbench.core.errors import UsageError
 from brainbench.core.reading.ranges import check_fields, check_number
-from brainbench.core.rotations import about, constant, multiply, tilted, twist_of
+from brainbench.core.rotations import TURN, about, constant, multiply, tilted, twist_of
 from robotics_bridge.tasks.checks import check_range, unit_vector
 
 if TYPE_CHECKING:
@@ -93,7 +93,7 @@ class SteppingRotation(Goal):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_fields(self, "step", least=-2 * math.pi, most=2 * math.pi, of="{} of a goal (rad)")
+        check_fields(self, "step", least=-TURN, most=TURN, of="{} of a goal (rad)")
         check_fields(self, "allowed_off_axis", least=0, of="{} of a goal (rad)")
 
     def first(self, quat: torch.Tensor, draw: torch.Tensor) -> torch.Tensor:

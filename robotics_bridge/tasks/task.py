@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from brainbench.core.errors import UsageError, check_each, check_name
 from brainbench.core.reading.ranges import check_fields, check_number, check_numbers
+from brainbench.core.rotations import TURN
 from robotics_bridge.tasks import terms
 from robotics_bridge.tasks.checks import check_parameters, check_range, unit_vector
 from robotics_bridge.tasks.contact_model import CONTACTS, ContactModel
@@ -136,7 +137,7 @@ class Placement:
         check_fields(self, "height", of="placement.{}")
         for name in ("x", "y"):
             check_range(f"placement.{name}", getattr(self, name))
-        check_range("placement.yaw (rad)", self.yaw, least=-2 * math.pi, most=2 * math.pi)
+        check_range("placement.yaw (rad)", self.yaw, least=-TURN, most=TURN)
         for site in self.sites:
             check_numbers("A site of placement.sites", site, 3)
         object.__setattr__(self, "quaternion", unit_vector("placement.quaternion", self.quaternion, 4))

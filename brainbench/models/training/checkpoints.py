@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, check_name, listing, missing_dependency
+from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, check_name, listing, needing
 from brainbench.models.architecture import Architecture
 
 if TYPE_CHECKING:
@@ -137,10 +137,8 @@ def find_folder(source: str) -> Path:
     owner, name, *inner = place.split("/") if "/" in place else ("", "")
     if not source.startswith(HUB) or not all((owner, name, *inner)):
         raise UsageError(f"A folder is local-dir:PATH or hf-hub:OWNER/NAME[/FOLDER][@REVISION]; received {source!r}.")
-    try:
+    with needing("huggingface_hub", extra="hub", purpose="Loading a model from a hub"):
         from huggingface_hub import snapshot_download
-    except ImportError as error:
-        raise missing_dependency("huggingface_hub", extra="hub", purpose="Loading a model from a hub") from error
 
     def download(*names: str) -> Path:
         patterns = ["/".join((*inner, item)) for item in names]

@@ -13,7 +13,7 @@ from typing import Literal
 import torch
 from torch import nn
 
-from brainbench.models.network import SUB_STEP_SECONDS
+from brainbench.core.contracts import SUB_STEP_SECONDS
 
 Time = Literal["native", "resampled"]
 TIMES = ("native", "resampled")

@@ -22,7 +22,7 @@ from typing import Any, Literal
 import torch
 from torch import nn
 
-from brainbench.core.errors import missing_dependency
+from brainbench.core.errors import needing
 from brainbench.core.files import file_hash, provenance, read_mapping, to_plain, write_json
 from brainbench.core.progress import Progress
 from brainbench.core.reading.ranges import check_number
@@ -93,10 +93,9 @@ def distill(
     """
     if stop_after is not None:
         check_number("stop_after", stop_after, least=0)
-    try:
+    # Without it a student can act, but not learn.
+    with needing("rsl-rl-lib", extra="policies", purpose="Training policies"):
         import rsl_rl.models  # noqa: F401
-    except ImportError as error:  # without it a student can act, but not learn
-        raise missing_dependency("rsl-rl-lib", extra="policies", purpose="Training policies") from error
     devices = [env.device] if torch.device(env.device).type == "cuda" else []
     with lock_folder(Path(out), wait=False), torch.random.fork_rng(devices=devices):
         torch.manual_seed(config.seed)

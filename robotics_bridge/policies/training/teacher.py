@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from brainbench.core.errors import BrainbenchError, DataError, DataFileNotFoundError, UsageError, missing_dependency
+from brainbench.core.errors import BrainbenchError, DataError, DataFileNotFoundError, UsageError, needing
 from brainbench.core.files import file_hash, provenance, read_mapping, to_plain, write_json
 from brainbench.core.progress import Progress
 from brainbench.core.reading.ranges import check_fields
@@ -81,10 +81,8 @@ class Trainer:
         observe: tuple[str, ...] = (),
         encoder: str = "rnn",
     ) -> None:
-        try:
+        with needing("rsl-rl-lib", extra="policies", purpose="Training policies"):
             from rsl_rl.algorithms import PPO
-        except ImportError as error:
-            raise missing_dependency("rsl-rl-lib", extra="policies", purpose="Training policies") from error
         self.env, self.settings = RslRlEnv(env), settings or env.task.teacher
         torch.manual_seed(seed)
         groups = {name: tuple(groups) for name, groups in env.task.groups.items()}
