@@ -8,8 +8,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from brainbench.core.lazy import lazy_exports
-
-__version__ = "0.1.0"
+from brainbench.core.version import __version__
 
 __all__ = [
     "BrainbenchError",

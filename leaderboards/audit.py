@@ -15,7 +15,7 @@ from typing import Any
 
 from packaging.version import InvalidVersion, Version
 
-from brainbench import __version__
+from brainbench.core.version import __version__
 from brainbench.core.records import ESTIMATOR_VERSION, ResultRecord
 from leaderboards.store import StoredRecord
 

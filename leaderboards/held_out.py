@@ -51,11 +51,7 @@ class Commitment:
         return found
 
     def open(self, secret: str | os.PathLike[str]) -> Path:
-        """Return the held-out file of a secret folder, after checking that it is the one committed to.
-
-        Raises:
-            DataError: a part of the folder is missing, or it is not what was committed to.
-        """
+        """Return the held-out file of a secret folder, after checking that it is the one committed to."""
         data, salt = Path(secret) / DATA, Path(secret) / SALT
         if not data.is_file() or not salt.is_file():
             raise DataError(f"The secret folder {os.fspath(secret)!r} lacks {DATA!r} or {SALT!r}.")

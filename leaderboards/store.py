@@ -41,9 +41,6 @@ def write_record(record: ResultRecord, folder: str | os.PathLike[str]) -> Path:
 
     Atomic, so that concurrent writers lose nothing. Idempotent: an equal result that is already
     there is left as it is (with its first time and machine); a damaged file of that name is replaced.
-
-    Raises:
-        DataError: the record contradicts itself (:func:`read_record` would refuse it), or cannot be written.
     """
     path, text = Path(folder) / record.file_name, record_text(record)
     try:
@@ -65,8 +62,6 @@ def read_record(path: str | os.PathLike[str]) -> ResultRecord:
 
     Raises:
         DataFileNotFoundError: there is no such file.
-        DataError: the file is not JSON, not a record of this schema version, contradicts itself, or
-            its content does not fit the hash in its name (edited by hand, or renamed).
     """
     path = Path(path)
     record, data = _parse(read_text(path, "result record"), path)

@@ -10,7 +10,7 @@ from typing import Annotated
 
 import typer
 
-from brainbench import __version__
+from brainbench.core.version import __version__
 
 COMMANDS = {
     "score": "Score a model against neural recordings and write a result record and an HTML report.",

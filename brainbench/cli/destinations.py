@@ -49,12 +49,7 @@ def beside(option: typer.CallbackParam, path: Path) -> Path:
 
 
 def report_file(path: Path | None) -> Path | None:
-    """Return the file of ``--report`` if it can be written and its ending is that of a format which can be made.
-
-    Raises:
-        UsageError: there is no such format, or nothing can be written there.
-        MissingDependencyError: the format is PDF, and WeasyPrint is not installed.
-    """
+    """Return the file of ``--report`` if it can be written and its ending is that of a format which can be made."""
     if path is None:
         return None
     from leaderboards.report.paper import FORMATS

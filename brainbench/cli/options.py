@@ -193,11 +193,7 @@ def items(text: str) -> list[str]:
 
 
 def numbers(text: str, what: str, kind: Callable[[str], Any] = int, *, count: int | None = None) -> tuple[Any, ...]:
-    """Return numbers written with commas (or, where there is a ``count`` of them, with x or ×) between them.
-
-    Raises:
-        UsageError: it is something else.
-    """
+    """Return numbers written with commas (or, where there is a ``count`` of them, with x or ×) between them."""
     fault = None
     try:
         values = tuple(kind(item) for item in (items(text) if count is None else re.split(r"[,x×]", text)))
@@ -210,11 +206,7 @@ def numbers(text: str, what: str, kind: Callable[[str], Any] = int, *, count: in
 
 
 def part_of(text: str, what: str) -> tuple[int, int]:
-    """Return the number and the count of ``NUMBER/COUNT``, the number from 0.
-
-    Raises:
-        UsageError: it is something else.
-    """
+    """Return the number and the count of ``NUMBER/COUNT``, the number from 0."""
     number, _, count = text.partition("/")
     if not re.fullmatch(r"\d{1,9}/\d{1,9}", text) or int(number) >= int(count):
         raise UsageError(f"{what} NUMBER/COUNT, the number from 0, such as 0/4; received {shown(text)}.")

@@ -89,11 +89,7 @@ def power(
 
 
 def _dimensions(asked: str, recordings: str | None, conditions: str | None, model: str | None) -> tuple[int, str]:
-    """Return the number of dimensions, and where it comes from in words.
-
-    Raises:
-        UsageError: it is neither a number nor 'auto', or more than one source is given.
-    """
+    """Return the number of dimensions, and where it comes from in words."""
     from brainbench.metrics.inference.power import DIMENSIONS
 
     if conditions is not None and recordings is None:

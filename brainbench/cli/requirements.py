@@ -102,8 +102,6 @@ def check_requirements(command: str, values: Mapping[str, Any]) -> None:
     """Check what a command needs for the values of its parameters.
 
     Raises:
-        UsageError: a number is NaN or infinite, which no comparison with a limit would refuse.
-        MissingDependencyError: a package of an extra is not installed.
         FileWriteError: the cache cannot be made or written.
     """
     for name, value in values.items():

@@ -45,9 +45,6 @@ def check_stimulus_set(dataset: xr.Dataset) -> xr.Dataset:
     ``time`` (s, increasing), ``whisker`` (names) with ``row`` and ``col`` (grid position from 0),
     ``channel`` (:data:`CHANNELS`); attributes ``array``, ``scene``, ``fidelity``, ``seed``,
     ``backend``, ``version``, ``content_hash``.
-
-    Raises:
-        DataError: something of this is missing or out of range.
     """
     _check(
         dataset,
@@ -84,9 +81,6 @@ def check_recordings(dataset: xr.Dataset) -> xr.Dataset:
     per unit ``unit_subject``, ``unit_session``, ``unit_id``; attributes ``vocabulary`` (ordered
     labels), ``window``, ``selection``, ``removed`` (rule → trials or units removed), ``source``,
     ``synthetic``, ``content_hash``.
-
-    Raises:
-        DataError: something of this is missing, or labels are not of the vocabulary, which names each once.
     """
     _check(
         dataset,
@@ -105,11 +99,7 @@ def check_recordings(dataset: xr.Dataset) -> xr.Dataset:
 
 
 def check_counts(dataset: xr.Dataset, name: str) -> xr.Dataset:
-    """Return recordings from outside, called ``name`` in messages, if they are valid and their numbers can be.
-
-    Raises:
-        DataError: see :func:`check_recordings`; or a number is not finite, negative, or none.
-    """
+    """Return recordings from outside, called ``name`` in messages, if they are valid and their numbers can be."""
     check_recordings(dataset)
     found = [dataset[item].values for item in ("counts", "duration", "time") if item in dataset.variables]
     if any(values.dtype.kind not in "fiu" for values in found):

@@ -142,9 +142,6 @@ class CudaGraphStep:
 
         Args:
             *subjects: What the work takes, the same objects in every call.
-
-        Raises:
-            UsageError: the work is required to be recorded and cannot be.
         """
         warming = self._left > 0
         self._left -= 1

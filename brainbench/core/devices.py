@@ -25,11 +25,7 @@ _STARTING = threading.Lock()
 
 
 def warp() -> Any:
-    """Return the initialised module ``warp``.
-
-    Raises:
-        MissingDependencyError: it is not installed.
-    """
+    """Return the initialised module ``warp``."""
     with _STARTING:
         return _start()
 
@@ -93,9 +89,6 @@ def pick_device(name: Any) -> Any:
     """Return the Warp device called ``cpu``, ``cuda`` or ``cuda:1``, or like a torch device; a Warp device passes.
 
     ``auto`` is the processor, or the GPU where this build of Warp lacks the compiler for processors.
-
-    Raises:
-        UsageError: there is no such device here, or nothing compiles for it.
     """
     wp = warp()
     if name is None or isinstance(name, wp.Device):
@@ -122,11 +115,7 @@ def gpus() -> list[str]:
 
 
 def torch_device(name: Any) -> torch.device:
-    """Return the torch device called ``cpu``, ``cuda`` or ``cuda:1``; a torch device passes through.
-
-    Raises:
-        UsageError: not a device, or none that is here.
-    """
+    """Return the torch device called ``cpu``, ``cuda`` or ``cuda:1``; a torch device passes through."""
     import torch
 
     try:

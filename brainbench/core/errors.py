@@ -145,9 +145,6 @@ def check_once(where: str, names: Iterable[str]) -> None:
 def choose_name(kind: str, wanted: str | None, options: Iterable[str], *, how: str = "") -> str:
     """Return the name that is wanted, or the only one there is; ``how`` says in what way one is named.
 
-    Raises:
-        UsageError: there is no such name, or none is given and there are several.
-
     >>> choose_name("stimulus", None, ["pole"])
     'pole'
     """

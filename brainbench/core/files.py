@@ -55,9 +55,6 @@ def check_folder(path: str | os.PathLike[str], option: str) -> None:
     Args:
         path: the folder.
         option: what names it, for the message.
-
-    Raises:
-        UsageError: it, or what it shall stand in, is no folder or may not be written.
     """
     place = Path(path).expanduser().absolute()
     while not os.path.lexists(place):
@@ -273,7 +270,7 @@ def provenance(**extra: Any) -> dict[str, Any]:
     import datetime
     import platform
 
-    from brainbench import __version__
+    from brainbench.core.version import __version__
 
     return {
         "version": __version__,

@@ -39,11 +39,6 @@ def run_jobs(
         workers: Processes on this machine; as many as there are usable processors when None. One: this process.
         scheduler: Address of a Dask scheduler (``tcp://host:8786``), whose workers do it instead.
         threads: As for :func:`worker_pool`.
-
-    Raises:
-        UsageError: no positive number of workers, or no scheduler answers.
-        DataError: a process died.
-        MissingDependencyError: a scheduler is given and Dask is not installed.
     """
     from brainbench.core.devices import usable_processors
 
@@ -79,11 +74,6 @@ def run_on_cluster(
         scheduler: Its address.
         names: One per job, by which an equal job of a client that was killed is not done twice; hashes of the jobs
             by default.
-
-    Raises:
-        MissingDependencyError: Dask is not installed.
-        UsageError: no scheduler answers at this address, or it has no workers.
-        DataError: several workers died of one job.
     """
     with needing("distributed", extra="cluster", purpose="A --scheduler"):
         from distributed import Client, as_completed

@@ -21,9 +21,6 @@ def join_labels(
         labels: stimulus labels of the model side.
         match: recording label → stimulus label (None drops it), or a file of such pairs. Labels it
             does not name are paired with their equals; without it every label must have an equal.
-
-    Raises:
-        UsageError: a label has no partner (both sides are listed), or two share one.
     """
     explicit = read_match(match) if isinstance(match, (str, os.PathLike)) else dict(match or {})
     sides = f"recordings: {listing(vocabulary, limit=40)}; stimuli: {listing(labels, limit=40)}"
@@ -53,12 +50,7 @@ def join_labels(
 
 
 def read_match(path: str | os.PathLike[str]) -> dict[str, str | None]:
-    """Read label pairs from JSON or TOML (an object) or CSV (two columns; an empty second one drops).
-
-    Raises:
-        UsageError: the file is missing, of another kind, names a label twice, or holds something else.
-        DataError: it is no valid JSON or TOML.
-    """
+    """Read label pairs from JSON or TOML (an object) or CSV (two columns; an empty second one drops)."""
     import csv
 
     from brainbench.core.reading.regular import readable

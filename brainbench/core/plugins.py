@@ -30,9 +30,7 @@ def load_object(target: str, kind: str) -> Any:
         kind: what is loaded, for messages: ``model``, ``metric``, ``layout``.
 
     Raises:
-        UsageError: the target has another form, or there is no such name.
         DataFileNotFoundError: there is no such file or module.
-        DataError: the file or module cannot be imported.
     """
     path, _, name = target.rpartition(":")
     if not path or not name:
@@ -49,7 +47,6 @@ def load_module(path: str) -> ModuleType:
 
     Raises:
         DataFileNotFoundError: there is no such file or module.
-        DataError: it cannot be imported.
         BrainbenchError: what the code itself raises of this kind stays as it is.
     """
     is_file = path.endswith(".py") or "/" in path or "\\" in path

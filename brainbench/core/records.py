@@ -135,11 +135,7 @@ class _Document:
 
     @classmethod
     def from_json(cls, source: str | Mapping[str, Any]) -> Self:
-        """Rebuild it from :meth:`to_json` or from the mapping inside it.
-
-        Raises:
-            DataError: a field is missing, unknown or of the wrong kind, or the schema version is not read here.
-        """
+        """Rebuild it from :meth:`to_json` or from the mapping inside it."""
         data = parse_json(source, "This text") if isinstance(source, str) else source
         cls._check_version(data)
         return _convert(cls, data)
@@ -431,11 +427,7 @@ def _steady(score: Mapping[str, Any] | None) -> dict[str, Any] | None:
 
 
 def _convert(kind: type, data: Any) -> Any:
-    """Make a dataclass from parsed JSON.
-
-    Raises:
-        DataError: a field is missing, unknown, of the wrong kind or outside its range; the text names its place.
-    """
+    """Make a dataclass from parsed JSON."""
     try:
         built = msgspec.convert(data, kind)
     except msgspec.ValidationError as error:

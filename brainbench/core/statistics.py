@@ -73,9 +73,6 @@ def two_factor_interval(
     """Return the t interval of a mean over animals and stimuli; None for fewer than two of either.
 
     ``animals`` [A] are the values of single animals, ``without_stimulus`` [K] the mean without each stimulus in turn.
-
-    Raises:
-        UsageError: a level outside (0, 1).
     """
     from scipy.special import stdtrit
 
@@ -108,12 +105,7 @@ def _spread(values: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def wilson_interval(successes: float, count: int, *, over: str = "trials") -> Interval:
-    """Return Wilson's score interval of a proportion of independent trials (Wilson 1927).
-
-    Raises:
-        DataError: there is nothing to count.
-        UsageError: not 0 to ``count`` successes.
-    """
+    """Return Wilson's score interval of a proportion of independent trials (Wilson 1927)."""
     from scipy.special import ndtri
 
     if count < 1:
@@ -131,11 +123,7 @@ def wilson_interval(successes: float, count: int, *, over: str = "trials") -> In
 def newcombe_interval(
     successes: float, count: int, other_successes: float, other_count: int, *, over: str = "trials"
 ) -> Interval:
-    """Return the interval of the difference of two independent proportions (Newcombe 1998, method 10).
-
-    Raises:
-        DataError: one of them has nothing to count.
-    """
+    """Return the interval of the difference of two independent proportions (Newcombe 1998, method 10)."""
     share, other = successes / max(count, 1), other_successes / max(other_count, 1)
     one, two = wilson_interval(successes, count), wilson_interval(other_successes, other_count)
     low = math.hypot(share - one.low, two.high - other)

@@ -39,11 +39,7 @@ def pareto_front(points: Iterable[TradeoffPoint]) -> list[TradeoffPoint]:
 
 
 def cheapest(points: Iterable[TradeoffPoint], error: float) -> TradeoffPoint:
-    """Return the cheapest point whose error is at most ``error``.
-
-    Raises:
-        UsageError: no measured point is that accurate; the message names the best one.
-    """
+    """Return the cheapest point whose error is at most ``error``."""
     front = pareto_front(points)
     if not front:
         raise UsageError("No measured setting is usable, so none can be chosen automatically.")

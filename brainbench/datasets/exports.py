@@ -37,11 +37,6 @@ def export(source: Source, target: str | os.PathLike[str], *, select: Selection 
 
     Returns:
         The files that were written.
-
-    Raises:
-        DataError: nothing is left, or a session cannot be stored as NWB.
-        UsageError: several sessions for one NWB file, another suffix, an unknown subject or rule, or the copy would
-            take the place of its source.
     """
     layout, paths = find_recordings(source)
     chosen = EVERYTHING if select is None else resolve_selection(select)
@@ -80,10 +75,6 @@ def subset(
     """Read a session into memory: spikes, tables and plain columns of the rows that a selection keeps.
 
     ``tally`` takes what the rules removed and met.
-
-    Raises:
-        DataError: units or tables are damaged, or no unit is left.
-        UsageError: a rule names a column that is not there.
     """
     units = session.units
     if units is None:

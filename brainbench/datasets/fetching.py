@@ -24,11 +24,6 @@ def fetch(name: str, folder: str | os.PathLike[str] = ".", *, assets: str | None
 
     Returns:
         The folder of the data set, ``folder/NUMBER``.
-
-    Raises:
-        UsageError: the name is neither.
-        MissingDependencyError: the client is not installed.
-        DataError: the client failed; its own messages stand above.
     """
     number, pattern = _dandiset(name)
     client = shutil.which("dandi")

@@ -57,11 +57,6 @@ def write_recordings(path: str | os.PathLike[str], recordings: xr.Dataset | Sess
         path: file to write, usually ``*.h5``.
         recordings: a recordings data set (kind "counts") or sessions (kind "spikes"; build them with
             :func:`~brainbench.datasets.sessions.make_session`).
-
-    Raises:
-        DataError: the data set does not fulfil the contract, or a session has no units or spike times that are not
-            finite.
-        UsageError: two sessions share subject and name, or there is none.
     """
     import h5py
     import xarray as xr
@@ -81,11 +76,7 @@ def is_ours(file: h5py.File) -> bool:
 
 
 def holds_counts(file: h5py.File, path: Path) -> bool:
-    """Return whether an open file has this layout and kind "counts".
-
-    Raises:
-        DataError: it has this layout, in a version or kind that this package does not read.
-    """
+    """Return whether an open file has this layout and kind "counts"."""
     if not is_ours(file):
         return False
     version, kind = file.attrs.get("version"), text(file.attrs.get("kind", ""))
@@ -100,11 +91,7 @@ def holds_counts(file: h5py.File, path: Path) -> bool:
 
 
 def read_sessions(file: h5py.File, path: Path) -> list[Session]:
-    """Describe the sessions of an open file of kind "spikes"; columns are read later.
-
-    Raises:
-        DataError: a group of the layout is missing.
-    """
+    """Describe the sessions of an open file of kind "spikes"; columns are read later."""
     sessions = []
     for name, group in _need(file, "sessions", path).items():
         source, tables = f"{path}:{name}", _need(group, "tables", path).items()
@@ -129,11 +116,7 @@ def read_sessions(file: h5py.File, path: Path) -> list[Session]:
 
 
 def read_counts(file: h5py.File, path: Path) -> xr.Dataset:
-    """Load the data set in an open file of kind "counts".
-
-    Raises:
-        DataError: a part of the layout is missing or does not fit the others.
-    """
+    """Load the data set in an open file of kind "counts"."""
     import xarray as xr
 
     coordinates: dict[str, Any] = {"time": ("time", _need(file, "time", path)[...])}

@@ -165,8 +165,6 @@ def inspect(path: str | os.PathLike[str], *, strict: bool = False, progress: Pro
 
     Raises:
         DataFileNotFoundError: there is no such file.
-        UsageError: the layout is unknown.
-        DataError: a file is not HDF5, is truncated, or has none of the known layouts.
     """
     summaries: list[SessionSummary] = []
     proposals: list[Proposal] = []

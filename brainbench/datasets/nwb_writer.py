@@ -53,9 +53,6 @@ def write_nwb(
 
     That it is synthetic is said in the descriptions and keywords. ``general`` and ``subject`` are further texts under
     ``/general`` and ``/general/subject``; ``columns`` says what columns mean, by name.
-
-    Raises:
-        DataError: a spike time is not finite, ids are no integers, or a table has no ``stop_time``, which NWB needs.
     """
     import h5py
 

@@ -72,11 +72,7 @@ def find_files(source: Source) -> list[Path]:
 
 
 def resolve_selection(select: Selection | str) -> Selection:
-    """Return a selection from itself, a name ("none", "default" or a layout's) or rules in text.
-
-    Raises:
-        UsageError: the text is neither a name nor a rule.
-    """
+    """Return a selection from itself, a name ("none", "default" or a layout's) or rules in text."""
     if isinstance(select, Selection):
         return select
     if select in _SELECTIONS:
@@ -90,11 +86,7 @@ def resolve_selection(select: Selection | str) -> Selection:
 
 
 def open_file(path: Path) -> AbstractContextManager[h5py.File]:
-    """Open an HDF5 file for reading; failures inside the block name the file too.
-
-    Raises:
-        DataError: the file is not HDF5, is truncated or is damaged.
-    """
+    """Open an HDF5 file for reading; failures inside the block name the file too."""
     if path.suffix.lower() == ".npz":
         raise DataError(
             f"{path} is an .npz file: published recordings are opened one at a time and without a layout, to be "
@@ -107,9 +99,6 @@ def suitable_files(paths: Sequence[Path], *, strict: bool = False) -> tuple[list
     """Return the files that hold sessions of spike times, and for each other file a sentence that says why not.
 
     One file alone was meant, so it is kept whatever it holds: reading it says what is wrong.
-
-    Raises:
-        DataError: there are several files of which none is suitable, or with ``strict`` not all.
     """
     if len(paths) < 2:
         return list(paths), []
@@ -135,9 +124,6 @@ def each_session(
 
     A session comes as its layout adapts it. Read it while the file is open, inside the block of
     :func:`open_file`, which names the file if reading fails.
-
-    Raises:
-        DataError: the file is neither NWB 2.x nor our layout, or holds responses that are already counted.
     """
     _check_kind(file, path)
     for session in hdf5.read_sessions(file, path) if hdf5.is_ours(file) else [nwb.read_nwb(file, path)]:

@@ -78,10 +78,6 @@ def open_recordings(
 
     Raises:
         DataFileNotFoundError: the source names nothing.
-        UsageError: an unknown table, column, layout or rule, no conditions where they are needed, or a bin longer than
-            every window.
-        DataError: a file is damaged or unusable, a session appears twice, or fewer than two
-            conditions, no trial or no unit remain.
     """
     layout, paths = find_recordings(source)
     wanted = Conditions.parse(conditions) if isinstance(conditions, str) else conditions

@@ -51,12 +51,7 @@ class SessionTable:
         return column in self.data
 
     def column(self, name: str) -> NDArray[Any]:
-        """Read one column [rows]; text comes as ``str``.
-
-        Raises:
-            UsageError: there is no such column (the nearest is named).
-            DataError: it is ragged, not one value per row, or of another length than the table.
-        """
+        """Read one column [rows]; text comes as ``str``."""
         self.require(name)
         if f"{name}_index" in self.data:
             raise DataError(f"Column {name!r} of {self.label} holds a list per row; choose one with a single value.")
@@ -77,11 +72,7 @@ class SessionTable:
         return values
 
     def times(self, name: str) -> NDArray[np.float64]:
-        """Read one numeric column [rows] in seconds.
-
-        Raises:
-            DataError: the column holds text.
-        """
+        """Read one numeric column [rows] in seconds."""
         values = self.column(name)
         if values.dtype.kind == "U":
             raise DataError(f"Column {name!r} of {self.label} holds text ({values[0]!r}); expected times in seconds.")
@@ -92,11 +83,7 @@ class SessionTable:
         return decode(self.data["id"][...]) if "id" in self.data else np.arange(len(self))
 
     def ends(self, name: str) -> NDArray[np.int64]:
-        """Return the checked row ends [rows] of a ragged column.
-
-        Raises:
-            DataError: they decrease, are negative or do not end where the values end.
-        """
+        """Return the checked row ends [rows] of a ragged column."""
         total = len(self.data[name])
         ends = np.asarray(self.data[f"{name}_index"][...]).astype(np.int64)
         steps = np.diff(ends, prepend=0)
@@ -110,11 +97,7 @@ class SessionTable:
         return ends
 
     def rows(self, name: str) -> list[NDArray[np.float64]]:
-        """Read a ragged column of numbers: one array per row.
-
-        Raises:
-            DataError: the ragged index is missing or inconsistent, or a number is not finite.
-        """
+        """Read a ragged column of numbers: one array per row."""
         what = name.replace("_", " ")
         if f"{name}_index" not in self:
             raise DataError(f"{self.label} has {name} without {name}_index; the {what} belong to no row.")
@@ -136,11 +119,7 @@ class SessionTable:
         return replace(self, data={**self.data, **columns})
 
     def require(self, column: str) -> None:
-        """Raise the error for an unknown column, naming the nearest one.
-
-        Raises:
-            UsageError: there is no such column.
-        """
+        """Raise the error for an unknown column, naming the nearest one."""
         if column not in self.data:
             raise unknown_name("column", column, self.columns, hint=f"(in {self.label})")
 
@@ -174,11 +153,7 @@ class Series:
         return float(np.prod(self.data.shape, dtype=np.float64) * self.data.dtype.itemsize / 1e9)
 
     def active_times(self) -> NDArray[np.float64]:
-        """Return the times (s, ascending) of the samples of a 0/1 signal that are 1.
-
-        Raises:
-            DataError: the samples are not 0 or 1, or timestamps are missing or of another number.
-        """
+        """Return the times (s, ascending) of the samples of a 0/1 signal that are 1."""
         values = np.asarray(self.data[...]).ravel()
         where = np.flatnonzero(values > 0.5)
         present = values[np.isfinite(values)]
@@ -224,11 +199,7 @@ class Session:
     """True when the file does not name its subject, and another name stands for it."""
 
     def table(self, name: str) -> SessionTable:
-        """Return one interval table.
-
-        Raises:
-            UsageError: there is no such table (the nearest is named).
-        """
+        """Return one interval table."""
         check_name("table", name, self.tables, hint=f"(interval tables of {self.source})")
         return self.tables[name]
 
@@ -254,11 +225,6 @@ def make_session(
     ``spikes`` are the times (s) of each unit, below 0 before the clock began; ``tables`` mappings of columns with at
     least ``start_time``, ``unit_columns`` such as ``id``, ``depth`` (µm) and ``layer``, ``observed`` the recorded spans
     [n, 2] (s) of each unit. The session's name is unique within the animal.
-
-    Raises:
-        DataError: columns differ in length, a table has no ``start_time``, a spike time is not finite, or a recorded
-            span does not end after it begins.
-        UsageError: ``start`` is no date and time of ISO 8601.
     """
     if start:
         try:

@@ -101,10 +101,6 @@ def decompose(mesh: Mesh, settings: DecompositionSettings | None = None) -> Deco
     The pieces are computed for the mesh at a diagonal of 1 and kept under
     ``brainbench.core.files.cache_dir("collision")`` by the hash of that mesh, the settings and the versions
     of the packages, so that one decomposition serves every size.
-
-    Raises:
-        MissingDependencyError: the package of the method is not installed.
-        DataError: the limit of time or memory was passed, or the method failed; the message says what to do.
     """
     settings = settings or DecompositionSettings()
     diagonal, centre = mesh.diagonal, mesh.bounds.mean(axis=0)

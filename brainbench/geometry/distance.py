@@ -49,9 +49,6 @@ def deviation(solid: Mesh, pieces: Sequence[Mesh], *, samples: int = SAMPLES, in
         solid, pieces: the mesh, inside where its winding number exceeds one half; convex meshes.
         samples: points in each direction, on top of the vertices of the pieces; equal calls give equal numbers.
         inside: a coarser mesh of the same solid that decides what is inside, to save time.
-
-    Raises:
-        UsageError: there are no pieces, or no samples.
     """
     check_number("The number of samples", samples, least=1, whole=True)
     check_number("The number of pieces", len(pieces), least=1, whole=True)

@@ -67,11 +67,7 @@ class Diagnosis:
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """A triangle mesh.
-
-    Raises:
-        DataError: a vertex is not finite, a face names a missing vertex, or there is no face.
-    """
+    """A triangle mesh."""
 
     vertices: NDArray[np.float64]
     """[V, 3] m."""
@@ -164,11 +160,7 @@ class Mesh:
         return Mesh(self.vertices * factor, self.faces, self.name)
 
     def transformed(self, rotation: ArrayLike, translation: ArrayLike = (0.0, 0.0, 0.0)) -> Mesh:
-        """Return the mesh rotated by a matrix [3, 3] and then moved by ``translation`` [3] (m).
-
-        Raises:
-            UsageError: the matrix is no rotation.
-        """
+        """Return the mesh rotated by a matrix [3, 3] and then moved by ``translation`` [3] (m)."""
         turn = np.asarray(rotation, dtype=float)
         # Orthonormal up to the rounding of single precision; a reflection has determinant -1.
         if turn.shape != (3, 3) or not np.allclose(turn @ turn.T, np.eye(3), atol=1e-5) or np.linalg.det(turn) < 0:
@@ -246,10 +238,6 @@ def load_mesh(path: str | os.PathLike[str], *, unit: str, apart: bool = False) -
     A scene with several meshes is joined into one. ``unit`` is that of the file's numbers, one of :data:`UNITS` (most
     formats carry none). With ``apart``, closed bodies that touch keep vertices of their own, so that
     :meth:`Mesh.pieces` tells them apart.
-
-    Raises:
-        UsageError: the unit is unknown.
-        DataError: the file is missing or holds no readable triangle mesh.
     """
     import trimesh
 

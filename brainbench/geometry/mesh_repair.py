@@ -35,9 +35,6 @@ def repair(mesh: Mesh) -> Repair:
     vertices within :data:`MERGE` of the diagonal are merged and tiny cracks of three or four edges are closed;
     neighbours are made to agree on the outside; closed bodies that are inside out are turned. Larger holes stay: their
     shape is unknown.
-
-    Raises:
-        DataError: no triangle is left.
     """
     done: list[str] = []
     fixed = _drop(mesh, done)

@@ -33,9 +33,6 @@ def score_agreement(
     The p-value permutes every animal's stimuli independently, (b+1)/(n+1). ``subjects`` are what :meth:`Metric.animal`
     made of each animal, ``stimuli`` the names of the K stimuli. Returns a score without layers; undefined for fewer
     than two usable animals.
-
-    Raises:
-        UsageError: no animals, subjects of other stimuli, or an unknown estimator.
     """
     if not subjects:
         raise UsageError("There are no animals to compare; give at least two SubjectRDM.")

@@ -57,11 +57,7 @@ class Animals:
 
 
 def gather(metric: Metric, subjects: Sequence[SubjectRDM], stimuli: int, *, estimator: str = "default") -> Animals:
-    """Sort subjects by name, correct each for noise as the metric does and decide who is scored.
-
-    Raises:
-        UsageError: no subjects, repeated names, or RDMs of another number of stimuli.
-    """
+    """Sort subjects by name, correct each for noise as the metric does and decide who is scored."""
     check_name(f"estimator of the metric {metric.name!r}", estimator, metric.estimators)
     if not subjects:
         raise UsageError("There are no animals to score against; give at least one SubjectRDM.")

@@ -31,11 +31,7 @@ def library(values: Array) -> Any:
 
 
 def find_device(device: Any, *arrays: Any) -> Any:
-    """Return the torch device to compute on: ``device``, else where a tensor among ``arrays`` lies; None for numpy.
-
-    Raises:
-        UsageError: not a device, one that is not there, or one without float64.
-    """
+    """Return the torch device to compute on: ``device``, else where a tensor among ``arrays`` lies; None for numpy."""
     if device is None:
         device = next((array.device for array in arrays if is_tensor(array)), None)
         if device is None:

@@ -112,7 +112,6 @@ def explain_file(path: str | Path) -> tuple[Step, ...]:
 
     Raises:
         DataFileNotFoundError: there is no such file.
-        DataError: it holds something else.
     """
     arrays = read_npz(path, ".npz file of plain arrays")
     if missing := {"r_xy", "r_yy"} - arrays.keys():
@@ -132,9 +131,6 @@ def explain_splits(r_xy: ArrayLike, r_yy: ArrayLike, *, r_xx: ArrayLike | None =
     """Walk through stored split halves of one model and one target, from the published bars to the default.
 
     Arguments are those of :func:`corrected_value`.
-
-    Raises:
-        UsageError: no splits.
     """
     halves = np.asarray(r_yy, dtype=np.float64).ravel()
     if not np.isfinite(halves).any():
@@ -173,9 +169,6 @@ def explain_score(layer_rdms: Mapping[str, ArrayLike], subjects: Sequence[Subjec
     """Walk a model's score from the published estimator to the default one, on the same RDMs, by Pearson's r.
 
     The published pool of all animals' units is represented by their mean RDM and halves.
-
-    Raises:
-        UsageError: no layers or animals, no animal with a usable RDM, or RDMs that do not fit.
     """
     rdms = rdm_stack(list(layer_rdms.values()), "layer_rdms")
     rdms = rdms[~is_flat(rdms)]

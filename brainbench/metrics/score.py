@@ -48,9 +48,6 @@ def score_layers(
     ``layers`` are what :meth:`Metric.layer` made of each layer, in network order, ``subjects`` what
     :meth:`Metric.animal` made of each animal. ``committed`` is a layer that was chosen before anything was scored;
     without a torch ``device`` numpy computes the permutations.
-
-    Raises:
-        UsageError: no animals, subjects of other stimuli, or an unknown estimator or layer.
     """
     check_once("A score", map(str, stimuli))
     if committed is not None:

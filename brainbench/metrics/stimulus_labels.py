@@ -23,9 +23,6 @@ def stimulus_codes(labels: ArrayLike, count: int | None = None) -> tuple[Ints, t
 
     Integers are codes already (0 … K−1, and K is ``count`` or the largest plus one); strings are
     coded in sorted order. The order of appearance never matters.
-
-    Raises:
-        UsageError: other types, negative codes, codes at or above ``count``, or strings with a ``count``.
     """
     array = np.asarray(labels)
     if array.ndim != 1:
@@ -49,11 +46,7 @@ def stimulus_codes(labels: ArrayLike, count: int | None = None) -> tuple[Ints, t
 
 
 def response_matrix(responses: ArrayLike, rows: str) -> Any:
-    """Return responses as a floating array [rows, U], keeping float32 and tensors where they lie.
-
-    Raises:
-        UsageError: not a two-dimensional array of real numbers with at least one unit.
-    """
+    """Return responses as a floating array [rows, U], keeping float32 and tensors where they lie."""
     try:
         array: Any = responses if is_tensor(responses) else np.asarray(responses)
     except ValueError as error:
@@ -91,10 +84,6 @@ def stimulus_means(responses: NDArray, codes: Ints, count: int) -> Floats:
     """Return the mean response [K, U] over the trials of each stimulus; NaN entries are missing.
 
     A unit without any value for a stimulus is NaN there.
-
-    Raises:
-        UsageError: the number of labels is not the number of trials.
-        DataError: a response is infinite.
     """
     check_lengths(responses, codes)
     numbers = np.bincount(codes, minlength=count)[:, None].astype(np.float64)
@@ -134,11 +123,7 @@ def _complete_means(responses: NDArray, codes: Ints, numbers: Floats) -> Floats 
 
 
 def tensor_means(responses: Any, codes: Ints, count: int, device: Any) -> Array:
-    """Return what :func:`stimulus_means` does as a tensor on ``device``, by products with the trials' membership.
-
-    Raises:
-        DataError: a response is infinite.
-    """
+    """Return what :func:`stimulus_means` does as a tensor on ``device``, by products with the trials' membership."""
     member = place(membership(codes, count), device)
     xp, found = library(member), []
     for _, part in slices(responses, _SLICE_ELEMENTS, device):

@@ -59,9 +59,6 @@ def measure_tradeoff(
     """Measure Monte-Carlo error and time of each number, the others at their defaults.
 
     Synthetic animals share one geometry of six stimuli; every setting is repeated with ``repeats`` seeds.
-
-    Raises:
-        UsageError: fewer than two repeats, or numbers that are not positive.
     """
     check_number("repeats of a trade-off", repeats, least=2)
     check_number("numbers of a trade-off", min(*splits, *permutations, animals, units, trials), least=1)

@@ -70,11 +70,6 @@ def extract(
             into memory.
         readout: ``published`` reads a network of the study by its layer names and steps there; the mean of axis 1 is
             then what was scored (:mod:`brainbench.models.published.readout`).
-
-    Raises:
-        UsageError: a layer does not exist or gives nothing per stimulus, no layer does, the model cannot
-            process the stimuli (the message says what it was given and what it failed with), or it answers the same
-            stimuli otherwise when it is run again.
     """
     import torch
 

@@ -38,9 +38,6 @@ class Architecture:
     def parse(cls, name: str) -> Architecture:
         """Take a name apart; ``str`` puts it together again unchanged.
 
-        Raises:
-            UsageError: the name is a path.
-
         >>> Architecture.parse("zhuang-gru-ln-small+gpt.simclr")
         Architecture(encoder='zhuang', cell='gru', layer_norm=True, small=True, attender='gpt', tag='simclr')
         """

@@ -47,11 +47,6 @@ def export_model(model: nn.Module, path: str | Path, *, format: str = "onnx", na
 
     The network is exported in evaluation mode, on the CPU, as ``onnx`` or ``torch``; the suffix of the format is added
     to a path without one. ``name`` is what the contract calls the network.
-
-    Raises:
-        UsageError: there is no such format, or the network cannot be streamed.
-        MissingDependencyError: the packages of the extra ``export`` are missing, for ``onnx``.
-        DataError: the file does not compute what the network does; it is then removed.
     """
     import copy
 

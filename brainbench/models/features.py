@@ -32,11 +32,7 @@ class Features:
 
 
 def write_features(path: str | Path, labels: Sequence[str], activations: Mapping[str, NDArray[np.floating]]) -> Path:
-    """Write activations ([K, F] or [K, T, F] per layer) in the layout above, atomically.
-
-    Raises:
-        DataError: a layer does not have one row per label.
-    """
+    """Write activations ([K, F] or [K, T, F] per layer) in the layout above, atomically."""
     import h5py
 
     from brainbench.core.files import atomic_path
@@ -58,7 +54,6 @@ def read_features(path: str | Path) -> Features:
 
     Raises:
         DataFileNotFoundError: there is no such file.
-        DataError: it is not HDF5, lacks ``labels`` or ``activations``, or a shape does not fit.
     """
     import h5py
 

@@ -73,9 +73,6 @@ class EncoderAttenderDecoder(nn.Module):
     linear layer; None is the linear one to 117 classes. None as normaliser is :meth:`Normaliser.physical`. Only a
     temporal graph can be unrolled otherwise than biologically.
 
-    Raises:
-        UsageError: the unrolling is unknown, or the encoder is no temporal graph and knows one way only.
-
     ``layers`` lists what :meth:`activations` can return, from stimulus to output.
     """
 
@@ -137,9 +134,6 @@ class EncoderAttenderDecoder(nn.Module):
         """Return the features [B, T, F] of sweeps in SI, which the decoder or the head of another objective reads.
 
         With ``last`` those of the last step [B, F] alone, which spares what no later step reads.
-
-        Raises:
-            UsageError: as for :meth:`forward`.
         """
         if self.spec.max_steps is not None and x.ndim == 5 and x.shape[1] > self.spec.max_steps:
             # Said before the encoder has worked for nothing.
@@ -152,20 +146,13 @@ class EncoderAttenderDecoder(nn.Module):
         return features[:, -1] if last else features
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """Return the decoder's output at the last step [B, classes].
-
-        Raises:
-            UsageError: ``x`` is not [B, T, C, H, W] as :attr:`spec` says, or too long for the attender.
-        """
+        """Return the decoder's output at the last step [B, classes]."""
         return self.decoder(self.encode(x, last=not isinstance(self.decoder, AllStepsDecoder)))
 
     def activations(self, x: torch.Tensor, layers: Collection[str] | None = None) -> dict[str, torch.Tensor]:
         """Return ``{layer: [B, T, ...]}`` for the layers asked for (all by default), in the order of ``layers``.
 
         The decoder is applied at every step; attender layers are read at the action tokens.
-
-        Raises:
-            UsageError: a layer does not exist, or as for :meth:`forward`.
         """
         wanted = self.layers if layers is None else tuple(layers)
         check_each("layer", wanted, self.layers)

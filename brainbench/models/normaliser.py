@@ -22,9 +22,6 @@ class Normaliser(nn.Module):
     """(x − offset) / scale per channel of [B, T, C, H, W] or [B, C, H, W], in SI; buffers, not parameters.
 
     Without an offset silence stays silence.
-
-    Raises:
-        UsageError: a scale is not above 0 (a channel that never varies has none), or a number is not finite.
     """
 
     scale: torch.Tensor

@@ -84,11 +84,7 @@ def list_recipes(pattern: str = "*") -> list[str]:
 
 
 def find_recipe(name: str) -> PublishedTraining:
-    """Return the recipe ``architecture.objective[-warmup]``.
-
-    Raises:
-        UsageError: nobody published one of this name; the message names the nearest.
-    """
+    """Return the recipe ``architecture.objective[-warmup]``."""
     check_name("recipe", name, _recipes(), hint="See them all with: brainbench models recipes")
     return _recipes()[name]
 
@@ -97,9 +93,6 @@ def recipe_for(architecture: str, objective: str) -> PublishedTraining:
     """Return the published recipe, or for an architecture without one that of its nearest published relative.
 
     A ``-small`` model is trained like the full one. Other architectures follow the row of their attender.
-
-    Raises:
-        UsageError: there is no such objective.
     """
     known = _recipes()
     full = Architecture.parse(architecture).full

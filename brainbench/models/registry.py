@@ -97,9 +97,6 @@ def register_model(
         citation: Paper the architecture comes from.
         licence: Licence of the code (weights carry their own).
 
-    Raises:
-        UsageError: the name is taken or breaks the grammar.
-
     Example:
         >>> @register_model("tiny-linear", family="linear")
         ... def tiny_linear():
@@ -139,12 +136,7 @@ class LocatedModel:
     """Safetensors file; None for untrained weights, and where there are none yet."""
 
     def build(self, seed: int = 0, **options: Any) -> nn.Module:
-        """Build the model with its weights, in evaluation mode; untrained weights follow from the seed alone.
-
-        Raises:
-            UsageError: an option is unknown, or nobody trained weights for this name yet.
-            DataError: the weights are unreadable or do not fit.
-        """
+        """Build the model with its weights, in evaluation mode; untrained weights follow from the seed alone."""
         from brainbench.models.ops.seeding import seeded
 
         if self.weights is None and self.architecture.tag is not None:
@@ -225,21 +217,12 @@ def load_model(
             numbers, and PyTorch's global random state is left as it was.
         pretrained: Folder of a checkpoint, or safetensors file, with the weights of a tagged name.
         **options: What the architecture's builder takes; ours take ``classes``, ``decoder`` and ``unroll``.
-
-    Raises:
-        UsageError: no such model, tag or option, weights given for an untagged name, or none for a tagged one.
-        DataError: the weights are missing, unreadable or do not fit.
-        MissingDependencyError: a hub was named and its client is not installed.
     """
     return locate_model(name, pretrained).build(seed, **options)
 
 
 def describe_model(name: str) -> ModelDescription:
-    """Return a model's record with its size and cost, computed without allocating its weights.
-
-    Raises:
-        UsageError: there is no such model.
-    """
+    """Return a model's record with its size and cost, computed without allocating its weights."""
     found = locate_model(name)
     record, model = found.record, found.outline()
     count: Callable[[], int] | None = getattr(model, "multiply_adds", None)

@@ -34,9 +34,6 @@ class StreamingStep(nn.Module):
 
     A transformer keeps a cache of fixed size. Beyond its last step (``max_steps``) the features are NaN, since an
     exported file cannot complain in words.
-
-    Raises:
-        UsageError: the network is of another kind.
     """
 
     def __init__(self, model: nn.Module) -> None:

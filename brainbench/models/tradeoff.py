@@ -34,11 +34,7 @@ REPEATS = 5
 
 @dataclass(frozen=True)
 class ModelSetting:
-    """One way to run a network.
-
-    Raises:
-        UsageError: the precision or the unrolling is unknown, or there is no step.
-    """
+    """One way to run a network."""
 
     precision: str = "float32"
     unroll: Unroll = "biological"
@@ -52,11 +48,7 @@ class ModelSetting:
 
 
 class Reduced(nn.Module):
-    """A network run in one setting; it can be scored and extracted from like the network itself.
-
-    Raises:
-        UsageError: the network is no encoder-attender-decoder, or cannot be unrolled that way.
-    """
+    """A network run in one setting; it can be scored and extracted from like the network itself."""
 
     def __init__(self, name: str, setting: ModelSetting, *, seed: int = 0) -> None:
         super().__init__()
@@ -114,9 +106,6 @@ def measure(name: str, setting: ModelSetting, sweeps: Any, *, seed: int = 0) -> 
 
     ``error`` is the relative difference of the answers from those of the reference setting on all steps, ``cost`` the
     median time of one sweep at batch 1 (ms); settings, stored size and p99 time stand beside them.
-
-    Raises:
-        UsageError: the setting does not fit the network or the sweeps.
     """
     x = torch.as_tensor(sweeps, dtype=torch.float32)
     if x.ndim != 5 or x.shape[1] < setting.steps:

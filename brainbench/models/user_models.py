@@ -51,8 +51,6 @@ class UserModel:
 
         Raises:
             DataFileNotFoundError: the file is gone.
-            UsageError: the code gives no module.
-            DataError: the code fails.
         """
         if self.path is not None and not self.path.is_file():
             raise DataFileNotFoundError(
@@ -73,10 +71,6 @@ def load_user_model(target: str, *, seed: int = 0) -> nn.Module:
 
     ``name`` is a class or function without required arguments, or a ready module. The file's own folder
     can be imported from while it loads. Random weights follow from the seed (CPU generator).
-
-    Raises:
-        UsageError: the target is not of this form, has no such name, or does not give a :class:`torch.nn.Module`.
-        DataError: the file or module cannot be imported, or building the model fails.
     """
     with seeded(seed):
         return build_user_model(target).eval()
@@ -99,11 +93,7 @@ def build_user_model(target: str, **options: Any) -> nn.Module:
 
 
 def check_module(made: Any, target: str) -> nn.Module:
-    """Return what a user's or another package's code made, which must be a module.
-
-    Raises:
-        UsageError: it is something else.
-    """
+    """Return what a user's or another package's code made, which must be a module."""
     from torch import nn
 
     if not isinstance(made, nn.Module):
@@ -122,11 +112,7 @@ def settings_file() -> Path:
 
 
 def read_user_models() -> dict[str, UserModel]:
-    """Return the added models by name.
-
-    Raises:
-        DataError: the file of settings is damaged.
-    """
+    """Return the added models by name."""
     path = settings_file()
     stored = read_json(path) if path.is_file() else {}
     fields = {"target", "hash"}
@@ -162,11 +148,7 @@ def add_user_model(target: str, name: str, *, taken: Collection[str]) -> UserMod
 
 
 def remove_user_model(name: str) -> UserModel:
-    """Take a stored name away and return what it stood for; the file with the code stays.
-
-    Raises:
-        UsageError: no model was added under this name.
-    """
+    """Take a stored name away and return what it stood for; the file with the code stays."""
     known = read_user_models()
     check_name("model of your own", name, known)
     made = known.pop(name)

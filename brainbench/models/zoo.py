@@ -50,9 +50,6 @@ def build(
     """Build the network with new random weights.
 
     ``unroll`` is for a Zhuang encoder.
-
-    Raises:
-        UsageError: an option does not exist or does not fit.
     """
     from brainbench.models.heads.decoders import make_decoder
     from brainbench.models.network import EncoderAttenderDecoder

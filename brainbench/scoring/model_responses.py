@@ -133,12 +133,7 @@ def follows_seed(model: Any) -> bool:
 
 
 def resolve_model(model: Any, *, seed: int = 0) -> ResolvedModel:
-    """Find what ``model`` names, and load it; see :func:`brainbench.scoring.scores.score`.
-
-    Raises:
-        UsageError: nothing has this name, or it is no model.
-        DataError: a file was found but cannot be used.
-    """
+    """Find what ``model`` names, and load it; see :func:`brainbench.scoring.scores.score`."""
     if isinstance(model, Mapping):
         return ResolvedModel(ModelCard("features", family=_ELSEWHERE), activations=model)
     if isinstance(model, (str, os.PathLike)) and Path(model).suffix.lower() in (".h5", ".hdf5"):

@@ -119,11 +119,7 @@ class NeuralResponses:
         return {label: pairs.get(label) for label in self.vocabulary}
 
     def pairs(self, stimuli: tuple[str, ...], match: Any) -> dict[str, str]:
-        """Pair recording labels with stimuli; slots without names one by one, as the published code does.
-
-        Raises:
-            UsageError: as :func:`brainbench.core.labels.join_labels`, or slots and stimuli differ in number.
-        """
+        """Pair recording labels with stimuli; slots without names one by one, as the published code does."""
         if self.label_doubt and match is None:
             if len(stimuli) != len(self.vocabulary):
                 raise UsageError(

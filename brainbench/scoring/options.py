@@ -39,12 +39,7 @@ _ELSEWHERE = ("recordings", "match", "explain", "title", "strict")
 
 @dataclass(frozen=True)
 class ScoreOptions:
-    """Options of scoring a model against recordings.
-
-    Raises:
-        UsageError: an unknown rule for time or readout, a reliability outside (−1, 1), no layer among ``layers``, or
-            a choice of trials or bins for recordings in memory, which are counted.
-    """
+    """Options of scoring a model against recordings."""
 
     recordings: str | os.PathLike[str] | Sequence[str | os.PathLike[str]] | xr.Dataset = "demo"
     """'demo' or 'demo-rodgers' (synthetic), an NWB, HDF5 or published .npz file, a folder, or a glob; in Python also a
@@ -126,11 +121,7 @@ class ScoreOptions:
 
     @classmethod
     def of(cls, values: Mapping[str, Any]) -> ScoreOptions:
-        """Return the options that a mapping of names and values states.
-
-        Raises:
-            UsageError: there is no such option.
-        """
+        """Return the options that a mapping of names and values states."""
         known = [item.name for item in fields(cls)]
         check_each("option of a score", values, known)
         return cls(**values)

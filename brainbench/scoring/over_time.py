@@ -32,10 +32,6 @@ def time_course(
     long as the window of most trials (the median). Recordings have bins of one width; ``kept`` are the labels that are
     scored, in order, and ``rows`` those of the activations. The options hold the seed, and the reliability that units
     must have.
-
-    Raises:
-        DataError: the recordings have no bins of time.
-        UsageError: fewer than 3 bins or 4 stimuli, or bins that do not follow one another from the window's begin.
     """
     if "time" not in brain.dataset.coords or brain.dataset.sizes["time"] < 3:
         raise DataError(

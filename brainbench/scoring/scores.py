@@ -50,10 +50,6 @@ def score(
 
     Returns:
         The score with its statistics.
-
-    Raises:
-        UsageError: a name, an option or a shape is wrong; the labels of both sides do not match.
-        DataError: a file was found but cannot be used.
     """
     return score_record(model, options, baselines=baselines, progress=progress, **changes).score
 

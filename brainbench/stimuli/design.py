@@ -105,11 +105,6 @@ def design(
         bounds: bounds of single variables, in their units.
         options: sensor, simulation and search.
         backend: physics engine.
-
-    Raises:
-        UsageError: there is one scene only, their whiskers or whisking differ, or a variable is unknown or starts
-            outside its bounds.
-        DataError: whiskers are unstable with the given motion.
     """
     options = options or DesignOptions()
     if len(scenes) < 2:
@@ -138,9 +133,6 @@ def find_motions(
         slope: worth at some values [p] and its derivatives by them, given the sizes of small changes [p]; NaN and 0
             with unstable whiskers. None where there is no gradient.
         begin, limits, options: values [p] of the given motion, bounds [p, 2], and the search.
-
-    Raises:
-        DataError: whiskers are unstable with the given motion.
     """
     from scipy.optimize import minimize
 

@@ -66,12 +66,7 @@ VARIABLES: Mapping[str, DesignVariable] = {
 def read_limits(
     scenes: Sequence[Scene], variables: Sequence[str], bounds: Mapping[str, tuple[float, float]]
 ) -> tuple[Array, Array]:
-    """Return the values [p] of variables in some scenes, and their bounds [p, 2].
-
-    Raises:
-        UsageError: whiskers or whisking differ between the scenes, or a variable is unknown, stands twice, is not one
-            of the scenes, or starts outside its bounds.
-    """
+    """Return the values [p] of variables in some scenes, and their bounds [p, 2]."""
     check_once("--variables", variables)
     check_each("variable of a design", variables, VARIABLES)
     check_each("chosen variable with bounds", bounds, variables)

@@ -78,12 +78,7 @@ class Explanation:
 
     @classmethod
     def of(cls, dataset: xr.Dataset) -> Explanation:
-        """Read the explanation that :func:`brainbench.stimuli.simulate` left in a stimulus set.
-
-        Raises:
-            UsageError: the set carries none.
-            DataError: it is damaged.
-        """
+        """Read the explanation that :func:`brainbench.stimuli.simulate` left in a stimulus set."""
         text = dataset.attrs.get(ATTRIBUTE)
         if text is None:
             raise UsageError("This stimulus set does not say how it was made; simulate it again to have it explained.")

@@ -53,9 +53,6 @@ def assemble_stimulus_set(
         frame_status: statuses that hold where there is no fault.
         contact: [stimulus, time, whisker] whether a whisker touches, where that is known.
         about: further attributes.
-
-    Raises:
-        DataError: two stimuli have the same label.
     """
     labels = [source["label"] for source in sources]
     if twice := repeats(labels):

@@ -34,10 +34,6 @@ def to_grid(
         substeps: frames S that make one time step.
         unstable: what to do with whiskers whose simulation became unstable (their numbers are NaN):
             refuse, or read them as zero.
-
-    Raises:
-        UsageError: the frames do not divide into sub-steps, there are several animals, or two whiskers share a cell.
-        DataError: a number is not finite.
     """
     check_stimulus_set(dataset)
     stimuli, frames, whiskers, channels = dataset["wrench"].shape
@@ -69,9 +65,6 @@ def to_axes(dataset: xr.Dataset, axes: Axes) -> xr.Dataset:
 
     The follicle's pose at each frame must be in the set: it is when the scenes were read with
     ``Frames(axes="follicle")``. Moments stay about the base point. Clipped numbers are turned as they are.
-
-    Raises:
-        UsageError: the axes are unknown, or the set does not hold the poses.
     """
     check_name("axes", axes, get_args(Axes))
     if axes == dataset.attrs.get("axes", "world"):

@@ -66,9 +66,6 @@ def simulate(
         how many components were clipped in each stimulus (``clipped``). The attribute ``config_hash`` names what was
         asked for and is equal on every machine; ``content_hash`` names the numbers, whose last digits depend on the
         processor. :meth:`brainbench.stimuli.explain.Explanation.of` reads what was simulated, shared and left out.
-
-    Raises:
-        UsageError: the scenes do not fit together, or a name is unknown.
     """
     chosen = _checked(scenes)
     engine, fidelity = resolve(backend, fidelity, chosen)

@@ -76,10 +76,6 @@ def load_stimuli(
             [K] (texts). Recipes and scenes are simulated, or taken from the cache.
         whiskers: only these; see :meth:`WhiskerArray.select`. Not for array files.
         fidelity, backend, progress, cache: as in :func:`simulate`; unused for files of finished stimuli.
-
-    Raises:
-        UsageError: nothing has this name, or an option does not fit the source.
-        DataError: a file cannot be used; the message says what it holds and what is needed.
     """
     if isinstance(source, Stimuli):
         if whiskers != "all" and source.dataset is None:
@@ -111,10 +107,6 @@ def load_stimulus_set(
     """Return the stimulus set that a source names, and its description; arguments are those of :func:`load_stimuli`.
 
     Whiskers that became unstable are NaN in it, with ``status`` and ``reason``; :func:`load_stimuli` refuses them.
-
-    Raises:
-        UsageError: nothing has this name, an option does not fit the source, or the file holds arrays.
-        DataError: a file cannot be used; the message says what it holds and what is needed.
     """
     if _is_array_file(source):
         raise UsageError(f"{os.fspath(source)!r} holds arrays, not forces of whiskers with names.")

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from brainbench import __version__
+from brainbench.core.version import __version__
 from brainbench.core.contracts import CHANNELS, check_stimulus_set
 from brainbench.core.errors import DataError
 from brainbench.core.files import atomic_path, content_hash
@@ -78,23 +78,14 @@ def hash_stimulus_set(dataset: xr.Dataset) -> str:
 
 
 def write_stimulus_set(dataset: xr.Dataset, path: str | os.PathLike[str]) -> Path:
-    """Write a stimulus set to an HDF5 file (netCDF4 layout), replacing an older one in one step.
-
-    Raises:
-        DataError: ``dataset`` is not a stimulus set.
-    """
+    """Write a stimulus set to an HDF5 file (netCDF4 layout), replacing an older one in one step."""
     with atomic_path(path) as temporary:
         check_stimulus_set(dataset).to_netcdf(temporary, engine="h5netcdf")
     return Path(path)
 
 
 def read_stimulus_set(path: str | os.PathLike[str]) -> xr.Dataset:
-    """Read a stimulus set into memory.
-
-    Raises:
-        DataError: the file is missing or damaged, is not a stimulus set, or its numbers do not match
-            the content hash it carries.
-    """
+    """Read a stimulus set into memory."""
     import xarray as xr
 
     name = os.fspath(path)

@@ -104,9 +104,6 @@ def settings(
         links, time_steps, backends, solvers: axes of the bench tests; the solver ``quasistatic``, of ``rod`` alone, has
             no presets, no steps per period and the first of :data:`CONTACT_TOLERANCES`.
         collisions: geometries of a concave object to measure as well, at each preset, as in :data:`COLLISIONS`.
-
-    Raises:
-        UsageError: a value lies outside the range of :class:`Fidelity`, or a collision geometry is unknown.
     """
     presets, steps = [Fidelity.preset(name) for name in list_presets()], list(itertools.product(links, time_steps))
     grid = [
@@ -137,10 +134,6 @@ def measure_tradeoff(
     Returns:
         All points of the table: the fields of the module's text, ``backend`` and the fields of :class:`Fidelity`;
         ``collision`` only where a concave object was touched.
-
-    Raises:
-        DataError: ``path`` holds something else, or points of other experiments or of another MuJoCo.
-        UsageError: a backend is unknown.
     """
     wanted = settings() if chosen is None else list(chosen)
     for name in {setting.backend for setting in wanted}:

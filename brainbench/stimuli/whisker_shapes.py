@@ -67,9 +67,6 @@ def record(
         times: instants [n] (s), increasing, not before t = 0.
         fidelity, backend, progress, cache: as for :func:`brainbench.stimuli.simulate`; shapes have a cache of their
             own.
-
-    Raises:
-        UsageError: the times do not increase, or the backend reports no shapes.
     """
     from brainbench.stimuli.simulation import cache_path, resolve
 

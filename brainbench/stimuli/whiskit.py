@@ -47,9 +47,6 @@ def load_parameters(folder: str | os.PathLike[str], *, species: str = "whiskit")
     Diameters, taper, density, stiffness, damping and friction follow the published rules that the mouse and
     rat arrays use. ``param_angles`` is not needed: the whole curvature is kept by any number of links.
     ``species`` is the name given to the array.
-
-    Raises:
-        DataError: a file is missing, or the tables do not fit together.
     """
     root = Path(folder)
     names = read_names(root / "param_name.csv")
@@ -105,9 +102,6 @@ def save_parameters(
 
     Diameters and material have no place there and are not written. ``bends_table`` is [whisker, link] (rad), such as
     :func:`load_bends` read; :func:`bends` of the array when None.
-
-    Raises:
-        UsageError: the bends do not fit the array.
     """
     table = bends(array) if bends_table is None else np.asarray(bends_table, dtype=float)
     if table.ndim != 2 or len(table) != len(array):
@@ -146,9 +140,6 @@ def save_run(
         shapes: joints and tip of each whisker [time, links + 1, 3] (m, world), in the order of the whiskers, as a
             backend records them; without them no ``kinematics`` are written.
         dialect: ``sense-lab`` ends lines with a comma, ``thesis`` does not.
-
-    Raises:
-        UsageError: the stimulus is unknown or not said, whiskers lack a side, or the shapes do not fit.
     """
     check_stimulus_set(dataset)
     check_name("dialect", dialect, DIALECTS)

@@ -66,11 +66,7 @@ def find_runs(folder: str | os.PathLike[str]) -> tuple[Path, ...]:
 
 
 def read_run(folder: str | os.PathLike[str]) -> WhiskitRun:
-    """Read one run without changing a value.
-
-    Raises:
-        DataError: a file is missing, the files do not fit together, or a whisker has no name of WHISKiT's.
-    """
+    """Read one run without changing a value."""
     root = Path(folder)
     names = _names(root / "whisker_ID.csv")
     tables = {name: read_numbers(root / "dynamics" / f"{name}.csv") for name in CHANNELS}
@@ -86,11 +82,7 @@ def read_run(folder: str | os.PathLike[str]) -> WhiskitRun:
 
 
 def published_cleaning(dynamics: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the 110 rows [110, whisker, channel] of a run (mN, µN·m) that the released cleaning makes of it.
-
-    Raises:
-        UsageError: the run has neither 1000 nor 110 rows.
-    """
+    """Return the 110 rows [110, whisker, channel] of a run (mN, µN·m) that the released cleaning makes of it."""
     if len(dynamics) not in _ROWS:
         raise UsageError(f"The published cleaning takes runs of 1000 or 110 rows; received {len(dynamics)}.")
     kept = dynamics[1:983:9] if len(dynamics) == 1000 else dynamics
@@ -114,10 +106,6 @@ def read_runs(
         folders: one or more runs with the same whiskers and as many rows.
         cleaning: one of :data:`Cleaning`.
         rate: rows per second [Hz]; by the number of rows when None: 1000 and 110 rows are one second.
-
-    Raises:
-        UsageError: the rate is unknown, or an option is out of range.
-        DataError: a run cannot be read, or runs differ in whiskers or rows.
     """
     check_name("cleaning", cleaning, get_args(Cleaning))
     paths = [Path(folder).absolute() for folder in folders]

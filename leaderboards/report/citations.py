@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
-from brainbench import __version__
+from brainbench.core.version import __version__
 from brainbench.core.records import ResultRecord
 
 

@@ -58,11 +58,6 @@ def write_paper(
     All files appear together. Markdown comes with a folder of SVG files and the citations as ``.bib``; HTML and PDF
     hold their figures, and bring a ``.bib`` too. A single record gives the report of that model, with its
     architecture and layers. The format is ``md``, ``html`` or ``pdf``, by the file's suffix if not given.
-
-    Raises:
-        UsageError: there is no such format.
-        DataError: there is no usable record, the PDF engine failed, or the files cannot be written. All are unchanged.
-        MissingDependencyError: WeasyPrint, which makes PDF, is not installed.
     """
     path = Path(path)
     kind = format or path.suffix.removeprefix(".").lower()

@@ -52,10 +52,6 @@ def build_leaderboard(
     files.
 
     Records are stored ones or in memory; those with problems are listed on the first page and left out of the boards.
-
-    Raises:
-        DataError: there is nothing to show, or the site cannot be written.
-        UsageError: ``folder`` is a file, or holds something that no build wrote or that was changed since.
     """
     stored = [_stored(item) if isinstance(item, ResultRecord) else item for item in records]
     if not stored:

@@ -30,10 +30,6 @@ def rebuilt(root: Path) -> Iterator[Callable[[str, str | bytes], Path]]:
 
     The new files appear together when the block ends, the one given first last; after an error the old site is
     unchanged. Another build of the same folder waits until this one has ended.
-
-    Raises:
-        UsageError: ``root`` is a file, or holds something that no build wrote or that was changed since.
-        DataError: it cannot be written.
     """
     check_site(root)
     with writable(root), lock_folder(root):
@@ -59,11 +55,7 @@ def rebuilt(root: Path) -> Iterator[Callable[[str, str | bytes], Path]]:
 
 
 def check_site(root: Path) -> tuple[_Hashes, set[str]]:
-    """Return what the manifest of a folder lists and which of it is there.
-
-    Raises:
-        UsageError: ``root`` is a file, or holds something that no build wrote or that was changed since.
-    """
+    """Return what the manifest of a folder lists and which of it is there."""
     if root.is_file() or root.suffix.lower() in (".html", ".htm"):
         raise UsageError(
             f"A leaderboard is a folder; received {str(root)!r}. For a single page use: brainbench leaderboard report"

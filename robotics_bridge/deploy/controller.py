@@ -83,10 +83,6 @@ class Controller:
             :class:`~robotics_bridge.deploy.touch.RealTouch`.
         clock: Tells the time and waits.
         record: Called after each tick with (reading, groups, action, targets [J]).
-
-    Raises:
-        UsageError: a group has no source or a source no group, the hand lacks a joint or has others than the limits, or
-            the rate is out of range.
     """
 
     def __init__(
@@ -120,11 +116,7 @@ class Controller:
         self.limited = self.overruns = self.ticks = 0
 
     def run(self, seconds: float) -> Report:
-        """Control for so many seconds, or until something is wrong; the hand is told to hold in the end.
-
-        Raises:
-            UsageError: the time is not a positive number.
-        """
+        """Control for so many seconds, or until something is wrong; the hand is told to hold in the end."""
         check_duration(seconds)
         begun = self.clock()
         reason: str | None = "the control loop was interrupted"

@@ -101,12 +101,7 @@ class SessionRecorder:
 
 
 def check_folder(folder: Path, fps: float) -> None:
-    """Check that a data set can be written, before it is recorded.
-
-    Raises:
-        UsageError: the folder is not empty or no folder, or LeRobot knows no such rate.
-        MissingDependencyError: pyarrow is not installed.
-    """
+    """Check that a data set can be written, before it is recorded."""
     if find_spec("pyarrow") is None:
         raise missing_dependency("pyarrow", extra="board", purpose="Writing a LeRobot data set")
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
@@ -137,11 +132,6 @@ def write_lerobot(
         points: Where the tactile points sit.
         robot: Name of the robot.
         unit: Of forces; torques are in that times metres.
-
-    Raises:
-        UsageError: the folder is not empty, or the frames do not fit.
-        DataError: a frame holds values that are not finite.
-        MissingDependencyError: pyarrow is not installed.
     """
     check_folder(folder, fps)
     import pandas

@@ -107,7 +107,6 @@ def read_key(path: str | os.PathLike[str]) -> bytes:
 
     Raises:
         DataFileNotFoundError: there is no such file.
-        DataError: it holds no key, or others can read it.
     """
     path = Path(path)
     hint = f"Make one with: (umask 077; openssl rand -hex {KEY} > hand.key), and copy it to the hand's computer."

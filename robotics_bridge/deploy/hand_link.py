@@ -24,9 +24,6 @@ class HandLink:
         key: Shared key (:func:`~robotics_bridge.deploy.frames.read_key`).
         joints: J.
         fingers: F.
-
-    Raises:
-        UsageError: the key has another length.
     """
 
     def __init__(self, link: socket.socket, key: bytes, joints: int, fingers: int) -> None:

@@ -24,11 +24,7 @@ its own. A delay that grows more slowly than this is not seen."""
 
 @dataclass(frozen=True, eq=False)
 class SafetyLimits:
-    """Limits of joints, readings and timing.
-
-    Raises:
-        UsageError: a limit is not a sensible number.
-    """
+    """Limits of joints, readings and timing."""
 
     low: NDArray[np.float64]
     """[J] (rad)."""
@@ -62,11 +58,7 @@ class SafetyLimits:
 
     @classmethod
     def of_hand(cls, hand: Hand, joints: tuple[str, ...], **changes: float) -> SafetyLimits:
-        """Return the limits of a hand's joints, in a given order.
-
-        Raises:
-            UsageError: the hand lacks a joint, or there is no such limit.
-        """
+        """Return the limits of a hand's joints, in a given order."""
         model = hand.model
         names = {model.joint(index).name: index for index in range(model.njnt)}
         if missing := [name for name in joints if name not in names]:

@@ -38,12 +38,7 @@ class DeployedPolicy:
     contract: PolicyContract
 
     def require(self, given: Collection[str], fingers: Sequence[str] | None = None) -> dict[str, str]:
-        """Return group → what a hand with these sensing fingers (all by default) cannot measure of it, in words.
-
-        Raises:
-            UsageError: one of them is not among the groups that something else gives, or is privileged: no constant
-                stands for what only the simulation knows.
-        """
+        """Return group → what a hand with these sensing fingers (all by default) cannot measure of it, in words."""
         contract = self.contract
         check_measured(contract.inputs, "A policy on a hand")
         # What is told to the hand is no measurement; a contract that states it needs no word of the user.
@@ -85,9 +80,6 @@ class DeployedPolicy:
             fallback: Simulated or constant touch where the hand senses nothing.
             threads: Of the network's computations.
             **settings: Further arguments of :class:`~robotics_bridge.deploy.controller.Controller`.
-
-        Raises:
-            UsageError: the hand or the sources do not fit the policy.
         """
         contract, body, sources = self.contract, hands.load(self.contract.hand), dict(sources or {})
         inputs = contract.inputs
@@ -110,9 +102,6 @@ def read_deployed(path: str | Path) -> DeployedPolicy:
 
     Raises:
         DataFileNotFoundError: the file or its contract is missing.
-        DataError: the contract is of another kind or of another file, a value is out of range, or the file is a program
-            (TorchScript).
-        UsageError: the contract does not say what a hand needs; export the policy from a trained run.
     """
     path = Path(path)
     contract = path.with_name(f"{path.name}.json")
@@ -128,11 +117,7 @@ def read_deployed(path: str | Path) -> DeployedPolicy:
 
 
 def constant(name: str, values: Sequence[float], shape: tuple[int, ...]) -> Source:
-    """Return a source that always gives a group the same numbers, such as a command: one for all, or one for each.
-
-    Raises:
-        UsageError: there are not as many numbers as the policy reads, or one is not finite.
-    """
+    """Return a source that always gives a group the same numbers, such as a command: one for all, or one for each."""
     size, given = math.prod(shape), np.asarray(values, np.float64).reshape(-1)
     if len(given) not in (1, size) or not (np.abs(given) <= LARGEST_INPUT).all():
         raise UsageError(

@@ -40,11 +40,7 @@ HOLD_AFTER = 0.25
 
 @dataclass(frozen=True)
 class Faults:
-    """Faults between hand and controller. Probabilities are per report.
-
-    Raises:
-        UsageError: a value is out of range.
-    """
+    """Faults between hand and controller. Probabilities are per report."""
 
     drop: float = 0.0
     """Probability that a report is lost."""
@@ -73,11 +69,7 @@ class Faults:
 
     @classmethod
     def parse(cls, texts: list[str]) -> Faults:
-        """Return the faults of texts such as ``drop=0.2``.
-
-        Raises:
-            UsageError: a fault is unknown or given twice, or its value is no number.
-        """
+        """Return the faults of texts such as ``drop=0.2``."""
         check_once("--fault", [text.partition("=")[0].replace("-", "_") for text in texts])
         faults = cls()
         for text in texts:
@@ -94,9 +86,6 @@ class SimulatedHand:
         observe: Observation type that its skin gives; reports need ``agg_force`` on the tips.
         twist: Torsional friction of force taxels (N·m·s); None: they hold what they touch.
         contacts: Firmness of contacts and strength of the drives.
-
-    Raises:
-        UsageError: a name is unknown, or the rate is out of range.
     """
 
     def __init__(
@@ -149,11 +138,7 @@ class SimulatedHand:
         self.drive(self.position)
 
     def drive(self, targets: NDArray[np.float64]) -> None:
-        """Set the targets [J] (rad) of the position drives.
-
-        Raises:
-            UsageError: there are not as many targets as joints, or one is not finite.
-        """
+        """Set the targets [J] (rad) of the position drives."""
         if np.shape(targets) != (len(self.joints),) or not np.isfinite(targets).all():
             raise UsageError(f"A hand takes {len(self.joints)} finite targets (rad); received {str(targets)[:80]}.")
         self.engine.data[0].ctrl[self._drives] = np.asarray(targets)[self._driven]
@@ -190,9 +175,6 @@ class ShadowTouch:
     Args:
         contract: Of the policy; hand, skin and contacts are those in which it was trained.
         joints: Names of the joints in the order of the reports.
-
-    Raises:
-        UsageError: the contract does not say what the skin is.
     """
 
     def __init__(self, contract: PolicyContract, joints: tuple[str, ...]) -> None:
@@ -284,12 +266,7 @@ def simulated_hand(
     hand: str = "xhand1", *, contacts: ContactModel = CONTACTS["firm"], faults: Faults | None = None,
     seconds: float = 600.0,
 ) -> Iterator[tuple[tuple[str, int], tuple[str, ...], tuple[str, ...], bytes]]:  # fmt: skip
-    """Run a simulated hand in a process of its own; yield its address, joints, fingers and key.
-
-    Raises:
-        UsageError: the time until it ends by itself (s) is out of range.
-        DataError: the process did not start.
-    """
+    """Run a simulated hand in a process of its own; yield its address, joints, fingers and key."""
     check_number("seconds of a simulated hand", seconds, above=0)
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()

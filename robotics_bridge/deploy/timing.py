@@ -23,9 +23,6 @@ def realtime() -> Iterator[None]:
     """Run the calling thread ahead of all ordinary ones (SCHED_FIFO) and without garbage collection, until it leaves.
 
     Processes that it starts meanwhile are ordinary. A loop that never sleeps would keep a processor to itself.
-
-    Raises:
-        UsageError: the system has no such scheduling (it is Linux's), or this user may not ask for it.
     """
     if not hasattr(os, "SCHED_FIFO"):
         raise UsageError("Real-time scheduling is Linux's; leave realtime out on this system.")

@@ -27,11 +27,7 @@ LARGEST_SCALE = 1e6
 
 @dataclass(frozen=True)
 class PressureCalibration:
-    """From the maker's contact pressure to the simulator's ``agg_force``; the published values.
-
-    Raises:
-        UsageError: a value is not valid.
-    """
+    """From the maker's contact pressure to the simulator's ``agg_force``; the published values."""
 
     scale: float = 1000.0
     """``agg_force`` of one unit of the maker's contact pressure."""
@@ -73,10 +69,6 @@ class RealTouch:
         fingers: Fingers whose tips the hand senses, in the order of the reports.
         calibration: From the maker's unit to the simulator's.
         fallback: Simulated group [S, N, C], used where the hand senses nothing; None leaves those items zero.
-
-    Raises:
-        UsageError: the type cannot be measured and nothing is simulated in its place, or the calibration names a finger
-            that the hand does not report.
     """
 
     def __init__(

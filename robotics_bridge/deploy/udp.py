@@ -39,9 +39,6 @@ class UdpDriver:
         joints: Names of its joints, in its order.
         fingers: Names of its sensing fingers, in its order.
         key: Shared key (:func:`~robotics_bridge.deploy.frames.read_key`).
-
-    Raises:
-        UsageError: there is no such host or port, a name occurs twice, or a number or the key is out of range.
     """
 
     def __init__(self, address: tuple[str, int], joints: tuple[str, ...], fingers: tuple[str, ...], key: bytes) -> None:
@@ -133,11 +130,7 @@ class UdpDriver:
         return True
 
     def send(self, targets: NDArray[np.float64]) -> None:
-        """Ask the position drives for targets [J] (rad).
-
-        Raises:
-            UsageError: there are not as many targets as joints, or one is not finite; the hand was told to hold.
-        """
+        """Ask the position drives for targets [J] (rad)."""
         body = frames.pack_values(targets) if np.shape(targets) == (len(self.joints),) else b""
         # As they would be sent: a large double is infinite as a float.
         if not (body and np.isfinite(np.frombuffer(body, "<f4")).all()):

@@ -42,9 +42,6 @@ def make(
         config: configuration of a named task: ``default`` or ``published``.
         **options: fields of :class:`~robotics_bridge.envs.options.EnvOptions`: ``num_envs``, ``device``, ``observe``, …
 
-    Raises:
-        UsageError: a name or number is not valid.
-
     Example::
 
         env = tasks.make("in_palm_rotate", num_envs=16, observe="force_torque")
@@ -56,11 +53,7 @@ def make(
 
 
 class Env:
-    """A batch of environments; environments that end are reset within the same step.
-
-    Raises:
-        UsageError: task, hand and options do not fit.
-    """
+    """A batch of environments; environments that end are reset within the same step."""
 
     def __init__(self, task: Task, hand: hands.Hand, options: EnvOptions | None = None) -> None:
         options = options or EnvOptions()
@@ -169,9 +162,6 @@ class Env:
             (none that diverged), ``dropped`` (by an ending that is not the last goal), ``metric``, ``return``,
             ``steps``, ``goals`` reached and ``turned`` [B] (rotation about the commanded axis while anything touched
             the object, rad), and ``final_observations`` if asked for.
-
-        Raises:
-            UsageError: the action is no tensor of numbers, or has another shape.
         """
         check_kind("action", action, torch.Tensor, "a torch tensor [environments, joints moved]")
         if tuple(action.shape) != (self.num_envs, self.num_actions):
@@ -189,11 +179,7 @@ class Env:
         return result
 
     def seed(self, seed: int) -> None:
-        """Begin the random numbers anew, from the next reset on, those of tactile noise included.
-
-        Raises:
-            UsageError: the seed is no whole number from 0.
-        """
+        """Begin the random numbers anew, from the next reset on, those of tactile noise included."""
         check_number("seed", seed, least=0, below=2**63, whole=True)
         if self.touch is not None:
             self.touch.suite.seed(seed)
@@ -223,11 +209,7 @@ class Env:
         return {name: value.clone() for name, value in self._memory().items()}
 
     def load_state_dict(self, values: Mapping[str, torch.Tensor]) -> None:
-        """Take up what :meth:`state_dict` returned.
-
-        Raises:
-            UsageError: it is the state of other environments: a part is missing, or has another shape.
-        """
+        """Take up what :meth:`state_dict` returned."""
         state = self.state
         for name, own in self._memory().items():
             # States that were kept before the noise could be seeded anew have the seed of the options.

@@ -61,9 +61,6 @@ def grasps_for(task: Task, hand: Hand, model: TaskModel, *, seed: int = 0) -> di
     Returns:
         ``joints`` [G, J] (rad) and ``target`` [G, J] of the drives, ``object`` [G, 7] poses (x y z, qw qx qy qz) and
         ``rows`` [shapes, n]: which grasps belong to which shape.
-
-    Raises:
-        DataError: too few grasps were found.
     """
     settings = SETTINGS.get(hand.name, SETTINGS["xhand1"])
     fields = ("geom_size", "geom_pos", "body_pos", "body_quat", "body_mass")
@@ -86,11 +83,7 @@ def grasps_for(task: Task, hand: Hand, model: TaskModel, *, seed: int = 0) -> di
 def sample(
     task: Task, hand: Hand, model: TaskModel, shape: int, count: int, settings: GraspSampling, seed: int
 ) -> dict[str, NDArray[np.float64]]:
-    """Return grasps ``joints``, ``target`` [n, J] and ``object`` [n, 7] of one shape.
-
-    Raises:
-        DataError: too few candidates held.
-    """
+    """Return grasps ``joints``, ``target`` [n, J] and ``object`` [n, 7] of one shape."""
     trial = _Trial(task, model, shape, settings)
     rng = np.random.default_rng((seed, shape))
     found: dict[str, list[NDArray[np.float64]]] = {"joints": [], "target": [], "object": []}

@@ -34,9 +34,6 @@ class GymVectorEnv(VectorEnv):
     """The environments of a task as numpy arrays; observations are a dictionary of groups, by default what a hand has.
 
     ``privileged`` groups of the simulation are given to who asks for them, such as a teacher.
-
-    Raises:
-        UsageError: the environment does not keep final observations, has no such group, or it is privileged.
     """
 
     def __init__(self, env: Env, groups: tuple[str, ...] = (), *, privileged: bool = False) -> None:
@@ -62,11 +59,7 @@ class GymVectorEnv(VectorEnv):
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        """Start new episodes, some with ``options={"reset_mask": [B] bool}``.
-
-        Raises:
-            UsageError: there is a list of seeds, another option, or a mask of another length.
-        """
+        """Start new episodes, some with ``options={"reset_mask": [B] bool}``."""
         super().reset(seed=None)
         if isinstance(seed, list):
             raise UsageError("Environments draw their random numbers together: give one seed, not a list.")

@@ -18,9 +18,6 @@ class RslRlEnv:
     """The environment as rsl_rl's runners and algorithms call it, without a state of its own.
 
     RND reads ``env.unwrapped.step_dt``, so ``unwrapped`` is the native environment.
-
-    Raises:
-        MissingDependencyError: tensordict is not installed.
     """
 
     def __init__(self, env: Env) -> None:

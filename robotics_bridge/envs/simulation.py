@@ -24,11 +24,7 @@ FIELDS = ("body_mass", "body_inertia", "body_subtreemass", "body_invweight0", "g
 
 
 class Simulation:
-    """Batched physics by the engine ``mujoco`` or ``warp``, with a ``mujoco.MjModel`` per shape of the object.
-
-    Raises:
-        UsageError: the engine does not run on the device.
-    """
+    """Batched physics by the engine ``mujoco`` or ``warp``, with a ``mujoco.MjModel`` per shape of the object."""
 
     def __init__(self, models: Sequence[Any], options: EnvOptions, *, substeps: int = 1) -> None:
         device, num_envs = options.device, options.num_envs

@@ -81,11 +81,7 @@ class EpisodeState:
 
 
 class EnvState:
-    """A batch of environments of a task: what resets, steps and observations read and write.
-
-    Raises:
-        UsageError: task, hand and options do not fit.
-    """
+    """A batch of environments of a task: what resets, steps and observations read and write."""
 
     def __init__(self, task: Task, hand: Hand, options: EnvOptions) -> None:
         self.task, self.hand, self.options, self.num_envs = task, hand, options, options.num_envs
@@ -208,11 +204,7 @@ class EnvState:
 
     @property
     def link_pose(self) -> torch.Tensor:
-        """Poses [B, L, 7] of the tactile links in the palm's frame (x y z, qw qx qy qz).
-
-        Raises:
-            UsageError: there are no tactile links.
-        """
+        """Poses [B, L, 7] of the tactile links in the palm's frame (x y z, qw qx qy qz)."""
         if self.touch is None:
             raise UsageError("There are no tactile links; make the environment with an observation type.")
         pose = self.simulation.pose

@@ -16,7 +16,7 @@ import torch
 import xarray as xr
 from numpy.typing import NDArray
 
-from brainbench import __version__
+from brainbench.core.version import __version__
 from brainbench.core.contracts import CHANNELS, GRID_SHAPE, SUB_STEP_SECONDS, SUB_STEPS, check_stimulus_set
 from brainbench.core.errors import DataError, UsageError, check_each, check_once, listing
 from brainbench.core.files import content_hash, to_json
@@ -45,11 +45,7 @@ _DENSE = 2e5
 
 @dataclass(frozen=True, eq=False)
 class Explored:
-    """An object to explore.
-
-    Raises:
-        UsageError: the orientation or the retreat is not valid, or the object is larger than 2 m.
-    """
+    """An object to explore."""
 
     label: str
     geometry: Geometry
@@ -89,11 +85,7 @@ class HandRecording:
     """Options of the recording."""
 
     def grid(self) -> torch.Tensor:
-        """Return the wrenches as [K, T/S, S·6, 5, 7], in the hand's own units.
-
-        Raises:
-            UsageError: the frames do not divide into time steps of five sub-steps.
-        """
+        """Return the wrenches as [K, T/S, S·6, 5, 7], in the hand's own units."""
         count, frames = self.wrench.shape[:2]
         if frames % SUB_STEPS:
             raise UsageError(f"{frames} frames do not divide into time steps of {SUB_STEPS} sub-steps.")
@@ -163,10 +155,6 @@ def record_exploration(
         noisy: With the published imperfections of force taxels, drawn by ``seed``.
         frames: T, of 9 ms; a procedure is stretched over them.
         progress: Called with (frames done, frames, what).
-
-    Raises:
-        UsageError: a name is unknown or occurs twice, or nothing is to be explored.
-        DataError: the simulation of the hand diverged.
     """
     check_each("exploratory procedure", procedures, PROCEDURES)
     check_once("procedures", procedures)

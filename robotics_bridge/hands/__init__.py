@@ -26,12 +26,7 @@ def list_hands() -> tuple[str, ...]:
 
 
 def load(name_or_path: str | os.PathLike[str]) -> Hand:
-    """Return a hand of ours by name (:func:`list_hands`), or that of a URDF or MJCF file.
-
-    Raises:
-        UsageError: there is no hand of this name.
-        DataError: the file is missing or holds no hand.
-    """
+    """Return a hand of ours by name (:func:`list_hands`), or that of a URDF or MJCF file."""
     name = os.fspath(name_or_path)
     if name in _OWN:
         spec = read_spec(_OWN[name])

@@ -67,12 +67,7 @@ class Hand:
     """Probes of :meth:`with_probes`, the resolution ``custom``."""
 
     def mjspec(self) -> Any:
-        """Return a new ``mujoco.MjSpec`` of the hand, for scenes to attach; the palm is fixed to the world.
-
-        Raises:
-            UsageError: the hand has neither data nor a file.
-            DataError: its file is missing, or MuJoCo cannot read it.
-        """
+        """Return a new ``mujoco.MjSpec`` of the hand, for scenes to attach; the palm is fixed to the world."""
         if self.spec is not None:
             return build(self.spec)
         if self.path is None:
@@ -140,9 +135,6 @@ class Hand:
         Our hands have exactly the counts of the thesis (table 4.11). On any other hand, grids are cast onto the
         palmar side of the links, which is where they move when their joints flex or jaws close; see
         :meth:`with_probes` for a layout of your own, which may also be named as a probe file in place of a resolution.
-
-        Raises:
-            UsageError: resolution or placement are unknown, or no link of the placement gets a probe (it says why).
         """
         links = self.links(placement)
         if is_probe_file(resolution):
@@ -159,11 +151,7 @@ class Hand:
         return self._cast(resolution, links)
 
     def with_probes(self, source: str | os.PathLike[str] | Layout) -> Hand:
-        """Return the hand with a layout from a probe file (:func:`read_probes`) or a mapping of link to probes.
-
-        Raises:
-            UsageError: it names no link, or one that the hand does not have, or a link has something else than probes.
-        """
+        """Return the hand with a layout from a probe file (:func:`read_probes`) or a mapping of link to probes."""
         layout = dict(source) if isinstance(source, Mapping) else read_probes(source)
         if not layout:
             raise UsageError(f"A layout of hand {self.name!r} needs at least one link with probes; received none.")
@@ -211,7 +199,6 @@ def read_mjspec(path: Path) -> Any:
 
     Raises:
         DataFileNotFoundError: the file is missing.
-        DataError: MuJoCo cannot read it.
     """
     mujoco = mujoco_module()
     _check_xml(path)
@@ -283,9 +270,6 @@ def from_file(path: Path) -> Hand:
     """Return the hand of a file; palm and fingers follow from its tree.
 
     The palm is the body from which most branches of joints part; a finger is a branch, named by its tip.
-
-    Raises:
-        DataError: the file holds no hand.
     """
     with readable(path, "URDF or MJCF file"):
         model = read_mjspec(path).compile()

@@ -123,11 +123,7 @@ def check_probes(resolution: str, trained: str | None) -> None:
 
 
 def read_probes(path: str | os.PathLike[str]) -> Layout:
-    """Read probes in the published JSON form: a list of links with a grid of {radius, pos, normal}.
-
-    Raises:
-        DataError: the file is missing or has another form.
-    """
+    """Read probes in the published JSON form: a list of links with a grid of {radius, pos, normal}."""
     document = read_json(path, "probe file")
     name = Path(path).name
     if not isinstance(document, list):

@@ -79,9 +79,6 @@ def sensors_for(
         **knobs: Further settings of the sensor class, e.g. ``convention="thesis"`` or ``points=500``. Force taxels hold
             what they touch and add up to the engine's contact forces (:data:`HOLDING`), unless a convention, a total, a
             friction or a ``twist`` is stated, which means the law; other classes ignore ``twist``.
-
-    Raises:
-        UsageError: there is no such type, or a knob is unknown or has a wrong value.
     """
     kind = observation_type(name)
     if kind.sensor is None:
@@ -117,9 +114,6 @@ def observe(name: str, readings: Mapping[str, torch.Tensor], layout: Layout) -> 
         name: One of :data:`OBSERVATIONS`.
         readings: Link → reading [B, N], [B, N, C], [B, ny, nx] or [B, ny, nx, C] of its sensor.
         layout: Link → probes; fixes the order.
-
-    Raises:
-        UsageError: the type is unknown, the layout has no link, or a link's reading is missing or has another shape.
     """
     kind = observation_type(name)
     if kind.sensor is None:

@@ -43,9 +43,6 @@ def holding_spec(
     A hand gets a weak position servo on every hinge and slide unless all drives of its file are position servos of one
     joint each, and each of the joints ``servos`` has one. The ball of 100 g has a ``radius`` [m] and lies between the
     middle of the palm (``reach`` 0) and the roots of the fingers (1).
-
-    Raises:
-        UsageError: the palm's side is unknown, or the radius is not positive.
     """
     check_number("radius of the ball (m)", radius, above=0)
     check_number("reach", reach)
@@ -146,20 +143,13 @@ def _between(hand: Hand, spec: Any, jaws: dict[int, tuple[float, float]]) -> Any
 
 
 def closing(hand: Hand, share: float) -> NDArray[np.float64]:
-    """Return targets (rad, m) of the servos of :func:`holding`, in their order: :func:`flexed` of their joints.
-
-    Raises:
-        UsageError: the share is not between 0 and 1.
-    """
+    """Return targets (rad, m) of the servos of :func:`holding`, in their order: :func:`flexed` of their joints."""
     target, joints = flexed(hand, share), _servoed(hand)
     return target[hand.joint_numbers if joints is None else joints]
 
 
 def flexed(hand: Hand, share: float) -> NDArray[np.float64]:
     """Return positions (rad, m) of all joints, by number, at which each is flexed, or closed, by a share of its range.
-
-    Raises:
-        UsageError: the share is not between 0 and 1.
     """
     check_number("share by which a hand closes", share, least=0, most=1)
     low, high = hand.model.jnt_range.T
@@ -199,9 +189,6 @@ def palm_surface(hand: Hand) -> tuple[NDArray[np.float64], NDArray[np.float64], 
     """Return where the palm is: its outward direction [3], the middle of its pad [3] and a step [3] (m, palm frame).
 
     The step leads along the palm from the pad to the mean root of the fingers.
-
-    Raises:
-        UsageError: the joints do not tell which side the palm is.
     """
     facing = palmar_directions(hand.model, hand.palm, hand.fingers)
     if hand.palm not in facing:

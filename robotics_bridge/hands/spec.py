@@ -189,9 +189,6 @@ def build(hand: HandSpec) -> Any:
     """Return the ``mujoco.MjSpec`` of a hand whose palm is fixed to the world.
 
     Every joint carries a position servo with the joint's name; solids are named ``<link>_<number>``.
-
-    Raises:
-        UsageError: the links form no tree.
     """
     mujoco = mujoco_module()
     spec = mujoco.MjSpec()

@@ -44,9 +44,6 @@ def cast_grid(
 
     Rays run against ``facing`` over a share ``extent`` of the link; columns run along its longest extent across
     ``facing``. Rays that miss the link leave fillers.
-
-    Raises:
-        UsageError: the model has no such link, the link has no surface there, or a number lies outside its range.
     """
     for name, number in {"rows": rows, "columns": columns}.items():
         check_number(name, number, least=1, whole=True)

@@ -38,9 +38,6 @@ class MujocoEngine:
         fields: values per environment [B, ...] of any model field, e.g. ``{"body_mass": …}``.
         assignment: variant of environment e is ``assignment[e % len(assignment)]``; each in turn by default.
         contacts: room for contacts per environment.
-
-    Raises:
-        UsageError: a field, or a number of environments, threads or contacts, is not valid.
     """
 
     def __init__(
@@ -102,11 +99,7 @@ class MujocoEngine:
         return np.stack([data.qvel for data in self.data])
 
     def set(self, **values: ArrayLike) -> None:
-        """Write ``qpos``, ``qvel``, ``ctrl``, … of every environment [B, n] (or one row [n] for all).
-
-        Raises:
-            UsageError: the simulation has no such array, or it has another shape.
-        """
+        """Write ``qpos``, ``qvel``, ``ctrl``, … of every environment [B, n] (or one row [n] for all)."""
         for name, value in values.items():
             if not isinstance(own := getattr(self.data[0], name, None), np.ndarray):
                 raise unknown_name("array of the simulation", name, model_fields(self.data[0]))
@@ -160,11 +153,7 @@ class MujocoEngine:
         self._each(lambda env: mujoco.mj_forward(self.models[env], self.data[env]))
 
     def reset(self, env_ids: EnvIds | None = None) -> None:
-        """Put environments (all by default), given by numbers or a mask, back to the model's start.
-
-        Raises:
-            UsageError: an environment does not exist, or these are neither numbers nor a mask.
-        """
+        """Put environments (all by default), given by numbers or a mask, back to the model's start."""
         for env in select_envs(env_ids, self.num_envs, "cpu").nonzero().flatten().tolist():
             mujoco.mj_resetData(self.models[env], self.data[env])
         self.forward()

@@ -37,10 +37,6 @@ class MujocoWarpEngine:
         model: as of ``MujocoEngine``; so are ``num_envs``, ``assignment`` and ``fields``, which MuJoCo Warp must batch.
         device: ``cuda``, ``cuda:1`` or ``cpu`` (slow; for tests).
         contacts: room for contacts per environment, on average; by default sixteen, and nine per moving link.
-
-    Raises:
-        MissingDependencyError: mujoco-warp is not installed.
-        UsageError: a field cannot differ between environments, or variants differ in it.
     """
 
     def __init__(
@@ -108,11 +104,7 @@ class MujocoWarpEngine:
         return warp().to_torch(self.data.ctrl)
 
     def field(self, name: str) -> torch.Tensor:
-        """Return a model field [B, ...], a view to write to; derived constants are the caller's business.
-
-        Raises:
-            UsageError: the field does not differ between environments here.
-        """
+        """Return a model field [B, ...], a view to write to; derived constants are the caller's business."""
         array = getattr(self._m, name, None)
         if array is None or array.shape[0] != self.num_envs or (self.num_envs == 1 and name not in self._varied):
             raise unknown_name("field that differs between environments", name, self._varied)
@@ -127,11 +119,7 @@ class MujocoWarpEngine:
             self._fill_links()
 
     def set(self, **values: ArrayLike | torch.Tensor) -> None:
-        """Write ``qpos``, ``qvel``, ``ctrl``, … of every environment [B, n] (or one row [n] for all).
-
-        Raises:
-            UsageError: the simulation has no such array, or it has another shape.
-        """
+        """Write ``qpos``, ``qvel``, ``ctrl``, … of every environment [B, n] (or one row [n] for all)."""
         wp = warp()
         for name, value in values.items():
             if not isinstance(own := getattr(self.data, name, None), wp.array):
@@ -165,11 +153,7 @@ class MujocoWarpEngine:
             self._fill()
 
     def reset(self, env_ids: EnvIds | None = None) -> None:
-        """Put environments (all by default), given by numbers or a mask, back to the model's start.
-
-        Raises:
-            UsageError: these are neither numbers nor a mask; on the processor also where an environment does not exist.
-        """
+        """Put environments (all by default), given by numbers or a mask, back to the model's start."""
         wp = warp()
         with wp.ScopedDevice(self._device):
             mask = None

@@ -32,11 +32,7 @@ LONGEST_STEP = 0.1
 
 @dataclass(frozen=True, kw_only=True)
 class Geometry:
-    """A solid that is fixed to a link.
-
-    Raises:
-        UsageError: the kind is unknown, a size or pose is not valid, or a mesh is missing.
-    """
+    """A solid that is fixed to a link."""
 
     name: str
     link: str
@@ -91,11 +87,7 @@ class Geometry:
 
 @dataclass(frozen=True, eq=False)
 class TouchScene:
-    """Links, their geometries and the pairs that may touch; says nothing about motion.
-
-    Raises:
-        UsageError: a name occurs twice, a link or number is unknown, or variants are empty.
-    """
+    """Links, their geometries and the pairs that may touch; says nothing about motion."""
 
     links: tuple[str, ...]
     geometries: tuple[Geometry, ...] = ()
@@ -183,9 +175,6 @@ class TouchScene:
 
         ``others`` are further variants that differ in numbers only. That of environment e is number
         ``assignment[e % len(assignment)]``; empty means each in turn.
-
-        Raises:
-            UsageError: the variants have different links or geometries, or the time step is no sensible time.
         """
         check_number("time step of the engine (s)", float(model.opt.timestep), above=0, most=LONGEST_STEP)
         for number in assignment:

@@ -14,12 +14,7 @@ EnvIds = Sequence[int] | np.ndarray | torch.Tensor
 
 
 def select_envs(env_ids: EnvIds | None, num_envs: int, device: torch.device | str) -> torch.Tensor:
-    """Return a mask [B] bool of the chosen environments, a new one; None chooses all.
-
-    Raises:
-        UsageError: an environment does not exist (on a GPU, where looking would wait for the device, this goes
-            unnoticed here), or these are neither whole numbers nor a mask.
-    """
+    """Return a mask [B] bool of the chosen environments, a new one; None chooses all."""
     device = torch.device(device)
     if env_ids is None:
         return torch.ones(num_envs, dtype=torch.bool, device=device)

@@ -64,9 +64,6 @@ class HandState:
     @classmethod
     def empty(cls, num_envs: int, num_links: int, contacts: int = 0, device: Any = "cpu") -> HandState:
         """Return a state of B environments with L links at the origin, at rest, and room C for all contacts together.
-
-        Raises:
-            UsageError: no or too many environments, no link, or negative room.
         """
         check_number("environments of a state", num_envs, least=1, most=MOST_ENVS, whole=True)
         check_number("links of a state", num_links, least=1, whole=True)
@@ -126,12 +123,7 @@ class HandState:
         return warp().to_torch(self.velocity)
 
     def set_pose(self, pose: ArrayLike | torch.Tensor) -> None:
-        """Write world poses [B, L, 7] (or one [L, 7] for all) as (x, y, z, qw, qx, qy, qz), quaternions normalised.
-
-        Raises:
-            UsageError: the shape is another, or a quaternion is zero (on a GPU, where looking would wait for the
-                device, it becomes NaN: its environment is diverged).
-        """
+        """Write world poses [B, L, 7] (or one [L, 7] for all) as (x, y, z, qw, qx, qy, qz), quaternions normalised."""
         self._check_shape(self.pose_torch, pose, "poses")
         values = _tensor(pose)
         length = values[..., 3:].norm(dim=-1, keepdim=True)
@@ -155,9 +147,6 @@ class HandState:
             geometries: pairs [n, 2] of geometry numbers.
             **optional: ``distance``, ``force`` [n], ``position``, ``normal``, ``friction`` [n, 3]. What is not given
                 is set to 0, and forces to NaN: nothing is left of earlier contacts.
-
-        Raises:
-            UsageError: there are more contacts than room, an environment or quantity is unknown, or a shape is another.
         """
         wp = warp()
         environments, pairs = (np.asarray(values, dtype=np.float64).reshape(-1) for values in (env, geometries))

@@ -23,11 +23,7 @@ def model_fields(model: Any) -> tuple[str, ...]:
 
 
 def check_fields(model: Any, fields: Mapping[str, ArrayLike], num_envs: int) -> dict[str, NDArray]:
-    """Return the fields as arrays [B, ...] after checking names and shapes.
-
-    Raises:
-        UsageError: the model has no such field, its shape is not one value per environment, or a value is NaN.
-    """
+    """Return the fields as arrays [B, ...] after checking names and shapes."""
     checked = {}
     for name, values in fields.items():
         own = getattr(model, name, None)
@@ -44,11 +40,7 @@ def check_fields(model: Any, fields: Mapping[str, ArrayLike], num_envs: int) -> 
 
 
 def differing_fields(models: Sequence[Any], order: Sequence[int], num_envs: int) -> dict[str, NDArray]:
-    """Stack per environment e [B, ...] every field in which compiled variants ``order[e % len(order)]`` differ.
-
-    Raises:
-        UsageError: variants differ in structure, not only in numbers.
-    """
+    """Stack per environment e [B, ...] every field in which compiled variants ``order[e % len(order)]`` differ."""
     first = models[0]
     rows = np.array([order[env % len(order)] for env in range(num_envs)])
     found = {}
@@ -76,9 +68,6 @@ def compile_variants(spec: Any, geometry: str, shapes: Sequence[Geometry], *, de
         geometry: name of what is replaced there.
         shapes: what to put there, with the link and pose of the spec. MuJoCo Warp needs equal kinds.
         density: kg/m³.
-
-    Raises:
-        UsageError: the spec has no such geometry, or a kind cannot be an object.
     """
     check_number("density (kg/m³)", density, above=0)
     models = []

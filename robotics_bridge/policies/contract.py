@@ -119,12 +119,7 @@ class PolicyContract:
 
     @classmethod
     def read(cls, path: Path) -> PolicyContract:
-        """Read a contract.
-
-        Raises:
-            DataError: the file is no contract, or a value is out of range, not finite or of another kind.
-            UsageError: it does not say what a hand needs; export the policy from a trained run.
-        """
+        """Read a contract."""
         return cls.of(read_mapping(path, "JSON file of names and values"), path.name)
 
     @classmethod
@@ -185,9 +180,6 @@ def trained_contacts(described: Mapping[str, Any], where: str = "config.json") -
     """Return the contact model in which the policy of a ``config.json`` was trained.
 
     Runs of versions that did not state it had the published one.
-
-    Raises:
-        DataError: a value is of another kind, or out of range.
     """
     given = described.get("contacts")
     return CONTACTS["published"] if given is None else from_json(ContactModel, given, f"contacts of {where}")

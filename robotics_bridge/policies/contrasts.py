@@ -75,11 +75,7 @@ class Help:
 
 @dataclass(frozen=True, eq=False)
 class MixedModel:
-    """Arms of policies with random draws and seeds.
-
-    Raises:
-        UsageError: no arm has two policies, or a policy is given twice.
-    """
+    """Arms of policies with random draws and seeds."""
 
     policies: tuple[TrainedPolicy, ...]
 
@@ -160,11 +156,7 @@ class MixedModel:
         return self._estimate(np.array([float(one == arm) - float(other == arm) for arm in self.arms]))
 
     def judge(self, arm: str, random: Collection[str]) -> Help:
-        """Return whether an arm helps beyond the best of some random arms.
-
-        Raises:
-            UsageError: an arm is unknown, or no random one is named.
-        """
+        """Return whether an arm helps beyond the best of some random arms."""
         check_each("arm", (arm, *random), self.arms)
         if not random or arm in random:
             raise UsageError(f"The arm {arm!r} is held against at least one random arm other than itself.")

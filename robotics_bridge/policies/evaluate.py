@@ -146,9 +146,6 @@ def evaluate(
         episodes: at least so many for every seed of the environments.
         seed: several are run one after the other.
         progress: called with seeds done, seeds and a word.
-
-    Raises:
-        UsageError: no episode or seed is asked for.
     """
     seeds = (seed,) if isinstance(seed, int) else tuple(seed)
     if episodes < 1 or not seeds:

@@ -86,10 +86,6 @@ def export_policy(
         path: The suffix .onnx is added when there is none.
         deployment: What a robot needs besides (rate, joints, limits, …); kept in the contract.
         name: What the contract calls the policy.
-
-    Raises:
-        MissingDependencyError: a package of the extra ``export`` is missing.
-        DataError: the file does not compute what the policy does, or the contract has values out of range.
     """
     target = Path(path) if Path(path).suffix else Path(path).with_suffix(".onnx")
     contract = {

@@ -30,9 +30,6 @@ def with_contacts_of(task: Task, policies: Iterable[str]) -> Task:
     """Return a task with the contacts in which some policies were trained; unchanged without any.
 
     A policy is a shipped one or the folder of a run; ``zero`` and ``random`` were trained in none.
-
-    Raises:
-        UsageError: the policies were trained with different contacts.
     """
     found = {name: trained_contacts(described) for name in policies if (described := stored(name))}
     models = {*found.values()} or {task.contacts}
@@ -101,10 +98,6 @@ def check_fit(described: Mapping[str, Any], env: Env, name: str) -> None:
 
     Other contacts than those of training are told as a warning: how a policy bears them is a question one may ask. So
     are a hand whose file was changed, and a student that reads the goal, as published ones do.
-
-    Raises:
-        DataError: the policy is of another version of the tasks.
-        UsageError: it was trained for another hand, with actions that meant other targets, or reads something else.
     """
     check_version(described, name)
     student = described.get("distill")

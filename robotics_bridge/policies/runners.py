@@ -32,10 +32,6 @@ def read_policy(
         shapes: Group → shape, in the order of the contract's ``inputs``.
         threads: Threads that ONNX Runtime computes with; its own choice if None.
         actions: A; not checked if None.
-
-    Raises:
-        DataError: the file cannot be read, has other inputs or actions, or holds weights that are not finite.
-        MissingDependencyError: a package of the extra ``export`` is missing.
     """
     require_onnx()
     check_file(path, "policy", most=MOST_POLICY)

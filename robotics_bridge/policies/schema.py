@@ -27,12 +27,7 @@ T = TypeVar("T")
 
 
 def from_json(kind: type[T], values: Any, where: str) -> T:
-    """Return parsed JSON of ``where``, a file or a place in one, as a class.
-
-    Raises:
-        DataError: a value is missing, of another kind or out of range.
-        UsageError: a dataclass has no field of a name; other classes take what they have fields for.
-    """
+    """Return parsed JSON of ``where``, a file or a place in one, as a class."""
     if is_dataclass(kind) and isinstance(values, Mapping):
         check_each(f"setting in {where!r}", values, kind.__dataclass_fields__)
     try:

@@ -130,9 +130,6 @@ class TactilePolicy(MLPModel):
         tactile: Fields of :class:`~robotics_bridge.policies.encoders.arms.EncoderConfig`; needed where the set has
             touch.
         embedder: Encoder of flat groups: ``none``, ``mlp`` or ``lstm``.
-
-    Raises:
-        UsageError: touch and its encoder do not fit.
     """
 
     is_recurrent: bool = True

@@ -29,11 +29,7 @@ _ORDER = 2
 
 
 def band_sections(name: str, rate: float) -> np.ndarray:
-    """Return the second-order sections [n, 6] of one of :data:`AFFERENTS` at a sample rate (Hz).
-
-    Raises:
-        UsageError: the band does not fit below half the rate.
-    """
+    """Return the second-order sections [n, 6] of one of :data:`AFFERENTS` at a sample rate (Hz)."""
     low, high = AFFERENTS[name]
     if high >= rate / 2:
         raise UsageError(
@@ -51,9 +47,6 @@ class AfferentFilter:
     Args:
         rate: Updates per second [Hz].
         bands: Names of :data:`AFFERENTS`.
-
-    Raises:
-        UsageError: there is no band, or one is unknown or does not fit below half the rate.
 
     Example::
 
@@ -75,9 +68,6 @@ class AfferentFilter:
 
         The first signal counts as having lasted for ever, so that contact before it rings in no band. A value that is
         not finite stays in its memory until :meth:`reset`.
-
-        Raises:
-            UsageError: the signal holds no real numbers with a fraction, or has another shape than before.
         """
         self._check(x)
         if not self._state:
@@ -98,9 +88,6 @@ class AfferentFilter:
 
     def reset(self, env_ids: EnvIds | None = None, x: torch.Tensor | None = None) -> None:
         """Forget the past of some environments (all by default); there the signal ``x`` [B, …], or 0, has always been.
-
-        Raises:
-            UsageError: an environment does not exist, or the signal has another shape than before.
         """
         from robotics_bridge.physics.selection import select_envs
 

@@ -23,11 +23,7 @@ TABLE = Path(__file__).with_name("fidelity_table.json")
 
 @dataclass(frozen=True)
 class SensorFidelity:
-    """Settings that trade exactness for speed; the rest of a sensor is its own.
-
-    Raises:
-        UsageError: a setting lies outside its range.
-    """
+    """Settings that trade exactness for speed; the rest of a sensor is its own."""
 
     query: Literal["sdf", "raycast"] = "sdf"
     """Way to ask meshes for their distance: sampled fields, or the nearest triangle."""
@@ -49,11 +45,7 @@ class SensorFidelity:
 
     @classmethod
     def auto(cls, error: float) -> SensorFidelity:
-        """Return the cheapest measured settings whose relative force errors are at most ``error``.
-
-        Raises:
-            UsageError: no measured setting is that accurate.
-        """
+        """Return the cheapest measured settings whose relative force errors are at most ``error``."""
         meshes = cheapest(_points("mesh"), error).settings
         points = cheapest(_points("points"), error).settings
         return cls(meshes["query"], meshes["resolution"] or 64, points["points"])

@@ -20,11 +20,7 @@ Convention = Literal["physical", "thesis"]
 
 @dataclass(frozen=True, kw_only=True)
 class Sensor(abc.ABC):
-    """Configuration of a sensor on one link.
-
-    Raises:
-        UsageError: the link has no name, a noise knob is set that the sensor does not have, or the history is negative.
-    """
+    """Configuration of a sensor on one link."""
 
     link: str
     """The link that carries it."""
@@ -103,11 +99,7 @@ class ProbeSensor(Sensor):
 
 @dataclass(frozen=True, kw_only=True)
 class QuerySensor(ProbeSensor):
-    """A probe sensor that asks for distances, by fields or by triangles.
-
-    Raises:
-        UsageError: the way to ask or the choice of pairs is unknown.
-    """
+    """A probe sensor that asks for distances, by fields or by triangles."""
 
     query: Literal["sdf", "raycast"] = "sdf"
     """``sdf``: closed forms, and for meshes sampled fields, or the nearest triangle where walls are thin for the cells.

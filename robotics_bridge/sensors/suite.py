@@ -52,9 +52,6 @@ class SensorSuite:
             more than 256 MiB. A warning says once how many there were if some were lost (on a GPU when :attr:`crowded`
             is read).
 
-    Raises:
-        UsageError: a sensor is no sensor, or names a link that the scene does not have.
-
     Example::
 
         suite = SensorSuite(engine.scene, {"tip": ContactProbe(link="tip", probes=probes)}, num_envs=engine.num_envs)
@@ -123,11 +120,7 @@ class SensorSuite:
         self._warned = False
 
     def update(self, state: HandState, dt: float = 0.01) -> None:
-        """Read the state of ``num_envs`` environments with every sensor, ``dt`` seconds after the last update.
-
-        Raises:
-            UsageError: the state does not fit the suite, or dt is not a positive time.
-        """
+        """Read the state of ``num_envs`` environments with every sensor, ``dt`` seconds after the last update."""
         if self._status is None or state.status is not self._status:
             self._check(state)
         check_number("dt (time since the last update, s)", dt, above=0)
@@ -165,11 +158,7 @@ class SensorSuite:
         return self._view(name, self.runtime_of(name).io.truth)
 
     def read_history(self, name: str) -> torch.Tensor:
-        """Return the last measured readings [B, T, N(, C)], oldest first; zeros before the reset. A view.
-
-        Raises:
-            UsageError: the sensor keeps no history.
-        """
+        """Return the last measured readings [B, T, N(, C)], oldest first; zeros before the reset. A view."""
         self.runtime_of(name)
         if name not in self._histories:
             raise UsageError(f"The sensor {name!r} keeps no history; configure it with history=<readings>.")
@@ -181,11 +170,7 @@ class SensorSuite:
         return tensor.squeeze(-1) if kept.part.scalar else tensor
 
     def read_nearest(self, name: str) -> torch.Tensor:
-        """Return the nearest surface points [B, N, 3] of a SurfaceDistanceProbe (m, link frame); a view.
-
-        Raises:
-            UsageError: the sensor keeps no nearest points.
-        """
+        """Return the nearest surface points [B, N, 3] of a SurfaceDistanceProbe (m, link frame); a view."""
         runtime, sensor = self.runtime_of(name), self.sensors[name]
         if not (isinstance(sensor, SurfaceDistanceProbe) and sensor.nearest):
             raise UsageError(f"{name!r} keeps no nearest points; it needs SurfaceDistanceProbe(..., nearest=True).")
@@ -194,11 +179,7 @@ class SensorSuite:
         return points.permute(1, 2, 0).unflatten(1, part.layout)
 
     def reset(self, env_ids: EnvIds | None = None) -> None:
-        """Start a new episode in some environments (all by default): memories are cleared, new errors drawn.
-
-        Raises:
-            UsageError: an environment does not exist, or these are neither numbers nor a mask.
-        """
+        """Start a new episode in some environments (all by default): memories are cleared, new errors drawn."""
         mask = wp.from_torch(select_envs(env_ids, self.num_envs, wp.device_to_torch(self.device)))
         self.context.launch(reset_clock, self.num_envs, mask, self.context.age, self.context.episode)
 
@@ -274,11 +255,7 @@ class SensorSuite:
             raise UsageError(f"The state lies on {state.device}, the suite on {self.device}; build both on one device.")
 
     def runtime_of(self, name: str, kind: type[Sensor] = Sensor, what: str = "sensor") -> Runtime:
-        """Return the runtime of a sensor of a kind, which messages call ``what``.
-
-        Raises:
-            UsageError: there is no such sensor.
-        """
+        """Return the runtime of a sensor of a kind, which messages call ``what``."""
         choices = tuple(key for key, sensor in self.sensors.items() if isinstance(sensor, kind))
         if name not in choices:
             raise unknown_name(what, name, choices)

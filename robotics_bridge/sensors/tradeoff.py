@@ -202,11 +202,7 @@ def _integral(places: NDArray) -> NDArray[np.float64]:
 
 
 def plot_tradeoff(rows: Sequence[dict[str, Any]], path: Path) -> None:
-    """Draw error against cost of every part.
-
-    Raises:
-        MissingDependencyError: matplotlib is not installed.
-    """
+    """Draw error against cost of every part."""
     figure, axes = panels(1, 3, (10.5, 3.6))
     titles = {
         "mesh": "distance to 4,608 triangles,\nby cells of the distance field",

@@ -22,11 +22,7 @@ def check_range(name: str, value: Any, **bounds: Any) -> None:
 
 
 def unit_vector(name: str, value: Any, count: int) -> tuple[float, ...]:
-    """Return an axis (3 numbers) or a quaternion (4) of unit length; one that has it stays as it is.
-
-    Raises:
-        UsageError: there are not so many finite numbers, or they have no length.
-    """
+    """Return an axis (3 numbers) or a quaternion (4) of unit length; one that has it stays as it is."""
     check_numbers(name, value, count)
     length = math.hypot(*value)
     if not length > 0:
@@ -39,9 +35,6 @@ def check_parameters(of: str, function: Callable[..., Any], given: Iterable[str]
     """Check that a function of a :class:`~robotics_bridge.tasks.step_context.StepContext` can be called by these names.
 
     It takes the context first. Messages call it ``of`` (``reward 'work' of task 'mine'``).
-
-    Raises:
-        UsageError: it is no function, a name is none of its parameters (with the nearest), or a needed one is missing.
     """
     if not callable(function):
         raise UsageError(f"The {of} needs a function of a step; received {shown(function)}.")

@@ -11,11 +11,7 @@ from brainbench.core.reading.ranges import check_fields
 
 @dataclass(frozen=True, kw_only=True)
 class ContactModel:
-    """Compliance of all contacts (MuJoCo's ``solref`` and ``solimp``), physics steps, and the scale of the drives.
-
-    Raises:
-        UsageError: a number is out of range.
-    """
+    """Compliance of all contacts (MuJoCo's ``solref`` and ``solimp``), physics steps, and the scale of the drives."""
 
     time_constant: float = 0.02
     """Time in which the solver takes overlap away [s]; the published engine's default."""

@@ -21,12 +21,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class Goal(abc.ABC):
-    """An orientation to reach; a new one is proposed as soon as it is.
-
-    Raises:
-        UsageError: the threshold is not positive, it begins narrower than it ends, a number lies outside its range, or
-            an axis has no length.
-    """
+    """An orientation to reach; a new one is proposed as soon as it is."""
 
     threshold: float = 0.1
     """Angle below which the goal counts as reached [rad]."""

@@ -26,12 +26,7 @@ _SIZES = {"box": 3, "cylinder": 2, "capsule": 2, "sphere": 1}
 
 @dataclass(frozen=True)
 class ObjectPrimitive:
-    """A primitive in the body's frame.
-
-    Raises:
-        UsageError: the kind is unknown, its sizes are not positive, not as many as the kind has or no object's in
-            metres, or its place or orientation is none.
-    """
+    """A primitive in the body's frame."""
 
     kind: str
     """``box``, ``cylinder``, ``capsule`` or ``sphere``."""
@@ -56,11 +51,7 @@ class ObjectPrimitive:
 
 @dataclass(frozen=True)
 class ObjectShape:
-    """One object: its solids and its outer measures.
-
-    Raises:
-        UsageError: it has no solid, or a measure is no length.
-    """
+    """One object: its solids and its outer measures."""
 
     name: str
     solids: tuple[ObjectPrimitive, ...]
@@ -119,9 +110,6 @@ def screwdriver(length: float, handle_length: float, handle_radius: float, shaft
     """Return a screwdriver along the body's y axis, tip at the origin, handle above [m].
 
     The handle is a cylinder, the shaft a capsule that ends in the tip.
-
-    Raises:
-        UsageError: the handle is not shorter than the tool.
     """
     if not 0 < handle_length < length:
         raise UsageError(f"The handle is shorter than the tool; received {handle_length} m of {length} m.")
@@ -142,9 +130,6 @@ def with_sizes(shapes: Sequence[ObjectShape], span: tuple[float, float]) -> tupl
     """Return every shape at eight sizes, evenly from the smallest to the largest factor of a span.
 
     Neighbours differ in both, so that a few environments, which take them in turn, have all sizes and shapes.
-
-    Raises:
-        UsageError: the range is not positive or falls.
     """
     if span == (1.0, 1.0):
         return tuple(shapes)

@@ -21,10 +21,6 @@ def apply_overrides(task: Task, words: Iterable[str]) -> Task:
     ``learning_rate_range=1e-4,1e-3``, ``episode=15``, ``goal.start_threshold=0.4``, ``object_changes.friction=0.8,1``,
     ``contacts=firm``, ``contacts.time_constant=0.01``, ``objects=box,cylinder,cylinder`` (all the task's objects whose
     names begin so; named twice, they are twice as many).
-
-    Raises:
-        UsageError: a word is not of this form, names nothing of the task or what another one names, or the value is
-            not of its kind.
     """
     words = list(words)
     check_once("--change", [word.partition("=")[0] for word in words])

@@ -18,9 +18,6 @@ _OWN = ("in_palm_rotate", "in_hand_repose", "screwdriver", "hot_ball")
 def register(name: str, config: str = "default") -> Callable[[Maker], Maker]:
     """Register a function without arguments that returns a :class:`Task`; every task needs the config ``default``.
 
-    Raises:
-        UsageError: the task has such a configuration already.
-
     Example::
 
         @register("balance")
@@ -66,11 +63,7 @@ def list_tasks() -> tuple[str, ...]:
 
 
 def load(name: str, config: str = "default") -> Task:
-    """Return a task in one of its configurations (``default``, ``published``, …).
-
-    Raises:
-        UsageError: there is no such task or configuration.
-    """
+    """Return a task in one of its configurations (``default``, ``published``, …)."""
     if name in _OWN:
         import_module(f"robotics_bridge.tasks.{name}")
     if name not in _MADE:

@@ -74,12 +74,7 @@ class TaskModel:
 
 
 def build(task: Task, hand: Hand) -> TaskModel:
-    """Compile a task for a hand.
-
-    Raises:
-        UsageError: a finger that the task moves, or a joint it names, does not exist on this hand, or a joint rests
-            beyond its limits.
-    """
+    """Compile a task for a hand."""
     shapes = with_sizes(task.objects, task.object_changes.size)
     names = tuple("object" if task.copies == 1 else f"object{index}" for index in range(task.copies))
     bare, drives = _hand_spec(task, hand)
@@ -285,11 +280,7 @@ def _tips(hand: Hand) -> dict[str, Any]:
 
 
 def palm_up(hand: Hand) -> Pose:
-    """Return the pose that turns the palm of a hand up below the object's place, fingers along −x.
-
-    Raises:
-        UsageError: the joints do not tell which side the palm is.
-    """
+    """Return the pose that turns the palm of a hand up below the object's place, fingers along −x."""
     up, surface, step = palm_surface(hand)
     length = float(np.linalg.norm(step))
     # Fingers around the middle of the palm, as of a gripper, point nowhere along it: then an axis of the palm.

@@ -30,11 +30,7 @@ LOSSES = ("mse", "inv_var_mse")
 
 @dataclass(frozen=True, kw_only=True)
 class TeacherSettings:
-    """PPO of the privileged teacher, upper half of table 4.4.
-
-    Raises:
-        UsageError: the schedule is unknown, or a range is empty or does not hold the learning rate.
-    """
+    """PPO of the privileged teacher, upper half of table 4.4."""
 
     num_envs: int = 8192
     """Environments at once."""

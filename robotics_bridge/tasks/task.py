@@ -185,11 +185,7 @@ class Success:
 
 @dataclass(frozen=True, kw_only=True)
 class Task:
-    """Everything that makes a task. Change one with ``dataclasses.replace``.
-
-    Raises:
-        UsageError: a name, a group or a number is not valid.
-    """
+    """Everything that makes a task. Change one with ``dataclasses.replace``."""
 
     name: str
     text: str
@@ -367,11 +363,7 @@ MEASURED = ("proprio", "tactile", "link_pose", "command", "thermal")
 
 
 def check_measured(names: Iterable[str], reader: str) -> None:
-    """Check that a policy reads what a hand has; ``reader`` names it in errors.
-
-    Raises:
-        UsageError: a name is unknown, or a group follows from the state of the simulation.
-    """
+    """Check that a policy reads what a hand has; ``reader`` names it in errors."""
     for name in names:
         check_name("observation group", name, GROUPS)
         if name not in MEASURED:

@@ -25,11 +25,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class ThermalSettings:
-    """Materials of fingers and balls. The first four numbers are the axes of figure 4.8 and section 4.6.3.
-
-    Raises:
-        UsageError: the target is not hotter than the room, or a number lies outside its range.
-    """
+    """Materials of fingers and balls. The first four numbers are the axes of figure 4.8 and section 4.6.3."""
 
     conductivity: float = 150.0
     """Conductivity of the fingers [W/(m·K)]."""

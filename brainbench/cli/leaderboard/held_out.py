@@ -94,9 +94,6 @@ def score_held_out(record: ResultRecord, told: Commitment, secret: Path) -> dict
     """Score the model of a record on held-out recordings, with the options that the record states.
 
     The answer is rounded to two digits: many submissions shall learn little of the held-out part.
-
-    Raises:
-        DataError: the secret is not what was committed to.
     """
     from brainbench.datasets import open_recordings
     from brainbench.scoring.options import ScoreOptions

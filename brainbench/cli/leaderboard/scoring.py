@@ -51,9 +51,6 @@ def jobs_of(patterns: Sequence[str], seeds: Sequence[int] | None, options: Mappi
     """Return the scores of the models that the patterns match, for each seed of untrained weights.
 
     Without ``seeds`` the options state one. Weights that follow no seed are scored once.
-
-    Raises:
-        UsageError: a pattern matches no model, or an option does not exist.
     """
     common = ScoreOptions.of(options)
     by_seed = {
@@ -70,10 +67,6 @@ def score_again(record: ResultRecord, *, recordings: str | None = None, trust_co
 
     Only demo recordings are found without ``recordings``, since records keep no folders. ``trust_code`` also runs code
     and weights that do not come with this package.
-
-    Raises:
-        DataError: the record does not say enough.
-        UsageError: the recordings are not given, or differ in their labels; or the record names foreign code.
     """
     from brainbench.scoring.demo import DEMOS
     from brainbench.scoring.scores import score_record
@@ -114,11 +107,7 @@ def _check_kinds(record: ResultRecord, model: Any, source: Any) -> None:
 
 
 def refuse_foreign_code(record: ResultRecord, *, trusted: bool) -> None:
-    """Refuse to run what a record names unless it is in the registry or comes with the package.
-
-    Raises:
-        UsageError: model or metric of the record are something else, and not ``trusted``.
-    """
+    """Refuse to run what a record names unless it is in the registry or comes with the package."""
     from brainbench.metrics import list_metrics
     from brainbench.models.registry import list_models
     from brainbench.models.training.checkpoints import shipped
@@ -138,9 +127,6 @@ def find_models(patterns: Sequence[str]) -> list[str]:
 
     A name that is no pattern may also be a file or a folder, and is then taken as it is. A pattern without a dot
     means architectures, one with a dot trained models: ``*-small`` and ``*-small.*``.
-
-    Raises:
-        UsageError: an architecture does not exist, or a pattern matches nothing.
     """
     from brainbench.models.architecture import Architecture, is_path
     from brainbench.models.registry import list_models
@@ -166,11 +152,8 @@ def missing(jobs: Sequence[ScoringJob], records: Iterable[ResultRecord]) -> list
 
     A record counts only if made by this version of the package and of the estimator from the same weights,
     recordings, stimuli, pairs of labels and settings, so that a batch also renews what has become stale.
-
-    Raises:
-        UsageError: the labels of recordings and stimuli do not match.
     """
-    from brainbench import __version__
+    from brainbench.core.version import __version__
     from brainbench.metrics import get_metric
     from brainbench.scoring.model_responses import DEFAULT_STIMULI, resolve_model
     from brainbench.scoring.neural_responses import open_neural_responses
@@ -224,9 +207,6 @@ def parse_seeds(text: str) -> tuple[int, ...]:
 
     >>> parse_seeds("0-2,7")
     (0, 1, 2, 7)
-
-    Raises:
-        UsageError: it is something else.
     """
     seeds: list[int] = []
     try:
@@ -245,10 +225,6 @@ def read_batch(path: Path) -> list[ScoringJob]:
     """Read the scores that a batch file asks for: TOML with ``[[entries]]`` of ``models`` and ``seeds``.
 
     ``[options]`` are the fields of :class:`~brainbench.scoring.options.ScoreOptions` that hold for all of them.
-
-    Raises:
-        DataError: the file is missing or of another kind.
-        UsageError: an option does not exist.
     """
     data = read_toml(path, "batch file")
     given, entries = data.get("options", {}), data.get("entries", [])

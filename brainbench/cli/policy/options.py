@@ -39,11 +39,7 @@ class World:
     task_file: TaskFileOption = None
 
     def check(self, agents: Iterable[str]) -> None:
-        """Raise UsageError for an unknown task or agent, before anything slow is imported.
-
-        Raises:
-            UsageError: there is no such task, or no such agent or folder.
-        """
+        """Raise UsageError for an unknown task or agent, before anything slow is imported."""
         from brainbench.core.errors import check_name, unknown_name
         from robotics_bridge import tasks
         from robotics_bridge.policies import shipped
@@ -106,11 +102,7 @@ def agent_of(name: str, env: Env, *, seed: int = 0) -> Any:
 
 
 def touch_of(names: list[str]) -> dict[str, Any]:
-    """Return the tactile options of the student among some agents; nothing if there is none.
-
-    Raises:
-        UsageError: students with different senses are asked for at once.
-    """
+    """Return the tactile options of the student among some agents; nothing if there is none."""
     from brainbench.core.errors import UsageError
     from robotics_bridge.policies.schema import from_json
     from robotics_bridge.policies.shipped import stored

@@ -35,11 +35,7 @@ _SHOWN = 20
 
 
 def open_recipe(source: str, whiskers: str) -> Recipe:
-    """Return the scenes that a recipe name or a scene file holds.
-
-    Raises:
-        UsageError: there is no such recipe, or the file holds finished forces.
-    """
+    """Return the scenes that a recipe name or a scene file holds."""
     from brainbench.stimuli import get_recipe, list_recipes, load_scene
 
     suffix = Path(source).suffix
@@ -56,11 +52,7 @@ def open_recipe(source: str, whiskers: str) -> Recipe:
 
 
 def choose_scene(recipe: Recipe, stimulus: str | None) -> Scene:
-    """Return the scene of a recipe that ``stimulus`` names, or its only one.
-
-    Raises:
-        UsageError: there is no such scene, or there are several and none was named.
-    """
+    """Return the scene of a recipe that ``stimulus`` names, or its only one."""
     chosen = choose_name("stimulus", stimulus, recipe.labels, how="with --stimulus")
     return recipe.scenes[recipe.labels.index(chosen)]
 

@@ -22,7 +22,6 @@ def read_npz(path: str | os.PathLike[str], kind: str = ".npz file") -> dict[str,
 
     Raises:
         DataFileNotFoundError: there is no such file.
-        DataError: it is no archive, is encrypted or damaged, holds objects, or unpacks to far more than is stored.
     """
     import numpy as np
 

@@ -37,7 +37,6 @@ def open_hdf5(path: str | os.PathLike[str], kind: str = "HDF5 file", hint: str =
 
     Raises:
         DataFileNotFoundError: there is no such file.
-        DataError: it is no regular file, is not HDF5, is damaged, or declares more data than it can hold.
     """
     import h5py
 

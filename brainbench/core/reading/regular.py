@@ -26,7 +26,6 @@ def check_file(path: str | os.PathLike[str], kind: str = "file", *, most: int | 
 
     Raises:
         DataFileNotFoundError: there is nothing of this name.
-        DataError: it is a folder, a pipe, a device or a loop of links, is too large, or may not be read.
     """
     name = shown(os.fspath(path))
     try:

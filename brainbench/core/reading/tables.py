@@ -28,7 +28,6 @@ def read_columns(
 
     Raises:
         DataFileNotFoundError: there is no such file.
-        DataError: two columns have one name, something is no finite number, or lines differ in length.
     """
     header, *rows = (read_rows(path, kind) if gaps else _trimmed(path, kind)) or [[]]
     if twice := repeats(filter(None, header)):
@@ -47,9 +46,6 @@ def read_numbers(path: str | os.PathLike[str], kind: str = "table of comma-separ
     """Return the numbers [line, column] of a comma-separated file; lines may end with a comma.
 
     NaN and infinity are numbers here: some tables have gaps, and their readers say what these mean.
-
-    Raises:
-        DataError: there is no such file, something is no number, or lines differ in length.
     """
     return to_numbers(_trimmed(path, kind), path, kind)
 
@@ -71,9 +67,6 @@ def to_numbers(
         first: number of the first line, for messages.
         columns: cells of a line; those of the first when None.
         gaps: True where cells may be empty, as for :func:`read_columns`.
-
-    Raises:
-        DataError: there is no line, something is no number, or lines differ in length.
     """
     name = shown(os.fspath(path))
     if not rows:

@@ -23,7 +23,6 @@ def read_tensors(path: str | os.PathLike[str], kind: str = "safetensors file") -
 
     Raises:
         DataFileNotFoundError: there is no such file.
-        DataError: it is damaged, of another format, or holds NaN or infinity.
     """
     from safetensors.torch import load_file
 
@@ -39,7 +38,6 @@ def read_checkpoint(path: str | os.PathLike[str], kind: str = "PyTorch file") ->
 
     Raises:
         DataFileNotFoundError: there is no such file.
-        DataError: it is damaged, holds objects, or a tensor in it is not plain or not finite.
     """
     import torch
 
@@ -63,11 +61,7 @@ def read_checkpoint(path: str | os.PathLike[str], kind: str = "PyTorch file") ->
 
 
 def check_stored(tensors: Mapping[str, torch.Tensor], name: str) -> None:
-    """Refuse tensors that stand for more numbers than are stored, or that are not finite.
-
-    Raises:
-        DataError: the first of them by name.
-    """
+    """Refuse tensors that stand for more numbers than are stored, or that are not finite."""
     import torch
 
     for key, value in tensors.items():

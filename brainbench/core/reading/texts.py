@@ -23,7 +23,6 @@ def read_text(path: str | os.PathLike[str], kind: str = "text file", *, most: in
 
     Raises:
         DataFileNotFoundError: there is no such file.
-        DataError: it is no regular file, is too large, or is no UTF-8 text.
     """
     found = check_file(path, kind, most=most)
     with readable(path, kind):
@@ -31,12 +30,7 @@ def read_text(path: str | os.PathLike[str], kind: str = "text file", *, most: in
 
 
 def parse_json(text: str, name: str) -> Any:
-    """Parse JSON text; ``name`` is that of its file in messages.
-
-    Raises:
-        DataError: it is not valid, nested too deeply, names a value twice, or holds a number that is not finite or too
-            large.
-    """
+    """Parse JSON text; ``name`` is that of its file in messages."""
 
     def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
         if len(found := dict(pairs)) < len(pairs):
@@ -67,7 +61,6 @@ def read_json(path: str | os.PathLike[str], kind: str = "file") -> Any:
 
     Raises:
         DataFileNotFoundError: there is no such file.
-        DataError: it is no regular file or too large; or see :func:`parse_json`.
     """
     return parse_json(read_text(path, kind), os.fspath(path))
 
@@ -82,8 +75,6 @@ def read_yaml(path: str | os.PathLike[str], kind: str = "file") -> Any:
 
     Raises:
         DataFileNotFoundError: there is no such file.
-        DataError: it cannot be parsed, repeats values by alias or names, or see :func:`parse_json`.
-        MissingDependencyError: no reader of YAML is installed.
     """
     with needing("pyyaml", extra="hub", purpose="Reading YAML settings"):
         import yaml
@@ -120,7 +111,6 @@ def read_mapping(path: str | os.PathLike[str], kind: str = "file") -> dict[str, 
 
     Raises:
         DataFileNotFoundError: there is no such file.
-        DataError: it cannot be parsed or holds no mapping.
     """
     suffix = Path(path).suffix.lower()
     read = read_json if suffix == ".json" else read_yaml if suffix in (".yaml", ".yml") else read_toml
@@ -131,11 +121,7 @@ def read_mapping(path: str | os.PathLike[str], kind: str = "file") -> dict[str, 
 
 
 def check_values(value: Any, name: str) -> Any:
-    """Return nested plain data whose numbers are all finite and not too large.
-
-    Raises:
-        DataError: a value is not; the message has its place in the file.
-    """
+    """Return nested plain data whose numbers are all finite and not too large."""
     _check(value, name, ())
     return value
 

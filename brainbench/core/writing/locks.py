@@ -28,9 +28,6 @@ def lock_folder(folder: Path, *, wait: bool = True) -> Iterator[bool]:
 
     Yields:
         False where there are no such locks (Windows; some network file systems, which are warned of).
-
-    Raises:
-        UsageError: another process holds it, and ``wait`` is false.
     """
     folder.mkdir(parents=True, exist_ok=True)
     if fcntl is None:

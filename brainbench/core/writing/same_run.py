@@ -14,11 +14,7 @@ CONFIG = "config.json"
 
 
 def check_same(folder: Path, known: object, identity: Mapping[str, Any], what: str = "run") -> None:
-    """Check that what is known of the run in a folder is what identifies this one, both as JSON has it.
-
-    Raises:
-        UsageError: the folder holds another run.
-    """
+    """Check that what is known of the run in a folder is what identifies this one, both as JSON has it."""
     other, mine = (dict(_leaves(part)) if isinstance(part, Mapping) else {} for part in (known, identity))
     # Of what identifies a run, no part may have more in it than now.
     names = [*mine, *(name for name in other if name not in mine and name.partition(".")[0] in identity)]
@@ -31,9 +27,6 @@ def begin_run(folder: Path, config: Mapping[str, Any], what: str, *, made: str) 
     """Note in an existing folder what is begun there, or check that it is what was begun.
 
     A first try that made none of the files ``made`` (a pattern) does not stand in the way: its note is replaced.
-
-    Raises:
-        UsageError: the folder holds another run, or other files and no run.
     """
     path, config = folder / CONFIG, to_plain(config)
     if not path.exists():

@@ -93,7 +93,6 @@ def check(source: Source, *, conditions: str | Conditions | None = None, progres
 
     Raises:
         DataFileNotFoundError: the source names nothing.
-        UsageError: it names an unknown layout, or the conditions cannot be read.
     """
     layout, paths = find_recordings(source)
     wanted = Conditions.parse(conditions) if isinstance(conditions, str) else conditions

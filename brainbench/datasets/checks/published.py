@@ -23,11 +23,7 @@ _ORDERS = np.array(list(permutations(range(len(SLOTS)))))
 
 
 def check_published(path: Path, names: list[str]) -> Iterator[Finding]:
-    """Yield the findings about a file, and add its sessions to ``names``.
-
-    Raises:
-        DataError: the file cannot be read.
-    """
+    """Yield the findings about a file, and add its sessions to ``names``."""
     arrays, stray = read_arrays(path)
     found = {name: recover_sessions(name, array) for name, array in arrays.items()}
     sessions = [item for items in found.values() for item in items]

@@ -84,11 +84,7 @@ def is_published(path: Path, layout: RecordingLayout | None = None) -> bool:
 
 
 def read_arrays(path: Path) -> tuple[dict[str, NDArray[np.float64]], bool]:
-    """Return rates [trials, 6, units] by animal, as the file holds them, and whether :data:`STRAY` is there.
-
-    Raises:
-        DataError: the file is no ``.npz`` of plain arrays, holds something else, or rates that cannot be.
-    """
+    """Return rates [trials, 6, units] by animal, as the file holds them, and whether :data:`STRAY` is there."""
     arrays = read_npz(path, "file of published recordings (.npz)")
     if {"data", "label"} <= arrays.keys():
         raise DataError(
@@ -160,12 +156,7 @@ def read_published(path: Path) -> Iterator[ZeroFilledSession]:
 
 
 def open_published(path: Path, **options: object) -> xr.Dataset:
-    """Read the file into the recordings contract; rates stand for counts in bins of one second.
-
-    Raises:
-        UsageError: conditions, select, window or bin are given, which need spike times.
-        DataError: as :func:`read_arrays`, or no trial has a stimulus.
-    """
+    """Read the file into the recordings contract; rates stand for counts in bins of one second."""
     if given := [name for name, value in options.items() if value is not None]:
         raise UsageError(
             f"{path} holds rates without spike times or bins, so conditions, select, window, bin and scores over time "

@@ -95,9 +95,6 @@ def register_layout(layout: RecordingLayout) -> RecordingLayout:
     """Make a layout known by its name and its columns for the rest of this process; returns it.
 
     On the command line ``FILE.py:PATH`` registers the ``LAYOUT`` that a file defines.
-
-    Raises:
-        UsageError: another layout has this name, or it could not be told from a path.
     """
     if not is_name(layout.name):
         raise UsageError(
@@ -111,11 +108,7 @@ def register_layout(layout: RecordingLayout) -> RecordingLayout:
 
 
 def get_layout(name: str) -> RecordingLayout:
-    """Return a layout by name.
-
-    Raises:
-        UsageError: there is no such layout (the nearest is named).
-    """
+    """Return a layout by name."""
     check_name("recording layout", name, _known())
     return _LAYOUTS[name]
 
@@ -136,8 +129,6 @@ def load_layout(path: str) -> RecordingLayout:
 
     Raises:
         DataFileNotFoundError: there is no such file.
-        DataError: it fails.
-        UsageError: it defines no layout.
     """
     module = load_module(path)
     found = getattr(module, "LAYOUT", getattr(module, "RECIPE", None))

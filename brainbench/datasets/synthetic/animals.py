@@ -33,9 +33,6 @@ def measure_ceiling(
     all, are left out. ``simulations`` studies are drawn, each of ``design.animals`` animals. Returns the ceiling and
     its Monte-Carlo standard error; NaN if no animal has all stimuli, an RDM is flat (two stimuli), or there is one
     animal only for the error.
-
-    Raises:
-        UsageError: no positive number of simulations.
     """
     check_number("simulations", simulations, least=1, whole=True)
     truth, stimuli = geometry.rdm, len(geometry.labels)
@@ -64,9 +61,6 @@ def calibrate(
 
     Found by Brent's method with common random numbers: the same animals are drawn at every step. ``ceiling`` is the
     wanted value of :func:`measure_ceiling`; the result is as exact as the Monte-Carlo error of so many ``simulations``.
-
-    Raises:
-        UsageError: even the largest modulation stays below the ceiling; what is reached is said.
     """
 
     from scipy.optimize import root_scalar

@@ -25,10 +25,6 @@ class ResponseGeometry:
         """Take the correlations between the rows of features [K, F], such as a model's activations.
 
         The truth is then 1 − Pearson between rows, the model's own correlation-distance RDM.
-
-        Raises:
-            UsageError: the features are not [K, F] with K ≥ 2 and F ≥ 2, or labels do not fit.
-            DataError: a value is not finite or a row is constant and has no direction.
         """
         values = _checked(features, 2)
         # Inner products of centred rows of length one are Pearson correlations (r), so the RDM below is 1 − r.

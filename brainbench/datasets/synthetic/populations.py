@@ -61,10 +61,6 @@ def draw_animals(
     one. Features [K, F] are each standardised over stimuli (:meth:`ResponseGeometry.from_activations`). The seed is one
     integer, or several (such as study and simulation). Returns subject → its sessions: ``responses`` [R, 1, U] Hz,
     ``labels`` [R], ``keys``.
-
-    Raises:
-        UsageError: features are not [K, F], or a missing stimulus does not exist.
-        DataError: a feature is not finite, or all are constant.
     """
     geometry = features if isinstance(features, ResponseGeometry) else ResponseGeometry.from_activations(features)
     animals: dict[str, tuple[Trials, ...]] = {}
@@ -76,11 +72,7 @@ def draw_animals(
 def draw_sessions(
     geometry: ResponseGeometry, design: PopulationDesign | None, seed: int | Sequence[int]
 ) -> Iterator[DrawnSession]:
-    """Draw the sessions of every animal; each is a pure function of geometry, design, seed, animal and session.
-
-    Raises:
-        UsageError: a missing stimulus does not exist.
-    """
+    """Draw the sessions of every animal; each is a pure function of geometry, design, seed, animal and session."""
     design = design or PopulationDesign()
     for animal in range(design.animals):
         for session in range(design.sessions):

@@ -72,10 +72,6 @@ def make_rodgers_demo(
     the fifth animal on their sessions repeat the first ones' design. Files of the same names are replaced. Returns the
     NWB files. ``truth.json`` beside them holds, over ``labels``, the distances [P] of the geometry that all share
     (``shared``) and the noiseless correlation-distance RDM of each animal's units.
-
-    Raises:
-        DataError: the stimuli lack a label or ``contact``, or one never touches a tracked whisker.
-        UsageError: fewer than one animal is asked for.
     """
     check_number("The number of animals of the demo", animals, least=1, whole=True)
     stimuli = _in_vocabulary_order(check_stimulus_set(stimuli))
@@ -134,11 +130,7 @@ def _definition(stimuli: xr.Dataset, seed: int, animals: int) -> str:
 
 
 def wrench_features(stimuli: xr.Dataset) -> NDArray[np.float64]:
-    """Return what whisker afferents tell of each stimulus [K, F] until the earliest choice.
-
-    Raises:
-        DataError: a wrench is not finite (an unstable simulation), all are zero, or no tracked whisker is there.
-    """
+    """Return what whisker afferents tell of each stimulus [K, F] until the earliest choice."""
     names = tuple(str(name) for name in stimuli["whisker"].values)
     wrench = stimuli["wrench"].transpose("stimulus", "time", "whisker", "channel").values.astype(np.float64)
     broken = [name for index, name in enumerate(names) if not np.isfinite(wrench[:, :, index]).all()]

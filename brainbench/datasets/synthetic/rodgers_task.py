@@ -89,9 +89,6 @@ def draw_session(
 
     ``expected`` [K, U] are the rates in the window, Hz; ``runs`` has per whisker and stimulus the contacts [n, 2] (s
     after onset).
-
-    Raises:
-        DataError: a stimulus touches none of the whiskers whose contacts are told, or too late for the choice.
     """
     behaviour = draw_behaviour(random, plan, geometry.labels)
     first = first_contacts(runs, geometry.labels, plan.lost_whisker)

@@ -49,9 +49,6 @@ def write_files(
     ``read_truth`` reads the truth. Files of the same names are replaced. The format is ``nwb`` or ``h5``, ``stimuli`` a
     recipe that the files then name. ``distance`` makes the RDM of each animal's expected rates [K, U] for the truth,
     ``about`` is what else that holds.
-
-    Raises:
-        UsageError: a format other than ``nwb`` and ``h5``.
     """
     writers: dict[str, Callable[[Path, Session], Path]] = {"nwb": write_synthetic_nwb, "h5": write_recordings}
     check_name("format", format, writers)

@@ -80,11 +80,7 @@ def write_with_truth(
 
 
 def read_truth(folder: str | os.PathLike[str]) -> dict[str, Any]:
-    """Return the truth of synthetic recordings: labels, and RDMs [P] of ``shared`` and ``subjects``.
-
-    Raises:
-        DataError: there is none.
-    """
+    """Return the truth of synthetic recordings: labels, and RDMs [P] of ``shared`` and ``subjects``."""
     truth = read_json(Path(folder) / TRUTH)
     truth["shared"] = np.array(truth["shared"])
     truth["subjects"] = {name: np.array(values) for name, values in truth["subjects"].items()}

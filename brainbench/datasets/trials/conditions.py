@@ -25,9 +25,6 @@ class Conditions:
 
         >>> Conditions.parse("trials:stimulus,servo_position").columns
         ('stimulus', 'servo_position')
-
-        Raises:
-            UsageError: the text is not of this form, or names a column twice.
         """
         table, colon, rest = source.rpartition(":")
         columns = tuple(item.strip() for item in rest.split(","))
@@ -43,12 +40,7 @@ class Conditions:
         return f"{self.table}:{','.join(self.columns)}"
 
     def values(self, table: SessionTable) -> NDArray[np.str_]:
-        """Return the condition values of every row as text [rows, columns]; "" where missing.
-
-        Raises:
-            UsageError: a column is unknown (the nearest is named).
-            DataError: a column has no single value per row.
-        """
+        """Return the condition values of every row as text [rows, columns]; "" where missing."""
         return np.stack([as_labels(table.column(name)) for name in self.columns], axis=1)
 
 
@@ -58,11 +50,7 @@ def joined_labels(values: NDArray[np.str_]) -> list[str]:
 
 
 def natural_vocabulary(values: Iterable[tuple[str, ...]]) -> tuple[str, ...]:
-    """Order the labels of condition values: column by column, numbers numerically, text naturally.
-
-    Raises:
-        DataError: two different combinations of values read the same when joined.
-    """
+    """Order the labels of condition values: column by column, numbers numerically, text naturally."""
     # Sorted, not in order of appearance: that depends on the session that comes first, and RDMs would not share axes.
     ordered = sorted(set(values), key=lambda row: [natural_key(item) for item in row])
     labels = ["-".join(row) for row in ordered]

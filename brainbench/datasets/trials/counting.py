@@ -75,12 +75,7 @@ class SessionCounts:
 
 
 def count_session(session: Session, options: ReadingOptions) -> SessionCounts:
-    """Count the trials of one session.
-
-    Raises:
-        UsageError: a table or column does not exist (the nearest is named).
-        DataError: the session's units or tables cannot be used.
-    """
+    """Count the trials of one session."""
     if session.units is None or not has_units(session):
         raise DataError(no_units(session))
     tally = Tally()
@@ -160,11 +155,7 @@ def no_units(session: Session) -> str:
 
 
 def read_spikes(units: SessionTable, notes: list[str]) -> list[NDArray[np.float64]]:
-    """Read the spike times (s, ascending) of every unit.
-
-    Raises:
-        DataError: the ragged index is inconsistent or a time is not finite.
-    """
+    """Read the spike times (s, ascending) of every unit."""
     spikes = units.rows(SPIKES)
     unsorted = [index for index, times in enumerate(spikes) if np.any(np.diff(times) < 0)]
     if unsorted:
@@ -193,9 +184,6 @@ def count(
     window may be shorter than ``bin`` and its duration says so. ``spikes`` [U] are ascending times (s), ``edges`` [R,
     2] the windows (s), ``covered`` [R, U] says whether a unit was recorded. ``length`` (s) is common to all windows, if
     they have one; no ``bin`` (s) is one bin. Returns counts [R, T, U] (float32) and duration [R, T] (s).
-
-    Raises:
-        UsageError: the bin is not positive, or so narrow that the counts would not fit in memory.
     """
     span = edges[:, 1] - edges[:, 0]
     if bin is None:

@@ -28,10 +28,6 @@ def join_sessions(
     """Join the sessions' trials and units, block by block, in canonical order.
 
     ``source`` is what the user asked for, ``layout`` the name of the layout with how it was chosen, or "".
-
-    Raises:
-        UsageError: no row of any session has a value that a rule keeps.
-        DataError: no trial, no unit or only one condition remains.
     """
     import xarray as xr
 

@@ -32,9 +32,6 @@ class Rule:
 
     Values are compared as text. In a column of numbers ``1`` and ``1.0`` agree, and in every column ``true`` and ``1``.
     A row without a value fails ``allow``, ``low`` and ``high`` and passes ``refuse``, unless the value is ``nan``.
-
-    Raises:
-        UsageError: it states nothing, an empty value, a text for several, or a range that no number is in.
     """
 
     column: str
@@ -75,10 +72,6 @@ class Rule:
 
         ``seen`` takes the values that the column has, and those of the rule that some row has in another spelling, for
         :func:`check_values`.
-
-        Raises:
-            UsageError: a required column is absent (the nearest is named).
-            DataError: the column holds lists, or text where a range is asked for.
         """
         if self.column not in table:
             if self.required:
@@ -107,11 +100,7 @@ class Rule:
 
 @dataclass(frozen=True)
 class Selection:
-    """Rules for trials and units. Each row is counted under the first rule that removes it.
-
-    Raises:
-        UsageError: ``min_spikes`` is no whole number from 0, or a text stands for several subjects.
-    """
+    """Rules for trials and units. Each row is counted under the first rule that removes it."""
 
     trials: tuple[Rule, ...] = ()
     units: tuple[Rule, ...] = ()
@@ -135,9 +124,6 @@ class Selection:
 
         >>> Selection.parse("outcome=correct|error; units.layer=4; min_spikes=50").min_spikes
         50
-
-        Raises:
-            UsageError: a part is not of this form, or subjects or spikes are stated twice.
         """
         trials: list[Rule] = []
         units: list[Rule] = []
@@ -224,9 +210,6 @@ def check_values(tallies: Iterable[Tally]) -> list[str]:
 
     Returns:
         A note for each value to remove that no row has but that is spelt nearly as one that rows have.
-
-    Raises:
-        UsageError: no row has a value to keep (the nearest is named).
     """
     found: dict[Rule, set[str]] = {}
     for tally in tallies:

@@ -40,10 +40,6 @@ def pooled(dataset: xr.Dataset, by: str = "subject") -> xr.Dataset:
     Only names change, no count does, so whatever takes recordings (``trials_by_subject``, ``score``) then gives one
     RDM per pool: ``"subject"`` leaves the animals as they are, ``"session"`` makes every session its own
     subject ``ANIMAL/SESSION``, ``"all"`` puts all sessions of all animals into the subject ``all``.
-
-    Raises:
-        UsageError: ``by`` is none of these.
-        DataError: ``dataset`` is not a recordings data set.
     """
     check_recordings(dataset)
     check_name("pool", by, POOLS)
@@ -88,9 +84,6 @@ def trials_by_subject(dataset: xr.Dataset, *, averaged: bool = False) -> dict[st
     ``averaged`` rates [R, 1, U] are those of the whole window. Covariates are those of
     :mod:`brainbench.datasets.trials.covariates` that the data set holds. Trials and units without any recorded value
     are left out, and so are sessions and subjects without a trial left.
-
-    Raises:
-        DataError: ``dataset`` is not a recordings data set.
     """
     check_recordings(dataset)
     counts, duration = dataset["counts"].values, dataset["duration"].values

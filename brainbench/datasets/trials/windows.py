@@ -35,9 +35,6 @@ class Window:
 
     ``first-contact`` is the earliest contact of any whisker (tables ``contacts_by_whisker_*``) that
     starts inside the trial and before the window's end.
-
-    Raises:
-        UsageError: it has no end, no positive length, ends at the first contact, or a setting means nothing to it.
     """
 
     anchor: str = "start"
@@ -71,9 +68,6 @@ class Window:
         'first-contact..choice'
         >>> Window.parse("start+0.2..+0.5").length
         0.5
-
-        Raises:
-            UsageError: the text is not of this form.
         """
         first, dots, last = (part.strip() for part in source.partition(".."))
         last, _, most = (part.strip() for part in last.partition(" or "))
@@ -106,12 +100,7 @@ class Window:
         return f"{self.anchor}{_signed(self.offset)}..{' or '.join(ends)}"
 
     def edges(self, session: Session, table: SessionTable, notes: list[str]) -> NDArray[np.float64]:
-        """Return begin and end of the window of every row [rows, 2] (s); NaN where an event is missing.
-
-        Raises:
-            UsageError: an anchor is neither a known one nor a column of the table.
-            DataError: contacts are asked for and the session has no contact tables and no fallback.
-        """
+        """Return begin and end of the window of every row [rows, 2] (s); NaN where an event is missing."""
         contacts = {name: item for name, item in session.tables.items() if CONTACTS.match(name)}
         if self.anchor == FIRST_CONTACT and not contacts:
             if self.fallback is None:

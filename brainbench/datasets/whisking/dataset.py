@@ -85,10 +85,6 @@ class WhiskingDataset:
             zero (``zero``), or refused (``error``). Sweeps without any forces are always left out.
         drop_last: leave out the last batch of an epoch when it is smaller.
         part: (rank, number of processes): each process reads another part of every epoch, all equally many batches.
-
-    Raises:
-        UsageError: an argument is out of range; the message names the nearest.
-        DataError: the folder holds no finished data set, a shard is missing or damaged, or the split is empty.
     """
 
     def __init__(
@@ -288,11 +284,7 @@ class WhiskingDataset:
         return {**self._identity(), "epoch": self.epoch, "batch": self._batch}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on where another data set of the same files and options stood.
-
-        Raises:
-            UsageError: it had other files or options; the message says which.
-        """
+        """Go on where another data set of the same files and options stood."""
         mine = self._identity()
         other = [key for key, value in mine.items() if state.get(key) != value]
         if other:
@@ -304,9 +296,6 @@ class WhiskingDataset:
         """Read every byte of the split and compare hashes.
 
         Shards that were found whole before and did not change since are read only ``again``.
-
-        Raises:
-            DataError: a shard is not what was generated; the message names it.
         """
         for shard in track(self._shards, "shards verified", progress):
             (shard.verify if again else shard.verify_once)()

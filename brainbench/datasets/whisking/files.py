@@ -76,11 +76,7 @@ class Shard:
 
 
 def read_manifest(folder: Path) -> Mapping[str, Any]:
-    """Read the manifest of a finished data set.
-
-    Raises:
-        DataError: there is none, or it is of a newer layout.
-    """
+    """Read the manifest of a finished data set."""
     path = folder / "manifest.json"
     if not path.is_file():
         if (folder / "config.json").is_file():
@@ -112,11 +108,7 @@ def read_manifest(folder: Path) -> Mapping[str, Any]:
 
 
 def open_shard(path: Path, entry: Mapping[str, Any], manifest: Mapping[str, Any]) -> Shard:
-    """Read what stands beside the forces of a shard that the manifest names.
-
-    Raises:
-        DataError: the file is missing, damaged, or another one.
-    """
+    """Read what stands beside the forces of a shard that the manifest names."""
     if not path.is_file():
         raise DataFileNotFoundError(f"The shard {str(path)!r} of the manifest is missing. {_AGAIN}")
     with open_hdf5(path, "shard", _AGAIN) as opened:

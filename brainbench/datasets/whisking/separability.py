@@ -75,11 +75,6 @@ def separability(
     Nothing was tuned. Memory grows with the square of the number of sweeps: 10 MB for 1,600. ``classes`` are the four
     with the most objects by default; all choices of each number in ``counts`` of them are averaged.
     ``sweeps_per_class`` are drawn evenly from the objects of each.
-
-    Raises:
-        UsageError: a class is unknown or named twice, or there are fewer classes than ``counts`` asks for.
-        DataError: a class has fewer than two objects.
-        MissingDependencyError: scikit-learn is not installed.
     """
     objects = data.objects
     chosen = _choose_classes(data.classes, data.labels, objects, classes, max(counts))
@@ -108,11 +103,6 @@ def separate(
     """Measure how well classes are told apart by features [n, F], for all choices of ``count`` of them.
 
     ``names`` are those of the labels [n]. Sweeps of the same object (``objects`` [n]) stay on one side of every test.
-
-    Raises:
-        UsageError: there are fewer classes than ``count``.
-        DataError: a class has fewer than two objects.
-        MissingDependencyError: scikit-learn is not installed.
     """
     with needing("scikit-learn", extra="learn", purpose="Separability"):
         from sklearn.metrics.pairwise import rbf_kernel

@@ -83,11 +83,7 @@ class SweepFile:
 
 
 def read_sweep(path: str | os.PathLike[str]) -> SweepFile:
-    """Read a sweep file; no pickle is loaded.
-
-    Raises:
-        DataError: the file is missing, damaged or another one; the message says what it holds.
-    """
+    """Read a sweep file; no pickle is loaded."""
     name, held = os.fspath(path), read_npz(path, "published sweep (.npz)")
     rate = next((rate for rate, needed in RATES.items() if {"data", "shape", *needed} <= held.keys()), None)
     if rate is None:

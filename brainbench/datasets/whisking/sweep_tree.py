@@ -177,10 +177,6 @@ def open_sweep_tree(folder: str | os.PathLike[str]) -> SweepTree:
 
     Class names are those of ``categories.json`` ("category/object" → number) in the folder, or of the sweeps' shapes; a
     number without a name is ``class-N``.
-
-    Raises:
-        DataError: there are no sweeps or no labels, a file is damaged or another one, or sweeps of 1000 and 110 Hz
-            are mixed.
     """
     root = Path(folder).absolute()
     paths = [path for name in FOLDERS for path in sorted((root / name).glob("*.npz"))]

@@ -26,12 +26,7 @@ _SPLITS = 20
 
 
 def pattern_dimensions(patterns: ArrayLike) -> float:
-    """Return the dimensions of patterns [K, F] without noise, such as a layer's features.
-
-    Raises:
-        UsageError: not [K, F] with at least 3 stimuli.
-        DataError: the patterns do not differ or are not finite.
-    """
+    """Return the dimensions of patterns [K, F] without noise, such as a layer's features."""
     array = np.asarray(patterns, dtype=np.float64)
     if array.ndim != 2 or len(array) < 3:
         raise UsageError(f"Dimensions need patterns [stimuli, features] of 3 stimuli; received shape {array.shape}.")
@@ -48,10 +43,6 @@ def signal_dimensions(animals: Iterable[Sequence[Trials]], n_stimuli: int, *, se
     own adds dimensions to its responses. Shared and own parts with weights a and b = 1 − a give 1/D_one = (a² + b²)/D
     within an animal and 1/D_two = a²/D between two, which are solved for D. ``animals`` are the sessions of each
     animal, responses [R, U] or [R, T, U], whose time is averaged.
-
-    Raises:
-        UsageError: fewer than 3 stimuli.
-        DataError: no session has 4 trials of every stimulus and 2 units, or the responses hold no signal.
     """
     if n_stimuli < 3:
         raise UsageError(f"Dimensions are estimated from at least 3 stimuli; received {n_stimuli}.")

@@ -68,9 +68,6 @@ def equivalence_test(differences: ArrayLike, without_stimulus: ArrayLike, *, mar
         without_stimulus: [K] the mean difference without each stimulus in turn.
         margin: Largest difference that still counts as alike, > 0.
 
-    Raises:
-        UsageError: a margin that is not positive.
-
     >>> test = equivalence_test([-0.01, 0.03, -0.02, -0.01, 0.02], [0.0, 0.004] * 6)
     >>> test.verdict, round(test.difference, 3)
     ('equivalent', 0.002)
@@ -103,11 +100,7 @@ def equivalence_test(differences: ArrayLike, without_stimulus: ArrayLike, *, mar
 
 
 def turing_test(score: Score, animal_to_animal: Score, *, margin: float = MARGIN) -> EquivalenceTest:
-    """Test a model's score against the animals' consistency with one another, paired by animal and stimulus.
-
-    Raises:
-        UsageError: a margin that is not positive, or scores by different estimators.
-    """
+    """Test a model's score against the animals' consistency with one another, paired by animal and stimulus."""
     if score.estimator != animal_to_animal.estimator:
         raise UsageError(
             f"Model and animals must be scored by one estimator; received {score.estimator!r} and "

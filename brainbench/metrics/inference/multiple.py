@@ -73,9 +73,6 @@ def compare_models(
         correction: ``holm``, ``fdr`` or ``none``, for the pairwise tests.
         seed: Seed of random permutations.
         device: Torch device for the permutations; numpy by default.
-
-    Raises:
-        UsageError: no models or animals, RDMs that do not fit, unknown names.
     """
     check_name("correction for multiple tests", correction, CORRECTIONS)
     if not models:
@@ -118,9 +115,6 @@ def step_down(null: Floats) -> Floats:
 
 def adjust(p: ArrayLike, correction: str) -> Floats:
     """Return p-values [N] corrected for their number; NaN entries stay NaN and do not count.
-
-    Raises:
-        UsageError: unknown correction.
 
     >>> adjust([0.01, 0.04, 0.03], "holm").round(3).tolist()
     [0.03, 0.06, 0.06]

@@ -114,9 +114,6 @@ def permutation_test(
         seed: Seed of the random orders; unused when all are taken.
         device: Torch device for the products, which pays from some hundred stimuli on; numpy by default.
 
-    Raises:
-        UsageError: unknown method or device, or RDMs of different numbers of stimuli.
-
     >>> test = permutation_test([1, 2, 3, 4, 5, 7], [[1, 2, 3, 4, 5, 6], [2, 3, 3, 4, 6, 7]])
     >>> test.count, round(test.p, 4), test.p == test.smallest
     (24, 0.0417, True)
@@ -202,9 +199,6 @@ def label_orders(
 
     All orders are taken up to ``exact`` stimuli (:data:`EXACT_STIMULI` by default), ``draws`` random ones above
     (:data:`RANDOM_PERMUTATIONS`).
-
-    Raises:
-        UsageError: the seed is no whole number from 0.
     """
     check_number("seed", seed, least=0, whole=True)
     if stimuli <= (EXACT_STIMULI if exact is None else exact):

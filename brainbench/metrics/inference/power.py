@@ -48,11 +48,7 @@ _CHUNK_ELEMENTS = 1 << 21
 
 @dataclass(frozen=True)
 class ExperimentDesign:
-    """An experiment, and the truth it is to find.
-
-    Raises:
-        UsageError: a number is out of range, or the effect is larger than what the animals share allows.
-    """
+    """An experiment, and the truth it is to find."""
 
     stimuli: int = 6
     """Number of stimuli."""
@@ -101,11 +97,7 @@ class Power:
 
 
 def power(design: ExperimentDesign, *, simulations: int = SIMULATIONS, seed: int = 0) -> Power:
-    """Simulate experiments of one design.
-
-    Raises:
-        UsageError: no positive number of simulations, or the seed is no whole number from 0.
-    """
+    """Simulate experiments of one design."""
     check_number("The number of simulations", simulations, least=1, whole=True)
     check_number("seed", seed, least=0, whole=True)
     smallest = smallest_p(design.stimuli, RSA.orders)
@@ -137,11 +129,7 @@ def needed(
     simulations: int = SIMULATIONS,
     seed: int = 0,
 ) -> int | None:
-    """Return the smallest tried number of stimuli or animals whose power reaches ``target``; None if none does.
-
-    Raises:
-        UsageError: ``vary`` is neither, or a target outside (0, 1).
-    """
+    """Return the smallest tried number of stimuli or animals whose power reaches ``target``; None if none does."""
     tried = {"stimuli": STIMULUS_COUNTS, "animals": ANIMAL_COUNTS}
     check_name("number that a power analysis varies", vary, tried)
     check_number("The target power", target, above=0, below=1)

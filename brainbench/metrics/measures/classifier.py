@@ -55,10 +55,6 @@ def decode(
         penalty: Inverse strength C of the penalty, on features scaled to unit mean square.
         seed: Seed of random orders of the classes, above 6 stimuli.
 
-    Raises:
-        UsageError: shapes that do not fit, fewer than two classes, a class of a single stimulus (it
-            cannot be learnt once that is left out), responses that are not finite, or no positive penalty.
-
     >>> decode([[0.], [1], [2], [10], [11], [12]], range(6), list("aaabbb")).accuracy
     1.0
     """

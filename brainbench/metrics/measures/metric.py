@@ -169,11 +169,7 @@ class Metric:
         seed: int = 0,
         layer: str | None = None,
     ) -> Score:
-        """Score a model by the features [K, F] of its layers; ``layer`` is one committed to beforehand.
-
-        Raises:
-            UsageError: no layers or animals, features of another number of stimuli, an unknown layer or estimator.
-        """
+        """Score a model by the features [K, F] of its layers; ``layer`` is one committed to beforehand."""
         check_features(features, stimuli)
         layers = {label: self.layer(values) for label, values in features.items()}
         options = {"name": name, "stimuli": stimuli, "estimator": estimator, "seed": seed, "committed": layer}

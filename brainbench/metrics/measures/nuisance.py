@@ -56,10 +56,6 @@ def variance_partition(
 
     Ordinary least squares per animal, with an intercept; the R² are averaged over animals. The p-value permutes the
     model's stimuli, as in :func:`permutation_test`, and tests the partial correlation.
-
-    Raises:
-        UsageError: no nuisances, or RDMs of different numbers of stimuli.
-        DataError: missing pairs, or too few pairs for so many nuisances.
     """
     if not nuisance_rdms:
         raise UsageError("There are no nuisances; give the RDM of at least one, or use permutation_test.")

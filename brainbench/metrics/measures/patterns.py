@@ -21,11 +21,7 @@ class PatternMetric(Metric):
     """
 
     def similarity(self, model: Floats, brain: Floats) -> float:
-        """Return how alike features [K, F] and mean responses [K, U] are; larger is more alike.
-
-        Raises:
-            UsageError: the metric does not define it.
-        """
+        """Return how alike features [K, F] and mean responses [K, U] are; larger is more alike."""
         raise UsageError(f"The metric {self.name or type(self).__name__!r} does not define similarity(model, brain).")
 
     def compare(self, model: Floats, brain: SubjectRDM) -> float:

@@ -17,11 +17,7 @@ _METRICS: dict[str, Metric] = {}
 
 
 def register_metric(metric: Metric) -> Metric:
-    """Add a metric under its name and return it.
-
-    Raises:
-        UsageError: the name is taken, or something that a metric needs is missing.
-    """
+    """Add a metric under its name and return it."""
     check_metric(metric)
     if metric.name in _METRICS:
         raise UsageError(f"A metric named {metric.name!r} exists already; choose another name.")
@@ -35,9 +31,7 @@ def get_metric(name: str | Metric) -> Metric:
     NAME is a metric, or a class or function that makes one without arguments. A metric itself is checked and returned.
 
     Raises:
-        UsageError: nothing has this name, or it is no metric.
         DataFileNotFoundError: there is no such file or module.
-        DataError: the file cannot be run.
     """
     if not isinstance(name, str):
         check_metric(name)

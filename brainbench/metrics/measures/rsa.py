@@ -35,9 +35,6 @@ class RSA(Metric):
     corrected for the animal's noise, and the score is the mean over animals; a single animal chooses on one half of its
     trials and is scored on the other. ``thesis`` and ``thesis-input`` are the published estimators with their maximum
     over layers, which is optimistic and says so.
-
-    Raises:
-        UsageError: a method or comparison is unknown, or there is no split.
     """
 
     name: str = "rsa"
@@ -169,9 +166,6 @@ def score_rdms(
 
     Both are of the same stimuli in the same order. ``options`` are those of
     :func:`~brainbench.metrics.score.score_layers`; a torch ``device`` pays from some hundred stimuli on.
-
-    Raises:
-        UsageError: no layers or animals, RDMs that do not fit the stimuli, unknown estimator or comparison.
     """
     check_comparison(compare)
     rdms = check_layers(layer_rdms, stimuli)
@@ -179,11 +173,7 @@ def score_rdms(
 
 
 def check_layers(layer_rdms: Mapping[str, ArrayLike], stimuli: Sequence[str]) -> dict[str, Floats]:
-    """Return the layers' RDMs [P] by name.
-
-    Raises:
-        UsageError: no layers, or RDMs of another number of stimuli.
-    """
+    """Return the layers' RDMs [P] by name."""
     if not layer_rdms:
         raise UsageError("There are no layers to score; give the RDM of at least one layer.")
     rdms = {str(layer): rdm_stack(values, f"The RDM of layer {layer!r}") for layer, values in layer_rdms.items()}

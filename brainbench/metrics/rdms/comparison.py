@@ -46,9 +46,6 @@ def compare(a: ArrayLike, b: ArrayLike, *, method: str = "pearson") -> Floats:
     Returns:
         [...], float64; a scalar array for two vectors.
 
-    Raises:
-        UsageError: unknown method, or RDMs of different numbers of stimuli.
-
     >>> round(float(compare([1, 2, 4], [2, 4, 8])), 6)
     1.0
     >>> layers, animals = [[1, 2, 3], [3, 2, 1]], [[1, 3, 4], [2, 3, 5], [4, 2, 1]]

@@ -38,11 +38,7 @@ class RDM:
     title: str
 
     def __init__(self, values: ArrayLike, stimuli: Sequence[str] | None = None, *, title: str = "") -> None:
-        """Name an RDM [P]; stimuli are numbered without names.
-
-        Raises:
-            UsageError: not one RDM vector, another number of names, or one of them twice.
-        """
+        """Name an RDM [P]; stimuli are numbered without names."""
         array = rdm_stack(values, "values")
         if array.ndim != 1:
             raise UsageError(f"An RDM is one vector [P]; received shape {array.shape}; name each one by itself.")
@@ -60,11 +56,7 @@ class RDM:
         return square(self.values)
 
     def between(self, one: str, other: str) -> float:
-        """Return the dissimilarity of two stimuli.
-
-        Raises:
-            UsageError: a name is not among the stimuli.
-        """
+        """Return the dissimilarity of two stimuli."""
         check_each("stimulus of this RDM", (one, other), self.stimuli)
         return float(self.matrix[self.stimuli.index(one), self.stimuli.index(other)])
 

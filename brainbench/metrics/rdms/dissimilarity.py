@@ -124,10 +124,6 @@ def rdm(
     Returns:
         Distances [P], float64. A pair that has no distance (constant pattern, non-finite entry, no trials) is NaN.
 
-    Raises:
-        UsageError: unknown method or device, shapes that do not fit, folds missing or not wanted.
-        DataError: infinite trials, negative rates for ``poisson``, or a singular noise covariance.
-
     >>> rdm([[1, 2, 3], [2, 4, 6], [3, 2, 1]]).round(3).tolist()
     [0.0, 2.0, 2.0]
     >>> rdm([[1, 2], [3, 2], [5, 5]], ["b", "b", "a"], method="sqeuclidean").tolist()

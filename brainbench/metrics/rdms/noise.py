@@ -49,9 +49,6 @@ class NoiseModel:
 
     def sides(self, left: Array, right: Array) -> tuple[Array, Array]:
         """Return vectors [N, V] and [M, V] whose inner products are those of ``left`` and ``right`` with C⁻¹ between.
-
-        Raises:
-            DataError: the covariance is singular.
         """
         same = left is right
         left = left / self.scale
@@ -71,11 +68,7 @@ class NoiseModel:
         return join([left, first], -1), join([right, -second], -1) / self.ridge
 
     def precision(self) -> Array:
-        """Return C⁻¹ [U, U].
-
-        Raises:
-            DataError: the covariance is singular.
-        """
+        """Return C⁻¹ [U, U]."""
         xp = library(self.scale)
         eye = xp.diag(xp.ones_like(self.scale))
         if not self.weight:
@@ -125,10 +118,6 @@ def noise_precision(
         method: ``shrinkage_diag`` towards the diagonal (Schäfer & Strimmer 2005), ``shrinkage_eye``
             towards a multiple of the identity (Ledoit & Wolf 2004), ``diag``, or ``full``.
         device: Torch device to compute on, see :func:`brainbench.metrics.rdm`.
-
-    Raises:
-        UsageError: unknown method or shapes that do not fit.
-        DataError: no more complete trials than stimuli, units without noise, or a singular covariance.
     """
     trials, codes, names = labelled_trials(responses, labels)
     model = estimate_noise(trials, codes, len(names), method, device=find_device(device, responses))
@@ -136,12 +125,7 @@ def noise_precision(
 
 
 def estimate_noise(trials: Any, codes: Ints, count: int, method: str, *, device: Any = None) -> NoiseModel:
-    """Return the covariance of trials [R, U] about the means of their ``count`` stimuli, on the device.
-
-    Raises:
-        UsageError: unknown method.
-        DataError: as :func:`noise_precision`, but a singular covariance is found only when it is used.
-    """
+    """Return the covariance of trials [R, U] about the means of their ``count`` stimuli, on the device."""
     check_name("noise covariance method", method, NOISE_METHODS)
     # Residuals are small beside the products of units that follow, so they are always made by numpy.
     trials = np.asarray(fetch(trials), dtype=np.float64)

@@ -24,11 +24,7 @@ LARGEST = 1e150
 
 
 def stimulus_count(pairs: int) -> int:
-    """Return K for P = K(K−1)/2 pairs.
-
-    Raises:
-        UsageError: ``pairs`` is not such a number.
-    """
+    """Return K for P = K(K−1)/2 pairs."""
     # Positive root of K² − K − 2P = 0, in integers, so that rounding accepts no wrong P.
     count = (1 + math.isqrt(1 + 8 * pairs)) // 2
     if pairs < 1 or count * (count - 1) // 2 != pairs:
@@ -85,11 +81,7 @@ def permuted_pairs(orders: Any, count: int | None = None) -> Any:
 
 
 def rdm_stack(rdms: ArrayLike | Sequence[ArrayLike], what: str) -> Floats:
-    """Return float64 RDM vectors [..., P], checked.
-
-    Raises:
-        UsageError: not real numbers, no pair axis, a length that is no K(K−1)/2, or a number above :data:`LARGEST`.
-    """
+    """Return float64 RDM vectors [..., P], checked."""
     try:
         array = np.asarray(rdms)
         if array.dtype.kind in "cSU":

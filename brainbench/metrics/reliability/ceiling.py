@@ -34,9 +34,6 @@ def noise_ceiling(rdms: ArrayLike, *, method: str = "pearson") -> NoiseCeiling:
 
     RDMs are pooled as suits the comparison (standardised, unit length or ranks). Pairs that are NaN in
     any animal are left out for all. One animal has no ceiling: both bounds are NaN.
-
-    Raises:
-        UsageError: unknown method, or not a stack [A, P].
     """
     check_comparison(method)
     animals = rdm_stack(rdms, "rdms")

@@ -90,9 +90,6 @@ def noise_corrected(
         other_split_half_r: The same for the other side when it is a noisy brain too (animal to animal);
             None for models, which have no trial noise.
 
-    Raises:
-        UsageError: unknown estimator, numbers of splits that do not fit, or numbers that are no correlations.
-
     >>> round(noise_corrected(0.6, [0.7, 0.8, 0.6]).value, 3)
     0.661
     >>> noise_corrected(0.6, [0.1, 0.2]).reason

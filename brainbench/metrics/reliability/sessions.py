@@ -87,9 +87,6 @@ def usable_sessions(
     """Check the sessions, leave out what cannot be split and say what.
 
     Returns sessions that can be split; why none can, or None; notes for people.
-
-    Raises:
-        UsageError: trials and labels differ in number, or a label is none of the stimuli.
     """
     sessions: list[SortedTrials] = []
     lacking: list[str] = []
@@ -130,11 +127,7 @@ def usable_sessions(
 
 
 def trial_hashes(block: Trials, responses: Floats, codes: Ints) -> Hashes:
-    """Return one hash per trial, of its key or of its content.
-
-    Raises:
-        UsageError: keys are not one per trial, or repeat.
-    """
+    """Return one hash per trial, of its key or of its content."""
     if block.keys is None:
         return content_hashes(responses, codes)
     if len(block.keys) != len(codes):

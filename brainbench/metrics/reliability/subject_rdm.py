@@ -121,10 +121,6 @@ def subject_rdm(
     ``method`` is one of :func:`brainbench.metrics.rdm`. ``noise`` is the noise covariance of ``mahalanobis`` and
     ``crossnobis``: ``none`` or one of :func:`brainbench.metrics.noise_precision`. ``diag``, ``none`` and ``full`` leave
     crossnobis unbiased; shrinkage leaves a bias of up to .01 per unit (docs/calibration.md).
-
-    Raises:
-        UsageError: unknown method, bad shapes or labels, repeated trial keys, a number out of range.
-        DataError: infinite responses, or negative ones for ``poisson``.
     """
     check_name("RDM method of an animal", method, RDM_METHODS)
     check_comparison(comparison)

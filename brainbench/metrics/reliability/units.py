@@ -35,9 +35,6 @@ def unit_reliability(blocks: Sequence[Trials], n_stimuli: int, *, seed: int = 0)
 
     Responses are [R, F] or [R, T, F], whose time is averaged. A unit without variation over stimuli, or with fewer than
     two trials of some stimulus in every split, has no reliability. Values can be negative.
-
-    Raises:
-        UsageError: fewer than 3 stimuli, bad shapes or labels.
     """
     if n_stimuli < 3:
         raise UsageError(f"A unit's tuning needs at least 3 stimuli; received {n_stimuli}.")
@@ -76,9 +73,6 @@ def reliable_units(
 
     A session without such a unit is left out; without a ``least`` none is, and the words are empty. ``whole`` are the
     same trials with rates of the whole window, of which bins of unequal length have no plain mean.
-
-    Raises:
-        UsageError: as :func:`unit_reliability`.
     """
     if least is None:
         return tuple(blocks), ""

@@ -47,9 +47,6 @@ def whitened(session: SortedTrials, count: int, noise: str) -> tuple[SortedTrial
     recorded in; the other methods mix units, so they leave out units that were not recorded in every trial.
 
     ``none`` divides by nothing.
-
-    Raises:
-        UsageError: unknown ``noise`` method.
     """
     check_name("noise covariance method", noise, ("none", *NOISE_METHODS))
     if noise == "none":

@@ -93,10 +93,6 @@ def score_over_time(
     ``layers`` are RDMs [T', P] in bins of ``width`` seconds from :func:`layer_movie`, bin 0 beginning when the animals'
     first bin does; ``animals`` come from :func:`animal_movie`, for the same stimuli and bins. ``permutations`` are
     drawn above six stimuli.
-
-    Raises:
-        UsageError: no layers or animals, fewer than 4 stimuli or 3 bins, RDMs that do not fit one another, or an
-            unknown comparison.
     """
     check_comparison(comparison)
     movies = _checked(layers, animals, width)

@@ -47,9 +47,6 @@ def animal_movie(subject: str, blocks: Sequence[Trials], n_stimuli: int, **optio
     All bins split the same trials into the same halves, so differences between bins are not those of the splits.
     ``options`` are those of :func:`~brainbench.metrics.reliability.subject_rdm.subject_rdm`. The default method is the
     squared Euclidean distance without the share of trial noise, which would look like geometry before any response.
-
-    Raises:
-        UsageError: responses without a time axis, or sessions of different numbers of bins.
     """
     shapes = [np.shape(block.responses) for block in blocks]
     if not shapes or any(len(shape) != 3 for shape in shapes) or len({shape[1] for shape in shapes}) > 1:
@@ -72,9 +69,6 @@ def layer_movie(values: ArrayLike, step: float, width: float, *, method: str = "
     """Return a layer's RDMs [T, P] in bins of ``width`` seconds, from activations [K, T, F] every ``step`` seconds.
 
     A layer without time ([K, 1, F]) gives one RDM, which stands for all times.
-
-    Raises:
-        UsageError: activations without a time axis, or times that are not positive.
     """
     array = np.asarray(values)
     bins = array if array.ndim == 3 and array.shape[1] == 1 else in_bins(array, step, width)
@@ -88,9 +82,6 @@ def in_bins(values: ArrayLike, step: float, width: float) -> Floats:
 
     >>> in_bins([[[0.0], [1.0], [2.0], [3.0]]], 0.5, 1.0).ravel().tolist()
     [0.5, 2.5]
-
-    Raises:
-        UsageError: activations without a time axis, or times that are not positive.
     """
     array = np.asarray(values)
     if array.ndim != 3 or not (step > 0 and width > 0):

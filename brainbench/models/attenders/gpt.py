@@ -86,9 +86,6 @@ class GPTAttender(nn.Module):
 
     ``context`` counts tokens, two per step and one over; ``dropout`` is the share dropped while training. 25,778,688
     parameters for 512 → 512; 6,532,608 for 512 → 256.
-
-    Raises:
-        UsageError: the width is no multiple of the heads, or ``dropout`` no share.
     """
 
     def __init__(
@@ -133,11 +130,7 @@ class GPTAttender(nn.Module):
         return GPTState(empty, empty)
 
     def step(self, x: torch.Tensor, state: GPTState) -> tuple[torch.Tensor, GPTState]:
-        """Advance by one step of features [B, F]; return the answer [B, width] and the next state.
-
-        Raises:
-            UsageError: the context is full.
-        """
+        """Advance by one step of features [B, F]; return the answer [B, width] and the next state."""
         stream = self.tokens(x[:, None], state.tokens)
         keys, values = [], []
         for block, *past in zip(self.blocks, state.keys, state.values, strict=True):
@@ -161,11 +154,7 @@ class GPTAttender(nn.Module):
         return y if return_activations is False else (y, activations)
 
     def tokens(self, x: torch.Tensor, start: int) -> torch.Tensor:
-        """Return what the blocks see of features [B, T, F]: two tokens per step [B, 2 T, width], from ``start`` on.
-
-        Raises:
-            UsageError: they exceed the context.
-        """
+        """Return what the blocks see of features [B, T, F]: two tokens per step [B, 2 T, width], from ``start`` on."""
         batch, steps, features = x.shape
         if start + 2 * steps > self.context:
             raise UsageError(

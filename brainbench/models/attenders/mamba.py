@@ -122,9 +122,6 @@ class MambaAttender(nn.Module):
 
     The inner width of a block is ``expansion`` times F, with ``states`` per inner channel; the short convolution sees
     ``convolution`` steps.
-
-    Raises:
-        UsageError: a size is not positive.
     """
 
     max_steps: int | None = None

@@ -32,11 +32,7 @@ class ChannelNorm(nn.LayerNorm):
 
 
 class Cell(nn.Module):
-    """Base of all cells: channels of x and y, the state's shape, zero initial states and PyTorchTNN's names.
-
-    Raises:
-        UsageError: there is no channel, or the numbers differ in a cell that passes its input on.
-    """
+    """Base of all cells: channels of x and y, the state's shape, zero initial states and PyTorchTNN's names."""
 
     state_factor: ClassVar[int] = 1
     """Channels of the state per output channel."""
@@ -70,11 +66,7 @@ class Cell(nn.Module):
         return ()
 
     def load_tnn_state(self, state: Mapping[str, Any]) -> None:
-        """Load arrays or tensors under PyTorchTNN's parameter names, such as ``conv.weight``.
-
-        Raises:
-            DataError: a name is missing or unexpected, or a shape differs.
-        """
+        """Load arrays or tensors under PyTorchTNN's parameter names, such as ``conv.weight``."""
         load_named(self.tnn_parameters(), state, what=type(self).__name__)
 
     def tnn_parameters(self) -> dict[str, torch.Tensor]:
@@ -103,9 +95,6 @@ class TimeDecay(Cell):
     Training changes τ if it is ``trainable``. There is no gate to normalise, so ``layer_norm`` normalises the output
     (y = LN(s)); the trace itself stays as it is, or it would forget how strong the stimulus was.
     ``kernel_size`` is unused.
-
-    Raises:
-        UsageError: the numbers of channels differ, or ``tau`` is not finite.
     """
 
     keeps_channels = True

@@ -111,9 +111,6 @@ class IntersectionRNN(GatedCell):
     """Cell gated through time and through depth (Collins et al. 2017), with as many channels of y as of x.
 
     State: p = σ(p' + 1), s ← p s + (1 − p) tanh(m'). Output: q = σ(q' + 1), y = q x + (1 − q) relu(n').
-
-    Raises:
-        UsageError: the numbers of channels differ.
     """
 
     keeps_channels = True

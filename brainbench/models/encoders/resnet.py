@@ -77,11 +77,7 @@ class ResNet18Encoder(nn.Module):
         return total
 
     def forward(self, x: torch.Tensor, *, return_activations: bool | Collection[str] = False) -> Any:
-        """Return the features [B, T, F], with activations also ``{layer: [B, T, ...]}``.
-
-        Raises:
-            UsageError: ``x`` is not [B, T, C, H, W] as :attr:`input_shape` says.
-        """
+        """Return the features [B, T, F], with activations also ``{layer: [B, T, ...]}``."""
         check_sweep(x, self.input_shape, "The ResNet")
         leading = x.shape[:2]
         layers = ((name, self.get_submodule(name)) for name in self.layers)

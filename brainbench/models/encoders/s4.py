@@ -78,11 +78,7 @@ class S4Encoder(nn.Module):
         return linear + sum(12 * block.memory.frequency.numel() for block in self.blocks)
 
     def forward(self, x: torch.Tensor, *, return_activations: bool | Collection[str] = False) -> Any:
-        """Return the features [B, T, F], with activations also ``{layer: [B, T, width]}``.
-
-        Raises:
-            UsageError: ``x`` is not [B, T, C, H, W] as :attr:`input_shape` says.
-        """
+        """Return the features [B, T, F], with activations also ``{layer: [B, T, width]}``."""
         check_sweep(x, self.input_shape, "S4")
         layers = zip(self.layers, (self.embed, *self.blocks, self.fc), strict=True)
         y, activations = run_layers(x.flatten(2), layers, return_activations)

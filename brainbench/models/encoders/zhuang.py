@@ -31,9 +31,6 @@ def zhuang_graph(
 
     It has 512 features, or 96 when ``small`` (every width × 3/16, about 1.3 M parameters with the largest cell).
     ``feedforward`` leaves out memory and feedback; cell and layer norm then have no meaning.
-
-    Raises:
-        UsageError: there is no such cell.
     """
     scaled = small_width if small else int
     memory = None if feedforward else Memory(cell, layer_norm=layer_norm)

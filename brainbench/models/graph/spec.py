@@ -102,11 +102,7 @@ class Dense(Operation):
 
 @dataclass(frozen=True)
 class Memory:
-    """A recurrent cell of :mod:`brainbench.models.cells`, channels unchanged.
-
-    Raises:
-        UsageError: there is no such cell, or a number is out of its range.
-    """
+    """A recurrent cell of :mod:`brainbench.models.cells`, channels unchanged."""
 
     kind: str = "time-decay"
     """One of :data:`MEMORIES`."""
@@ -127,11 +123,7 @@ class Memory:
 
 @dataclass(frozen=True)
 class Pool:
-    """Pooling at the end of a node: ``max``, or ``average`` to a fixed output size.
-
-    Raises:
-        UsageError: there is no such kind, or a size is out of its range.
-    """
+    """Pooling at the end of a node: ``max``, or ``average`` to a fixed output size."""
 
     kind: Literal["max", "average"]
     size: tuple[int, int]
@@ -206,12 +198,7 @@ class Edge:
 
 @dataclass(frozen=True)
 class GraphSpec:
-    """Nodes, edges and the shape of one time step of the stimulus.
-
-    Raises:
-        UsageError: names repeat or do not exist, a node is out of the stimulus' reach, or the
-            feedforward edges form a cycle; the message names the culprits.
-    """
+    """Nodes, edges and the shape of one time step of the stimulus."""
 
     nodes: tuple[Node, ...]
     edges: tuple[Edge, ...]
@@ -287,11 +274,7 @@ class GraphSpec:
         return {(e.source, e.target): 1 if unroll == "biological" or e.feedback else 0 for e in self.edges}
 
     def shapes(self) -> tuple[dict[str, Shape], dict[str, Shape]]:
-        """Return each node's concatenated input shape and output shape.
-
-        Raises:
-            UsageError: shapes do not fit one another; the message names the node.
-        """
+        """Return each node's concatenated input shape and output shape."""
         # Feedback reaches back to nodes whose grid is known only later, so outputs come first: they
         # depend on the shape_from predecessor's grid and on no other input.
         outputs: dict[str, Shape] = {}

@@ -69,10 +69,6 @@ class TemporalGraph(nn.Module):
         ``input_shape`` (C, H, W) overrides the configuration's. PyTorchTNN's published files declare shapes that its
         callers override, so without this argument the declared shape is a default: :meth:`load_tnn_state` gives it up
         if the weights were made for another.
-
-        Raises:
-            DataError: the file is missing or not JSON or TOML, or a key is missing or unsupported.
-            UsageError: the graph is not valid.
         """
         spec = read_graph(source)
         graph = cls(spec if input_shape is None else replace(spec, input_shape=tuple(input_shape)))
@@ -100,11 +96,7 @@ class TemporalGraph(nn.Module):
         return self.spec.receptive_field()
 
     def load_tnn_state(self, state: Mapping[str, Any]) -> None:
-        """Load arrays or tensors under PyTorchTNN's names, ``<node>._pre_memory.conv.weight`` and so on.
-
-        Raises:
-            DataError: names are missing or unexpected, or shapes differ; the graph is then unchanged.
-        """
+        """Load arrays or tensors under PyTorchTNN's names, ``<node>._pre_memory.conv.weight`` and so on."""
         resized = {} if self._fixed_shape else self._resized_by(state)
         shapes = {name: tuple(value.shape) for name, value in self.tnn_parameters().items()} | resized
         check_named(shapes, state, what="this graph")
@@ -193,11 +185,7 @@ class TemporalGraph(nn.Module):
         return total
 
     def init_state(self, batch: int) -> GraphState:
-        """Return the state before the first step: silent nodes and empty memories, all zeros.
-
-        Raises:
-            UsageError: the shape of the stimulus is still open.
-        """
+        """Return the state before the first step: silent nodes and empty memories, all zeros."""
         if self._open_grid:
             raise UsageError("The stimulus shape is still open; pass input_shape to TemporalGraph.from_config.")
         like = next(self.parameters())
@@ -225,9 +213,6 @@ class TemporalGraph(nn.Module):
         """Advance by one step of the stimulus [B, C, H, W]; return the output [B, ...] and the next state.
 
         Equals :meth:`forward` step by step.
-
-        Raises:
-            UsageError: the stimulus has another shape, or the unrolling is unknown.
         """
         check_name("unrolling", unroll, UNROLLS)
         if x.ndim != 4:
@@ -269,9 +254,6 @@ class TemporalGraph(nn.Module):
         Returns:
             The outputs [B, T, ...] or, with ``last``, those of the last step [B, ...]; with ``return_activations``
             (True for every node, or names) also ``{node: [B, T, ...]}``.
-
-        Raises:
-            UsageError: the shape does not fit, or a node or unrolling does not exist.
         """
         check_name("unrolling", unroll, UNROLLS)
         asked = set(wanted(self.layers, return_activations))

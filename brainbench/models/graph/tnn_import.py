@@ -104,10 +104,6 @@ def read_graph(source: Mapping[str, Any] | str | os.PathLike[str]) -> GraphSpec:
 
     Feedback is what leads back in ``ff_order`` if that is given, else in the listed order of the nodes; without cycles
     nothing is feedback. ``num_timesteps`` is not needed and ignored.
-
-    Raises:
-        DataError: the file is missing or not JSON, or a key is missing or unsupported.
-        UsageError: the graph itself is not valid, or a number is out of its range.
     """
     if isinstance(source, Mapping):
         return _graph(source)

@@ -77,11 +77,7 @@ DECODERS: Mapping[str, Callable[..., nn.Module]] = {
 
 
 def make_decoder(name: str, features: int, classes: int = CLASSES) -> nn.Module:
-    """Build a decoder of :data:`DECODERS` by name.
-
-    Raises:
-        UsageError: there is none of this name, or fewer than two classes.
-    """
+    """Build a decoder of :data:`DECODERS` by name."""
     check_name("decoder", name, DECODERS)
     check_number("The number of classes of a decoder", classes, least=2, whole=True)
     return DECODERS[name](features, classes)

@@ -44,9 +44,6 @@ class SimSiamHead(nn.Module):
 
 class AutoencoderHead(nn.Module):
     """Reconstruction [B, T, F] → [B, T, C, H, W]: a linear layer to C/2 channels, then three transposed convolutions.
-
-    Raises:
-        UsageError: there are fewer than 2 channels.
     """
 
     def __init__(self, features: int, *, channels: int = 30, grid: tuple[int, int] = GRID_SHAPE) -> None:

@@ -25,9 +25,6 @@ def packed(model: nn.Module, *, precision: str = "float32") -> nn.Module:
 
     Batches of two and more are computed as before, in single precision. The copy does not notice later changes of its
     weights: pack again after training.
-
-    Raises:
-        UsageError: there is no such precision, or the network is not on the CPU.
     """
     import torch
 

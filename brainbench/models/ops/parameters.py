@@ -13,21 +13,13 @@ from brainbench.core.files import content_hash
 
 
 def load_named(targets: Mapping[str, torch.Tensor], state: Mapping[str, Any], *, what: str) -> None:
-    """Copy arrays or tensors of ``state`` into ``targets``, which has the same names; all or nothing.
-
-    Raises:
-        DataError: names are missing or unexpected, or shapes differ.
-    """
+    """Copy arrays or tensors of ``state`` into ``targets``, which has the same names; all or nothing."""
     check_named({name: tuple(value.shape) for name, value in targets.items()}, state, what=what)
     copy_named(targets, state)
 
 
 def check_named(shapes: Mapping[str, tuple[int, ...]], state: Mapping[str, Any], *, what: str) -> None:
-    """Compare the names and shapes of ``state`` with the expected ones.
-
-    Raises:
-        DataError: names are missing or unexpected, or shapes differ; the message names them.
-    """
+    """Compare the names and shapes of ``state`` with the expected ones."""
     problems = []
     missing = [name for name in shapes if name not in state]
     unexpected = [name for name in state if name not in shapes]

@@ -10,11 +10,7 @@ from brainbench.core.reading.ranges import check_number
 
 @contextmanager
 def seeded(seed: int) -> Iterator[None]:
-    """Run a block with PyTorch's CPU generator at ``seed``; its state is put back afterwards.
-
-    Raises:
-        UsageError: the seed is not a whole number from 0 to 2**63 − 1.
-    """
+    """Run a block with PyTorch's CPU generator at ``seed``; its state is put back afterwards."""
     # PyTorch keeps seeds as signed 64-bit numbers.
     check_number("seed", seed, least=0, below=2**63, whole=True)
     import torch

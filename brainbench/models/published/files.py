@@ -47,7 +47,6 @@ def read_weights(path: str | os.PathLike[str]) -> ForeignWeights:
 
     Raises:
         DataFileNotFoundError: there is no such file.
-        DataError: it is no such file, is cut short, needs pickle, or a weight is not finite.
     """
     path, kind = Path(path), "file of weights"
     read = read_tensors if path.suffix == ".safetensors" else read_checkpoint
@@ -69,8 +68,6 @@ def read_settings(path: str | os.PathLike[str]) -> Settings:
 
     Raises:
         DataFileNotFoundError: there is no such file.
-        DataError: it cannot be read, or says nothing that is known here.
-        MissingDependencyError: it is YAML and no reader is installed.
     """
     values = read_mapping(path, "file of settings")
     if "nodes" in values:

@@ -57,10 +57,6 @@ def import_checkpoint(
     The file is a Lightning checkpoint (``.ckpt``), a state dict of PyTorch, or safetensors. Where names and shapes
     leave a choice, the registry name ``architecture`` or the run's settings ``config`` decide it. The default folder is
     ``ARCHITECTURE-HASH`` where the command runs.
-
-    Raises:
-        DataError: the file cannot be read, or is no network of the study.
-        UsageError: its architecture is ambiguous, or there is none of that name.
     """
     settings = None if config is None else read_settings(config)
     weights = read_weights(path)
@@ -103,11 +99,7 @@ def import_to_cache(path: Path, config: Path | None = None) -> Path:
 
 
 def build_published(state: Mapping[str, torch.Tensor], found: Recognised) -> tuple[EncoderAttenderDecoder, set[str]]:
-    """Build a recognised network with its weights; return it with the names of the entries that it took.
-
-    Raises:
-        DataError: entries are missing or unexpected, or shapes differ.
-    """
+    """Build a recognised network with its weights; return it with the names of the entries that it took."""
     name = found.architecture
     model = load_model(name, classes=found.classes, decoder=found.decoder or "linear")
     if not isinstance(model, EncoderAttenderDecoder):
@@ -123,11 +115,7 @@ def build_published(state: Mapping[str, torch.Tensor], found: Recognised) -> tup
 def matched_entries(
     state: Mapping[str, torch.Tensor], model: EncoderAttenderDecoder, found: Recognised
 ) -> dict[str, torch.Tensor]:
-    """Return the entries of a file that are a network's weights, each with its place in ours.
-
-    Raises:
-        DataError: entries are missing or unexpected, or shapes differ.
-    """
+    """Return the entries of a file that are a network's weights, each with its place in ours."""
     places, names = model.state_dict(), published_names(model)
     if found.decoder is None:
         names = {ours: theirs for ours, theirs in names.items() if not ours.startswith("decoder.")}

@@ -32,11 +32,7 @@ Layers = list[tuple[str, Callable[[torch.Tensor], torch.Tensor]]]
 
 
 def published_layers(model: nn.Module) -> tuple[str, ...]:
-    """Return the names that a network's layers have in the study, from stimulus to output.
-
-    Raises:
-        UsageError: the network is of another kind.
-    """
+    """Return the names that a network's layers have in the study, from stimulus to output."""
     if not isinstance(model, EncoderAttenderDecoder):
         raise UsageError(
             f"The published readout knows the networks of the study; received {type(model).__name__}. Leave "
@@ -55,11 +51,7 @@ def published_layers(model: nn.Module) -> tuple[str, ...]:
 
 
 def published_activations(model: nn.Module, x: torch.Tensor, layers: Collection[str] | None = None) -> Named:
-    """Return ``{layer: [B, averaged axis, F]}`` of sweeps [B, T, C, H, W] in SI, by the names of the study.
-
-    Raises:
-        UsageError: the network is of another kind, a layer does not exist, or the sweeps do not fit.
-    """
+    """Return ``{layer: [B, averaged axis, F]}`` of sweeps [B, T, C, H, W] in SI, by the names of the study."""
     names = published_layers(model)
     check_each("published layer", layers or (), names)
     assert isinstance(model, EncoderAttenderDecoder)

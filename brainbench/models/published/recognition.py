@@ -33,10 +33,6 @@ def recognise(
     state: Mapping[str, torch.Tensor], settings: Settings | None = None, architecture: str | None = None
 ) -> Recognised:
     """Recognise a network; ``architecture`` (a registry name without a tag) and the settings decide where names do not.
-
-    Raises:
-        DataError: it is no network of the study, or has a part that none here has.
-        UsageError: two architectures have such entries, and nothing says which one it is.
     """
     settings = settings or Settings()
     name = architecture or f"{_encoder(state, settings)}{_attender(state)}"

@@ -36,11 +36,7 @@ _MIRRORED = {"vertical": "z", "horizontal": "y"}
 
 @dataclass(frozen=True)
 class Augmentation:
-    """Change of every sample at training time.
-
-    Raises:
-        UsageError: there is no such kind, or the masked share is not in [0, 1).
-    """
+    """Change of every sample at training time."""
 
     kind: str = "none"
     """``none``, ``physical``, ``thesis`` or ``image``."""
@@ -90,9 +86,6 @@ def flip(x: torch.Tensor, direction: str, cells: tuple[int, ...] = MOUSE, axes: 
 
     Follicle axes are mirrored with their whisker: what changes sign, for both directions, is their third axis, which
     stands on the plane of the whisker's curvature.
-
-    Raises:
-        UsageError: there is no such direction, or ``x`` is not [B, T, S·6, 5, 7].
     """
     check_name("direction of a flip", direction, _MIRRORED)
     if x.ndim != 5 or x.shape[2] % len(CHANNELS) or tuple(x.shape[3:]) != GRID_SHAPE:

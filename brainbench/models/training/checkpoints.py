@@ -43,10 +43,6 @@ def save_checkpoint(
     ``architecture`` is a registry name without a tag, ``options`` are the keywords that it was built with, ``info`` is
     what else the configuration keeps (objective, accuracy, data, seed, …), ``dtype`` the precision of the
     floating-point parameters on disk.
-
-    Raises:
-        UsageError: there is no such precision.
-        DataError: a parameter is not finite, or not in ``dtype``.
     """
     import torch
 
@@ -79,7 +75,6 @@ def read_config(folder: str | os.PathLike[str]) -> dict[str, Any]:
 
     Raises:
         DataFileNotFoundError: there is no such folder, or no configuration in it.
-        DataError: the configuration is of another kind, or its weights of a version that is not computed here.
     """
     from brainbench.core.files import read_mapping
 
@@ -108,7 +103,6 @@ def load_weights(model: nn.Module, path: str | os.PathLike[str], *, what: str) -
 
     Raises:
         DataFileNotFoundError: there is no such file.
-        DataError: it cannot be read, or does not fit the model.
     """
     from brainbench.core.reading.tensors import read_tensors
     from brainbench.models.ops.parameters import load_named
@@ -124,9 +118,7 @@ def find_folder(source: str) -> Path:
     checkpoint (:data:`FOREIGN`) instead of ours is imported into our cache.
 
     Raises:
-        UsageError: the name has another form, or there are several foreign checkpoints.
         DataFileNotFoundError: there is no such folder or repository.
-        MissingDependencyError: ``huggingface_hub`` is not installed.
     """
     if source.startswith(LOCAL):
         folder = Path(source.removeprefix(LOCAL)).expanduser()

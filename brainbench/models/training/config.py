@@ -19,11 +19,7 @@ AUGMENTATIONS = ("none", "physical", "thesis", "image")
 
 @dataclass(frozen=True)
 class TrainingConfig:
-    """One training run. :meth:`published` fills in the published recipe.
-
-    Raises:
-        UsageError: a value is outside its range; the message names what is allowed.
-    """
+    """One training run. :meth:`published` fills in the published recipe."""
 
     model: str
     """Registry name without a tag."""
@@ -86,11 +82,7 @@ class TrainingConfig:
 
     @classmethod
     def published(cls, model: str, objective: str = "supervised", **changes: Any) -> TrainingConfig:
-        """Return the published recipe of an architecture and an objective, with changes.
-
-        Raises:
-            UsageError: there is no such objective or field, or a value is outside its range.
-        """
+        """Return the published recipe of an architecture and an objective, with changes."""
         objective, _, variant = objective.partition("-")
         recipe = recipe_for(model, objective)
         setting = recipe.setting
@@ -105,11 +97,7 @@ class TrainingConfig:
 
     @classmethod
     def from_mapping(cls, values: Mapping[str, Any]) -> TrainingConfig:
-        """Build a configuration from names and values.
-
-        Raises:
-            UsageError: a name does not exist, or a value is of another kind or outside its range.
-        """
+        """Build a configuration from names and values."""
         known = {field.name: str(field.type) for field in fields(cls)}
         for name, value in values.items():
             check_name("training option", name, known)

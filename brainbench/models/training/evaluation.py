@@ -121,11 +121,7 @@ def collapse(predicted: int, classes: int, spread: float) -> str:
 
 
 def evaluate(model: nn.Module, batches: Iterable[tuple[Any, Any]], *, device: Any = None) -> Evaluation:
-    """Evaluate a network on labelled batches ([B, T, C, H, W] in SI, [B]), in evaluation mode.
-
-    Raises:
-        DataError: there are no batches, or an answer is not [B, classes].
-    """
+    """Evaluate a network on labelled batches ([B, T, C, H, W] in SI, [B]), in evaluation mode."""
     encode: Any = getattr(model, "encode", None)
     decoder: Any = getattr(model, "decoder", None)
     digest, seen, first, five = SweepsHash(), 0, 0, 0
@@ -305,10 +301,6 @@ def baselines(
     of random features: as many as the probe of the network beside it sees. Up to ``memory`` bytes of raw sweeps are
     held (about three times as many are used); a larger training set is read again in every pass. Returns evaluations on
     the test sweeps by the names ``raw-input`` and ``random-features``.
-
-    Raises:
-        DataError: there are no batches, or the sweeps are not finite.
-        UsageError: the batches can be read but once.
     """
     for batches in (train, test):
         _check_repeatable(batches, "sweeps of a baseline")

@@ -60,9 +60,6 @@ class Learner(nn.Module):
 
     Self-supervised objectives need a network with ``encode``, ``features`` and ``normaliser``, as
     :class:`~brainbench.models.network.EncoderAttenderDecoder` has them.
-
-    Raises:
-        UsageError: the objective learns from features, and the network names none.
     """
 
     views: int = 1
@@ -137,11 +134,7 @@ class Autoencoding(Learner):
         self.head = AutoencoderHead(self.model.features, channels=channels, grid=(grid[0], grid[1]))
 
     def forward(self, views: tuple[torch.Tensor, ...], labels: torch.Tensor) -> torch.Tensor:
-        """Return the loss; labels have no part in it.
-
-        Raises:
-            UsageError: sweeps are no longer than the encoder's latency.
-        """
+        """Return the loss; labels have no part in it."""
         del labels
         x, latency = views[0], self.model.spec.latency
         if x.shape[1] <= latency:
@@ -158,11 +151,7 @@ LEARNERS = {"supervised": Supervised, "simclr": SimCLR, "simsiam": SimSiam, "ae"
 
 
 def make_learner(objective: str, model: nn.Module) -> Learner:
-    """Join a network and an objective by name.
-
-    Raises:
-        UsageError: there is no such objective, or the network does not offer what it needs.
-    """
+    """Join a network and an objective by name."""
     check_name("objective", objective, LEARNERS)
     return LEARNERS[objective](model)
 

@@ -65,11 +65,7 @@ _MAKERS: Mapping[str, Callable[..., Optimizer]] = {
 
 
 def make_optimizer(name: str, parameters: Iterable[nn.Parameter], learning_rate: float) -> Optimizer:
-    """Build an optimiser by name over the parameters that want a gradient.
-
-    Raises:
-        UsageError: there is no such optimiser, or the rate is not a positive number.
-    """
+    """Build an optimiser by name over the parameters that want a gradient."""
     check_name("optimizer", name, OPTIMIZERS)
     check_number("learning_rate", learning_rate, above=0)
     return _MAKERS[name]([p for p in parameters if p.requires_grad], learning_rate)
@@ -79,9 +75,6 @@ def rate_factor(schedule: str, epoch: float, *, epochs: int, warmup_epochs: int 
     """Return the learning rate after so many epochs of all, relative to the initial one.
 
     For ``cosine`` fractions of an epoch count, and ``warmup_epochs`` of linear rise from 1e-4.
-
-    Raises:
-        UsageError: there is no such schedule.
     """
     check_name("schedule", schedule, SCHEDULES)
     if schedule == "constant":

@@ -41,11 +41,7 @@ class Processes:
         vector.div_(self.count)
 
     def prepare(self, module: nn.Module) -> nn.Module:
-        """Return the module on its device, with batch norms that pool over processes.
-
-        Raises:
-            UsageError: batch norms over several processes without CUDA, where PyTorch has none.
-        """
+        """Return the module on its device, with batch norms that pool over processes."""
         if self.count > 1 and any(isinstance(m, nn.modules.batchnorm._BatchNorm) for m in module.modules()):
             if self.device.type != "cuda":
                 raise UsageError(
@@ -82,11 +78,7 @@ class Processes:
 
 @contextmanager
 def processes(device: str | None = None) -> Iterator[Processes]:
-    """Join the processes that torchrun started, or be the only one; without a device's name CUDA when there is one.
-
-    Raises:
-        UsageError: the device does not exist.
-    """
+    """Join the processes that torchrun started, or be the only one; without a device's name CUDA when there is one."""
     where = torch_device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
     count, rank = int(os.environ.get("WORLD_SIZE", "1")), int(os.environ.get("RANK", "0"))
     if where.type == "cuda":

@@ -36,9 +36,6 @@ def claim(folder: Path, identity: Mapping[str, Any], *, write: bool) -> None:
     """Enter a run into its folder, or find it there: a run is resumed if its identity is equal.
 
     Where ``write`` is off, as in all processes but one, a folder without a run stays so.
-
-    Raises:
-        UsageError: the folder holds another run.
     """
     path = folder / RUN
     if path.is_file():
@@ -73,11 +70,7 @@ def save_state(path: Path, learner: nn.Module, optimizer: torch.optim.Optimizer,
 
 
 def load_state(path: Path, learner: nn.Module, optimizer: torch.optim.Optimizer) -> dict[str, Any]:
-    """Put a run back where :func:`save_state` found it; return the plain values.
-
-    Raises:
-        DataError: the file is damaged or belongs to another network.
-    """
+    """Put a run back where :func:`save_state` found it; return the plain values."""
     from safetensors import safe_open
 
     check_file(path, "training state")
@@ -171,11 +164,7 @@ class RunLog:
 
 
 def read_log(folder: str | Path, kind: str) -> list[dict[str, Any]]:
-    """Return the lines of one kind (``train``, ``epoch``, ``validation``, ``test``) of a run's log.
-
-    Raises:
-        DataError: the folder holds no log.
-    """
+    """Return the lines of one kind (``train``, ``epoch``, ``validation``, ``test``) of a run's log."""
     path = Path(folder) / LOG
     if not path.is_file():
         raise DataError(f"There is no log {str(path)!r}.")

@@ -21,9 +21,6 @@ def sweep_runs(
 
     ``config`` is what all runs share; optimiser, schedule and learning rate are replaced. ``job`` is (number of this
     job from 0, number of jobs); ``warmup`` searches SimSiam's warmed-up schedule.
-
-    Raises:
-        UsageError: the job's number is not below the number of jobs.
     """
     if not 0 <= job[0] < job[1]:
         raise UsageError(f"A job is (number, count) with 0 ≤ number < count; received {job}.")
@@ -42,9 +39,6 @@ def best_run(out: str | Path) -> tuple[Path, dict[str, float]]:
 
     Scores are those of the validation data: highest accuracy, or lowest self-supervised loss. The test split has no
     say.
-
-    Raises:
-        DataError: no run of the sweep is finished.
     """
     from brainbench.core.files import read_mapping
     from brainbench.models.training.run_folder import RUN, read_log

@@ -118,10 +118,6 @@ def train(
     Returns:
         How it ended. A loss or gradient that is not finite ends it as ``diverged``: the last good state and model
         stay, and the batch is kept in ``failed-batch.safetensors``.
-
-    Raises:
-        UsageError: the folder holds another run, or the configuration does not fit the data.
-        DataError: the data set has no training sweeps, or a file of the run is damaged.
     """
     if stop_after is not None:
         check_number("stop_after", stop_after, least=0)

@@ -40,9 +40,6 @@ def draw_twin(twin: Mapping[str, Any], options: Mapping[str, Any]) -> tuple[nn.M
     """Return the twin that a checkpoint's configuration names, and why it is another network after all, or ''.
 
     ``twin`` and ``options`` are entries of the configuration.
-
-    Raises:
-        UsageError: there is no such model.
     """
     model = load_model(twin["name"], seed=twin["seed"], **options)
     return model, difference(twin, describe_twin(twin["name"], twin["seed"], model))

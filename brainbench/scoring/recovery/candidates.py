@@ -38,11 +38,7 @@ class Candidate:
     def of(
         cls, name: str, stimuli: Sequence[str], layers: Mapping[str, ArrayLike], weights: str | None = None
     ) -> Candidate:
-        """Take the layers that can be compared.
-
-        Raises:
-            UsageError: no layer can, or rows do not fit the stimuli.
-        """
+        """Take the layers that can be compared."""
         usable = {}
         for layer, values in layers.items():
             array = np.asarray(values, dtype=np.float64)
@@ -55,11 +51,7 @@ class Candidate:
         return cls(name, tuple(stimuli), usable, weights)
 
     def choose(self, layer: str, random: np.random.Generator) -> str:
-        """Return the layer that ``any``, ``last`` or a name means.
-
-        Raises:
-            UsageError: there is no such layer.
-        """
+        """Return the layer that ``any``, ``last`` or a name means."""
         names = list(self.features)
         if layer in names:
             return layer
@@ -105,9 +97,6 @@ def open_candidates(
     models: Sequence[Any], options: ScoreOptions, *, progress: Progress | None = None
 ) -> tuple[tuple[Candidate, ...], dict[str, Any]]:
     """Run the models on the stimuli of ``options`` and return them as candidates, with the provenance of the stimuli.
-
-    Raises:
-        UsageError: fewer than two models, two of one name, or a file of activations without one of the stimuli.
     """
     from brainbench.scoring.model_responses import resolve_model
     from brainbench.stimuli import load_stimuli

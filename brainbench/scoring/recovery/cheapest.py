@@ -51,9 +51,6 @@ def find_cheapest(
     that failed clearly (interval below ``wanted``) is not tried. The one returned reaches the rate on boards of other
     numbers too. The design's numbers of animals, units, trials and stimuli are replaced; ``where`` are ``workers`` and
     ``scheduler`` of :func:`recover`.
-
-    Raises:
-        UsageError: a rate outside (0, 1).
     """
     check_number("The wanted rate", wanted, above=0, below=1)
     pool = len(candidates[0].stimuli)

@@ -127,10 +127,6 @@ def plot_confusion(recovery: Recovery, path: str | os.PathLike[str]) -> Path:
     """Draw, for every true candidate (row), the share of its boards in which each candidate (column) came first.
 
     The suffix of the path is the format.
-
-    Raises:
-        UsageError: another format.
-        MissingDependencyError: matplotlib is not installed (extra ``report``).
     """
     target = Path(path)
     check_format(target, FORMATS)

@@ -15,11 +15,7 @@ FEWEST_STIMULI = 4
 
 @dataclass(frozen=True)
 class RecoveryDesign:
-    """An experiment that is repeated on the computer with every candidate in turn as the truth.
-
-    Raises:
-        UsageError: a number is out of range.
-    """
+    """An experiment that is repeated on the computer with every candidate in turn as the truth."""
 
     population: PopulationDesign = field(default_factory=PopulationDesign)
     """Animals, units, trials and noise."""
@@ -47,9 +43,6 @@ def parse_trials(text: str) -> int | tuple[int, int]:
 
     >>> parse_trials("16-20")
     (16, 20)
-
-    Raises:
-        UsageError: it is something else.
     """
     found = re.fullmatch(r"\s*(\d{1,9})\s*(?:-\s*(\d{1,9})\s*)?", text)
     first, last = (int(part or 0) for part in found.groups()) if found else (0, 0)

@@ -97,10 +97,6 @@ def design_for_networks(
             and ``last`` stand for the last.
         boards: boards of each network on which motions are compared, at least 2.
         backend: physics engine.
-
-    Raises:
-        UsageError: there are too few scenes, or not two networks, or a network cannot see other motions.
-        DataError: whiskers are unstable with the given motion.
     """
     options, study = options or DesignOptions(), replace(study or RecoveryDesign(), stimuli=None)
     check_number("number of scenes, half of which are held out,", len(scenes), least=2 * FEWEST_STIMULI)

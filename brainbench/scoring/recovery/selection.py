@@ -58,10 +58,6 @@ def select_stimuli(
     """Pick the stimuli of the pool that separate the candidates best.
 
     Stimuli are chosen on so many ``boards`` of each candidate, whose design's own ``stimuli`` do not count.
-
-    Raises:
-        UsageError: as :func:`recover`; the pool is too small, ``keep`` too few, or the metric does not compare
-            RDMs.
     """
     design = replace(design or RecoveryDesign(), stimuli=None)
     check_candidates(candidates, design, boards)

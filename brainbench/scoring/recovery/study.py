@@ -57,10 +57,6 @@ def recover(
     started again. ``first`` is the number of the first board: boards of other numbers have other animals. A folder
     keeps finished boards; ``scheduler`` is the address of a Dask scheduler, whose workers make the boards instead of
     processes here.
-
-    Raises:
-        UsageError: fewer than two candidates, more stimuli asked for than there are, an unknown metric or layer, or
-            the folder holds another recovery.
     """
     design = design or RecoveryDesign()
     check_candidates(candidates, design, boards)

@@ -41,9 +41,6 @@ def get_engine(name: str, *, device: str | None = None, retry: int | None = None
         name: one of :func:`list_engines`.
         device: ``cpu`` or ``cuda``; the engine's own choice when None.
         retry: as :attr:`WhiskerEngine.retry`; the engine's own choice when None.
-
-    Raises:
-        UsageError: there is no such engine, or it does not run on the device.
     """
     check_name("backend", name, list_engines())
     module, symbol = _ENGINES[name]

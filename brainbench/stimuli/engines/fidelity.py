@@ -80,9 +80,6 @@ class Fidelity:
 
         Values stand in SI units, as the fields of this class; ``none`` stands for None. ``auto=0.1`` in place of a
         preset is :meth:`auto`.
-
-        Raises:
-            UsageError: there is no such preset or field, a field stands twice, or a value lies outside its range.
         """
         preset, *changes = (item.strip() for item in text.split(","))
         names = {item.name: item for item in fields(cls)}
@@ -106,10 +103,6 @@ class Fidelity:
         root mean square over the time. A setting is taken when the measured share stays below :data:`MARGIN` of
         ``error``, so that other scenes keep the promise (benchmarks/RESULTS.md, "Settings chosen for an error"). As
         text: ``auto=0.1``.
-
-        Raises:
-            UsageError: ``error`` is not positive, ``share`` or the backend was not measured, or no setting is that
-                accurate.
         """
         check_number("error (0.05 = 5 %)", error, above=0)
         return cls(**cheapest(measured(backend, share), error).settings)

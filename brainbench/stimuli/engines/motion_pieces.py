@@ -151,9 +151,6 @@ class Cutting:
         """Cut a motion, which is not evaluated before 0 when it starts at 0 or later; ``what`` names it in messages.
 
         ``finest`` is the shortest period (s) of anything in it, None when unknown.
-
-        Raises:
-            UsageError: the motion is not finite, its position jumps, or the finest pieces do not follow it.
         """
         spans = self.stop - self.start, self.longest_step
         cells = sum(max(1, math.ceil(span / KNOT - 1e-9)) for span in spans)

@@ -78,11 +78,7 @@ class Load:
 
 @dataclass(frozen=True, eq=False)
 class Job:
-    """One whisker to simulate from ``start``, at rest relative to its base and unbent, to the last frame.
-
-    Raises:
-        UsageError: the frame times are not increasing or begin before ``start``, or a load lies beyond the tip.
-    """
+    """One whisker to simulate from ``start``, at rest relative to its base and unbent, to the last frame."""
 
     whisker: Whisker
     follicle: Follicle
@@ -199,9 +195,6 @@ class WhiskerEngine(ABC):
             progress: called as ``progress(done, total)`` when a job is finished.
             workers: native threads; all usable processors when None.
             record_shape: fill :attr:`Trace.link_positions`.
-
-        Raises:
-            UsageError: the engine cannot run these jobs at this fidelity.
         """
 
     def prepare_sweeps(  # noqa: B027 — as for prepare

@@ -30,9 +30,6 @@ def write_film(
         path, frames: file to write, and pictures of one size.
         style: size and frames per second.
         palette_from: frames whose colours the 255 colours of a GIF are chosen from.
-
-    Raises:
-        DataError: the encoder failed.
     """
     write = _write_gif if path.suffix.lower() == ".gif" else _write_mp4
     with atomic_path(path) as temporary:

@@ -207,10 +207,6 @@ def render(
         camera, style: an oblique perspective that frames whiskers and objects when None; films are smaller than
             pictures.
         fidelity, backend, progress, cache: as for :func:`brainbench.stimuli.whisker_shapes.record`.
-
-    Raises:
-        UsageError: the format is unknown, a picture was asked for several instants, or one lies behind the scene's end.
-        MissingDependencyError: a package of the extra ``report`` is missing.
     """
     path = Path(out)
     suffix = check_format(path, FORMATS)
@@ -251,11 +247,7 @@ def still_time(scene: Scene) -> float:
 
 
 def film_times(scene: Scene, start: float = 0.0, stop: float | None = None, step: float = 0.002) -> Sequence[float]:
-    """Return instants [n] (s) from ``start`` to ``stop`` (None: 150 ms later, or the scene's end) every ``step``.
-
-    Raises:
-        UsageError: the times are no interval, or the film would have more than 10,000 frames.
-    """
+    """Return instants [n] (s) from ``start`` to ``stop`` (None: 150 ms later, or the scene's end) every ``step``."""
     stop = min(float(scene.frames.times[-1]), start + 0.15) if stop is None else stop
     if not (math.isfinite(step) and step > 0 and math.isfinite(stop) and 0 <= start < stop):
         raise UsageError(

@@ -58,10 +58,6 @@ def plot(
         channel: one of :data:`QUANTITIES`.
         stimulus: draw only this one.
         window, size: first and last time to show [s]; width and height in pixels.
-
-    Raises:
-        UsageError: a name or format is unknown, two whiskers share a cell, or the window is empty.
-        MissingDependencyError: matplotlib is not installed.
     """
     check_stimulus_set(dataset)
     path = Path(out)

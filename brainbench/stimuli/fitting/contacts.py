@@ -112,9 +112,6 @@ def find_contacts(
         [time, axis] (m), ``moment`` (N·m, of the whisker on its base), ``base_angle``, standard deviations
         ``force_deviation`` and ``arc_deviation``, ``residual`` (m), ``status`` and ``reason``. ``undefined``: no sign
         of a contact, or no fit.
-
-    Raises:
-        DataError: the shapes are not those of a whisker of this length, change places, or bend in no plane.
     """
     import xarray as xr
 

@@ -55,12 +55,6 @@ def fit(
 
     Returns:
         Estimates with intervals, noise, tests of the residuals, and a status with reasons.
-
-    Raises:
-        UsageError: a parameter is unknown, one with bounds or a prior is not fitted, or a start value lies outside its
-            bounds.
-        DataError: there are fewer readings than parameters, wrenches have the wrong unit or sign, or the whisker is
-            unstable at the start values.
     """
     began = time.perf_counter()
     trials, options = [trials] if isinstance(trials, Trial) else list(trials), options or FitOptions()

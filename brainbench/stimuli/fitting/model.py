@@ -52,11 +52,7 @@ class Readings:
 
     @classmethod
     def of(cls, trials: Sequence[Trial]) -> Readings:
-        """Return the readings of some trials: every finite number that was measured.
-
-        Raises:
-            DataError: trials disagree on the noise of a channel.
-        """
+        """Return the readings of some trials: every finite number that was measured."""
         names = tuple(dict.fromkeys(name for trial in trials for name in trial.channels))
         rows: list[NDArray[np.int_]] = []
         owners, groups = [], []
@@ -192,11 +188,7 @@ class FitModel:
         ])  # fmt: skip
 
     def jacobian(self, u: Array) -> Array:
-        """Return the derivatives [m, p] of the whitened residuals.
-
-        Raises:
-            DataError: a simulation cannot be trusted, so that there are none.
-        """
+        """Return the derivatives [m, p] of the whitened residuals."""
         tangents = self.run(u).tangents()
         traces = self._traces(u)
         columns = []

@@ -118,11 +118,7 @@ PARAMETERS: Mapping[str, Parameter] = {
 
 @dataclass(frozen=True)
 class FreeParameters:
-    """The parameters of one fit, with their start values and bounds.
-
-    Raises:
-        UsageError: a name is unknown or stands twice, bounds are of none of them, or a start value is not possible.
-    """
+    """The parameters of one fit, with their start values and bounds."""
 
     names: tuple[str, ...]
     start: Condition

@@ -39,11 +39,7 @@ DEAD = 0.05
 
 
 def check_clock(times: NDArray[np.float64], frequency: float, damping_ratio: float) -> None:
-    """Refuse times [n] (s) at which a whisker of this frequency (Hz) cannot be followed as it rings down.
-
-    Raises:
-        DataError: readings are many periods apart, end at the start of the first, or begin when nothing is left of it.
-    """
+    """Refuse times [n] (s) at which a whisker of this frequency (Hz) cannot be followed as it rings down."""
     gap, period = float(np.median(np.diff(times))), 1 / frequency
     if gap > RARE * period:
         raise DataError(
@@ -64,11 +60,7 @@ def check_clock(times: NDArray[np.float64], frequency: float, damping_ratio: flo
 
 
 def check_wrenches(trials: Sequence[Trial], traces: Sequence[Trace]) -> None:
-    """Refuse wrenches that are no wrenches of these trials, whose ``traces`` were simulated at the start of a fit.
-
-    Raises:
-        DataError: the unit or the sign is wrong.
-    """
+    """Refuse wrenches that are no wrenches of these trials, whose ``traces`` were simulated at the start of a fit."""
     for trial, trace in zip(trials, traces, strict=True):
         for kind, unit, small in (("F", "N", "mN"), ("M", "N·m", "µN·m")):
             measured, expected = _of_kind(trial, trace, kind)

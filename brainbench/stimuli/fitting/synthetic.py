@@ -38,11 +38,7 @@ def blank_wrenches(times: ArrayLike) -> xr.Dataset:
 
 
 def simulate_trial(trial: Trial, *, options: FitOptions = FINE) -> Trace:
-    """Simulate a trial as it stands, with its shapes.
-
-    Raises:
-        DataError: the whisker is unstable.
-    """
+    """Simulate a trial as it stands, with its shapes."""
     model = FitModel([trial], FreeParameters(("young_modulus",), trial.condition), options)
     (trace,) = model.run(np.zeros(1)).traces
     if trace.status != "ok":

@@ -38,11 +38,7 @@ swings."""
 
 @dataclass(frozen=True)
 class Pluck:
-    """A whisker held aside and let go at t = 0.
-
-    Raises:
-        UsageError: the deflection or the arc length is not above 0, or the direction is none.
-    """
+    """A whisker held aside and let go at t = 0."""
 
     deflection: float
     """Deflection of the held point before the release [m]."""
@@ -80,12 +76,7 @@ class Pluck:
 
 @dataclass(frozen=True, eq=False)
 class Trial:
-    """One recording of one whisker, with the motion and the objects that belong to it.
-
-    Raises:
-        DataError: the measurement holds fewer than three instants, its noise is not positive, or a shape is longer than
-            the whisker.
-    """
+    """One recording of one whisker, with the motion and the objects that belong to it."""
 
     job: Job
     """Whisker, motion of its base, objects; it is read at the times of the measurement."""
@@ -140,10 +131,6 @@ class Trial:
             deflection: deflection of the held point (m), roughly; the parameter ``deflection`` refines it.
             arc: arc length of the held point (m); near the tip when None.
             direction: direction of the deflection.
-
-        Raises:
-            DataError: the readings are too rare or too late to follow the swing.
-            UsageError: the held point is beyond the tip, or the readings begin before the release.
         """
         arc = 0.95 * whisker.arc_length if arc is None else arc
         check_number("The arc length (m) of the held point", arc, above=0, most=whisker.arc_length)

@@ -68,9 +68,6 @@ def simulate_tensors(
         values: tensor [p] on any device; computed in double precision.
         scales, fidelity, device: as for :class:`brainbench.stimuli.gradients.GradientRun`; ``device`` is that of the
             solver.
-
-    Raises:
-        UsageError: as for :class:`brainbench.stimuli.gradients.GradientRun`.
     """
     options = {"scales": scales, "fidelity": fidelity, "device": device}
     found = SimulateJobs.apply(values, build, options)

@@ -47,10 +47,6 @@ class JobParameters:
             jobs: at the nominal values.
             names: of :data:`WHISKER`, :data:`BASE` and :data:`OBJECT`.
             knots: times (s) of the knots of parameters such as ``base.theta[2]``.
-
-        Raises:
-            UsageError: a name is unknown or given twice, there is no such knot or object, or whiskers or objects
-                of the jobs differ in a parameter of theirs.
         """
         self.jobs, self.names = tuple(jobs), tuple(names)
         self.knots = None if knots is None else np.array(knots, dtype=float)

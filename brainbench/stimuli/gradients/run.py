@@ -104,9 +104,6 @@ class GradientRun:
             fidelity: as for :func:`brainbench.stimuli.simulate`; precision is always double here, and steps have the
                 length that the given values ask for.
             device: as for the engine ``rod``.
-
-        Raises:
-            UsageError: a value or scale is not finite, a scale is 0, or jobs cannot be simulated.
         """
         self.values = np.array(values, dtype=float)
         self.scales = np.abs(self.values if scales is None else np.array(scales, dtype=float))

@@ -39,10 +39,6 @@ def follow_angles(
 
     ``rotation`` gives base frames [m, 3, 3] at times [m]; ``first`` are the angles at t = 0, which tell the turn to
     start in. Times may have any order: the angles do not depend on which others are asked for.
-
-    Raises:
-        UsageError: the whisker ``name`` points nearly along the z axis of its frame, where θ and ζ turn about the
-            same axis (gimbal lock) and no hinge angles follow its motion.
     """
     times = np.asarray(times, dtype=float)
     grid = np.arange(math.floor(max(times.max(initial=0.0), 0.0) * _RATE) + 2) / _RATE

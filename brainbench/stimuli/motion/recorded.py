@@ -58,11 +58,7 @@ B5) of the published sample; the average arrays have 30, the mouse E0–E5 and t
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """Angular velocities of whisker bases, evenly sampled from t = 0.
-
-    Raises:
-        DataError: shapes do not fit, a number is not finite, or a name appears twice.
-    """
+    """Angular velocities of whisker bases, evenly sampled from t = 0."""
 
     names: tuple[str, ...]
     """[W] side and name, such as ``RC2``."""
@@ -103,9 +99,6 @@ class Trajectory:
 
         The velocity between samples is a cubic spline, and Q′ = [ω]Q is integrated by the exponential map with the
         fourth-order Magnus expansion, one step per sample: Q is a rotation to rounding, however long the recording.
-
-        Raises:
-            UsageError: there is no such whisker, or a time lies outside the recording.
         """
         from scipy.spatial.transform import Rotation
 
@@ -194,12 +187,7 @@ class Recorded:
         return chosen
 
     def angles(self, mount: MountedWhisker, times: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return continuous (θ, φ, ζ) [n, 3] (rad) of one whisker.
-
-        Raises:
-            UsageError: a time lies outside the recording, no line moves the whisker, or it turns towards the
-                vertical, where these angles lose their meaning.
-        """
+        """Return continuous (θ, φ, ζ) [n, 3] (rad) of one whisker."""
         first = np.array(mount.angles) + self.start * np.array(self.rotations.rates(mount))
         first = np.array(self.initial.get(mount.full_name, first), dtype=float)
         # Recorded turns are in the axes of the array: they act from the left on the starting frame.
@@ -227,10 +215,6 @@ def load_trajectory(path: str | os.PathLike[str], *, layout: str | None = None, 
         path: comma-separated angular velocities, one line per whisker.
         layout: one of :data:`LAYOUTS`; None takes ``whiskit-62`` for 62 lines.
         rate: samples per second [Hz].
-
-    Raises:
-        UsageError: the layout is unknown, or must be given because the lines could be a rat's or a mouse's.
-        DataError: the file is missing, or its lines are not whiskers of equally many velocities.
     """
     table = read_numbers(path)
     if table.shape[1] % 3:

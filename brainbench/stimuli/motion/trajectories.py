@@ -81,9 +81,6 @@ class Whisking(_Motion):
     Knutsen et al. 2008); the left side mirrors the right. The sinusoid starts retracted, at a = −retraction.
     During ``onset`` the part that leaves this pose grows from nothing as 6u⁵ − 15u⁴ + 10u³, so position,
     velocity and acceleration start without a jump.
-
-    Raises:
-        UsageError: a value is not finite or negative, or protraction and retraction cancel.
     """
 
     frequency: float = 20.0
@@ -193,10 +190,6 @@ class Path(_Motion):
     Positions follow a natural cubic spline and orientations a rotation spline, so velocity and acceleration are
     continuous, angular ones too. The body moves off with the velocity of the first stretch; repeat the first
     keyframe to start from rest. Between keyframes it turns the shorter way.
-
-    Raises:
-        UsageError: the lists differ in length, times do not ascend from 0, the first keyframe is displaced, or the
-            angles of two keyframes go the longer way round.
     """
 
     times: tuple[float, ...]

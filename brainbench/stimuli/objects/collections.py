@@ -69,10 +69,6 @@ def resolve_objects(
             collision geometry by default.
         surfaces: build shape families as their exact surface alone, without convex parts, which takes tens of
             milliseconds instead of a second; for engines that collide meshes. Not with ``collision``.
-
-    Raises:
-        UsageError: a word names nothing, two objects have the same name, or mesh files have no unit.
-        DataError: a ShapeNet folder holds no models.
     """
     found: dict[str, NamedObject] = {}
     collision = SURFACE if surfaces and collision is None else collision

@@ -39,11 +39,6 @@ def mesh_solid(
     The file is of any format that :func:`brainbench.geometry.load_mesh` reads, its lengths in ``unit`` (``m``, ``mm``,
     …); it is scaled to a bounding-box ``diagonal`` [m] where one is given. Whiskers touch its ``collision`` geometry,
     one of :data:`COLLISIONS`.
-
-    Raises:
-        UsageError: ``collision`` or the unit is unknown, or ``exact`` is asked of a mesh that is not closed.
-        DataError: the file is missing, unreadable or flat, or the decomposition passed its limits.
-        MissingDependencyError: the decomposition needs a package that is not installed.
     """
     check_name("collision geometry", collision, COLLISIONS)
     repaired = repair(load_mesh(path, unit=unit, apart=collision == "pieces"))

@@ -98,10 +98,6 @@ def load_shapenet(
             that the tree lacks are listed in :attr:`ShapeNet.missing` and logged.
         categories: class labels by ``synset/model`` (first choice) or by synset, or a file of them (see
             :func:`read_categories`); :data:`SYNSETS` when None. Unlisted synsets are their own labels.
-
-    Raises:
-        UsageError: an id is not of the form ``synset/model``, or occurs twice.
-        DataError: the folder does not exist, or holds none of the models.
     """
     folder = Path(root)
     if not folder.is_dir():
@@ -131,12 +127,7 @@ def load_shapenet(
 
 
 def read_ids(path: str | os.PathLike[str]) -> tuple[str, ...]:
-    """Read names ``synset/model``, one a line; empty lines and lines from ``#`` on are skipped.
-
-    Raises:
-        DataError: the file is missing, or is not text.
-        UsageError: a line is not such a name, or occurs twice.
-    """
+    """Read names ``synset/model``, one a line; empty lines and lines from ``#`` on are skipped."""
     lines = [line.partition("#")[0].strip() for line in read_text(path).splitlines()]
     return _checked((line for line in lines if line), repr(os.fspath(path)))
 
@@ -146,9 +137,6 @@ def read_categories(path: str | os.PathLike[str]) -> dict[str, str]:
 
     A ``.json`` file holds one object of texts; any other file is CSV with two columns, name and label, a
     header line being allowed.
-
-    Raises:
-        DataError: the file is missing or is neither.
     """
     if Path(path).suffix == ".json":
         data = read_json(path)

@@ -34,10 +34,6 @@ class Frames:
     vibrates above 1/(2·interval) = 56 Hz then aliases, and a sliding tip does: the RDM of the six Rodgers stimuli at
     the presets ``balanced`` and ``accurate`` correlates by .90, with ``average`` = 18 by .995. A mean still lets some
     aliases through; ``lowpass`` stops them with a Butterworth filter.
-
-    Raises:
-        UsageError: a value is outside its range; the filter's cut-off lies above half the frame rate, where it
-            would let aliases through, or needs more readings than there are.
     """
 
     first: float = 0.001

@@ -35,12 +35,7 @@ PLACE: Keys = {"position": ("position_mm", vector(MILLI)), "rotation": ("rotatio
 
 
 def read_object(table: TomlTable, folder: Path) -> PlacedObject:
-    """Return the object that a table describes; paths are relative to ``folder``.
-
-    Raises:
-        UsageError: a key is unknown, missing or of the wrong kind, or the shape is unknown.
-        DataError: a mesh file is missing or unreadable.
-    """
+    """Return the object that a table describes; paths are relative to ``folder``."""
     made = {"solid": _solid(table, folder), "motion": read_object_motion(table)}
     placed = table.build(PlacedObject, {**PLACE, "friction": ("friction", number())}, **made)
     table.finish()

@@ -66,11 +66,6 @@ def get_recipe(
             asked for.
         trajectory: what ``rodgers-recorded`` plays, instead of a file behind its name.
         species: whose array plays it, ``mouse`` or ``rat``. For the rat, objects and places are doubled.
-
-    Raises:
-        UsageError: there is no such recipe, the selection names no whisker, or something the recipe needs is
-            missing or superfluous.
-        DataError: the trajectory file is missing or unreadable.
     """
     from brainbench.stimuli.sweeps.sweep_scenes import GRIDS, SweepScenes, describe_grid
 
@@ -153,11 +148,7 @@ def _scene_files() -> dict[str, Traversable]:
 
 
 def recipe_file(name: str) -> Traversable:
-    """Return the scene file of a packaged recipe.
-
-    Raises:
-        UsageError: there is no such recipe.
-    """
+    """Return the scene file of a packaged recipe."""
     files = _scene_files()
     if name not in files:
         raise unknown_name("stimulus recipe", name, list_recipes())

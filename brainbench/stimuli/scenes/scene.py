@@ -61,11 +61,7 @@ class Animal:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """One stimulus to simulate.
-
-    Raises:
-        UsageError: it has no label, or two animals have the same name.
-    """
+    """One stimulus to simulate."""
 
     label: str
     array: WhiskerArray
@@ -147,9 +143,6 @@ class Scene:
 
         There the follicles have the published angles, far from the poles of the Euler angles. That frame
         stands still even when the head moves, so one rotation turns the wrenches to the world (:attr:`axes`).
-
-        Raises:
-            UsageError: a motion is too short for the frames, or turns a whisker upright in that frame.
         """
         if self.others:
             return [job for part in self.split() for job in part.jobs()]

@@ -105,10 +105,6 @@ def load_scene(path: str | os.PathLike[str], *, whiskers: str = "all") -> Recipe
     Args:
         path: a ``.toml`` file.
         whiskers: keep only these of the file's whiskers; see :meth:`WhiskerArray.select`.
-
-    Raises:
-        UsageError: a key is unknown (the message has the nearest), missing or of the wrong kind.
-        DataError: the file is missing or is not TOML.
     """
     path = Path(path)
     data = read_toml(path, "scene file")

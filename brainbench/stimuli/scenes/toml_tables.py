@@ -32,11 +32,7 @@ class TomlTable:
         self._known: list[str] = []
 
     def take(self, key: str, convert: Convert, default: Any = _REQUIRED) -> Any:
-        """Return the converted value of a key, or the default without it.
-
-        Raises:
-            UsageError: the key is missing and has no default, or its value is of another kind.
-        """
+        """Return the converted value of a key, or the default without it."""
         self._known.append(key)
         if key not in self._rest:
             if default is _REQUIRED:
@@ -55,11 +51,7 @@ class TomlTable:
         return {name: value for name, value in values.items() if value is not missing}
 
     def build(self, make: Callable[..., Built], keys: Keys, **others: Any) -> Built:
-        """Call ``make`` with the values of some keys, and ``others``; a parameter without its key keeps its default.
-
-        Raises:
-            UsageError: the key of a parameter without default is missing, or a value is of another kind.
-        """
+        """Call ``make`` with the values of some keys, and ``others``; a parameter without its key keeps its default."""
         parameters = inspect.signature(make).parameters
         values = self.read(keys)
         for name, (key, _) in keys.items():

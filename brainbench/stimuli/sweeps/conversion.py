@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench import __version__
+from brainbench.core.version import __version__
 from brainbench.core.contracts import SWEEPS_FORMAT, SWEEPS_SCHEMA
 from brainbench.core.errors import DataError
 from brainbench.core.files import content_hash
@@ -40,11 +40,7 @@ from brainbench.stimuli.whiskers.array import WhiskerArray
 
 @dataclass(frozen=True, eq=False)
 class SweepTable:
-    """Facts about the sweeps of a data set; arrays have one entry per sweep.
-
-    Raises:
-        DataError: sweeps of one object have different labels.
-    """
+    """Facts about the sweeps of a data set; arrays have one entry per sweep."""
 
     label: NDArray[np.integer]
     """Index into ``classes``."""
@@ -153,10 +149,6 @@ def convert_sweeps(
     """Write a data set of sweeps, one shard in memory at a time, and return its manifest.
 
     A run that was killed goes on when it is started again, and ends with the same bytes.
-
-    Raises:
-        UsageError: the folder holds another data set, or another process is writing it.
-        DataError: a file cannot be read, or the disk is too small; finished shards are kept.
     """
 
     def run(missing: Sequence[PlannedShard], folder: Path, done: Callable[[int], None]) -> None:

@@ -53,12 +53,6 @@ def generate(
         workers: processes on this machine; as many as there are usable processors when None.
         scheduler: address of a Dask scheduler (``tcp://host:8786``), whose workers make the shards instead.
         progress: called as ``progress(sweeps done, sweeps in all, what)``, without those that were there already.
-
-    Raises:
-        UsageError: the folder holds another data set, another process is writing it, the backend does not run on
-            the device, or a script that is only being imported asks.
-        DataError: the disk is too small, or a worker or shard failed; finished shards are kept.
-        MissingDependencyError: a scheduler is given and Dask is not installed.
     """
     if workers is not None:
         check_number("workers", workers, least=1, whole=True)

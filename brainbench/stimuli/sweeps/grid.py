@@ -87,11 +87,7 @@ class Sweep:
 
 @dataclass(frozen=True)
 class SweepGrid:
-    """A frozen set of sweep conditions; lists are combined, spans are sampled once per draw and object.
-
-    Raises:
-        UsageError: a list is empty, or a value lies outside its range.
-    """
+    """A frozen set of sweep conditions; lists are combined, spans are sampled once per draw and object."""
 
     speed: Values = (0.030,)
     """[m/s]"""

@@ -51,9 +51,6 @@ def make_manifest(plan: GenerationPlan | SweepTable, folder: str | os.PathLike[s
     """Put together the manifest of a finished data set from what its shards say.
 
     Equal data sets have equal manifests on one machine: there is no time in it.
-
-    Raises:
-        DataError: a shard is missing or damaged, or an object differs between shards.
     """
     objects: dict[str, dict[str, Any]] = {
         name: {"label": item.label, "source": item.source, "hash": None, "sweeps": {}, "untouched": True}

@@ -65,11 +65,6 @@ def run_shards_on_cluster(tasks: Sequence[ShardTask], folder: Path, scheduler: s
     """Make shards on a cluster, whose workers see the folder under the same path, one thread each.
 
     A shard whose worker dies is made by another one: nothing is there before it is complete.
-
-    Raises:
-        MissingDependencyError: Dask is not installed.
-        UsageError: no scheduler answers at this address, or it has no workers.
-        DataError: a shard failed, or the workers write to a disk of their own.
     """
     names = [f"{folder / task.name}-{task.config_hash}" for task in tasks]
     make = partial(make_shard, folder=str(folder), workers=1)

@@ -35,9 +35,6 @@ def simulate_sweeps(
 
     Ordered by object they are fastest. Options are those of :meth:`WhiskerEngine.run_sweeps` and
     :func:`brainbench.stimuli.engines.get_engine`.
-
-    Raises:
-        UsageError: the backend is unknown or does not run on the device.
     """
     engine = get_engine(backend, device=device, retry=retry)
     if takes_sweeps(engine, scenes.grid):

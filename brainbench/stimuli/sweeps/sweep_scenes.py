@@ -22,11 +22,7 @@ from brainbench.stimuli.whiskers.array import WhiskerArray
 
 
 class SweepScenes(Sequence[Scene]):
-    """Every sweep of every object, built one at a time on request.
-
-    Raises:
-        UsageError: there is no object, or two have the same name.
-    """
+    """Every sweep of every object, built one at a time on request."""
 
     def __init__(
         self,

@@ -85,10 +85,6 @@ def point_load(
     """Load a straight whisker with ``force`` (N, along +y) at arc length ``at`` (m) and wait until it is at rest.
 
     The closed form holds for small bending; the base moment of the reference uses the undeformed lever.
-
-    Raises:
-        UsageError: the whisker is curved, ``at`` lies beyond it, or the force is zero.
-        DataError: the simulation was unstable.
     """
     if force == 0 or not math.isfinite(force):
         raise UsageError(f"force must be a finite number of newtons other than zero; received {force!r}.")
@@ -118,10 +114,6 @@ def peg(
     whisker until the centre-line point at the contact is (``at``, ``offset``), and rests there. Its axis then
     lies one peg radius plus the local rod radius from that point, along the rod's normal. The end state is
     quasi-static, without gravity. ``offset`` > 0 pushes towards +y.
-
-    Raises:
-        UsageError: the whisker is curved, the offset is zero, or the whisker would slip off the peg.
-        DataError: the simulation was unstable.
     """
     _check_peg(whisker, peg_radius)
     if offset == 0:
@@ -152,10 +144,6 @@ def slip_off(
     The peg moves slowly and straight towards +y from touching the undeformed whisker; no gravity. It carries a flange
     on either side, as a pulley does, which keeps the whisker in the plane of the elastica: bent by more than 90° at the
     contact, as before most slip-offs at small ``at``, it would swing out sideways.
-
-    Raises:
-        UsageError: the whisker is curved, or ``at`` lies beyond it.
-        DataError: the simulation was unstable, or the whisker was still held an eighth beyond the reference depth.
     """
     _check_peg(whisker, peg_radius)
     touch = -(peg_radius + float(whisker.radius(at)))

@@ -110,9 +110,6 @@ def elastica(whisker: Whisker, at: float, offset: float) -> Contact:
     Solves x' = cos θ, y' = sin θ, E I(s)(θ' − κ₀(s)) = (a − x) Fy − (d − y) Fx with F normal to the rod at
     the contact, on the branch that starts from the undeformed rod. The peg pushes towards +y when
     ``offset`` lies above the rest shape, else towards −y.
-
-    Raises:
-        UsageError: there is no such equilibrium: the whisker slips off the peg before.
     """
     _check_at(whisker, at)
     rest = whisker.curvature * at**2
@@ -123,9 +120,6 @@ def elastica_finite_peg(whisker: Whisker, centre: tuple[float, float], peg_radiu
     """Return the equilibrium with a frictionless round peg of radius ``peg_radius`` at ``centre`` [m], pushed to +y.
 
     The rod's own radius counts: its centre line passes one radius sum from the axis.
-
-    Raises:
-        UsageError: there is no such equilibrium, or the peg does not touch.
     """
     _check_at(whisker, centre[0])
     return _Branch(whisker, centre[0], 1, peg_radius).reach(centre[1])

@@ -76,11 +76,6 @@ def ringdown(
     tip: these frequencies test the chain of links, not the time step. With ``own_step`` they keep the fidelity's step
     too, and show what it makes of them: a backward Euler step h turns an undamped mode ω into one of frequency |ln(1 +
     i ω h)|/h with damping ratio ln(1 + ω² h²)/(2 |ln(1 + i ω h)|). A mode of fewer than six steps counts as NaN.
-
-    Raises:
-        UsageError: the whisker is curved, its damping ratio is not between 0 and 1, so nothing rings, or ``modes``
-            is not between 1 and 5.
-        DataError: the simulation was unstable, or nothing rang: the time step overdamps the whisker.
     """
     check_number("damping_ratio of a whisker that rings down", whisker.damping_ratio, above=0, below=1)
     check_number("modes of a ring-down", modes, least=1, most=5, whole=True)

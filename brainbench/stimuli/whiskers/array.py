@@ -84,9 +84,6 @@ class WhiskerArray:
             whiskers: a selection as :meth:`select` takes it.
             source: ``average``, the measured means; or ``model``, the equations fitted to them, which give
                 arc length, curvature, base point and angles from row and column alone.
-
-        Raises:
-            UsageError: a name is unknown, or the model equations of the mouse are asked for.
         """
         check_name("species", species, SPECIES)
         check_name("source of an array", source, SOURCES)

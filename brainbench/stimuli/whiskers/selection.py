@@ -22,9 +22,6 @@ def match_whiskers(pattern: str, names: Sequence[str], rows: Sequence[int], cols
             Case does not matter. In an array with both sides ``C2`` names both and ``RC2`` one.
         names: unique names, ``C2`` or with a side ``RC2``.
         rows, cols: grid row (0 for A) and column of each whisker.
-
-    Raises:
-        UsageError: a term names no whisker (the message has the nearest name) or a range is no line.
     """
     terms = [term.strip() for term in pattern.split(",") if term.strip()]
     if not terms:

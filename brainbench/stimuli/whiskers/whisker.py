@@ -27,9 +27,6 @@ class Whisker:
 
     Radius and density vary linearly with arc length; the cross-section is a solid circle. The rest
     shape is the parabola y = A x² (A = ``curvature``), measured along its arc.
-
-    Raises:
-        UsageError: a value is not finite or lies outside its physical range.
     """
 
     arc_length: float

@@ -44,11 +44,7 @@ Stepped = tuple[torch.Tensor, torch.Tensor]
 
 @dataclass(frozen=True, kw_only=True)
 class EncoderConfig:
-    """A tactile encoder and what it reads; plain values only, so that it can stand in a file.
-
-    Raises:
-        UsageError: a size is out of range, or a setting is given to an encoder that does not have it.
-    """
+    """A tactile encoder and what it reads; plain values only, so that it can stand in a file."""
 
     name: str = AUTO
     """An arm (:data:`ARMS`), or the name of a network."""
@@ -127,11 +123,7 @@ class EncoderConfig:
         return TaxelGraph(hands.load(self.hand).layout(self.resolution, self.placement), self.observe)
 
     def build(self) -> TactileEncoder:
-        """Return the encoder with new weights (the global random state), or a network's own.
-
-        Raises:
-            UsageError: a name is unknown, or the arm cannot read the observation type.
-        """
+        """Return the encoder with new weights (the global random state), or a network's own."""
         if self.arm in ARMS:
             return ARMS[self.arm](self)
         if ":" not in self.arm and Architecture.parse(self.arm).untrained not in list_models():

@@ -21,9 +21,6 @@ class HandCalibration:
 
     One number for all three axes of each kind, so that directions are kept. The encoder's own normaliser, per channel,
     follows; one that was fitted to whiskers therefore sees values of the size that it was fitted to.
-
-    Raises:
-        UsageError: a value is not a positive number.
     """
 
     force: float = 0.5
@@ -36,11 +33,7 @@ class HandCalibration:
 
     @classmethod
     def fit(cls, grid: torch.Tensor) -> HandCalibration:
-        """Return the calibration at which touched sites of recorded grids [..., S·6, 5, 7] have an rms of one unit.
-
-        Raises:
-            DataError: nothing touches in the recording, or it holds values that are no numbers.
-        """
+        """Return the calibration at which touched sites of recorded grids [..., S·6, 5, 7] have an rms of one unit."""
         if grid.ndim < 3 or grid.shape[-2:] != GRID_SHAPE or grid.shape[-3] % len(CHANNELS):
             raise UsageError(f"A recording has the shape [..., S·6, 5, 7]; received {list(grid.shape)}.")
         if not torch.isfinite(grid).all():

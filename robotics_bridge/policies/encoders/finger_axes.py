@@ -41,9 +41,6 @@ def finger_rows(fingers: Mapping[str, Sequence[str]]) -> dict[str, int]:
     Names are read in English or as the usual two letters (``ff``, ``mf``, ``rf``, ``lf``, ``th``). If one of them says
     nothing, the fingers take the rows in their own order.
 
-    Raises:
-        UsageError: the hand has more fingers than the grid has rows.
-
     >>> finger_rows({"index": (), "thumb": ()})
     {'index': 1, 'thumb': 0}
     """
@@ -82,11 +79,7 @@ class FingerAxes:
         return points @ turn.T + origin
 
     def sites(self, link: str, points: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the rows [N] and columns [N] of points [N, 3] on a link (its frame).
-
-        Raises:
-            UsageError: the link is neither the palm nor part of a finger.
-        """
+        """Return the rows [N] and columns [N] of points [N, 3] on a link (its frame)."""
         rows, lengths = self.locate(link, self.to_palm(link, points))
         # The number of edges that a length lies beyond.
         return rows, (self.edges[rows] <= lengths[:, None]).sum(axis=1)
@@ -109,9 +102,6 @@ class FingerAxes:
 
 def finger_axes_of(hand: Hand, reference: Layout) -> FingerAxes:
     """Return the finger axes of a hand; sites are the seven quantiles of a reference layout's taxels along each axis.
-
-    Raises:
-        UsageError: the hand has more than five fingers, or a taxel sits on a link that is no part of it.
     """
     data = mujoco.MjData(hand.model)
     mujoco.mj_kinematics(hand.model, data)

@@ -36,9 +36,6 @@ class FrontEnd(nn.Module):
         time: ``native`` or ``resampled`` (:mod:`~robotics_bridge.policies.encoders.timing`).
         learning: ``frozen`` computes no gradients and never leaves evaluation mode.
         calibration: What a unit of force is to the network.
-
-    Raises:
-        UsageError: a name is unknown, or the network is no causal network of [T, 30, 5, 7].
     """
 
     gain: torch.Tensor
@@ -96,11 +93,7 @@ class FrontEnd(nn.Module):
         return self
 
     def stimulus(self, taxels: torch.Tensor) -> torch.Tensor:
-        """Return the network's input [B, 30, 5, 7] of readings [B, S, N, C], in the units of its own stimuli.
-
-        Raises:
-            UsageError: the readings do not fit the grid or the network's sub-steps.
-        """
+        """Return the network's input [B, 30, 5, 7] of readings [B, S, N, C], in the units of its own stimuli."""
         if taxels.ndim == 4 and taxels.shape[1] != self.sub_steps:
             raise UsageError(f"The encoder takes {self.sub_steps} sub-steps; received {taxels.shape[1]} readings.")
         return self.grid(taxels) * self.gain

@@ -26,11 +26,7 @@ from robotics_bridge.policies.encoders.taxel_grid import SITES
 
 
 class TaxelGraph(nn.Module):
-    """The smoothest :data:`~robotics_bridge.policies.encoders.taxel_grid.SITES` patterns, or all if there are fewer.
-
-    Raises:
-        UsageError: the observation type is not ``force_torque``.
-    """
+    """The smoothest :data:`~robotics_bridge.policies.encoders.taxel_grid.SITES` patterns, or all if there are fewer."""
 
     patterns: torch.Tensor
     """[K, N]."""

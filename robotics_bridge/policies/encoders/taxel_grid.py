@@ -45,9 +45,6 @@ class TaxelGrid(nn.Module):
     Of what they ``observe``, ``force_torque`` and ``proximity`` are wrenches already; the force of ``force`` and the
     displacement of ``elastomer`` act at their taxel; ``bool`` and ``depth`` push there against the normal; values per
     link act at the middle of its taxels.
-
-    Raises:
-        UsageError: a name is unknown, the observation type has no touch, or the hand has more than five fingers.
     """
 
     matrix: torch.Tensor
@@ -90,11 +87,7 @@ class TaxelGrid(nn.Module):
         return self.matrix.abs().sum(1).view(SITES, len(CHANNELS)).sum(1).view(GRID_SHAPE) > 0
 
     def forward(self, taxels: torch.Tensor) -> torch.Tensor:
-        """Return the grid [B, S·6, 5, 7] of readings [B, S, N, C], links in the layout's order and fillers left out.
-
-        Raises:
-            UsageError: the readings have another shape.
-        """
+        """Return the grid [B, S·6, 5, 7] of readings [B, S, N, C], links in the layout's order and fillers left out."""
         if taxels.ndim != 4 or taxels.shape[2:] != (self.items, self.channels):
             raise UsageError(
                 f"The grid reads [batch, sub-step, {self.items} items, {self.channels} channels] of "

@@ -61,11 +61,7 @@ def bits(rollout: TouchRollout, links: Sequence[int]) -> Features:
 
 
 def without_latency(model: str) -> dict[str, str]:
-    """Return the options with which a network answers at once; only temporal graphs add latency.
-
-    Raises:
-        UsageError: there is no such network.
-    """
+    """Return the options with which a network answers at once; only temporal graphs add latency."""
     graph = isinstance(getattr(locate_model(model).outline(), "encoder", None), TemporalGraph)
     return {"unroll": "full"} if graph else {}
 

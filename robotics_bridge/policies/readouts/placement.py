@@ -61,9 +61,6 @@ def choose_taxels(
         features: [T, B, N, F].
         wanted: [T, B, D] targets.
         valid: [T, B] bool, steps that count.
-
-    Raises:
-        UsageError: there are fewer environments than folds.
     """
     taxels, width = features.shape[2:]
     if features.shape[1] < _INNER:
@@ -191,9 +188,6 @@ def read_placements(
         others: Further placements, name → taxels.
         draws: Random placements, by the seed.
         progress: Called with parts done, in all, and a word.
-
-    Raises:
-        UsageError: the hand has fewer taxels, or a half too few environments.
     """
     check_count(layout, count)
     wanted, valid = rollout.wanted, rollout.valid

@@ -77,11 +77,7 @@ def check_environments(env: Env, parts: int = 1) -> int:
 
 
 def roll_out(env: Env, policy: Acting, options: ProbeOptions, parts: int = 1) -> TouchRollout:
-    """Roll a policy out once; what is read is known wherever ``valid`` is.
-
-    Raises:
-        UsageError: each of so many parts of the environments needs at least twice :data:`FOLDS` that touch the object.
-    """
+    """Roll a policy out once; what is read is known wherever ``valid`` is."""
     least = check_environments(env, parts)
     found = collect(env, policy, options.seconds)
     valid = found.valid & ~found.wanted.isnan().any(-1)
@@ -92,12 +88,7 @@ def roll_out(env: Env, policy: Acting, options: ProbeOptions, parts: int = 1) ->
 
 @torch.no_grad()
 def probe(env: Env, policy: Acting, options: ProbeOptions, progress: Progress | None = None) -> list[Readout]:
-    """Roll a policy out once and read the targets from every arm.
-
-    Raises:
-        UsageError: the environment or a network does not fit, or too few environments touch the object.
-        DataError: nothing is touched.
-    """
+    """Roll a policy out once and read the targets from every arm."""
     check_environments(env)
     say = progress or (lambda done, total, what: None)
     names = (*(options.arms or ARMS), *options.networks)
@@ -132,9 +123,6 @@ def place(
     """Roll a policy out once, read the targets from placements of taxels, and return the layout chosen on all of it.
 
     Beside all, chosen, random and evenly spread taxels stand the hand's own placements (fingers, tips, palm).
-
-    Raises:
-        UsageError: as for :func:`probe`, or the hand has fewer taxels.
     """
     count, layout = options.place, env.hand.layout(env.options.resolution, env.options.placement)
     if count is None:

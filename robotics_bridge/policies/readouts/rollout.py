@@ -53,11 +53,7 @@ class TouchRollout:
 
 @torch.no_grad()
 def collect(env: Env, policy: Acting, seconds: float) -> TouchRollout:
-    """Run a policy and return what it felt, and what is to be read from it.
-
-    Raises:
-        UsageError: the environment has no force and torque on its taxels.
-    """
+    """Run a policy and return what it felt, and what is to be read from it."""
     if env.options.observe != "force_torque" or env.touch is None:
         raise UsageError("A probe reads force and torque: make the environment with observe='force_torque'.")
     observations = env.reset()
@@ -89,9 +85,6 @@ def calibrate(env: Env, policy: Acting, grid: TaxelGrid, seed: int) -> HandCalib
     """Return the unit of force and moment of episodes of another seed, in which nothing is read; then begin anew.
 
     As students, encoders know their unit before the episodes in which they are tried.
-
-    Raises:
-        DataError: nothing is touched.
     """
     env.seed(seed + 1)
     felt = collect(env, policy, CALIBRATION_SECONDS).taxels

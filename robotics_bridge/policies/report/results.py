@@ -136,7 +136,6 @@ def read_results(folders: Iterable[str | Path], *, at_least: int = 0) -> list[St
 
     Raises:
         DataFileNotFoundError: no student was evaluated there, or none of them learned so long.
-        DataError: an evaluation is damaged.
     """
     groups: dict[str, list[_Member]] = defaultdict(list)
     for root in folders:
@@ -175,11 +174,7 @@ def read_results(folders: Iterable[str | Path], *, at_least: int = 0) -> list[St
 
 
 def mixed_model(results: Sequence[StudentResult]) -> MixedModel:
-    """Return the model of students of one task, hand and contacts, whose arms are their names without the seed.
-
-    Raises:
-        UsageError: no student has two training seeds.
-    """
+    """Return the model of students of one task, hand and contacts, whose arms are their names without the seed."""
     found = [
         TrainedPolicy(result.name, share, config.seed, config.draw)
         for result in results
@@ -311,11 +306,7 @@ def _by_seed(result: StudentResult) -> dict[int, float]:
 
 
 def read_agents(folders: Iterable[str | Path]) -> list[dict[str, Any]]:
-    """Return what stands in the files :data:`AGENTS` below some folders: one summary per agent and task.
-
-    Raises:
-        DataError: a file is damaged.
-    """
+    """Return what stands in the files :data:`AGENTS` below some folders: one summary per agent and task."""
     files = [path for root in folders for path in sorted(Path(root).rglob(AGENTS))]
     what = "evaluated agents; brainbench policy evaluate --out writes one"
     return [summary for path in files for summary in _listed(path, _Agent, what)]

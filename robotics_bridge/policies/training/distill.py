@@ -85,11 +85,6 @@ def distill(
         teacher: Of :func:`robotics_bridge.policies.training.teacher.load_teacher`.
         stop_after, stop_at: When to stop, where that is before the end.
         progress: Called with (iterations done, iterations in all, what).
-
-    Raises:
-        UsageError: the folder holds another run, another process is writing it, or the environment does not fit.
-        DataError: a file of the run is damaged.
-        MissingDependencyError: rsl-rl-lib is not installed.
     """
     if stop_after is not None:
         check_number("stop_after", stop_after, least=0)

@@ -19,12 +19,7 @@ CSV = "log.csv"
 
 
 def check_loggers(names: Iterable[str]) -> None:
-    """Check names of :data:`LOGGERS`, and that their packages are there, before anything is trained.
-
-    Raises:
-        UsageError: there is no such logger.
-        MissingDependencyError: its package is not installed.
-    """
+    """Check names of :data:`LOGGERS`, and that their packages are there, before anything is trained."""
     for name in names:
         check_name("logger", name, LOGGERS)
         if name == "tensorboard" and find_spec(name) is None:

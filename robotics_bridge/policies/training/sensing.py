@@ -35,11 +35,7 @@ def sensed_groups(observe: Iterable[str]) -> tuple[str, ...]:
 def sensing_policy(
     env: Env, settings: TeacherSettings, seed: int, observe: tuple[str, ...], encoder: str
 ) -> DistillConfig:
-    """Return what a policy that reads some observations is as a student: its touch and network, and its memory.
-
-    Raises:
-        UsageError: the environment has no such observation.
-    """
+    """Return what a policy that reads some observations is as a student: its touch and network, and its memory."""
     for name in sensed_groups(observe):
         if name not in env.observation_shapes:
             given = "make the environment with an observation type" if name == TACTILE else "leave it out"

@@ -61,11 +61,7 @@ def save(path: str | os.PathLike[str], tree: Any) -> None:
 
 
 def load(path: str | os.PathLike[str], device: str = "cpu") -> Any:
-    """Read a tree.
-
-    Raises:
-        DataError: the file is missing or holds no tree.
-    """
+    """Read a tree."""
     check_file(path, "saved state")
     with readable(path, "saved state"):
         with safe_open(str(path), framework="pt", device=device) as file:

@@ -37,11 +37,7 @@ class _Described(msgspec.Struct):
 def build_student(
     config: DistillConfig, shapes: Mapping[str, tuple[int, ...]], groups: list[str], actions: int
 ) -> TactilePolicy:
-    """Return a student of ``groups`` with new weights (the global random state).
-
-    Raises:
-        UsageError: the shapes of the groups, per environment, do not fit the tactile encoder.
-    """
+    """Return a student of ``groups`` with new weights (the global random state)."""
     example: Any = {name: torch.zeros(1, *shapes[name]) for name in groups}
     tactile = config.tactile
     return TactilePolicy(
@@ -51,12 +47,7 @@ def build_student(
 
 
 def begin_with(student: TactilePolicy, start: str | Path) -> None:
-    """Give a student the weights of another, by folder or shipped name; learning begins anew.
-
-    Raises:
-        UsageError: there is no such folder or name.
-        DataError: it has no weights, or those of another network.
-    """
+    """Give a student the weights of another, by folder or shipped name; learning begins anew."""
     path = policy_path("student", start) / MODEL
     with readable(path, "student", "It is damaged, or of another student."):
         found = read_tensors(path, "file of weights (safetensors)")
@@ -73,10 +64,6 @@ def load_student(folder: str | Path, *, device: str = "cpu") -> tuple[TactilePol
     """Return a distilled student in evaluation mode, and its run's configuration.
 
     The folder is that of a run, or a name of :func:`~robotics_bridge.policies.shipped.list_policies`.
-
-    Raises:
-        UsageError: there is no such folder or name.
-        DataError: the folder holds no student, or a value or weight is damaged, out of range or not finite.
     """
     folder = student_folder(policy_path("student", folder))
     described = read_mapping(folder / CONFIG, "configuration of a student")

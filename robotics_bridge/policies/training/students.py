@@ -66,10 +66,6 @@ def train_student(
         stop_after: Seconds; this and the next as of :func:`~robotics_bridge.policies.training.distill.distill`.
         stop_at: Iterations.
         progress: Called with (done, in all, what).
-
-    Raises:
-        UsageError: no teacher is named, or something does not fit.
-        DataError: a file is missing or damaged.
     """
     if not config.teacher:
         raise UsageError(

@@ -72,11 +72,7 @@ class StudentSweep:
     """Folder of a teacher's run, with ``{task}`` and ``{hand}``."""
 
     def students(self, subset: str = "all") -> list[DistillConfig]:
-        """Return every student of a subset: ``all``, ``types``, ``encoders`` or an observation type.
-
-        Raises:
-            UsageError: there is no such subset.
-        """
+        """Return every student of a subset: ``all``, ``types``, ``encoders`` or an observation type."""
         every = (*self.types, *self.extra_types)
         check_name("subset of the sweep", subset, (*SUBSETS, *every))
         each = product(self.entries, self.seeds)
@@ -125,8 +121,6 @@ def read_sweep(path: str | Path = PUBLISHED) -> StudentSweep:
 
     Raises:
         DataFileNotFoundError: there is no such file.
-        DataError: the file is no TOML.
-        UsageError: a key or name in it is unknown, or an entry is incomplete.
     """
     document = read_toml(path, f"sweep (the published one is {PUBLISHED.name})")
     with readable(path, "sweep of students"):

@@ -66,11 +66,7 @@ class TeacherResult:
 
 
 class Trainer:
-    """PPO on one environment batch, by default with the task's settings; :meth:`iterate` is one iteration.
-
-    Raises:
-        MissingDependencyError: rsl-rl-lib is not installed.
-    """
+    """PPO on one environment batch, by default with the task's settings; :meth:`iterate` is one iteration."""
 
     def __init__(
         self,
@@ -111,11 +107,7 @@ class Trainer:
         self.algorithm.train_mode()
 
     def iterate(self) -> dict[str, float]:
-        """Collect steps, learn from them, and return losses, episode means and seconds spent.
-
-        Raises:
-            DataError: weights are no longer numbers.
-        """
+        """Collect steps, learn from them, and return losses, episode means and seconds spent."""
         env, algorithm, steps = self.env, self.algorithm, self.config["num_steps_per_env"]
         start = _now(env.device)
         reward = torch.zeros((), device=env.device)
@@ -176,9 +168,6 @@ class Trainer:
         """Take up actor and critic of another run (:func:`model_file`); learning begins anew.
 
         Actions begin with the standard deviation ``std``; None takes that of the other run.
-
-        Raises:
-            DataError: there is no model, or it has other inputs, outputs or layers.
         """
         file = model_file(path)
         found, own = state_tree.load(file), self.algorithm.save()
@@ -237,13 +226,7 @@ class Trainer:
 
 @dataclass(frozen=True, kw_only=True)
 class TeacherRun:
-    """Extent of a training run, and what it begins with.
-
-    Raises:
-        UsageError: a number is out of range, ``start_std`` has no run to start from, or an observation or logger is not
-            known.
-        MissingDependencyError: the package of a logger is not installed.
-    """
+    """Extent of a training run, and what it begins with."""
 
     iterations: int | None = None
     """In total, earlier ones of the run included; the settings' by default."""
@@ -287,10 +270,6 @@ def train(
     """Train a teacher in a folder, or go on with the run that the folder holds, in environments as before.
 
     The settings of the optimisation are those of the task by default.
-
-    Raises:
-        UsageError: the folder holds a run of other settings.
-        DataError: the start does not fit.
     """
     settings, options = settings or env.task.teacher, options or TeacherRun()
     with lock_folder(run, wait=False):
@@ -392,12 +371,7 @@ def newest(run: Path) -> Path:
 
 
 def model_file(path: Path) -> Path:
-    """Return the last model of a run, given its folder or the name of a shipped one, or the model itself.
-
-    Raises:
-        UsageError: there is no such file, folder or name.
-        DataError: the folder holds no model.
-    """
+    """Return the last model of a run, given its folder or the name of a shipped one, or the model itself."""
     found = policy_path("teacher", path)
     return newest(found) if found.is_dir() else found
 
@@ -407,10 +381,6 @@ def load_teacher(run: str | Path, env: Env) -> Policy:
 
     The run is a folder, one of its ``model_<iteration>.safetensors``, or a name of
     :func:`~robotics_bridge.policies.shipped.list_policies`.
-
-    Raises:
-        UsageError: there is no such file, folder or name.
-        DataError: there is no model, or it was trained on other observations.
     """
     path = Path(run)
     file = model_file(path)

@@ -12,11 +12,7 @@ from brainbench.core.reading.ranges import check_fields, check_number
 
 @dataclass(frozen=True)
 class ElasticMaterial:
-    """An isotropic solid with Rayleigh damping C = α M + β K.
-
-    Raises:
-        UsageError: a number lies outside its range.
-    """
+    """An isotropic solid with Rayleigh damping C = α M + β K."""
 
     young_modulus: float
     """E [Pa]."""
@@ -52,11 +48,7 @@ ELASTIC_MATERIALS: dict[str, ElasticMaterial] = {
 
 
 def elastic_material(name: str | ElasticMaterial) -> ElasticMaterial:
-    """Return a material by name of :data:`ELASTIC_MATERIALS` (``metal`` is steel); a material passes through.
-
-    Raises:
-        UsageError: there is no material of that name.
-    """
+    """Return a material by name of :data:`ELASTIC_MATERIALS` (``metal`` is steel); a material passes through."""
     if isinstance(name, ElasticMaterial):
         return name
     chosen = "steel" if name == "metal" else name
@@ -67,11 +59,7 @@ def elastic_material(name: str | ElasticMaterial) -> ElasticMaterial:
 
 @dataclass(frozen=True)
 class Modes:
-    """Damped modes of a solid.
-
-    Raises:
-        UsageError: the numbers of frequencies, decays and gains differ, or one is not positive.
-    """
+    """Damped modes of a solid."""
 
     frequency: tuple[float, ...]
     """[Hz]."""
@@ -101,9 +89,6 @@ def preset_modes(material: str | ElasticMaterial, lowest: float, count: int = 16
 
     The frequencies are those of a free bar, (2n + 1)² / 9 times the lowest one, up to 20 kHz; decays follow the
     material's damping, gains fall with 1/n and are 1/kg at first.
-
-    Raises:
-        UsageError: the lowest frequency lies outside the audible range, or the count is not positive.
     """
     chosen = elastic_material(material)
     check_number("lowest frequency of a body that is heard (Hz)", lowest, least=20, below=20_000)

@@ -19,11 +19,7 @@ from robotics_bridge.sensors.suite import SensorSuite
 
 @dataclass(frozen=True)
 class Microphone:
-    """A place of a listener, and the way sound takes to it.
-
-    Raises:
-        UsageError: a number lies outside its range.
-    """
+    """A place of a listener, and the way sound takes to it."""
 
     position: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """In the frame of ``link``, or of the world [m]."""
@@ -59,9 +55,6 @@ class Listener:
     Args:
         microphone: Where it is and which sources it hears; all of the suite if it names none.
         suite: Whose audio sensors are the sources; update it before each block.
-
-    Raises:
-        UsageError: a source is unknown, none exists, or their blocks differ in length.
     """
 
     def __init__(self, microphone: Microphone, suite: SensorSuite) -> None:
@@ -87,11 +80,7 @@ class Listener:
         self._slot = 0
 
     def update(self, state: HandState, dt: float) -> None:
-        """Take the suite's latest block, of ``dt`` seconds.
-
-        Raises:
-            UsageError: the time step changed, or is not a positive time.
-        """
+        """Take the suite's latest block, of ``dt`` seconds."""
         check_number("dt (time of a block, s)", dt, above=0)
         c, m, envs = self._suite.context, self.microphone, self._suite.num_envs
         rate, age, block = self.samples / dt, c.age, (self.samples, envs)

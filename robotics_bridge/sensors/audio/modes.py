@@ -44,10 +44,6 @@ def find_modes(
             mean square over the surface.
         hear: Point [3] (m, frame of the solid) whose normal velocity is heard; otherwise as ``strike``.
         cache: Whether the result is kept in the cache folder.
-
-    Raises:
-        UsageError: the solid is of another kind, a point does not lie on it, or the mesh is too coarse for so many
-            modes.
     """
     for name, value in {"count": count, "cells": cells}.items():
         check_number(name, value, least=1, whole=True)
@@ -86,9 +82,6 @@ def solve(
     """Return frequencies [M] (Hz), normal components [V, M] (1/√kg) of mass-normalised modes, and points [V, 3].
 
     V are the corners on the surface.
-
-    Raises:
-        UsageError: the mesh is too coarse for so many modes.
     """
     fem = tetrahedra.skfem()
     helpers, elasticity = import_module("skfem.helpers"), import_module("skfem.models.elasticity")

@@ -23,11 +23,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class AudioSensor(Sensor):
-    """A sensor that reads a block of samples [N, K] per update.
-
-    Raises:
-        UsageError: a block without a sample, or a knob of the sensor is out of range.
-    """
+    """A sensor that reads a block of samples [N, K] per update."""
 
     samples: int = 160
     """K: the sample rate is K over the time step."""
@@ -51,9 +47,6 @@ class ContactAudio(AudioSensor):
 
     A rise of the summed normal force by more than ``threshold`` within one update is an impact of the impulse
     ΔF·Δt; sliding is noise of the strength F·v. Engines that give no contact forces are silent.
-
-    Raises:
-        UsageError: a threshold, strength or contact time is negative or no number.
     """
 
     shared: ClassVar[tuple[str, ...]] = ("samples", "quads")
@@ -90,9 +83,6 @@ class ActuationAudio(AudioSensor):
 
     Loudness is β_load |τ| + β_pow |τ ω|, the whine a bank of partials on κ |ω|. Write torque and speed of the joints
     to the views of :func:`joint_drive` before each update.
-
-    Raises:
-        UsageError: there is no joint, or a strength, pitch or frequency is negative or no number.
     """
 
     runtime: ClassVar[str] = "robotics_bridge.sensors.audio.runtime:DriveAudioRuntime"
@@ -127,11 +117,7 @@ class ActuationAudio(AudioSensor):
 
 
 def joint_drive(suite: SensorSuite, name: str) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return the views [B, J] for torque (N·m) and speed (rad/s) of the joints of an ActuationAudio.
-
-    Raises:
-        UsageError: the suite has no such sensor.
-    """
+    """Return the views [B, J] for torque (N·m) and speed (rad/s) of the joints of an ActuationAudio."""
     runtime = cast("DriveAudioRuntime", suite.runtime_of(name, ActuationAudio, "actuation sound"))
     window, wp = runtime.slices[name].span, warp()
     return wp.to_torch(runtime.effort)[:, window], wp.to_torch(runtime.speed)[:, window]

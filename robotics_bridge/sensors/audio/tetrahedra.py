@@ -25,11 +25,7 @@ def skfem() -> Any:
 
 
 def fill(solid: Geometry, cells: int) -> Any:
-    """Return the ``skfem.MeshTet`` of a solid with ``cells`` elements along its longest edge.
-
-    Raises:
-        UsageError: the solid is of a kind that is not filled, or too thin for so few cells.
-    """
+    """Return the ``skfem.MeshTet`` of a solid with ``cells`` elements along its longest edge."""
     if solid.kind == "box":
         return box(solid.size, cells)
     if solid.kind in ("sphere", "ellipsoid"):
@@ -75,11 +71,7 @@ def _rounded(p: NDArray[np.float64], core: float) -> NDArray[np.float64]:
 
 
 def voxels(surface: Mesh, cells: int) -> Any:
-    """Return a closed surface filled with voxels of six tetrahedra each, whose skin is moved onto the surface.
-
-    Raises:
-        UsageError: no voxel lies inside; the body is too thin for so few cells.
-    """
+    """Return a closed surface filled with voxels of six tetrahedra each, whose skin is moved onto the surface."""
     vertices = np.asarray(surface.vertices, dtype=float)
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     edge = float((high - low).max()) / cells

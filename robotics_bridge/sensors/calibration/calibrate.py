@@ -55,13 +55,7 @@ class Calibration:
 
 
 def calibrate(log: Log, *, max_delay: float = 0.5) -> Calibration:
-    """Fit the knobs to a log, with delays of at most ``max_delay`` [s].
-
-    Raises:
-        UsageError: the longest delay is negative or not finite.
-        DataError: no probe is alive, every episode is too short, the reference never changes, or readings fall where
-            it rises.
-    """
+    """Fit the knobs to a log, with delays of at most ``max_delay`` [s]."""
     check_number("max_delay (s)", max_delay, least=0)
     estimates: dict[str, Estimate] = {}
     notes = [f"Not fitted: {', '.join(NOT_FITTED)}."]

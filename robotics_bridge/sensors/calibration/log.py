@@ -24,11 +24,7 @@ Episode = tuple["NDArray[np.float64]", "NDArray[np.float64]"]
 
 @dataclass(frozen=True, eq=False)
 class Log:
-    """A recording.
-
-    Raises:
-        UsageError: the arrays do not fit each other, hold what is not finite, or the time stands still or falls.
-    """
+    """A recording."""
 
     time: NDArray[np.float64]
     """[T] (s), evenly spaced within an episode."""
@@ -67,7 +63,6 @@ def read_log(path: str | os.PathLike[str]) -> Log:
 
     Raises:
         DataFileNotFoundError: the file is missing.
-        DataError: it has no time or probe, fewer than 20 rows, uneven steps, or holds what is no number.
     """
     name = Path(path).name
     header, table = read_columns(path, "log")
@@ -98,11 +93,7 @@ def read_log(path: str | os.PathLike[str]) -> Log:
 
 
 def segments(log: Log) -> list[Episode]:
-    """Split a log into its episodes, without those of fewer than :data:`SHORTEST` readings.
-
-    Raises:
-        DataError: none is longer.
-    """
+    """Split a log into its episodes, without those of fewer than :data:`SHORTEST` readings."""
     x = np.zeros(len(log.time)) if log.reference is None else log.reference
     numbers = np.zeros(len(x), int) if log.episode is None else log.episode
     edges = np.flatnonzero(np.diff(numbers)) + 1

@@ -41,10 +41,6 @@ def contact_pressure(
         poisson: its Poisson ratio ν.
         state: that was read. With it, pressures are scaled so that they add up to the normal forces of the engine's
             contacts between the pad's link and what the sensor tracks; the modulus then plays no part.
-
-    Raises:
-        UsageError: there is no such elastomer, nothing was read yet, its markers form no grid, or a number lies outside
-            its range.
     """
     runtime = cast(ElastomerRuntime, suite.runtime_of(name, ElastomerTaxel, "elastomer"))
     sensor = cast(ElastomerTaxel, suite.sensors[name])

@@ -16,11 +16,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class Layer:
-    """Terms of a real gel pad that the published equations lack; derived in docs/elastomers.md.
-
-    Raises:
-        UsageError: a number lies outside its range.
-    """
+    """Terms of a real gel pad that the published equations lack; derived in docs/elastomers.md."""
 
     poisson: float = 0.45
     """Poisson ratio ν: how compressible the gel is (0 to 0.5). It shapes the shear field."""
@@ -53,10 +49,6 @@ class ElastomerTaxel(QuerySensor):
     The pad is the surface of the link's own geometries (or the plane of the probes, if the link has none). What
     indents it pushes markers apart (4.19); points that slide along it drag them (4.20). Defaults are the published
     parameters; ``layer`` replaces the Gaussian shear kernel by that of an elastic layer.
-
-    Raises:
-        UsageError: the way to sum dilation is unknown or does not fit the probes or the layer, or a number lies
-            outside its range.
     """
 
     dilate_scale: float = 100.0

@@ -33,11 +33,7 @@ _FORMAT = "brainbench-noise-1"
 
 @dataclass(frozen=True, kw_only=True)
 class Noise:
-    """Imperfections of one sensor; every knob is off by default.
-
-    Raises:
-        UsageError: a knob lies outside its range.
-    """
+    """Imperfections of one sensor; every knob is off by default."""
 
     read_delay: float = 0.0
     """Age of what is read [s]; a zero-order hold between updates."""
@@ -107,11 +103,7 @@ class Noise:
         return bool(self.set_knobs)
 
     def check(self, knobs: frozenset[str], sensor: str) -> None:
-        """Refuse knobs that a sensor does not have (table 4.2).
-
-        Raises:
-            UsageError: a knob outside ``knobs`` is set.
-        """
+        """Refuse knobs that a sensor does not have (table 4.2)."""
         if extra := [name for name in self.set_knobs if name not in knobs]:
             raise UsageError(
                 f"{sensor} has no noise knob {', '.join(map(repr, extra))}; it has: {', '.join(sorted(knobs))}."
@@ -132,11 +124,7 @@ class Noise:
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Noise:
-        """Read a preset that :meth:`save` or ``brainbench tactile calibrate`` wrote.
-
-        Raises:
-            DataError: the file is missing or is no preset.
-        """
+        """Read a preset that :meth:`save` or ``brainbench tactile calibrate`` wrote."""
         document = read_json(path, "noise preset")
         knobs = document.get("noise") if isinstance(document, dict) else None
         if not isinstance(knobs, dict) or document.get("format") != _FORMAT:
@@ -150,11 +138,7 @@ class Noise:
 
     @classmethod
     def preset(cls, name: str) -> Noise:
-        """Return a named preset; :data:`PRESETS` lists them.
-
-        Raises:
-            UsageError: there is no preset of this name.
-        """
+        """Return a named preset; :data:`PRESETS` lists them."""
         check_name("noise preset", name, PRESETS)
         return PRESETS[name]
 

@@ -35,9 +35,6 @@ class ReadingNoise:
         context: Device, clock and seed.
         staged: Crosstalk and everything up to dead probes are applied here; otherwise the sensors' kernel does it.
         gained: The sensors apply the gain themselves; otherwise it multiplies the signal here.
-
-    Raises:
-        UsageError: crosstalk is asked for on probes that form no grid.
     """
 
     def __init__(
@@ -108,9 +105,6 @@ class ReadingNoise:
 
     def launch(self, x: Any, out: Any, dt: float) -> None:
         """Measure the signal ``x`` [C, B, N] (after radius noise) into ``out``, if that is staged, and record ``out``.
-
-        Raises:
-            UsageError: the time step ``dt`` (s) became so short that recorded readings do not reach back far enough.
         """
         context = self._context
         known, now = [self.params, self.part], [context.age, context.episode, context.env_offset, float(dt)]
@@ -173,9 +167,6 @@ def simulate(
         seed: Seed of the experiment; its numbers also depend on the ``name`` of the sensor.
         layout: (ny, nx) where crosstalk is wanted.
         env_offset: Number of the first environment in the whole experiment.
-
-    Raises:
-        UsageError: the signal has not four axes, or the layout is none of its probes.
     """
     frames = np.asarray(clean, dtype=np.float32)
     if frames.ndim != 4:

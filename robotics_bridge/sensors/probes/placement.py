@@ -15,12 +15,7 @@ from brainbench.geometry import Mesh
 
 @dataclass(frozen=True, eq=False)
 class Probes:
-    """Positions, outward normals and sensing radii of probes. A radius of 0 marks a filler that always reads 0.
-
-    Raises:
-        UsageError: shapes do not match, numbers are not finite, a radius is negative, a normal has no length, or the
-            probes do not lie a pitch apart.
-    """
+    """Positions, outward normals and sensing radii of probes. A radius of 0 marks a filler that always reads 0."""
 
     position: NDArray[np.float64]
     """[N, 3] (m)."""
@@ -130,9 +125,6 @@ class Probes:
             facing: keep triangles whose normal lies within ``within`` degrees of this direction.
             within: that angle (degrees).
             box: keep triangles whose centre lies between two corners [2, 3] (m).
-
-        Raises:
-            UsageError: no triangle is left, or a number lies outside its range.
         """
         for name, number, least in (("count", count, 1), ("seed", seed, 0)):
             check_number(name, number, least=least, whole=True)

@@ -16,9 +16,6 @@ class SurfaceDistanceProbe(QuerySensor):
     """Shortest signed distance [N] from each probe to the surfaces it tracks (m), negative inside.
 
     Needs no contact. Its noise knob ``radius`` is an error of the distance.
-
-    Raises:
-        UsageError: ``max_range`` is not positive.
     """
 
     nearest: bool = False
@@ -48,11 +45,7 @@ class ContactDepthProbe(QuerySensor):
 
 @dataclass(frozen=True, kw_only=True)
 class ContactProbe(QuerySensor):
-    """Contact [N] as 0 or 1, from the depth by a Schmitt trigger (thesis 4.3); noise acts on the depth.
-
-    Raises:
-        UsageError: the threshold is negative, or the release lies outside 0 and the threshold.
-    """
+    """Contact [N] as 0 or 1, from the depth by a Schmitt trigger (thesis 4.3); noise acts on the depth."""
 
     threshold: float = 5e-4
     """Depth η_on (m) beyond which contact begins."""

@@ -37,9 +37,6 @@ def sample_field(mesh: Mesh, resolution: int = 64, device: Any = "cpu") -> Field
         mesh: its surface; where it has holes, inside is where its winding number exceeds one half.
         resolution: cells along the longest edge of the bounding box; the grid extends a quarter of that edge beyond the
             box on every side, further out distances are extrapolated.
-
-    Raises:
-        UsageError: the resolution is below 4 or above 512.
     """
     check_number("The resolution of a distance field (cells)", resolution, least=4, most=512, whole=True)
     low, high = mesh.bounds

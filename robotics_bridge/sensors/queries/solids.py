@@ -132,11 +132,7 @@ class Solids:
         """The Warp structure that kernels take."""
 
     def kinds_of(self, geometries: Iterable[int]) -> frozenset[int]:
-        """Return the kinds (numbers) that some geometries take in any environment.
-
-        Raises:
-            UsageError: one of them is of a kind that no sensor can query.
-        """
+        """Return the kinds (numbers) that some geometries take in any environment."""
         chosen = list(geometries)
         kinds = frozenset(self.kinds[:, chosen].ravel().tolist()) if chosen else frozenset()
         if OTHER in kinds:

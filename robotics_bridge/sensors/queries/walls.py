@@ -26,11 +26,7 @@ _SHARE = 0.02
 
 
 def as_solid(mesh: Mesh) -> Mesh:
-    """Return a mesh with its faults mended, as far as that can be; what was done and what is left is warned of.
-
-    Raises:
-        UsageError: the mesh has no thickness, so that it has no inside.
-    """
+    """Return a mesh with its faults mended, as far as that can be; what was done and what is left is warned of."""
     spread = np.linalg.svd(mesh.vertices - mesh.vertices.mean(axis=0), compute_uv=False)
     # A closed surface of area A and thickness t has the volume A t / 2; an open one must at least not be flat.
     empty = 2 * abs(mesh.volume) <= _FLAT * mesh.diagonal * float(mesh.to_trimesh().area)

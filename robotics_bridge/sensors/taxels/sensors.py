@@ -26,9 +26,6 @@ class KinematicTaxel(QuerySensor):
 
     ``physical`` takes plus signs (friction drags the sensor along) and never pulls; ``thesis`` takes the published
     minus signs. Defaults are the published parameters (4.10), but for k_ω in the physical convention.
-
-    Raises:
-        UsageError: the convention or the total is unknown, or a number lies outside its range.
     """
 
     stiffness: float = 500.0
@@ -100,9 +97,6 @@ class ProximityTaxel(ProbeSensor):
 
     ``thesis`` pulls along +a and takes the torque about the taxel (published); ``physical`` pushes the sensor along
     −a and takes it about the link's origin, so that taxels add up to a wrench. Defaults: published parameters.
-
-    Raises:
-        UsageError: the convention is unknown, a number lies outside its range, or it follows no surface point.
     """
 
     stiffness: float = 300.0

@@ -13,9 +13,6 @@ class Skin:
 
     It cannot widen, so a pressure p presses it in by δ = p t / M with the constrained modulus
     M = E (1 − ν) / ((1 + ν) (1 − 2ν)), and shear gives way by G = E / (2 (1 + ν)). Taxels are placed on the base.
-
-    Raises:
-        UsageError: a number lies outside its range; the layer's stiffness has no end as ν nears ½.
     """
 
     thickness: float

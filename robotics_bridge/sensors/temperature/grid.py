@@ -33,11 +33,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class TemperatureGrid(Sensor):
-    """Temperature [nx, ny, nz] of the cells of a link (°C).
-
-    Raises:
-        UsageError: a number lies outside its range, or a material is unknown.
-    """
+    """Temperature [nx, ny, nz] of the cells of a link (°C)."""
 
     cells: tuple[int, int, int] = (2, 2, 2)
     """Along the axes of the link; at most a million."""
@@ -125,20 +121,12 @@ class TemperatureGrid(Sensor):
 
 
 def link_temperature(suite: SensorSuite, name: str) -> torch.Tensor:
-    """Return the temperatures [B, L] (°C) of the links that a grid may touch, a view to write to.
-
-    Raises:
-        UsageError: the suite has no such temperature grid.
-    """
+    """Return the temperatures [B, L] (°C) of the links that a grid may touch, a view to write to."""
     return warp().to_torch(_runtime_of(suite, name).heat.link_temperature)
 
 
 def lost_contacts(suite: SensorSuite, name: str) -> torch.Tensor:
-    """Return how many contacts [B] of the last update a grid had no room for (it looks at 48).
-
-    Raises:
-        UsageError: the suite has no such temperature grid.
-    """
+    """Return how many contacts [B] of the last update a grid had no room for (it looks at 48)."""
     from robotics_bridge.sensors.temperature.kernels.heat import CAPACITY
 
     runtime = _runtime_of(suite, name)

@@ -14,11 +14,7 @@ ABSOLUTE_ZERO = -273.15
 
 @dataclass(frozen=True)
 class ThermalMaterial:
-    """Conduction, storage and radiation of heat in a body.
-
-    Raises:
-        UsageError: a number is not positive, or the emissivity lies outside 0 and 1.
-    """
+    """Conduction, storage and radiation of heat in a body."""
 
     conductivity: float
     """k [W/(m·K)]."""
@@ -59,11 +55,7 @@ MATERIALS: dict[str, ThermalMaterial] = {
 
 
 def material(name: str | ThermalMaterial) -> ThermalMaterial:
-    """Return a material by name of :data:`MATERIALS`; a material passes through.
-
-    Raises:
-        UsageError: there is no material of that name.
-    """
+    """Return a material by name of :data:`MATERIALS`; a material passes through."""
     if isinstance(name, ThermalMaterial):
         return name
     check_name("thermal material", name, MATERIALS)
@@ -72,11 +64,7 @@ def material(name: str | ThermalMaterial) -> ThermalMaterial:
 
 @dataclass(frozen=True)
 class ThermalBody:
-    """Material and temperature of a link that may be touched.
-
-    Raises:
-        UsageError: the temperature is not finite, or below absolute zero.
-    """
+    """Material and temperature of a link that may be touched."""
 
     material: str | ThermalMaterial = "plastic"
     temperature: float = 22.0

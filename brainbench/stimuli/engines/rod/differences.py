@@ -77,10 +77,6 @@ def packed_change(task: JobTask, low: Job, high: Job, width: float, quasistatic:
     """Return the derivatives of packed numbers from two jobs, built from values of a parameter ``width`` apart.
 
     The jobs have the structure of the task. Parts that are one object in both do not change, and are not among them.
-
-    Raises:
-        UsageError: a job has another number of obstacles, parts or loads than that of the task, a mesh that is not the
-            same moved rigidly, or a motion where that of the task stands still.
     """
     changes: Numbers = {}
     span = (task.job.start, float(task.job.times[-1]))

@@ -34,12 +34,7 @@ SLICE = 65_536
 
 @dataclass(frozen=True)
 class RodEngine(WhiskerEngine):
-    """Runs whisker jobs in our own solver.
-
-    Raises:
-        UsageError: the device is unknown, or ``cuda`` is asked for where there is none.
-        MissingDependencyError: warp-lang is not installed.
-    """
+    """Runs whisker jobs in our own solver."""
 
     device: str = "auto"
     """``cpu`` or ``cuda``; ``auto``: ``cpu``, or ``cuda`` where Warp cannot compile for processors."""

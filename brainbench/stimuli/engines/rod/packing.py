@@ -127,11 +127,7 @@ def still_track(place: NDArray[np.float64], quaternion: ArrayLike = (1.0, 0.0, 0
 def knots_alike(
     track: Track, pose: Pose, to_matrices: Callable[[NDArray], NDArray], span: tuple[float, float], what: str
 ) -> NDArray[np.float64]:
-    """Return the knots [knot, 16] of another pose, where a track that begins and ends at ``span`` (s) has its own.
-
-    Raises:
-        UsageError: the track stands still or moves straight and the pose does not; ``what`` names it.
-    """
+    """Return the knots [knot, 16] of another pose, where a track that begins and ends at ``span`` (s) has its own."""
     if track.pieces is None:
         seen = np.linspace(*span, 17)
         place, turn = pose(seen)

@@ -42,11 +42,7 @@ SLICED_BOUNDS = (BLOCK, 4)
 
 
 class SweepLauncher:
-    """The whiskers of a grid of sweeps on a device, ready for any number of sweeps.
-
-    Raises:
-        UsageError: the head of the grid moves, or the device is unknown.
-    """
+    """The whiskers of a grid of sweeps on a device, ready for any number of sweeps."""
 
     def __init__(
         self,

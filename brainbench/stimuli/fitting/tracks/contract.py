@@ -33,9 +33,6 @@ def new_shapes(times: ArrayLike, points: ArrayLike, *, noise: float | None = Non
         points: [n, k, 2 or 3] (m), from the base to the tip; NaN where missing.
         noise: standard deviation of a coordinate (m), when repeats tell it.
         attributes: where they come from.
-
-    Raises:
-        DataError: shapes do not fit, times do not increase, or nothing was traced.
     """
     import xarray as xr
 
@@ -79,10 +76,6 @@ def new_wrenches(
         channels: names of the columns, of Fx, Fy, Fz, Mx, My, Mz.
         noise: standard deviation of a reading, one for each channel, when repeats tell it.
         attributes: where they come from.
-
-    Raises:
-        UsageError: a channel is unknown or stands twice.
-        DataError: shapes do not fit, times do not increase, or nothing was measured.
     """
     import xarray as xr
 

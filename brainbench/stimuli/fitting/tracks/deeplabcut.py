@@ -26,12 +26,7 @@ Columns = dict[tuple[str, str, str], Array]
 
 
 def read_deeplabcut(path: str | os.PathLike[str], options: TrackOptions) -> tuple[NDArray[np.int_], Array]:
-    """Return frame numbers [n] and points [n, k, 2 or 3] (pixels) of one whisker.
-
-    Raises:
-        UsageError: a body part or an individual is unknown, or several individuals are there and none is named.
-        DataError: the file is no table of DeepLabCut.
-    """
+    """Return frame numbers [n] and points [n, k, 2 or 3] (pixels) of one whisker."""
     name = shown(os.fspath(path))
     frames, columns = _read_hdf5(path) if Path(path).suffix in (".h5", ".hdf5") else _read_csv(path)
     individuals = list(dict.fromkeys(individual for individual, _, _ in columns))
@@ -107,11 +102,7 @@ def frame_numbers(values: Array, path: str | os.PathLike[str]) -> NDArray[np.int
 
 
 def pickled_names(data: bytes, name: str) -> list[tuple[str, ...]]:  # noqa: PLR0912 — a branch for each word
-    """Return the list of tuples of texts that a pickle spells out, without loading it.
-
-    Raises:
-        DataError: it spells out anything else.
-    """
+    """Return the list of tuples of texts that a pickle spells out, without loading it."""
     stack: list[Any] = []
     memo: dict[int, Any] = {}
     mark = object()

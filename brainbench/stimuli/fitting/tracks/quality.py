@@ -63,11 +63,7 @@ class TrackQuality:
 
 
 def every_frame(frames: NDArray[np.int_], path: str | os.PathLike[str]) -> NDArray[np.int_]:
-    """Return all frame numbers from the first to the last of some, before room is made for their shapes.
-
-    Raises:
-        DataError: more of them are missing than a track may lack, as where times stand for frame numbers.
-    """
+    """Return all frame numbers from the first to the last of some, before room is made for their shapes."""
     first, last, seen = int(frames.min()), int(frames.max()), len(np.unique(frames))
     if (count := last - first + 1) - seen > MOST_GAPS * count:
         raise DataError(
@@ -98,11 +94,7 @@ def inspect_track(shapes: xr.Dataset) -> TrackQuality:
 
 
 def check_track(shapes: xr.Dataset) -> TrackQuality:
-    """Return what is wrong with traced shapes that can be used.
-
-    Raises:
-        DataError: more than half of the frames have no shape, or whiskers change places.
-    """
+    """Return what is wrong with traced shapes that can be used."""
     found = inspect_track(shapes)
     if found.missing_frames > MOST_GAPS * found.frames:
         raise DataError(
@@ -115,11 +107,7 @@ def check_track(shapes: xr.Dataset) -> TrackQuality:
 
 
 def check_length(shapes: xr.Dataset, arc_length: float) -> None:
-    """Refuse traced shapes that are no shapes of a whisker of this arc length [m].
-
-    Raises:
-        DataError: the unit is wrong, or shapes are longer than the whisker.
-    """
+    """Refuse traced shapes that are no shapes of a whisker of this arc length [m]."""
     lengths = traced_lengths(shapes["shape"].values)
     if not np.isfinite(lengths).any():  # single points, as of a tip, have no length
         return

@@ -39,10 +39,6 @@ def read_shapes(path: str | os.PathLike[str], options: TrackOptions):  # noqa: A
     Returns:
         The data set of :mod:`brainbench.stimuli.fitting.tracks.contract`; its attributes ``faults`` say, a sentence
         each, what is missing.
-
-    Raises:
-        UsageError: the whisker, or an option, is unknown.
-        DataError: the file is no such track, has too few shapes, or whiskers change places in it.
     """
     layout = options.layout if options.layout != "auto" else detect_layout(path)
     frames, points = _READERS[layout](path, options)

@@ -31,12 +31,7 @@ _MOST_POINTS = 100_000
 
 
 def read_whisk(path: str | os.PathLike[str], options: TrackOptions) -> tuple[NDArray[np.int_], Array]:
-    """Return frame numbers [n] and points [n, k, 2] (pixels) of one whisker.
-
-    Raises:
-        UsageError: frames hold several traces and nothing says which is meant.
-        DataError: the file is no such file, or the whisker has no trace in it.
-    """
+    """Return frame numbers [n] and points [n, k, 2] (pixels) of one whisker."""
     name = shown(os.fspath(path))
     if Path(path).suffix in (".h5", ".hdf5"):
         segments, labels, follicles = _read_whiskiwrap(path)

@@ -25,12 +25,7 @@ _FIELDS = ("r3all", "tracked", "fp3_all")
 
 
 def read_whiskerman(path: str | os.PathLike[str], options: TrackOptions) -> tuple[NDArray[np.int_], Array]:
-    """Return frame numbers [n] and points [n, k, 2 or 3] (pixels) of one whisker.
-
-    Raises:
-        UsageError: the file holds several whiskers and none is named, or there is none of this number.
-        DataError: the file is no track of WhiskerMan.
-    """
+    """Return frame numbers [n] and points [n, k, 2 or 3] (pixels) of one whisker."""
     name = shown(os.fspath(path))
     whiskers = _read(path)
     if not whiskers:

@@ -44,10 +44,6 @@ def read_wrenches(
             ``time``, or with a time series as NWB stores it (``data`` with ``timestamps``, or ``starting_time`` and its
             rate); or a stimulus set of ours.
         whisker, stimulus: which of a stimulus set; the only one when None.
-
-    Raises:
-        UsageError: the whisker or the stimulus is unknown, or several are there and none is named.
-        DataError: the file holds no wrenches, or no time stamps.
     """
     suffix = Path(path).suffix.lower()
     if suffix == ".csv":

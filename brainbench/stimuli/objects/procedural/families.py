@@ -74,9 +74,6 @@ def make(family: str, seed: int = 0, *, detail: int = 4_000) -> Shape:
     The same family, seed and detail give the same shape in every process; the seed alone chooses the
     proportions, so shapes of different detail (about so many triangles, within :data:`DETAIL`) approximate the same
     solid.
-
-    Raises:
-        UsageError: the family is unknown, or a number lies outside its range.
     """
     build = _family(family)
     check_number("The seed of a shape", seed, least=0, whole=True)
