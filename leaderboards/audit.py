@@ -15,8 +15,8 @@ from typing import Any
 
 from packaging.version import InvalidVersion, Version
 
-from brainbench.core.version import __version__
 from brainbench.core.records import ESTIMATOR_VERSION, ResultRecord
+from brainbench.core.version import __version__
 from leaderboards.store import StoredRecord
 
 TOLERANCE = 1e-3

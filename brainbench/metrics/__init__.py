@@ -10,9 +10,8 @@ from __future__ import annotations
 
 from brainbench.metrics.inference.multiple import compare_models
 from brainbench.metrics.inference.permutation import permutation_test
-from brainbench.metrics.measures.metric import Metric
+from brainbench.metrics.measures.metric import Metric, get_metric, list_metrics, register_metric
 from brainbench.metrics.measures.patterns import PatternMetric
-from brainbench.metrics.measures.registry import get_metric, list_metrics, register_metric
 from brainbench.metrics.rdms.comparison import compare
 from brainbench.metrics.rdms.display import RDM
 from brainbench.metrics.rdms.dissimilarity import rdm

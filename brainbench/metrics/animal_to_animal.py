@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,18 +14,21 @@ from brainbench.core.records import Score, Status, SubjectScore
 from brainbench.core.statistics import two_factor_interval
 from brainbench.metrics.animals import Animals, ceiling_of, gather, mean_rdm, mean_reliability
 from brainbench.metrics.comparisons import LayerComparisons
+from brainbench.metrics.hooks import MetricHooks
 from brainbench.metrics.inference.intervals import held_to_scale, interval_reasons
 from brainbench.metrics.inference.permutation import SMALLEST_STIMULI, TIE, label_orders
 from brainbench.metrics.rdms.pairs import Floats
 from brainbench.metrics.reliability.noise_correction import RELIABILITY_GATE, Corrected
 from brainbench.metrics.reliability.subject_rdm import SubjectRDM
 
-if TYPE_CHECKING:
-    from brainbench.metrics.measures.metric import Metric
-
 
 def score_agreement(
-    metric: Metric, subjects: Sequence[SubjectRDM], *, stimuli: Sequence[str], estimator: str = "default", seed: int = 0
+    metric: MetricHooks,
+    subjects: Sequence[SubjectRDM],
+    *,
+    stimuli: Sequence[str],
+    estimator: str = "default",
+    seed: int = 0,
 ) -> Score:
     """Score each reliable animal against the others together, by a metric.
 
@@ -104,7 +106,7 @@ def score_agreement(
     return held_to_scale(made)
 
 
-def _null(metric: Metric, animals: Animals, factors: Floats, seed: int) -> Floats:
+def _null(metric: MetricHooks, animals: Animals, factors: Floats, seed: int) -> Floats:
     """Return the mean agreement [N] under orders of every animal's stimuli, the given ones first."""
     # Each animal has its own order: one order for all would leave their agreement as it is.
     orders = np.tile(animals.order, (metric.orders_between + 1, len(animals.scored), 1))
@@ -114,7 +116,7 @@ def _null(metric: Metric, animals: Animals, factors: Floats, seed: int) -> Float
 
 
 def _verdict(
-    metric: Metric, animals: Animals, factors: dict[int, Corrected], found: list[int], count: int, smallest: float
+    metric: MetricHooks, animals: Animals, factors: dict[int, Corrected], found: list[int], count: int, smallest: float
 ) -> tuple[Status, tuple[str, ...]]:
     """Return the status of the agreement and its reasons, the gravest first."""
     told = tuple(f"{animals.subjects[i].subject}: {factors[i].reason}" for i in factors if factors[i].reason)

@@ -6,21 +6,18 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from brainbench.core.errors import UsageError, check_name, repeats
 from brainbench.core.records import Ceiling, Interval
 from brainbench.core.statistics import t_interval
+from brainbench.metrics.hooks import MetricHooks
 from brainbench.metrics.inference.permutation import canonical_order
 from brainbench.metrics.rdms.pairs import Floats, Ints
 from brainbench.metrics.reliability.ceiling import noise_ceiling
-from brainbench.metrics.reliability.noise_correction import RELIABILITY_GATE, Corrected
+from brainbench.metrics.reliability.noise_correction import Corrected
 from brainbench.metrics.reliability.subject_rdm import SubjectRDM, is_flat
-
-if TYPE_CHECKING:
-    from brainbench.metrics.measures.metric import Metric
 
 
 @dataclass(frozen=True)
@@ -56,7 +53,7 @@ class Animals:
         return tuple(self.subjects[i].take(self.order) for i in self.scored)
 
 
-def gather(metric: Metric, subjects: Sequence[SubjectRDM], stimuli: int, *, estimator: str = "default") -> Animals:
+def gather(metric: MetricHooks, subjects: Sequence[SubjectRDM], stimuli: int, *, estimator: str = "default") -> Animals:
     """Sort subjects by name, correct each for noise as the metric does and decide who is scored."""
     check_name(f"estimator of the metric {metric.name!r}", estimator, metric.estimators)
     if not subjects:
@@ -83,20 +80,12 @@ def gather(metric: Metric, subjects: Sequence[SubjectRDM], stimuli: int, *, esti
     return Animals(ordered, corrections, usable, scored, reliable, tuple(reasons))
 
 
-def _correction(metric: Metric, subject: SubjectRDM, estimator: str) -> Corrected:
+def _correction(metric: MetricHooks, subject: SubjectRDM, estimator: str) -> Corrected:
     if subject.problem is not None:
         return Corrected(math.nan, "undefined", subject.problem)
     if is_flat(subject.rdm):
         return Corrected(math.nan, "undefined", "its RDM has missing pairs or no differences between pairs")
     return metric.correction(subject, estimator)
-
-
-def gated(factor: float, reliability: float) -> Corrected:
-    """Return a factor with the status that the animal's reliability gives it."""
-    if not reliability >= RELIABILITY_GATE:
-        text = f"reliability {reliability:.2f} is below {RELIABILITY_GATE}"
-        return Corrected(factor, "unreliable", text, 1.0, reliability)
-    return Corrected(factor, "ok", "", 1.0, reliability)
 
 
 def mean_reliability(animals: Animals) -> tuple[float, Interval | None]:

@@ -8,15 +8,13 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from brainbench.metrics.hooks import MetricHooks
 from brainbench.metrics.rdms.pairs import Floats, Ints
-
-if TYPE_CHECKING:
-    from brainbench.metrics.measures.metric import Metric
-    from brainbench.metrics.reliability.subject_rdm import SubjectRDM
+from brainbench.metrics.reliability.subject_rdm import SubjectRDM
 
 Orders = Callable[[], Iterable[Ints]]
 """Gives chunks of orders of the stimuli [N, K], the same at every call."""
@@ -26,7 +24,7 @@ Orders = Callable[[], Iterable[Ints]]
 class LayerComparisons:
     """Verdict of a metric on the layers of one model and a number of animals."""
 
-    metric: Metric
+    metric: MetricHooks
     layers: Sequence[Floats] = field(repr=False)
     """[L] what :meth:`Metric.layer` made of each."""
     animals: Sequence[SubjectRDM] = field(repr=False)

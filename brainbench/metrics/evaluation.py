@@ -6,12 +6,12 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from brainbench.metrics.animals import Animals
 from brainbench.metrics.comparisons import LayerComparisons
+from brainbench.metrics.hooks import MetricHooks
 from brainbench.metrics.inference.permutation import (
     SMALLEST_STIMULI,
     PermutationTest,
@@ -22,9 +22,6 @@ from brainbench.metrics.inference.permutation import (
 )
 from brainbench.metrics.layers import HALVES, LayerRule, layer_rule, most_chosen, take_layers
 from brainbench.metrics.rdms.pairs import Floats, Ints
-
-if TYPE_CHECKING:
-    from brainbench.metrics.measures.metric import Metric
 
 _CHUNK_ELEMENTS = 1 << 22
 _HALVES_IN_PERMUTATIONS = 100
@@ -52,7 +49,7 @@ class LayerEvaluation:
     """[N, L] mean of every layer under the orders of the stimuli; empty without a test."""
 
 
-def defined_layers(metric: Metric, layers: Mapping[str, Floats]) -> list[str]:
+def defined_layers(metric: MetricHooks, layers: Mapping[str, Floats]) -> list[str]:
     """Return the layers with a value for enough stimuli: at least half of them, and as many as the metric needs."""
     found = []
     for label, layer in layers.items():
@@ -119,7 +116,7 @@ def _test(judged: LayerComparisons, rule: LayerRule, weights: Floats, seed: int)
     return make_test(found, exact=count <= exact, smallest=smallest), np.concatenate(means)
 
 
-def attainable_value(metric: Metric, animals: Animals, result: LayerEvaluation, seed: int) -> tuple[float, str]:
+def attainable_value(metric: MetricHooks, animals: Animals, result: LayerEvaluation, seed: int) -> tuple[float, str]:
     """Return the value of a perfect model, NaN where chance reaches it in one of twenty orders, and why."""
     raw = metric.attainable([animals.subjects[i] for i in animals.scored], seed)
     found = float((raw * animals.factors(animals.scored)).mean())

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -21,18 +21,16 @@ from brainbench.metrics.animals import Animals, ceiling_of, gather, mean_rdm, me
 from brainbench.metrics.arrays import finite_mean
 from brainbench.metrics.comparisons import LayerComparisons
 from brainbench.metrics.evaluation import LayerEvaluation, attainable_value, defined_layers, evaluate
+from brainbench.metrics.hooks import MetricHooks
 from brainbench.metrics.inference.intervals import held_to_scale, interval_reasons
 from brainbench.metrics.inference.permutation import SMALLEST_STIMULI, PermutationTest, layer_p, smallest_p
 from brainbench.metrics.layers import first_best, most_chosen
 from brainbench.metrics.rdms.pairs import Floats
 from brainbench.metrics.reliability.noise_correction import RELIABILITY_GATE
 
-if TYPE_CHECKING:
-    from brainbench.metrics.measures.metric import Metric
-
 
 def score_layers(
-    metric: Metric,
+    metric: MetricHooks,
     layers: Mapping[str, Floats],
     subjects: Sequence[Any],
     *,
@@ -127,7 +125,7 @@ def score_layers(
 
 
 def _verdict(
-    metric: Metric,
+    metric: MetricHooks,
     animals: Animals,
     lacking: Mapping[str, Sequence[str]],
     defined: Sequence[str],
@@ -173,7 +171,7 @@ def _layer_score(label: str, row: int | None, result: LayerEvaluation, status: S
 
 
 def _subjects(
-    metric: Metric, layers: Mapping[str, Any], animals: Animals, result: LayerEvaluation, names: Sequence[str]
+    metric: MetricHooks, layers: Mapping[str, Any], animals: Animals, result: LayerEvaluation, names: Sequence[str]
 ) -> tuple[SubjectScore, ...]:
     """Return every animal's part; one that did not vote meets the layer that the others chose."""
     overall = names[most_chosen(result.chosen)]

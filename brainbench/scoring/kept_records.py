@@ -19,7 +19,7 @@ def record_path(model: str, options: ScoreOptions, command: str) -> Path | None:
     Their changes do not show in the name of the entry: models and metrics of a file, and those that another package
     registered.
     """
-    from brainbench.metrics.measures.registry import get_metric
+    from brainbench.metrics.measures.metric import get_metric
     from brainbench.models.registry import locate_model
 
     # A path, or FILE.py:NAME, has characters that no name of the package has.

@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from brainbench.core.version import __version__
 from brainbench.core.contracts import CHANNELS, check_stimulus_set
 from brainbench.core.errors import DataError
 from brainbench.core.files import atomic_path, content_hash
 from brainbench.core.reading.hdf5 import open_hdf5
+from brainbench.core.version import __version__
 from brainbench.stimuli.whiskers.selection import ROWS
 
 if TYPE_CHECKING:

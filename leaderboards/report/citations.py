@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
-from brainbench.core.version import __version__
 from brainbench.core.records import ResultRecord
+from brainbench.core.version import __version__
 
 
 @dataclass(frozen=True)

@@ -4,8 +4,8 @@ import pytest
 
 from brainbench.core.records import ModelCard, ResultRecord, Score
 from brainbench.metrics.measures import registry
+from brainbench.metrics.measures.metric import register_metric
 from brainbench.metrics.measures.patterns import LinearCKA
-from brainbench.metrics.measures.registry import register_metric
 from brainbench.metrics.measures.rsa import RSA
 from brainbench.scoring import kept_records
 from brainbench.scoring.options import ScoreOptions

@@ -19,9 +19,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from brainbench.core.records import Score
+from brainbench.metrics.hooks import usable_features
 from brainbench.metrics.inference.permutation import label_orders, most_exact, tail_p
 from brainbench.metrics.measures.classifier import Decoder
-from brainbench.metrics.measures.metric import Metric, usable_features
+from brainbench.metrics.measures.metric import Metric
 from brainbench.metrics.rdms.pairs import Floats, Ints
 from brainbench.metrics.reliability.denoising import denoised
 from brainbench.metrics.reliability.subject_rdm import SubjectRDM

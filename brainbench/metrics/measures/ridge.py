@@ -21,10 +21,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from brainbench.metrics.animals import gated
 from brainbench.metrics.measures.patterns import PatternMetric, centred_products
 from brainbench.metrics.rdms.pairs import Floats, Ints
-from brainbench.metrics.reliability.noise_correction import Corrected
+from brainbench.metrics.reliability.noise_correction import Corrected, gated
 from brainbench.metrics.reliability.subject_rdm import SubjectRDM
 
 PENALTIES = tuple(10.0**power for power in range(-3, 4))

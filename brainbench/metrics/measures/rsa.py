@@ -13,7 +13,8 @@ from numpy.typing import ArrayLike
 from brainbench.core.errors import UsageError, check_each, check_name
 from brainbench.core.reading.ranges import check_fields
 from brainbench.core.records import Score
-from brainbench.metrics.measures.metric import Metric, usable_features
+from brainbench.metrics.hooks import usable_features
+from brainbench.metrics.measures.metric import Metric
 from brainbench.metrics.rdms.comparison import check_comparison, compare_all, permuted_comparisons
 from brainbench.metrics.rdms.comparison import compare as compare_rdms
 from brainbench.metrics.rdms.dissimilarity import RDM_METHODS, rdm

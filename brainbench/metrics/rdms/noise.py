@@ -48,8 +48,7 @@ class NoiseModel:
         return float((self.trials * self.trials).mean()) * len(self.trials)
 
     def sides(self, left: Array, right: Array) -> tuple[Array, Array]:
-        """Return vectors [N, V] and [M, V] whose inner products are those of ``left`` and ``right`` with C⁻¹ between.
-        """
+        """Return vectors [N, V] and [M, V] whose inner products are those of both sides with C⁻¹ between them."""
         same = left is right
         left = left / self.scale
         right = left if same else right / self.scale

@@ -154,3 +154,11 @@ _ESTIMATORS: dict[str, _Estimator] = {
 }
 
 ESTIMATORS = tuple(_ESTIMATORS)
+
+
+def gated(factor: float, reliability: float) -> Corrected:
+    """Return a factor with the status that the animal's reliability gives it."""
+    if not reliability >= RELIABILITY_GATE:
+        text = f"reliability {reliability:.2f} is below {RELIABILITY_GATE}"
+        return Corrected(factor, "unreliable", text, 1.0, reliability)
+    return Corrected(factor, "ok", "", 1.0, reliability)

@@ -18,7 +18,7 @@ import numpy as np
 from brainbench.core.records import Score
 from brainbench.core.statistics import compare_scores
 from brainbench.metrics.inference.multiple import adjust
-from brainbench.metrics.measures.registry import get_metric
+from brainbench.metrics.measures.metric import get_metric
 from brainbench.metrics.rdms.pairs import Ints
 from brainbench.metrics.score import score_layers
 from brainbench.scoring.recovery.candidates import Candidate

@@ -96,8 +96,7 @@ class Candidate:
 def open_candidates(
     models: Sequence[Any], options: ScoreOptions, *, progress: Progress | None = None
 ) -> tuple[tuple[Candidate, ...], dict[str, Any]]:
-    """Run the models on the stimuli of ``options`` and return them as candidates, with the provenance of the stimuli.
-    """
+    """Run the models on the stimuli of ``options``; return them as candidates, and the provenance of the stimuli."""
     from brainbench.scoring.model_responses import resolve_model
     from brainbench.stimuli import load_stimuli
 

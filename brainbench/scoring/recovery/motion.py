@@ -23,8 +23,8 @@ from brainbench.core.errors import DataError, UsageError
 from brainbench.core.reading.ranges import check_number
 from brainbench.core.records import Interval, Status
 from brainbench.core.statistics import t_interval
+from brainbench.metrics.measures.metric import get_metric
 from brainbench.metrics.measures.patterns import LinearCKA
-from brainbench.metrics.measures.registry import get_metric
 from brainbench.scoring.model_responses import ResolvedModel, resolve_model, takes_si
 from brainbench.scoring.options import ScoreOptions
 from brainbench.scoring.recovery.candidates import Candidate

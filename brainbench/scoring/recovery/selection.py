@@ -18,8 +18,7 @@ from brainbench.core.errors import UsageError
 from brainbench.core.progress import Progress
 from brainbench.core.reading.ranges import check_number
 from brainbench.metrics.layers import held_out
-from brainbench.metrics.measures.metric import Metric
-from brainbench.metrics.measures.registry import get_metric
+from brainbench.metrics.measures.metric import Metric, get_metric
 from brainbench.metrics.rdms.comparison import compare_all
 from brainbench.metrics.rdms.pairs import Floats, Ints, permuted_pairs
 from brainbench.scoring.recovery.boards import draw_board

@@ -16,7 +16,7 @@ from brainbench.core.progress import Progress
 from brainbench.core.reading.ranges import check_number
 from brainbench.core.reading.regular import readable
 from brainbench.core.writing.same_run import begin_run
-from brainbench.metrics.measures.registry import get_metric
+from brainbench.metrics.measures.metric import get_metric
 from brainbench.scoring.recovery.boards import RecoveryBoard, make_board
 from brainbench.scoring.recovery.candidates import Candidate
 from brainbench.scoring.recovery.confusion import Recovery

@@ -15,11 +15,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.version import __version__
 from brainbench.core.contracts import SWEEPS_FORMAT, SWEEPS_SCHEMA
 from brainbench.core.errors import DataError
 from brainbench.core.files import content_hash
 from brainbench.core.progress import Progress
+from brainbench.core.version import __version__
 from brainbench.stimuli.objects.collections import NamedObject
 from brainbench.stimuli.objects.solid import Solid
 from brainbench.stimuli.sweeps.generation import write_data_set

@@ -11,11 +11,11 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.version import __version__
 from brainbench.core.contracts import SWEEPS_FORMAT, SWEEPS_SCHEMA
 from brainbench.core.errors import UsageError, check_name
 from brainbench.core.files import content_hash, portable, to_plain
 from brainbench.core.reading.ranges import check_fields
+from brainbench.core.version import __version__
 from brainbench.stimuli.engines import DEFAULT_ENGINE, PHYSICS_VERSION, get_engine
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.objects.collections import NamedObject
