@@ -149,7 +149,7 @@ def closing(hand: Hand, share: float) -> NDArray[np.float64]:
 
 
 def flexed(hand: Hand, share: float) -> NDArray[np.float64]:
-    """Return positions (rad, m) of all joints, by number, at which each is flexed, or closed, by a share of its range."""
+    """Return positions (rad, m) of all joints, by number, where each is flexed, or closed, by a share of its range."""
     check_number("share by which a hand closes", share, least=0, most=1)
     low, high = hand.model.jnt_range.T
     # Flexion is the longer side of a joint's range, where a gripper may be open.

@@ -63,7 +63,7 @@ class HandState:
 
     @classmethod
     def empty(cls, num_envs: int, num_links: int, contacts: int = 0, device: Any = "cpu") -> HandState:
-        """Return a state of B environments with L links at the origin, at rest, and room C for all contacts together."""
+        """Return a state of B environments: L links at rest at the origin, and room C for all contacts together."""
         check_number("environments of a state", num_envs, least=1, most=MOST_ENVS, whole=True)
         check_number("links of a state", num_links, least=1, whole=True)
         check_number("contacts of a state", contacts, least=0, whole=True)

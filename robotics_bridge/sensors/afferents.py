@@ -87,7 +87,7 @@ class AfferentFilter:
         return filtered
 
     def reset(self, env_ids: EnvIds | None = None, x: torch.Tensor | None = None) -> None:
-        """Forget the past of some environments (all by default); there the signal ``x`` [B, …], or 0, has always been."""
+        """Forget the past of some environments (all by default); the signal ``x`` [B, …], or 0, was always there."""
         from robotics_bridge.physics.selection import select_envs
 
         if env_ids is None and x is None:

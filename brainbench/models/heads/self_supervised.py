@@ -43,7 +43,7 @@ class SimSiamHead(nn.Module):
 
 
 class AutoencoderHead(nn.Module):
-    """Reconstruction [B, T, F] → [B, T, C, H, W]: a linear layer to C/2 channels, then three transposed convolutions."""
+    """Reconstruction [B, T, F] → [B, T, C, H, W]: a linear layer to C/2 channels, three transposed convolutions."""
 
     def __init__(self, features: int, *, channels: int = 30, grid: tuple[int, int] = GRID_SHAPE) -> None:
         super().__init__()

@@ -32,7 +32,7 @@ class Recognised:
 def recognise(
     state: Mapping[str, torch.Tensor], settings: Settings | None = None, architecture: str | None = None
 ) -> Recognised:
-    """Recognise a network; ``architecture`` (a registry name without a tag) and the settings decide where names do not."""
+    """Recognise a network; ``architecture`` (a registry name without a tag) and settings decide where names do not."""
     settings = settings or Settings()
     name = architecture or f"{_encoder(state, settings)}{_attender(state)}"
     found = Architecture.parse(name).untrained

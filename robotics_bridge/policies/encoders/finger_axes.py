@@ -101,7 +101,7 @@ class FingerAxes:
 
 
 def finger_axes_of(hand: Hand, reference: Layout) -> FingerAxes:
-    """Return the finger axes of a hand; sites are the seven quantiles of a reference layout's taxels along each axis."""
+    """Return the finger axes of a hand; sites are the seven quantiles of a reference layout's taxels along it."""
     data = mujoco.MjData(hand.model)
     mujoco.mj_kinematics(hand.model, data)
     palm = hand.model.body(hand.palm).id

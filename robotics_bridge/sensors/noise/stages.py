@@ -104,7 +104,7 @@ class ReadingNoise:
         return context.array(shape, int), context.array(strength, float), context.array(weights, float)
 
     def launch(self, x: Any, out: Any, dt: float) -> None:
-        """Measure the signal ``x`` [C, B, N] (after radius noise) into ``out``, if that is staged, and record ``out``."""
+        """Measure the signal ``x`` [C, B, N] (after radius noise) into ``out`` if that is staged; record ``out``."""
         context = self._context
         known, now = [self.params, self.part], [context.age, context.episode, context.env_offset, float(dt)]
         if self._mixes:
