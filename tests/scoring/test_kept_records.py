@@ -3,7 +3,7 @@ from pathlib import Path
 import pytest
 
 from brainbench.core.records import ModelCard, ResultRecord, Score
-from brainbench.metrics.measures import registry
+from brainbench.metrics.measures import metric as registry
 from brainbench.metrics.measures.metric import register_metric
 from brainbench.metrics.measures.patterns import LinearCKA
 from brainbench.metrics.measures.rsa import RSA
