@@ -22,19 +22,71 @@ from brainbench.core.files import read_json, write_json, write_text
 
 FOLDER = Path(__file__).parent / "results"
 PAGE = Path(__file__).with_name("RESULTS.md")
-SUBJECTS = {
-    "commands": "Commands",
-    "whiskers": "Whisker simulation",
-    "models": "Networks and training",
-    "scores": "Scores and statistics",
-    "leaderboards": "Leaderboards",
-    "tactile": "Tactile simulation",
-    "policies": "Tasks, policies and deployment",
-}
+SUBJECTS = ("commands", "whiskers", "models", "scores", "leaderboards", "tactile", "policies")
+QUESTIONS = (
+    ("How exact is a simulated whisker?", "whiskers", "accura|agree|bases|bullet|chosen|finer|friction|nothing in rod"
+     "|plane|presets|random scenes|tolerance|trust|twist|Contact forces solved"),
+    ("What can be fitted to a real whisker?", "whiskers", "Fitted|Contact forces from|Gradients|Motions|Ring-downs"),
+    ("How fast are whiskers simulated?", "whiskers", ""),
+    ("What do networks cost, and how were the shipped ones trained?", "models", ""),
+    ("Could an experiment tell networks apart?", "scores", "Recovery|demo-rodgers|default recordings"),
+    ("Can a score be trusted?", "scores", ""),
+    ("How exact is simulated touch?", "tactile", "closed forms|extremes|GelSight|Genesis 1|adds up"
+     "|faults|hot_ball|Hand and|noise"),
+    ("How fast is simulated touch?", "tactile", ""),
+    ("What does touch bring to a policy?", "policies", ""),
+    ("How quick, small and robust are the commands?", "commands|leaderboards", ""),
+)  # fmt: skip
+"""Question of a reader, subjects and words of the titles that answer it; a section stands under the first that fits."""
+HEADLINES = (
+    ("whiskers below the 10 % error that `Fidelity.auto` promises to 90 %", "Settings chosen for an error",
+     r"\| 10% \|[^|]*\| ([^|]*) \|", ""),
+    ("median error at that setting", "Settings chosen for an error", r"\| 10% \|[^|]*\|[^|]*\| ([^|]*) \|", ""),
+    ("processor time of a simulated second of one whisker, there", "Settings chosen for an error",
+     r"\| 10% \|[^|]*\|[^|]*\|[^|]*\| ([^|]*) \|", " s"),
+    ("error of Young's modulus fitted to base forces with 1 % noise, median",
+     "Fitted whiskers: truth, coverage and wrong models", r"\| young_modulus \| ([^|]*) \|", " %"),
+    ("95 % intervals of it that hold the truth, with Wilson interval",
+     "Fitted whiskers: truth, coverage and wrong models", r"\| young_modulus \|[^|]*\|[^|]*\|[^|]*\| ([^|]*) \|", " %"),
+    ("error of a contact force from a traced shape, contact point known: median / 90 %", "Contact forces from shapes",
+     r"\| contact point known \| all \|[^|]*\| ([^|]*) \|", " %"),
+    ("sweeps past objects on one GPU, by the public command", "Sweeps on a GPU, by the public command",
+     r"\| procedural-24:32 \|[^|]*\|[^|]*\| ([^|]*) \|", " a second"),
+    ("steps of free whiskers of ten links on one GPU", "The rod backend on a GPU",
+     r"([\d.e]+) whisker-steps/s at 10 links", " a second"),
+    ("difference of the published networks from the authors' outputs", "Published networks beside the authors' outputs",
+     r"logits, encoder \| ([^|,]*),", " of the largest"),
+    ("training of zhuang-intersection-ln+gpt on one GPU",
+     "Training step (zhuang-intersection-ln+gpt, NVIDIA H200)",
+     r"\| ours \| bf16 \| captured \|[^|]*\|[^|]*\| ([^|]*) \|", " sweeps a second"),
+    ("boards on which the true network comes first", "Recovery: the shipped networks",
+     r"comes first in (.*?) by chance|comes first in (.*?);", ""),
+    ("false positives of RSA at p ≤ .05", "Calibration: nulls", r"\| rsa \|[^|]*\| ([^|]*) \|", ""),
+    ("95 % intervals of RSA that hold the truth (20 stimuli, 11 animals, half of the signal)", "Calibration: coverage",
+     r"\| 20 \| 11 \| 0.5 \|[^|]*\|[^|]*\|[^|]*\| ([^|]*) \|", ""),
+    ("difference of crossnobis distances from rsatoolbox", "Metrics: parity with rsatoolbox",
+     r"\| RDM, crossnobis \| ([^|]*) \|", ""),
+    ("sum of taxels less sum of contact forces, worst of 200 scenes", "Touch: what adds up",
+     r"normal, law \|[^|]*\|[^|]*\| ([^|]*) \|", ""),
+    ("environments × steps with 100 kinematic taxels on one GPU, 4,096 at once",
+     "Tactile whole step on the pyramid (NVIDIA H200)", r"\| 4,096 \| kinematic \| ([^|]*) \|", " a second"),
+    ("success of the teacher of `in_palm_rotate`", "Teacher of in_palm_rotate",
+     r"\(in_palm_rotate.teacher\) \|[^|]*\| ([^|]*) \|", ""),
+    ("success of the shipped student, deployed", "Evaluation and deployment of a student",
+     r"\| deployed \|[^|]*\| ([^|]*) \|", ""),
+    ("control tick of a deployed policy with a small encoder, median", "Control tick of a deployed policy",
+     r"\| zhuang-intersection-ln-small \| no \|[^|]*\|[^|]*\|[^|]*\| ([^|]*) \|", " ms"),
+    ("files that differ after commands were killed and given again (of 118 kills)", "Kills",
+     r"\| all \|[^|]*\|[^|]*\|[^|]*\|[^|]*\| ([^|]*) \|", ""),
+)  # fmt: skip
+"""What is measured, title of its section, where the figure stands in the body, and its unit."""
+EARLIER = "f0af6943"
+"""Commit that holds the scripts whose results stand here and that no release repeats."""
 HEAD = (
     "# Measured results\n\n"
     "Every figure stands with the command that made it, the date and the machine. This page is written by "
-    "`python -m benchmarks.report` from `benchmarks/results/*.json`; commands run in the repository's root.\n"
+    "`python -m benchmarks.report` from `benchmarks/results/*.json`; commands run in the repository's root. "
+    f"Studies that are not repeated have left the tree: where commit {EARLIER} is named, the script is found there.\n"
 )
 
 
@@ -44,7 +96,7 @@ class Section:
 
     title: str
     subject: str
-    """One of :data:`SUBJECTS`."""
+    """One of :data:`SUBJECTS`: the folder of the script, as a rule."""
     command: str
     """What made it; empty where the body names several."""
     date: str
@@ -144,25 +196,68 @@ def write_section(title: str, command: str, body: str, *, subject: str, where: s
 
 
 def read_sections() -> list[Section]:
-    """Return all sections, by subject and then by title."""
+    """Return all sections, by title."""
     sections = [Section(**read_json(path)) for path in sorted(FOLDER.glob("*.json"))]
     for section in sections:
         if section.subject not in SUBJECTS:
             raise UsageError(f"{section.path.name} has the subject {section.subject!r}; allowed: {list(SUBJECTS)}.")
-    return sorted(sections, key=lambda section: (list(SUBJECTS).index(section.subject), section.title))
+    return sorted(sections, key=lambda section: section.title)
+
+
+def question(section: Section) -> str:
+    """Return the question under which a section stands."""
+    return next(
+        heading
+        for heading, subjects, words in QUESTIONS
+        if section.subject in subjects.split("|") and re.search(words, section.title)
+    )
+
+
+def headline(section: Section, pattern: str) -> str:
+    """Return the figure that a pattern finds in the body of a section.
+
+    Raises:
+        UsageError: the body has no such place; the table of headline figures would go on with a stale one.
+    """
+    match = re.search(pattern, section.body)
+    if match is None:
+        raise UsageError(f"The section {section.title!r} has no place that fits {pattern!r}; mend HEADLINES.")
+    return next(text for text in match.groups() if text is not None).strip(" ;:")
+
+
+def anchor(title: str) -> str:
+    """Return the anchor of a heading, as GitHub and MkDocs make it."""
+    return re.sub(r"[^\w\- ]", "", title.lower()).strip().replace(" ", "-")
 
 
 def page(sections: list[Section]) -> str:
-    """Return the page: a heading a subject, a heading a section, and how each was measured."""
-    parts = [HEAD]
-    for subject, heading in SUBJECTS.items():
+    """Return the page: the headline figures, then a heading a question and a heading a section."""
+    by_title = {section.title: section for section in sections}
+    rows = [
+        [words, f"**{headline(by_title[title], pattern)}{unit}**", f"[{title}](#{anchor(title)})", by_title[title].date]
+        for words, title, pattern, unit in HEADLINES
+    ]
+    parts = [HEAD, "## Twenty figures\n", table(["what", "measured", "section", "date"], rows) + "\n"]
+    for heading, *_ in QUESTIONS:
         parts.append(f"## {heading}\n")
-        for section in (item for item in sections if item.subject == subject):
-            made = f"`{section.command}` — " if section.command else ""
+        for section in (section for section in sections if question(section) == heading):
+            command = f"`{section.command}` — " if section.command else ""
             where = section.where or "2 cores (AMD EPYC), 24 GiB, Python 3.11, torch 2.13 (CPU)"
             body = re.sub(r"^(#{2,4} )", r"#\1", section.body, flags=re.MULTILINE)
-            parts.append(f"### {section.title}\n\n{made}{section.date}, {where}.\n\n{body}\n")
+            gone = removed_scripts(f"{section.command}\n{body}")
+            note = f" Not in the tree any more, but in commit {EARLIER}: {', '.join(gone)}." if gone else ""
+            parts.append(f"### {section.title}\n\n{command}{section.date}, {where}.{note}\n\n{body}\n")
     return "\n".join(parts)
+
+
+def removed_scripts(text: str) -> list[str]:
+    """Return the scripts and files of ``benchmarks`` that a text names and that are not in the tree."""
+    modules = re.findall(r"benchmarks\.(\w+)\.(\w+)", text)
+    paths = {f"{folder}/{module}.py" for folder, module in modules}
+    paths |= set(re.findall(r"benchmarks/((?:\w+/)*[\w-]+\.(?:py|sh|toml))\b", text))
+    paths |= {f"policies/{name}" for name in re.findall(r"(?:policies/)?(records/[\w.-]+\.tar\.xz)", text)}
+    paths |= {"policies/trainings"} if "policies/trainings" in text else set()
+    return sorted(f"`benchmarks/{path}`" for path in paths if not (FOLDER.parent / path).exists())
 
 
 def write_page() -> None:

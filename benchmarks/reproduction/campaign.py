@@ -1,6 +1,6 @@
 """The trainings and result records of a campaign, joined by network and seed.
 
-Both are made by :mod:`benchmarks.models.campaign`. A line of ``trainings.jsonl`` and a record belong together when
+A line of ``trainings.jsonl`` and a record belong together when
 architecture, objective, augmentation, masking and seed agree.
 """
 

@@ -14,6 +14,7 @@ import argparse
 import faulthandler
 import io
 import json
+import multiprocessing
 import os
 import resource
 import shutil
@@ -24,11 +25,17 @@ import tempfile
 import threading
 import time
 from collections import Counter
+from concurrent.futures import ProcessPoolExecutor
 from contextlib import redirect_stdout
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from benchmarks.report import script_parser, table, write_section
+from brainbench.stimuli.objects.collections import resolve_objects
+
+if TYPE_CHECKING:
+    from brainbench.stimuli.objects.collections import NamedObject
+    from brainbench.stimuli.objects.solid import Solid
 
 STARTED = time.time()
 PARTS = ("kernels", "stages")
@@ -129,9 +136,22 @@ def processor_seconds() -> float:
     return used.ru_utime + used.ru_stime
 
 
+def load_objects(words: list[str]) -> dict[str, Solid]:
+    """Make objects, many of them on all processors as data generation does."""
+    objects = resolve_objects(words, surfaces=True)
+    processors = len(os.sched_getaffinity(0))
+    if len(objects) < 64 or processors < 4:
+        return {name: source.load() for name, source in objects.items()}
+    with ProcessPoolExecutor(processors, mp_context=multiprocessing.get_context("spawn")) as pool:
+        return dict(zip(objects, pool.map(_load, objects.values(), chunksize=4), strict=True))
+
+
+def _load(source: NamedObject) -> Solid:
+    return source.load()
+
+
 def kernels(args: argparse.Namespace) -> None:
     """Print the rate of the kernels: all sweeps in one launch, then those that are simulated again."""
-    from benchmarks.whiskers.slices import load_objects
     from brainbench.core.files import content_hash
     from brainbench.stimuli import Fidelity
     from brainbench.stimuli.engines.rod.sweeps import SweepLauncher
