@@ -46,6 +46,7 @@ def render(
     """Draw a scene: whiskers bent by its objects, as a picture or a film; no display is needed."""
     from brainbench.core.figures.style import check_format
     from brainbench.stimuli.figures import scenes as drawing
+    from brainbench.stimuli.figures.canvas import Style
     from brainbench.stimuli.figures.camera import Camera
 
     suffix = check_format(out, drawing.FORMATS)
@@ -63,9 +64,9 @@ def render(
         target=None if target is None else tuple(1e-3 * value for value in target),  # type: ignore[arg-type]
         width=None if width is None else width * 1e-3,
     )
-    usual = drawing.Style().size if suffix == ".png" else drawing.FILM_SIZE
+    usual = Style().size if suffix == ".png" else drawing.FILM_SIZE
     pixels = usual if size is None else numbers(size, "--size", count=2)
-    style = drawing.Style(
+    style = Style(
         color=color,  # type: ignore[arg-type]
         moment_limit=None if moment_limit is None else moment_limit * 1e-6,
         thickness=thickness,

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.figures.style import DOTS_PER_INCH, INK, PALE, new_figure, save_figure
 from brainbench.stimuli.figures import canvas
+from brainbench.stimuli.figures.picture import Picture
 from brainbench.stimuli.whiskers.selection import ROWS
-
-if TYPE_CHECKING:
-    from brainbench.stimuli.figures.scenes import Picture
 
 AXES = ("right", "rostral", "dorsal")
 

@@ -5,17 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.errors import DataError, needing
 from brainbench.core.files import atomic_path
-
-if TYPE_CHECKING:
-    from brainbench.stimuli.figures.scenes import Style
-
+from brainbench.stimuli.figures.canvas import Style
 
 _UNCHANGED = 255
 """Index of a GIF's palette that means "as in the frame before"; the colours are those below it."""

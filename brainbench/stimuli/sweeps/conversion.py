@@ -96,7 +96,7 @@ class SweepTable:
         """Hash of :attr:`config`."""
         return content_hash(self.config)
 
-    @cached_property
+    @property
     def objects(self) -> dict[str, NamedObject]:
         """The objects by name; only their names are known."""
         names, first = np.unique(self.object, return_index=True)
@@ -107,12 +107,12 @@ class SweepTable:
     @cached_property
     def shards(self) -> tuple[PlannedShard, ...]:
         """The shards, those of training first, in the order of the table."""
-        shards = []
+        objects_by_name, shards = self.objects, []
         for split in SPLITS:
             mine = np.flatnonzero(self.split == split)
             for place, first in enumerate(range(0, len(mine), self.shard_size)):
                 index = mine[first : first + self.shard_size]
-                objects = tuple(self.objects[name] for name in np.unique(self.object[index]).tolist())
+                objects = tuple(objects_by_name[name] for name in np.unique(self.object[index]).tolist())
                 shard = PlannedShard(
                     split=split, place=place, objects=objects, index=index, frames=len(self.times), config=self.config,
                     config_hash=self.config_hash,

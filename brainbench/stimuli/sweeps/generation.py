@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Sequence
 from datetime import timedelta
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from brainbench.core.errors import DataError, UsageError
 from brainbench.core.files import write_json
@@ -22,10 +22,7 @@ from brainbench.core.writing.temporaries import is_temporary
 from brainbench.stimuli.engines import get_engine
 from brainbench.stimuli.sweeps import running
 from brainbench.stimuli.sweeps.manifest import MANIFEST, is_complete, make_manifest
-from brainbench.stimuli.sweeps.plan import GenerationPlan, PlannedShard
-
-if TYPE_CHECKING:
-    from brainbench.stimuli.sweeps.conversion import SweepTable
+from brainbench.stimuli.sweeps.plan import GenerationPlan, Plan, PlannedShard
 
 _LOG = logging.getLogger(__name__)
 
@@ -73,7 +70,7 @@ def generate(
 
 
 def write_data_set(
-    plan: GenerationPlan | SweepTable,
+    plan: Plan,
     out: str | os.PathLike[str],
     run: Callable[[Sequence[Any], Path, Callable[[int], None]], None],
     *,

@@ -6,7 +6,7 @@ import logging
 import os
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -15,12 +15,9 @@ from brainbench.core.errors import DataError
 from brainbench.core.files import content_hash, provenance
 from brainbench.core.reading.hdf5 import open_hdf5
 from brainbench.core.reading.regular import readable
-from brainbench.stimuli.sweeps.plan import GenerationPlan, PlannedShard
+from brainbench.stimuli.sweeps.plan import Plan, PlannedShard
 from brainbench.stimuli.sweeps.shards import COUNTS, OK, UNUSABLE
 from brainbench.stimuli.sweeps.split import SPLITS
-
-if TYPE_CHECKING:
-    from brainbench.stimuli.sweeps.conversion import SweepTable
 
 _LOG = logging.getLogger(__name__)
 MANIFEST = "manifest.json"
@@ -47,7 +44,7 @@ def is_complete(path: Path, task: PlannedShard) -> bool:
     return whole
 
 
-def make_manifest(plan: GenerationPlan | SweepTable, folder: str | os.PathLike[str]) -> dict[str, Any]:
+def make_manifest(plan: Plan, folder: str | os.PathLike[str]) -> dict[str, Any]:
     """Put together the manifest of a finished data set from what its shards say.
 
     Equal data sets have equal manifests on one machine: there is no time in it.

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
 from importlib import metadata
-from typing import Any, ClassVar
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -115,6 +115,45 @@ class ShardTask(PlannedShard):
     settings: GenerationSettings
 
 
+class Plan(Protocol):
+    """Data set before its shards are made, simulated (:class:`GenerationPlan`) or converted."""
+
+    @property
+    def objects(self) -> Mapping[str, NamedObject]:
+        """Objects by name."""
+        ...
+
+    @property
+    def classes(self) -> Sequence[str]:
+        """Class labels; a label's place is its number in the shards."""
+        ...
+
+    @property
+    def sweeps(self) -> int:
+        """Number of sweeps."""
+        ...
+
+    @property
+    def notes(self) -> Mapping[str, Any]:
+        """Further entries of the manifest."""
+        ...
+
+    @cached_property
+    def config(self) -> dict[str, Any]:
+        """Plain values that determine every byte of the data set."""
+        ...
+
+    @cached_property
+    def config_hash(self) -> str:
+        """Hash of :attr:`config`."""
+        ...
+
+    @cached_property
+    def shards(self) -> tuple[PlannedShard, ...]:
+        """Shards, those of training first."""
+        ...
+
+
 @dataclass(frozen=True, eq=False)
 class GenerationPlan:
     """The shards of a data set, which needs an object."""
@@ -131,15 +170,17 @@ class GenerationPlan:
         if not self.objects:
             raise UsageError("A data set of sweeps needs at least one object.")
 
-    notes: ClassVar[Mapping[str, Any]] = {}
-    """Further entries of the manifest: none."""
+    @property
+    def notes(self) -> Mapping[str, Any]:
+        """Further entries of the manifest: none."""
+        return {}
 
     @cached_property
     def array(self) -> WhiskerArray:
         """The whiskers."""
         return WhiskerArray.of(self.grid.species).select(self.whiskers)
 
-    @cached_property
+    @property
     def classes(self) -> tuple[str, ...]:
         """Class labels, sorted; a label's place is its number in the shards."""
         return tuple(sorted({item.label for item in self.objects.values()}))
