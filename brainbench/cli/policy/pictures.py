@@ -12,9 +12,9 @@ import numpy as np
 from brainbench.cli.tactile import figures
 from brainbench.core.figures.style import panels, save_figure
 from brainbench.stimuli.figures.camera import Camera
+from brainbench.stimuli.figures.canvas import Style
 from brainbench.stimuli.figures.films import write_film
 from brainbench.stimuli.figures.raster import Triangles
-from brainbench.stimuli.figures.canvas import Style
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -46,8 +46,8 @@ def render(
     """Draw a scene: whiskers bent by its objects, as a picture or a film; no display is needed."""
     from brainbench.core.figures.style import check_format
     from brainbench.stimuli.figures import scenes as drawing
-    from brainbench.stimuli.figures.canvas import Style
     from brainbench.stimuli.figures.camera import Camera
+    from brainbench.stimuli.figures.canvas import Style
 
     suffix = check_format(out, drawing.FORMATS)
     scene = scenes.choose_scene(scenes.open_recipe(source, whiskers), stimulus)
