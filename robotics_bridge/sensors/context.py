@@ -7,22 +7,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brainbench.core.devices import warp
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from robotics_bridge.physics.scene import TouchScene
-    from robotics_bridge.sensors.noise.model import Noise
-    from robotics_bridge.sensors.queries.pairs import PairTable
-    from robotics_bridge.sensors.queries.solids import Solids
-    from robotics_bridge.sensors.sensor import Sensor
-
+from robotics_bridge.sensors.noise.model import Noise
 
 _MOST = 512
 """Packed launches that are kept."""
@@ -88,17 +80,6 @@ class LaunchContext:
     def zeros(self, shape: int | Sequence[int], dtype: Any = float) -> Any:
         """Return a Warp array of zeros on the device."""
         return warp().zeros(shape, dtype=dtype, device=self.device)
-
-
-@dataclass(eq=False)
-class SuiteContext(LaunchContext):
-    """Parts of a suite that the runtimes of its sensors share."""
-
-    scene: TouchScene
-    solids: Solids
-    sensors: Sequence[Sensor]
-    """Of the whole suite."""
-    pairs: PairTable = field(init=False)
 
 
 @dataclass(frozen=True)

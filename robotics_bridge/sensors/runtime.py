@@ -7,20 +7,35 @@ probes that meet geometries.
 from __future__ import annotations
 
 import abc
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from brainbench.core.devices import warp
+from robotics_bridge.physics.scene import TouchScene
 from robotics_bridge.physics.state import HandState
-from robotics_bridge.sensors.context import LaunchContext, ReadoutSlice, SuiteContext
+from robotics_bridge.sensors.context import LaunchContext, ReadoutSlice
 from robotics_bridge.sensors.kernels.readout import CLEAN, FUSED, STAGED, ProbeArrays, ReadoutArrays, append_history
 from robotics_bridge.sensors.noise.stages import ReadingNoise
 from robotics_bridge.sensors.probes.placement import enclosing_sphere
+from robotics_bridge.sensors.queries.pairs import PairTable
+from robotics_bridge.sensors.queries.solids import Solids
 from robotics_bridge.sensors.sensor import ProbeSensor, Sensor
 
 wp = warp()
+
+
+@dataclass(eq=False)
+class SuiteContext(LaunchContext):
+    """Parts of a suite that the runtimes of its sensors share."""
+
+    scene: TouchScene
+    solids: Solids
+    sensors: Sequence[Sensor]
+    """Of the whole suite."""
+    pairs: PairTable = field(init=False)
 
 
 class Runtime(abc.ABC):

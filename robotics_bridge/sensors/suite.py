@@ -16,7 +16,7 @@ from brainbench.core.reading.ranges import check_number
 from robotics_bridge.physics.scene import TouchScene
 from robotics_bridge.physics.selection import EnvIds, select_envs
 from robotics_bridge.physics.state import DIVERGED, MOST_ENVS, UNFELT, HandState
-from robotics_bridge.sensors.context import SuiteContext, memory_of
+from robotics_bridge.sensors.context import memory_of
 from robotics_bridge.sensors.fidelity import SensorFidelity
 from robotics_bridge.sensors.plausibility import warn_of
 from robotics_bridge.sensors.probes.runtime import DistanceRuntime
@@ -24,7 +24,7 @@ from robotics_bridge.sensors.probes.sensors import SurfaceDistanceProbe
 from robotics_bridge.sensors.queries.kernels.pairs import count_update, reset_clock
 from robotics_bridge.sensors.queries.pairs import PairTable
 from robotics_bridge.sensors.queries.solids import Solids
-from robotics_bridge.sensors.runtime import History, Runtime
+from robotics_bridge.sensors.runtime import History, Runtime, SuiteContext
 from robotics_bridge.sensors.sensor import Sensor
 
 wp = warp()
@@ -100,7 +100,7 @@ class SensorSuite:
             self.solids = Solids(scene, num_envs, self.device, queries, resolution=resolution)
             shared = (num_envs, self.device, seed, env_offset, scene, self.solids, [*self.sensors.values()])
             self.context = context = SuiteContext(*shared)
-            context.pairs = self.pairs = PairTable(context, listed)
+            context.pairs = self.pairs = PairTable(context, self.solids, listed)
             self.runtimes: list[Runtime] = [
                 load_object(next(iter(members.values())).runtime, "runtime")(members, context)
                 for members in groups.values()

@@ -13,8 +13,9 @@ import numpy as np
 from brainbench.core.devices import warp
 from brainbench.core.errors import UsageError, check_name
 from brainbench.core.reading.ranges import check_fields, check_number
-from robotics_bridge.sensors.temperature.grid import TemperatureGrid, link_temperature
+from robotics_bridge.sensors.temperature.grid import TemperatureGrid
 from robotics_bridge.sensors.temperature.materials import ABSOLUTE_ZERO, ThermalBody, ThermalMaterial, material
+from robotics_bridge.sensors.temperature.runtime import link_temperature
 
 if TYPE_CHECKING:
     import torch

@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
+import torch
 
 from brainbench.core.devices import warp
 from brainbench.core.reading.ranges import check_number
@@ -23,9 +24,10 @@ from robotics_bridge.sensors.audio.kernels.sound import (
     sound_drives,
 )
 from robotics_bridge.sensors.audio.sensors import ActuationAudio, ContactAudio
-from robotics_bridge.sensors.context import SuiteContext, fill
+from robotics_bridge.sensors.context import fill
 from robotics_bridge.sensors.noise.model import stream_key
-from robotics_bridge.sensors.runtime import Runtime
+from robotics_bridge.sensors.runtime import Runtime, SuiteContext
+from robotics_bridge.sensors.suite import SensorSuite
 
 wp = warp()
 
@@ -129,3 +131,10 @@ class DriveAudioRuntime(Runtime):
         """Make the next block from the torques and speeds that were written."""
         c = self.context
         c.launch(sound_drives, (c.num_envs, self.count), self._own, self.io, self.samples)
+
+
+def joint_drive(suite: SensorSuite, name: str) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return the views [B, J] for torque (N·m) and speed (rad/s) of the joints of an ActuationAudio."""
+    runtime = cast(DriveAudioRuntime, suite.runtime_of(name, ActuationAudio, "actuation sound"))
+    window = runtime.slices[name].span
+    return wp.to_torch(runtime.effort)[:, window], wp.to_torch(runtime.speed)[:, window]

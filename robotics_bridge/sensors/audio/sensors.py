@@ -7,18 +7,11 @@ surface (m/s) when its modes come from :func:`robotics_bridge.sensors.audio.mode
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, cast
+from typing import ClassVar
 
-from brainbench.core.devices import warp
 from brainbench.core.reading.ranges import check_fields
 from robotics_bridge.sensors.audio.materials import Modes
 from robotics_bridge.sensors.sensor import Sensor
-
-if TYPE_CHECKING:
-    import torch
-
-    from robotics_bridge.sensors.audio.runtime import DriveAudioRuntime
-    from robotics_bridge.sensors.suite import SensorSuite
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,7 +75,7 @@ class ActuationAudio(AudioSensor):
     """Sound of the drives of a hand: [J, K] samples, one emitter per joint.
 
     Loudness is β_load |τ| + β_pow |τ ω|, the whine a bank of partials on κ |ω|. Write torque and speed of the joints
-    to the views of :func:`joint_drive` before each update.
+    to the views of :func:`robotics_bridge.sensors.audio.runtime.joint_drive` before each update.
     """
 
     runtime: ClassVar[str] = "robotics_bridge.sensors.audio.runtime:DriveAudioRuntime"
@@ -114,10 +107,3 @@ class ActuationAudio(AudioSensor):
     def layout(self) -> tuple[int, ...]:
         """Return the shape of one emitter per joint."""
         return (self.joints,)
-
-
-def joint_drive(suite: SensorSuite, name: str) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return the views [B, J] for torque (N·m) and speed (rad/s) of the joints of an ActuationAudio."""
-    runtime = cast("DriveAudioRuntime", suite.runtime_of(name, ActuationAudio, "actuation sound"))
-    window, wp = runtime.slices[name].span, warp()
-    return wp.to_torch(runtime.effort)[:, window], wp.to_torch(runtime.speed)[:, window]

@@ -11,7 +11,7 @@ import torch
 
 from brainbench.core.devices import warp
 from robotics_bridge.physics.state import HandState
-from robotics_bridge.sensors.context import ReadoutSlice, SuiteContext, fill
+from robotics_bridge.sensors.context import ReadoutSlice, fill
 from robotics_bridge.sensors.elastomer.kernels.anchors import anchor_kernel
 from robotics_bridge.sensors.elastomer.kernels.dilation import (
     ElastomerArrays,
@@ -23,7 +23,7 @@ from robotics_bridge.sensors.elastomer.kernels.dilation import (
 from robotics_bridge.sensors.elastomer.kernels.shear import CHUNK, sum_shear
 from robotics_bridge.sensors.elastomer.taxel import ElastomerTaxel, Layer
 from robotics_bridge.sensors.queries.surface_points import sample_cloud
-from robotics_bridge.sensors.runtime import ProbeRuntime
+from robotics_bridge.sensors.runtime import ProbeRuntime, SuiteContext
 from robotics_bridge.sensors.taxels.kernels.proximity import BLOCK, CloudArrays
 
 wp = warp()
@@ -46,7 +46,7 @@ class ElastomerRuntime(ProbeRuntime):
         self._planes = 2 if any(sensor.noise.radius for sensor in self._sensors) else 1
         count, tracked = len(self._sensors), first.tracked(scene)
         self._followed = first.points > 0 and bool(tracked)
-        cloud = sample_cloud(context, tracked, first.points) if self._followed else None
+        cloud = sample_cloud(context.solids, tracked, first.points) if self._followed else None
         self.points = cloud.struct if cloud else CloudArrays()
         """Warp structure of the surface points that are followed."""
         total_points = cloud.total if cloud else 0

@@ -109,15 +109,6 @@ class Noise:
                 f"{sensor} has no noise knob {', '.join(map(repr, extra))}; it has: {', '.join(sorted(knobs))}."
             )
 
-    def params(self, seed: int, name: str) -> Any:
-        """Return the Warp structure ``NoiseParams`` of the sensor ``name`` in an experiment."""
-        from robotics_bridge.sensors.context import fill
-        from robotics_bridge.sensors.noise.kernels.noise import NoiseParams
-
-        ranges = dict(zip(("gain_low", "gain_high", "dead_low", "dead_high"), self.gain + self.dead_range, strict=True))
-        levels = 1.0 / self.quantum if self.quantum else 0.0
-        return fill(NoiseParams, self, tau=self.hysteresis_tau, levels=levels, **stream_key(seed, name), **ranges)
-
     def save(self, path: str | os.PathLike[str], **about: Any) -> None:
         """Write the knobs as a preset (JSON), with what else is worth telling about it."""
         write_json(path, {"format": _FORMAT, "noise": to_plain(self), "about": about})

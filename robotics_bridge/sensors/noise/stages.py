@@ -16,9 +16,9 @@ from numpy.typing import ArrayLike, NDArray
 from brainbench.core.devices import pick_device, warp
 from brainbench.core.errors import UsageError
 from brainbench.core.reading.ranges import check_number
-from robotics_bridge.sensors.context import LaunchContext, ReadoutSlice
+from robotics_bridge.sensors.context import LaunchContext, ReadoutSlice, fill
 from robotics_bridge.sensors.noise.kernels.noise import NoiseParams, crosstalk, delay_line, measure
-from robotics_bridge.sensors.noise.model import Noise
+from robotics_bridge.sensors.noise.model import Noise, stream_key
 
 wp = warp()
 
@@ -73,7 +73,7 @@ class ReadingNoise:
         """Warp arrays of the delay; its ring exists from the first launch on."""
 
     def _draw_keys(self) -> Any:
-        structures = [part.noise.params(self._context.seed, part.name) for part in self._slices]
+        structures = [noise_params(part.noise, self._context.seed, part.name) for part in self._slices]
         return self._context.array(structures, NoiseParams)
 
     def seed(self) -> None:
@@ -135,6 +135,13 @@ class ReadingNoise:
     def read(self, measured: Any) -> Any:
         """Return what is read where ``measured`` [C, B, N] is newest: an earlier reading if there is a delay."""
         return self._late if self._longest > 0 else measured
+
+
+def noise_params(noise: Noise, seed: int, name: str) -> Any:
+    """Return the Warp structure ``NoiseParams`` of the sensor ``name`` in an experiment."""
+    ranges = dict(zip(("gain_low", "gain_high", "dead_low", "dead_high"), noise.gain + noise.dead_range, strict=True))
+    levels = 1.0 / noise.quantum if noise.quantum else 0.0
+    return fill(NoiseParams, noise, tau=noise.hysteresis_tau, levels=levels, **stream_key(seed, name), **ranges)
 
 
 def gaussian_weights(sigma: float, half: int) -> NDArray[np.float64]:

@@ -10,8 +10,9 @@ from numpy.typing import ArrayLike
 
 from brainbench.core.devices import to_struct, warp
 from robotics_bridge.physics.state import HandState
-from robotics_bridge.sensors.context import SuiteContext
+from robotics_bridge.sensors.context import LaunchContext
 from robotics_bridge.sensors.queries.kernels.pairs import CONTACTS, PairArrays, SlotArrays, pair_kernel, start_kernel
+from robotics_bridge.sensors.queries.solids import Solids
 
 _LISTED = 16
 """Geometries in contact with one link that are listed where lists of all would be too long."""
@@ -32,8 +33,9 @@ class PairTable:
             256 MiB, and 16 otherwise.
     """
 
-    def __init__(self, context: SuiteContext, listed: int | None = None) -> None:
-        self._context, self._listed, self._slots = context, listed, list[dict[str, Any]]()
+    def __init__(self, context: LaunchContext, solids: Solids, listed: int | None = None) -> None:
+        self._context, self._solids = context, solids
+        self._listed, self._slots = listed, list[dict[str, Any]]()
         self.struct: Any = None
         """The Warp structure ``PairArrays``; None before :meth:`freeze`."""
         self.plan: Any = None
@@ -85,11 +87,12 @@ class PairTable:
         self._rooms = [max(1, len(s["members"][: most if s["contact"] else None])) for s in slots]
         self._words = max([1, *(-(-len(s["members"]) // 32) for s in slots)])
         count = max(len(slots), 1)
-        place = np.full((count, c.solids.kinds.shape[1]), -1)
+        place = np.full((count, self._solids.kinds.shape[1]), -1)
         for number, slot in enumerate(slots):
             place[number, list(slot["members"])] = np.arange(len(slot["members"]))
+        scene = self._solids.scene
         # The link of every geometry whose contacts matter, to turn the others away at once.
-        links = c.scene.link_of if c.scene.geometries else np.full(1, -1)
+        links = scene.link_of if scene.geometries else np.full(1, -1)
         first = np.cumsum([0, *self._rooms])
         plan = {
             "link": [s["link"] for s in slots],
@@ -122,6 +125,6 @@ class PairTable:
         dim = max(envs, -(-room // CONTACTS)) if self._contacts else envs
         c.launch(start_kernel(self._contacts, self._apart), dim, *inputs)
         if self._slots:
-            inputs = [self.plan, c.solids.struct, state.arrays, self._words, self._bits, self.struct]
+            inputs = [self.plan, self._solids.struct, state.arrays, self._words, self._bits, self.struct]
             dim = envs * (len(self._slots) + self._apart * state.num_links)
             c.launch(pair_kernel(self._apart), dim, *inputs, self.crowded, self.diverged)

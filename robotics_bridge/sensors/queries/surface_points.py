@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 
 from brainbench.core.devices import to_struct
 from robotics_bridge.physics.scene import Geometry
-from robotics_bridge.sensors.context import SuiteContext
 from robotics_bridge.sensors.probes.placement import cover_evenly, face_areas
-from robotics_bridge.sensors.queries.solids import tessellate
+from robotics_bridge.sensors.queries.solids import Solids, tessellate
 from robotics_bridge.sensors.taxels.kernels.proximity import BLOCK, CellArrays, CloudArrays
 
 
@@ -40,12 +39,12 @@ def surface_points(geometry: Geometry, count: int) -> NDArray[np.float64]:
     return cover_evenly(corners, face_areas(corners)[0], count)
 
 
-def sample_cloud(context: SuiteContext, geometries: Sequence[int], points: int) -> Cloud:
+def sample_cloud(solids: Solids, geometries: Sequence[int], points: int) -> Cloud:
     """Spread ``points`` over geometries in proportion to their areas, row by row of variants.
 
     Planes are left out: they have no end.
     """
-    scene, rows = context.scene, context.solids.rows
+    scene, rows = solids.scene, solids.rows
     sampled: dict[tuple[int, int], tuple[int, int, NDArray]] = {}
     counts, totals = np.zeros(rows, np.int64), np.zeros(rows, np.int64)
     first, blocks, number = (np.zeros((rows, max(len(scene.geometries), 1)), np.int32) for _ in range(3))
@@ -74,7 +73,7 @@ def sample_cloud(context: SuiteContext, geometries: Sequence[int], points: int) 
         "first": first,
         "blocks": blocks,
     }
-    return Cloud(to_struct(CloudArrays, arrays, context.device), int(totals.max()), counts, clouds, number)
+    return Cloud(to_struct(CloudArrays, arrays, solids.device), int(totals.max()), counts, clouds, number)
 
 
 def list_by_cells(cloud: Cloud, reach: float, device: Any) -> Any:

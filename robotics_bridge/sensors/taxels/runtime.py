@@ -9,10 +9,10 @@ import numpy as np
 
 from brainbench.core.devices import warp
 from robotics_bridge.physics.state import HandState
-from robotics_bridge.sensors.context import SuiteContext, fill
+from robotics_bridge.sensors.context import fill
 from robotics_bridge.sensors.kernels.readout import FUSED
 from robotics_bridge.sensors.queries.surface_points import list_by_cells, sample_cloud
-from robotics_bridge.sensors.runtime import ProbeRuntime, probe_rows
+from robotics_bridge.sensors.runtime import ProbeRuntime, SuiteContext, probe_rows
 from robotics_bridge.sensors.taxels.kernels.contact_load import ContactNodes, PressArrays, SpreadPlan
 from robotics_bridge.sensors.taxels.kernels.kinematic import KinematicParams, kinematic_kernel
 from robotics_bridge.sensors.taxels.kernels.proximity import ProximityArrays, ProximityParams, proximity_kernel
@@ -66,7 +66,7 @@ class ProximityRuntime(ProbeRuntime):
         super().__init__(sensors, 6, context, reach=max(sensor.noise.radius for sensor in sensors.values()))
         first = next(iter(sensors.values()))
         tracked, rows = first.tracked(context.scene), context.solids.rows
-        self.cloud = sample_cloud(context, tracked, first.points)
+        self.cloud = sample_cloud(context.solids, tracked, first.points)
         laws = [fill(ProximityParams, sensor) for sensor in sensors.values()]
         densities = np.zeros((len(sensors), rows))
         for row, sensor in zip(densities, sensors.values(), strict=True):

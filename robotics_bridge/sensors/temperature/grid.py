@@ -11,24 +11,17 @@ from __future__ import annotations
 import math
 from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, cast
+from typing import Any, ClassVar, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
-from brainbench.core.devices import warp
 from brainbench.core.errors import UsageError, check_kind, check_name
 from brainbench.core.reading.ranges import check_fields, check_number
 from brainbench.core.rotations import to_matrices
+from robotics_bridge.physics.scene import Geometry, TouchScene
 from robotics_bridge.sensors.sensor import Sensor
 from robotics_bridge.sensors.temperature.materials import ABSOLUTE_ZERO, ThermalBody, ThermalMaterial, material
-
-if TYPE_CHECKING:
-    import torch
-    from numpy.typing import NDArray
-
-    from robotics_bridge.physics.scene import Geometry, TouchScene
-    from robotics_bridge.sensors.suite import SensorSuite
-    from robotics_bridge.sensors.temperature.runtime import TemperatureRuntime
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -118,24 +111,6 @@ class TemperatureGrid(Sensor):
         if not boxes:
             raise UsageError(f"Link {self.link!r} has no geometry of finite size; give the grid its corners low, high.")
         return np.min([low for low, _ in boxes], axis=0), np.max([high for _, high in boxes], axis=0)
-
-
-def link_temperature(suite: SensorSuite, name: str) -> torch.Tensor:
-    """Return the temperatures [B, L] (°C) of the links that a grid may touch, a view to write to."""
-    return warp().to_torch(_runtime_of(suite, name).heat.link_temperature)
-
-
-def lost_contacts(suite: SensorSuite, name: str) -> torch.Tensor:
-    """Return how many contacts [B] of the last update a grid had no room for (it looks at 48)."""
-    from robotics_bridge.sensors.temperature.kernels.heat import CAPACITY
-
-    runtime = _runtime_of(suite, name)
-    column = list(runtime.slices).index(name)
-    return (warp().to_torch(runtime.heat.number)[:, column] - CAPACITY).clamp(min=0)
-
-
-def _runtime_of(suite: SensorSuite, name: str) -> TemperatureRuntime:
-    return cast("TemperatureRuntime", suite.runtime_of(name, TemperatureGrid, "temperature grid"))
 
 
 def _bounds(geometry: Geometry) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -68,7 +68,7 @@ class ThermalBody:
 
     material: str | ThermalMaterial = "plastic"
     temperature: float = 22.0
-    """At the start [°C]; later through :func:`link_temperature`."""
+    """At the start [°C]; later through :func:`robotics_bridge.sensors.temperature.runtime.link_temperature`."""
 
     def __post_init__(self) -> None:
         check_fields(self, "temperature", least=ABSOLUTE_ZERO)

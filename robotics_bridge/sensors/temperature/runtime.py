@@ -5,15 +5,17 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from brainbench.core.devices import warp
 from robotics_bridge.physics.state import HandState
-from robotics_bridge.sensors.context import SuiteContext, fill
-from robotics_bridge.sensors.runtime import Runtime
+from robotics_bridge.sensors.context import fill
+from robotics_bridge.sensors.runtime import Runtime, SuiteContext
+from robotics_bridge.sensors.suite import SensorSuite
 from robotics_bridge.sensors.temperature.grid import TemperatureGrid
 from robotics_bridge.sensors.temperature.kernels.heat import (
     CAPACITY,
@@ -135,6 +137,22 @@ class TemperatureRuntime(Runtime):
             c.launch(diffuse_heat, cells, axis, heat, now, spare)
             now, spare = spare, now
         c.launch(sense_temperature, cells, heat, self.io, now)
+
+
+def link_temperature(suite: SensorSuite, name: str) -> torch.Tensor:
+    """Return the temperatures [B, L] (°C) of the links that a grid may touch, a view to write to."""
+    return wp.to_torch(_runtime_of(suite, name).heat.link_temperature)
+
+
+def lost_contacts(suite: SensorSuite, name: str) -> torch.Tensor:
+    """Return how many contacts [B] of the last update a grid had no room for (it looks at 48)."""
+    runtime = _runtime_of(suite, name)
+    column = list(runtime.slices).index(name)
+    return (wp.to_torch(runtime.heat.number)[:, column] - CAPACITY).clamp(min=0)
+
+
+def _runtime_of(suite: SensorSuite, name: str) -> TemperatureRuntime:
+    return cast(TemperatureRuntime, suite.runtime_of(name, TemperatureGrid, "temperature grid"))
 
 
 def diffusion(cells: int, edge: float, spread: float) -> NDArray[np.float64]:

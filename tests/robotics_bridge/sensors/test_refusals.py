@@ -27,7 +27,7 @@ from robotics_bridge.sensors import (
 )
 from robotics_bridge.sensors.audio.materials import Modes
 from robotics_bridge.sensors.audio.modes import find_modes
-from robotics_bridge.sensors.audio.sensors import joint_drive
+from robotics_bridge.sensors.audio.runtime import joint_drive
 from robotics_bridge.sensors.calibration.calibrate import calibrate
 from robotics_bridge.sensors.calibration.log import Log
 from robotics_bridge.sensors.elastomer.pressure import contact_pressure

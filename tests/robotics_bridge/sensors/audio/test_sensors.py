@@ -15,7 +15,8 @@ from robotics_bridge.physics.state import HandState
 from robotics_bridge.sensors.audio.materials import Modes
 from robotics_bridge.sensors.audio.microphone import Microphone
 from robotics_bridge.sensors.audio.modes import find_modes
-from robotics_bridge.sensors.audio.sensors import ActuationAudio, ContactAudio, joint_drive
+from robotics_bridge.sensors.audio.runtime import joint_drive
+from robotics_bridge.sensors.audio.sensors import ActuationAudio, ContactAudio
 from robotics_bridge.sensors.noise.model import Noise
 from robotics_bridge.sensors.suite import SensorSuite
 from tests.factories.sensor_episode import require_processor

@@ -12,7 +12,7 @@ from scipy import stats
 from brainbench.core.errors import DataError, UsageError
 from robotics_bridge.sensors.context import LaunchContext, ReadoutSlice, memory_of
 from robotics_bridge.sensors.noise.model import PRESETS, TAXEL_KNOBS, Noise, stream_key
-from robotics_bridge.sensors.noise.stages import ReadingNoise, gaussian_weights, simulate
+from robotics_bridge.sensors.noise.stages import ReadingNoise, gaussian_weights, noise_params, simulate
 from tests.factories.sensor_episode import require_processor
 
 
@@ -139,7 +139,7 @@ def test_the_radius_error_is_uniform_and_new_in_every_update():
 
     wp = warp()
     out = wp.zeros((200, 50), dtype=wp.float32, device="cpu")
-    wp.launch(_radius_kernel(), dim=(200, 50), inputs=[Noise(radius=3e-4).params(7, "a"), out], device="cpu")
+    wp.launch(_radius_kernel(), dim=(200, 50), inputs=[noise_params(Noise(radius=3e-4), 7, "a"), out], device="cpu")
     assert stats.kstest(out.numpy().ravel(), "uniform", args=(-3e-4, 6e-4)).pvalue > 0.01
     assert abs(np.corrcoef(out.numpy()[1:].ravel(), out.numpy()[:-1].ravel())[0, 1]) < 0.03
 
