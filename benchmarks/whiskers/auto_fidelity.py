@@ -20,7 +20,7 @@ from benchmarks.report import publish, script_parser, table
 from brainbench.core.statistics import wilson_interval
 from brainbench.stimuli.engines import get_engine
 from brainbench.stimuli.engines.fidelity import Fidelity
-from brainbench.stimuli.engines.protocol import Job, Trace
+from brainbench.stimuli.motion.jobs import Job, Trace
 from brainbench.stimuli.tradeoff import REFERENCE, SimulationSetting, run_for_cost
 from brainbench.stimuli.validation.contact_scenes import FRICTIONS, contact_jobs, difference
 

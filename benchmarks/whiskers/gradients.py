@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 from benchmarks.report import publish, script_parser, table
 from brainbench.stimuli import Fidelity, Whisker
 from brainbench.stimuli.engines import get_engine
-from brainbench.stimuli.engines.protocol import Job, Load, StillFollicle, Trace
 from brainbench.stimuli.gradients import GradientRun, JobParameters
+from brainbench.stimuli.motion.jobs import Job, Load, StillFollicle, Trace
 from brainbench.stimuli.motion.trajectories import smooth_step
 from brainbench.stimuli.objects.obstacle import Capsule, Obstacle
 from brainbench.stimuli.validation.contact_scenes import OBJECTS, contact_jobs

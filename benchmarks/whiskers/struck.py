@@ -17,9 +17,9 @@ import numpy as np
 from benchmarks.report import table
 from brainbench.stimuli.engines import get_engine
 from brainbench.stimuli.engines.fidelity import Fidelity
-from brainbench.stimuli.engines.protocol import Job, StillFollicle
 from brainbench.stimuli.engines.rod.engine import RodEngine
 from brainbench.stimuli.engines.trust import LARGEST_CHANGE, LARGEST_STRUCK_CHANGE, force_change
+from brainbench.stimuli.motion.jobs import Job, StillFollicle
 from brainbench.stimuli.objects.obstacle import Obstacle
 from brainbench.stimuli.objects.primitives import box, capsule, sphere
 from brainbench.stimuli.validation.contact_scenes import FRICTIONS, contact_jobs, difference

@@ -80,8 +80,8 @@ def peer(device_name: str, worlds: int, links: int, steps: int) -> None:
     import mujoco_warp
 
     from brainbench.stimuli.engines.mujoco.model import build_model
-    from brainbench.stimuli.engines.protocol import Job, StillFollicle
     from brainbench.stimuli.engines.reach import reachable
+    from brainbench.stimuli.motion.jobs import Job, StillFollicle
 
     wp = warp()
     whisker = next(mount.whisker for mount in WhiskerArray.mouse() if mount.name == "C2")

@@ -10,7 +10,7 @@ import typer
 from brainbench.cli.destinations import out_file, out_file_option, picture_file
 from brainbench.cli.options import items, numbers
 from brainbench.cli.output import Output, progress_bar, table_of
-from brainbench.stimuli.engines import DEFAULT_ENGINE
+from brainbench.stimuli.engines.fidelity import DEFAULT_ENGINE
 
 _PLOT = typer.Option(callback=picture_file, help="Also draw error against cost (.png, .svg, .pdf).")
 PlotOption = Annotated[Path | None, _PLOT]

@@ -54,6 +54,24 @@ def euler_matrix(angles: ArrayLike) -> NDArray[np.float64]:
     return about_z @ about_y @ about_x
 
 
+def base_rotation(euler: ArrayLike) -> NDArray[np.float64]:
+    """Return the rotation matrices [..., 3, 3] from base frame to world of Euler angles [..., 3] (θ, φ, ζ; rad)."""
+    theta, phi, zeta = np.moveaxis(np.asarray(euler, dtype=float), -1, 0)
+    return _about("z", theta - np.pi / 2) @ _about("y", -phi) @ _about("x", zeta + np.pi / 2)
+
+
+def _about(axis: str, angle: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return rotation matrices [..., 3, 3] about one coordinate axis."""
+    # The cyclic order of the axes gives all three rotations the right-handed sign.
+    first, second = {"x": (1, 2), "y": (2, 0), "z": (0, 1)}[axis]
+    matrix = np.zeros((*np.shape(angle), 3, 3))
+    matrix[..., [0, 1, 2], [0, 1, 2]] = 1.0
+    matrix[..., first, first] = matrix[..., second, second] = np.cos(angle)
+    matrix[..., second, first] = np.sin(angle)
+    matrix[..., first, second] = -np.sin(angle)
+    return matrix
+
+
 def from_z_axis(direction: ArrayLike) -> NDArray[np.float64]:
     """Return the quaternion [4] of the shortest turn of the z axis to a unit vector [3]."""
     x, y, z = np.asarray(direction, dtype=np.float64)

@@ -19,10 +19,10 @@ from brainbench.core.errors import DataError, UsageError
 from brainbench.core.reading.ranges import check_fields
 from brainbench.core.records import Status
 from brainbench.stimuli.design_variables import Array, changed, read_limits
-from brainbench.stimuli.engines import DEFAULT_ENGINE, get_engine
-from brainbench.stimuli.engines.fidelity import Fidelity
-from brainbench.stimuli.engines.protocol import Job, Trace
+from brainbench.stimuli.engines import get_engine
+from brainbench.stimuli.engines.fidelity import DEFAULT_ENGINE, Fidelity
 from brainbench.stimuli.gradients import GradientRun
+from brainbench.stimuli.motion.jobs import Job, Trace
 from brainbench.stimuli.scenes.scene import Scene
 
 SCALE = 0.05

@@ -17,7 +17,7 @@ import msgspec
 from brainbench.core.errors import DataError, UsageError
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.job_schedule import JobSchedule
-from brainbench.stimuli.engines.protocol import Trace
+from brainbench.stimuli.motion.jobs import Trace
 from brainbench.stimuli.objects.solid import Solid
 from brainbench.stimuli.scenes.scene import Scene
 

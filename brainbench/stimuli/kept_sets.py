@@ -9,8 +9,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from brainbench.core.files import file_hash, read_json
-from brainbench.stimuli.engines import DEFAULT_ENGINE, PHYSICS_VERSION
-from brainbench.stimuli.engines.fidelity import Fidelity
+from brainbench.stimuli.engines import PHYSICS_VERSION
+from brainbench.stimuli.engines.fidelity import DEFAULT_ENGINE, Fidelity
 from brainbench.stimuli.scenes.recipes import describe_recipe, recipe_file
 
 SHIPPED = Path(__file__).with_name("data") / "sets"

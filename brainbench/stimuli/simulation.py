@@ -21,12 +21,13 @@ from brainbench.core.files import cache_dir, content_hash, portable, to_json
 from brainbench.core.progress import PREPARATION, Progress
 from brainbench.core.reading import sealed
 from brainbench.core.reading.sealed import keeping, seal_file, trust_sealed
-from brainbench.stimuli.engines import DEFAULT_ENGINE, PHYSICS_VERSION, get_engine
-from brainbench.stimuli.engines.fidelity import Fidelity
+from brainbench.stimuli.engines import PHYSICS_VERSION, get_engine
+from brainbench.stimuli.engines.fidelity import DEFAULT_ENGINE, Fidelity
 from brainbench.stimuli.engines.job_schedule import plan
-from brainbench.stimuli.engines.protocol import Trace, WhiskerEngine
+from brainbench.stimuli.engines.protocol import WhiskerEngine
 from brainbench.stimuli.explain import ATTRIBUTE, SECONDS, explain
 from brainbench.stimuli.kept_sets import find_entry
+from brainbench.stimuli.motion.jobs import Trace
 from brainbench.stimuli.readout import ORIENTATION, turn
 from brainbench.stimuli.scenes.frames import clip_wrenches
 from brainbench.stimuli.scenes.scene import Scene

@@ -19,8 +19,7 @@ from brainbench.core.progress import Progress
 from brainbench.core.reading.hdf5 import open_hdf5
 from brainbench.core.reading.regular import readable
 from brainbench.core.reading.texts import read_toml
-from brainbench.stimuli.engines import DEFAULT_ENGINE
-from brainbench.stimuli.engines.fidelity import Fidelity
+from brainbench.stimuli.engines.fidelity import DEFAULT_ENGINE, Fidelity
 from brainbench.stimuli.kept_sets import find_kept
 from brainbench.stimuli.readout import to_grid
 from brainbench.stimuli.scenes.recipes import get_recipe, is_packaged, is_recipe, list_recipes, recipe_file

@@ -38,10 +38,10 @@ from brainbench.core.files import read_json, write_json, write_text
 from brainbench.core.progress import Progress, track
 from brainbench.core.tradeoffs import TradeoffPoint, pareto_front
 from brainbench.geometry import DecompositionSettings
-from brainbench.stimuli.engines import DEFAULT_ENGINE, get_engine
-from brainbench.stimuli.engines.fidelity import RESOLUTION, SHARES, Fidelity, list_presets
-from brainbench.stimuli.engines.protocol import Job, Trace
+from brainbench.stimuli.engines import get_engine
+from brainbench.stimuli.engines.fidelity import DEFAULT_ENGINE, RESOLUTION, SHARES, Fidelity, list_presets
 from brainbench.stimuli.engines.reach import touched
+from brainbench.stimuli.motion.jobs import Job, Trace
 from brainbench.stimuli.objects.mesh_solids import touchable
 from brainbench.stimuli.objects.obstacle import Obstacle
 from brainbench.stimuli.objects.primitives import rodgers_solid

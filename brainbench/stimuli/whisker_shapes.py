@@ -16,9 +16,9 @@ from numpy.typing import ArrayLike, NDArray
 from brainbench.core.errors import UsageError
 from brainbench.core.progress import Progress
 from brainbench.core.reading.sealed import read_sealed, write_sealed
-from brainbench.stimuli.engines import DEFAULT_ENGINE
-from brainbench.stimuli.engines.fidelity import Fidelity
-from brainbench.stimuli.engines.protocol import Job, WhiskerEngine
+from brainbench.stimuli.engines.fidelity import DEFAULT_ENGINE, Fidelity
+from brainbench.stimuli.engines.protocol import WhiskerEngine
+from brainbench.stimuli.motion.jobs import Job
 from brainbench.stimuli.scenes.scene import Scene
 
 
@@ -42,7 +42,7 @@ class Recording:
 
     def unbent(self, whisker: int, instant: int) -> NDArray[np.float64]:
         """Return joints and tip [N + 1, 3] (m, world) of a whisker that nothing bends, at one instant."""
-        from brainbench.stimuli.engines.protocol import base_rotation
+        from brainbench.core.rotations import base_rotation
         from brainbench.stimuli.whiskers.chain import build_chain
 
         job, axes = self.scene.jobs()[whisker], self.scene.axes[whisker]
@@ -98,7 +98,7 @@ def bending_moments(job: Job, joints: NDArray[np.float64]) -> NDArray[np.float64
     direction (:mod:`brainbench.stimuli.whiskers.chain`); damping and twist carry none of it. ``joints`` are [n, N + 1,
     3] (m) in the frame of the job, at its times [n].
     """
-    from brainbench.stimuli.engines.protocol import base_rotation
+    from brainbench.core.rotations import base_rotation
     from brainbench.stimuli.whiskers.chain import build_chain
 
     links = joints.shape[1] - 1

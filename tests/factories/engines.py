@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from brainbench.stimuli.engines.protocol import Trace, WhiskerEngine, base_rotation
+from brainbench.core.rotations import base_rotation
+from brainbench.stimuli.engines.protocol import WhiskerEngine
+from brainbench.stimuli.motion.jobs import Trace
 
 
 class FakeEngine(WhiskerEngine):

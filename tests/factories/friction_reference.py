@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 
 from brainbench.stimuli.engines.mujoco.model import build_model, engine
-from brainbench.stimuli.engines.protocol import Job, StillFollicle
 from brainbench.stimuli.engines.reach import Reach
+from brainbench.stimuli.motion.jobs import Job, StillFollicle
 from brainbench.stimuli.objects.obstacle import Cylinder, Obstacle, Sphere
 from brainbench.stimuli.whiskers.chain import build_chain
 from brainbench.stimuli.whiskers.whisker import Whisker

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from brainbench.geometry import Mesh
 from brainbench.stimuli.engines.fidelity import Fidelity
-from brainbench.stimuli.engines.protocol import Job, StillFollicle, Trace
 from brainbench.stimuli.gradients import GradientRun, JobParameters
+from brainbench.stimuli.motion.jobs import Job, StillFollicle, Trace
 from brainbench.stimuli.objects.obstacle import Obstacle, Part
 from brainbench.stimuli.whiskers.whisker import Whisker
 

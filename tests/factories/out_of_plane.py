@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 
 from brainbench.core.errors import UsageError
 from brainbench.core.reading.ranges import check_number
-from brainbench.stimuli.engines import DEFAULT_ENGINE
-from brainbench.stimuli.engines.fidelity import Fidelity
-from brainbench.stimuli.engines.protocol import Load
+from brainbench.stimuli.engines.fidelity import DEFAULT_ENGINE, Fidelity
+from brainbench.stimuli.motion.jobs import Load
 from brainbench.stimuli.motion.trajectories import smooth_step
 from brainbench.stimuli.objects.obstacle import Capsule, Obstacle
 from brainbench.stimuli.validation.bench_tests import BenchTest, PointLoad, job_at_rest, run_one, settling_time

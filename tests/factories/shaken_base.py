@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.errors import DataError, UsageError
-from brainbench.stimuli.engines import DEFAULT_ENGINE, get_engine
-from brainbench.stimuli.engines.fidelity import Fidelity
-from brainbench.stimuli.engines.protocol import Job, StillFollicle, Trace
+from brainbench.stimuli.engines import get_engine
+from brainbench.stimuli.engines.fidelity import DEFAULT_ENGINE, Fidelity
+from brainbench.stimuli.motion.jobs import Job, StillFollicle, Trace
 from brainbench.stimuli.validation.references import beam_matrices
 from brainbench.stimuli.whiskers.whisker import Whisker
 

@@ -9,8 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from brainbench.stimuli.engines import DEFAULT_ENGINE
-from brainbench.stimuli.engines.fidelity import Fidelity
+from brainbench.stimuli.engines.fidelity import DEFAULT_ENGINE, Fidelity
 from brainbench.stimuli.scenes.recipes import get_recipe
 from brainbench.stimuli.simulation import config_hash
 from leaderboards import rank, read_records

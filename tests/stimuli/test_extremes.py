@@ -10,7 +10,7 @@ from scipy.integrate import quad
 from brainbench.core.errors import UsageError
 from brainbench.stimuli.engines import get_engine
 from brainbench.stimuli.engines.fidelity import Fidelity
-from brainbench.stimuli.engines.protocol import Job, Load, StillFollicle
+from brainbench.stimuli.motion.jobs import Job, Load, StillFollicle
 from brainbench.stimuli.objects.obstacle import Box, Capsule, Obstacle, Sphere
 from brainbench.stimuli.validation import bench_tests
 from brainbench.stimuli.whiskers.chain import build_chain

@@ -16,11 +16,10 @@ import xarray as xr
 import brainbench
 from brainbench.core.contracts import check_stimulus_set
 from brainbench.core.errors import UsageError
-from brainbench.core.rotations import euler_matrix
+from brainbench.core.rotations import base_rotation, euler_matrix
 from brainbench.stimuli import simulation
 from brainbench.stimuli.engines import PHYSICS_VERSION
 from brainbench.stimuli.engines.fidelity import Fidelity
-from brainbench.stimuli.engines.protocol import base_rotation
 from brainbench.stimuli.motion.trajectories import ArrayFollicle, Still, Translation, Whisking
 from brainbench.stimuli.objects.placed_object import PlacedObject
 from brainbench.stimuli.objects.primitives import sphere

@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 
 from brainbench.core.errors import UsageError
-from brainbench.core.rotations import euler_matrix
+from brainbench.core.rotations import base_rotation, euler_matrix
 from brainbench.stimuli import simulation
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.mujoco.engine import MujocoWhiskerEngine
-from brainbench.stimuli.engines.protocol import base_rotation
 from brainbench.stimuli.motion.trajectories import Still, Translation, Whisking
 from brainbench.stimuli.scenes.scene import Animal, Frames, Head, Scene
 from brainbench.stimuli.simulation import simulate

@@ -10,7 +10,7 @@ from brainbench.cli.options import items, with_options
 from brainbench.cli.output import Output, progress_bar, table_of
 from brainbench.cli.stimuli import scenes
 from brainbench.cli.stimuli.scenes import BackendOption, WhiskersOption
-from brainbench.stimuli.engines import DEFAULT_ENGINE
+from brainbench.stimuli.engines.fidelity import DEFAULT_ENGINE
 
 if TYPE_CHECKING:
     from brainbench.scoring.recovery.motion import NetworkDesign

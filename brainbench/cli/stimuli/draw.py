@@ -12,7 +12,7 @@ from brainbench.cli.options import numbers, refuse
 from brainbench.cli.output import Output, progress_bar
 from brainbench.cli.stimuli import scenes
 from brainbench.cli.stimuli.scenes import BackendOption, FidelityOption, StimulusOption, WhiskersOption
-from brainbench.stimuli.engines import DEFAULT_ENGINE
+from brainbench.stimuli.engines.fidelity import DEFAULT_ENGINE
 
 
 def render(

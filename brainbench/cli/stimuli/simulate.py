@@ -11,7 +11,7 @@ from brainbench.cli.destinations import out_file_option
 from brainbench.cli.options import items, numbers
 from brainbench.cli.output import Output, progress_bar, table_of
 from brainbench.cli.stimuli.scenes import BackendOption, FidelityOption, WhiskersOption
-from brainbench.stimuli.engines import DEFAULT_ENGINE
+from brainbench.stimuli.engines.fidelity import DEFAULT_ENGINE
 
 
 def simulate(

@@ -14,7 +14,7 @@ from brainbench.cli.options import SchedulerOption, WorkersOption, with_options
 from brainbench.cli.output import Output, facts, progress_bar
 from brainbench.cli.stimuli.scenes import BackendOption, FidelityOption, WhiskersOption
 from brainbench.core.errors import UsageError, check_name, listing
-from brainbench.stimuli.engines import DEFAULT_ENGINE
+from brainbench.stimuli.engines.fidelity import DEFAULT_ENGINE
 
 if TYPE_CHECKING:
     from brainbench.stimuli.sweeps.plan import GenerationPlan

@@ -33,8 +33,8 @@ from brainbench.scoring.recovery.selection import Margins
 from brainbench.stimuli import Scene, load_stimuli, simulate
 from brainbench.stimuli.design import NOTHING, DesignOptions, find_motions
 from brainbench.stimuli.design_variables import changed, read_limits
-from brainbench.stimuli.engines import DEFAULT_ENGINE, get_engine
-from brainbench.stimuli.engines.fidelity import Fidelity
+from brainbench.stimuli.engines import get_engine
+from brainbench.stimuli.engines.fidelity import DEFAULT_ENGINE, Fidelity
 from brainbench.stimuli.gradients import GradientRun
 
 Array = NDArray[np.float64]

@@ -14,9 +14,6 @@ from brainbench.core.errors import UsageError, check_name, listing
 if TYPE_CHECKING:
     from brainbench.stimuli.engines.protocol import WhiskerEngine
 
-DEFAULT_ENGINE = "rod"
-"""Engine of whatever does not ask for one; it needs no GPU."""
-
 PHYSICS_VERSION = 6
 """Version of the physics, part of the name under which simulations are kept in the cache. To be raised whenever a
 change of the code changes what a simulation gives; tests/stimuli/engines/test_golden_wrenches.py says when."""

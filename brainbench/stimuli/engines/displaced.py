@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core import rotations
-from brainbench.stimuli.engines.protocol import Follicle
+from brainbench.stimuli.motion.jobs import Follicle
 from brainbench.stimuli.objects.obstacle import Obstacle
 
 

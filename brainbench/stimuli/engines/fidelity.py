@@ -15,9 +15,11 @@ from typing import Any, Literal
 from brainbench.core.errors import UsageError, check_name, check_once, shown
 from brainbench.core.reading.ranges import check_fields, check_number
 from brainbench.core.tradeoffs import TradeoffPoint, cheapest
-from brainbench.stimuli.engines import DEFAULT_ENGINE
 from brainbench.stimuli.whiskers.chain import Chain
 from brainbench.stimuli.whiskers.whisker import Whisker
+
+DEFAULT_ENGINE = "rod"
+"""Engine of whatever does not ask for one; it needs no GPU."""
 
 
 @dataclass(frozen=True)

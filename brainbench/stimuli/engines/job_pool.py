@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 
-from brainbench.stimuli.engines.protocol import Progress, Trace
+from brainbench.stimuli.engines.protocol import Progress
+from brainbench.stimuli.motion.jobs import Trace
 
 
 def run_groups(

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from brainbench.core.files import content_hash
-from brainbench.stimuli.engines.protocol import Job
 from brainbench.stimuli.engines.reach import Reach, reachable
+from brainbench.stimuli.motion.jobs import Job
 from brainbench.stimuli.motion.trajectories import Still
 from brainbench.stimuli.scenes.scene import Scene
 

@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
-from brainbench.core.rotations import to_matrices
-from brainbench.stimuli.engines.protocol import base_rotation
+from brainbench.core.rotations import base_rotation, to_matrices
 from brainbench.stimuli.engines.reach import to_obstacle_frame
 from brainbench.stimuli.engines.trust import AT_BASE, LARGEST_START_OVERLAP, STARTED_INSIDE, fault
 from brainbench.stimuli.objects.obstacle import Box, Capsule, Cylinder, Obstacle, Part, Sphere

@@ -12,9 +12,9 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.rotations import to_matrices
-from brainbench.stimuli.engines.protocol import Job, base_rotation
+from brainbench.core.rotations import base_rotation, to_matrices
 from brainbench.stimuli.engines.reach import Reach
+from brainbench.stimuli.motion.jobs import Job
 from brainbench.stimuli.objects.obstacle import Capsule, Cylinder, Obstacle, Sphere
 
 _TINY = 1e-9

@@ -15,11 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.devices import usable_processors
+from brainbench.core.rotations import base_rotation
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.job_pool import run_groups
 from brainbench.stimuli.engines.motion_pieces import Cutting
 from brainbench.stimuli.engines.overlap import overlap_fault
-from brainbench.stimuli.engines.protocol import Job, Progress, Trace, WhiskerEngine, base_rotation
+from brainbench.stimuli.engines.protocol import Progress, WhiskerEngine
 from brainbench.stimuli.engines.reach import Reach, reachable
 from brainbench.stimuli.engines.trust import (
     GOT_INSIDE,
@@ -37,6 +38,7 @@ from brainbench.stimuli.engines.trust import (
     roughness,
     strongest_force,
 )
+from brainbench.stimuli.motion.jobs import Job, Trace
 from brainbench.stimuli.whiskers.chain import Chain
 
 

@@ -31,7 +31,7 @@ class SweepBatch:
     retried: int = 0
     """Sweeps with a whisker that was simulated again with finer steps, because it could not be trusted at first."""
     unsolved: int = 0
-    """Time steps whose contact forces were not solved (:attr:`brainbench.stimuli.engines.protocol.Trace.unsolved`)."""
+    """Time steps whose contact forces were not solved (:attr:`brainbench.stimuli.motion.jobs.Trace.unsolved`)."""
 
     def __post_init__(self) -> None:
         count, _, whiskers, channels = np.shape(self.wrench)

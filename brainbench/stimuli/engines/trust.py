@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 from brainbench.core.errors import UsageError, listing
 from brainbench.core.reading.ranges import check_number
 from brainbench.stimuli.engines.fidelity import Fidelity
-from brainbench.stimuli.engines.protocol import Job, WhiskerEngine
+from brainbench.stimuli.engines.protocol import WhiskerEngine
 from brainbench.stimuli.engines.reach import Reach, distances
 from brainbench.stimuli.engines.units import MILLI
+from brainbench.stimuli.motion.jobs import Job
 from brainbench.stimuli.objects.obstacle import Obstacle
 from brainbench.stimuli.whiskers.chain import build_chain
 from brainbench.stimuli.whiskers.whisker import Whisker

@@ -14,8 +14,7 @@ from numpy.typing import ArrayLike
 from brainbench.core.errors import UsageError, listing
 from brainbench.core.figures.style import check_format
 from brainbench.core.progress import Progress, track
-from brainbench.stimuli.engines import DEFAULT_ENGINE
-from brainbench.stimuli.engines.fidelity import Fidelity
+from brainbench.stimuli.engines.fidelity import DEFAULT_ENGINE, Fidelity
 from brainbench.stimuli.engines.protocol import WhiskerEngine
 from brainbench.stimuli.engines.units import MILLI
 from brainbench.stimuli.figures.annotation import Annotation

@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 from brainbench.core.errors import DataError
 from brainbench.stimuli.engines import get_engine
 from brainbench.stimuli.engines.fidelity import MOST_LINKS, Fidelity
-from brainbench.stimuli.engines.protocol import Job, Trace
 from brainbench.stimuli.fitting.options import FitOptions
 from brainbench.stimuli.fitting.parameters import Condition, FreeParameters
 from brainbench.stimuli.fitting.trials import Trial
 from brainbench.stimuli.gradients import GradientRun, Tangents
+from brainbench.stimuli.motion.jobs import Job, Trace
 from brainbench.stimuli.validation import references
 
 Array = NDArray[np.float64]

@@ -16,8 +16,8 @@ import numpy as np
 
 from brainbench.core.errors import UsageError, check_each
 from brainbench.core.reading.ranges import check_number
-from brainbench.stimuli.engines.protocol import Job
 from brainbench.stimuli.gradients.parameters import WHISKER, JobParameters, whisker_value, with_values
+from brainbench.stimuli.motion.jobs import Job
 from brainbench.stimuli.whiskers.whisker import Whisker
 
 

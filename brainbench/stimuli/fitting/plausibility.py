@@ -16,8 +16,8 @@ from brainbench.core.contracts import CHANNELS
 from brainbench.core.errors import DataError, listing
 
 if TYPE_CHECKING:
-    from brainbench.stimuli.engines.protocol import Trace
     from brainbench.stimuli.fitting.trials import Trial
+    from brainbench.stimuli.motion.jobs import Trace
 
 UNITS = 100.0
 """Size of the wrenches over that at the start, or its inverse, from which the unit is wrong and not the start."""

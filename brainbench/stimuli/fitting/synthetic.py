@@ -25,7 +25,7 @@ from brainbench.stimuli.whiskers.whisker import Whisker
 if TYPE_CHECKING:
     import xarray as xr
 
-    from brainbench.stimuli.engines.protocol import Trace
+    from brainbench.stimuli.motion.jobs import Trace
 
 FINE = FitOptions(links=40, steps_per_period=1000.0)
 """Setting of the simulated truth."""

@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 from brainbench.core.contracts import CHANNELS
 from brainbench.core.errors import DataError, UsageError, check_name
 from brainbench.core.reading.ranges import check_fields, check_number
-from brainbench.stimuli.engines.protocol import Job, Load, StillFollicle, Trace
 from brainbench.stimuli.fitting.curves import normal_offsets
 from brainbench.stimuli.fitting.parameters import Condition
 from brainbench.stimuli.fitting.plausibility import check_clock
 from brainbench.stimuli.fitting.tracks.contract import AXES
 from brainbench.stimuli.fitting.tracks.quality import check_length
+from brainbench.stimuli.motion.jobs import Job, Load, StillFollicle, Trace
 from brainbench.stimuli.validation import references
 from brainbench.stimuli.whiskers.chain import build_chain
 from brainbench.stimuli.whiskers.whisker import Whisker

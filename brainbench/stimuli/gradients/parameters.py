@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from brainbench.core.errors import UsageError, unknown_name
 from brainbench.stimuli.engines.displaced import MovedFollicle, move_obstacle
-from brainbench.stimuli.engines.protocol import Follicle, Job
+from brainbench.stimuli.motion.jobs import Follicle, Job
 from brainbench.stimuli.objects.obstacle import Obstacle
 from brainbench.stimuli.whiskers.whisker import Whisker
 

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from brainbench.core.devices import pick_device, usable_processors
 from brainbench.core.errors import UsageError
+from brainbench.core.rotations import base_rotation
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.planarity import stays_in_plane
-from brainbench.stimuli.engines.protocol import Job, Trace, base_rotation
 from brainbench.stimuli.engines.reach import reachable
 from brainbench.stimuli.engines.rod.adjoint import RecordingSolver
 from brainbench.stimuli.engines.rod.differences import (
@@ -30,6 +30,7 @@ from brainbench.stimuli.engines.rod.packing import capacity_for, knots_alike
 from brainbench.stimuli.engines.rod.tasks import JobTask, PackedTasks, make_task
 from brainbench.stimuli.engines.trust import check_jobs
 from brainbench.stimuli.gradients.events import ContactEvents, contact_events
+from brainbench.stimuli.motion.jobs import Job, Trace
 from brainbench.stimuli.whiskers.chain import build_chain
 
 T = TypeVar("T")

@@ -28,8 +28,7 @@ from numpy.typing import NDArray
 from brainbench.core.errors import DataError, UsageError, check_name, listing
 from brainbench.core.reading.ranges import check_fields, check_numbers
 from brainbench.core.reading.tables import read_numbers
-from brainbench.core.rotations import TURN
-from brainbench.stimuli.engines.protocol import base_rotation
+from brainbench.core.rotations import TURN, base_rotation
 from brainbench.stimuli.motion.hinge_angles import follow_angles
 from brainbench.stimuli.motion.trajectories import ROTATIONS, Rotations, Vector
 from brainbench.stimuli.whiskers.array import MountedWhisker

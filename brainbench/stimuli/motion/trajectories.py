@@ -5,19 +5,16 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.errors import UsageError
 from brainbench.core.reading.ranges import check_fields, check_number
-from brainbench.stimuli.engines.protocol import base_rotation
+from brainbench.core.rotations import base_rotation
 from brainbench.stimuli.motion.hinge_angles import follow_angles
 from brainbench.stimuli.whiskers.array import MountedWhisker
-
-if TYPE_CHECKING:
-    from brainbench.stimuli.motion.recorded import Recorded
 
 Vector = tuple[float, float, float]
 
@@ -44,6 +41,14 @@ ROTATIONS = {
 """Published coefficients for the couplings that Knutsen, Biess & Ahissar (2008, Neuron 59, 35–42)
 measured in rats: ``knutsen`` as WHISKiT uses them (Zweifel et al. 2021), ``knutsen-b`` a second
 published fit."""
+
+
+class HingeMotion(Protocol):
+    """Motion of whiskers relative to the head, such as :class:`Still`, :class:`Whisking` or recorded whisking."""
+
+    def angles(self, mount: MountedWhisker, times: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return (θ, φ, ζ) [n, 3] (rad) of one whisker."""
+        ...
 
 
 class _Motion:
@@ -270,7 +275,7 @@ class ArrayFollicle:
     """Trajectory of one whisker base in the frame in which its array stood at t = 0."""
 
     mount: MountedWhisker
-    whisking: Still | Whisking | Recorded = field(default_factory=Still)
+    whisking: HingeMotion = field(default_factory=Still)
     travel: Callable[[NDArray[np.float64]], NDArray[np.float64]] | None = None
     """Displacement of the head [n, 3] (m) at times [n]; None when it stands still."""
     turn: Callable[[NDArray[np.float64]], NDArray[np.float64]] | None = None

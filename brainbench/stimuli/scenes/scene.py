@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from brainbench.core.errors import UsageError
 from brainbench.core.reading.ranges import check_fields
-from brainbench.core.rotations import TURN, euler_matrix
-from brainbench.stimuli.engines.protocol import Job, base_rotation
+from brainbench.core.rotations import TURN, base_rotation, euler_matrix
+from brainbench.stimuli.motion.jobs import Job
 from brainbench.stimuli.motion.recorded import Recorded
 from brainbench.stimuli.motion.trajectories import ArrayFollicle, Path, Still, Translation, Vector, Whisking
 from brainbench.stimuli.objects.placed_object import PlacedObject

@@ -16,8 +16,8 @@ from brainbench.core.errors import UsageError, check_name
 from brainbench.core.files import content_hash, portable, to_plain
 from brainbench.core.reading.ranges import check_fields
 from brainbench.core.version import __version__
-from brainbench.stimuli.engines import DEFAULT_ENGINE, PHYSICS_VERSION, get_engine
-from brainbench.stimuli.engines.fidelity import Fidelity
+from brainbench.stimuli.engines import PHYSICS_VERSION, get_engine
+from brainbench.stimuli.engines.fidelity import DEFAULT_ENGINE, Fidelity
 from brainbench.stimuli.objects.collections import NamedObject
 from brainbench.stimuli.sweeps.grid import SweepGrid
 from brainbench.stimuli.sweeps.split import SPLITS, SplitBy, split_objects, split_sweeps

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from brainbench.stimuli.engines import DEFAULT_ENGINE, get_engine
-from brainbench.stimuli.engines.fidelity import Fidelity
+from brainbench.stimuli.engines import get_engine
+from brainbench.stimuli.engines.fidelity import DEFAULT_ENGINE, Fidelity
 from brainbench.stimuli.engines.protocol import WhiskerEngine
 from brainbench.stimuli.engines.sweep_batch import SweepBatch, describe_unstable, join_batches
 from brainbench.stimuli.explain import Explanation

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from brainbench.core.errors import DataError, UsageError
 from brainbench.core.reading.ranges import check_number
-from brainbench.stimuli.engines import DEFAULT_ENGINE, get_engine
-from brainbench.stimuli.engines.fidelity import Fidelity
-from brainbench.stimuli.engines.protocol import Job, Load, StillFollicle, Trace
+from brainbench.stimuli.engines import get_engine
+from brainbench.stimuli.engines.fidelity import DEFAULT_ENGINE, Fidelity
+from brainbench.stimuli.motion.jobs import Job, Load, StillFollicle, Trace
 from brainbench.stimuli.motion.trajectories import smooth_step
 from brainbench.stimuli.objects.obstacle import Capsule, Cylinder, Obstacle, RigidMotion
 from brainbench.stimuli.validation import references

@@ -10,8 +10,8 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.rotations import euler_matrix
-from brainbench.stimuli.engines.protocol import Job, Trace, base_rotation
+from brainbench.core.rotations import base_rotation, euler_matrix
+from brainbench.stimuli.motion.jobs import Job, Trace
 from brainbench.stimuli.motion.trajectories import ArrayFollicle, Whisking
 from brainbench.stimuli.objects.obstacle import Obstacle
 from brainbench.stimuli.objects.primitives import box, capsule, rodgers_solid, sphere

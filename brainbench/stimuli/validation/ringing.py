@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 
 from brainbench.core.errors import DataError, UsageError
 from brainbench.core.reading.ranges import check_number
-from brainbench.stimuli.engines import DEFAULT_ENGINE
-from brainbench.stimuli.engines.fidelity import Fidelity
-from brainbench.stimuli.engines.protocol import Job, Load, StillFollicle
+from brainbench.stimuli.engines.fidelity import DEFAULT_ENGINE, Fidelity
+from brainbench.stimuli.motion.jobs import Job, Load, StillFollicle
 from brainbench.stimuli.validation import references
 from brainbench.stimuli.validation.bench_tests import run_one
 from brainbench.stimuli.whiskers.chain import build_chain

@@ -7,7 +7,8 @@ import pytest
 from brainbench.cli.stimuli import draw, sweep
 from brainbench.cli.stimuli import simulate as simulate_command
 from brainbench.stimuli import load_stimuli, simulation, tradeoff, whisker_shapes
-from brainbench.stimuli.engines import DEFAULT_ENGINE, fidelity, get_engine, list_engines
+from brainbench.stimuli.engines import fidelity, get_engine, list_engines
+from brainbench.stimuli.engines.fidelity import DEFAULT_ENGINE
 from brainbench.stimuli.figures import scenes
 from brainbench.stimuli.sweeps.plan import GenerationSettings
 from brainbench.stimuli.sweeps.simulation import simulate_sweeps

@@ -11,8 +11,8 @@ from brainbench.geometry import Mesh
 from brainbench.stimuli import get_recipe, simulate
 from brainbench.stimuli.engines import get_engine
 from brainbench.stimuli.engines.fidelity import Fidelity
-from brainbench.stimuli.engines.protocol import Job, Load, StillFollicle
 from brainbench.stimuli.engines.trust import LARGEST_OVERLAP, LARGEST_STRAIN, LOST, halved, judge
+from brainbench.stimuli.motion.jobs import Job, Load, StillFollicle
 from brainbench.stimuli.objects.obstacle import Box, Capsule, Obstacle, Sphere
 from brainbench.stimuli.validation.contact_scenes import contact_jobs, difference
 from tests.factories.trust import facts

@@ -8,9 +8,9 @@ from brainbench.stimuli.engines import get_engine
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.motion_pieces import KNOT, MOST_PIECES, SPEED_ERROR, Cutting
 from brainbench.stimuli.engines.mujoco.engine import MujocoWhiskerEngine
-from brainbench.stimuli.engines.protocol import Job, StillFollicle
 from brainbench.stimuli.engines.rod.engine import RodEngine
 from brainbench.stimuli.engines.stepping import SteppedJob
+from brainbench.stimuli.motion.jobs import Job, StillFollicle
 from brainbench.stimuli.motion.trajectories import Whisking
 from brainbench.stimuli.objects.obstacle import Obstacle, Sphere
 from tests.factories.swing import FLAT, Oscillation

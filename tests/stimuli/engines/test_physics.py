@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from brainbench.core.errors import UsageError
+from brainbench.core.rotations import base_rotation
 from brainbench.stimuli.engines import get_engine, list_engines
 from brainbench.stimuli.engines.fidelity import Fidelity
-from brainbench.stimuli.engines.protocol import Job, Load, StillFollicle, base_rotation
+from brainbench.stimuli.motion.jobs import Job, Load, StillFollicle
 from brainbench.stimuli.objects.obstacle import Box, Capsule, ConvexPart, Cylinder, Obstacle, Sphere
 from brainbench.stimuli.validation import bench_tests
 from brainbench.stimuli.validation.ringing import ringdown

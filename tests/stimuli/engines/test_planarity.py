@@ -7,9 +7,9 @@ import pytest
 
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.planarity import stays_in_plane
-from brainbench.stimuli.engines.protocol import Job, Load, StillFollicle
 from brainbench.stimuli.engines.reach import reachable
 from brainbench.stimuli.engines.rod.engine import RodEngine
+from brainbench.stimuli.motion.jobs import Job, Load, StillFollicle
 from brainbench.stimuli.objects.obstacle import Box, Capsule, Cylinder, Obstacle, Sphere
 from tests.factories.whiskers import H
 

@@ -8,9 +8,9 @@ import pytest
 from brainbench.stimuli import WhiskerArray
 from brainbench.stimuli.engines import get_engine
 from brainbench.stimuli.engines.fidelity import Fidelity
-from brainbench.stimuli.engines.protocol import Job, StillFollicle
 from brainbench.stimuli.engines.stepping import SteppedJob
 from brainbench.stimuli.engines.trust import changes_words, roughness
+from brainbench.stimuli.motion.jobs import Job, StillFollicle
 from brainbench.stimuli.objects.obstacle import Box, Capsule, Cylinder, Obstacle, Sphere
 from brainbench.stimuli.validation.contact_scenes import contact_jobs
 from tests.factories.whiskers import C2

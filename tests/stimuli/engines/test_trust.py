@@ -10,7 +10,6 @@ from brainbench.core.errors import UsageError
 from brainbench.geometry import Mesh
 from brainbench.stimuli.engines import get_engine
 from brainbench.stimuli.engines.fidelity import Fidelity
-from brainbench.stimuli.engines.protocol import Job, StillFollicle
 from brainbench.stimuli.engines.reach import reachable
 from brainbench.stimuli.engines.trust import (
     AT_BASE,
@@ -28,6 +27,7 @@ from brainbench.stimuli.engines.trust import (
     step_travel,
     strongest_force,
 )
+from brainbench.stimuli.motion.jobs import Job, StillFollicle
 from brainbench.stimuli.objects.obstacle import Capsule, Obstacle, Sphere
 from brainbench.stimuli.whiskers.whisker import Whisker
 from tests.factories.trust import facts

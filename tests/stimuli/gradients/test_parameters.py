@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from brainbench.core.errors import UsageError
-from brainbench.stimuli.engines.protocol import Job, StillFollicle
 from brainbench.stimuli.gradients import JobParameters
+from brainbench.stimuli.motion.jobs import Job, StillFollicle
 from brainbench.stimuli.objects.obstacle import Sphere
 from tests.factories.gradients import WHISKER, Swing, gradient_errors, touching_job
 

@@ -9,9 +9,9 @@ from brainbench.core.errors import UsageError
 from brainbench.core.rotations import euler_matrix
 from brainbench.geometry import Mesh
 from brainbench.stimuli.engines.fidelity import Fidelity
-from brainbench.stimuli.engines.protocol import Job, Load, StillFollicle
 from brainbench.stimuli.engines.rod.adjoint import RecordingSolver
 from brainbench.stimuli.gradients import GradientRun, JobParameters
+from brainbench.stimuli.motion.jobs import Job, Load, StillFollicle
 from brainbench.stimuli.objects.obstacle import Box, Capsule, Cylinder, Obstacle, Sphere
 from brainbench.stimuli.validation.contact_scenes import contact_jobs
 from tests.factories.gradients import COARSE, WHISKER, Swing, gradient_errors, touching_job

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from brainbench.core.errors import UsageError
-from brainbench.core.rotations import euler_matrix
+from brainbench.core.rotations import base_rotation, euler_matrix
 from brainbench.stimuli.engines.fidelity import Fidelity
-from brainbench.stimuli.engines.protocol import base_rotation
 from brainbench.stimuli.motion.trajectories import Path, Still, Translation, Whisking
 from brainbench.stimuli.objects.placed_object import PlacedObject
 from brainbench.stimuli.objects.primitives import sphere

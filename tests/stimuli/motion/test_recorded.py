@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError
+from brainbench.core.rotations import base_rotation
 from brainbench.stimuli.engines.fidelity import Fidelity
-from brainbench.stimuli.engines.protocol import base_rotation
 from brainbench.stimuli.motion.hinge_angles import follow_angles, principal_angles
 from brainbench.stimuli.motion.recorded import LAYOUTS, Recorded, Trajectory, load_initial_angles, load_trajectory
 from brainbench.stimuli.motion.trajectories import Whisking

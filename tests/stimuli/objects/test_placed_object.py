@@ -13,7 +13,7 @@ from brainbench.core.rotations import euler_matrix, to_matrices
 from brainbench.geometry import DecompositionSettings, Mesh, load_mesh
 from brainbench.stimuli.engines import get_engine
 from brainbench.stimuli.engines.fidelity import Fidelity
-from brainbench.stimuli.engines.protocol import Job, StillFollicle
+from brainbench.stimuli.motion.jobs import Job, StillFollicle
 from brainbench.stimuli.motion.trajectories import Path, Spin, Translation
 from brainbench.stimuli.objects import procedural
 from brainbench.stimuli.objects.mesh_solids import mesh_solid, shape_solid, touchable

@@ -8,8 +8,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from brainbench.core.errors import UsageError
+from brainbench.core.rotations import base_rotation
 from brainbench.stimuli.engines.fidelity import Fidelity
-from brainbench.stimuli.engines.protocol import Trace, WhiskerEngine, base_rotation
+from brainbench.stimuli.engines.protocol import WhiskerEngine
+from brainbench.stimuli.motion.jobs import Trace
 from brainbench.stimuli.motion.trajectories import ArrayFollicle, Path, Still, Whisking
 from brainbench.stimuli.objects.placed_object import PlacedObject
 from brainbench.stimuli.objects.primitives import sphere

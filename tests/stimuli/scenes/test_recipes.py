@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from brainbench.core.errors import UsageError
-from brainbench.core.rotations import euler_matrix
-from brainbench.stimuli.engines.protocol import base_rotation
+from brainbench.core.rotations import base_rotation, euler_matrix
 from brainbench.stimuli.motion.recorded import Trajectory
 from brainbench.stimuli.objects.primitives import box, rodgers_solid
 from brainbench.stimuli.scenes.recipes import describe_recipe, get_recipe, list_recipes

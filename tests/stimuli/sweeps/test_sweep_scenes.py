@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from brainbench.core.errors import UsageError
+from brainbench.core.rotations import base_rotation
 from brainbench.stimuli.engines.fidelity import Fidelity
-from brainbench.stimuli.engines.protocol import base_rotation
 from brainbench.stimuli.motion.trajectories import Still, Translation
 from brainbench.stimuli.objects.primitives import box, capsule, cylinder, rodgers_solid, sphere
 from brainbench.stimuli.scenes.recipes import describe_recipe, get_recipe

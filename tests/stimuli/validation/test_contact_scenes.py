@@ -7,7 +7,7 @@ import pytest
 
 from brainbench.stimuli.engines import get_engine
 from brainbench.stimuli.engines.fidelity import Fidelity
-from brainbench.stimuli.engines.protocol import Trace
+from brainbench.stimuli.motion.jobs import Trace
 from brainbench.stimuli.validation.contact_scenes import CELLS, contact_jobs, difference
 
 

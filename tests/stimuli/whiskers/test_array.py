@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from brainbench.core.errors import UsageError
-from brainbench.stimuli.engines.protocol import base_rotation
+from brainbench.core.rotations import base_rotation
 from brainbench.stimuli.whiskers.array import WhiskerArray
 
 ARRAYS = {"mouse": WhiskerArray.mouse, "rat": WhiskerArray.rat}

@@ -23,15 +23,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.rotations import to_matrices
+from brainbench.core.rotations import base_rotation, to_matrices
 from brainbench.stimuli.engines.bullet.contact import contact_axes, cross_matrix, solve_contacts
 from brainbench.stimuli.engines.bullet.model import FOLLICLE, BulletWorld, engine
 from brainbench.stimuli.engines.mujoco.drive import drive_scalars
-from brainbench.stimuli.engines.protocol import Trace, base_rotation
 from brainbench.stimuli.engines.reach import Reach
 from brainbench.stimuli.engines.stepping import SteppedEngine, SteppedJob
 from brainbench.stimuli.engines.trust import state_fault
 from brainbench.stimuli.engines.units import MICRO, MILLI
+from brainbench.stimuli.motion.jobs import Trace
 
 SEARCH = 0.02
 """Distance (mm), beside the way that the whisker may move in the step, within which contacts are sought."""

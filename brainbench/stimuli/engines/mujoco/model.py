@@ -18,13 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.errors import MissingDependencyError
-from brainbench.core.rotations import to_matrices
+from brainbench.core.rotations import base_rotation, to_matrices
 from brainbench.stimuli.engines.mujoco.drive import ARMATURE, PrescribedMotion, drive_free, drive_scalars
-from brainbench.stimuli.engines.protocol import Job, base_rotation
 from brainbench.stimuli.engines.reach import Reach
 from brainbench.stimuli.engines.tapered_links import LEAST_TAPER, cone_vertices
 from brainbench.stimuli.engines.trust import step_travel
 from brainbench.stimuli.engines.units import MICRO, MILLI
+from brainbench.stimuli.motion.jobs import Job
 from brainbench.stimuli.objects.obstacle import Box, ConvexPart, Obstacle, Part, Sphere
 from brainbench.stimuli.whiskers.chain import Chain
 

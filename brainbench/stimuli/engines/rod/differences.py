@@ -18,14 +18,15 @@ from numpy.typing import NDArray
 
 from brainbench.core import rotations
 from brainbench.core.errors import UsageError
+from brainbench.core.rotations import base_rotation
 from brainbench.geometry import Mesh
 from brainbench.stimuli.engines.motion_pieces import carried_pose
-from brainbench.stimuli.engines.protocol import Job, base_rotation
 from brainbench.stimuli.engines.rod.limits import LIGHT
 from brainbench.stimuli.engines.rod.packing import knots_alike, pack_chains, rotation_vectors
 from brainbench.stimuli.engines.rod.shapes import PackedShapes, middle_of
 from brainbench.stimuli.engines.rod.tasks import JobTask, PackedTasks
 from brainbench.stimuli.engines.units import MILLI
+from brainbench.stimuli.motion.jobs import Job
 from brainbench.stimuli.objects.obstacle import ConvexPart, Obstacle
 from brainbench.stimuli.whiskers.chain import Chain, build_chain
 from brainbench.stimuli.whiskers.whisker import Whisker

@@ -15,7 +15,7 @@ from brainbench.core.devices import pick_device, usable_processors, warp
 from brainbench.core.progress import Progress as NamedProgress
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.job_pool import run_groups
-from brainbench.stimuli.engines.protocol import Job, Progress, Trace, WhiskerEngine
+from brainbench.stimuli.engines.protocol import Progress, WhiskerEngine
 from brainbench.stimuli.engines.rod.compilation import load_kernels
 from brainbench.stimuli.engines.rod.launch import LaunchResult, WhiskerSolver, real_type
 from brainbench.stimuli.engines.rod.packing import Track, capacity_for
@@ -25,6 +25,7 @@ from brainbench.stimuli.engines.rod.tries import Try, run_with_retries, tries_ah
 from brainbench.stimuli.engines.stepping import silent_trace
 from brainbench.stimuli.engines.sweep_batch import SweepBatch
 from brainbench.stimuli.engines.trust import check_jobs
+from brainbench.stimuli.motion.jobs import Job, Trace
 from brainbench.stimuli.objects.solid import Solid
 from brainbench.stimuli.sweeps.sweep_scenes import SweepScenes
 

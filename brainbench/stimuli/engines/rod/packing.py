@@ -11,10 +11,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core import rotations
 from brainbench.core.errors import UsageError
+from brainbench.core.rotations import base_rotation
 from brainbench.stimuli.engines.motion_pieces import Cutting, MotionPieces, Pose, carried_pose, side_of
-from brainbench.stimuli.engines.protocol import Follicle, Load, base_rotation
 from brainbench.stimuli.engines.rod.limits import LIGHT
 from brainbench.stimuli.engines.units import MICRO, MILLI
+from brainbench.stimuli.motion.jobs import Follicle, Load
 from brainbench.stimuli.objects.obstacle import Obstacle
 from brainbench.stimuli.whiskers.chain import Chain
 

@@ -18,9 +18,8 @@ from numpy.typing import NDArray
 
 from brainbench.core.devices import pick_device
 from brainbench.core.errors import UsageError
-from brainbench.core.rotations import euler_matrix, from_matrices
+from brainbench.core.rotations import base_rotation, euler_matrix, from_matrices
 from brainbench.stimuli.engines.fidelity import Fidelity
-from brainbench.stimuli.engines.protocol import base_rotation
 from brainbench.stimuli.engines.rod.launch import LaunchResult, WhiskerSolver
 from brainbench.stimuli.engines.rod.limits import MESHES
 from brainbench.stimuli.engines.rod.packing import PackedJobs, PackedMotions, still_knots

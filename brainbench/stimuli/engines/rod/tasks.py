@@ -13,7 +13,6 @@ from numpy.typing import ArrayLike, NDArray
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.motion_pieces import KNOT, Cutting
 from brainbench.stimuli.engines.planarity import stays_in_plane
-from brainbench.stimuli.engines.protocol import Job
 from brainbench.stimuli.engines.reach import Reach, reachable
 from brainbench.stimuli.engines.rod.launch import LaunchResult, WhiskerSolver
 from brainbench.stimuli.engines.rod.limits import FINEST, WIDEST
@@ -30,6 +29,7 @@ from brainbench.stimuli.engines.rod.shapes import PackedShapes, TrackedObstacle
 from brainbench.stimuli.engines.stepping import is_silent
 from brainbench.stimuli.engines.trust import BLOW, BLOW_STRIDE, HARD_BLOW, near_travel, step_travel
 from brainbench.stimuli.engines.units import MILLI
+from brainbench.stimuli.motion.jobs import Job
 from brainbench.stimuli.whiskers.chain import Chain
 
 

@@ -11,13 +11,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from brainbench.core.errors import MissingDependencyError, UsageError
+from brainbench.core.rotations import base_rotation
 from brainbench.stimuli import get_recipe
 from brainbench.stimuli.engines import get_engine
 from brainbench.stimuli.engines.bullet import model
 from brainbench.stimuli.engines.bullet.contact import contact_axes, cross_matrix, solve_contacts
 from brainbench.stimuli.engines.bullet.model import FOLLICLE, MOST_LINKS, BulletWorld
 from brainbench.stimuli.engines.fidelity import Fidelity
-from brainbench.stimuli.engines.protocol import Job, Load, StillFollicle, base_rotation
+from brainbench.stimuli.motion.jobs import Job, Load, StillFollicle
 from brainbench.stimuli.objects.obstacle import Box, Capsule, ConvexPart, Cylinder, Obstacle, Sphere
 from brainbench.stimuli.scenes.frames import Frames
 from brainbench.stimuli.validation import bench_tests

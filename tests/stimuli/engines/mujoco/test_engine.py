@@ -12,8 +12,8 @@ from brainbench.core.errors import UsageError
 from brainbench.stimuli import Frames, PlacedObject, Scene, Solid, WhiskerArray, simulate
 from brainbench.stimuli.engines import get_engine, list_engines
 from brainbench.stimuli.engines.fidelity import Fidelity
-from brainbench.stimuli.engines.protocol import Job, Load, StillFollicle
 from brainbench.stimuli.engines.reach import reachable
+from brainbench.stimuli.motion.jobs import Job, Load, StillFollicle
 from brainbench.stimuli.motion.trajectories import Still, Translation
 from brainbench.stimuli.objects.obstacle import ConvexPart
 from brainbench.stimuli.whiskers.chain import build_chain

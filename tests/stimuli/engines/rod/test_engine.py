@@ -12,8 +12,8 @@ import pytest
 from brainbench.core.errors import UsageError
 from brainbench.geometry import Mesh
 from brainbench.stimuli.engines.fidelity import Fidelity
-from brainbench.stimuli.engines.protocol import Job, StillFollicle
 from brainbench.stimuli.engines.rod.engine import RodEngine
+from brainbench.stimuli.motion.jobs import Job, StillFollicle
 from brainbench.stimuli.objects.collections import resolve_objects
 from brainbench.stimuli.objects.obstacle import Box, Capsule, Obstacle
 from brainbench.stimuli.sweeps.grid import SweepGrid

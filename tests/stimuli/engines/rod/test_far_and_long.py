@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from brainbench.stimuli.engines.fidelity import Fidelity
-from brainbench.stimuli.engines.protocol import Job, StillFollicle
 from brainbench.stimuli.engines.rod.engine import RodEngine
+from brainbench.stimuli.motion.jobs import Job, StillFollicle
 from brainbench.stimuli.objects.obstacle import Box, Capsule, Obstacle, Sphere
 from tests.factories.obstacles import post
 from tests.factories.swing import Oscillation

@@ -5,12 +5,13 @@ import itertools
 import numpy as np
 import pytest
 
+from brainbench.core.rotations import base_rotation
 from brainbench.geometry import Mesh, winding_number
 from brainbench.geometry.distance import point_triangle_distance
 from brainbench.stimuli.engines import get_engine
 from brainbench.stimuli.engines.fidelity import Fidelity
-from brainbench.stimuli.engines.protocol import Job, StillFollicle, base_rotation
 from brainbench.stimuli.engines.rod.engine import RodEngine
+from brainbench.stimuli.motion.jobs import Job, StillFollicle
 from brainbench.stimuli.objects.mesh_solids import shape_solid
 from brainbench.stimuli.objects.obstacle import Box, Capsule, ConvexPart, Cylinder, Obstacle, Sphere
 from brainbench.stimuli.objects.procedural import make
