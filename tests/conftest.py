@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
@@ -41,3 +43,49 @@ def _private_cache(tmp_path_factory: pytest.TempPathFactory) -> None:
     chosen = os.environ.get("BRAINBENCH_TEST_CACHE")
     os.environ["BRAINBENCH_CACHE"] = chosen or str(tmp_path_factory.mktemp("cache"))
     os.environ["BRAINBENCH_CONFIG"] = str(tmp_path_factory.mktemp("settings"))
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Exit status and streams of a command."""
+
+    status: int
+    out: str
+    err: str
+
+
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., Outcome]:
+    """Return a function that runs the command line in this process, as the console script does."""
+    from brainbench.cli import main, output
+
+    # Lines of progress depend on the machine's load; they stay out of what is asserted of stderr.
+    monkeypatch.setattr(output, "FIRST_LINE", 1e6)
+
+    def call(*arguments: str) -> Outcome:
+        monkeypatch.setattr(sys, "argv", ["brainbench", *arguments])
+        status = 0
+        try:
+            main()
+        except SystemExit as stop:
+            status = int(stop.code or 0)
+        captured = capsys.readouterr()
+        return Outcome(status, captured.out, captured.err)
+
+    return call
+
+
+@pytest.fixture
+def files(tmp_path: Path) -> dict[str, str]:
+    """Files of a recording of two animals, and features, stimuli and a model for its four conditions."""
+    from tests.factories.scored_files import write_scored_files
+
+    return write_scored_files(tmp_path)
+
+
+@pytest.fixture
+def study(tmp_path: Path) -> dict[str, str]:
+    """Files of four animals and eight stimuli, and features for them."""
+    from tests.factories.scored_files import write_study
+
+    return write_study(tmp_path)

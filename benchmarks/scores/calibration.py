@@ -28,13 +28,13 @@ from brainbench.core.files import write_text
 from brainbench.core.jobs import run_jobs
 from brainbench.core.trials import Trials
 from brainbench.metrics import compare, get_metric, noise_ceiling, rdm
-from brainbench.metrics.inference.dimension import signal_dimensions
 from brainbench.metrics.inference.multiple import step_down
 from brainbench.metrics.inference.permutation import label_orders
-from brainbench.metrics.inference.power import ExperimentDesign, power, simulate_experiments
 from brainbench.metrics.rdms.comparison import compare_all, features
 from brainbench.metrics.rdms.pairs import permuted_pairs
 from brainbench.metrics.reliability.subject_rdm import SubjectRDM, subject_rdm
+from brainbench.scoring.power.dimensions import signal_dimensions
+from brainbench.scoring.power.experiments import ExperimentDesign, power, simulate_experiments
 
 DOCS = Path(__file__).parents[2] / "docs"
 IMAGES = DOCS / "images"

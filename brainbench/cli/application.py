@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+import copy
 import logging
 import sys
 from collections.abc import Sequence
 from importlib import import_module
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
+from brainbench.core.errors import MissingDependencyError
+from brainbench.core.plugins import OptionalPart, optional_parts
 from brainbench.core.version import __version__
 
 COMMANDS = {
     "score": "Score a model against neural recordings and write a result record and an HTML report.",
-    "power": "Say how often a true effect would be found, and how many stimuli or animals are needed.",
     "recovery": "Say whether an experiment could tell networks apart: each network in turn makes the animals.",
     "train": "Train a model with its published recipe, or go on with a run that was interrupted.",
     "export": "Export one step, obs and h_in to features and h_out, with its contract, and check the written file.",
@@ -30,16 +32,27 @@ COMMANDS = {
 """Command or group of commands → its line in the help."""
 ELSEWHERE = {"export": "models"}
 """Command → its module, where that is called otherwise."""
+OPTIONAL = "brainbench.commands"
+"""Entry points of optional commands: ``power``, or ``stimuli.fit`` inside a group."""
+OPTIONAL_PANEL = "Optional commands, each in a folder that can be taken off"
+_LOG = logging.getLogger(__name__)
 
 
 def build(words: Sequence[str] | None = None) -> typer.Typer:
     """Return the command line: the command that ``words`` begin with alone; without words all, complete.
 
     Before any command is named in the words, all stand there with their help alone.
+
+    Raises:
+        MissingDependencyError: the words name an optional command whose folder was taken off.
     """
-    asked = None if words is None else next((word for word in words if not word.startswith("-")), "")
+    named = None if words is None else next((word for word in words if not word.startswith("-")), "")
+    second = words[1] if words and len(words) > 1 else ""
+    # Looking for entry points takes a twentieth of a second: main commands do without.
+    optional = {} if named in COMMANDS else _optional_commands()
+    single = named in COMMANDS or named in optional
     # To read options of its own costs typer a tenth of a second: they stand there where they are used or shown.
-    bare = bool(words) and words[0] == asked and asked in COMMANDS
+    bare = bool(words) and words[0] == named and single
     app = typer.Typer(
         name="brainbench",
         help="Which artificial networks process touch the way a brain does?",
@@ -50,23 +63,66 @@ def build(words: Sequence[str] | None = None) -> typer.Typer:
         rich_markup_mode="rich",
         context_settings={"help_option_names": ["-h", "--help"]},
     )
-    second = words[1] if words and len(words) > 1 else ""
     app.callback()(_set_up if bare else _root)
     for name, summary in COMMANDS.items():
-        if asked is None or asked == name:
+        if named is None or named == name:
             module = import_module(f"brainbench.cli.{ELSEWHERE.get(name, name)}")
-            if hasattr(module, name):
-                app.command(name)(getattr(module, name))
-                continue
-            inner = {command.name for command in module.app.registered_commands}
-            app.add_typer(module.app, name=name, help=summary, add_help_option=not (bare and second in inner))
-        elif asked not in COMMANDS:
+            command = getattr(module, name, None) or _with_optional(module.app, name, second if bare else None)
+            _add(app, name, command, summary, second if bare else None)
+        elif not single:
             app.command(name, help=summary)(_named_only)
-    if asked is None or asked in COMMANDS:
+    for name, part in optional.items():
+        if named == name:
+            _add(app, name, part.load("command"), part.summary, second if bare else None)
+        elif named is None and (command := _loaded(part)) is not None:
+            _add(app, name, command, part.summary, None, OPTIONAL_PANEL)
+        elif named is not None and not single and part.present:
+            app.command(name, help=part.summary, rich_help_panel=OPTIONAL_PANEL)(_named_only)
+    if named is None or single:
         from brainbench.cli.requirements import guard
 
         guard(app)
     return app
+
+
+def _add(app: typer.Typer, name: str, command: Any, help: str, second: str | None, panel: str | None = None) -> None:
+    """Enter a command or a group; a group whose ``second`` word names one of its commands needs no help of its own."""
+    if not isinstance(command, typer.Typer):
+        app.command(name, rich_help_panel=panel)(command)
+        return
+    inner = {item.name for item in command.registered_commands}
+    app.add_typer(command, name=name, help=help, add_help_option=second not in inner, rich_help_panel=panel)
+
+
+def _optional_commands(group: str = "") -> dict[str, OptionalPart]:
+    """Return the optional commands of a group, or those outside groups, by their own names."""
+    parts = {name.rpartition("."): part for name, part in optional_parts(OPTIONAL).items() if name not in COMMANDS}
+    return {name: part for (outer, _, name), part in sorted(parts.items()) if outer == group}
+
+
+def _with_optional(group: typer.Typer, name: str, second: str | None) -> typer.Typer:
+    """Return a group with its optional commands; only the ``second`` word's, if the group's own do not have it."""
+    if second and second in {item.name for item in group.registered_commands}:
+        return group
+    complete = copy.copy(group)
+    complete.registered_commands = [*group.registered_commands]
+    for inner, part in _optional_commands(name).items():
+        if second and second == inner:
+            complete.command(inner)(part.load("command"))
+        elif (command := _loaded(part)) is not None:
+            complete.command(inner, rich_help_panel=OPTIONAL_PANEL)(command)
+    return complete
+
+
+def _loaded(part: OptionalPart) -> Any:
+    """Return an optional command for the help of all; None, with a line in the log if it is faulty, where it is not."""
+    if part.taken_off:
+        return None
+    try:
+        return part.load("command")
+    except MissingDependencyError as error:
+        _LOG.warning("%s", error)
+        return None
 
 
 def _named_only() -> None:

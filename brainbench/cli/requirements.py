@@ -15,7 +15,7 @@ from typing import Any
 
 import typer
 
-from brainbench.cli.output import printed
+from brainbench.cli.output import Output, printed
 from brainbench.core.errors import FileWriteError, UsageError, missing_dependency, shown
 from brainbench.core.files import CACHE_VARIABLE, cache_dir
 
@@ -81,11 +81,35 @@ EXTRAS: dict[str, tuple[Requirement, ...]] = {
 }  # fmt: skip
 
 CACHED = (
-    "score", "power", "recovery", "train", "stimuli simulate", "stimuli render", "stimuli plot", "stimuli separability",
+    "score", "recovery", "train", "stimuli simulate", "stimuli render", "stimuli plot", "stimuli separability",
     "stimuli hand", "tactile demo", "tactile bench", "policy play", "policy train", "policy evaluate", "policy distill",
     "tradeoff score", "tradeoff model", "leaderboard add", "leaderboard verify",
 )  # fmt: skip
 """Commands that keep what they compute in the cache."""
+
+
+@dataclass(frozen=True)
+class Needs:
+    """What a command needs before it starts."""
+
+    packages: tuple[Requirement, ...] = ()
+    cache: bool = False
+    """Whether the command keeps what it computes in the cache."""
+
+
+def needs(*packages: Requirement, cache: bool = False) -> Callable[[Callable[..., Output]], Callable[..., Output]]:
+    """Decorate a command, outermost, with what it needs."""
+
+    def mark(command: Callable[..., Output]) -> Callable[..., Output]:
+        command.needs = Needs(packages, cache)  # type: ignore[attr-defined]
+        return command
+
+    return mark
+
+
+def needs_of(name: str, command: Callable[..., Any] | None) -> Needs:
+    """Return what a command needs: what it was decorated with, else what the tables say."""
+    return getattr(command, "needs", Needs(EXTRAS.get(name, ()), name in CACHED))
 
 
 def check_cache() -> None:
@@ -98,7 +122,7 @@ def check_cache() -> None:
         )
 
 
-def check_requirements(command: str, values: Mapping[str, Any]) -> None:
+def check_requirements(needs: Needs, values: Mapping[str, Any]) -> None:
     """Check what a command needs for the values of its parameters.
 
     Raises:
@@ -110,14 +134,14 @@ def check_requirements(command: str, values: Mapping[str, Any]) -> None:
                 raise UsageError(f"The option {name!r} takes a finite number; received {number}.")
     lacking = {
         DISTRIBUTIONS.get(module, module): item
-        for item in EXTRAS.get(command, ())
+        for item in needs.packages
         for module in (item.packages if item.when(values) else ())
         if find_spec(module) is None
     }
     if lacking:
         extras = ",".join(dict.fromkeys(item.extra for item in lacking.values()))
         raise missing_dependency(*lacking, extra=extras, purpose=next(iter(lacking.values())).purpose)
-    if command in CACHED:
+    if needs.cache:
         check_cache()
 
 
@@ -139,9 +163,11 @@ def commands(app: typer.Typer, path: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def _checked(name: str, callback: Callable[..., Any]) -> Callable[..., Any]:
+    needed = needs_of(name, callback)
+
     @functools.wraps(callback)
     def run(*args: Any, **values: Any) -> Any:
-        check_requirements(name, values)
+        check_requirements(needed, values)
         return callback(*args, **values)
 
     return run

@@ -1,7 +1,13 @@
-"""Objects of users and of other packages: ``FILE.py:NAME``, ``package.module:NAME`` and entry points."""
+"""Objects of users and of other packages: ``FILE.py:NAME``, ``package.module:NAME`` and entry points.
+
+Optional folders of this project register their commands, metrics, engines and so on as entry points too
+(``pyproject.toml``). Such a folder may be deleted: its entries are then left out of every list, and whoever asks for
+one of them by name reads which folder held it.
+"""
 
 from __future__ import annotations
 
+import ast
 import hashlib
 import importlib
 import importlib.util
@@ -9,11 +15,19 @@ import logging
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from brainbench.core.errors import BrainbenchError, DataError, DataFileNotFoundError, UsageError, unknown_name
+from brainbench.core.errors import (
+    BrainbenchError,
+    DataError,
+    DataFileNotFoundError,
+    MissingDependencyError,
+    UsageError,
+    unknown_name,
+)
 
 _LOG = logging.getLogger(__name__)
 _beside: dict[str, Path] = {}
@@ -69,15 +83,127 @@ def files_of(path: Path) -> tuple[Path, ...]:
     return _files.get(path.resolve(), (path,))
 
 
-def load_entry_points(group: str, take: Callable[[str, Any], None]) -> None:
-    """Hand every object of an entry-point group to ``take(name, object)``; a faulty one is logged and left out."""
+@dataclass(frozen=True)
+class OptionalPart:
+    """An entry point: a named object that its module, possibly in a folder that was taken off, adds to a group."""
+
+    group: str
+    """Entry-point group, for instance ``brainbench.commands``."""
+    name: str
+    target: str
+    """``package.module:attribute``."""
+
+    @property
+    def present(self) -> bool:
+        """Whether its module can be found; nothing of it is imported for that."""
+        if self._source() is not None:
+            return True
+        try:
+            return importlib.util.find_spec(self.target.partition(":")[0]) is not None
+        except ImportError:
+            return False
+
+    @property
+    def taken_off(self) -> bool:
+        """Whether its package is here without the folder that should hold it."""
+        return not self.present and _folder_of(self.target.partition(".")[0]) is not None
+
+    @property
+    def folder(self) -> str:
+        """Folder that holds it, from the root of the checkout: the outermost one that is missing, if one is."""
+        package = self.target.partition(":")[0].rpartition(".")[0]
+        parts, root = package.split("."), _folder_of(package.partition(".")[0])
+        for depth in range(1, len(parts) + 1):
+            if root is None or not any(root.parent.joinpath(*parts[:depth]).glob("*.py")):
+                return "/".join(parts[:depth])
+        return "/".join(parts)
+
+    @property
+    def summary(self) -> str:
+        """First line of its documentation, read from its source: the help of a command group, else the docstring."""
+        source, attribute = self._source(), self.target.partition(":")[2]
+        for node in ast.parse(source.read_text(encoding="utf-8")).body if source is not None else []:
+            if isinstance(node, ast.FunctionDef | ast.ClassDef) and node.name == attribute:
+                return (ast.get_docstring(node) or "").partition("\n")[0]
+            if isinstance(node, ast.Assign) and isinstance(node.value, ast.Call) and _assigns(node, attribute):
+                texts = [keyword.value for keyword in node.value.keywords if keyword.arg == "help"]
+                return str(texts[0].value) if texts and isinstance(texts[0], ast.Constant) else ""
+        return ""
+
+    def load(self, kind: str) -> Any:
+        """Import and return the object; ``kind`` is what it is, for messages: ``command``, ``metric``, ``engine``.
+
+        Raises:
+            MissingDependencyError: its folder was taken off, or its module cannot be imported.
+        """
+        module, _, attribute = self.target.partition(":")
+        words = self.name.replace(".", " ")
+        if self.taken_off:
+            raise MissingDependencyError(
+                f"The {kind} {words!r} belongs to the optional folder {self.folder}, which is "
+                "not in this installation; put the folder back to use it."
+            )
+        try:
+            loaded = importlib.import_module(module)
+            return getattr(loaded, attribute) if attribute else loaded
+        except BrainbenchError:
+            raise
+        except Exception as error:
+            raise MissingDependencyError(
+                f"The {kind} {words!r} ({self.target}) could not be loaded: {type(error).__name__}: {error}."
+            ) from error
+
+    def _source(self) -> Path | None:
+        module = self.target.partition(":")[0]
+        root = _folder_of(module.partition(".")[0])
+        if root is None:
+            return None
+        path = root.parent.joinpath(*module.split("."))
+        return next((file for file in (path.with_suffix(".py"), path / "__init__.py") if file.is_file()), None)
+
+
+def optional_parts(group: str) -> dict[str, OptionalPart]:
+    """Return the entries of an entry-point group by name, whether or not their folders are there."""
     from importlib.metadata import entry_points
 
-    for entry in entry_points(group=group):
+    return {entry.name: OptionalPart(group, entry.name, entry.value) for entry in entry_points(group=group)}
+
+
+def load_optional(group: str, name: str, kind: str) -> Any | None:
+    """Return the object of one name of a group, or None where no entry has the name.
+
+    Raises:
+        MissingDependencyError: the folder that holds it was taken off.
+    """
+    part = optional_parts(group).get(name)
+    return None if part is None else part.load(kind)
+
+
+def load_entry_points(group: str, take: Callable[[str, Any], None]) -> None:
+    """Hand every object of an entry-point group to ``take(name, object)``.
+
+    An entry whose folder was taken off is left out; a faulty one is logged and left out.
+    """
+    for part in optional_parts(group).values():
+        if part.taken_off:
+            continue
         try:
-            take(entry.name, entry.load())
+            take(part.name, part.load("object"))
         except Exception as error:  # noqa: BLE001 - another package's fault must not take ours away
-            _LOG.warning("The entry point %r (%s) of %s could not be loaded: %s", entry.name, entry.value, group, error)
+            _LOG.warning("The entry point %r (%s) of %s is left out: %s", part.name, part.target, group, error)
+
+
+def _folder_of(package: str) -> Path | None:
+    """Return the folder of a top-level package, or the place of a top-level module's file as if it were one."""
+    spec = importlib.util.find_spec(package)
+    if spec is None or spec.origin is None:
+        return None
+    origin = Path(spec.origin)
+    return origin.parent if origin.name == "__init__.py" else origin.with_suffix("")
+
+
+def _assigns(node: ast.Assign, name: str) -> bool:
+    return any(isinstance(target, ast.Name) and target.id == name for target in node.targets)
 
 
 def _import_file(path: Path) -> ModuleType:

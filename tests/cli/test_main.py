@@ -12,6 +12,8 @@ import typer
 import brainbench
 from brainbench.cli import app
 from brainbench.cli.application import COMMANDS as COMMAND_HELP
+from brainbench.cli.application import OPTIONAL
+from brainbench.core.plugins import optional_parts
 
 HEAVY = {"torch", "xarray", "h5py", "mujoco", "scipy", "trimesh", "pandas", "matplotlib", "plotly"}
 COMMANDS = ["score", "models", "recordings", "stimuli", "leaderboard", "doctor"]
@@ -86,7 +88,28 @@ def test_shell_completion_can_be_shown():
 
 def test_the_help_of_all_commands_says_what_each_of_them_says():
     shown = typer.main.get_command(app).commands  # pyright: ignore[reportAttributeAccessIssue]
-    assert {name: command.help.splitlines()[0] for name, command in shown.items()} == COMMAND_HELP
+    optional = {name: part.summary for name, part in optional_parts(OPTIONAL).items() if "." not in name}
+    assert {name: command.help.splitlines()[0] for name, command in shown.items()} == {**COMMAND_HELP, **optional}
+
+
+def test_a_command_of_another_package_is_listed_and_a_broken_one_is_announced(run, tmp_path, monkeypatch, caplog):
+    (tmp_path / "elsewhere.py").write_text(
+        "from brainbench.cli.output import Output\n"
+        "def greet(name: str) -> Output:\n    'Say hello.'\n    return Output({'name': name}, f'hello {name}')\n"
+    )
+    (tmp_path / "broken_elsewhere.py").write_text("raise RuntimeError('out of order')\n")
+    info = tmp_path / "elsewhere-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: elsewhere\nVersion: 1.0\n")
+    entries = "[brainbench.commands]\ngreet = elsewhere:greet\nstimuli.broken = broken_elsewhere:command\n"
+    (info / "entry_points.txt").write_text(entries)
+    monkeypatch.syspath_prepend(tmp_path)
+    assert "Say hello." in run("--help").out
+    assert run("greet", "you").out == "hello you\n"
+    assert "simulate" in run("stimuli", "--help").out
+    assert "'stimuli broken'" in caplog.text
+    assert "out of order" in caplog.text
+    assert "out of order" in run("stimuli", "broken").err
 
 
 @pytest.mark.parametrize("words", [["score", "--help"], ["stimuli", "render", "--help"], ["--help"], ["-v", "doctor"]])

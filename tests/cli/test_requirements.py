@@ -8,7 +8,7 @@ import sys
 import pytest
 
 from brainbench.cli import app
-from brainbench.cli.requirements import CACHED, DISTRIBUTIONS, EXTRAS, check_requirements, commands
+from brainbench.cli.requirements import CACHED, DISTRIBUTIONS, EXTRAS, check_requirements, commands, needs_of
 from brainbench.core.errors import FileWriteError, MissingDependencyError
 
 WORDS = {
@@ -44,19 +44,22 @@ WORDS = {
 """Command lines whose input does not exist: that would be told next."""
 
 
-def _needs():
-    return [(name, module) for name, needs in EXTRAS.items() for item in needs for module in item.packages]
+NEEDS = {name: needs_of(name, command.callback) for name, command in commands(app)}
+
+
+def _packages():
+    return [(name, module) for name, needs in NEEDS.items() for item in needs.packages for module in item.packages]
 
 
 def test_the_table_names_commands_that_exist():
     assert {*EXTRAS, *CACHED} <= {name for name, _ in commands(app)}
 
 
-@pytest.mark.parametrize(("command", "module"), _needs())
+@pytest.mark.parametrize(("command", "module"), _packages())
 def test_a_missing_package_is_told_before_the_input_is_read(run, tmp_path, monkeypatch, command, module):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("BRAINBENCH_CACHE", str(tmp_path / "cache"))
-    for name in {name for needs in EXTRAS.values() for item in needs for name in item.packages} - {module}:
+    for name in {name for needs in NEEDS.values() for item in needs.packages for name in item.packages} - {module}:
         # All others are there, whatever is installed here.
         monkeypatch.setitem(sys.modules, name, sys.modules.get(name) or _module(name))
     monkeypatch.setitem(sys.modules, module, None)
@@ -67,7 +70,7 @@ def test_a_missing_package_is_told_before_the_input_is_read(run, tmp_path, monke
     assert sorted(path.name for path in tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("command", CACHED)
+@pytest.mark.parametrize("command", [name for name, needs in NEEDS.items() if needs.cache])
 def test_an_unwritable_cache_is_told_before_the_input_is_read(run, tmp_path, monkeypatch, command):
     monkeypatch.chdir(tmp_path)
     cache = tmp_path / "cache"
@@ -85,14 +88,14 @@ def test_an_unwritable_cache_is_told_before_the_input_is_read(run, tmp_path, mon
 def test_what_is_not_asked_for_is_not_needed(tmp_path, monkeypatch):
     monkeypatch.setenv("BRAINBENCH_CACHE", str(tmp_path / "cache"))
     monkeypatch.setitem(sys.modules, "onnx", None)
-    check_requirements("export", {"format": "torch"})
+    check_requirements(NEEDS["export"], {"format": "torch"})
     with pytest.raises(MissingDependencyError):
-        check_requirements("export", {"format": "onnx"})
+        check_requirements(NEEDS["export"], {"format": "onnx"})
     (tmp_path / "file").touch()
     monkeypatch.setenv("BRAINBENCH_CACHE", str(tmp_path / "file" / "cache"))
-    check_requirements("doctor", {})
+    check_requirements(NEEDS["doctor"], {})
     with pytest.raises(FileWriteError):
-        check_requirements("score", {})
+        check_requirements(NEEDS["score"], {})
 
 
 def _module(name):

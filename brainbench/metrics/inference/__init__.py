@@ -1,2 +1,2 @@
-"""Inference: ``permutation`` tests, ``intervals`` over animals and stimuli, ``multiple`` models or layers,
-``equivalence`` with the animals, and the ``power`` of a planned experiment."""
+"""Inference: ``permutation`` tests, ``intervals`` over animals and stimuli, ``multiple`` models or layers, and
+``equivalence`` with the animals."""

@@ -1,4 +1,4 @@
-"""Number of dimensions of a representation, for the simulated experiments of :mod:`brainbench.metrics.inference.power`.
+"""Number of dimensions of a representation, for the simulated experiments of ``brainbench power``.
 
 The participation ratio of a signal covariance Σ is (tr Σ)²/tr Σ² (Gao & Ganguli 2015, doi:10.1016/j.conb.2015.04.003):
 D for D dimensions of equal variance. Over few stimuli it is smaller: (nD + 2)/(D + n + 1) for n = K − 1 contrasts of

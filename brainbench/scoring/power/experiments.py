@@ -65,7 +65,7 @@ class ExperimentDesign:
     alpha: float = 0.05
     """Level of the test."""
     dimensions: int = DIMENSIONS
-    """Dimensions of the representations, see :mod:`brainbench.metrics.inference.dimension`."""
+    """Dimensions of the representations, see :mod:`brainbench.scoring.power.dimensions`."""
 
     def __post_init__(self) -> None:
         """Refuse what no experiment can be."""

@@ -9,13 +9,15 @@ import typer
 
 from brainbench.cli.options import option_fields, with_options
 from brainbench.cli.output import Output, progress_bar, table_of, tracked
+from brainbench.cli.requirements import needs
 from brainbench.core.errors import UsageError
 from brainbench.core.files import to_plain
 
 _EFFECTS = (0.0, 0.3, 0.5, 0.7)
-DESIGN = "brainbench.metrics.inference.power:ExperimentDesign"
+DESIGN = "brainbench.scoring.power.experiments:ExperimentDesign"
 
 
+@needs(cache=True)
 @with_options(DESIGN, [name for name in option_fields(DESIGN) if name not in ("effect", "dimensions")], build=False)
 def power(
     options: dict[str, Any],
@@ -44,7 +46,7 @@ def power(
     Correlation, consistency and reliability of your own recordings: 'brainbench score' and
     'brainbench recordings rdm'.
     """
-    from brainbench.metrics.inference import power as experiments
+    from brainbench.scoring.power import experiments
 
     effects = _EFFECTS if effect is None else (effect,)
     # Whatever is wrong with the design is told before recordings are opened.
@@ -90,7 +92,7 @@ def power(
 
 def _dimensions(asked: str, recordings: str | None, conditions: str | None, model: str | None) -> tuple[int, str]:
     """Return the number of dimensions, and where it comes from in words."""
-    from brainbench.metrics.inference.power import DIMENSIONS
+    from brainbench.scoring.power.experiments import DIMENSIONS
 
     if conditions is not None and recordings is None:
         raise UsageError("--conditions labels the trials of --recordings; name those too.")
@@ -110,8 +112,8 @@ def _dimensions(asked: str, recordings: str | None, conditions: str | None, mode
 
 def _of_recordings(recordings: str, conditions: str | None) -> tuple[int, str]:
     from brainbench.datasets.trials.session_trials import trials_by_subject
-    from brainbench.metrics.inference.dimension import signal_dimensions
     from brainbench.scoring.neural_responses import open_neural_responses
+    from brainbench.scoring.power.dimensions import signal_dimensions
 
     with progress_bar() as progress:
         brain = open_neural_responses(recordings, progress=progress, conditions=conditions)
@@ -122,9 +124,9 @@ def _of_recordings(recordings: str, conditions: str | None) -> tuple[int, str]:
 def _of_model(model: str) -> tuple[int, str]:
     import numpy as np
 
-    from brainbench.metrics.inference.dimension import pattern_dimensions
     from brainbench.scoring.model_responses import resolve_model
     from brainbench.scoring.options import ScoreOptions
+    from brainbench.scoring.power.dimensions import pattern_dimensions
 
     with progress_bar() as progress:
         responses = resolve_model(model).respond(ScoreOptions(), progress=progress)

@@ -10,12 +10,12 @@ import pytest
 from brainbench.core.errors import UsageError
 from brainbench.core.trials import Trials
 from brainbench.metrics import compare
-from brainbench.metrics.inference.dimension import signal_dimensions
 from brainbench.metrics.inference.permutation import label_orders, tail_p
-from brainbench.metrics.inference.power import ExperimentDesign, needed, power, simulate_experiments
 from brainbench.metrics.measures.rsa import score_rdms
 from brainbench.metrics.rdms.comparison import compare_all, permuted_comparisons
 from brainbench.metrics.rdms.dissimilarity import rdm
+from brainbench.scoring.power.dimensions import signal_dimensions
+from brainbench.scoring.power.experiments import ExperimentDesign, needed, power, simulate_experiments
 from tests.factories.animals import STIMULI, make_subject
 
 

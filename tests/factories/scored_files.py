@@ -1,52 +1,17 @@
-"""Run the command line in this process, as the console script does, and files for it to score."""
+"""Recordings, features, stimuli and models in files, for the command line to score."""
 
-import sys
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
 
 import h5py
 import numpy as np
-import pytest
 
-from brainbench.cli import main, output
 from brainbench.datasets import write_recordings
 from brainbench.datasets.sessions import make_session
 from brainbench.models.features import write_features
 
 LABELS = ("a", "b", "c", "d")
 EIGHT = tuple("abcdefgh")
-
-
-@dataclass(frozen=True)
-class Outcome:
-    status: int
-    out: str
-    err: str
-
-
-@pytest.fixture(autouse=True)
-def quiet(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Keep lines of progress, which depend on the machine's load, out of what is asserted of stderr."""
-    if request.path.name != "test_output.py":
-        monkeypatch.setattr(output, "FIRST_LINE", 1e6)
-
-
-@pytest.fixture
-def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., Outcome]:
-    """Return a function from arguments to exit status, stdout and stderr."""
-
-    def call(*arguments: str) -> Outcome:
-        monkeypatch.setattr(sys, "argv", ["brainbench", *arguments])
-        status = 0
-        try:
-            main()
-        except SystemExit as stop:
-            status = int(stop.code or 0)
-        captured = capsys.readouterr()
-        return Outcome(status, captured.out, captured.err)
-
-    return call
 
 
 def _record(rng: np.random.Generator, folder: Path, animals: str, labels: Sequence[str], repeats: int, until: float):
@@ -76,9 +41,8 @@ def _show(rng: np.random.Generator, path: Path, labels: Sequence[str]):
         file["labels"] = np.array(labels, dtype=h5py.string_dtype())
 
 
-@pytest.fixture
-def files(tmp_path: Path) -> dict[str, str]:
-    """A recording of two animals, features and arrays for its four conditions."""
+def write_scored_files(tmp_path: Path) -> dict[str, str]:
+    """Write a recording of two animals, features and arrays for its four conditions."""
     rng = np.random.default_rng(0)
     _record(rng, tmp_path / "data", "xy", LABELS, 10, 60.0)
     features = write_features(tmp_path / "features.h5", LABELS, {"fc": rng.normal(size=(4, 6))})
@@ -97,9 +61,8 @@ def files(tmp_path: Path) -> dict[str, str]:
     }
 
 
-@pytest.fixture
-def study(tmp_path: Path) -> dict[str, str]:
-    """Four animals and eight stimuli; features and a module for them."""
+def write_study(tmp_path: Path) -> dict[str, str]:
+    """Write four animals and eight stimuli; features and a module for them."""
     rng = np.random.default_rng(0)
     _record(rng, tmp_path / "data", "wxyz", EIGHT, 8, 90.0)
     _show(rng, tmp_path / "eight.h5", EIGHT)

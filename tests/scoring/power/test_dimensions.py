@@ -7,7 +7,7 @@ import pytest
 
 from brainbench.core.errors import DataError, UsageError
 from brainbench.core.trials import Trials
-from brainbench.metrics.inference.dimension import MOST, pattern_dimensions, signal_dimensions
+from brainbench.scoring.power.dimensions import MOST, pattern_dimensions, signal_dimensions
 
 
 def _animals(rng, stimuli, dimensions, *, individual=0.0, noise=1.0, animals=6, units=60, trials=8):
