@@ -1,7 +1,7 @@
 """Gradients of simulated whiskers: of base wrenches, shapes and contact forces by whatever jobs are built from.
 
-:class:`JobParameters` names parameters of jobs, :class:`GradientRun` simulates and goes back over the simulation
-(:mod:`brainbench.stimuli.engines.rod.adjoint`), :class:`ContactEvents` say where a gradient holds on one side only.
+:class:`JobParameters` names parameters of jobs, :class:`GradientRun` simulates and differentiates
+(:mod:`brainbench.stimuli.fitting.derivatives`), :class:`ContactEvents` say where a gradient holds on one side only.
 :func:`brainbench.stimuli.gradients.autograd.simulate_tensors` is the same for PyTorch.
 """
 

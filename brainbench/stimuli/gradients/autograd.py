@@ -1,4 +1,4 @@
-"""Simulated whiskers in PyTorch: results as tensors whose ``backward`` is the adjoint of the solver."""
+"""Simulated whiskers in PyTorch: results as tensors that are differentiable by what the jobs were built from."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class SimulateJobs(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *grads: torch.Tensor | None) -> tuple[torch.Tensor | None, ...]:
-        """Go back over the simulation."""
+        """Return the gradient by the values."""
         arrays: list[NDArray[np.float64] | None] = [
             None if grad is None else grad.detach().cpu().double().numpy() for grad in grads
         ]

@@ -38,7 +38,7 @@ class ContactEvents:
 
 
 def contact_events(summary: Any, reason: str) -> ContactEvents:
-    """Return the events of one job from its ``kernels.adjoint.contacts.ContactSummary``.
+    """Return the events of one job from its ``fitting.derivatives.kernels.contacts.ContactSummary``.
 
     ``reason`` is why the run cannot be trusted, if so.
     """
@@ -58,5 +58,5 @@ def contact_events(summary: Any, reason: str) -> ContactEvents:
         status = "degenerate"
     if reason:
         status = "unstable"
-    begun = int(summary["begun"]) + int(summary["contacts"] > 0)
+    begun = int(summary["begun"]) + int(summary["first"] > 0)
     return ContactEvents(status, begun, int(summary["ended"]), int(summary["slipped"]), tuple(close))

@@ -1,4 +1,4 @@
-"""Simulation of jobs that can be gone back over: results, then the gradient of any number made of them."""
+"""Simulation of jobs that is differentiated: results, and the gradient of any number made of them."""
 
 from __future__ import annotations
 
@@ -17,18 +17,12 @@ from brainbench.core.rotations import base_rotation
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.planarity import stays_in_plane
 from brainbench.stimuli.engines.reach import reachable
-from brainbench.stimuli.engines.rod.adjoint import RecordingSolver
-from brainbench.stimuli.engines.rod.differences import (
-    Numbers,
-    PackedPlaces,
-    contract,
-    packed_change,
-    packed_part,
-)
 from brainbench.stimuli.engines.rod.engine import RodEngine, trace_of
 from brainbench.stimuli.engines.rod.packing import capacity_for, knots_alike
 from brainbench.stimuli.engines.rod.tasks import JobTask, PackedTasks, make_task
 from brainbench.stimuli.engines.trust import check_jobs
+from brainbench.stimuli.fitting.derivatives.packed_changes import Numbers, PackedPlaces, packed_change, packed_part
+from brainbench.stimuli.fitting.derivatives.recorded_run import RecordingSolver
 from brainbench.stimuli.gradients.events import ContactEvents, contact_events
 from brainbench.stimuli.motion.jobs import Job, Trace
 from brainbench.stimuli.whiskers.chain import build_chain
@@ -38,8 +32,8 @@ R = TypeVar("R")
 Build = Callable[[NDArray[np.float64]], Sequence[Job]]
 """Values of the parameters [p] → jobs, of the same kind and number for all values."""
 CUDA_ROOM = 2**32
-"""Bytes that records of steps may take on a GPU: what does not fit is simulated once more on the way back, and its
-threads take a whisker each, so that steps take as long for one whisker as for thousands."""
+"""Bytes that records of steps may take on a GPU: what does not fit is simulated once more, and its threads take a
+whisker each, so that steps take as long for one whisker as for thousands."""
 Given = Sequence[NDArray[np.float64] | None]
 """Derivatives of a number by one output of each job; None for zeros."""
 
@@ -84,7 +78,7 @@ class _Group:
 
 
 class GradientRun:
-    """Jobs built from parameters, simulated, and ready to be gone back over."""
+    """Jobs built from parameters, simulated, and ready to be differentiated."""
 
     def __init__(
         self,
@@ -244,36 +238,30 @@ class GradientRun:
             link_positions: [job] of arrays [n, links + 1, 3].
             contact_wrench: [job] of arrays [n, 6].
         """
-        count = len(self.jobs)
         outputs = (wrench, link_positions, contact_wrench)
-        given: list[Given] = [[None] * count if some is None else some for some in outputs]
-        by_job = np.zeros((count, len(self.values)))
-        events: dict[int, ContactEvents] = {}
-        passes = _at_once(lambda group: group.solver.reverse(*self._outputs(group, given)), self._groups)
-        for group, found in zip(self._groups, passes, strict=True):
-            for row, index in enumerate(group.indices):
-                trace = self.traces[index]
-                events[index] = contact_events(found["contacts"][row], trace.reason)
-                points = given[1][index]
-                for p, change in enumerate(of_jobs[index] for of_jobs in self.changes):
-                    value = contract(found, change, group.places[row], row)
-                    if points is not None and "positions" in change:
-                        value += float(np.vdot(np.sum(points, axis=1), change["positions"]))
-                    by_job[index, p] = value
-                if trace.status != "ok":
-                    by_job[index] = np.nan if any(some[index] is not None for some in given) else 0.0
-        return Gradient(by_job.sum(axis=0), by_job, tuple(events[index] for index in range(count)))
+        by_job = np.zeros((len(self.jobs), len(self.values)))
+        for index, tangents in enumerate(self.tangents()):
+            for given, changes in zip(outputs, vars(tangents).values(), strict=True):
+                weights = None if given is None else given[index]
+                if weights is not None:
+                    by_job[index] += np.tensordot(changes, weights, axes=np.ndim(weights))
+        return Gradient(by_job.sum(axis=0), by_job, self._passes[1])
 
     def tangents(self) -> list[Tangents]:
         """Return the derivatives of what :attr:`traces` hold by each parameter, one for each job.
 
-        One pass over the recorded steps gives them for all parameters: what a least-squares problem with many readings
-        needs, where :meth:`gradient` gives those of one number by any number of parameters.
+        One pass over the recorded steps gives them for all parameters.
         """
-        found: dict[int, Tangents] = {}
+        return list(self._passes[0])
+
+    @cached_property
+    def _passes(self) -> tuple[tuple[Tangents, ...], tuple[ContactEvents, ...]]:
+        """Derivatives and changes of contact of each job, from one pass over its steps."""
+        tangents: dict[int, Tangents] = {}
+        events: dict[int, ContactEvents] = {}
         changes = self.changes
 
-        def forward(group: _Group) -> dict[str, NDArray[np.float64]]:
+        def forward(group: _Group) -> dict[str, NDArray[Any]]:
             shapes = group.solver.packed_shapes
             arrays = {name: np.zeros((len(self.values), *shape)) for name, shape in shapes.items()}
             for row, index in enumerate(group.indices):
@@ -285,26 +273,17 @@ class GradientRun:
 
         for group, results in zip(self._groups, _at_once(forward, self._groups), strict=True):
             for row, index in enumerate(group.indices):
+                trace = self.traces[index]
+                events[index] = contact_events(results["contacts"][row], trace.reason)
                 points = results["points"][:, row, :, : group.places[row].links + 1]
                 for p, change in enumerate(of_jobs[index] for of_jobs in changes):
                     if "positions" in change:
                         points[p] += change["positions"][:, None]
                 parts = results["wrench"][:, row], points, results["contact_wrench"][:, row]
-                trusted = self.traces[index].status == "ok"
-                found[index] = Tangents(*(part if trusted else np.full_like(part, np.nan) for part in parts))
-        return [found[index] for index in range(len(self.jobs))]
-
-    def _outputs(self, group: _Group, given: Sequence[Given]) -> list[NDArray[np.float64]]:
-        """Return the arguments of :meth:`RecordingSolver.reverse`; what is not given is zero."""
-        frames, nodes = len(group.packed.tasks[0].job.times), group.solver.capacity + 1
-        shapes = ((frames, 6), (frames, nodes, 3), (frames, 6))
-        arrays = [np.zeros((len(group.indices), *shape)) for shape in shapes]
-        for row, index in enumerate(group.indices):
-            for array, some in zip(arrays, given, strict=True):
-                value = some[index]
-                if value is not None:
-                    array[row][tuple(slice(n) for n in np.shape(value))] = value
-        return arrays
+                trusted = trace.status == "ok"
+                tangents[index] = Tangents(*(part if trusted else np.full_like(part, np.nan) for part in parts))
+        order = range(len(self.jobs))
+        return tuple(tangents[index] for index in order), tuple(events[index] for index in order)
 
 
 def _at_once(function: Callable[[T], R], items: Sequence[T]) -> list[R]:

@@ -11,7 +11,7 @@ from brainbench.stimuli.objects.obstacle import Capsule, Sphere
 from tests.factories.gradients import COARSE, touching_job
 
 SUMMARY = {
-    "contacts": 0, "begun": 1, "ended": 1, "slipped": 0, "degenerate": 0, "largest_force": 1.0, "least_force": 0.1,
+    "first": 0, "begun": 1, "ended": 1, "slipped": 0, "degenerate": 0, "largest_force": 1.0, "least_force": 0.1,
     "fastest_slip": 1.0, "slowest_slip": 0.1, "fullest_cone": 0.5, "least_gap": 0.01, "least_lead": 0.01,
 }  # fmt: skip
 

@@ -19,7 +19,7 @@ def load_kernels(
     needs: int = MESHES,
     *,
     hinges: int = 2,
-    recorded: bool = False,
+    recorder: str = "",
     compiling: Callable[[bool], None] | None = None,
     **options: Any,
 ) -> Any:
@@ -36,10 +36,10 @@ def load_kernels(
 
     with BUILDING:
         if device.is_cuda:
-            kernels = build_kernels(real, capacity, needs, cuda=True, hinges=hinges, recorded=recorded, **options)
+            kernels = build_kernels(real, capacity, needs, cuda=True, hinges=hinges, recorder=recorder, **options)
         else:
             sliced = options.get("sliced", False)
-            kernels = build_kernels(real, capacity, sliced=sliced, hinges=hinges, recorded=recorded)
+            kernels = build_kernels(real, capacity, sliced=sliced, hinges=hinges, recorder=recorder)
     if device.is_cuda and options.get("sliced"):
         with kernels.loading, turn(device):
             _load_together(kernels, options["bounds"][0], device)

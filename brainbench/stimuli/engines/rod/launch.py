@@ -136,7 +136,7 @@ class WhiskerSolver:
         self.real = real_type(fidelity)
         self.capacity = capacity_for(max(chain.links for chain in chains))
         self.quasistatic = fidelity.solver == "quasistatic"
-        self.iterations = TO_ROUNDING if options.get("recorded") else contact_iterations(fidelity.contact_tolerance)
+        self.iterations = TO_ROUNDING if options.get("recorder") else contact_iterations(fidelity.contact_tolerance)
         hinges = 2 + (fidelity.twist is not False if twists is None else twists)
         if options:
             options["sliced"] = sliced

@@ -30,7 +30,7 @@ solved to a tolerance")."""
 MOST_ITERATIONS = 400
 """Most sweeps, and most iterations within one, where it states a tolerance."""
 TO_ROUNDING = 1e-12, 16, 8
-"""How runs of gradients solve them, whose sweeps alternate with Newton's steps: the adjoint is that of the solution."""
+"""How recorded runs solve them, whose sweeps alternate with Newton's steps: derivatives are those of the solution."""
 FOLD = 1.2
 """Bend (rad) beyond which a joint stiffens. The last links of a fine tip are so soft that the slightest force folds
 them double; what reaches the base through them is nothing."""

@@ -4,7 +4,7 @@
 accelerations without contact, ``broad_phase`` and ``narrow_phase`` (with ``distances`` and ``mesh_bvh``) where it may
 touch something, ``contact_problem``, ``delassus`` and ``contact_solver`` the contact forces. ``sleeping`` skips
 whiskers at rest; on a GPU ``scheduling`` pauses whiskers while kernels of ``narrow_phase`` and ``contact_solver`` find
-the distances and forces that they wait for. ``adjoint`` writes steps down and goes back over them.
+the distances and forces that they wait for. Steps may be written down by the kernels of another package, the recorder.
 
 The modules are ordinary Warp code for the types and sizes in ``parameters``. :func:`specialize` loads them once for
 each precision and size, like a template.
@@ -15,6 +15,7 @@ import sys
 import threading
 from dataclasses import dataclass, field
 from functools import cache
+from importlib.util import find_spec
 from types import ModuleType
 from typing import Any
 
@@ -44,8 +45,11 @@ class Kernels:
     loading: threading.Lock = field(default_factory=threading.Lock)
 
 
-def specialize(module: str, **parameters: Any) -> ModuleType:
-    """Return a module of this package for given ``parameters``; the others keep their values."""
+def specialize(module: str, *, recorder: str = "", **parameters: Any) -> ModuleType:
+    """Return a module of this package for given ``parameters``; the others keep their values.
+
+    ``recorder`` is the package of kernels whose modules stand beside these as ``recorder.…``.
+    """
     label = "_".join(str(getattr(value, "__name__", value)) for _, value in sorted(parameters.items()))
     package = f"{__name__}_{label}"
     if package not in sys.modules:
@@ -55,6 +59,11 @@ def specialize(module: str, **parameters: Any) -> ModuleType:
         if unknown := set(parameters) - set(given):
             raise TypeError(f"no such parameters: {sorted(unknown)}")
         given.update(parameters)
+        if recorder:
+            spec = find_spec(recorder)
+            assert spec is not None
+            beside = sys.modules[f"{package}.recorder"] = ModuleType(f"{package}.recorder")
+            beside.__path__ = spec.submodule_search_locations
     return importlib.import_module(f"{package}.{module}")
 
 
@@ -67,7 +76,7 @@ def build_kernels(
     sliced: bool = False,
     cuda: bool = False,
     hinges: int = 2,
-    recorded: bool = False,
+    recorder: str = "",
 ) -> Kernels:
     """Return the kernels for chains of at most ``capacity`` links in one precision; each is compiled by itself.
 
@@ -79,13 +88,14 @@ def build_kernels(
             done for all whiskers by kernels of their own; results are the same. One shape a scene.
         cuda: compile for a GPU: with approximate divisions and roots, and groups of threads that find contact forces.
         hinges: hinges of a joint, 2 for bending alone or 3 for bending and twist.
-        recorded: whether whiskers pause after some steps, which are written down for the adjoint; not with ``sliced``.
+        recorder: package of the kernels that write steps down (``recording``, ``records``) and solve their contact
+            forces to rounding (``newton``); whiskers then pause after some steps. Not with ``sliced``.
     """
     most = contacts_for(capacity)
     common = {"real": real, "capacity": capacity, "against": against, "sliced": sliced, "cuda": cuda, "hinges": hinges}
     whole = {"max_contacts": most, "bounds": bounds, **common}
-    if recorded:
-        whole["recorded"] = True
+    if recorder:
+        whole |= {"recorded": True, "recorder": recorder}
     run, structs = specialize("step", **whole).run, specialize("state", **whole)
     if not sliced:
         return Kernels(run, structs, parameters=whole)
@@ -103,8 +113,3 @@ def build_kernels(
             for rank, (held, size) in enumerate(sizes)
         ),
     )
-
-
-def build_adjoint(kernels: Kernels, module: str) -> ModuleType:
-    """Return the module ``adjoint.chain`` or ``adjoint.tangent`` for kernels that record their steps."""
-    return specialize(f"adjoint.{module}", **kernels.parameters)

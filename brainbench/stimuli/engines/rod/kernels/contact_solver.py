@@ -37,7 +37,7 @@ from .state import ContactProblems, PausedWhiskers, PerLinkJoint
 from .thread_groups import broadcast, group_max, group_or, group_sum, warp_max
 
 if recorded:
-    from .adjoint.newton import CAUTIOUS, DIRECT, newton_forces
+    from .recorder.newton import CAUTIOUS, DIRECT, newton_forces
 
 
 @wp.func

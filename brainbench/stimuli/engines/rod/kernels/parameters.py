@@ -16,7 +16,7 @@ against = MESHES
 sliced = False
 """True: whiskers pause for distances and contact forces."""
 recorded = False
-"""True: whiskers pause after some steps, whose states and contacts are written down (``adjoint.recording``)."""
+"""True: whiskers pause after some steps, whose states and contacts the recorder writes down (``specialize``)."""
 cuda = False
 """True: the code is for a GPU."""
 bounds: tuple[int, int] | None = None

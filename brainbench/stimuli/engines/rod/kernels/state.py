@@ -19,7 +19,7 @@ from .motion import Instant, JobArrays, MotionArrays, ReadingArrays  # noqa: F40
 from .parameters import capacity, hinges, real, recorded
 
 if recorded:
-    from .adjoint.records import StepRecords
+    from .recorder.records import StepRecords
 
 WAIT_DISTANCES, WAIT_SLICE, WAIT_FORCES, WAIT_REST, ENDED = range(1, 6)
 """Reasons to pause: distances of near links, its next slice, contact forces, distances at rest, its end."""

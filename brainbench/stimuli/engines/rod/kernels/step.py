@@ -48,7 +48,7 @@ from .state import (
 )
 
 if recorded:
-    from .adjoint.recording import record_accelerations, record_contacts, record_state
+    from .recorder.recording import record_accelerations, record_contacts, record_state
 
 
 @wp.func(inline=True)

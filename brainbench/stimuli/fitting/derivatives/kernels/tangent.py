@@ -1,20 +1,19 @@
 """Forward derivatives of recorded steps: one thread takes one whisker, with the changes of all parameters.
 
-The equations are those of :mod:`brainbench.stimuli.engines.rod.adjoint`. A step solves R(a, f; q, q̇, θ) = 0; with a
-change of state and packed numbers, those of a and f solve
+A step solves R(a, f; q, q̇, θ) = 0; with a change of state and packed numbers, those of a and f solve
 
     H δa − Jᵀ δf = −δR,        h A J δa + B δf = −δc,
 
-where δR and δc are the changes at fixed a and f: the factorised chain and the contacts' system of the step, transposed
-against the adjoint's. One step costs one solution for each parameter, where a difference costs two simulations. Rates
-of change have the letter p of their parameter; ``_d`` marks the change of a number. Units as in ``step``.
+where δR and δc are the changes at fixed a and f: the factorised chain and the contacts' system of the step. One step
+costs one solution for each parameter, where a difference costs two simulations. Rates of change have the letter p of
+their parameter; ``_d`` marks the change of a number. Units as in ``step``.
 """
 
 import warp as wp
 
-from brainbench.stimuli.engines.rod.limits import CREVICE, MESH
+from brainbench.stimuli.engines.rod.limits import CAPSULE, CREVICE, CYLINDER, MESH, SPHERE
 
-from ..algebra import JointVector, Wrench, rotate, symmetric_times, unrotate, vec3
+from ..algebra import JointVector, Wrench, rotate, symmetric_times, unrotate, vec3, vec4
 from ..articulated_body import ChainState, ProximityState
 from ..delassus import PerContact3
 from ..motion import MotionArrays, elapsed, pose_from
@@ -22,26 +21,35 @@ from ..parameters import hinges, module_options, real
 from ..state import ChainArrays, JobArrays, PerLink3, PerLinkJoint, ShapeArrays, StepOptions, WhiskerJob, row
 from ..step import load_job
 from .chain import (
-    AXIAL,
-    BEND,
-    CENTRE,
-    END_RADIUS,
-    LENGTH,
-    MASS,
-    START_RADIUS,
-    STIFFNESS,
-    TORSION,
-    TRANSVERSE,
+    Fields,
+    FieldTangents,
+    PerHinge3,
+    StepFrame,
+    StepLinks,
+    add_hinge,
+    hinge_row,
+    hinges_of,
+    move_hinge,
+    restore_step,
+    solve_chain,
     spring_state,
-    virtual_motion,
 )
-from .contacts import AdjointContacts, ContactSystem, build_system, contact_row, solve_system, unit, velocity_block
-from .dense import DenseSystem
-from .fields import Fields, FieldTangents, PerHinge3, StepLinks, add_hinge, hinge_row, hinges_of, move_hinge
+from .contacts import (
+    ContactSummary,
+    ContactSystem,
+    StepContacts,
+    build_system,
+    contact_row,
+    solve_system,
+    summarize,
+    velocity_block,
+)
+from .newton import DenseSystem
 from .pose import move_pose
 from .records import ContactRecord, StepRecords
-from .restoring import StepFrame, restore_step
-from .surfaces import size_cotangent
+
+LENGTH, BEND, MASS, CENTRE, AXIAL, TRANSVERSE, STIFFNESS, TORSION, START_RADIUS, END_RADIUS = range(10)
+"""Rows of :attr:`PackedTangents.link`."""
 
 
 @wp.struct
@@ -53,7 +61,8 @@ class PackedTangents:
     rate: wp.array3d(dtype=JointVector)
     """[p, link, job]"""
     link: wp.array4d(dtype=real)
-    """[p, 10, link, job] rows as in :class:`.chain.PackedGradients`."""
+    """[p, 10, link, job] length, angle at rest, mass, centre, axial and transverse inertia, stiffness, torsion, radius
+    at start and end."""
     beta: wp.array2d(dtype=real)
     """[p, job]"""
     friction: wp.array2d(dtype=real)
@@ -61,15 +70,15 @@ class PackedTangents:
     gravity: wp.array2d(dtype=vec3)
     """[p, job]"""
     knots: wp.array3d(dtype=real)
-    """[p, knot, 16]"""
+    """[p, knot, 16] place, velocity, quaternion, angular velocity, angular acceleration."""
     load_force: wp.array2d(dtype=vec3)
     """[p, load]"""
     load_share: wp.array2d(dtype=real)
     """[p, load]"""
     shape_place: wp.array2d(dtype=vec3)
-    """[p, shape] as in :class:`.surfaces.ShapeGradients`."""
+    """[p, shape] in the frame of its body."""
     shape_turn: wp.array2d(dtype=vec3)
-    """[p, shape]"""
+    """[p, shape] small turn about its origin, in the frame of its body."""
     shape_size: wp.array2d(dtype=vec3)
     """[p, shape]"""
     shape_friction: wp.array2d(dtype=real)
@@ -86,6 +95,8 @@ class OutputTangents:
     """[p, reading, node, job] joints and tip, from the base point."""
     contact: wp.array4d(dtype=vec3)
     """[p, reading, 2, job] force and moment about the base point of all contacts."""
+    contacts: wp.array(dtype=ContactSummary)
+    """[job]"""
 
 
 @wp.struct
@@ -112,11 +123,45 @@ class ContactTangent:
 
 
 @wp.func
+def grow(kind: int, size: vec3, x: vec3, size_d: vec3) -> vec4:
+    """Return how a primitive's sizes shift what is nearest to x, and the change of the gap there besides.
+
+    All in the frame of the shape. A size moves the feature that is nearest, or makes a round one thicker.
+    """
+    zero = real(0.0)
+    moved = vec4(zero, zero, zero, zero)
+    if kind == wp.static(SPHERE):
+        moved[3] = -size_d[0]
+    elif kind == wp.static(CAPSULE):
+        moved[3] = -size_d[0]
+        if wp.abs(x[2]) > size[1]:
+            moved[2] = wp.sign(x[2]) * size_d[1]
+    elif kind == wp.static(CYLINDER):
+        radial = wp.sqrt(x[0] * x[0] + x[1] * x[1])
+        side = radial - size[0]
+        end = wp.abs(x[2]) - size[1]
+        if end > side or (side > zero and end > zero):
+            moved[2] = wp.sign(x[2]) * size_d[1]
+        if side > zero and end > zero:
+            moved[0] = x[0] * size_d[0] / radial
+            moved[1] = x[1] * size_d[0] / radial
+        elif side > end:
+            moved[3] = -size_d[0]
+    else:
+        over = vec3(wp.abs(x[0]) - size[0], wp.abs(x[1]) - size[1], wp.abs(x[2]) - size[2])
+        most = wp.max(over[0], wp.max(over[1], over[2]))
+        for d in range(3):
+            if over[d] > zero or (most <= zero and over[d] == most):
+                moved[d] = wp.sign(x[d]) * size_d[d]
+    return moved
+
+
+@wp.func
 def move_contact(
     motions: MotionArrays,
     shapes: ShapeArrays,
     tangents: PackedTangents,
-    contacts: wp.ref[AdjointContacts],
+    contacts: wp.ref[StepContacts],
     k: int,
     contact: ContactRecord,
     frame: StepFrame,
@@ -131,7 +176,7 @@ def move_contact(
     radii: vec3,
     radii_d: vec3,
 ) -> ContactTangent:
-    """Return the change of a contact's point and of its condition c; the reverse of ``surfaces.reverse_contact``.
+    """Return the change of a contact's point and of its condition c.
 
     ``turning`` is the angular velocity of the link at the end of the step, ``radii`` are those at both of its ends;
     ``link`` goes from the joint ``at`` to its far end.
@@ -155,12 +200,9 @@ def move_contact(
     if shapes.kind[shape] != wp.static(MESH):
         inside = unrotate(shapes.turn[shape], unrotate(body.turn, x - origin))
         size_d = tangents.shape_size[p, shape]
-        none = vec3(zero, zero, zero)
-        grown = vec3(zero, zero, zero)
-        for d in range(3):
-            grown[d] = wp.dot(size_d, size_cotangent(shapes.kind[shape], shapes.size[shape], inside, zero, unit(d)))
-        gap_d = wp.dot(size_d, size_cotangent(shapes.kind[shape], shapes.size[shape], inside, real(1.0), none))
-        shift = shift + rotate(body.turn, rotate(shapes.turn[shape], grown))
+        grown = grow(shapes.kind[shape], shapes.size[shape], inside, size_d)
+        gap_d = grown[3]
+        shift = shift + rotate(body.turn, rotate(shapes.turn[shape], vec3(grown[0], grown[1], grown[2])))
 
     # The place on the axis, gap and normal there.
     away = moved.at + link_d * s - shift
@@ -242,7 +284,7 @@ def tangent_step(
     chain = ChainState()
     proximity = ProximityState()
     links = StepLinks()
-    contacts = AdjointContacts()
+    contacts = StepContacts()
     on = Fields()
     frame = restore_step(
         chains, motions, shapes, jobs, options, records, job, place, chain, proximity, links, contacts, on
@@ -251,7 +293,9 @@ def tangent_step(
     pose = frame.pose
     matrix = DenseSystem()
     if contacts.count > 0:
-        build_system(job, chain, proximity, contacts, system, h, 1, matrix)
+        build_system(job, chain, proximity, contacts, system, h, matrix)
+    summary = outputs.contacts[index]
+    summarize(summary, contacts, records.step[place, index])
     lag = wp.max(h, job.beta)
     # What the changes of all parameters share: fields of each link, and the load on and behind it.
     fields = LinkFields()
@@ -265,7 +309,7 @@ def tangent_step(
         rate = row(chain.rate, i)
         a = records.acceleration[place, i, index]
         for d in range(hinges_of(i)):
-            add_hinge(on, at, hinge_row(links.axis, wp.static(hinges) * i + d), rate[d], a[d], zero)
+            add_hinge(on, at, hinge_row(links.axis, wp.static(hinges) * i + d), rate[d], a[d])
         x = (row(chain.node, i + 1) - at) / chains.build[i, job.whisker].length
         com = at + x * inertia.centre
         vc = on.vv + wp.cross(on.vw, com)
@@ -299,7 +343,7 @@ def tangent_step(
     moment_d = PerLink3()
     force_d = PerLink3()
     asked = PerLinkJoint()
-    virtual = PerLinkJoint()
+    acceleration_d = PerLinkJoint()
     point_d = PerContact3()
     missed = PerContact3()
     there = PerContact3()
@@ -418,7 +462,7 @@ def tangent_step(
             asked[i] = due
 
         # Accelerations without a change of contact forces, then with it.
-        held = virtual_motion(job, chain, proximity, links, asked, none, none, contacts, 0, virtual, there)
+        held = solve_chain(job, chain, proximity, links, asked, contacts, 0, acceleration_d, there)
         contact_d = Wrench()
         contact_d.moment = none
         contact_d.force = none
@@ -427,25 +471,27 @@ def tangent_step(
                 there[k] = -contact_row(missed, k) - velocity_block(contacts, k) * contact_row(there, k) * h
             work = DenseSystem()
             work = matrix
-            solve_system(contacts, work, there)
+            degenerate = solve_system(contacts, work, there)
+            if p == 0:
+                summary.degenerate = summary.degenerate + degenerate
             for k in range(contacts.count):
-                push = contact_row(contacts.multiplier, k)
-                contacts.push[k] = push
+                push = contact_row(contacts.change, k)
                 contact_d.force = contact_d.force + push
                 contact_d.moment = contact_d.moment + wp.cross(contact_row(contacts.point, k), push)
                 contact_d.moment = contact_d.moment + wp.cross(contact_row(point_d, k), contact_row(contacts.force, k))
-            held = virtual_motion(job, chain, proximity, links, asked, none, none, contacts, 1, virtual, there)
+            held = solve_chain(job, chain, proximity, links, asked, contacts, 1, acceleration_d, there)
         if frame.reading >= 0:
             outputs.wrench[p, frame.reading, 0, index] = total_d.moment - held.moment
             outputs.wrench[p, frame.reading, 1, index] = total_d.force - held.force
             outputs.contact[p, frame.reading, 0, index] = contact_d.force
             outputs.contact[p, frame.reading, 1, index] = contact_d.moment
         for i in range(job.links):
-            rate_d = tangents.rate[p, i, index] + row(virtual, i) * h
+            rate_d = tangents.rate[p, i, index] + row(acceleration_d, i) * h
             tangents.angle[p, i, index] = tangents.angle[p, i, index] + rate_d * h
             if options.quasistatic == 1:
                 rate_d = JointVector()
             tangents.rate[p, i, index] = rate_d
+    outputs.contacts[index] = summary
 
 
 @wp.kernel(enable_backward=False, module="unique", module_options=module_options())

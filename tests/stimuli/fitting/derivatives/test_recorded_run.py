@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from brainbench.core.devices import pick_device
-from brainbench.stimuli.engines.rod.adjoint import RecordingSolver
 from brainbench.stimuli.engines.rod.engine import RodEngine
 from brainbench.stimuli.engines.rod.tasks import PackedTasks, make_task
+from brainbench.stimuli.fitting.derivatives.recorded_run import RecordingSolver
 from brainbench.stimuli.objects.obstacle import Capsule
 from brainbench.stimuli.validation.contact_scenes import contact_jobs
 from tests.factories.gradients import COARSE, touching_job
@@ -26,9 +26,13 @@ def _record(job, fidelity=FINE):
     return solver, packed.launch(solver, record_shape=True)
 
 
-def _of_wrenches(solver, frames):
-    """Return the derivatives of the sum of all wrenches by the results of one job."""
-    return np.ones((1, frames, 6)), np.zeros((1, frames, solver.capacity + 1, 3)), np.zeros((1, frames, 6))
+def _forward(solver):
+    """Return the change of one job's results with its stiffness, its base's speed and an object's place."""
+    changes = {name: np.zeros((3, *shape)) for name, shape in solver.packed_shapes.items()}
+    changes["link"][0, 6] = 1.0
+    changes["knots"][1, :, 3] = 1.0
+    changes["shape_place"][2, :, 1] = 1.0
+    return solver.forward(changes)
 
 
 def test_a_recorded_run_takes_the_steps_of_the_ordinary_one():
@@ -55,38 +59,36 @@ def test_forces_of_several_contacts_with_friction_are_solved_to_rounding():
     # Sweeps alone leave a seventh of the contact steps of this whisker on a mesh unsolved.
     job = contact_jobs(11, each=1)[31]
     solver, result = _record(job, replace(FINE, links=11))
-    found = solver.reverse(*_of_wrenches(solver, result.wrench.shape[1]))["contacts"][0]
+    summary = _forward(solver)["contacts"][0]
     assert result.steps[0, 0] > 2000
-    assert found["slipped"] > 5
-    assert found["degenerate"] == 0
+    assert summary["slipped"] > 5
+    assert summary["degenerate"] == 0
 
 
 def test_short_runs_are_written_down_once_and_long_ones_in_parts_with_the_same_derivatives(monkeypatch):
     solver, _ = _record(touching_job(POST, friction=0.4))
-    outputs = _of_wrenches(solver, 30)
     assert len(solver.checkpoints) == 1
-    whole = solver.reverse(*outputs)
+    whole = _forward(solver)
     monkeypatch.setattr(RecordingSolver, "room", 0)
     solver, _ = _record(touching_job(POST, friction=0.4))
     assert len(solver.checkpoints) > 10
-    assert np.array_equal(whole["link"], solver.reverse(*outputs)["link"])
+    assert np.array_equal(whole["wrench"], _forward(solver)["wrench"])
 
 
-def test_going_back_twice_gives_the_same():
-    solver, result = _record(touching_job(POST, friction=0.4))
-    outputs = _of_wrenches(solver, result.wrench.shape[1])
-    first, second = solver.reverse(*outputs), solver.reverse(*outputs)
-    for name in ("link", "knots", "shape_place"):
-        assert np.abs(first[name]).max() > 0
+def test_going_over_the_steps_twice_gives_the_same():
+    solver, _ = _record(touching_job(POST, friction=0.4))
+    first, second = _forward(solver), _forward(solver)
+    for name in ("wrench", "points", "contact_wrench"):
+        assert (np.abs(first[name]).max(axis=(1, 2, 3)).reshape(3, -1).max(axis=1) > 0).all()
         assert np.array_equal(first[name], second[name])
 
 
 @pytest.mark.slow
 def test_scenes_that_ask_for_no_gradient_do_not_load_its_kernels():
     code = (
-        "import sys; from tests.stimuli.engines.rod.test_adjoint import *;"
+        "import sys; from tests.stimuli.fitting.derivatives.test_recorded_run import *;"
         "RodEngine().run([touching_job(POST)], COARSE);"
-        "found = [name for name in sys.modules if 'adjoint' in name and 'kernels' in name];"
-        "assert not found, found"
+        "loaded = [name for name in sys.modules if 'kernels' in name and 'recorder' in name];"
+        "assert not loaded, loaded"
     )
     subprocess.run([sys.executable, "-c", code], check=True)

@@ -1,4 +1,4 @@
-"""Record of a whisker's steps, for the adjoint: state, length and pressing contacts of each.
+"""Steps of whiskers as they are written down: state, length and pressing contacts of each.
 
 A run that is recorded pauses after some steps (``PausedWhiskers.budget``), so that the host keeps its state there as a
 checkpoint; from a checkpoint the same steps are taken again and written down. Recorded steps are the ordinary ones, to

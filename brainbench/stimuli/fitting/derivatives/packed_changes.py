@@ -1,9 +1,9 @@
 """How the packed numbers of a job change with a parameter: central differences of the packing, which is cheap.
 
-The adjoint (:mod:`.adjoint`) gives derivatives by what is packed: masses, stiffness, knots, places of shapes. Whatever
-else a job is made of reaches the solver through these alone. So a parameter is anything from which a job can be built,
-and a difference of two packed jobs completes the chain rule. Packing is smooth, in double precision, and keeps here the
-structure of the nominal job: its links, its knots, and what is in reach.
+The kernels give derivatives by what is packed: masses, stiffness, knots, places of shapes. Whatever else a job is made
+of reaches the solver through these alone. So a parameter is anything from which a job can be built, and a difference of
+two packed jobs completes the chain rule. Packing is smooth, in double precision, and keeps here the structure of the
+nominal job: its links, its knots, and what is in reach.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from brainbench.stimuli.whiskers.chain import Chain, build_chain
 from brainbench.stimuli.whiskers.whisker import Whisker
 
 Numbers = dict[str, NDArray[np.float64]]
-"""Packed numbers of one job by the names of ``kernels.adjoint.chain.PackedGradients``; rotations as matrices."""
+"""Packed numbers of one job by the names of ``kernels.tangent.PackedTangents``; rotations as matrices."""
 
 _RIGID = 1e-7
 """Share of its size by which a moved mesh may differ from a rigid one: rounding of its vertices."""
@@ -226,12 +226,3 @@ def packed_part(arrays: Mapping[str, NDArray[Any]], name: str, places: PackedPla
     if name.startswith("shape"):
         return arrays[name][places.shapes]
     return arrays["knots"][places.base if name == "base" else places.bodies[int(name.removeprefix("body"))]]
-
-
-def contract(gradients: Mapping[str, NDArray[Any]], change: Numbers, places: PackedPlaces, job: int) -> float:
-    """Return the derivative by a parameter from those by the packed numbers and the change of these with it.
-
-    Positions of the base in the readings are not among them.
-    """
-    names = change.keys() - {"positions"}
-    return float(sum(np.vdot(packed_part(gradients, name, places, job), change[name]) for name in sorted(names)))

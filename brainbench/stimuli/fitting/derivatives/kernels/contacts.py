@@ -19,7 +19,7 @@ from ..delassus import PerContact1, PerContact3, PerContactInt
 from ..delassus import row as contact_row
 from ..parameters import hinges, real
 from ..state import WhiskerJob, row
-from .dense import DenseSystem, dense_entry, solve_dense, width
+from .newton import DenseSystem, dense_entry, solve_dense, width
 from .records import ContactRecord, StepRecord
 
 SLIDING = 1 - 1e-6
@@ -27,7 +27,7 @@ SLIDING = 1 - 1e-6
 
 
 @wp.struct
-class AdjointContacts:
+class StepContacts:
     """Contacts of a step, in order of the record."""
 
     count: wp.int32
@@ -46,10 +46,8 @@ class AdjointContacts:
     """Friction times normal force over the speed of slip."""
     scale: PerContact1
     """σ"""
-    multiplier: PerContact3
-    """ν, or going forward the change of the force."""
-    push: PerContact3
-    """Force −h A ν that the multipliers exert on the virtual motion."""
+    change: PerContact3
+    """Change of the force."""
 
 
 @wp.struct
@@ -62,10 +60,12 @@ class ContactSystem:
 
 @wp.struct
 class ContactSummary:
-    """Contacts of all steps of a run, gathered from its end on: what changed, and how near they came to a change."""
+    """Contacts of all steps of a run: what changed, and how near they came to a change."""
 
+    first: wp.int32
+    """Contacts of the first step."""
     contacts: wp.int32
-    """Contacts of the step before which it stands, and how many of them slide."""
+    """Contacts of the last step so far, and how many of them slide."""
     sliding: wp.int32
     begun: wp.int32
     """Steps with more contacts than the one before, with fewer, and with as many of which others slide."""
@@ -91,11 +91,12 @@ class ContactSummary:
 @wp.func
 def summarize(
     summary: wp.ref[ContactSummary],
-    contacts: wp.ref[AdjointContacts],
+    contacts: wp.ref[StepContacts],
     step: StepRecord,
 ):
-    """Add a step, which comes before those in the summary."""
+    """Add the next step."""
     if summary.steps == 0:
+        summary.first = contacts.count
         summary.least_force = real(1e30)
         summary.slowest_slip = real(1e30)
         summary.least_gap = real(1e30)
@@ -120,9 +121,9 @@ def summarize(
     summary.least_lead = wp.min(summary.least_lead, step.lead)
     summary.degenerate = summary.degenerate + step.inexact
     if summary.steps > 0:
-        if summary.contacts > contacts.count:
+        if contacts.count > summary.contacts:
             summary.begun = summary.begun + 1
-        elif summary.contacts < contacts.count:
+        elif contacts.count < summary.contacts:
             summary.ended = summary.ended + 1
         elif summary.sliding != sliding:
             summary.slipped = summary.slipped + 1
@@ -140,7 +141,7 @@ def unit(d: int) -> vec3:
 
 
 @wp.func
-def set_state(contacts: wp.ref[AdjointContacts], k: int, contact: ContactRecord, velocity: vec3):
+def set_state(contacts: wp.ref[StepContacts], k: int, contact: ContactRecord, velocity: vec3):
     """Find whether a contact sticks or slides, and where to."""
     n = contact.normal
     f = contact.force
@@ -164,7 +165,7 @@ def set_state(contacts: wp.ref[AdjointContacts], k: int, contact: ContactRecord,
 
 
 @wp.func
-def velocity_block(contacts: wp.ref[AdjointContacts], k: int) -> mat33:
+def velocity_block(contacts: wp.ref[StepContacts], k: int) -> mat33:
     """Return A = ∂c/∂v of a contact."""
     zero = real(0.0)
     one = real(1.0)
@@ -179,8 +180,8 @@ def velocity_block(contacts: wp.ref[AdjointContacts], k: int) -> mat33:
 
 
 @wp.func
-def force_block(contacts: wp.ref[AdjointContacts], k: int) -> mat33:
-    """Return Bᵀ = (∂c/∂f)ᵀ of a contact."""
+def force_block(contacts: wp.ref[StepContacts], k: int) -> mat33:
+    """Return B = ∂c/∂f of a contact."""
     zero = real(0.0)
     one = real(1.0)
     if contact_row(contacts.slides, k) == 0:
@@ -188,12 +189,12 @@ def force_block(contacts: wp.ref[AdjointContacts], k: int) -> mat33:
     n = contact_row(contacts.normal, k)
     whole = mat33(one, zero, zero, zero, one, zero, zero, zero, one)
     coefficient = contact_row(contacts.coefficient, k)
-    sliding = whole - wp.outer(n, n) + wp.outer(n, contact_row(contacts.slip, k)) * coefficient
+    sliding = whole - wp.outer(n, n) + wp.outer(contact_row(contacts.slip, k), n) * coefficient
     return sliding * contact_row(contacts.scale, k)
 
 
 @wp.func
-def carry_units(job: WhiskerJob, chain: wp.ref[ChainState], contacts: wp.ref[AdjointContacts], system: ContactSystem):
+def carry_units(job: WhiskerJob, chain: wp.ref[ChainState], contacts: wp.ref[StepContacts], system: ContactSystem):
     """Carry unit forces at the contacts up the factorised chain, as ``delassus.build_delassus`` does."""
     for k in range(contacts.count):
         for d in range(3):
@@ -225,7 +226,7 @@ def carry_units(job: WhiskerJob, chain: wp.ref[ChainState], contacts: wp.ref[Adj
 def compliance(
     job: WhiskerJob,
     proximity: wp.ref[ProximityState],
-    contacts: wp.ref[AdjointContacts],
+    contacts: wp.ref[StepContacts],
     system: ContactSystem,
     k: int,
     e: int,
@@ -253,27 +254,20 @@ def build_system(
     job: WhiskerJob,
     chain: wp.ref[ChainState],
     proximity: wp.ref[ProximityState],
-    contacts: wp.ref[AdjointContacts],
+    contacts: wp.ref[StepContacts],
     system: ContactSystem,
     h: real,
-    forward: int,
     matrix: wp.ref[DenseSystem],
 ):
-    """Write the matrix of the multipliers, G A + Bᵀ, or with ``forward`` that of the change of forces, A G + B."""
+    """Write the matrix A G + B of the change of the forces."""
     carry_units(job, chain, contacts, system)
     for k in range(contacts.count):
         own = compliance(job, proximity, contacts, system, k, k, h)
         contacts.scale[k] = (own[0, 0] + own[1, 1] + own[2, 2]) / real(3.0)
     for k in range(contacts.count):
         for e in range(contacts.count):
-            block = compliance(job, proximity, contacts, system, k, e, h)
-            if forward == 1:
-                block = velocity_block(contacts, k) * block
-            else:
-                block = block * velocity_block(contacts, e)
-            if k == e and forward == 1:
-                block = block + wp.transpose(force_block(contacts, k))
-            elif k == e:
+            block = velocity_block(contacts, k) * compliance(job, proximity, contacts, system, k, e, h)
+            if k == e:
                 block = block + force_block(contacts, k)
             for a in range(3):
                 for b in range(3):
@@ -281,16 +275,13 @@ def build_system(
 
 
 @wp.func
-def solve_system(contacts: wp.ref[AdjointContacts], matrix: wp.ref[DenseSystem], asked: wp.ref[PerContact3]) -> int:
-    """Solve the system in place for the multipliers, or for the change of the forces in their place.
-
-    Returned is 1 where contacts share a load in more than one way.
-    """
+def solve_system(contacts: wp.ref[StepContacts], matrix: wp.ref[DenseSystem], asked: wp.ref[PerContact3]) -> int:
+    """Solve the system in place for the change of the forces; return 1 where contacts share a load in several ways."""
     size = 3 * contacts.count
     for r in range(size):
         matrix[r * wp.static(width) + size] = contact_row(asked, r // 3)[r % 3]
     degenerate = solve_dense(matrix, size)
     for k in range(contacts.count):
         for d in range(3):
-            contacts.multiplier[k, d] = dense_entry(matrix, (3 * k + d) * wp.static(width) + size)
+            contacts.change[k, d] = dense_entry(matrix, (3 * k + d) * wp.static(width) + size)
     return degenerate

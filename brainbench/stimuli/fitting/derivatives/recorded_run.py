@@ -1,4 +1,4 @@
-"""Adjoint of the ``rod`` solver: derivatives of what it reads with respect to everything that is packed for it.
+"""Runs of the engine ``rod`` that are written down, and the derivatives of their results by whatever was packed.
 
 **One step**, as the kernels solve it. State: joint angles q and rates q̇, 2 or 3 hinges a joint; step length h. With the
 spatial inertia I of each link, its twist V and acceleration A (of the base as its track moves within the step, less
@@ -18,28 +18,24 @@ Coulomb problem has one of three solutions at each:
 
 A reading is the wrench at the base of the step that begins at its time, and the joints' places at its beginning.
 
-**Adjoint.** The step solves R(a, f; q, q̇, θ) = 0, so by the implicit function theorem the derivative of any output L is
-that of L + μ·R at fixed a and f, where the multipliers μ solve the transposed system (∂R/∂(a, f))ᵀ μ = −∂L/∂(a, f). How
-the forces were iterated plays no part; contacts keep the state that the solution has. The chain's part of the system is
-symmetric: the factorised chain solves it in O(links), with the derivative by the base wrench as the motion of the base.
-The contacts' part is a dense system of 3 × contacts. What is left, the derivative of μ·R by q, q̇ and θ at fixed a and
-f, is that of a virtual power, one pass down the chain and one up (``kernels.adjoint.chain``). Contact points move over
-spheres, cylinders, faces, edges and corners by the second derivatives of the distance (``kernels.adjoint.contacts``).
-Forces of recorded steps are solved to rounding, which those of the ordinary engine are not: the theorem holds at the
-solution.
-
-**Forward.** With a change of the state and of θ the same system, transposed, gives the changes of a and f: one solution
-a step for each parameter, and with it the derivatives of all readings (``kernels.adjoint.tangent``).
+**Derivatives.** The step solves R(a, f; q, q̇, θ) = 0. By the implicit function theorem the changes of a and f with a
+change of q, q̇ and the packed numbers θ solve the linear system ∂R/∂(a, f) (δa, δf) = −δR, where δR is the change at
+fixed a and f. How the forces were iterated plays no part; contacts keep the state that the solution has. The chain's
+part of the system is symmetric: the factorised chain solves it in O(links). The contacts' part is a dense system of
+3 × contacts. Contact points move over spheres, cylinders, faces, edges and corners by the second derivatives of the
+distance (``kernels.recording``). So one pass over the steps gives the changes of all readings, at one solution a step
+for each parameter (``kernels.tangent``). Forces of recorded steps are solved to rounding, which those of the ordinary
+engine are not: the theorem holds at the solution.
 
 **Memory.** Runs whose steps take at most ``ROOM`` are written down as they go. Longer ones pause after every √steps
-steps, where the state is kept; going back, each segment is run again from there and written down, the same steps to the
-digit. Step lengths are those that the run took: derivatives are at a fixed sequence of steps.
+steps, where the state is kept; each segment is then run again from there and written down, the same steps to the digit.
+Step lengths are those that the run took: derivatives are at a fixed sequence of steps.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -54,19 +50,21 @@ from brainbench.stimuli.engines.rod.streams import turn
 from brainbench.stimuli.engines.units import MICRO, MILLI
 from brainbench.stimuli.whiskers.chain import Chain
 
+KERNELS = f"{__package__}.kernels"
+"""Package that writes steps down."""
 ROOM = 2**26
 """Bytes that records of the steps of a launch may take; beyond them they are written down in parts."""
 
 
 class RecordingSolver(WhiskerSolver):
-    """A solver whose launches can be gone back over. In double precision."""
+    """A solver whose launches can be gone over again. In double precision."""
 
     room = ROOM
     """Bytes that records of steps may take."""
 
     def __init__(self, chains: Sequence[Chain], fidelity: Fidelity, device: Any, needs: int, *, twists: bool) -> None:
         """Load kernels; arguments as for :class:`.launch.WhiskerSolver`."""
-        super().__init__(chains, fidelity, device, needs, twists=twists, recorded=True)
+        super().__init__(chains, fidelity, device, needs, twists=twists, recorder=KERNELS)
         self.inputs: list[Any] = []
         """Arguments of the last launch."""
         self.checkpoints: list[tuple[Any, Any, Any]] = []
@@ -104,15 +102,16 @@ class RecordingSolver(WhiskerSolver):
         self.paused.records.count.zero_()
         warp().launch(self.kernels.run, self.count, [*self.inputs, self.paused], device=self.device)
 
-    def _segments(self, checkpoints: Iterable[tuple[Any, Any, Any]]) -> Iterator[Any]:
+    def _segments(self) -> Iterator[Any]:
         """Yield the records of the segments that begin at checkpoints; each is run again unless there is one."""
         wp = warp()
         whole = self.paused.keep == 1 and len(self.checkpoints) == 1
         self.paused.keep = 1
-        for kept in checkpoints:
+        for checkpoint in self.checkpoints:
             if not whole:
-                for state, now in zip(kept, (self.paused.state, self.paused.link, self.inputs[-1].held), strict=True):
-                    wp.copy(now, state)
+                current = self.paused.state, self.paused.link, self.inputs[-1].held
+                for before, now in zip(checkpoint, current, strict=True):
+                    wp.copy(now, before)
                 self._run()
             yield self.paused.records
 
@@ -137,21 +136,22 @@ class RecordingSolver(WhiskerSolver):
             "shape_friction": (solids,),
         }
 
-    def forward(self, changes: Mapping[str, NDArray[np.float64]]) -> dict[str, NDArray[np.float64]]:
+    def forward(self, changes: Mapping[str, NDArray[np.float64]]) -> dict[str, NDArray[Any]]:
         """Go over the last launch again; return the change of its results with that of what was packed.
 
         Args:
             changes: [p, …] by parameter, of the arrays and shapes of :attr:`packed_shapes`.
 
         Returns:
-            ``wrench`` [p, job, reading, 6], ``points`` [p, job, reading, node, 3] from the base point, and
-            ``contact_wrench`` [p, job, reading, 6]. SI units.
+            ``wrench`` [p, job, reading, 6], ``points`` [p, job, reading, node, 3] from the base point,
+            ``contact_wrench`` [p, job, reading, 6] in SI units, and ``contacts`` [job], the summary of the run's
+            contacts (``kernels.contacts.ContactSummary``).
         """
-        from brainbench.stimuli.engines.rod.kernels import BUILDING, build_adjoint
+        from brainbench.stimuli.engines.rod.kernels import BUILDING, specialize
 
         wp, device = warp(), self.device
         with BUILDING:
-            kernels = build_adjoint(self.kernels, "tangent")
+            kernels = specialize("recorder.tangent", **self.kernels.parameters)
         chains, motions, shapes, jobs, options, readings, *_ = self.inputs
         count, some = self.count, len(changes["beta"])
         frames = int(readings.row.numpy().max()) + 1
@@ -170,65 +170,20 @@ class RecordingSolver(WhiskerSolver):
                 device,
                 points=(some, frames, self.capacity + 1, count),
                 **dict.fromkeys(("wrench", "contact"), (some, frames, 2, count)),
+                contacts=count,
             )
-            for records in self._segments(self.checkpoints):
+            for records in self._segments():
                 arguments = [chains, motions, shapes, jobs, options, records, system, tangents, outputs]
                 wp.launch(kernels.tangent_segment, count, arguments, device=device)
-            found = {
-                name: np.moveaxis(getattr(outputs, name).numpy(), 3, 1) for name in ("wrench", "points", "contact")
-            }
+            wrench, points, contact = (
+                np.moveaxis(values.numpy(), 3, 1) for values in (outputs.wrench, outputs.points, outputs.contact)
+            )
+            summaries = outputs.contacts.numpy()
         units = np.array([MILLI, MICRO])[:, None]
         # The kernels find the wrench of the base on the whisker, moment first.
         return {
-            "wrench": (-found["wrench"][:, :, :, ::-1] / units).reshape(*found["wrench"].shape[:3], 6),
-            "points": found["points"] / MILLI,
-            "contact_wrench": (found["contact"] / units).reshape(*found["contact"].shape[:3], 6),
+            "wrench": (-wrench[:, :, :, ::-1] / units).reshape(*wrench.shape[:3], 6),
+            "points": points / MILLI,
+            "contact_wrench": (contact / units).reshape(*contact.shape[:3], 6),
+            "contacts": summaries,
         }
-
-    def reverse(
-        self, wrench: NDArray[np.float64], points: NDArray[np.float64], contact_wrench: NDArray[np.float64]
-    ) -> dict[str, NDArray[Any]]:
-        """Go back over the last launch; return the derivatives by what was packed.
-
-        They have the names of ``kernels.adjoint.chain.PackedGradients``, those of shapes ``shape_…``. Arguments are the
-        derivatives of a number by the results, of all nodes, in the shapes of :meth:`forward` without p. SI units.
-        """
-        from brainbench.stimuli.engines.rod.kernels import BUILDING, build_adjoint
-
-        wp, device, structs = warp(), self.device, self.kernels.structs
-        with BUILDING:
-            adjoint = build_adjoint(self.kernels, "chain")
-        chains, motions, shapes, jobs, options, *_ = self.inputs
-        count, contacts = self.count, contacts_for(self.capacity)
-        units = np.array([MILLI, MICRO])[:, None]
-        acting, felt = (np.moveaxis(some.reshape(*some.shape[:2], 2, 3), 0, 2) for some in (wrench, contact_wrench))
-        outputs = {
-            # The kernels find the wrench of the base on the whisker, moment first.
-            "wrench": -acting[:, ::-1] / units[::-1, None],
-            "points": np.moveaxis(points, 0, 2) / MILLI,
-            "contact": felt / units[:, None],
-        }
-        with turn(device):
-            given = adjoint.OutputCotangents()
-            for name, values in outputs.items():
-                setattr(given, name, wp.array(values, dtype=structs.vec3, device=device))
-            system = allocate(adjoint.ContactSystem, device, unit=(3 * contacts, self.capacity, count))
-            gradients = allocate(
-                adjoint.PackedGradients,
-                device,
-                **dict.fromkeys(("angle", "rate"), (self.capacity, count)),
-                link=(10, self.capacity, count),
-                **dict.fromkeys(("beta", "friction", "gravity", "contacts", "reading"), count),
-                knots=(int(motions.place.shape[0]), 16),
-                **dict.fromkeys(("load_force", "load_share"), int(jobs.load_force.shape[0])),
-            )
-            places = dict.fromkeys(("place", "turn", "size", "friction"), int(shapes.kind.shape[0]))
-            gradients.shape = allocate(adjoint.ShapeGradients, device, **places)
-            for records in self._segments(reversed(self.checkpoints)):
-                # Going back needs no trees of meshes, nor what else only contact searches read.
-                arguments = [chains, motions, shapes, jobs, options, records, given, system, gradients]
-                wp.launch(adjoint.reverse_segment, count, arguments, device=device)
-            names = ("link", "beta", "friction", "gravity", "contacts", "knots", "load_force", "load_share")
-            found = {name: getattr(gradients, name).numpy() for name in names}
-            found |= {f"shape_{name}": getattr(gradients.shape, name).numpy() for name in places}
-        return found

@@ -1,21 +1,10 @@
-"""Derivatives of ``motion.pose_at``: those by a pose become those by the knots of its track, and knots move a pose."""
+"""Derivatives of ``motion.pose_at``: how the knots of a track move its pose."""
 
 import warp as wp
 
 from ..algebra import vec3, vec4
 from ..motion import Instant, MotionArrays, cell_at, elapsed, turning
 from ..parameters import real
-
-
-@wp.struct
-class PoseCotangent:
-    """Derivatives with respect to the pose of a body at one time."""
-
-    place: vec3
-    velocity: vec3
-    turn: vec3
-    """By a small turn of the body about its place, world axes."""
-    spin: vec3
 
 
 @wp.struct
@@ -68,62 +57,6 @@ def raw_turn(motions: MotionArrays, piece: TrackPiece) -> vec4:
         + motions.turn[b] * piece.v1
         + turning(motions.turn[b], motions.spin[b]) * piece.s1
     )
-
-
-@wp.func
-def add_knot(knots: wp.array2d(dtype=real), knot: int, first: int, value: vec3):
-    """Add to three numbers of a knot."""
-    for d in range(3):
-        wp.atomic_add(knots, knot, first + d, value[d])
-
-
-@wp.func
-def add_quaternion(knots: wp.array2d(dtype=real), knot: int, value: vec4):
-    """Add to the quaternion of a knot."""
-    for d in range(4):
-        wp.atomic_add(knots, knot, 6 + d, value[d])
-
-
-@wp.func
-def spin_cotangent(turn: vec4, bar: vec4) -> vec3:
-    """Return the derivative by the angular velocity of ``turning(turn, spin)``, given that by its result."""
-    half = real(0.5)
-    return vec3(
-        half * (bar[1] * turn[0] - bar[0] * turn[1] + bar[3] * turn[2] - bar[2] * turn[3]),
-        half * (bar[2] * turn[0] - bar[0] * turn[2] + bar[1] * turn[3] - bar[3] * turn[1]),
-        half * (bar[3] * turn[0] - bar[0] * turn[3] + bar[2] * turn[1] - bar[1] * turn[2]),
-    )
-
-
-@wp.func
-def spread_pose(motions: MotionArrays, knots: wp.array2d(dtype=real), index: int, when: Instant, bar: PoseCotangent):
-    """Add to the derivatives by the knots [knot, 16] of a track what derivatives by its pose at a time give."""
-    first = motions.first[index]
-    count = motions.count[index]
-    # A small turn φ changes the unit quaternion q by ½ (0, φ) q, so the derivative by it is 2 (0, φ̄) q.
-    if count == 1:
-        add_knot(knots, first, 0, bar.place)
-        add_knot(knots, first, 3, bar.velocity + bar.place * elapsed(when))
-        add_quaternion(knots, first, turning(motions.turn[first], bar.turn) * real(4.0))
-        return
-    piece = piece_at(motions, first, count, when)
-    a = piece.first
-    b = a + 1
-    way = bar.place * piece.v1 - bar.velocity * piece.dv
-    add_knot(knots, a, 0, bar.place - way)
-    add_knot(knots, b, 0, way)
-    add_knot(knots, a, 3, bar.place * piece.s0 + bar.velocity * piece.ds0)
-    add_knot(knots, b, 3, bar.place * piece.s1 + bar.velocity * piece.ds1)
-    turn = raw_turn(motions, piece)
-    size = wp.length(turn)
-    raw = turning(turn / size, bar.turn) * (real(4.0) / size)
-    # The transpose of turning(·, w) is turning(·, −w).
-    add_quaternion(knots, a, raw * piece.v0 - turning(raw, motions.spin[a]) * piece.s0)
-    add_quaternion(knots, b, raw * piece.v1 - turning(raw, motions.spin[b]) * piece.s1)
-    add_knot(knots, a, 10, spin_cotangent(motions.turn[a], raw) * piece.s0 + bar.spin * piece.v0)
-    add_knot(knots, b, 10, spin_cotangent(motions.turn[b], raw) * piece.s1 + bar.spin * piece.v1)
-    add_knot(knots, a, 13, bar.spin * piece.s0)
-    add_knot(knots, b, 13, bar.spin * piece.s1)
 
 
 @wp.struct
