@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Any, Protocol
 if TYPE_CHECKING:
     import torch
 
+    from robotics_bridge.hands import Hand
+
 
 @dataclass(eq=False)
 class StepContext:
@@ -76,11 +78,36 @@ class StepContext:
     """Additions of the task's own state, by name."""
 
 
-class TaskState(Protocol):
-    """Made once by ``task.task_state(state)``, given the ``EnvState`` of B environments.
+class TaskScene(Protocol):
+    """What a part of a task with a state of its own sees of B environments (``robotics_bridge.envs.state.EnvState``).
 
     It reads there poses and contacts, and may write ``episode.target`` [B], the number of the object that counts.
     """
+
+    hand: Hand
+    num_envs: int
+    device: torch.device
+    model: Any
+    """Compiled physics of the task (:class:`~robotics_bridge.tasks.scenes.TaskModel`)."""
+    simulation: Any
+    """Physics: its engine, ``state`` and ``pose`` [B, L, 7] of links (m; x y z, qx qy qz qw)."""
+    contacts: Any
+    """Contacts of finger tips; ``tip_links`` [F] are their links."""
+    episode: Any
+    """Memory of the running episodes."""
+
+    @property
+    def target_pose(self) -> torch.Tensor:
+        """Pose [B, 7] of the object that counts (m; x y z, qw qx qy qz)."""
+        ...
+
+    def draw(self, count: int, low: float, high: float) -> torch.Tensor:
+        """Return uniform random numbers [B, count]."""
+        ...
+
+
+class TaskState(Protocol):
+    """Made once by ``task.task_state(scene)``, given the :class:`TaskScene` of B environments."""
 
     def reset(self, mask: torch.Tensor) -> None:
         """Begin new episodes where the mask [B] is set."""

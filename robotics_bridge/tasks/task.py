@@ -6,7 +6,7 @@ import itertools
 import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from brainbench.core.errors import UsageError, check_each, check_name
 from brainbench.core.reading.ranges import check_fields, check_number, check_numbers
@@ -17,10 +17,7 @@ from robotics_bridge.tasks.contact_model import CONTACTS, ContactModel
 from robotics_bridge.tasks.goals import Goal
 from robotics_bridge.tasks.objects import PRIMITIVES, ObjectShape
 from robotics_bridge.tasks.settings import AuxiliaryDecoder, StudentSettings, TeacherSettings
-from robotics_bridge.tasks.step_context import TaskState
-
-if TYPE_CHECKING:
-    from robotics_bridge.envs.state import EnvState
+from robotics_bridge.tasks.step_context import TaskScene, TaskState
 
 Range = tuple[float, float]
 """Lower and upper bound of a uniform distribution."""
@@ -248,7 +245,7 @@ class Task:
     """Axis of the object whose rotation is counted (its own frame); made unit length."""
     turn_window: int = 60
     """Steps over which stagnation is judged."""
-    task_state: Callable[[EnvState], TaskState] | None = None
+    task_state: Callable[[TaskScene], TaskState] | None = None
     """Makes the part of the task that keeps a state of its own (hot_ball's thermometers)."""
     # --- learning ---
     command: tuple[str, ...] = ("on",)

@@ -20,8 +20,7 @@ from robotics_bridge.sensors.temperature.runtime import link_temperature
 if TYPE_CHECKING:
     import torch
 
-    from robotics_bridge.envs.state import EnvState
-    from robotics_bridge.tasks.step_context import StepContext
+    from robotics_bridge.tasks.step_context import StepContext, TaskScene
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,7 +88,7 @@ class Thermometers:
     ``env.episode.target`` says which ball is hot; with ``chooses`` it is drawn anew at every reset.
     """
 
-    def __init__(self, env: EnvState, thermal: ThermalSettings, *, chooses: bool = True) -> None:
+    def __init__(self, env: TaskScene, thermal: ThermalSettings, *, chooses: bool = True) -> None:
         import torch
 
         from robotics_bridge.sensors import SensorSuite
