@@ -13,7 +13,7 @@ from brainbench.metrics.measures.patterns import LinearCKA, Procrustes
 from brainbench.metrics.measures.ridge import RidgeEncoding
 from brainbench.metrics.measures.rsa import RSA
 
-for metric in (
+for measure in (
     # Squared Euclidean RDMs by whitened cosine is linear CKA (Diedrichsen 2021), here with the noise of trials taken
     # out of the animals' distances.
     RSA("rsa", "whitened cosine between RDMs of squared Euclidean distances, without trial noise, noise-corrected"),
@@ -37,4 +37,4 @@ for metric in (
     ),
     PartialRSA(),
 ):
-    register_metric(metric)
+    register_metric(measure)
