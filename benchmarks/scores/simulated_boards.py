@@ -21,7 +21,7 @@ from brainbench.datasets.synthetic.populations import draw_sessions
 from brainbench.metrics import get_metric, rdm
 from brainbench.metrics.measures.rsa import RSA
 from brainbench.metrics.rdms.comparison import compare_all
-from brainbench.metrics.time import AnimalMovie, score_over_time
+from brainbench.scoring.over_time import AnimalMovie, score_over_time
 
 DIMENSIONS = 10
 RULES = ("animals alone", "two factors")

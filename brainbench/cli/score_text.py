@@ -20,11 +20,6 @@ def score_text(record: ResultRecord) -> str:
     parts += _details(score.provenance.statistics)
     if notes := list(_notes(record)):
         parts.append("\n".join(f"Note: {note}." for note in notes))
-    if record.animal_to_animal is not None and score.estimator == "default" and score.subjects:
-        from brainbench.metrics.inference.equivalence import turing_test
-
-        alike = turing_test(score, record.animal_to_animal).summary()
-        parts.append(f"As much like the animals as they are like one another? {alike}")
     if walk := score.provenance.statistics.get("estimator_walk"):
         parts.append(walk_text(walk))
     others = {"animal to animal": record.animal_to_animal, **record.baselines}

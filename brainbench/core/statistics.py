@@ -14,7 +14,7 @@ from brainbench.core.reading.ranges import check_number
 from brainbench.core.records import Interval, Score
 
 LEVEL = 0.95
-"""Confidence level of all intervals but those of an equivalence test."""
+"""Confidence level of all intervals."""
 
 
 def t_interval(values: ArrayLike, *, over: str = "values") -> Interval | None:

@@ -15,8 +15,7 @@ from brainbench.core.statistics import t_interval
 from brainbench.metrics.hooks import MetricHooks
 from brainbench.metrics.inference.permutation import canonical_order
 from brainbench.metrics.rdms.pairs import Floats, Ints
-from brainbench.metrics.reliability.ceiling import noise_ceiling
-from brainbench.metrics.reliability.noise_correction import Corrected
+from brainbench.metrics.reliability.noise_correction import Corrected, noise_ceiling
 from brainbench.metrics.reliability.subject_rdm import SubjectRDM, is_flat
 
 

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from functools import partial
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property, partial
+from typing import Any, Literal
 
 import numpy as np
 
 from brainbench.metrics.animals import Animals
-from brainbench.metrics.comparisons import LayerComparisons
 from brainbench.metrics.hooks import MetricHooks
 from brainbench.metrics.inference.permutation import (
     SMALLEST_STIMULI,
@@ -20,8 +20,162 @@ from brainbench.metrics.inference.permutation import (
     most_exact,
     smallest_p,
 )
-from brainbench.metrics.layers import HALVES, LayerRule, layer_rule, most_chosen, take_layers
 from brainbench.metrics.rdms.pairs import Floats, Ints
+from brainbench.metrics.reliability.subject_rdm import SubjectRDM
+
+_TIE = 1e-12
+
+Kind = Literal["fixed", "others", "halves", "maximum"]
+
+
+@dataclass(frozen=True)
+class LayerRule:
+    """Choice of the layer for each animal among comparisons [..., L, A]."""
+
+    kind: Kind
+    words: str
+    """The rule, as a record states it."""
+    fixed: int = 0
+    """The layer, where it is given."""
+    factors: Floats | None = None
+    """[A] weights of the animals, where the maximum of the corrected mean is taken."""
+
+    def choose(self, r: Floats) -> Ints:
+        """Return the layer [..., A] for each animal."""
+        if self.kind == "others":
+            return choose_on_others(r)
+        if self.kind == "halves":
+            # Animals are the halves of one animal's splits: each is scored by the layer best on its other half.
+            pairs = r.reshape(*r.shape[:-1], -1, 2)[..., ::-1]
+            return first_best(pairs.reshape(r.shape))
+        shape = (*r.shape[:-2], r.shape[-1])
+        if self.kind == "maximum":
+            weighted = r if self.factors is None else r * self.factors
+            return np.broadcast_to(first_best(weighted.mean(axis=-1)[..., None]), shape)
+        return np.full(shape, self.fixed)
+
+    def held(self, r: Floats) -> Floats:
+        """Return the comparison [..., A] of each animal with the layer chosen for it."""
+        return r[..., self.fixed, :] if self.kind == "fixed" else take_layers(r, self.choose(r))
+
+
+def layer_rule(
+    names: list[str], animals: int, *, committed: str | None = None, estimator: str = "default", factors: Floats
+) -> LayerRule:
+    """Return the rule for layers ``names`` [L] and a number of animals (a single one whose halves are not known)."""
+    if committed is not None:
+        return LayerRule("fixed", "committed to beforehand", names.index(committed))
+    if len(names) == 1:
+        return LayerRule("fixed", "only layer")
+    if estimator != "default":
+        # The published rule; the test takes the same maximum, so its p stays honest where the value is not.
+        words = "maximum over layers on the data that are scored (as published; optimistic)"
+        return LayerRule("maximum", words, factors=factors)
+    if animals == 1:
+        words = "maximum over layers on the only animal (optimistic; the permutation takes the same maximum)"
+        return LayerRule("maximum", words)
+    return LayerRule("others", "chosen on the other animals, evaluated on the animal held out")
+
+
+HALVES = LayerRule("halves", "chosen on one half of the only animal's trials, evaluated on the other half")
+
+
+def choose_on_others(r: Floats) -> Ints:
+    """Return the layer [..., A] that compares best with all animals but each.
+
+    From raw comparisons [..., L, A], A ≥ 2.
+    """
+    # All leave-one-out means from one sum over animals.
+    others = (r.sum(axis=-1, keepdims=True) - r) / (r.shape[-1] - 1)
+    return first_best(others)
+
+
+def held_out(r: Floats) -> Floats:
+    """Return the comparison [..., A] of each animal with the layer chosen on the others, from r [..., L, A]."""
+    return take_layers(r, choose_on_others(r))
+
+
+def most_chosen(chosen: Ints) -> int:
+    """Return the layer chosen most often; the first among equals."""
+    return int(np.argmax(np.bincount(np.ravel(chosen))))
+
+
+def first_best(values: Floats) -> Ints:
+    """Return the first index [..., A] of the layers [..., L, A] whose value equals the largest up to rounding."""
+    # A tolerance for ties: layers with equal RDMs differ by rounding, and the first of them is to win on every machine.
+    return np.argmax(values >= values.max(axis=-2, keepdims=True) - _TIE, axis=-2)
+
+
+def take_layers(values: Floats, index: Ints) -> Floats:
+    """Return the values [..., A] of one layer for each animal, from [..., L, A] and layers [A] or [..., A]."""
+    index = np.broadcast_to(index, (*values.shape[:-2], values.shape[-1]))
+    return np.take_along_axis(values, index[..., None, :], axis=-2)[..., 0, :]
+
+
+Orders = Callable[[], Iterable[Ints]]
+"""Gives chunks of orders of the stimuli [N, K], the same at every call."""
+
+
+@dataclass(frozen=True)
+class LayerComparisons:
+    """Verdict of a metric on the layers of one model and a number of animals."""
+
+    metric: MetricHooks
+    layers: Sequence[Floats] = field(repr=False)
+    """[L] what :meth:`Metric.layer` made of each."""
+    animals: Sequence[SubjectRDM] = field(repr=False)
+    """[A]"""
+    device: Any = None
+
+    @cached_property
+    def known(self) -> np.ndarray:
+        """[L, K] where a layer has a value for a stimulus."""
+        return np.stack([self.metric.known(layer) for layer in self.layers])
+
+    def among(self, layers: Sequence[Floats], animals: Sequence[SubjectRDM]) -> LayerComparisons:
+        """Return the comparisons of some layers with some animals."""
+        return LayerComparisons(self.metric, layers, animals, self.device)
+
+    def given(self) -> Floats:
+        """Return comparisons [L, A] of the stimuli as they are."""
+        return next(self.under(lambda: [np.arange(self.known.shape[1])[None]]))[0]
+
+    def under(self, orders: Orders) -> Iterator[Floats]:
+        """Yield comparisons [N, L, A] with the model's stimuli in each order of a chunk [N, K]."""
+        if self.known.all():
+            yield from self.metric.compare_layers(self.layers, self.animals, orders(), self.device)
+            return
+        patterns, group = np.unique(self.known, axis=0, return_inverse=True)
+        streams = [
+            self._some(np.flatnonzero(group.ravel() == index), np.flatnonzero(kept), orders)
+            for index, kept in enumerate(patterns)
+        ]
+        for parts in zip(*streams, strict=True):
+            found = np.empty((len(parts[0]), len(self.layers), len(self.animals)))
+            for index, part in enumerate(parts):
+                found[:, group.ravel() == index] = part
+            yield found
+
+    def _some(self, layers: Ints, stimuli: Ints, orders: Orders) -> Iterator[Floats]:
+        """Yield comparisons of some layers over the stimuli that they have."""
+        count = self.known.shape[1]
+        place = np.full(count, -1)
+        place[stimuli] = np.arange(len(stimuli))
+        # A random order of all stimuli is a random order of those that are left, when the others are passed over.
+        kept = (place[chunk][place[chunk] >= 0].reshape(len(chunk), -1) for chunk in orders())
+        reps = [self.metric.take(self.layers[layer], stimuli) for layer in layers]
+        yield from self.metric.compare_layers(reps, [one.take(stimuli) for one in self.animals], kept, self.device)
+
+    def without_each(self) -> Floats:
+        """Return comparisons [K, L, A] without each stimulus in turn."""
+        if self.known.all():
+            return self.metric.compare_without(self.layers, self.animals)
+        found = np.repeat(self.given()[None], self.known.shape[1], axis=0)
+        for layer, kept in enumerate(map(np.flatnonzero, self.known)):
+            part = [self.metric.take(self.layers[layer], kept)], [one.take(kept) for one in self.animals]
+            found[kept, layer] = self.metric.compare_without(*part)[:, 0]
+        return found
+
 
 _CHUNK_ELEMENTS = 1 << 22
 _HALVES_IN_PERMUTATIONS = 100

@@ -30,7 +30,7 @@ from brainbench.core.errors import DataError, UsageError, shown
 from brainbench.core.reading.archives import read_npz
 from brainbench.core.records import Status
 from brainbench.metrics.animals import gather
-from brainbench.metrics.layers import held_out
+from brainbench.metrics.evaluation import held_out
 from brainbench.metrics.measures.rsa import RSA
 from brainbench.metrics.rdms.comparison import compare
 from brainbench.metrics.rdms.pairs import Floats, rdm_stack, stimulus_count

@@ -17,9 +17,8 @@ from brainbench.core.trials import Trials
 from brainbench.metrics.arrays import fetch
 from brainbench.metrics.inference.permutation import SMALLEST_STIMULI, canonical_order
 from brainbench.metrics.rdms.pairs import Floats, Ints
-from brainbench.metrics.reliability.denoising import simulated_animals
 from brainbench.metrics.reliability.noise_correction import Corrected, gated
-from brainbench.metrics.reliability.subject_rdm import SubjectRDM, subject_rdm
+from brainbench.metrics.reliability.subject_rdm import SubjectRDM, simulated_animals, subject_rdm
 from brainbench.metrics.stimulus_labels import response_matrix
 
 _SAFE_EXPONENT = 64

@@ -21,7 +21,7 @@ from brainbench.core.records import LayerScore, Score, SubjectScore
 from brainbench.metrics.animals import recorded_rdm
 from brainbench.metrics.inference.permutation import EXACT_STIMULI, make_test, permuted_values
 from brainbench.metrics.rdms.comparison import compare
-from brainbench.metrics.rdms.distances import correlation_distances
+from brainbench.metrics.rdms.dissimilarity import correlation_distances
 from brainbench.metrics.rdms.pairs import Floats
 from brainbench.metrics.reliability.noise_correction import THESIS_FILTER, noise_corrected
 

@@ -128,7 +128,7 @@ def score_record(
         rdms = {layer: metrics.rdm(values) for layer, values in features.items()}
         statistics[0] = {**statistics[0], "estimator_walk": to_plain(explain_score(rdms, animals))}
     if options.over_time and isinstance(metric, RSA):
-        from brainbench.scoring.over_time import time_course
+        from brainbench.scoring.over_time.course import time_course
 
         course = time_course(brain, network, metric, kept, rows, options, progress=progress)
         statistics[0] = {**statistics[0], "time_course": to_plain(course)}

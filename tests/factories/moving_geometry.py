@@ -6,7 +6,7 @@ import numpy as np
 
 from brainbench.core.trials import Trials
 from brainbench.metrics import rdm
-from brainbench.metrics.time import AnimalMovie
+from brainbench.scoring.over_time import AnimalMovie
 
 BIN = 0.05
 DIMENSIONS = 4
@@ -41,7 +41,7 @@ def make_layer(rng, path, features=40):
     return np.stack([rdm(value, method="sqeuclidean") for value in values])
 
 
-def make_session(rng, path, *, units=25, repeats=8, noise=2.0):
+def make_moving_session(rng, path, *, units=25, repeats=8, noise=2.0):
     """One session of trials [R, T, U] that follow a path."""
     labels = np.repeat(np.arange(path.shape[1]), repeats)
     means = (path @ rng.normal(size=(DIMENSIONS, units))).swapaxes(0, 1)

@@ -16,8 +16,7 @@ import pytest
         "reliability.noise_correction",
         "inference.permutation",
         "inference.multiple",
-        "inference.equivalence",
-        "measures.classifier",
+        "measures.decoding",
     ],
 )
 def test_the_examples_of_the_docstrings_hold(module):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,12 +13,15 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from brainbench.core.errors import UsageError
-from brainbench.core.records import Score
-from brainbench.core.statistics import t_interval
+from brainbench.core.records import Interval, Score
+from brainbench.core.statistics import t_interval, two_factor_error, two_factor_interval
 from brainbench.metrics import compare, noise_ceiling, noise_corrected, rdm
-from brainbench.metrics.measures.rsa import score_rdms
+from brainbench.metrics.measures.rsa import RSA, score_rdms
+from brainbench.metrics.rdms.comparison import compare_all
 from brainbench.metrics.rdms.pairs import permuted_pairs
+from brainbench.metrics.reliability.noise_correction import spearman_brown
 from brainbench.metrics.reliability.subject_rdm import subject_rdm
+from brainbench.metrics.score import held_to_scale, interval_reasons
 from tests.factories.animals import STIMULI, make_block, make_latent, make_rdm, make_subject
 
 
@@ -350,3 +354,171 @@ def test_the_interval_covers_the_mean_of_all_animals(animals):
         interval = t_interval(rng.choice(values, animals, replace=False))
         covered += interval.low <= values.mean() <= interval.high
     assert 0.93 <= covered / 2000 <= 0.97
+
+
+def _difference(rng, stimuli, animals, shares):
+    """Two models that hold a share of what animals' features have in common: difference, its error and freedom."""
+    shared = rng.normal(size=(stimuli, 6))
+    brain, layers = [], []
+    for _ in range(animals):
+        tuning = shared @ rng.normal(size=(6, 40)) / math.sqrt(6)
+        brain.append(rdm(tuning + rng.normal(size=tuning.shape), method="sqeuclidean"))
+    for share in shares:
+        weight = 1 / (1 + math.sqrt(1 / share**2 - 1)) if share else 0.0
+        other = rng.normal(size=shared.shape)
+        features = np.concatenate([math.sqrt(weight) * shared, math.sqrt(1 - weight) * other], axis=1)
+        layers.append(rdm(features, method="sqeuclidean"))
+    models, brain = np.stack(layers), np.stack(brain)
+    values = compare_all(models, brain, method="whitened-cosine")
+    without = []
+    for stimulus in range(stimuli):
+        kept = permuted_pairs(np.delete(np.arange(stimuli), stimulus)[None], stimuli)[0]
+        without.append(compare_all(models[:, kept], brain[:, kept], method="whitened-cosine").mean(axis=1))
+    each, left_out = values[0] - values[1], np.array(without)
+    error, freedom = two_factor_error(each, left_out[:, 0] - left_out[:, 1])
+    return each.mean(), float(error), float(freedom)
+
+
+@pytest.mark.parametrize(("stimuli", "animals"), [(12, 4), (24, 8)])
+def test_models_that_know_nothing_are_rarely_told_apart_and_a_better_one_mostly_is(stimuli, animals):
+    rng = np.random.default_rng(stimuli)
+    null = [_difference(rng, stimuli, animals, (0.0, 0.0)) for _ in range(150)]
+    p = [2 * stats.t.sf(abs(mean) / error, freedom) for mean, error, freedom in null]
+    # Three standard errors of 150 simulations at 5 %.
+    assert np.mean(np.array(p) <= 0.05) <= 0.05 + 3 * math.sqrt(0.05 * 0.95 / 150)
+    # The error is that of the difference over studies, or a little more.
+    spread = np.std([mean for mean, _, _ in null], ddof=1)
+    assert 0.9 * spread < np.sqrt(np.mean([error**2 for _, error, _ in null])) < 2.5 * spread
+    if stimuli < 20:
+        return
+    found = [_difference(rng, stimuli, animals, (0.9, 0.4)) for _ in range(40)]
+    power = np.mean([mean > 0 and 2 * stats.t.sf(mean / error, freedom) <= 0.05 for mean, error, freedom in found])
+    assert power >= 0.8
+
+
+def test_the_interval_is_students_where_stimuli_change_nothing_and_wider_where_they_do():
+    values = np.random.default_rng(0).normal(0.5, 0.1, 8)
+    narrow = two_factor_interval(values.mean(), values, np.full(20, values.mean()))
+    low, high = stats.t.interval(0.95, 7, loc=values.mean(), scale=stats.sem(values))
+    assert (narrow.low, narrow.high) == pytest.approx((low, high))
+    wide = two_factor_interval(values.mean(), values, values.mean() + 0.02 * np.random.default_rng(1).normal(size=20))
+    assert wide.low < narrow.low < narrow.high < wide.high
+    assert two_factor_interval(0.5, [0.5], np.full(20, 0.5)) is None
+
+
+def test_too_few_animals_or_stimuli_say_what_is_needed():
+    assert interval_reasons(8, 20) == ()
+    assert "1" not in interval_reasons(1, 20)[0]
+    (told,) = interval_reasons(3, 20)
+    assert "3 animals" in told
+    assert "stimuli" not in told
+    assert "6 stimuli" in interval_reasons(8, 6)[0]
+
+
+def test_a_score_above_all_that_is_reliable_is_not_trusted():
+    above = Score("x", 0.9, "ok", interval=Interval(0.88, 0.92), chance=0.5, attainable=0.8)
+    held = held_to_scale(above)
+    assert (held.status, "1.27" in held.reasons[0]) == ("unreliable", True)
+    reaching = replace(above, interval=Interval(0.78, 1.02))
+    assert held_to_scale(reaching) is reaching
+
+
+def score_animals(animals, stimuli=STIMULI):
+    return RSA(comparison="pearson").score_animals(animals, stimuli=stimuli)
+
+
+def _make_agreeing_animals(count, seed=0, noise=3.0, latent=None, splits=100):
+    return [
+        subject_rdm(
+            f"m{i}",
+            [make_block(make_latent(seed) if latent is None else latent[i], seed=seed + i, units=40, noise=noise)],
+            6,
+            splits=splits,
+        )
+        for i in range(count)
+    ]
+
+
+def test_each_animal_meets_the_mean_of_the_others_and_both_are_corrected():
+    animals = _make_agreeing_animals(3)
+    score = score_animals(animals, stimuli=STIMULI)
+    others = np.mean([animals[1].rdm, animals[2].rdm], axis=0)
+    halves = np.mean([animals[1].halves, animals[2].halves], axis=0)
+    both = spearman_brown(animals[0].split_half_r.mean()) * spearman_brown(compare(halves[:, 0], halves[:, 1]).mean())
+    assert score.subjects[0].value == pytest.approx(float(compare(animals[0].rdm, others)) / math.sqrt(both))
+    assert score.value == pytest.approx(np.mean([subject.value for subject in score.subjects]))
+    assert score.stimuli == STIMULI
+    assert score.status == "ok"
+
+
+def test_animals_that_share_a_geometry_agree_fully_after_correction():
+    # Tuning is drawn anew per animal, so many units are needed before the geometry itself is shared.
+    animals = [
+        subject_rdm(f"m{i}", [make_block(make_latent(1), seed=i, units=600, noise=5.0)], 6, splits=100)
+        for i in range(8)
+    ]
+    score = score_animals(animals)
+    assert score.r < 0.96
+    assert score.value == pytest.approx(1.0, abs=0.03)
+    assert score.p == pytest.approx(1 / 500)
+
+
+def test_animals_that_share_nothing_do_not_agree():
+    p = []
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        animals = [make_subject(f"m{i}", make_rdm(rng), reliability=0.9, seed=i) for i in range(4)]
+        p.append(score_animals(animals).p)
+    assert stats.kstest(p, "uniform").pvalue > 0.01
+
+
+def test_the_order_of_animals_and_stimuli_is_irrelevant():
+    latent = make_latent(2)
+    rng = np.random.default_rng(3)
+    order = rng.permutation(6)
+    blocks = [make_block(latent, seed=i, noise=4.0) for i in range(4)]
+    moved = [type(b)(b.responses, np.argsort(order)[b.labels], b.keys) for b in blocks]
+    first = score_animals([subject_rdm(f"m{i}", [blocks[i]], 6, splits=30) for i in range(4)])
+    second = score_animals([subject_rdm(f"m{i}", [moved[i]], 6, splits=30) for i in (2, 0, 3, 1)])
+    assert second.value == pytest.approx(first.value, abs=1e-12)
+    assert second.p == first.p
+    pairs = permuted_pairs(order[None])[0]
+    np.testing.assert_allclose(second.brain_rdm, np.array(first.brain_rdm)[pairs], atol=1e-12)
+
+
+def test_one_animal_is_undefined_in_words():
+    score = score_animals(_make_agreeing_animals(1))
+    assert score.status == "undefined"
+    assert score.reasons[0] == "fewer than two animals can be used"
+    assert math.isnan(score.value)
+
+
+def test_two_animals_make_one_comparison_and_have_no_interval():
+    score = score_animals(_make_agreeing_animals(2))
+    assert score.subjects[0].value == pytest.approx(score.subjects[1].value, abs=1e-12)
+    assert score.interval is None
+    assert "two animals make one comparison: no confidence interval" in score.reasons
+
+
+def test_unreliable_animals_are_left_out_and_named():
+    animals = _make_agreeing_animals(3)
+    noisy = make_subject("z", make_rdm(np.random.default_rng(0)), reliability=0.2)
+    score, without = score_animals([*animals, noisy]), score_animals(animals)
+    assert score.value == pytest.approx(without.value, abs=1e-15)
+    assert any(reason.startswith("animal z left out: reliability 0.20") for reason in score.reasons)
+
+
+def test_unreliable_animals_alone_are_scored_as_unreliable():
+    rng = np.random.default_rng(4)
+    shared = make_rdm(rng)
+    animals = [make_subject(f"m{i}", shared + 0.05 * rng.normal(size=15), reliability=0.4, seed=i) for i in range(3)]
+    score = score_animals(animals)
+    assert score.status == "unreliable"
+    assert math.isfinite(score.value)
+
+
+def test_an_agreement_refuses_what_it_cannot_take():
+    with pytest.raises(UsageError, match="at least two SubjectRDM"):
+        score_animals([])
+    with pytest.raises(UsageError, match="6 stimuli; 2 are scored"):
+        score_animals(_make_agreeing_animals(2), stimuli=["a", "b"])

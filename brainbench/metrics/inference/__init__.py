@@ -1,2 +1,1 @@
-"""Inference: ``permutation`` tests, ``intervals`` over animals and stimuli, ``multiple`` models or layers, and
-``equivalence`` with the animals."""
+"""Inference: ``permutation`` tests, and comparisons of ``multiple`` models or layers."""

@@ -9,8 +9,7 @@ from __future__ import annotations
 from brainbench.metrics.measures.decoding import LabelDecoding
 from brainbench.metrics.measures.metric import register_metric
 from brainbench.metrics.measures.nuisance import PartialRSA
-from brainbench.metrics.measures.patterns import LinearCKA, Procrustes
-from brainbench.metrics.measures.ridge import RidgeEncoding
+from brainbench.metrics.measures.patterns import LinearCKA, Procrustes, RidgeEncoding
 from brainbench.metrics.measures.rsa import RSA
 
 for measure in (

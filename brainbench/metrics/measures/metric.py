@@ -15,10 +15,9 @@ from numpy.typing import ArrayLike
 from brainbench.core.errors import UsageError, unknown_name
 from brainbench.core.plugins import load_object
 from brainbench.core.records import Score
-from brainbench.metrics.animal_to_animal import score_agreement
 from brainbench.metrics.hooks import MetricHooks
 from brainbench.metrics.reliability.subject_rdm import SubjectRDM
-from brainbench.metrics.score import score_layers
+from brainbench.metrics.score import score_agreement, score_layers
 
 
 class Metric(MetricHooks):

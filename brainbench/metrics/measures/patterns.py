@@ -10,6 +10,7 @@ import numpy as np
 from brainbench.core.errors import UsageError
 from brainbench.metrics.measures.metric import Metric
 from brainbench.metrics.rdms.pairs import Floats, Ints
+from brainbench.metrics.reliability.noise_correction import Corrected, gated
 from brainbench.metrics.reliability.subject_rdm import SubjectRDM
 
 
@@ -105,3 +106,123 @@ def _similarities(left: Floats, right: Floats) -> Floats:
     root = (vectors * np.sqrt(np.maximum(values, 0))) @ vectors.T
     inner = np.linalg.eigvalsh(root @ right @ root)
     return np.sqrt(np.maximum(inner, 0)).sum(axis=-1)
+
+
+PENALTIES = tuple(10.0**power for power in range(-3, 4))
+"""Ridge penalties, relative to the mean square of the centred training features."""
+
+FOLDS = 10
+
+
+class RidgeEncoding(PatternMetric):
+    """Cross-validated ridge regression from features to units."""
+
+    name = "ridge"
+    title = "share of explainable variance that ridge regression predicts for stimuli left out"
+    orders_between = 39
+
+    def correction(self, animal: SubjectRDM, estimator: str) -> Corrected:
+        """Return the ratio of all variance to that without noise."""
+        share = float(_explainable([animal])[0])
+        if not share > 0:
+            reason = "the variance between stimuli is no larger than trial noise explains"
+            return Corrected(np.nan, "undefined", reason, reliability=animal.reliability)
+        return gated(1 / share, animal.reliability)
+
+    def compare_orders(self, model: Floats, animals: Sequence[SubjectRDM], orders: Ints) -> Floats:
+        """Return raw values [N, A] with the model's stimuli in each order [N, K]."""
+        error, base = _errors(model, animals, orders, _folds(len(model)))
+        return _share(error, base, animals) * _explainable(animals)
+
+    def compare_without(self, layers: Sequence[Floats], animals: Sequence[SubjectRDM]) -> Floats:
+        """Return raw values [K, L, A] without each stimulus in turn; the others stay in their folds."""
+        count, found = animals[0].count, []
+        for stimulus in range(count):
+            kept = np.delete(np.arange(count), stimulus)
+            others, order = [animal.take(kept) for animal in animals], np.arange(count - 1)[None]
+            # Its part in the training of the others must go too: without that, intervals of 14 stimuli were a quarter
+            # too narrow.
+            sums = [_errors(layer[kept], others, order, _folds(count)[kept]) for layer in layers]
+            found.append([_share(error[0], base[0], others) for error, base in sums])
+        return np.array(found) * _explainable(animals)
+
+
+def _share(error: Floats, base: Floats, animals: Sequence[SubjectRDM]) -> Floats:
+    """Return the share [..., A] of the explainable variance that is predicted, of squared errors [..., A, K]."""
+    noise = np.array([animal.noise.sum() for animal in animals])
+    with np.errstate(invalid="ignore", divide="ignore"):
+        explainable = base.sum(axis=-1) - noise
+        return 1 - (error.sum(axis=-1) - noise) / np.where(explainable > 0, explainable, np.nan)
+
+
+def _explainable(animals: Sequence[SubjectRDM]) -> Floats:
+    """Return the share [A] of each animal's variance between stimuli that is not noise, whatever the folds."""
+    # Deviations from the mean of the K − 1 other stimuli are K/(K − 1) of those from the mean of all.
+    count = animals[0].count
+    total = np.array([np.trace(centred_products(animal.patterns)) for animal in animals]) * (count / (count - 1)) ** 2
+    noise = np.array([animal.noise.sum() for animal in animals])
+    return 1 - noise * count / (count - 1) / np.where(total > 0, total, np.nan)
+
+
+def _folds(count: int) -> Ints:
+    """Return the fold [K] of each stimulus: every tenth, in the order that the animals give them, is of one fold."""
+    return np.arange(count) % min(count, FOLDS)
+
+
+def _errors(model: Floats, animals: Sequence[SubjectRDM], orders: Ints, folds: Ints) -> tuple[Floats, Floats]:
+    """Return squared errors of the prediction and of the training mean [N, A, K], by the stimulus of the model."""
+    count, kernel = len(model), centred_products(model)
+    # Brain stimulus i stands at the model's stimulus order[i]: products are moved to the model's places.
+    place = np.argsort(orders, axis=1)
+    products = np.stack([centred_products(animal.patterns) for animal in animals])
+    moved = products[:, place[:, :, None], place[:, None, :]].swapaxes(0, 1)
+    flat = moved.reshape(-1, count * count)
+    error, base = np.empty((len(flat), count)), np.empty((len(flat), count))
+    for fold in np.unique(folds):
+        test, train = np.flatnonzero(folds == fold), np.flatnonzero(folds != fold)
+        inner, combinations = _fits(kernel, train, test)
+        # The penalty with the least squared error over left-out training stimuli serves the fold, chosen anew for
+        # every order.
+        chosen = np.argmin(flat @ inner.reshape(len(PENALTIES), -1).T, axis=1)
+        for index in np.unique(chosen):
+            rows = np.flatnonzero(chosen == index)
+            outer = np.einsum("ti,tj->tij", combinations[index], combinations[index]).reshape(len(test), -1)
+            error[np.ix_(rows, test)] = flat[rows] @ outer.T
+        means = _means(count, train, test)
+        base[:, test] = flat @ np.einsum("ti,tj->tij", means, means).reshape(len(test), -1).T
+    shape = (len(orders), len(animals), count)
+    return error.reshape(shape), base.reshape(shape)
+
+
+def _means(count: int, train: Ints, test: Ints) -> Floats:
+    """Return combinations [test, K] that give a stimulus less the training mean."""
+    combination = np.zeros((len(test), count))
+    combination[np.arange(len(test)), test] = 1.0
+    combination[:, train] -= 1 / len(train)
+    return combination
+
+
+def _fits(kernel: Floats, train: Ints, test: Ints) -> tuple[Floats, Floats]:
+    """Return, per penalty, what gives the training error [Λ, K, K] and the combinations [Λ, test, K] of residuals.
+
+    The product of the first with Y Yᵀ is the squared error over the training stimuli, each predicted from the others.
+    """
+    count, size = len(kernel), len(train)
+    # Centring by the training mean is the intercept, which is not penalised.
+    centre = np.eye(size) - 1 / size
+    inside = centre @ kernel[np.ix_(train, train)] @ centre
+    across = (kernel[np.ix_(test, train)] - kernel[np.ix_(train, train)].mean(axis=0)) @ centre
+    # ŷ = k (K + λ·1)⁻¹ y: one eigendecomposition of the kernel serves all penalties.
+    values, vectors = np.linalg.eigh(inside)
+    values = np.maximum(values, 0)
+    scale = max(float(np.trace(inside)) / size, np.finfo(float).tiny)
+    inner, outer = np.zeros((len(PENALTIES), count, count)), np.empty((len(PENALTIES), len(test), count))
+    for index, penalty in enumerate(PENALTIES):
+        # Leaving one training stimulus out: its residual is that of the whole fit over 1 − its leverage.
+        hat = (vectors * (values / (values + penalty * scale))) @ vectors.T + 1 / size
+        residual = (np.eye(size) - hat) / (1 - np.diag(hat))[:, None]
+        inner[index][np.ix_(train, train)] = residual.T @ residual
+        weight = across @ (vectors / (values + penalty * scale)) @ vectors.T @ centre
+        outer[index] = _means(count, train, test)
+        outer[index][:, train] -= weight
+    return inner, outer

@@ -8,16 +8,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from brainbench.metrics.rdms.dissimilarity import poisson_rates
-from brainbench.metrics.rdms.distances import (
+from brainbench.metrics.rdms.dissimilarity import (
     correlation_distances,
     correlation_from_gram,
+    poisson_rates,
     product_distances,
     products_from_gram,
 )
 from brainbench.metrics.rdms.pairs import Floats, Ints, upper
-from brainbench.metrics.reliability.sessions import SortedTrials
-from brainbench.metrics.reliability.trial_hashes import Hashes, draws
+from brainbench.metrics.reliability.sessions import Hashes, SortedTrials, draws
 
 _CHUNK_BYTES = 1 << 20
 """Sums of one chunk of splits stay in the processor's cache."""

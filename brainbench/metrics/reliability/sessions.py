@@ -8,18 +8,76 @@ left the animal is undefined.
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from brainbench.core.errors import UsageError
+from brainbench.core.errors import DataError, UsageError, check_name
 from brainbench.core.trials import Trials
+from brainbench.metrics.rdms.noise import NOISE_METHODS, NoiseModel, estimate_noise
 from brainbench.metrics.rdms.pairs import Floats, Ints
-from brainbench.metrics.reliability.trial_hashes import Hashes, content_hashes, key_hashes
 from brainbench.metrics.stimulus_labels import check_finite, labelled_trials, listed, stimulus_means
+
+Hashes = NDArray[np.uint64]
+
+_STEP = np.uint64(0x9E3779B97F4A7C15)
+_REFINEMENTS = 2
+
+
+def key_hashes(keys: Sequence[str]) -> Hashes:
+    """Hash trial keys to 64 bits each, equally on every machine."""
+    return np.array(
+        [int.from_bytes(hashlib.blake2b(str(key).encode(), digest_size=8).digest(), "little") for key in keys],
+        dtype=np.uint64,
+    )
+
+
+def content_hashes(responses: NDArray, codes: Ints) -> Hashes:
+    """Hash each trial's responses [R, F], whatever the order of trials, units and stimuli.
+
+    A trial starts as the set of its values; then trials and units describe one another (a unit by
+    the trials it responds in, a trial by its units' values), so trials that hold the same values on
+    different units differ. Trials that are still equal are numbered; swapping them changes nothing.
+    """
+    # Adding zero turns −0.0 into 0.0, which is equal but has other bits.
+    values = _mix((np.where(np.isnan(responses), np.inf, responses).astype(np.float64) + 0.0).view(np.uint64))
+    with np.errstate(over="ignore"):
+        trial = _mix(values.sum(axis=1, dtype=np.uint64))
+        for _ in range(_REFINEMENTS):
+            stimulus = np.zeros(int(codes.max(initial=-1)) + 1, dtype=np.uint64)
+            np.add.at(stimulus, codes, trial)
+            trial = _mix(trial + _mix(stimulus)[codes])
+            # Sums of mixed values do not depend on order, which makes trials and units anonymous sets to one another.
+            unit = _mix(_mix(values ^ trial[:, None]).sum(axis=0, dtype=np.uint64))
+            trial = _mix(trial + _mix(values ^ unit).sum(axis=1, dtype=np.uint64))
+        order = np.argsort(trial, kind="stable")
+        _, first, inverse = np.unique(trial[order], return_index=True, return_inverse=True)
+        occurrence = np.empty(len(trial), dtype=np.uint64)
+        occurrence[order] = np.arange(len(trial)) - first[inverse]
+        return _mix(trial + occurrence * _STEP)
+
+
+def draws(hashes: Hashes, splits: Ints, seed: int) -> Hashes:
+    """Return one 64-bit random number per split and trial [S, R]."""
+    with np.errstate(over="ignore"):
+        start = _mix(np.uint64(seed & 0xFFFFFFFFFFFFFFFF) * _STEP + np.uint64(1))
+        state = _mix(splits.astype(np.uint64) * _STEP + start)
+        return _mix(hashes[None, :] ^ state[:, None])
+
+
+def _mix(state: NDArray[np.uint64] | np.uint64) -> Hashes:
+    with np.errstate(over="ignore"):
+        z = np.asarray(state, dtype=np.uint64) + _STEP
+        # SplitMix64's finaliser (Steele 2014) maps 64 bits one to one, so different trials keep different numbers.
+        z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+        z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+        return z ^ (z >> np.uint64(31))
+
 
 _SLICE_ELEMENTS = 1 << 20
 
@@ -154,3 +212,98 @@ def shifted_sessions(sessions: list[SortedTrials], count: int, *, by_unit: bool)
         np.subtract(session.responses, shift, out=session.responses)
     # What was derived from the trials before does not hold for them now.
     return [replace(session) for session in sessions]
+
+
+_FOLDS = 10
+
+
+def whitened_sessions(
+    sessions: list[SortedTrials], count: int, noise: str, notes: tuple[str, ...]
+) -> tuple[list[SortedTrials], str | None, tuple[str, ...]]:
+    """Whiten every session; return those with a noise covariance, why there is none (or None), and notes for people."""
+    found = [whitened(session, count, noise) for session in sessions]
+    kept = [session for session, _ in found if session is not None]
+    notes += tuple(dict.fromkeys(told for session, told in found if told and session is not None))
+    lost = sorted({told for session, told in found if session is None})
+    if not kept:
+        return sessions, f"no session has a noise covariance: {'; '.join(lost)}", notes
+    if lost:
+        notes += (f"{len(found) - len(kept)} sessions left out: {'; '.join(lost)}",)
+    return kept, None, notes
+
+
+def whitened(session: SortedTrials, count: int, noise: str) -> tuple[SortedTrials | None, str]:
+    """Return the session with noise of unit covariance, and what was left out in words.
+
+    The covariance comes from all trials of the session, about their stimulus' mean. Units that never vary between
+    trials of a stimulus have no noise to divide by and are left out. ``diag`` scales each unit by the trials it was
+    recorded in; the other methods mix units, so they leave out units that were not recorded in every trial.
+
+    ``none`` divides by nothing.
+    """
+    check_name("noise covariance method", noise, ("none", *NOISE_METHODS))
+    if noise == "none":
+        return session, ""
+    varies, power, number = (np.concatenate(part) for part in zip(*_noise(session, count), strict=True))
+    usable = varies if noise == "diag" else varies & np.isfinite(session.responses).all(axis=0)
+    lost = int((~usable).sum())
+    told = f"{lost} units or bins left out: without noise or not in every trial" if lost else ""
+    if not usable.any():
+        return None, "no unit has noise to divide by"
+    responses = session.responses if usable.all() else session.responses[:, usable]
+    if noise == "diag":
+        # ν = trials − stimuli, per unit; for Gaussian noise E[σ²/σ̂²] = ν/(ν − 2).
+        freedom = number[usable] - count
+        scaled = np.divide(responses, np.sqrt(power[usable] / freedom), out=responses)
+        # Units with two degrees of freedom or fewer have no expected factor; four is the least anyone has.
+        inflation = float(np.mean(freedom / np.maximum(freedom - 2, 1)))
+        return replace(session, responses=scaled, inflation=inflation), told
+    try:
+        precision = estimate_noise(responses, session.labels, count, noise).precision()
+    except DataError as error:
+        return None, str(error).rstrip(".")
+    # With the precision P̂ = L Lᵀ, trials times L have noise of unit covariance.
+    inflation = _inflation(responses, session.labels, noise, count)
+    return replace(session, responses=responses @ np.linalg.cholesky(precision), inflation=inflation), told
+
+
+def _noise(session: SortedTrials, count: int) -> Iterator[tuple[NDArray[np.bool_], Floats, Ints]]:
+    """Yield for slices of units whether each varies between trials of a stimulus, Σ residual² and its trials."""
+    for units in session.slices():
+        # Noise is what trials differ by from their stimulus' mean; below the rounding of its values a unit has none.
+        responses = session.responses[:, units]
+        residuals = responses - stimulus_means(responses, session.labels, count)[session.labels]
+        largest = np.nanmax(np.abs(responses), axis=0)
+        varies = np.nanmax(np.abs(residuals), axis=0) > 8 * np.finfo(np.float64).eps * largest
+        yield varies, np.nansum(residuals**2, axis=0), np.isfinite(residuals).sum(axis=0)
+
+
+def _inflation(responses: Floats, codes: Ints, noise: str, count: int) -> float:
+    """Return tr(P̂ S) of a precision P̂ and the covariance S of other trials, over that of its own trials."""
+    units, freedom = responses.shape[1], len(codes) - count
+    # Mean of an inverse Wishart matrix: E[Σ̂⁻¹] = Σ⁻¹ ν/(ν − U − 1), exact for Gaussian noise.
+    if noise == "full":
+        return freedom / (freedom - units - 1) if freedom > units + 1 else 1.0
+    residuals = responses - stimulus_means(responses, codes, count)[codes]
+    # Trials of each stimulus go to the folds in turn, so that every fold has its share.
+    place = np.empty(len(codes), dtype=np.int64)
+    for stimulus in range(count):
+        rows = np.flatnonzero(codes == stimulus)
+        place[rows] = (np.arange(len(rows)) + stimulus) % _FOLDS
+    found = []
+    for fold in range(_FOLDS):
+        rest, held = residuals[place != fold], residuals[place == fold]
+        try:
+            model = estimate_noise(rest, np.zeros(len(rest), dtype=np.int64), 1, noise)
+            ratio = _mean_square(held, model, len(held)) / _mean_square(rest, model, len(rest) - 1)
+        except DataError:
+            return 1.0
+        found.append(ratio)
+    # An estimate from nine tenths errs by ten ninths of what one from all trials does.
+    return 1 + (float(np.mean(found)) - 1) * (1 - 1 / _FOLDS)
+
+
+def _mean_square(residuals: Floats, model: NoiseModel, freedom: int) -> float:
+    """Return tr(P̂ S) for the covariance S of residuals."""
+    left, right = model.sides(residuals, residuals)
+    return float((left * right).sum()) / freedom

@@ -5,7 +5,7 @@ averaging trials, so an RDM spans them all. What cannot be split is left out by 
 :mod:`brainbench.metrics.reliability.sessions`.
 
 ``mahalanobis`` and ``crossnobis`` divide by the noise of each session, see
-:mod:`brainbench.metrics.reliability.whitening`; ``crossnobis`` takes every trial as its own fold, so unequal
+:mod:`brainbench.metrics.reliability.sessions`; ``crossnobis`` takes every trial as its own fold, so unequal
 numbers of trials leave it unbiased.
 """
 
@@ -28,8 +28,7 @@ from brainbench.metrics.rdms.noise import NOISE_METHODS
 from brainbench.metrics.rdms.pairs import Floats, Ints, permuted_pairs, stimulus_count
 from brainbench.metrics.reliability.halves import SplitRDMs, half_rdms
 from brainbench.metrics.reliability.noise_correction import spearman_brown
-from brainbench.metrics.reliability.sessions import SortedTrials, shifted_sessions, usable_sessions
-from brainbench.metrics.reliability.whitening import whitened_sessions
+from brainbench.metrics.reliability.sessions import SortedTrials, shifted_sessions, usable_sessions, whitened_sessions
 from brainbench.metrics.stimulus_labels import membership, stimulus_means
 
 SPLITS = 1000
@@ -208,3 +207,44 @@ def _split_halves(
 def is_flat(rdms: Floats) -> NDArray[np.bool_]:
     """Return where RDMs [..., P] have missing pairs or no differences between pairs: nothing compares with them."""
     return np.isnan(compare(rdms, rdms, method="pearson")) | ~np.isfinite(rdms).all(axis=-1)
+
+
+SIMULATIONS = 20
+"""Noisy copies of an animal over which what a perfect model attains is averaged."""
+
+
+def denoised(patterns: Floats, noise: Floats) -> Floats:
+    """Return patterns [K, U] whose products are those of the given ones without their noise.
+
+    ``patterns`` [K, U] are mean responses, ``noise`` [K, U] the variance of these means.
+    """
+    mean = patterns.mean(axis=0)
+    centred = patterns - mean
+    own = np.diag(noise.sum(axis=1))
+    # Both sides centred over stimuli: E[C Cᵀ] = G + H diag(n) H, with the centring matrix H.
+    own = own - own.mean(axis=0)
+    gram = centred @ centred.T - (own - own.mean(axis=1, keepdims=True))
+    values, vectors = np.linalg.eigh(gram)
+    kept = np.flatnonzero(values > 0)[::-1][: patterns.shape[1]]
+    total = float(np.trace(gram))
+    if not len(kept) or total <= 0:
+        return np.broadcast_to(mean, patterns.shape)
+    # Dropping what is negative leaves too much in all; the trace is unbiased.
+    values = values[kept] * total / values[kept].sum()
+    directions = centred.T @ vectors[:, kept] * np.sqrt(values)
+    # The nearest orthonormal directions of units keep each unit's part as close to the data as the products allow.
+    left, _, right = np.linalg.svd(directions, full_matrices=False)
+    return mean + (vectors[:, kept] * np.sqrt(values)) @ (left @ right).T
+
+
+def simulated_animals(animal: SubjectRDM, seed: int) -> tuple[Floats, list[SubjectRDM]]:
+    """Return an animal's responses without noise [K, U], and copies of the animal with new noise on them."""
+    # Sorted by their responses, units draw the same noise in whatever order they were listed; rounding makes no order.
+    scale = np.abs(animal.patterns).max(initial=0.0) or 1.0
+    units = np.lexsort(np.round(np.concatenate([animal.noise / scale**2, animal.patterns / scale]), 9))
+    animal = replace(animal, patterns=animal.patterns[:, units], noise=animal.noise[:, units])
+    truth = denoised(animal.patterns, animal.noise)
+    generator = np.random.default_rng(seed)
+    spread = np.sqrt(np.maximum(animal.noise, 0.0))
+    drawn = (truth + spread * generator.standard_normal(truth.shape) for _ in range(SIMULATIONS))
+    return truth, [replace(animal, patterns=patterns) for patterns in drawn]

@@ -25,8 +25,8 @@ from brainbench.core.errors import UsageError, check_name
 from brainbench.core.reading.ranges import check_fields, check_number
 from brainbench.core.records import Interval
 from brainbench.core.statistics import wilson_interval
+from brainbench.metrics.evaluation import held_out
 from brainbench.metrics.inference.permutation import SMALLEST_STIMULI, label_orders, smallest_p, tail_p
-from brainbench.metrics.layers import held_out
 from brainbench.metrics.measures.rsa import RSA
 from brainbench.metrics.rdms.comparison import features
 from brainbench.metrics.rdms.pairs import Floats, Ints, upper

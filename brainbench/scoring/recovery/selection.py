@@ -17,7 +17,7 @@ import numpy as np
 from brainbench.core.errors import UsageError
 from brainbench.core.progress import Progress
 from brainbench.core.reading.ranges import check_number
-from brainbench.metrics.layers import held_out
+from brainbench.metrics.evaluation import held_out
 from brainbench.metrics.measures.metric import Metric, get_metric
 from brainbench.metrics.rdms.comparison import compare_all
 from brainbench.metrics.rdms.pairs import Floats, Ints, permuted_pairs

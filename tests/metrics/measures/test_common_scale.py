@@ -10,7 +10,7 @@ import pytest
 from brainbench.core.trials import Trials
 from brainbench.metrics import get_metric
 from brainbench.metrics.measures.decoding import LabelDecoding
-from brainbench.metrics.reliability.denoising import denoised
+from brainbench.metrics.reliability.subject_rdm import denoised
 
 METRICS = ("rsa", "rsa-correlation", "rsa-crossnobis", "rsa-partial", "cka", "procrustes", "ridge", "decoding")
 PLACES, SHAPES = ("close", "far"), ("flat", "round")

@@ -9,8 +9,7 @@ from scipy.linalg import orthogonal_procrustes
 from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError
 from brainbench.core.trials import Trials
 from brainbench.metrics import PatternMetric, compare, get_metric, list_metrics, rdm, register_metric
-from brainbench.metrics.measures.patterns import Procrustes
-from brainbench.metrics.measures.ridge import PENALTIES, RidgeEncoding
+from brainbench.metrics.measures.patterns import PENALTIES, Procrustes, RidgeEncoding
 from brainbench.metrics.reliability.subject_rdm import subject_rdm
 from tests.factories.animals import STIMULI, make_block, make_latent
 

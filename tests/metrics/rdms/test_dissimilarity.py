@@ -183,7 +183,7 @@ def test_float32_input_is_computed_in_float64():
 
 
 def test_patterns_larger_than_one_slice_of_units_agree_with_scipy(monkeypatch):
-    monkeypatch.setattr("brainbench.metrics.rdms.distances._SLICE_ELEMENTS", 64)
+    monkeypatch.setattr("brainbench.metrics.rdms.dissimilarity._SLICE_ELEMENTS", 64)
     patterns = np.random.default_rng(10).normal(size=(5, 333))
     np.testing.assert_allclose(rdm(patterns), pdist(patterns, "correlation"), atol=1e-13)
     np.testing.assert_allclose(rdm(patterns, method="sqeuclidean"), pdist(patterns, "sqeuclidean") / 333, rtol=1e-12)

@@ -16,8 +16,8 @@ from brainbench.metrics import compare, rdm
 from brainbench.metrics.rdms.pairs import permuted_pairs
 from brainbench.metrics.reliability.halves import SplitRDMs, members
 from brainbench.metrics.reliability.noise_correction import spearman_brown
+from brainbench.metrics.reliability.sessions import content_hashes, draws, key_hashes
 from brainbench.metrics.reliability.subject_rdm import subject_rdm
-from brainbench.metrics.reliability.trial_hashes import content_hashes, draws, key_hashes
 from tests.factories.animals import STIMULI, make_block, make_latent
 
 

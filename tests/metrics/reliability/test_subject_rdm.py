@@ -11,9 +11,8 @@ from brainbench.core.errors import UsageError
 from brainbench.core.trials import Trials
 from brainbench.metrics import noise_precision, rdm
 from brainbench.metrics.reliability.halves import SplitRDMs, half_rdms, split_members
-from brainbench.metrics.reliability.sessions import SortedTrials
+from brainbench.metrics.reliability.sessions import SortedTrials, key_hashes
 from brainbench.metrics.reliability.subject_rdm import subject_rdm
-from brainbench.metrics.reliability.trial_hashes import key_hashes
 from tests.factories.animals import make_block, make_latent
 
 

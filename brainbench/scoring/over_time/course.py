@@ -13,23 +13,35 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from brainbench.core.errors import UsageError
+from brainbench.core.errors import DataError, UsageError, listing
+from brainbench.core.progress import Progress, stages
 from brainbench.core.reading.ranges import check_number
 from brainbench.core.records import Interval
 from brainbench.core.statistics import FEWEST_ANIMALS, FEWEST_STIMULI, two_factor_interval
 from brainbench.metrics.arrays import finite_mean
+from brainbench.metrics.evaluation import most_chosen
 from brainbench.metrics.inference.permutation import tail_p
-from brainbench.metrics.layers import most_chosen
+from brainbench.metrics.measures.rsa import RSA
 from brainbench.metrics.rdms.comparison import check_comparison
 from brainbench.metrics.rdms.pairs import Floats, rdm_stack
 from brainbench.metrics.reliability.noise_correction import RELIABILITY_GATE
-from brainbench.metrics.time.lags import LaggedRDMs, held_out_course, votes
-from brainbench.metrics.time.latency import LayerLatency, layer_latencies, standardised
-from brainbench.metrics.time.movies import AnimalMovie
+from brainbench.scoring.model_responses import ModelResponses
+from brainbench.scoring.neural_responses import NeuralResponses
+from brainbench.scoring.options import ScoreOptions
+from brainbench.scoring.over_time.lags import (
+    LaggedRDMs,
+    LayerLatency,
+    held_out_course,
+    layer_latencies,
+    standardised,
+    votes,
+)
+from brainbench.scoring.over_time.movies import AnimalMovie, animal_movie, layer_movie
 
 PERMUTATIONS = 1000
 """Random orders of the stimuli, above six stimuli; all orders up to six."""
@@ -191,3 +203,57 @@ def _reasons(animals: Sequence[AnimalMovie], points: tuple[TimePoint, ...], stim
     broken = {item.subject: next(filter(None, item.problems)) for item in animals if any(item.problems)}
     reasons += [f"{subject} has no RDM in some bins: {problem}" for subject, problem in broken.items()]
     return tuple(reasons)
+
+
+def time_course(
+    brain: NeuralResponses,
+    network: ModelResponses,
+    metric: RSA,
+    kept: tuple[str, ...],
+    rows: list[int],
+    options: ScoreOptions,
+    *,
+    progress: Progress | None = None,
+) -> TimeCourse:
+    """Return the score over time of a model against recordings in bins.
+
+    The window of the recordings begins when the stimuli do. Where the stimuli do not state their duration, they last as
+    long as the window of most trials (the median). Recordings have bins of one width; ``kept`` are the labels that are
+    scored, in order, and ``rows`` those of the activations. The options hold the seed, and the reliability that units
+    must have.
+    """
+    if "time" not in brain.dataset.coords or brain.dataset.sizes["time"] < 3:
+        raise DataError(
+            "Scores over time need recordings in at least 3 bins of time; give a smaller bin (--bin, seconds) or a "
+            "longer window."
+        )
+    begins = brain.dataset["time"].values.astype(np.float64)
+    width = float(np.median(np.diff(begins)))
+    # Bins between which others were left out are shorter than the distances of their begins.
+    longest = float(brain.dataset["duration"].values.max())
+    if not np.allclose(begins, longest * np.arange(len(begins)), rtol=0, atol=1e-6 * longest):
+        raise UsageError(
+            "Scores over time need bins that follow one another from the begin of the window; those of these "
+            f"recordings begin at {listing(f'{begin:g}' for begin in begins[:4])} … s: take the whole recordings, or "
+            "another window (--window)."
+        )
+    seconds = network.seconds
+    if seconds is None:
+        # The last bin may be shorter than the others, and a single trial longer than the others.
+        window, whole = float(np.median(brain.dataset["duration"].values.sum(axis=1))), width * len(begins)
+        seconds = whole if math.isclose(window, whole, rel_tol=1e-6) else window
+    sessions = brain.reliable_trials(kept, options)
+    how: dict[str, Any] = {"method": metric.brain_method, "noise": metric.noise, "comparison": metric.comparison}
+    stage_done = stages(len(sessions) + len(network.activations), "RDMs over time", progress)
+    animals, layers = [], {}
+    for subject, (blocks, note) in sessions.items():
+        if blocks:
+            animals.append(animal_movie(subject, blocks, len(kept), stimuli=kept, seed=options.seed, **how))
+        else:
+            nothing = np.full((len(begins), math.comb(len(kept), 2)), np.nan)
+            animals.append(AnimalMovie(subject, nothing, nothing[:, 0], (note,) * len(begins)))
+        stage_done()
+    for name, values in network.activations.items():
+        layers[name] = layer_movie(values[rows], seconds / values.shape[1], width, method=metric.model_method)
+        stage_done()
+    return score_over_time(layers, animals, width=width, comparison=metric.comparison, seed=options.seed)

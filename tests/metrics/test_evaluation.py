@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from brainbench.metrics.layers import HALVES, choose_on_others, first_best, held_out, most_chosen
+from brainbench.metrics.evaluation import HALVES, choose_on_others, first_best, held_out, most_chosen
 from brainbench.metrics.measures.rsa import score_rdms
 from tests.factories.animals import STIMULI, make_rdm, make_subject
 

@@ -9,8 +9,8 @@ from brainbench.core.errors import UsageError
 from brainbench.core.trials import Trials
 from brainbench.metrics import rdm
 from brainbench.metrics.reliability.subject_rdm import subject_rdm
-from brainbench.metrics.time import animal_movie, in_bins, layer_movie
-from tests.factories.moving_geometry import lagged, make_path, make_session
+from brainbench.scoring.over_time import animal_movie, in_bins, layer_movie
+from tests.factories.moving_geometry import lagged, make_moving_session, make_path
 
 
 def test_an_activation_counts_in_a_bin_for_as_long_as_it_lasts_there():
@@ -30,7 +30,7 @@ def test_a_layer_without_time_has_one_rdm():
 
 def test_each_bin_of_an_animal_is_prepared_as_a_score_without_time():
     rng = np.random.default_rng(1)
-    session = make_session(rng, make_path(rng, 6, 4))
+    session = make_moving_session(rng, make_path(rng, 6, 4))
     how = {"method": "sqeuclidean", "comparison": "pearson", "splits": 30, "seed": 5}
     movie = animal_movie("a", [session], 6, **how)
     for bin in range(4):
@@ -41,7 +41,7 @@ def test_each_bin_of_an_animal_is_prepared_as_a_score_without_time():
 
 def test_an_animal_is_reliable_only_where_it_responds():
     rng = np.random.default_rng(2)
-    session = make_session(rng, lagged(make_path(rng, 8, 6), 0, onset=3), noise=1.0)
+    session = make_moving_session(rng, lagged(make_path(rng, 8, 6), 0, onset=3), noise=1.0)
     movie = animal_movie("a", [session], 8, splits=30)
     assert (movie.reliability[3:] > 0.6).all()
     assert (movie.reliability[:3] < 0.5).all()
@@ -49,7 +49,7 @@ def test_an_animal_is_reliable_only_where_it_responds():
 
 def test_a_bin_without_an_rdm_says_why():
     rng = np.random.default_rng(3)
-    session = make_session(rng, make_path(rng, 6, 3))
+    session = make_moving_session(rng, make_path(rng, 6, 3))
     responses = session.responses.copy()
     responses[session.labels == 2, 1] = np.nan
     movie = animal_movie("a", [Trials(responses, session.labels, session.keys)], 6, splits=5)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from brainbench.metrics import compare
-from brainbench.metrics.time.lags import LaggedRDMs, best_lag, held_out_course, votes
+from brainbench.scoring.over_time.lags import LaggedRDMs, best_lag, held_out_course, votes
 from tests.factories.moving_geometry import lagged, make_layer, make_movie, make_path
 
 

@@ -5,9 +5,9 @@ the animals at every lag) → ``course`` (the score at each time, corrected for 
 ``latency`` (of each layer).
 """
 
-from brainbench.metrics.time.course import TimeCourse, TimePoint, score_over_time
-from brainbench.metrics.time.latency import LayerLatency
-from brainbench.metrics.time.movies import AnimalMovie, animal_movie, in_bins, layer_movie
+from brainbench.scoring.over_time.course import TimeCourse, TimePoint, score_over_time
+from brainbench.scoring.over_time.lags import LayerLatency
+from brainbench.scoring.over_time.movies import AnimalMovie, animal_movie, in_bins, layer_movie
 
 __all__ = [
     "AnimalMovie",
