@@ -33,7 +33,7 @@ from brainbench.core.cuda_graphs import record_step
 from brainbench.models.activations import evaluating
 from brainbench.models.export import export_model, read_onnx
 from brainbench.models.ops import dispatch
-from brainbench.models.ops.packing import packed
+from brainbench.models.ops.layers import packed
 from brainbench.models.registry import describe_model, load_model
 from brainbench.models.streaming import StreamingStep
 from brainbench.models.training.gradients import compiled, fuse

@@ -18,7 +18,7 @@ from brainbench.core.errors import UsageError, check_each, check_name
 from brainbench.core.reading.ranges import check_number
 from brainbench.models.graph.spec import UNROLLS, Unroll
 from brainbench.models.graph.temporal_graph import TemporalGraph
-from brainbench.models.heads.decoders import AllStepsDecoder, make_decoder
+from brainbench.models.heads import AllStepsDecoder, make_decoder
 from brainbench.models.normaliser import Normaliser
 from brainbench.models.parts import Attender, Encoder
 

@@ -17,9 +17,8 @@ from torch.nn import functional
 
 from brainbench.core.errors import UsageError
 from brainbench.core.reading.ranges import check_number
-from brainbench.models.attenders.gpt import GPTAttender
-from brainbench.models.attenders.mamba import MambaAttender, MambaMemory
-from brainbench.models.encoders.s4 import S4Encoder
+from brainbench.models.attenders import GPTAttender, MambaAttender, MambaMemory
+from brainbench.models.encoders import S4Encoder
 from brainbench.models.graph.temporal_graph import GraphState, TemporalGraph
 from brainbench.models.network import EncoderAttenderDecoder
 from brainbench.models.ops.state_space import System

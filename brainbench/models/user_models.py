@@ -18,7 +18,6 @@ from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError,
 from brainbench.core.files import check_folder, content_hash, read_json, write_json
 from brainbench.core.plugins import files_of, load_object
 from brainbench.models.architecture import check_new_name
-from brainbench.models.ops.seeding import seeded
 
 if TYPE_CHECKING:
     from torch import nn
@@ -72,6 +71,8 @@ def load_user_model(target: str, *, seed: int = 0) -> nn.Module:
     ``name`` is a class or function without required arguments, or a ready module. The file's own folder
     can be imported from while it loads. Random weights follow from the seed (CPU generator).
     """
+    from brainbench.models.ops.parameters import seeded
+
     with seeded(seed):
         return build_user_model(target).eval()
 

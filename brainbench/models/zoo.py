@@ -51,7 +51,7 @@ def build(
 
     ``unroll`` is for a Zhuang encoder.
     """
-    from brainbench.models.heads.decoders import make_decoder
+    from brainbench.models.heads import make_decoder
     from brainbench.models.network import EncoderAttenderDecoder
     from brainbench.models.ops.layers import draw_silent_biases
 
@@ -68,14 +68,14 @@ def build(
 
 def _encoder(item: Architecture) -> Encoder:
     if item.encoder == "resnet18":
-        from brainbench.models.encoders.resnet import ResNet18Encoder
+        from brainbench.models.encoders import ResNet18Encoder
 
         return ResNet18Encoder(small=item.small)
     if item.encoder == "s4":
-        from brainbench.models.encoders.s4 import S4Encoder
+        from brainbench.models.encoders import S4Encoder
 
         return S4Encoder(small=item.small)
-    from brainbench.models.encoders.zhuang import zhuang_graph
+    from brainbench.models.encoders import zhuang_graph
     from brainbench.models.graph.temporal_graph import TemporalGraph
 
     if item.cell == "feedforward":
@@ -85,12 +85,12 @@ def _encoder(item: Architecture) -> Encoder:
 
 def _attender(item: Architecture, features: int) -> Attender | None:
     if item.attender == "gpt":
-        from brainbench.models.attenders.gpt import GPTAttender
+        from brainbench.models.attenders import GPTAttender
 
         # As published, the ResNet's transformer is half as wide as its features.
         return GPTAttender(features, features // 2 if item.encoder == "resnet18" else features)
     if item.attender == "mamba":
-        from brainbench.models.attenders.mamba import MambaAttender
+        from brainbench.models.attenders import MambaAttender
 
         return MambaAttender(features)
     return None

@@ -5,10 +5,10 @@ import torch
 
 from brainbench.core.contracts import CHANNELS, GRID_SHAPE
 from brainbench.core.errors import UsageError
-from brainbench.models.attenders.gpt import GPTAttender
-from brainbench.models.encoders.zhuang import zhuang_graph
+from brainbench.models.attenders import GPTAttender
+from brainbench.models.encoders import zhuang_graph
 from brainbench.models.graph.temporal_graph import TemporalGraph
-from brainbench.models.heads.decoders import make_decoder
+from brainbench.models.heads import make_decoder
 from brainbench.models.network import EncoderAttenderDecoder
 from tests.factories.training_sweeps import SCALE, random_sweeps
 

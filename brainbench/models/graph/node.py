@@ -10,8 +10,7 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from brainbench.models.cells import CELLS, TimeDecay
-from brainbench.models.cells.cell import Cell
+from brainbench.models.cells import CELLS, Cell, TimeDecay
 from brainbench.models.graph.spec import Convolution, Dense, Memory, Node, Operation, Pool, Shape
 from brainbench.models.ops import dispatch
 from brainbench.models.ops.layers import RECTIFIER_GAIN, Conv2d, Linear, activation

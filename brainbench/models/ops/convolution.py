@@ -11,13 +11,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch.autograd.function import once_differentiable
 
-if TYPE_CHECKING:
-    from brainbench.models.ops.layers import Conv2d
+from brainbench.models.ops.layers import Conv2d
 
 HALF = torch.bfloat16
 

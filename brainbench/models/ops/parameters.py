@@ -1,8 +1,9 @@
-"""Loading of named parameters into modules: all or nothing, and errors that say which do not fit."""
+"""Parameters of modules: loaded by name (all or nothing), and drawn from a seed that disturbs nobody."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any
 
 import torch
@@ -10,6 +11,17 @@ from torch import nn
 
 from brainbench.core.errors import DataError, listing, nearest
 from brainbench.core.files import content_hash
+from brainbench.core.reading.ranges import check_number
+
+
+@contextmanager
+def seeded(seed: int) -> Iterator[None]:
+    """Run a block with PyTorch's CPU generator at ``seed``; its state is put back afterwards."""
+    # PyTorch keeps seeds as signed 64-bit numbers.
+    check_number("seed", seed, least=0, below=2**63, whole=True)
+    with torch.random.fork_rng(devices=[]):
+        torch.default_generator.manual_seed(seed)
+        yield
 
 
 def load_named(targets: Mapping[str, torch.Tensor], state: Mapping[str, Any], *, what: str) -> None:

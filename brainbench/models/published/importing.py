@@ -13,7 +13,7 @@ import torch
 from brainbench.core.errors import DataError
 from brainbench.core.files import cache_dir, content_hash, provenance
 from brainbench.core.reading.sealed import is_sealed, seal_file
-from brainbench.models.encoders.s4 import S4Encoder
+from brainbench.models.encoders import S4Encoder
 from brainbench.models.network import EncoderAttenderDecoder
 from brainbench.models.normaliser import PUBLISHED_FORCE_SCALE, Normaliser
 from brainbench.models.ops.parameters import check_named, copy_named

@@ -11,7 +11,7 @@ import re
 import torch
 
 from brainbench.models.graph.temporal_graph import TemporalGraph
-from brainbench.models.heads.decoders import AllStepsDecoder
+from brainbench.models.heads import AllStepsDecoder
 from brainbench.models.network import EncoderAttenderDecoder
 
 _RESNET = (

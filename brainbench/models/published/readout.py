@@ -18,12 +18,10 @@ import torch
 from torch import nn
 
 from brainbench.core.errors import UsageError, check_each
-from brainbench.models.attenders.gpt import GPTAttender
-from brainbench.models.attenders.mamba import MambaAttender
-from brainbench.models.encoders.resnet import ResNet18Encoder
-from brainbench.models.encoders.s4 import S4Encoder
+from brainbench.models.attenders import GPTAttender, MambaAttender
+from brainbench.models.encoders import ResNet18Encoder, S4Encoder
 from brainbench.models.graph.temporal_graph import TemporalGraph
-from brainbench.models.heads.decoders import AllStepsDecoder
+from brainbench.models.heads import AllStepsDecoder
 from brainbench.models.network import EncoderAttenderDecoder
 from brainbench.models.parts import Attender
 

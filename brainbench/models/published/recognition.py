@@ -9,7 +9,7 @@ import torch
 
 from brainbench.core.errors import DataError, UsageError, listing
 from brainbench.models.architecture import Architecture
-from brainbench.models.heads.decoders import CLASSES
+from brainbench.models.heads import CLASSES
 from brainbench.models.published.files import Settings
 
 _HEADS = {"loss.neck.fc0.": "simclr", "loss.projection_mlp.": "simsiam", "loss.decoder.deconv.": "ae"}
@@ -23,7 +23,7 @@ class Recognised:
 
     architecture: str
     decoder: str | None
-    """Name of :data:`brainbench.models.heads.decoders.DECODERS`; None in a file without one."""
+    """Name of :data:`brainbench.models.heads.DECODERS`; None in a file without one."""
     classes: int
     objective: str | None
     """Objective of its training; None where the file does not tell."""

@@ -38,7 +38,7 @@ class TrainingConfig:
     batch_size: int = BATCH_SIZE
     """Sweeps per optimiser step, over all processes."""
     decoder: str = "linear"
-    """One of :data:`~brainbench.models.heads.decoders.DECODERS`."""
+    """One of :data:`~brainbench.models.heads.DECODERS`."""
     augmentation: str = "physical"
     """``none``, ``physical``, ``thesis`` or ``image`` (:mod:`brainbench.models.training.augmentation`)."""
     masking: float = 0.0

@@ -23,7 +23,7 @@ from brainbench.core.errors import DataError, UsageError
 from brainbench.core.records import Interval
 from brainbench.core.statistics import wilson_interval
 from brainbench.models.activations import evaluating
-from brainbench.models.heads.decoders import AllStepsDecoder
+from brainbench.models.heads import AllStepsDecoder
 from brainbench.models.normaliser import Normaliser
 from brainbench.models.ops.layers import Linear
 from brainbench.models.recipes import BATCH_SIZE, PROBE

@@ -13,12 +13,9 @@ import torch
 from torch import nn
 
 from brainbench.core.cuda_graphs import record_step
-from brainbench.models.attenders.gpt import GPTBlock
-from brainbench.models.attenders.mamba import MambaBlock
-from brainbench.models.cells.cell import Cell
-from brainbench.models.cells.gated import GatedCell
-from brainbench.models.encoders.resnet import BasicBlock
-from brainbench.models.encoders.s4 import S4Block
+from brainbench.models.attenders import GPTBlock, MambaBlock
+from brainbench.models.cells import Cell, GatedCell
+from brainbench.models.encoders import BasicBlock, S4Block
 from brainbench.models.ops.parameters import copy_named
 
 PARTS = (Cell, GPTBlock, MambaBlock, S4Block, BasicBlock)

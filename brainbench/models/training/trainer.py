@@ -29,7 +29,7 @@ from brainbench.core.reading.regular import readable
 from brainbench.core.writing.locks import lock_folder
 from brainbench.core.writing.tensors import write_tensors
 from brainbench.models.activations import evaluating
-from brainbench.models.ops.seeding import seeded
+from brainbench.models.ops.parameters import seeded
 from brainbench.models.registry import load_model
 from brainbench.models.training.augmentation import MOUSE, Augmentation
 from brainbench.models.training.batches import Batches, BatchOptions, Data

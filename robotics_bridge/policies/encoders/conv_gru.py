@@ -11,8 +11,7 @@ from __future__ import annotations
 import torch
 from torch import nn
 
-from brainbench.models.cells import GRU
-from brainbench.models.cells.cell import FORGET_BIAS
+from brainbench.models.cells import FORGET_BIAS, GRU
 
 MOST_CELLS = 64
 """Cells of a picture beyond which the products outweigh what they save (they grow with the square of P)."""

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from brainbench.models.activations import extract
-from brainbench.models.encoders.s4 import S4Encoder
+from brainbench.models.encoders import S4Encoder
 from brainbench.models.ops.state_space import StateSpace
 from brainbench.models.published.files import Settings
 from brainbench.models.published.importing import build_published

@@ -6,10 +6,11 @@ from torch import nn
 from torch.nn import functional
 
 from brainbench.core.errors import UsageError
-from brainbench.models.attenders.gpt import GPTAttender
+from brainbench.models.attenders import GPTAttender, MambaAttender
+from brainbench.models.ops import dispatch
 
 
-def _attender(**options):
+def _gpt(**options):
     return GPTAttender(12, 16, **({"blocks": 2, "heads": 4, "context": 11} | options)).eval()
 
 
@@ -22,7 +23,7 @@ def test_parameters_equal_the_published_counts(width, parameters):
 
 
 def test_a_pass_equals_pytorchs_transformer():
-    attender, gelu = _attender(), partial(functional.gelu, approximate="tanh")
+    attender, gelu = _gpt(), partial(functional.gelu, approximate="tanh")
     layers = nn.ModuleList(
         nn.TransformerEncoderLayer(16, 4, 64, 0.0, gelu, batch_first=True, norm_first=True) for _ in range(2)
     ).eval()
@@ -48,7 +49,7 @@ def test_a_pass_equals_pytorchs_transformer():
 
 
 def test_the_future_does_not_show():
-    attender, x = _attender(), torch.randn(2, 5, 12)
+    attender, x = _gpt(), torch.randn(2, 5, 12)
     later = x.clone()
     later[:, 3:] = 9.0
     with torch.no_grad():
@@ -58,7 +59,7 @@ def test_the_future_does_not_show():
 
 
 def test_a_step_equals_the_sweep():
-    attender, x = _attender(), torch.randn(2, 5, 12)
+    attender, x = _gpt(), torch.randn(2, 5, 12)
     with torch.no_grad():
         expected, state = attender(x), attender.init_state(2)
         for t in range(5):
@@ -68,7 +69,7 @@ def test_a_step_equals_the_sweep():
 
 
 def test_a_full_context_is_announced():
-    attender = _attender()
+    attender = _gpt()
     with pytest.raises(UsageError, match=r"at most 5 steps .* step 6"):
         attender(torch.zeros(1, 6, 12))
     state = attender.init_state(1)
@@ -79,7 +80,7 @@ def test_a_full_context_is_announced():
 
 
 def test_activations_are_read_at_the_action_tokens():
-    attender, x = _attender(), torch.randn(2, 5, 12)
+    attender, x = _gpt(), torch.randn(2, 5, 12)
     with torch.no_grad():
         y, activations = attender(x, return_activations=True)
     assert {name: tuple(value.shape) for name, value in activations.items()} == {
@@ -93,7 +94,7 @@ def test_activations_are_read_at_the_action_tokens():
 
 
 def test_dropout_acts_in_training_alone():
-    attender, x = _attender(dropout=0.5), torch.randn(1, 3, 12)
+    attender, x = _gpt(dropout=0.5), torch.randn(1, 3, 12)
     assert not torch.equal(attender.train()(x), attender(x))
     assert torch.equal(attender.eval()(x), attender(x))
 
@@ -105,3 +106,89 @@ def test_a_width_that_heads_cannot_share_is_refused():
         GPTAttender(12, 0)
     with pytest.raises(UsageError, match=r"received -0\.5"):
         GPTAttender(12, 8, dropout=-0.5)
+
+
+def _mamba(**options):
+    return MambaAttender(12, **({"blocks": 2, "states": 4} | options)).eval()
+
+
+def test_parameters_equal_the_published_count():
+    with torch.device("meta"):
+        assert sum(parameter.numel() for parameter in MambaAttender(512).parameters()) == 6_784_000
+
+
+@torch.no_grad()
+def test_a_block_follows_the_published_equations():
+    attender, x = _mamba(blocks=1), torch.randn(2, 6, 12)
+    block = attender.blocks[0]
+    branch, gate = (block.norm(x) @ block.expand.weight.T).chunk(2, -1)
+    h, decay = torch.zeros(2, 24, 4), -torch.exp(block.log_decay)
+    for t in range(6):
+        taps = sum(branch[:, t - lag] * block.convolution.weight[:, 0, 3 - lag] for lag in range(min(t, 3) + 1))
+        u = functional.silu(taps + block.convolution.bias)
+        rank, drive, readout = (u @ block.select.weight.T).split((1, 4, 4), -1)
+        size = functional.softplus(rank @ block.step_size.weight.T + block.step_size.bias)
+        h = torch.exp(size[..., None] * decay) * h + (size * u)[..., None] * drive[:, None]
+        y = (h @ readout[..., None])[..., 0] + block.skip * u
+        expected = x[:, t] + (y * functional.silu(gate[:, t])) @ block.project.weight.T
+        torch.testing.assert_close(block(x)[:, t], expected, atol=1e-6, rtol=1e-5)
+
+
+def test_initial_steps_lie_in_the_published_range():
+    bias = MambaAttender(64).blocks[0].step_size.bias
+    size = functional.softplus(bias)
+    assert size.min() >= 0.999e-3
+    assert size.max() <= 1.001e-1
+
+
+@torch.no_grad()
+def test_a_stream_equals_the_sweep():
+    attender, x = _mamba(), torch.randn(2, 30, 12)
+    expected, state = attender(x), attender.init_state(2)
+    for t in range(30):
+        y, state = attender.step(x[:, t], state)
+        torch.testing.assert_close(y, expected[:, t], atol=1e-5, rtol=1e-4)
+
+
+@torch.no_grad()
+def test_activations_are_the_blocks_and_the_norm():
+    attender, x = _mamba(), torch.randn(2, 3, 12)
+    y, activations = attender(x, return_activations=True)
+    assert tuple(activations) == ("block1", "block2", "norm")
+    assert torch.equal(activations["norm"], y)
+    assert list(attender(x, return_activations=["block2"])[1]) == ["block2"]
+
+
+def test_sizes_are_positive():
+    with pytest.raises(UsageError, match="features 12, blocks 0"):
+        MambaAttender(12, blocks=0)
+
+
+def _selective_scan(u, delta, A, B, C, D, *, z, delta_bias, delta_softplus):
+    """What mamba_ssm documents its kernel to compute: u, delta, z [B, D, L], A [D, N], B and C [B, N, L], D [D]."""
+    assert delta_softplus
+    size = functional.softplus(delta + delta_bias[:, None])
+    state, outputs = u.new_zeros(*u.shape[:2], A.shape[1]), []
+    for t in range(u.shape[2]):
+        state = torch.exp(size[:, :, t, None] * A) * state + (size * u)[:, :, t, None] * B[:, None, :, t]
+        outputs.append((state * C[:, None, :, t]).sum(-1))
+    return (torch.stack(outputs, 2) + D[:, None] * u) * functional.silu(z)
+
+
+def test_a_kernel_that_does_what_mamba_ssm_documents_changes_neither_answers_nor_gradients(monkeypatch):
+    attender, x = _mamba(), torch.randn(2, 7, 12)
+
+    def results():
+        attender.zero_grad()
+        y = attender(x)
+        y.square().sum().backward()
+        return [y.detach(), *(parameter.grad.clone() for parameter in attender.parameters())]
+
+    plain = results()
+    monkeypatch.setattr(dispatch, "selective_scan", lambda x: _selective_scan)
+    torch.testing.assert_close(results(), plain, atol=1e-4, rtol=1e-4)
+
+
+def test_without_cuda_no_kernel_is_looked_for(monkeypatch):
+    monkeypatch.setattr(dispatch, "_mamba_kernel", lambda: pytest.fail("asked for a CUDA kernel"))
+    _mamba()(torch.randn(1, 3, 12))

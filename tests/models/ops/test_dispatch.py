@@ -1,5 +1,7 @@
 """A graph whose convolutions and gates are our own kernels computes what PyTorch's operations compute."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Sequence
 from typing import Any
 

@@ -1,1 +1,0 @@
-"""Encoders: a stimulus [B, T, C, H, W] to features [B, T, F]."""
