@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
-from xml.etree import ElementTree
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,9 +18,9 @@ from numpy.typing import NDArray
 from brainbench.core.devices import mujoco_module
 from brainbench.core.errors import DataError, UsageError, check_each, check_kind, listing, shown
 from brainbench.core.files import content_hash
-from brainbench.core.reading.regular import check_file, readable
-from brainbench.core.reading.texts import read_text
+from brainbench.core.reading.regular import readable
 from robotics_bridge.hands.facing import palmar_directions
+from robotics_bridge.hands.files import read_mjspec, stated_speeds
 from robotics_bridge.hands.layouts import Layout, check_names, is_probe_file, pad_probes, read_probes, select
 from robotics_bridge.hands.spec import HandSpec, build
 from robotics_bridge.sensors.probes.placement import Probes
@@ -34,8 +33,6 @@ _AUTO_GRIDS = {
     "high": {"tips": (6, 8, 0.002), "fingers": (6, 7, 0.0016), "palm": (20, 11, 0.0016)},
 }
 """Rows, columns and radius (m) on a link of a hand without a layout of its own."""
-_NAMES = {"name", "class", "childclass", "joint", "body", "link", "geom", "site", "mesh", "material", "file"}
-"""Attributes of URDF and MJCF that hold words."""
 UNKNOWN_SPEED = 5.0
 """Speed (rad/s) that counts as the largest of a hinge whose data states none."""
 LEVER = 0.05
@@ -46,8 +43,6 @@ _PHYSICS = (
     "actuator_gainprm", "actuator_biasprm", "actuator_forcerange",
 )  # fmt: skip
 """Numbers of a compiled hand by which it moves and feels."""
-_LARGEST = 1e15
-"""Magnitude of numbers in a hand's file that no hand has."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,7 +104,7 @@ class Hand:
         :data:`LEVER` times that.
         """
         names = list(joints)
-        known = _stated_speeds(self.path) if self.spec is None else {one.name: one.velocity for one in self.spec.joints}
+        known = stated_speeds(self.path) if self.spec is None else {one.name: one.velocity for one in self.spec.joints}
         if assumed := [name for name in names if name not in known]:
             slow = f"slides: {UNKNOWN_SPEED * LEVER:g} m/s"
             told = f"{UNKNOWN_SPEED:g} rad/s ({slow}) counts as the largest of {listing(assumed)}"
@@ -188,82 +183,6 @@ class Hand:
                 "Hand.with_probes (a probe file, or link → Probes)."
             )
         return found
-
-
-def read_mjspec(path: Path) -> Any:
-    """Read a URDF or MJCF file.
-
-    Meshes for display only are dropped (their files are often absent), degenerate inertias are bounded, mesh paths
-    given from the file's own folder are found too, bodies and joints without a name are numbered, and a hand that
-    floats is fixed.
-
-    Raises:
-        DataFileNotFoundError: the file is missing.
-    """
-    mujoco = mujoco_module()
-    _check_xml(path)
-    folder = path.parent
-    with readable(path, "URDF or MJCF file"):
-        spec = mujoco.MjSpec.from_file(str(path))
-        files = [mesh.file for mesh in spec.meshes if mesh.file]
-    if any(not (folder / spec.meshdir / name).exists() and (folder / name).exists() for name in files):
-        spec.meshdir = ""
-    for name in files:
-        # To open a pipe or a device would wait for ever; what is not there is told in compiling.
-        if os.path.lexists(place := folder / spec.meshdir / name):
-            check_file(place, "mesh file")
-    if path.suffix.lower() == ".urdf":
-        spec.compiler.discardvisual = True
-        # Fixed links join their parents, as their solids should; a sensor keeps the palm from joining the world.
-        root = spec.worldbody.first_body()
-        kinds = {"type": mujoco.mjtSensor.mjSENS_FRAMEPOS, "objtype": mujoco.mjtObj.mjOBJ_BODY}
-        spec.add_sensor(name="palm_pose", objname=root.name, **kinds)
-    for joint in [joint for joint in spec.joints if joint.type == mujoco.mjtJoint.mjJNT_FREE]:
-        # A hand that floats in its file is held by what it is put on; its keyframes would have other sizes.
-        if len(joint.parent.find_all(mujoco.mjtObj.mjOBJ_JOINT)) > 1:
-            for item in (joint, *spec.keys):
-                spec.delete(item)
-    for kind, items in (("link", spec.bodies), ("joint", spec.joints)):
-        for number, item in enumerate(items):
-            item.name = item.name or f"{kind}{number}"
-    spec.compiler.boundmass = max(spec.compiler.boundmass, 1e-6)
-    spec.compiler.boundinertia = max(spec.compiler.boundinertia, 1e-9)
-    return spec
-
-
-def _check_xml(path: Path) -> None:
-    """Refuse numbers that are not finite, which MuJoCo takes, and included files that are no files."""
-    kind = "hand file (URDF or MJCF)"
-    text = read_text(path, kind)
-    with readable(path, kind):
-        for element in ElementTree.fromstring(text).iter():
-            if element.tag == "include":
-                _check_xml(path.parent / element.get("file", ""))
-            for key, value in element.items():
-                for word in value.split() if key not in _NAMES else ():
-                    if _is_absurd(word):
-                        raise DataError(
-                            f"{key!r} of <{shown(element.tag, quoted=False)}> in {shown(str(path))} is {shown(value)}; "
-                            f"finite numbers of at most {_LARGEST:g} are needed."
-                        )
-
-
-def _stated_speeds(path: Path | None) -> dict[str, float]:
-    """Return joint → largest speed (rad/s or m/s) of a URDF file, which MuJoCo does not keep; 0 states none."""
-    if path is None or path.suffix.lower() != ".urdf":
-        return {}
-    with readable(path, "URDF or MJCF file"):
-        root = ElementTree.fromstring(read_text(path, "hand file (URDF or MJCF)"))
-        limits = {joint.get("name", ""): joint.find("limit") for joint in root.iter("joint")}
-        speeds = {name: float(limit.get("velocity", 0)) for name, limit in limits.items() if limit is not None}
-    return {name: speed for name, speed in speeds.items() if speed > 0}
-
-
-def _is_absurd(word: str) -> bool:
-    try:
-        return not abs(float(word)) <= _LARGEST
-    except ValueError:
-        return False
 
 
 def from_file(path: Path) -> Hand:
