@@ -126,7 +126,7 @@ def _commands(page: str) -> list[str]:
 
 PRELUDES = {
     "docs/export.md": "import torch\nstimuli = torch.zeros(2, 22, 30, 5, 7)",
-    "docs/whiskit.md": "from brainbench.stimuli import WhiskerArray, whiskit\n"
+    "docs/whiskit.md": "from brainbench.published import whiskit\nfrom brainbench.stimuli import WhiskerArray\n"
     "whiskit.save_parameters(WhiskerArray.rat(), 'whisker_param_average_rat/')",
 }
 """What a page takes for granted."""

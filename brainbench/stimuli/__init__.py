@@ -2,8 +2,7 @@
 
 ``whiskers``, ``objects`` and ``motion`` make ``scenes``; ``engines`` simulate them (:func:`simulate`), many at once as
 ``sweeps``; the wrenches go to a stimulus set or as an array [K, T, C, H, W] to a model (:func:`load_stimuli`).
-``whiskit`` and ``whiskit_runs`` write and read WHISKiT's folders, ``external`` makes stimulus sets of forces from
-elsewhere. ``fitting`` estimates whiskers and contacts from measurements. ``validation`` holds engines against closed
+``fitting`` estimates whiskers and contacts from measurements. ``validation`` holds engines against closed
 forms, ``figures`` draws scenes and traces.
 """
 

@@ -33,6 +33,7 @@ from brainbench.models.training.config import TrainingConfig
 from brainbench.models.training.processes import Processes
 from brainbench.models.training.run_folder import STATE
 from brainbench.models.training.trainer import _Run
+from brainbench.published.whiskit import read_runs
 from brainbench.scoring.recovery.design import parse_trials
 from brainbench.stimuli import WhiskerArray, load_stimuli
 from brainbench.stimuli.engines.fidelity import Fidelity
@@ -43,7 +44,6 @@ from brainbench.stimuli.objects.shapenet import read_categories, read_ids
 from brainbench.stimuli.scenes.scene_files import load_scene
 from brainbench.stimuli.stimulus_set import hash_stimulus_set, write_stimulus_set
 from brainbench.stimuli.sweeps.generation import generate
-from brainbench.stimuli.whiskit_runs import read_runs
 from leaderboards import build_leaderboard, read_records
 from leaderboards.held_out import Commitment
 from leaderboards.site.folder import MANIFEST, check_site

@@ -1,7 +1,7 @@
 """Read data sets of whisker sweeps for training: memory-mapped shards, shuffled batches, exact resume.
 
 The files are those of ``brainbench stimuli sweep --out``, whose layout is described in ``docs/datasets.md``, or the
-sweep folders of the published study (:mod:`~brainbench.datasets.whisking.sweep_tree`). Letters: B batch, T time step,
+sweep folders of the published study, which an optional room opens. Letters: B batch, T time step,
 S sub-step, C channel, W whisker, H×W whisker grid, N sweep.
 """
 
@@ -21,11 +21,11 @@ import numpy as np
 from brainbench.core.contracts import CHANNELS, GRID_SHAPE, SUB_STEP_SECONDS, SUB_STEPS
 from brainbench.core.errors import DataError, UsageError, check_name, listing
 from brainbench.core.files import cache_dir, content_hash
+from brainbench.core.plugins import load_optional
 from brainbench.core.progress import Progress, track
 from brainbench.core.reading.ranges import check_number
 from brainbench.core.reading.sealed import read_sealed, write_sealed
-from brainbench.datasets.whisking.files import Buffers, most_open, open_shard, read_manifest
-from brainbench.datasets.whisking.sweep_tree import is_sweep_tree, open_sweep_tree
+from brainbench.datasets.whisking.files import Buffers, is_sweep_tree, most_open, open_shard, read_manifest
 
 if TYPE_CHECKING:
     import torch
@@ -36,6 +36,8 @@ Unstable = Literal["skip", "zero", "error"]
 
 SPLITS = ("train", "validation", "test", "all")
 """Values of ``split``; ``all`` is the three together."""
+SWEEP_READERS = "brainbench.sweeps"
+"""Entry points that open sweeps of others; the published study's are ``published``."""
 
 _AHEAD = 2
 _BLOCK = 64
@@ -116,7 +118,9 @@ class WhiskingDataset:
         self.split, self.view, self.substeps, self.unstable = split, view, substeps, unstable
         self.batch_size, self.shuffle, self.seed, self.device = batch_size, shuffle, seed, device
         self.drop_last, self.part = drop_last, part
-        tree = open_sweep_tree(self.folder) if is_sweep_tree(self.folder) else None
+        tree = None
+        if is_sweep_tree(self.folder):
+            tree = load_optional(SWEEP_READERS, "published", "reader of sweeps")(self.folder)
         self.manifest: Mapping[str, Any] = read_manifest(self.folder) if tree is None else tree.manifest()
         self.classes = tuple(str(name) for name in self.manifest["classes"])
         entries = [item for item in self.manifest["shards"] if split in ("all", item["split"])]

@@ -21,6 +21,8 @@ from brainbench.core.reading.regular import readable
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+FOLDERS = {"train": "train", "validate": "validation", "validation": "validation", "val": "validation", "test": "test"}
+"""Folders of the published study's sweeps → split."""
 _UNUSABLE = 2
 _AGAIN = "Remove it and give the command that made the data set again."
 
@@ -73,6 +75,12 @@ class Shard:
         if not mark.exists():
             self.verify()
             write_text(mark, "")
+
+
+def is_sweep_tree(folder: Path) -> bool:
+    """Return whether a folder has the published study's folders for splits and is no data set of ours."""
+    ours = any((folder / name).is_file() for name in ("manifest.json", "config.json"))
+    return not ours and any((folder / name).is_dir() for name in FOLDERS)
 
 
 def read_manifest(folder: Path) -> Mapping[str, Any]:

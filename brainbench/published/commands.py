@@ -55,8 +55,8 @@ def convert(
 
     Numbers become N and N·m, or mN and µN·m in a run; axes and signs are alike. What cannot be trusted is counted.
     """
-    from brainbench.datasets.whisking.sweep_tree import is_sweep_tree
-    from brainbench.stimuli.whiskit_runs import find_runs, read_runs
+    from brainbench.datasets.whisking.files import is_sweep_tree
+    from brainbench.published.whiskit import find_runs, read_runs
 
     if not source.exists():
         raise DataFileNotFoundError(f"There is no file or folder {str(source)!r}.")
@@ -64,28 +64,28 @@ def convert(
     of_sets = {"--stimulus": stimulus, "--dialect": dialect}
     if source.is_dir() and is_sweep_tree(source):
         _check("a folder of sweeps", of_runs | of_sets, out, "a data set, which is a folder", not _is_set(out))
-        made = _data_set(source, out)
+        result = _data_set(source, out)
     elif sweeps := [source] if source.suffix == ".npz" else sorted(source.glob("*.npz")):
         _check("sweeps without splits", of_runs | of_sets, out, _SET, _is_set(out))
         with progress_bar("converting the sweeps"):
-            made = _write_set(_sweep_set(sweeps), out)
+            result = _write_set(_sweep_set(sweeps), out)
     elif source.is_file():
         free = not out.is_file() and not (out.is_dir() and any(out.iterdir()))
         _check("a stimulus set", of_runs, out, "a run, which is a new folder", free)
         with progress_bar("writing the run"):
-            made = _run(source, out, stimulus=stimulus, dialect=dialect or "thesis")
+            result = _run(source, out, stimulus=stimulus, dialect=dialect or "thesis")
     elif runs := find_runs(source):
         _check("runs", of_sets, out, _SET, _is_set(out))
         with progress_bar("converting the runs"):
-            made = _write_set(read_runs(runs, cleaning=cleaning or "mark", rate=rate), out)  # type: ignore[arg-type]
+            result = _write_set(read_runs(runs, cleaning=cleaning or "mark", rate=rate), out)  # type: ignore[arg-type]
     else:
         raise DataError(
             f"{str(source)!r} holds nothing to convert: no folders train, validate and test, no sweeps (.npz) and no "
             "WHISKiT runs (whisker_ID.csv and dynamics/)."
         )
-    made = {"source": source, "out": out, **made}
-    text = {name.replace("_", " "): _told(value) for name, value in made.items()}
-    return Output(made, facts(text))
+    result = {"source": source, "out": out, **result}
+    text = {name.replace("_", " "): _in_words(value) for name, value in result.items()}
+    return Output(result, facts(text))
 
 
 _SET = "a stimulus set, a file that ends in .h5, .hdf5 or .nc"
@@ -103,8 +103,8 @@ def _check(what: str, refused: Mapping[str, Any], out: Path, becomes: str, fits:
 
 
 def _data_set(source: Path, out: Path) -> dict[str, Any]:
-    from brainbench.datasets.whisking.sweep_tree import open_sweep_tree
-    from brainbench.stimuli.sweeps.conversion import SweepTable, convert_sweeps
+    from brainbench.published.conversion import SweepTable, convert_sweeps
+    from brainbench.published.sweep_files import open_sweep_tree
 
     tree = open_sweep_tree(source)
     table = SweepTable(
@@ -122,8 +122,8 @@ def _data_set(source: Path, out: Path) -> dict[str, Any]:
     with progress_bar() as progress:
         manifest = convert_sweeps(table, out, progress=progress)
     about = ("sweeps", "splits", "left_out", "faults", "unstable", "content_hash", "config_hash")
-    known = {"rate_hz": tree.rate, "classes": len(tree.classes), **_frames(tree.times)}
-    return {"kind": "data set", **known, **{name: manifest[name] for name in about}}
+    summary = {"rate_hz": tree.rate, "classes": len(tree.classes), **_frames(tree.times)}
+    return {"kind": "data set", **summary, **{name: manifest[name] for name in about}}
 
 
 def _sweep_set(paths: list[Path]) -> xr.Dataset:
@@ -131,9 +131,9 @@ def _sweep_set(paths: list[Path]) -> xr.Dataset:
     import numpy as np
 
     from brainbench.core.contracts import GRID_SHAPE
-    from brainbench.datasets.whisking.sweep_files import CELLS, CONDITIONS, FAULTS, FRAME_TIMES, FRAMES, read_sweep
+    from brainbench.published.conversion import assemble_stimulus_set
+    from brainbench.published.sweep_files import CELLS, CONDITIONS, FAULTS, FRAME_TIMES, FRAMES, read_sweep
     from brainbench.stimuli import Frames
-    from brainbench.stimuli.external import assemble_stimulus_set
 
     sweeps = [read_sweep(path) for path in paths]
     if len(rates := {sweep.rate for sweep in sweeps}) > 1:
@@ -170,8 +170,8 @@ def _write_set(dataset: xr.Dataset, out: Path) -> dict[str, Any]:
 
 
 def _run(source: Path, out: Path, **options: Any) -> dict[str, Any]:
+    from brainbench.published.whiskit import save_run
     from brainbench.stimuli import read_stimulus_set
-    from brainbench.stimuli.whiskit import save_run
 
     dataset = read_stimulus_set(source)
     out.parent.mkdir(parents=True, exist_ok=True)
@@ -196,8 +196,8 @@ def _frames(times: Any) -> dict[str, Any]:
     return {"frames": len(times), "first_ms": round(first, 4), "interval_ms": round(interval, 4)}
 
 
-def _told(value: Any) -> str:
+def _in_words(value: Any) -> str:
     """Return a value for people: nested counts as ``name: count``, without zeros."""
     if isinstance(value, Mapping):
-        return "; ".join(f"{name}: {_told(item)}" for name, item in value.items() if item) or "none"
+        return "; ".join(f"{name}: {_in_words(item)}" for name, item in value.items() if item) or "none"
     return ", ".join(value) if isinstance(value, list) else f"{value:,}" if isinstance(value, int) else str(value)

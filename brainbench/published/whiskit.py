@@ -15,19 +15,26 @@ line with a comma; the thesis's programs write and expect none.
 
 from __future__ import annotations
 
+import math
 import os
+from collections import Counter
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from brainbench.core.contracts import CHANNELS, check_stimulus_set
-from brainbench.core.errors import DataError, UsageError, check_name, choose_name
+from brainbench.core.contracts import CHANNELS, GRID_SHAPE, check_stimulus_set
+from brainbench.core.errors import DataError, UsageError, check_name, choose_name, listing, unknown_name
 from brainbench.core.files import write_text
+from brainbench.core.reading.ranges import check_number
 from brainbench.core.reading.tables import read_numbers
 from brainbench.core.reading.texts import read_text
+from brainbench.published.conversion import FRAME_STATUSES, assemble_stimulus_set
+from brainbench.published.sweep_files import LARGEST, SCALE
+from brainbench.stimuli.scenes.frames import Frames
 from brainbench.stimuli.whiskers.array import MountedWhisker, WhiskerArray, published_whisker
 from brainbench.stimuli.whiskers.selection import ROWS
 
@@ -85,14 +92,14 @@ def bends(array: WhiskerArray, links: int = BENDS) -> NDArray[np.float64]:
 
     WHISKiT's own table is computed from an approximate arc length and differs by up to 2 %.
     """
-    found = np.zeros((len(array), links))
+    table = np.zeros((len(array), links))
     for index, mount in enumerate(array):
         points = mount.whisker.centre_line(np.linspace(0.0, mount.whisker.arc_length, links + 1))
         directions = np.arctan2(*np.diff(points, axis=0).T[::-1])
-        found[index, 1:] = np.diff(directions, prepend=0.0)[1:]
+        table[index, 1:] = np.diff(directions, prepend=0.0)[1:]
         # The table has no place for the direction of the first link: it is added to the bend of the second.
-        found[index, 1] += directions[0]
-    return found
+        table[index, 1] += directions[0]
+    return table
 
 
 def save_parameters(
@@ -147,25 +154,25 @@ def save_run(
     chosen = choose_name("stimulus", stimulus, labels)
     if not str(dataset.attrs.get("frame", "world")).startswith("world"):
         raise UsageError("WHISKiT's results are in world axes; read the stimulus set in world axes to write them.")
-    one = dataset.isel(stimulus=labels.index(chosen))
-    names = _run_names(one)
+    run = dataset.isel(stimulus=labels.index(chosen))
+    names = _run_names(run)
     end = ",\n" if dialect == "sense-lab" else "\n"
     root = Path(folder)
     _write(root / "whisker_ID.csv", [[name] for name in names], end)
-    # N to mN, and N·m to mN·mm.
-    wrench = one["wrench"].values.astype(float) * np.repeat([1e3, 1e6], 3)
+    # N to mN, and N·m to mN·mm = µN·m.
+    wrench = run["wrench"].values.astype(float) * np.repeat([1e3, 1e6], 3)
     for index, channel in enumerate(CHANNELS):
         _write(root / "dynamics" / f"{channel}.csv", wrench[:, :, index].tolist(), end)
     if shapes is not None:
-        _write_kinematics(one, root / "kinematics", names, shapes, end)
+        _write_kinematics(run, root / "kinematics", names, shapes, end)
     return root
 
 
-def _write_kinematics(one: xr.Dataset, root: Path, names: Sequence[str], shapes: Sequence[ArrayLike], end: str) -> None:
-    times = one.sizes["time"]
+def _write_kinematics(run: xr.Dataset, root: Path, names: Sequence[str], shapes: Sequence[ArrayLike], end: str) -> None:
+    times = run.sizes["time"]
     if len(shapes) != len(names):
         raise UsageError(f"{len(names)} whiskers need as many shapes; received {len(shapes)}.")
-    arcs, touches = one["contact_arc"].values, one["contact"].values
+    arcs, touches = run["contact_arc"].values, run["contact"].values
     for index, (name, shape) in enumerate(zip(names, shapes, strict=True)):
         joints = np.asarray(shape, dtype=float)
         if joints.ndim != 3 or joints.shape[0] != times or joints.shape[1] < 2 or joints.shape[2] != 3:
@@ -183,12 +190,12 @@ def _write_kinematics(one: xr.Dataset, root: Path, names: Sequence[str], shapes:
         _write(root / "c" / f"{name}.csv", flags.tolist(), end)
 
 
-def _run_names(one: xr.Dataset) -> list[str]:
+def _run_names(run: xr.Dataset) -> list[str]:
     """Return the names with their side: ``RC2``."""
-    if "side" not in one.coords:
+    if "side" not in run.coords:
         raise UsageError("The stimulus set does not say on which side its whiskers are; WHISKiT's names need it.")
-    sides = [str(side)[0].upper() for side in one["side"].values]
-    rows, cols = one["row"].values.astype(int), one["col"].values.astype(int)
+    sides = [str(side)[0].upper() for side in run["side"].values]
+    rows, cols = run["row"].values.astype(int), run["col"].values.astype(int)
     names = [f"{side}{ROWS[row]}{col}" for side, row, col in zip(sides, rows, cols, strict=True)]
     if len(set(names)) < len(names):
         raise UsageError("The stimulus set has several animals; a WHISKiT run has one: select its whiskers first.")
@@ -213,3 +220,149 @@ def _table(root: Path, name: str, lines: int, columns: int | None) -> NDArray[np
             f"{os.fspath(path)!r} has shape {list(table.shape)}; {lines} names need [{lines}, {columns or 'links'}]."
         )
     return table
+
+
+Cleaning = Literal["mark", "published"]
+"""``mark``: values that cannot be trusted become missing (NaN) and their frames get a status. ``published``: what the
+released ``process_raw_dataset.py --process_values`` does: of 1000 rows 1, 10, … 982 are kept; a missing value becomes
+0; a value beyond 1000 becomes the last one that is not, or 0."""
+
+_NAMES = [f"{side}{row}{col}" for side in "RL" for row in ROWS for col in range(GRID_SHAPE[1])]
+_ROWS = {1000: Frames(first=0.0, interval=0.001, count=1000), 110: Frames(first=0.0, interval=1 / 110, count=110)}
+"""Frames of a run by its number of rows, as the study ran them: one second at 1000 or 110 Hz."""
+_KEPT = Frames(first=0.001, interval=0.009, count=110)
+"""Frames that the published cleaning keeps of 1000."""
+
+
+@dataclass(frozen=True, eq=False)
+class WhiskitRun:
+    """One run as its files hold it."""
+
+    names: tuple[str, ...]
+    """Whiskers with their side: ``RC2``."""
+    dynamics: NDArray[np.float64]
+    """[row, whisker, channel] as written (mN, µN·m), with its missing and impossible values."""
+    contact: NDArray[np.bool_] | None
+    """[row, whisker] whether any link touches; None without kinematics."""
+
+
+def find_runs(folder: str | os.PathLike[str]) -> tuple[Path, ...]:
+    """Return the folder itself if it is a run, or else all runs below it, by path."""
+    root = Path(folder)
+    folders = {path.parent for name in ("whisker_ID.csv", "dynamics") for path in root.rglob(name)}
+    return (root,) if root in folders else tuple(sorted(folders))
+
+
+def read_run(folder: str | os.PathLike[str]) -> WhiskitRun:
+    """Read one run without changing a value."""
+    root = Path(folder)
+    names = _names(root / "whisker_ID.csv")
+    tables = {name: read_numbers(root / "dynamics" / f"{name}.csv") for name in CHANNELS}
+    rows = Counter(map(len, tables.values())).most_common(1)[0][0]
+    for name, table in tables.items():
+        for size, needed, what in zip(table.shape, (rows, len(names)), ("rows", "columns"), strict=True):
+            if size != needed:
+                raise DataError(
+                    f"'dynamics/{name}.csv' of the run {str(root)!r} has {size} {what}; it needs {needed}, as most "
+                    "components have rows and whisker_ID.csv has names."
+                )
+    return WhiskitRun(names, np.stack(list(tables.values()), axis=-1), _contacts(root, names, rows))
+
+
+def published_cleaning(dynamics: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the 110 rows [110, whisker, channel] of a run (mN, µN·m) that the released cleaning makes of it."""
+    if len(dynamics) not in _ROWS:
+        raise UsageError(f"The published cleaning takes runs of 1000 or 110 rows; received {len(dynamics)}.")
+    values = dynamics[1:983:9] if len(dynamics) == 1000 else dynamics
+    values = np.where(np.isnan(values), 0.0, values)
+    good = np.abs(values) <= LARGEST
+    rows = np.arange(len(values))[:, None, None]
+    last = np.maximum.accumulate(np.where(good, rows, -1), axis=0)
+    filled = np.take_along_axis(values, np.maximum(last, 0), axis=0)
+    return np.where(last < 0, 0.0, filled)
+
+
+def read_runs(
+    folders: Sequence[str | os.PathLike[str]], *, cleaning: Cleaning = "mark", rate: float | None = None
+) -> xr.Dataset:
+    """Read runs as one stimulus set in SI units, a stimulus per run.
+
+    What cannot be trusted is marked and counted by :func:`~brainbench.published.conversion.assemble_stimulus_set`; with
+    ``cleaning="published"`` that tells what was replaced.
+
+    Args:
+        folders: one or more runs with the same whiskers and as many rows.
+        cleaning: one of :data:`Cleaning`.
+        rate: rows per second [Hz]; by the number of rows when None: 1000 and 110 rows are one second.
+    """
+    check_name("cleaning", cleaning, get_args(Cleaning))
+    paths = [Path(folder).absolute() for folder in folders]
+    if not paths:
+        raise DataError("There is no run of WHISKiT (whisker_ID.csv and dynamics/) to be read.")
+    # Runs of several objects have the same names; their paths differ.
+    common = os.path.commonpath(paths) if len(paths) > 1 else paths[0].parent
+    labels = [path.relative_to(common).as_posix() for path in paths]
+    runs = [read_run(path) for path in paths]
+    first = runs[0]
+    for label, run in zip(labels, runs, strict=True):
+        if (run.names, len(run.dynamics)) != (first.names, len(first.dynamics)):
+            raise DataError(
+                f"The runs {labels[0]!r} and {label!r} differ in whiskers or rows ({len(first.names)} and "
+                f"{len(run.names)} whiskers, {len(first.dynamics)} and {len(run.dynamics)} rows); convert them apart."
+            )
+    raw = np.stack([run.dynamics for run in runs])
+    frames = _frames(raw.shape[1], cleaning, rate)
+    chosen = slice(1, 983, 9) if frames is _KEPT else slice(None)
+    faults = {"missing": np.isnan(raw), "too large": np.abs(raw) > LARGEST}
+    bad = faults["missing"] | faults["too large"]
+    values = np.where(bad, math.nan, raw)
+    if cleaning == "published":
+        values = np.stack([published_cleaning(run.dynamics) for run in runs])
+    row = np.zeros(raw.shape, dtype=bool)
+    row[:, 0] = True
+    faults = {"unwritten": row & (raw != 0) & ~bad, **faults}
+    touching = [run.contact for run in runs if run.contact is not None]
+    return assemble_stimulus_set(
+        values * SCALE,
+        first.names,
+        frames,
+        [{"label": label} for label in labels],
+        {name: where[:, chosen] for name, where in faults.items()},
+        frame_status=(row[:, chosen, :, 0] * FRAME_STATUSES.index("unwritten")).astype(np.uint8),
+        contact=np.stack(touching)[:, chosen] if len(touching) == len(runs) else None,
+        cleaning=cleaning,
+    )
+
+
+def _frames(rows: int, cleaning: Cleaning, rate: float | None) -> Frames:
+    if cleaning == "published" and rows == 1000:
+        return _KEPT
+    if rate is None and rows not in _ROWS:
+        raise UsageError(
+            f"A run of {rows} rows does not tell its times; say how many rows make a second, as --rate does (1000 and "
+            "110 rows are taken as one second)."
+        )
+    if rate is not None:
+        check_number("rate (rows per second, Hz)", rate, above=0)
+    return _ROWS[rows] if rate is None else Frames(first=0.0, interval=1 / rate, count=rows)
+
+
+def _names(path: Path) -> tuple[str, ...]:
+    names = read_names(path)
+    for name in names:
+        if name not in _NAMES:
+            raise DataError(str(unknown_name(f"whisker in {str(path)!r}:", name, _NAMES)))
+    if not names or len(set(names)) < len(names):
+        raise DataError(f"{str(path)!r} must name each whisker once; it has {listing(names)}.")
+    return tuple(names)
+
+
+def _contacts(root: Path, names: Sequence[str], rows: int) -> NDArray[np.bool_] | None:
+    """Return whether any link of a whisker touches [row, whisker]; None where nobody wrote it."""
+    paths = [root / "kinematics" / "c" / f"{name}.csv" for name in names]
+    if not all(path.is_file() for path in paths):
+        return None
+    flags = [(read_numbers(path) != 0).any(axis=1) for path in paths]
+    if odd := [path for path, flag in zip(paths, flags, strict=True) if len(flag) != rows]:
+        raise DataError(f"{str(odd[0])!r} has another number of rows than the {rows} of dynamics.")
+    return np.stack(flags, axis=1)

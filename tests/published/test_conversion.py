@@ -1,3 +1,5 @@
+from __future__ import annotations
+
 import dataclasses
 import os
 import subprocess
@@ -8,7 +10,7 @@ import numpy as np
 import pytest
 
 from brainbench.core.errors import DataError, UsageError
-from brainbench.stimuli.sweeps.conversion import SweepTable, convert_sweeps
+from brainbench.published.conversion import SweepTable, convert_sweeps
 from tests.factories.sweep_batches import files_of
 
 ROOT = Path(__file__).parents[3]
@@ -72,7 +74,7 @@ def test_a_whisker_with_missing_values_is_unstable(tmp_path):
 
 CODE = """
 import os, sys
-from brainbench.stimuli.sweeps.conversion import convert_sweeps
+from brainbench.published.conversion import convert_sweeps
 from tests.stimuli.sweeps.test_conversion import make_table
 
 def die(done, total, what):
