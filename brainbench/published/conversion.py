@@ -92,10 +92,15 @@ def assemble_stimulus_set(
     sides, short = [_SIDES[name[0]] for name in names], [name[1:] for name in names]
     short_names = short if len(set(short)) == len(short) else list(names)
     values = {name: where.sum(axis=(1, 2, 3)).tolist() for name, where in faults.items()}
-    fault_counts = {label: {name: n for name, found in values.items() if (n := found[i])} for i, label in enumerate(labels)}
+    fault_counts = {
+        label: {name: n for name, found in values.items() if (n := found[i])} for i, label in enumerate(labels)
+    }
     dataset = new_stimulus_set(
         labels,
-        [(one, ROWS.index(name[1]), int(name[2:]), _SIDES[name[0]]) for one, name in zip(short_names, names, strict=True)],
+        [
+            (one, ROWS.index(name[1]), int(name[2:]), _SIDES[name[0]])
+            for one, name in zip(short_names, names, strict=True)
+        ],
         frames,
         {
             "wrench": ((*over_time, "channel"), wrench.astype(np.float32), {"units": "N (F), N m (M)"}),
@@ -104,7 +109,9 @@ def assemble_stimulus_set(
             "reason": (grid, reasons),
         },
         {
-            "array": text({"species": "not stated", "side": " and ".join(dict.fromkeys(sides)), "whiskers": short_names}),
+            "array": text(
+                {"species": "not stated", "side": " and ".join(dict.fromkeys(sides)), "whiskers": short_names}
+            ),
             "scene": text([{"label": source["label"], "frames": frames.config(), **source} for source in sources]),
             "fidelity": text({}),
             "backend": "whiskit",

@@ -75,7 +75,7 @@ def test_a_whisker_with_missing_values_is_unstable(tmp_path):
 CODE = """
 import os, sys
 from brainbench.published.conversion import convert_sweeps
-from tests.stimuli.sweeps.test_conversion import make_table
+from tests.published.test_conversion import make_table
 
 def die(done, total, what):
     if done >= 6:
