@@ -115,7 +115,7 @@ def assemble_stimulus_set(
             "scene": text([{"label": source["label"], "frames": frames.config(), **source} for source in sources]),
             "fidelity": text({}),
             "backend": "whiskit",
-            "faults": text({label: found for label, found in fault_counts.items() if found}),
+            "faults": text({label: counts for label, counts in zip(labels, counted, strict=True) if counts}),
             **about,
         },
     )
