@@ -92,9 +92,7 @@ def assemble_stimulus_set(
     sides, short = [_SIDES[name[0]] for name in names], [name[1:] for name in names]
     short_names = short if len(set(short)) == len(short) else list(names)
     values = {name: where.sum(axis=(1, 2, 3)).tolist() for name, where in faults.items()}
-    fault_counts = {
-        label: {name: n for name, found in values.items() if (n := found[i])} for i, label in enumerate(labels)
-    }
+    counted = [{name: n for name, sums in values.items() if (n := sums[i])} for i in range(len(labels))]
     dataset = new_stimulus_set(
         labels,
         [

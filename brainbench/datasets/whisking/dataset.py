@@ -118,9 +118,8 @@ class WhiskingDataset:
         self.split, self.view, self.substeps, self.unstable = split, view, substeps, unstable
         self.batch_size, self.shuffle, self.seed, self.device = batch_size, shuffle, seed, device
         self.drop_last, self.part = drop_last, part
-        tree = None
-        if is_sweep_tree(self.folder):
-            tree = load_optional(SWEEP_READERS, "published", "reader of sweeps")(self.folder)
+        read = load_optional(SWEEP_READERS, "published", "reader of sweeps") if is_sweep_tree(self.folder) else None
+        tree = None if read is None else read(self.folder)
         self.manifest: Mapping[str, Any] = read_manifest(self.folder) if tree is None else tree.manifest()
         self.classes = tuple(str(name) for name in self.manifest["classes"])
         entries = [item for item in self.manifest["shards"] if split in ("all", item["split"])]
