@@ -1,8 +1,8 @@
 """Doubtful records of a set: stale ones, and those that contradict one another.
 
-A record is **stale** when something newer exists than what made it: the package, the default estimator, or the
-definition behind a fidelity's name. Two records **conflict** when they state the same computation (recordings, stimuli,
-their pairing, weights, seeds, settings) and different numbers.
+A record is **stale** when something newer exists than what made it: the default estimator, or the definition behind a
+fidelity's name. A newer package alone makes none: what changes numbers raises the estimator's version. Two records
+**conflict** when they state one identity (:class:`brainbench.core.identity.ScoreIdentity`) and different numbers.
 """
 
 from __future__ import annotations
@@ -13,19 +13,14 @@ from collections.abc import Iterable, Iterator
 from itertools import islice
 from typing import Any
 
-from packaging.version import InvalidVersion, Version
-
+from brainbench.core.identity import ScoreIdentity
 from brainbench.core.records import ESTIMATOR_VERSION, ResultRecord
-from brainbench.core.version import __version__
 from leaderboards.store import StoredRecord
 
 TOLERANCE = 1e-3
 """Two runs of one computation agree within this on every machine: float32 sums differ in their last digits."""
 MOST_NAMED = 3
 """Most contradicting records that are named for one."""
-_SETTINGS = (
-    "time", "seed", "layers", "layer", "units_reliability", "normalize", "whiskers", "estimator_version", "readout"
-)  # fmt: skip
 
 
 def remarks(stored: Iterable[StoredRecord]) -> dict[str, tuple[str, ...]]:
@@ -34,61 +29,32 @@ def remarks(stored: Iterable[StoredRecord]) -> dict[str, tuple[str, ...]]:
     Every sentence begins with ``stale:`` or ``conflict:``.
     """
     usable = [item.record for item in stored if item.record is not None]
-    found: dict[str, list[str]] = defaultdict(list)
+    doubts: dict[str, list[str]] = defaultdict(list)
     newest = _newest_stimuli(usable)
-    groups: dict[tuple[Any, ...], list[ResultRecord]] = defaultdict(list)
+    groups: dict[ScoreIdentity, list[ResultRecord]] = defaultdict(list)
     for record in usable:
-        found[record.identity] += [f"stale: {reason}" for reason in _stale(record, newest)]
-        groups[computation(record)].append(record)
+        doubts[record.identity] += [f"stale: {reason}" for reason in _stale(record, newest)]
+        groups[ScoreIdentity.of(record)].append(record)
     for group in groups.values():
-        for one in group:
+        for record in group:
             # A few are enough to find out, and a set of many contradicting records stays readable.
-            for other in islice((other for other in group if not _agree(one, other)), MOST_NAMED):
-                found[one.identity].append(
-                    f"conflict: the same computation gave {_value(one)} here and {_value(other)} in the record "
-                    f"{other.identity}; find out which with: brainbench leaderboard verify"
+            for rival in islice((rival for rival in group if not _agree(record, rival)), MOST_NAMED):
+                doubts[record.identity].append(
+                    f"conflict: the same computation gave {_value(record)} here and {_value(rival)} in the record "
+                    f"{rival.identity}; find out which with: brainbench leaderboard verify"
                 )
-    return {identity: tuple(sentences) for identity, sentences in found.items() if sentences}
+    return {identity: tuple(sentences) for identity, sentences in doubts.items() if sentences}
 
 
 def conflicting(record: ResultRecord, others: Iterable[ResultRecord]) -> Iterator[ResultRecord]:
     """Yield those of ``others`` that state the same computation as ``record`` and other numbers."""
-    key = computation(record)
-    rivals = (other for other in others if not _agree(record, other) and computation(other) == key)
-    return (other for other in rivals if other.identity != record.identity)
-
-
-def computation(record: ResultRecord) -> tuple[Any, ...]:
-    """Return what was computed from what, as a key: equal keys must have equal numbers."""
-    score, card, origin = record.score, record.card, record.score.provenance
-    inputs = (origin.recordings_hash, origin.stimuli_hash, score.stimuli, card.weights if card else None)
-    return (
-        *inputs,
-        origin.pairing,
-        *(score.estimator, score.metric, score.name, origin.version),
-        *(str(origin.settings.get(name)) for name in _SETTINGS),
-        *(str(origin.recordings.get(name)) for name in ("window", "selection")),
-    )
-
-
-def older(version: str, than: str) -> bool:
-    """Tell whether a version is older; one that is none is not.
-
-    >>> older("0.9.1", "0.10.0"), older("0.2", "0.2.0"), older("unknown", "0.2")
-    (True, False, False)
-    """
-    try:
-        return Version(version) < Version(than)
-    except InvalidVersion:
-        return False
+    key = ScoreIdentity.of(record)
+    rivals = (rival for rival in others if not _agree(record, rival) and ScoreIdentity.of(rival) == key)
+    return (rival for rival in rivals if rival.identity != record.identity)
 
 
 def _stale(record: ResultRecord, newest: dict[tuple[Any, ...], tuple[str, str]]) -> list[str]:
-    score, version = record.score, record.score.provenance.version
-    settings = score.provenance.settings
-    reasons = []
-    if older(version, __version__):
-        reasons.append(f"made by brainbench {version}, this is {__version__}")
+    score, settings, reasons = record.score, record.score.provenance.settings, []
     estimator = settings.get("estimator_version")
     if score.estimator == "default" and isinstance(estimator, int) and estimator < ESTIMATOR_VERSION:
         reasons.append(f"version {estimator} of the default estimator, now {ESTIMATOR_VERSION}")
@@ -118,8 +84,8 @@ def _newest_stimuli(records: list[ResultRecord]) -> dict[tuple[Any, ...], tuple[
     return newest
 
 
-def _agree(one: ResultRecord, other: ResultRecord) -> bool:
-    a, b = one.score, other.score
+def _agree(left: ResultRecord, right: ResultRecord) -> bool:
+    a, b = left.score, right.score
     same = all(
         (math.isnan(x) and math.isnan(y)) or abs(x - y) <= TOLERANCE
         for x, y in ((a.value, b.value), (a.r, b.r), (a.reliability, b.reliability))

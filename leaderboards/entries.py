@@ -15,7 +15,8 @@ from functools import cached_property
 
 import numpy as np
 
-from brainbench.core.files import content_hash, to_plain
+from brainbench.core.files import content_hash
+from brainbench.core.identity import unusual_settings
 from brainbench.core.records import Interval, ModelCard, ResultRecord, Score
 from brainbench.core.statistics import is_finite
 from leaderboards.ranking import CHANCE_LEVEL, Sample
@@ -24,8 +25,6 @@ from leaderboards.standing import STANDINGS, Standing, not_repeatable, standing_
 UNTRAINED = "untrained"
 _SAME = 1e-6
 """Largest difference of values, and of RDMs scaled to length 1, of one computation (float32 sums differ)."""
-_ASKED = {"readout": "default", "normalize": True, "layers": None, "layer": None}
-"""Settings that make another score of the same network, with their defaults."""
 
 
 @dataclass(frozen=True)
@@ -209,21 +208,15 @@ def _same_score(one: Score, other: Score) -> bool:
     )
 
 
-def _asked(record: ResultRecord) -> dict[str, object]:
-    """Return the settings of a score that are not the usual ones."""
-    settings = record.score.provenance.settings
-    stated = {name: to_plain(settings.get(name)) for name in _ASKED}
-    return {name: value for name, value in stated.items() if value not in (None, _ASKED[name])}
-
-
 def _kind(record: ResultRecord) -> tuple[object, ...]:
     card = record.card
     if card is None or card.seed is None:  # nobody can know what else differs
         return (record.score.name, card.weights if card else None, record.identity if card is None else None)
-    other = (str(asked),) if (asked := _asked(record)) else ()
+    settings = unusual_settings(record.score.provenance.settings)
+    rest = (str(settings),) if settings else ()
     # The name of somebody's file or folder says little: what stands there now may be another network.
-    other += (card.parameters,) if not_repeatable(record) else ()
-    return (record.score.name, card.objective, card.augmentation, str(card.training.get("masking")), *other)
+    rest += (card.parameters,) if not_repeatable(record) else ()
+    return (record.score.name, card.objective, card.augmentation, str(card.training.get("masking")), *rest)
 
 
 def _entry(
@@ -232,8 +225,8 @@ def _entry(
     records = sorted(records, key=lambda record: ((record.card and record.card.seed) or 0, record.identity))
     page = f"{records[0].file_name.rpartition('--')[0]}--{content_hash([*map(str, (*board, *key))], length=10)}.html"
     notes = list(dict.fromkeys(note for record in records for note in remarks.get(record.identity, ())))
-    if asked := _asked(records[0]):
-        notes.append(f"scored with {', '.join(f'{name} {value}' for name, value in asked.items())}")
+    if settings := unusual_settings(records[0].score.provenance.settings):
+        notes.append(f"scored with {', '.join(f'{name} {value}' for name, value in settings.items())}")
     if key[-1]:
         notes.append("an earlier record of a model that stands above or below once more")
     return Entry(tuple(records), page, tuple(notes))

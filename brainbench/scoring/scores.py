@@ -84,7 +84,7 @@ def score_record(
     options = _options(model, {**vars(options or ScoreOptions()), **changes})
     _prepare(model, options, progress)
     # Whatever can be wrong with a name or a file is found before the slow part, the simulation.
-    metric = _metric(options)
+    metric = metric_of(options)
     options = replace(options, metric=metric)
     resolved = resolve_model(model, seed=options.model_seed)
     stage_done()
@@ -237,7 +237,7 @@ def _doubted(score: Score, doubt: str) -> Score:
     return replace(score, status=status, reasons=(doubt, *score.reasons))
 
 
-def _metric(options: ScoreOptions) -> Metric:
+def metric_of(options: ScoreOptions) -> Metric:
     """Return the metric, checked against the other options."""
     from brainbench.metrics import get_metric, list_metrics
     from brainbench.metrics.measures.rsa import RSA

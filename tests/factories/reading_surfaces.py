@@ -15,7 +15,6 @@ import numpy as np
 import torch
 from safetensors.torch import save_file
 
-from brainbench.cli.leaderboard.scoring import parse_seeds, read_batch
 from brainbench.cli.options import numbers as option_numbers
 from brainbench.core.errors import DataError
 from brainbench.core.files import read_mapping, write_json
@@ -34,7 +33,8 @@ from brainbench.models.training.processes import Processes
 from brainbench.models.training.run_folder import STATE
 from brainbench.models.training.trainer import _Run
 from brainbench.published.whiskit import read_runs
-from brainbench.scoring.recovery.design import parse_trials
+from brainbench.scoring.jobs import parse_seeds, read_batch
+from brainbench.scoring.recovery.boards import parse_trials
 from brainbench.stimuli import WhiskerArray, load_stimuli
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.motion.recorded import load_initial_angles, load_trajectory

@@ -19,7 +19,7 @@ def test_the_records_of_the_page_become_a_site(tmp_path: Path, monkeypatch: pyte
 
 
 def test_the_batch_file_of_the_page_names_scores(tmp_path: Path):
-    from brainbench.cli.leaderboard.scoring import read_batch
+    from brainbench.scoring.jobs import read_batch
 
     (block,) = re.findall(r"```toml\n(.*?)```", PAGE.read_text(encoding="utf-8"), flags=re.DOTALL)
     (tmp_path / "batch.toml").write_text(block, encoding="utf-8")

@@ -11,7 +11,7 @@ import xarray as xr
 from torch import nn
 
 import brainbench
-from brainbench.cli.leaderboard.scoring import score_again
+from brainbench.cli.leaderboard.verify import score_again
 from brainbench.core.errors import UsageError
 from brainbench.datasets import open_recordings, write_recordings
 from brainbench.datasets.sessions import make_session

@@ -48,8 +48,8 @@ def add(
     states other numbers for the same computation. Scores that are there already are not computed again, so an
     interrupted batch goes on where it stopped, and a stale one is renewed.
     """
-    from brainbench.cli.leaderboard.collection import given_files, score_jobs, take_in
-    from brainbench.cli.leaderboard.scoring import jobs_of, parse_seeds, read_batch
+    from brainbench.cli.leaderboard.collection import command_of, given_files, score_jobs, take_in
+    from brainbench.scoring.jobs import jobs_of, parse_seeds, read_batch
 
     if not records and not model and batch is None:
         raise UsageError("Name record files to take in, or models to score with --model or --batch.")
@@ -65,7 +65,7 @@ def add(
     if batch is not None:
         jobs += read_batch(batch)
     # Patterns, entries and both flags may name a model twice.
-    jobs = list({job.command: job for job in jobs}.values())
+    jobs = list({command_of(job): job for job in jobs}.values())
     done = take_in(given_files(records or []), to, keep_both=keep_both)
     done += score_jobs(jobs, to, prune=prune, workers=workers, scheduler=scheduler)
     states = [item["state"] for item in done]

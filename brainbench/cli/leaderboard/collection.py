@@ -2,35 +2,37 @@
 
 from __future__ import annotations
 
+import shlex
 from collections import defaultdict
-from collections.abc import Hashable
 from pathlib import Path
 from typing import Any
 
-from brainbench.cli.leaderboard.scoring import ScoringJob, full_settings, missing
+from brainbench.cli.options import SCORE, SCORE_FLAGS, as_flags
 from brainbench.cli.output import progress_bar
 from brainbench.core.errors import DataFileNotFoundError
 from brainbench.core.files import to_json
+from brainbench.core.identity import ScoreIdentity
 from brainbench.core.records import ResultRecord
-from leaderboards.audit import computation, conflicting, remarks
+from brainbench.scoring.jobs import ScoringJob, asked_settings, missing
+from leaderboards.audit import conflicting, remarks
 from leaderboards.store import StoredRecord, read_records, record_files, write_record
 
 
 def given_files(sources: list[Path]) -> list[Path]:
     """Return the record files among files and folders; a :class:`DataFileNotFoundError` for one that is missing."""
-    found: list[Path] = []
+    files: list[Path] = []
     for source in sources:
         if not source.exists():
             raise DataFileNotFoundError(f"There is no record file or folder {str(source)!r}.")
-        found += record_files(source) if source.is_dir() else [source]
-    return found
+        files += record_files(source) if source.is_dir() else [source]
+    return files
 
 
 def take_in(paths: list[Path], to: Path, *, keep_both: bool) -> list[dict[str, Any]]:
     """Take in files one after the other; what one brought counts for the next."""
-    present: dict[Hashable, dict[str, ResultRecord]] = defaultdict(dict)
+    present: dict[ScoreIdentity, dict[str, ResultRecord]] = defaultdict(dict)
     for record in (record for _, record in (_present(to) if paths else [])):
-        present[computation(record)][record.identity] = record
+        present[ScoreIdentity.of(record)][record.identity] = record
     done = []
     for path in paths:
         (stored,) = read_records(path)
@@ -39,12 +41,12 @@ def take_in(paths: list[Path], to: Path, *, keep_both: bool) -> list[dict[str, A
 
 
 def _take_in_one(
-    stored: StoredRecord, to: Path, present: dict[Hashable, dict[str, ResultRecord]], *, keep_both: bool
+    stored: StoredRecord, to: Path, present: dict[ScoreIdentity, dict[str, ResultRecord]], *, keep_both: bool
 ) -> dict[str, Any]:
     record = stored.record
     if record is None:
         return {"state": "refused", "model": None, "note": f": {stored.problem}"}
-    alike = present[computation(record)]
+    alike = present[ScoreIdentity.of(record)]
     rival = None if keep_both else next(conflicting(record, alike.values()), None)
     if rival is not None:
         note = (
@@ -70,10 +72,19 @@ def _present(to: Path) -> list[tuple[Path, ResultRecord]]:
 def _question(record: ResultRecord) -> str:
     """Return what two records share when they answer the same question, the old one with what has since changed."""
     origin = record.score.provenance
-    named = [origin.recordings.get(name) for name in ("source", "title")]
+    titles = [origin.recordings.get(name) for name in ("source", "title")]
     # The source is the last part of a path: folders of one name are told apart by their animals.
     animals = sorted(item.subject for item in record.score.subjects)
-    return to_json([record.score.name, *named, animals, origin.pairing, full_settings(origin.settings)])
+    return to_json([record.score.name, *titles, animals, origin.pairing, asked_settings(origin.settings)])
+
+
+def command_of(job: ScoringJob) -> str:
+    """Return the command line that makes a job's score by itself."""
+    return shlex.join(["brainbench", "score", job.model, *as_flags(SCORE, job.options, SCORE_FLAGS)])
+
+
+def _run(job: ScoringJob) -> ResultRecord:
+    return job.run(command_of(job))
 
 
 def score_jobs(
@@ -87,9 +98,9 @@ def score_jobs(
     done: list[dict[str, Any]] = []
     with progress_bar() as progress:
         present = _present(to)
-        asked: dict[str, list[Path]] = defaultdict(list)
+        answers: dict[str, list[Path]] = defaultdict(list)
         for old, record in present if prune else ():
-            asked[_question(record)].append(old)
+            answers[_question(record)].append(old)
         open_jobs = missing(jobs, [record for _, record in present])
         open_ones = {id(job) for job in open_jobs}
         done += [
@@ -97,11 +108,11 @@ def score_jobs(
             for job in jobs
             if id(job) not in open_ones
         ]
-        scored = run_jobs(ScoringJob.run, open_jobs, workers=workers, scheduler=scheduler)
+        scored = run_jobs(_run, open_jobs, workers=workers, scheduler=scheduler)
         for index, (place, record) in enumerate(scored, start=1):
             progress(index, len(open_jobs), "models scored")
             path = write_record(record, to)
-            replaced = [old for old in (asked[_question(record)] if prune else ()) if old != path]
+            replaced = [old for old in (answers[_question(record)] if prune else ()) if old != path]
             for old in replaced:
                 old.unlink(missing_ok=True)
             note = "".join(f"\n          replaces {old.name}" for old in replaced)

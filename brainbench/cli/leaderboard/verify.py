@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from brainbench.cli.options import SCORE, option_fields
 from brainbench.cli.output import Output, table_of, tracked
-from brainbench.core.errors import BrainbenchError
+from brainbench.core.errors import BrainbenchError, DataError, UsageError
+
+if TYPE_CHECKING:
+    from brainbench.core.records import ResultRecord
 
 
 def verify(
@@ -35,7 +39,6 @@ def verify(
     cannot be made; what differs is printed.
     """
     from brainbench.cli.leaderboard.held_out import score_held_out
-    from brainbench.cli.leaderboard.scoring import refuse_foreign_code, score_again
     from leaderboards.audit import remarks
     from leaderboards.changes import differences
     from leaderboards.held_out import Commitment
@@ -67,6 +70,69 @@ def verify(
     failed = any(result["verdict"] in ("refused", "differs", "not repeated") for result in results)
     text = "\n".join(_verdict(result) for result in results)
     return Output(results, text, failure=typer.Exit(1) if failed else None)
+
+
+def score_again(record: ResultRecord, *, recordings: str | None = None, trust_code: bool = False) -> ResultRecord:
+    """Repeat a record's computation from its provenance.
+
+    Only demo recordings are found without ``recordings``, since records keep no folders. ``trust_code`` also runs code
+    and weights that do not come with this package.
+    """
+    from brainbench.scoring.demo import DEMOS
+    from brainbench.scoring.options import ScoreOptions
+    from brainbench.scoring.scores import score_record
+
+    origin = record.score.provenance
+    model, source = origin.settings.get("model"), origin.recordings.get("source")
+    _check_kinds(record, model, source)
+    if not isinstance(model, str):
+        raise DataError(
+            f"The record of {record.score.name!r} does not name a model that can be loaded (a module in memory or a "
+            "record of an earlier layout); score the model again."
+        )
+    refuse_foreign_code(record, trusted=trust_code)
+    if recordings is None and (not isinstance(source, str) or source not in DEMOS):
+        raise UsageError(f"The record was made with recordings {str(source)[:80]!r}; give them with --recordings PATH.")
+    options = ScoreOptions.stated_in(origin.settings, recordings=recordings or source, match=origin.pairs or None)
+    return score_record(model, options)
+
+
+def _check_kinds(record: ResultRecord, model: Any, source: Any) -> None:
+    """Raise DataError for settings of other kinds than the options of a score: anyone may have written the record."""
+    import msgspec
+
+    origin = record.score.provenance
+    stated: dict[str, tuple[Any, Any]] = {
+        "model": (model, str),
+        "source": (source, str | list[str]),
+        "pairs": (origin.pairs, dict[str, str | None]),
+        # Presets are texts, other fidelities their fields.
+        "fidelity": (origin.settings.get("fidelity"), str | dict[str, Any]),
+    }
+    for name, option in option_fields(SCORE).items():
+        kind = list[str] if option.several else str if option.kind is Path else option.kind
+        stated.setdefault(name, (origin.settings.get(name), kind))
+    for name, (value, kind) in stated.items():
+        try:
+            msgspec.convert(value, kind | None)
+        except msgspec.ValidationError as error:
+            raise DataError(f"The settings of {record.score.name[:80]!r} cannot be used: {name}: {error}.") from error
+
+
+def refuse_foreign_code(record: ResultRecord, *, trusted: bool) -> None:
+    """Refuse to run what a record names unless it is in the registry or comes with the package."""
+    from brainbench.metrics import list_metrics
+    from brainbench.models.registry import list_models
+    from brainbench.models.training.checkpoints import shipped
+
+    settings = record.score.provenance.settings
+    ours = {"model": [*list_models(), *shipped()], "metric": list_metrics()}
+    for what, names in ours.items():
+        if not trusted and settings.get(what) not in names:
+            raise UsageError(
+                f"The {what} {str(settings.get(what))[:80]!r} of the record is not in the registry and does not come "
+                "with this package; read its code, then run it with --trust-code."
+            )
 
 
 def _verdict(result: dict[str, Any]) -> str:

@@ -13,13 +13,11 @@ from typing import TYPE_CHECKING
 from brainbench.core.lazy import lazy_exports
 
 if TYPE_CHECKING:
-    from brainbench.scoring.recovery.candidates import Candidate, open_candidates
-    from brainbench.scoring.recovery.cheapest import find_cheapest
+    from brainbench.scoring.recovery.boards import Candidate, RecoveryDesign, open_candidates
     from brainbench.scoring.recovery.confusion import Recovery, plot_confusion
-    from brainbench.scoring.recovery.design import RecoveryDesign
     from brainbench.scoring.recovery.motion import NetworkDesign, design_for_networks
     from brainbench.scoring.recovery.selection import select_stimuli
-    from brainbench.scoring.recovery.study import recover
+    from brainbench.scoring.recovery.study import find_cheapest, recover
 
 __all__ = [
     "Candidate",

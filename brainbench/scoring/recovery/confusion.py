@@ -13,8 +13,7 @@ from brainbench.core.figures.style import INK, PALE, check_format, new_figure, s
 from brainbench.core.records import Interval
 from brainbench.core.statistics import FEWEST_ANIMALS, FEWEST_STIMULI, wilson_interval
 from brainbench.metrics.rdms.pairs import Floats, Ints
-from brainbench.scoring.recovery.boards import RecoveryBoard
-from brainbench.scoring.recovery.design import RecoveryDesign
+from brainbench.scoring.recovery.boards import RecoveryBoard, RecoveryDesign
 
 WANTED = 0.8
 """Share of boards that the true candidate is to win."""
@@ -41,12 +40,12 @@ class Recovery:
         return count
 
     @cached_property
-    def made(self) -> Ints:
+    def counts(self) -> Ints:
         """[C] boards of each candidate."""
         return np.bincount([board.true for board in self.boards], minlength=len(self.names))
 
     @cached_property
-    def told(self) -> Floats:
+    def won(self) -> Floats:
         """[C, C] share of the boards of a candidate (row) in which it is told apart above another (column)."""
         return self._share(1)
 
@@ -58,15 +57,15 @@ class Recovery:
     def _share(self, sign: int) -> Floats:
         count = np.zeros((len(self.names),) * 2)
         for board in self.boards:
-            count[board.true] += np.array(board.told) == sign
-        return count / np.maximum(self.made[:, None], 1)
+            count[board.true] += np.array(board.verdicts) == sign
+        return count / np.maximum(self.counts[:, None], 1)
 
     def wins(self, candidate: int | None = None) -> Interval:
         """Return Wilson's interval of the share of boards in which the true candidate comes first."""
-        own = np.diag(self.firsts)
+        firsts = np.diag(self.firsts)
         if candidate is None:
-            return wilson_interval(int(own.sum()), int(self.made.sum()), over="boards")
-        return wilson_interval(int(own[candidate]), int(self.made[candidate]), over="boards")
+            return wilson_interval(int(firsts.sum()), int(self.counts.sum()), over="boards")
+        return wilson_interval(int(firsts[candidate]), int(self.counts[candidate]), over="boards")
 
     @property
     def win_rate(self) -> float:
@@ -76,8 +75,8 @@ class Recovery:
     @property
     def outcomes(self) -> dict[str, float]:
         """Shares of pairs (true candidate, another): win, tie and loss by the test of a board."""
-        other = ~np.eye(len(self.names), dtype=bool)
-        win, loss = float(self.told[other].mean()), float(self.lost[other].mean())
+        rivals = ~np.eye(len(self.names), dtype=bool)
+        win, loss = float(self.won[rivals].mean()), float(self.lost[rivals].mean())
         return {"win": win, "tie": 1 - win - loss, "loss": loss}
 
     @property
@@ -89,11 +88,15 @@ class Recovery:
     def answer(self, wanted: float = WANTED) -> str:
         """Say in one sentence whether the design can tell the candidates apart.
 
-        Yes or no where the interval of the win rate lies above or below ``wanted``.
+        Yes or no where the interval of the win rate lies above or below ``wanted``. Yes also needs that as many$
+        of the pairs with the true network are told apart: a tied pair may stand in another order for other stimuli.
         """
         interval = self.wins()
         said = f"the true network comes first in {self.win_rate:.0%} of {len(self.boards)} boards"
         said += f" [{interval.low:.0%}, {interval.high:.0%}]; by chance it would in {1 / len(self.names):.0%}"
+        tie = self.outcomes["tie"]
+        if interval.low >= wanted and self.outcomes["win"] < wanted:
+            return f"Not beyond these stimuli: {said}, but {tie:.0%} of the pairs with it tie."
         if interval.low >= wanted:
             return f"Yes, this design finds the true network: {said}."
         if interval.high < wanted:
@@ -102,7 +105,7 @@ class Recovery:
 
     def hardest(self, count: int = 3) -> list[tuple[str, str, float]]:
         """Return the pairs (true, mistaken for, share of the true one's boards) that are confused most often."""
-        share = self.firsts / np.maximum(self.made[:, None], 1)
+        share = self.firsts / np.maximum(self.counts[:, None], 1)
         np.fill_diagonal(share, 0)
         order = np.argsort(-share, axis=None, kind="stable")[:count]
         pairs = [np.unravel_index(place, share.shape) for place in order.tolist()]
@@ -131,13 +134,13 @@ def plot_confusion(recovery: Recovery, path: str | os.PathLike[str]) -> Path:
     target = Path(path)
     check_format(target, FORMATS)
     count = len(recovery.names)
-    share = recovery.firsts / np.maximum(recovery.made[:, None], 1)
+    share = recovery.firsts / np.maximum(recovery.counts[:, None], 1)
     size = 260 + 42 * count
     figure = new_figure(size + 160, size)
     figure.set_layout_engine("constrained")
     axes = figure.subplots()
-    shown = axes.imshow(share, cmap="BuGn", vmin=0, vmax=1)
-    figure.colorbar(shown, ax=axes, label="share of the boards in which it came first", shrink=0.6)
+    image = axes.imshow(share, cmap="BuGn", vmin=0, vmax=1)
+    figure.colorbar(image, ax=axes, label="share of the boards in which it came first", shrink=0.6)
     for row, column in np.argwhere(share > 0).tolist():
         value = share[row, column]
         ink = "white" if value > 0.6 else INK

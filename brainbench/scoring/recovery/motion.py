@@ -27,8 +27,7 @@ from brainbench.metrics.measures.metric import get_metric
 from brainbench.metrics.measures.patterns import LinearCKA
 from brainbench.scoring.model_responses import ResolvedModel, resolve_model, takes_si
 from brainbench.scoring.options import ScoreOptions
-from brainbench.scoring.recovery.candidates import Candidate
-from brainbench.scoring.recovery.design import FEWEST_STIMULI, RecoveryDesign
+from brainbench.scoring.recovery.boards import FEWEST_STIMULI, Candidate, RecoveryDesign
 from brainbench.scoring.recovery.selection import Margins
 from brainbench.stimuli import Scene, load_stimuli, simulate
 from brainbench.stimuli.design import NOTHING, DesignOptions, find_motions

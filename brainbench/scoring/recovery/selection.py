@@ -21,9 +21,7 @@ from brainbench.metrics.evaluation import held_out
 from brainbench.metrics.measures.metric import Metric, get_metric
 from brainbench.metrics.rdms.comparison import compare_all
 from brainbench.metrics.rdms.pairs import Floats, Ints, permuted_pairs
-from brainbench.scoring.recovery.boards import draw_board
-from brainbench.scoring.recovery.candidates import Candidate
-from brainbench.scoring.recovery.design import FEWEST_STIMULI, RecoveryDesign
+from brainbench.scoring.recovery.boards import FEWEST_STIMULI, Candidate, RecoveryDesign, draw_board
 from brainbench.scoring.recovery.study import check_candidates
 
 BOARDS = 4

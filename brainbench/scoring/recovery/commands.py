@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 POPULATION = "brainbench.datasets.synthetic.design:PopulationDesign"
 _NOISE = ("animals", "units", "rate", "window", "modulation", "individual", "emphasis", "dispersion", "shared_gain")
-_DESIGN = "brainbench.scoring.recovery.design:RecoveryDesign"
+_DESIGN = "brainbench.scoring.recovery.boards:RecoveryDesign"
 
 
 @with_options(POPULATION, _NOISE, build=False)
@@ -73,7 +73,7 @@ def recovery(
     from brainbench.datasets.synthetic import PopulationDesign
     from brainbench.scoring.options import ScoreOptions
     from brainbench.scoring.recovery import RecoveryDesign, find_cheapest, open_candidates, plot_confusion, recover
-    from brainbench.scoring.recovery.design import parse_trials
+    from brainbench.scoring.recovery.boards import parse_trials
 
     if (pool is None) is not (keep is None):
         raise UsageError("Stimuli are picked with both --pool STIMULI and --keep NUMBER; received one of them.")
@@ -117,8 +117,8 @@ def recovery(
 
 def _find(patterns: Sequence[str] | None) -> list[str]:
     """Return the models that names and patterns mean; the shipped ones without any."""
-    from brainbench.cli.leaderboard.scoring import find_models
     from brainbench.models.training.checkpoints import shipped
+    from brainbench.scoring.jobs import find_models
 
     if not patterns:
         return list(shipped())
