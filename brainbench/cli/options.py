@@ -8,21 +8,25 @@ parsed, not imported, so that ``--help`` stays quick whatever its package loads.
 from __future__ import annotations
 
 import ast
+import builtins
 import inspect
 import math
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cache
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Annotated, Any
+from types import NoneType, UnionType
+from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 import typer
 
 from brainbench.cli.output import Output
+from brainbench.core import limits
 from brainbench.core.errors import UsageError, shown
+from brainbench.core.limits import bounds_of, check_value
 
 WorkersOption = Annotated[int | None, typer.Option(min=1, help="Processes. [default: as many as there are processors]")]
 SchedulerOption = Annotated[str | None, typer.Option(help="Let workers of a Dask scheduler (tcp://host:8786) do it.")]
@@ -35,57 +39,136 @@ SCORE_FLAGS = {
 }
 """Flags of fields of :class:`~brainbench.scoring.ScoreOptions` that are not just their names."""
 
-_KINDS: dict[str, Any] = {"str": str, "int": int, "float": float, "bool": bool, "Path": Path}
+_KINDS = (str, int, float, bool, Path)
+_NAMES: dict[str, Any] = {**vars(builtins), "Path": Path, "Annotated": Annotated, "Literal": Literal, "math": math}
+"""Names in annotations that are what they always are."""
 
 
 @dataclass(frozen=True)
 class OptionField:
     """One field of a dataclass as an option."""
 
-    kind: Any
-    """Type of one value."""
-    several: bool
-    """True for a tuple, which is written with commas on the command line."""
+    annotation: Any
+    """Its annotation, in which types that the command line does not know are all one."""
     default: Any
     help: str
+
+    @property
+    def several(self) -> bool:
+        """Whether the field holds a tuple, which is written with commas on the command line."""
+        return get_origin(_bare(self.annotation)) is tuple
+
+    @property
+    def kind(self) -> Any:
+        """Type of one value."""
+        return next((kind for kind in _plain_types(self.annotation) if kind in _KINDS), str)
 
     def parameter(self, name: str, flags: tuple[str, ...], default: Any) -> inspect.Parameter:
         """Return the parameter of a typer command."""
         # A switch that is off by default has no opposite.
         flags = flags or ((f"--{name.replace('_', '-')}",) if self.kind is bool and not default else ())
         kind = str if self.several else self.kind
-        hint = Annotated[kind if default is not None else kind | None, typer.Option(*flags, help=self.help)]
+        bounds = bounds_of(_bare(self.annotation, bounds=True))
+        text = f"{self.help} \\[{bounds}]" if bounds else self.help
+        hint = Annotated[kind if default is not None else kind | None, typer.Option(*flags, help=text)]
         return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=hint)
 
     def value(self, name: str, given: Any) -> Any:
-        """Return what the field of a name holds for a value of the command line."""
-        if not self.several or given is None:
-            return given
-        return tuple(items(given)) if self.kind is str else numbers(given, f"--{name}", self.kind)
+        """Return what the field of a name holds for a value of the command line, within its limits."""
+        if given is None:
+            return None
+        if self.several:
+            given = tuple(items(given)) if self.kind is str else numbers(given, f"--{name}", self.kind)
+        check_value(f"--{name.replace('_', '-')}", given, self.annotation)
+        return given
+
+
+def _plain_types(annotation: Any) -> Iterator[Any]:
+    """Yield the types that an annotation is composed of."""
+    inner = [] if get_origin(annotation) is Literal else get_args(annotation)
+    for kind in inner[:1] if get_origin(annotation) is Annotated else inner:
+        yield from _plain_types(kind)
+    if not inner:
+        yield annotation
+
+
+def _bare(annotation: Any, *, bounds: bool = False) -> Any:
+    """Return an annotation without ``None``, and without what is said of it unless its ``bounds`` are wanted."""
+    if get_origin(annotation) in (Union, UnionType):
+        annotation = next((kind for kind in get_args(annotation) if kind is not NoneType), _Unknown)
+    return annotation.__origin__ if get_origin(annotation) is Annotated and not bounds else annotation
+
+
+class _AnyType(type):
+    """Metaclass of the type that stands for all that are not known: its attributes and items are itself."""
+
+    def __getattr__(cls, name: str) -> Any:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        return cls
+
+    def __getitem__(cls, _: Any) -> Any:
+        return cls
+
+    def __instancecheck__(cls, _: Any) -> bool:
+        return True
+
+
+class _Unknown(metaclass=_AnyType):
+    """A type that the command line reads as text."""
+
+
+class _SourceNames(dict[str, Any]):
+    """Names that annotations of a module use, as far as its source states them: constants and limits."""
+
+    def __init__(self, module: str) -> None:
+        self._constants = {}
+        for node in _tree(module).body:
+            if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name):
+                self._constants[node.targets[0].id] = node.value
+            elif isinstance(node, ast.ImportFrom):
+                self._constants |= {alias.asname or alias.name: (node.module, alias.name) for alias in node.names}
+        super().__init__(_NAMES)
+
+    def __missing__(self, name: str) -> Any:
+        stated = self._constants.get(name)
+        if isinstance(stated, tuple):
+            module, inner = stated
+            if module == limits.__name__:
+                return getattr(limits, inner)
+            # What a limit needs is a constant; types stay unknown.
+            return _SourceNames(module)[inner] if name.isupper() else _Unknown
+        return _Unknown if stated is None else self.evaluated(stated)
+
+    def evaluated(self, node: ast.expr) -> Any:
+        """Return the value of an expression of the module."""
+        return eval(compile(ast.Expression(node), "<annotation>", "eval"), {"__builtins__": {}}, self)
+
+
+@cache
+def _tree(module: str) -> ast.Module:
+    package, *parts = module.split(".")
+    origin = getattr(find_spec(package), "origin", None)
+    assert origin is not None, module
+    return ast.parse(Path(origin).parent.joinpath(*parts).with_suffix(".py").read_text(encoding="utf-8"))
 
 
 @cache
 def option_fields(kind: str) -> Mapping[str, OptionField]:
     """Return the fields of the dataclass ``package.module:Class`` by name, from its source."""
     module, _, wanted = kind.partition(":")
-    package, *parts = module.split(".")
-    origin = getattr(find_spec(package), "origin", None)
-    assert origin is not None, kind
-    source = Path(origin).parent.joinpath(*parts).with_suffix(".py").read_text(encoding="utf-8")
-    (body,) = (node.body for node in ast.parse(source).body if isinstance(node, ast.ClassDef) and node.name == wanted)
-    found = {}
+    (body,) = (node.body for node in _tree(module).body if isinstance(node, ast.ClassDef) and node.name == wanted)
+    names, options = _SourceNames(module), {}
     for node, after in zip(body, [*body[1:], None], strict=True):
         if not isinstance(node, ast.AnnAssign) or not isinstance(node.target, ast.Name):
             continue
-        text = ast.unparse(node.annotation)
         said = after.value.value if isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant) else ""
-        found[node.target.id] = OptionField(
-            kind=_KINDS[(re.findall(rf"\b({'|'.join(_KINDS)})\b", text) or ["str"])[0]],
-            several=text.startswith("tuple"),
+        options[node.target.id] = OptionField(
+            annotation=names.evaluated(node.annotation),
             default=node.value.value if isinstance(node.value, ast.Constant) else None,
             help=_plain(str(said)),
         )
-    return found
+    return options
 
 
 def with_options(

@@ -18,11 +18,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 
 from brainbench.core.errors import UsageError, check_name
-from brainbench.core.reading.ranges import check_fields, check_number
+from brainbench.core.limits import Count, Limit, Share, limited
+from brainbench.core.reading.ranges import check_number
 from brainbench.core.records import Interval
 from brainbench.core.statistics import wilson_interval
 from brainbench.metrics.evaluation import held_out
@@ -47,33 +49,29 @@ _CHUNK_ELEMENTS = 1 << 21
 
 
 @dataclass(frozen=True)
+@limited
 class ExperimentDesign:
     """An experiment, and the truth it is to find."""
 
-    stimuli: int = 6
+    stimuli: Annotated[int, Limit(least=2)] = 6
     """Number of stimuli."""
-    animals: int = 11
+    animals: Count = 11
     """Number of animals."""
-    effect: float = 0.5
+    effect: Annotated[float, Limit(least=-1, most=1)] = 0.5
     """True score of the model on the scale from chance (0) to all that is reliable (1); 0 gives the false alarms."""
-    consistency: float = 0.8
-    """Correlation of two animals' noiseless RDMs, 0 … 1."""
-    reliability: float = 0.8
-    """Reliability of one animal's RDM, 0 … 1."""
-    layers: int = 1
+    consistency: Share = 0.8
+    """Correlation of two animals' noiseless RDMs."""
+    reliability: Share = 0.8
+    """Reliability of one animal's RDM."""
+    layers: Count = 1
     """Layers among which one is chosen; one of them has the effect."""
-    alpha: float = 0.05
+    alpha: Annotated[float, Limit(above=0, below=1)] = 0.05
     """Level of the test."""
-    dimensions: int = DIMENSIONS
+    dimensions: Count = DIMENSIONS
     """Dimensions of the representations, see :mod:`brainbench.scoring.power.dimensions`."""
 
     def __post_init__(self) -> None:
-        """Refuse what no experiment can be."""
-        check_fields(self, "stimuli", least=2, whole=True)
-        check_fields(self, "animals", "layers", "dimensions", least=1, whole=True)
-        check_fields(self, "consistency", "reliability", least=0, most=1)
-        check_fields(self, "alpha", above=0, below=1)
-        check_fields(self, "effect", least=-1, most=1)
+        """Refuse what no model can reach."""
         if self.effect**2 > self.consistency + 1e-12:
             raise UsageError(
                 f"No model can score {self.effect:g} on animals whose consistency is {self.consistency:g}: "

@@ -19,6 +19,9 @@ def test_an_impossible_design_is_refused(run):
     found = run("power", "--effect", "0.99", "--consistency", "0.5")
     assert found.status == 2
     assert "bounds it by √consistency" in found.err
+    few = run("power", "--stimuli", "1")
+    assert few.status == 2
+    assert "--stimuli must be a whole number, at least 2; received 1." in few.err
 
 
 def test_dimensions_are_estimated_given_or_assumed(run, tmp_path):

@@ -1,0 +1,255 @@
+"""Limits of the fields of a dataclass, stated in its annotations and read wherever a value arrives.
+
+Construction checks them (:func:`limited`), msgspec reads the same annotations where files are converted, and the
+command line where options are made from the dataclass::
+
+    @dataclass(frozen=True)
+    @limited
+    class Stepping:
+        step: Annotated[float, Limit(above=0, most=5e-3, unit="s")] = 1e-4
+        order: Literal["first", "second"] = "first"
+        corner: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+A plain type is a limit too: ``float`` takes finite numbers, ``int`` whole ones, ``bool`` truth values, ``Literal`` one
+of its names, a tuple so many values of these. What stands behind another type is left to the class.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import fields
+from functools import cache, wraps
+from types import NoneType, UnionType
+from typing import Annotated, Any, Literal, Union, get_args, get_origin
+
+import msgspec
+
+from brainbench.core.errors import UsageError, check_name, shown
+from brainbench.core.reading.ranges import check_number
+
+Check = Callable[[str, Any], None]
+
+
+def Limit(
+    *,
+    least: float | None = None,
+    most: float | None = None,
+    above: float | None = None,
+    below: float | None = None,
+    shortest: int | None = None,
+    longest: int | None = None,
+    unit: str = "",
+    infinite: bool = False,
+) -> msgspec.Meta:
+    """Return what stands behind the type in ``Annotated[...]``.
+
+    Args:
+        least, most: smallest and largest number.
+        above, below: numbers that are themselves too small and too large.
+        shortest, longest: lengths of a tuple or a text.
+        unit: unit of the number, for messages.
+        infinite: True where infinity is a value too.
+    """
+    numbers: dict[str, Any] = {"ge": least, "le": most, "gt": above, "lt": below}
+    about = {"unit": unit, "infinite": infinite}
+    return msgspec.Meta(min_length=shortest, max_length=longest, extra=about, **numbers)
+
+
+Count = Annotated[int, Limit(least=1)]
+Seed = Annotated[int, Limit(least=0)]
+Share = Annotated[float, Limit(least=0, most=1)]
+Positive = Annotated[float, Limit(above=0)]
+NotNegative = Annotated[float, Limit(least=0)]
+
+
+def limited(cls: type | None = None, *, of: str = "{}", unresolved: Sequence[str] = ()) -> Any:
+    """Let a dataclass check the limits of its fields when it is made; stands below ``@dataclass``.
+
+    What its own ``__post_init__`` checks, relations between fields, comes after.
+
+    Args:
+        cls: the class.
+        of: text with braces for the field's name in messages, for instance ``"{} of a whisker"``.
+        unresolved: fields without limits whose annotation names types that are imported for type checkers alone.
+    """
+
+    def decorate(cls: type) -> type:
+        if "__dataclass_fields__" in vars(cls):
+            raise TypeError(f"@limited stands below @dataclass on {cls.__qualname__}, or it would check nothing.")
+        relations = vars(cls).get("__post_init__", getattr(cls, "__post_init__", None))
+
+        def __post_init__(self: Any, *values: Any) -> None:
+            check_limits(self)
+            if relations is not None:
+                relations(self, *values)
+
+        if relations is not None:
+            __post_init__ = wraps(relations)(__post_init__)
+        __post_init__.checks_limits = True  # type: ignore[attr-defined]
+        cls.__post_init__ = __post_init__  # type: ignore[attr-defined]
+        cls.__limits_of__ = of  # type: ignore[attr-defined]
+        cls.__unresolved__ = (*getattr(cls, "__unresolved__", ()), *unresolved)  # type: ignore[attr-defined]
+        return cls
+
+    return decorate if cls is None else decorate(cls)
+
+
+def check_limits(options: Any) -> None:
+    """Raise a :class:`UsageError` for the first field of a dataclass whose value is outside its limits."""
+    cls = type(options)
+    for name, (told, check) in _checks(cls).items():
+        check(told, getattr(options, name))
+
+
+def limits_of(cls: type) -> dict[str, Any]:
+    """Return the annotations, resolved, of the fields of a dataclass that limit what they hold.
+
+    Raises:
+        TypeError: an annotation cannot be resolved, so that nobody knows its limits.
+    """
+    texts: dict[str, tuple[type, Any]] = {}
+    for base in reversed(cls.__mro__):
+        texts |= {name: (base, text) for name, text in vars(base).get("__annotations__", {}).items()}
+    limits = {}
+    for field in fields(cls):
+        if field.name in getattr(cls, "__unresolved__", ()):
+            continue
+        owner, annotation = texts[field.name]
+        if isinstance(annotation, str):
+            try:
+                annotation = eval(annotation, vars(sys.modules[owner.__module__]), dict(vars(owner)))
+            except Exception as error:
+                raise TypeError(
+                    f"The limits of {cls.__module__}.{cls.__qualname__}.{field.name} are unknown, since its annotation "
+                    f"{annotation!r} cannot be resolved: {error}. Import what it names at run time, or, if it has no "
+                    f"limits, name the field in @limited(unresolved=…)."
+                ) from error
+        if checker(annotation) is not None:
+            limits[field.name] = annotation
+    return limits
+
+
+def check_value(name: str, value: Any, annotation: Any) -> None:
+    """Raise a :class:`UsageError` that calls a value ``name`` unless its annotation allows it."""
+    check = checker(annotation)
+    if check is not None:
+        check(name, value)
+
+
+def bounds_of(annotation: Any) -> str:
+    """Return the bounds of a number, or of the numbers of a tuple, in words: ``at least 1``; empty without any."""
+    for kind in (annotation, *get_args(annotation)):
+        for meta in getattr(kind, "__metadata__", ()):
+            if isinstance(meta, msgspec.Meta):
+                words = {"at least": meta.ge, "above": meta.gt, "at most": meta.le, "below": meta.lt}
+                return ", ".join(f"{word} {bound:g}" for word, bound in words.items() if bound is not None)
+    return ""
+
+
+@cache
+def _checks(cls: type) -> dict[str, tuple[str, Check]]:
+    """Return, by field, its name in messages and its check."""
+    of = getattr(cls, "__limits_of__", "{}")
+    # No format: what a user named may hold braces of its own.
+    checks = {name: (of.replace("{}", name), checker(kind)) for name, kind in limits_of(cls).items()}
+    return {name: (told, check) for name, (told, check) in checks.items() if check is not None}
+
+
+def checker(annotation: Any, limit: msgspec.Meta | None = None) -> Check | None:
+    """Return a function of a name and a value that raises :class:`UsageError`; None where nothing is limited.
+
+    Raises:
+        TypeError: limits stand where nothing reads them.
+    """
+    origin, kinds = get_origin(annotation), get_args(annotation)
+    if origin is Annotated:
+        metas = [meta for meta in annotation.__metadata__ if isinstance(meta, msgspec.Meta)]
+        return checker(annotation.__origin__, metas[0] if metas else limit)
+    if annotation is int or annotation is float:
+        return _number(annotation is int, limit or Limit())
+    sized = limit is not None and limit.ge is limit.gt is limit.le is limit.lt is None
+    if origin in (tuple, list, Sequence) and (limit is None or sized):
+        return _values(origin is tuple and kinds[-1:] != (Ellipsis,), kinds, limit or Limit())
+    if annotation is str:
+        return None if limit is None else lambda name, value: _check_length(name, value, limit, "characters")
+    if limit is not None:
+        raise TypeError(f"Limits stand behind a number, a text or a tuple, not behind {annotation}: {limit}.")
+    if annotation is bool:
+        return _check_truth
+    if origin is Literal:
+        return lambda name, value: check_name(name, value, kinds)
+    return _union(kinds) if origin in (Union, UnionType) else None
+
+
+def _number(whole: bool, limit: msgspec.Meta) -> Check:
+    about = limit.extra or {"unit": "", "infinite": False}
+    pairs = {"least": limit.ge, "most": limit.le, "above": limit.gt, "below": limit.lt}
+    bounds = {word: bound for word, bound in pairs.items() if bound is not None}
+    endless = [
+        sign * math.inf
+        for sign, words in ((1, ("most", "below")), (-1, ("least", "above")))
+        if about["infinite"] and not {*words} & {*bounds}
+    ]
+
+    def check(name: str, value: Any) -> None:
+        if not (endless and isinstance(value, float) and value in endless):
+            check_number(f"{name} ({about['unit']})" if about["unit"] else name, value, whole=whole, **bounds)
+
+    return check
+
+
+def _check_truth(name: str, value: Any) -> None:
+    if type(value).__name__ not in ("bool", "bool_"):  # NumPy has its own
+        raise UsageError(f"{name} must be True or False; received {shown(value)}.")
+
+
+def _union(kinds: Sequence[Any]) -> Check | None:
+    checks = [(kind, checker(kind)) for kind in kinds if kind is not NoneType]
+    if all(check is None for _, check in checks):
+        return None
+    allows_none = NoneType in kinds
+
+    def check(name: str, value: Any) -> None:
+        faults = []
+        for kind, limit in checks if value is not None or not allows_none else ():
+            if limit is None and isinstance(kind, type) and not isinstance(value, kind):
+                continue
+            try:
+                if limit is not None:
+                    limit(name, value)
+                return
+            except UsageError as error:
+                faults.append(error)
+        if faults:
+            # Of a number or a tuple, a tuple is answered as one.
+            raise faults[-1 if isinstance(value, tuple | list) else 0]
+
+    return check
+
+
+def _values(fixed: bool, kinds: Sequence[Any], limit: msgspec.Meta) -> Check | None:
+    checks = [checker(kind) for kind in kinds if kind is not Ellipsis]
+    if all(check is None for check in checks) and not fixed and limit.min_length is limit.max_length is None:
+        return None
+    noun = "values" if None in checks else "numbers"
+
+    def check(name: str, value: Any) -> None:
+        several = isinstance(value, Iterable) and not isinstance(value, str | bytes | Mapping | Iterator)
+        values = list(value) if several else []
+        if not several or (fixed and len(values) != len(checks)):
+            raise UsageError(f"{name} holds {f'{len(checks)} {noun}' if fixed else noun}; received {shown(value)}.")
+        _check_length(name, values, limit, "values")
+        for inner, limited in zip(values, checks if fixed else checks * len(values), strict=True):
+            if limited is not None:
+                limited(name, inner)
+
+    return check
+
+
+def _check_length(name: str, value: Any, limit: msgspec.Meta, noun: str) -> None:
+    shortest, longest = limit.min_length or 0, limit.max_length or math.inf
+    if not shortest <= len(value) <= longest:
+        words = [f"at least {shortest:,}"] * (shortest > 0) + [f"at most {longest:,}"] * (longest < math.inf)
+        raise UsageError(f"{name} holds {' and '.join(words)} {noun}; received {shown(value)}.")

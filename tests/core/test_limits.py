@@ -1,0 +1,203 @@
+"""Limits of fields: one table over every class of options, and what the annotations themselves can say."""
+
+from __future__ import annotations
+
+import copy
+import importlib
+import math
+import re
+from collections.abc import Iterator
+from dataclasses import MISSING, dataclass, field, fields
+from pathlib import Path
+from typing import Annotated, Any, Literal, get_args, get_origin
+
+import msgspec
+import numpy as np
+import pytest
+
+from brainbench.core.errors import UsageError
+from brainbench.core.limits import Count, Limit, bounds_of, check_limits, check_value, limited, limits_of
+
+ROOT = Path(__file__).parents[2]
+
+
+MODULES = [
+    ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+    for package in ("brainbench", "robotics_bridge", "leaderboards")
+    for path in sorted((ROOT / package).rglob("*.py"))
+    if re.search(r"^ *@limited", path.read_text(encoding="utf-8"), re.M)
+    for parts in [path.relative_to(ROOT).with_suffix("").parts]
+]
+"""Modules that define classes of options with limits."""
+
+
+def _classes(module: str) -> list[type]:
+    values = vars(importlib.import_module(module)).values()
+    return [value for value in values if isinstance(value, type) and value.__module__ == module and _is_limited(value)]
+
+
+def _is_limited(cls: type) -> bool:
+    return "__limits_of__" in vars(cls)
+
+
+def _bad_values(annotation: Any, limit: msgspec.Meta | None = None) -> Iterator[Any]:
+    """Yield values just outside of what an annotation allows."""
+    origin, kinds = get_origin(annotation), get_args(annotation)
+    if origin is Annotated:
+        yield from _bad_values(annotation.__origin__, annotation.__metadata__[0])
+    elif origin is Literal:
+        yield "no such name"
+    elif annotation is bool:
+        yield "yes"
+    elif annotation in (int, float):
+        yield "text"
+        yield math.nan
+        if annotation is int:
+            yield 2.5
+        if limit is not None:
+            step = 1 if annotation is int else 1e-9
+            yield from (bound for bound in (limit.gt, limit.lt) if bound is not None)
+            yield from (limit.ge - step * max(1, abs(limit.ge)) for _ in [0] if limit.ge is not None)
+            yield from (limit.le + step * max(1, abs(limit.le)) for _ in [0] if limit.le is not None)
+        if limit is None or not (limit.extra or {}).get("infinite"):
+            yield math.inf
+    elif origin in (tuple, list):
+        fixed = origin is tuple and kinds[-1] is not Ellipsis
+        good = [_good_value(kind) for kind in (kinds if fixed else kinds[:1])]
+        if fixed:
+            yield (*good, good[-1])
+        if limit is not None and limit.min_length:
+            yield ()
+        if None not in good:
+            yield from ((bad, *good[1:]) for bad in _bad_values(kinds[0]) if bad != "text")
+    elif type(None) in kinds and len(kinds) == 2:
+        yield from _bad_values(next(kind for kind in kinds if kind is not type(None)))
+
+
+def _good_value(annotation: Any, limit: msgspec.Meta | None = None) -> Any:
+    """Return a value that an annotation allows, on its bound if it has one; None for kinds that are not limited."""
+    origin, kinds = get_origin(annotation), get_args(annotation)
+    if origin is Annotated:
+        return _good_value(annotation.__origin__, annotation.__metadata__[0])
+    if origin is Literal:
+        return kinds[0]
+    if annotation in (int, float):
+        least, most = (limit.ge, limit.le) if limit is not None else (None, None)
+        above, below = (limit.gt, limit.lt) if limit is not None else (None, None)
+        if least is not None or most is not None:
+            return annotation(least if least is not None else most)
+        low, high = above if above is not None else (below or 2) - 2, below if below is not None else (above or 0) + 2
+        return annotation((low + high) / 2)
+    return None
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_every_field_takes_its_bounds_and_nothing_beyond(module: str):
+    for cls in _classes(module):
+        limits, good = limits_of(cls), object.__new__(cls)
+        assert limits, f"{cls.__name__} limits nothing"
+        for item in fields(cls):
+            default = item.default_factory() if item.default_factory is not MISSING else item.default
+            object.__setattr__(good, item.name, _good_value(limits.get(item.name)) if default is MISSING else default)
+        for name, annotation in limits.items():
+            if (bound := _good_value(annotation)) is not None:
+                check_value(name, bound, annotation)
+            for bad in _bad_values(annotation):
+                options = copy.copy(good)
+                object.__setattr__(options, name, bad)
+                with pytest.raises(UsageError, match=re.escape(name)):
+                    check_limits(options)
+                with pytest.raises(msgspec.ValidationError):
+                    msgspec.convert(list(bad) if isinstance(bad, tuple) else bad, annotation)
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_every_class_with_limits_checks_them_when_it_is_made(module: str):
+    def below(base: type) -> Iterator[type]:
+        yield base
+        for inner in base.__subclasses__():
+            yield from below(inner)
+
+    for cls in {inner for base in _classes(module) for inner in below(base)}:
+        assert getattr(cls.__post_init__, "checks_limits", False), f"{cls.__name__} needs @limited below @dataclass"
+
+
+@dataclass(frozen=True)
+@limited(of="{} of a grid")
+class Grid:
+    step: Annotated[float, Limit(above=0, most=5e-3, unit="m")] = 1e-4
+    count: Count | None = None
+    order: Literal["first", "second"] = "first"
+    corner: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    sizes: Annotated[tuple[Count, ...], Limit(shortest=1, longest=3)] = (1,)
+    width: float | tuple[float, float] = 1.0
+    reach: Annotated[float, Limit(least=0, infinite=True)] = math.inf
+    closed: bool = False
+    names: tuple[str, ...] = ()
+    made: list[str] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        if self.closed and self.width != 1:
+            raise UsageError("A closed grid has no width.")
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        ({"step": 0}, "step of a grid (m) must be a finite number, at most 0.005 and above 0; received 0."),
+        ({"step": math.nan}, "received nan."),
+        ({"step": True}, "received True."),
+        ({"count": 0}, "count of a grid must be a whole number, at least 1; received 0."),
+        ({"count": 2.0}, "received 2.0."),
+        ({"order": "frist"}, "Unknown order of a grid 'frist'; did you mean 'first'? Allowed: 'first', 'second'."),
+        ({"corner": (1, 2)}, "corner of a grid holds 3 numbers; received (1, 2)."),
+        ({"corner": 3}, "corner of a grid holds 3 numbers; received 3."),
+        ({"sizes": (1, 0)}, "sizes of a grid must be a whole number, at least 1; received 0."),
+        ({"sizes": ()}, "sizes of a grid holds at least 1 and at most 3 values; received []."),
+        ({"width": (1.0,)}, "width of a grid holds 2 numbers; received (1.0,)."),
+        ({"width": "x"}, "width of a grid must be a finite number; received 'x'."),
+        ({"reach": -math.inf}, "reach of a grid must be a finite number, at least 0; received -inf."),
+        ({"closed": 1}, "closed of a grid must be True or False; received 1."),
+        ({"closed": True, "width": 2.0}, "A closed grid has no width."),
+    ],
+)
+def test_an_error_says_what_was_received_and_what_is_allowed(values, words):
+    with pytest.raises(UsageError) as caught:
+        Grid(**values)
+    assert words in str(caught.value)
+
+
+def test_numpy_numbers_arrays_and_none_are_taken():
+    Grid(step=np.float32(1e-3), count=np.int64(3), corner=np.zeros(3), width=2, closed=np.bool_(False))
+
+
+def test_files_and_words_read_the_same_annotations():
+    with pytest.raises(msgspec.ValidationError, match=r"`float` > 0.0 - at `\$.step`"):
+        msgspec.convert({"step": 0}, Grid)
+    assert bounds_of(limits_of(Grid)["step"]) == "above 0, at most 0.005"
+    assert bounds_of(limits_of(Grid)["count"]) == "at least 1"
+
+
+def test_an_annotation_that_cannot_be_resolved_is_an_error_of_the_class():
+    @dataclass(frozen=True)
+    @limited
+    class Broken:
+        step: NoSuchLimit = 1.0  # type: ignore[name-defined] # noqa: F821
+
+    with pytest.raises(TypeError, match=r"Broken\.step are unknown.*NoSuchLimit"):
+        Broken()
+
+
+def test_limits_that_nothing_reads_are_an_error_of_the_class():
+    @dataclass(frozen=True)
+    @limited
+    class Misplaced:
+        step: Annotated[int | None, Limit(least=1)] = None
+
+    with pytest.raises(TypeError, match="behind a number"):
+        Misplaced()
+
+
+def test_the_decorator_stands_below_dataclass():
+    with pytest.raises(TypeError, match="stands below @dataclass"):
+        limited(dataclass(type("Late", (), {"__annotations__": {"step": float}})))
