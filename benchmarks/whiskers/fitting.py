@@ -20,15 +20,15 @@ from benchmarks.report import table, write_section
 from brainbench.core.files import read_json, write_json
 from brainbench.core.statistics import wilson_interval
 from brainbench.stimuli.fitting import FitOptions, Trial, fit
-from brainbench.stimuli.fitting.synthetic import (
+from brainbench.stimuli.validation import references
+from brainbench.stimuli.whiskers.array import WhiskerArray
+from tests.factories.whisker_measurements import (
     FINE,
     blank_wrenches,
     measure_shapes,
     measure_wrenches,
     simulate_trial,
 )
-from brainbench.stimuli.validation import references
-from brainbench.stimuli.whiskers.array import WhiskerArray
 
 TITLE = "Fitted whiskers: truth, coverage and wrong models"
 NAMES = ("young_modulus", "tip_radius", "damping_ratio", "deflection")

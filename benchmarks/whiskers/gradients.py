@@ -23,11 +23,12 @@ from numpy.typing import NDArray
 from benchmarks.report import publish, script_parser, table
 from brainbench.stimuli import Fidelity, Whisker
 from brainbench.stimuli.engines import get_engine
-from brainbench.stimuli.gradients import GradientRun, JobParameters
+from brainbench.stimuli.fitting.gradients import GradientRun, JobParameters
 from brainbench.stimuli.motion.jobs import Job, Load, StillFollicle, Trace
 from brainbench.stimuli.motion.trajectories import smooth_step
 from brainbench.stimuli.objects.obstacle import Capsule, Obstacle
 from brainbench.stimuli.validation.contact_scenes import OBJECTS, contact_jobs
+from tests.factories.gradients import traces_at
 
 FIDELITY = Fidelity(links=11, time_step=1e-4, precision="double")
 MATERIAL = ("young_modulus", "density", "damping_ratio", "base_radius", "tip_radius", "curvature")
@@ -83,7 +84,7 @@ def compare(job: Job, names: tuple[str, ...]) -> Comparison | None:
         differences, same = [], True
         for change in CHANGES:
             shift = change * parameters.scales[p] * (np.arange(len(names)) == p)
-            ends = [run.traces_at(parameters.values + sign * shift)[0] for sign in (1, -1)]
+            ends = [traces_at(run, parameters.values + sign * shift)[0] for sign in (1, -1)]
             same &= all(end.status == "ok" and end.steps == trace.steps for end in ends)
             sums = [_sums(weights, end) for end in ends]
             differences.append((sums[0] - sums[1]) / (2 * shift[p]))

@@ -7,11 +7,15 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from brainbench.core.rotations import base_rotation
 from brainbench.geometry import Mesh
 from brainbench.stimuli.engines.fidelity import Fidelity
-from brainbench.stimuli.gradients import GradientRun, JobParameters
+from brainbench.stimuli.engines.rod.packing import knots_alike
+from brainbench.stimuli.engines.rod.tasks import make_task
+from brainbench.stimuli.fitting.gradients import GradientRun, JobParameters
 from brainbench.stimuli.motion.jobs import Job, StillFollicle, Trace
 from brainbench.stimuli.objects.obstacle import Obstacle, Part
+from brainbench.stimuli.whiskers.chain import build_chain
 from brainbench.stimuli.whiskers.whisker import Whisker
 
 COARSE = Fidelity(links=8, time_step=1e-4)
@@ -56,12 +60,29 @@ def gradient_errors(
     errors = np.full((3, len(names)), np.nan)
     for p, scale in enumerate(parameters.scales):
         shift = change * scale * (np.arange(len(names)) == p)
-        ends = [outputs_of(run.traces_at(parameters.values + sign * shift)[0]) for sign in (1, -1)]
+        ends = [outputs_of(traces_at(run, parameters.values + sign * shift)[0]) for sign in (1, -1)]
         for output, weight in enumerate(weights):
             expected = np.vdot(weight, ends[0][output] - ends[1][output]) / (2 * shift[p])
             if abs(expected * scale) > 1e-6:
                 errors[output, p] = abs(exact[output].values[p] / expected - 1)
     return errors, run
+
+
+def traces_at(run: GradientRun, values: NDArray[np.float64]) -> list[Trace]:
+    """Return what the jobs of other values give, simulated as those of a run, with its links, steps, knots and hinges.
+
+    Contacts are solved to rounding here, which the ordinary engine does not do.
+    """
+    tasks, steps = [], []
+    for job, (group, row) in zip(run.build(np.array(values, dtype=float)), run._rows, strict=True):
+        near, span = group.packed.tasks[row], (job.start, float(job.times[-1]))
+        task = make_task(job, run.fidelity, {}, silent=True)
+        assert task is not None
+        knots = knots_alike(near.base, job.follicle.pose, base_rotation, span, "the base of a whisker")
+        base, chain = replace(near.base, knots=knots), build_chain(job.whisker, near.chain.links)
+        tasks.append(replace(task, chain=chain, base=base, limit=near.limit, twists=near.twists))
+        steps.append(group.solver.steps[group.packed.jobs.whisker[row]])
+    return run._launch(tasks, steps)[0]
 
 
 def outputs_of(trace: Trace) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:

@@ -9,7 +9,7 @@ import numpy as np
 
 from brainbench.stimuli import WhiskerArray, references
 from brainbench.stimuli.fitting import FitOptions, Trial
-from brainbench.stimuli.fitting.synthetic import blank_wrenches, measure_wrenches, simulate_trial
+from tests.factories.whisker_measurements import blank_wrenches, measure_wrenches, simulate_trial
 
 
 def write_ringdown(path: Path) -> Path:

@@ -4,8 +4,9 @@ A recovery compares a network with animals by the whitened cosine of RDMs of squ
 centred kernel alignment (CKA) of their responses (Diedrichsen et al. 2020, arXiv 2007.02789). The less alike two
 networks are by it, the larger the lead of the true one on a board, at equal noise; so 1 − CKA is raised, by its
 gradient where both networks can be differentiated: through the network by PyTorch, and through the simulation by
-:mod:`brainbench.stimuli.gradients`. Every other object is searched on. For the others animals are drawn from each
-network as for boards, which say what the motion is worth. Letters: K stimulus, F feature, p variable.
+:mod:`brainbench.stimuli.fitting.gradients`. Every other object is searched on. For the others animals are drawn from
+each network as for boards, which say what the motion is worth. Search and gradients lie in the optional folder
+``brainbench/stimuli/fitting``. Letters: K stimulus, F feature, p variable.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from numpy.typing import NDArray
 
 from brainbench.core.contracts import GRID_SHAPE
 from brainbench.core.errors import DataError, UsageError
+from brainbench.core.plugins import OptionalPart
 from brainbench.core.reading.ranges import check_number
 from brainbench.core.records import Interval, Status
 from brainbench.core.statistics import t_interval
@@ -30,11 +32,8 @@ from brainbench.scoring.options import ScoreOptions
 from brainbench.scoring.recovery.boards import FEWEST_STIMULI, Candidate, RecoveryDesign
 from brainbench.scoring.recovery.selection import Margins
 from brainbench.stimuli import Scene, load_stimuli, simulate
-from brainbench.stimuli.design import NOTHING, DesignOptions, find_motions
-from brainbench.stimuli.design_variables import changed, read_limits
 from brainbench.stimuli.engines import get_engine
 from brainbench.stimuli.engines.fidelity import DEFAULT_ENGINE, Fidelity
-from brainbench.stimuli.gradients import GradientRun
 
 Array = NDArray[np.float64]
 SUBSTEPS = 5
@@ -80,7 +79,7 @@ def design_for_networks(
     networks: Sequence[Any],
     variables: Sequence[str],
     *,
-    options: DesignOptions | None = None,
+    options: Any = None,
     study: RecoveryDesign | None = None,
     boards: int = BOARDS,
     backend: str = DEFAULT_ENGINE,
@@ -90,25 +89,27 @@ def design_for_networks(
     Args:
         scenes: the same whiskers and motion, each with another object; at least eight, every other one is held out.
         networks: two models as :func:`brainbench.score` takes them; no files of activations.
-        variables: names of :data:`brainbench.stimuli.design_variables.VARIABLES`.
-        options: search and simulation; noise and rate of its sensor do not count, the noise is that of animals.
+        variables: names of :data:`brainbench.stimuli.fitting.design.VARIABLES`.
+        options: ``brainbench.stimuli.fitting.design.DesignOptions``, search and simulation; noise and rate of its
+            sensor do not count, the noise is that of animals.
         study: animals that are drawn to compare motions; its layer is that of networks that commit to none: ``any``
             and ``last`` stand for the last.
         boards: boards of each network on which motions are compared, at least 2.
         backend: physics engine.
     """
-    options, study = options or DesignOptions(), replace(study or RecoveryDesign(), stimuli=None)
+    search = _search()
+    options, study = options or search.DesignOptions(), replace(study or RecoveryDesign(), stimuli=None)
     check_number("number of scenes, half of which are held out,", len(scenes), least=2 * FEWEST_STIMULI)
     if len(networks) != 2:
         raise UsageError(f"A design tells two networks apart; received {len(networks)}.")
-    begin, limits = read_limits(scenes, variables, {})
+    begin, limits = search.read_limits(scenes, variables, {})
     models = [_Network.of(model, study.layer) for model in networks]
     if models[0].name == models[1].name:
         raise UsageError(f"The network {models[0].name!r} is given twice; give two different ones.")
     names = tuple(variables)
     evaluator = _Evaluator(scenes[::2], names, models, options.fidelity, backend)
     slope = evaluator.slope if evaluator.differentiable else None
-    points = find_motions(evaluator.worths, slope, begin, limits, options)
+    points = search.find_motions(evaluator.worths, slope, begin, limits, options)
     # What is best at the coarse setting need not be at the finer one, which has the last word.
     fine = _Evaluator(scenes[::2], names, models, options.check, backend)
     other = _Evaluator(scenes[1::2], names, models, options.check, backend)
@@ -133,9 +134,14 @@ def design_for_networks(
         leads=(float(margins[0].mean()), float(margins[1].mean())),
         gain=gain,
         won=(float((margins[0] > 0).mean()), float((margins[1] > 0).mean())),
-        scenes=tuple(changed(scene, names, chosen) for scene in scenes),
+        scenes=tuple(search.changed(scene, names, chosen) for scene in scenes),
         evaluations=evaluator.count,
     )
+
+
+def _search() -> Any:
+    """Return the module that searches for motions."""
+    return OptionalPart("", "motions", "brainbench.stimuli.fitting.design").load("search for")
 
 
 def _judge(gain: Interval | None, same: bool) -> tuple[Status, str]:
@@ -192,7 +198,7 @@ class _Evaluator:
         self, scenes: Sequence[Scene], names: tuple[str, ...], networks: Sequence[_Network], fidelity: str, backend: str
     ) -> None:
         self.scenes, self.names, self.networks, self.backend = list(scenes), names, networks, backend
-        self.engine = get_engine(backend)
+        self.search, self.engine = _search(), get_engine(backend)
         twist = self.engine.twists and any(scene.twist for scene in scenes)
         self.fidelity = Fidelity.of(fidelity).resolved(twist)
         frames = scenes[0].frames
@@ -204,7 +210,7 @@ class _Evaluator:
     def worths(self, points: Sequence[Array]) -> list[float]:
         """Return log(1 − CKA) at each of some values; NaN with unstable whiskers."""
         self.count += len(points)
-        return [math.log(max(value, math.exp(NOTHING))) for value in map(self.contrast, points)]
+        return [math.log(max(value, math.exp(self.search.NOTHING))) for value in map(self.contrast, points)]
 
     def contrast(self, values: Array) -> float:
         """Return 1 − CKA at some values; 0 where a network responds alike to all, NaN with unstable whiskers."""
@@ -218,7 +224,7 @@ class _Evaluator:
         """Return the responses [K, F] of both networks at some values; None with unstable whiskers."""
         key = values.tobytes()
         if key not in self._kept:
-            some = [changed(scene, self.names, values) for scene in self.scenes]
+            some = [self.search.changed(scene, self.names, values) for scene in self.scenes]
             dataset = simulate(some, fidelity=self.fidelity, backend=self.backend, cache=False)
             sound = bool((dataset["status"].values == "ok").all())
             self._kept[key] = [network.features(dataset) for network in self.networks] if sound else None
@@ -235,7 +241,7 @@ class _Evaluator:
         # As the engine does, steps are taken finer where a whisker cannot be trusted.
         for finer in (1, FINER):
             fidelity = replace(self.fidelity, time_step=self.fidelity.time_step / finer)
-            run = GradientRun(self._jobs, values, scales=scales, fidelity=fidelity)
+            run = self.search.GradientRun(self._jobs, values, scales=scales, fidelity=fidelity)
             if all(trace.status == "ok" for trace in run.traces):
                 break
         else:
@@ -254,8 +260,8 @@ class _Evaluator:
             centred = response - response.mean(dim=0)
             grams.append(centred @ centred.T)
         apart = 1 - (grams[0] * grams[1]).sum() / (grams[0].norm() * grams[1].norm())
-        if not apart.item() > math.exp(NOTHING):
-            return NOTHING, nothing
+        if not apart.item() > math.exp(self.search.NOTHING):
+            return self.search.NOTHING, nothing
         worth = apart.log()
         (by_wrench,) = torch.autograd.grad(worth, wrench)
         return worth.item(), run.gradient(list(by_wrench.numpy())).values
@@ -274,7 +280,7 @@ class _Evaluator:
         return Margins(candidates, design, get_metric(design.metric), boards)(np.arange(len(labels)))
 
     def _jobs(self, values: Array) -> list[Any]:
-        return [job for scene in self.scenes for job in changed(scene, self.names, values).jobs()]
+        return [job for scene in self.scenes for job in self.search.changed(scene, self.names, values).jobs()]
 
     def _input(self, wrench: Any) -> Any:
         """Return the networks' input [K, T, S·C, H, W] of readings [K·whisker, n, 6] in the frames of the jobs.

@@ -1,7 +1,8 @@
 """Physics engines for whiskers: jobs and a fidelity go in, traces of forces come out (:mod:`.protocol`).
 
 A schedule finds the distinct jobs of some scenes (:mod:`.job_schedule`) and what each can touch (:mod:`.reach`); one of
-the engines ``rod``, ``mujoco`` and ``bullet`` simulates them; one rule says which results are reliable (:mod:`.trust`).
+the engines ``rod``, ``mujoco`` and, if its folder is there, ``bullet`` simulates them; one rule says which results are
+reliable (:mod:`.trust`).
 """
 
 from __future__ import annotations
@@ -9,7 +10,8 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING
 
-from brainbench.core.errors import UsageError, check_name, listing
+from brainbench.core.errors import UsageError, listing, unknown_name
+from brainbench.core.plugins import load_optional, optional_parts
 
 if TYPE_CHECKING:
     from brainbench.stimuli.engines.protocol import WhiskerEngine
@@ -19,16 +21,16 @@ PHYSICS_VERSION = 6
 change of the code changes what a simulation gives; tests/stimuli/engines/test_golden_wrenches.py says when."""
 
 _ENGINES = {
-    "bullet": ("brainbench.stimuli.engines.bullet.engine", "BulletEngine"),
     "mujoco": ("brainbench.stimuli.engines.mujoco.engine", "MujocoWhiskerEngine"),
     "rod": ("brainbench.stimuli.engines.rod.engine", "RodEngine"),
 }
-"""Name of each engine, and the module and class that it is."""
+"""Name of each engine, and the module and class that it is; optional engines are entry points of :data:`_GROUP`."""
+_GROUP = "brainbench.engines"
 
 
 def list_engines() -> tuple[str, ...]:
     """Return the names that :func:`get_engine` knows."""
-    return tuple(sorted(_ENGINES))
+    return tuple(sorted({*_ENGINES, *(name for name, part in optional_parts(_GROUP).items() if part.present)}))
 
 
 def get_engine(name: str, *, device: str | None = None, retry: int | None = None) -> WhiskerEngine:
@@ -39,9 +41,13 @@ def get_engine(name: str, *, device: str | None = None, retry: int | None = None
         device: ``cpu`` or ``cuda``; the engine's own choice when None.
         retry: as :attr:`WhiskerEngine.retry`; the engine's own choice when None.
     """
-    check_name("backend", name, list_engines())
-    module, symbol = _ENGINES[name]
-    engine: type[WhiskerEngine] = getattr(import_module(module), symbol)
+    if name in _ENGINES:
+        module, symbol = _ENGINES[name]
+        engine: type[WhiskerEngine] = getattr(import_module(module), symbol)
+    elif (optional := load_optional(_GROUP, name, "backend")) is not None:
+        engine = optional
+    else:
+        raise unknown_name("backend", name, list_engines())
     if device is not None and device not in engine.devices:
         raise UsageError(f"The backend {name!r} does not run on {device!r}; it runs on {listing(engine.devices)}.")
     options = {"device": device, "retry": retry}

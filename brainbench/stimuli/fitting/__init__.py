@@ -13,10 +13,9 @@ from brainbench.core.lazy import lazy_exports
 if TYPE_CHECKING:
     from brainbench.stimuli.fitting.contacts import ContactOptions, find_contacts
     from brainbench.stimuli.fitting.least_squares import fit
-    from brainbench.stimuli.fitting.options import FitOptions
+    from brainbench.stimuli.fitting.options import FitOptions, TrackOptions
     from brainbench.stimuli.fitting.result import FitResult, FittedParameter
     from brainbench.stimuli.fitting.tracks.contract import new_shapes, new_wrenches
-    from brainbench.stimuli.fitting.tracks.options import TrackOptions
     from brainbench.stimuli.fitting.tracks.readers import read_shapes
     from brainbench.stimuli.fitting.tracks.wrenches import read_wrenches
     from brainbench.stimuli.fitting.trials import Trial

@@ -19,9 +19,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.errors import DataError, UsageError
 from brainbench.core.reading.ranges import check_fields, check_number
-from brainbench.stimuli.fitting.curves import offsets_of_samples
-from brainbench.stimuli.fitting.elastica import STEPS, LoadedShapes, LoadedWhisker
-from brainbench.stimuli.fitting.tracks.quality import check_length, check_track
+from brainbench.stimuli.fitting.curves import STEPS, LoadedShapes, LoadedWhisker, offsets_of_samples
+from brainbench.stimuli.fitting.tracks.contract import check_length, check_track
 from brainbench.stimuli.whiskers.whisker import Whisker
 
 if TYPE_CHECKING:

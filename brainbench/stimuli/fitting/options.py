@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -53,3 +54,55 @@ class FitOptions:
         check_number("most_iterations of a fit", self.most_iterations, least=1, whole=True)
         check_number("steps_per_period of a fit", self.steps_per_period, least=4)
         check_number("time_step of a fit (s)", self.time_step, above=0)
+
+
+LAYOUTS = ("auto", "deeplabcut", "points", "whisk", "whiskerman")
+
+
+@dataclass(frozen=True)
+class TrackOptions:
+    """Scale, frame rate and identity of a track; a value that cannot be is a :class:`UsageError`."""
+
+    metres_per_pixel: float | None = None
+    """Length of a pixel (or of the unit of the file) in m."""
+    frame_rate: float | None = None
+    """Frames per second of the video (Hz)."""
+    track: str | None = None
+    """Which whisker of the file: a label of whisk, a number of WhiskerMan (from 1), or an individual of DeepLabCut."""
+    layout: str = "auto"
+    """Kind of table: auto, deeplabcut, points, whisk or whiskerman."""
+    zero_frame: int = 0
+    """Frame at which time is 0: the start of the scene, or the release of a plucked whisker."""
+    identities: str | None = None
+    """Table of whisk's measurements (CSV) that says which trace is which whisker and where its follicle is."""
+    parts: tuple[str, ...] = ()
+    """Body parts of DeepLabCut from the base to the tip; in the order of the file when empty."""
+    least_likelihood: float = 0.6
+    """Likelihood of DeepLabCut from which a point is used."""
+    points: int = 30
+    """Most points of a frame that are kept of whisk's traces."""
+    rows_down: bool = True
+    """True for image coordinates, whose y runs down; it is turned, so that left stays left."""
+
+    def __post_init__(self) -> None:
+        check_name("layout of a track", self.layout, LAYOUTS)
+        for name, what in (
+            ("metres_per_pixel", "the scale: metres per pixel (5e-5 for 50 µm)"),
+            ("frame_rate", "the frames per second of the video"),
+        ):
+            value = getattr(self, name)
+            if value is None:
+                raise UsageError(f"A track holds pixels and frame numbers; give {what} as {name}.")
+            check_number(name, value, above=0)
+        if not 1e-8 <= float(self.metres_per_pixel or math.nan) <= 1e-2:
+            raise UsageError(
+                f"metres_per_pixel is {self.metres_per_pixel:g} m; a pixel of a whisker video is between 1e-8 and "
+                "1e-2 m (50 µm = 5e-5)."
+            )
+        if not 10 <= float(self.frame_rate or math.nan) <= 1e6:
+            raise UsageError(
+                f"frame_rate is {self.frame_rate:g} Hz; videos of whiskers have 10 to 1e6 frames per second: give "
+                "frames per second, not the time of a frame."
+            )
+        check_number("least_likelihood", self.least_likelihood, least=0, most=1)
+        check_number("points of a trace", self.points, least=2, whole=True)

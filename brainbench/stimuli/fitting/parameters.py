@@ -16,7 +16,7 @@ import numpy as np
 
 from brainbench.core.errors import UsageError, check_each
 from brainbench.core.reading.ranges import check_number
-from brainbench.stimuli.gradients.parameters import WHISKER, JobParameters, whisker_value, with_values
+from brainbench.stimuli.fitting.gradients.parameters import WHISKER, JobParameters, whisker_value, with_values
 from brainbench.stimuli.motion.jobs import Job
 from brainbench.stimuli.whiskers.whisker import Whisker
 
@@ -68,7 +68,7 @@ class Parameter:
     of_length: int = 0
     """Power of the arc length that ``scale`` is multiplied by."""
     of_job: str = ""
-    """Displacement of :class:`brainbench.stimuli.gradients.JobParameters` that it is."""
+    """Displacement of :class:`brainbench.stimuli.fitting.gradients.JobParameters` that it is."""
     real: tuple[float, float] = (-math.inf, math.inf)
     """Smallest and largest value of real whiskers, a little wider than what was published."""
 

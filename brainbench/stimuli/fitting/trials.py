@@ -17,9 +17,7 @@ from brainbench.core.errors import DataError, UsageError, check_name
 from brainbench.core.reading.ranges import check_fields, check_number
 from brainbench.stimuli.fitting.curves import normal_offsets
 from brainbench.stimuli.fitting.parameters import Condition
-from brainbench.stimuli.fitting.plausibility import check_clock
-from brainbench.stimuli.fitting.tracks.contract import AXES
-from brainbench.stimuli.fitting.tracks.quality import check_length
+from brainbench.stimuli.fitting.tracks.contract import AXES, check_length
 from brainbench.stimuli.motion.jobs import Job, Load, StillFollicle, Trace
 from brainbench.stimuli.validation import references
 from brainbench.stimuli.whiskers.chain import build_chain
@@ -34,6 +32,13 @@ Vector = tuple[float, float, float]
 SETTLING = 4.0
 """Time for which a plucked whisker is held, in decay times 1/(ζ ω) of its first mode; it is held in a way that hardly
 swings."""
+
+RARE = 10.0
+"""Periods of the first mode between two readings from which the clock is wrong."""
+SHORT = 0.02
+"""Share of a period of the first mode that the readings last from which the clock or the whisker is wrong."""
+SPENT = 25.0
+"""Decay times of the first mode after which nothing is left of a swing: e⁻²⁵."""
 
 
 @dataclass(frozen=True)
@@ -182,6 +187,27 @@ class Trial:
         assert trace.link_positions is not None
         nodes = build_chain(whisker, trace.link_positions.shape[1] - 1).nodes
         return normal_offsets(nodes, trace.link_positions, self.measured["shape"].values)
+
+
+def check_clock(times: NDArray[np.float64], frequency: float, damping_ratio: float) -> None:
+    """Refuse times [n] (s) at which a whisker of this frequency (Hz) cannot be followed as it rings down."""
+    gap, period = float(np.median(np.diff(times))), 1 / frequency
+    if gap > RARE * period:
+        raise DataError(
+            f"Readings are {gap:.3g} s apart, and this whisker swings with a period of {period:.3g} s; times are in "
+            "seconds: call a column of milliseconds time_ms, or correct the frame rate."
+        )
+    if times[-1] < SHORT * period:
+        raise DataError(
+            f"The readings end {times[-1]:.3g} s after the release, and this whisker swings with a period of "
+            f"{period:.3g} s; times are in seconds and properties of the whisker in SI units (lengths in m)."
+        )
+    spent = SPENT / (2 * math.pi * frequency * max(damping_ratio, 0.02))
+    if times[0] > spent:
+        raise DataError(
+            f"The first reading is {times[0]:.3g} s after the release, and nothing is left of the swing after "
+            f"{spent:.2g} s; times count from the release: subtract its time, or give --zero-frame."
+        )
 
 
 def to_frame(measured: xr.Dataset, axes: NDArray[np.float64], origin: NDArray[np.float64]) -> xr.Dataset:

@@ -15,7 +15,7 @@ from brainbench.metrics import compare, rdm
 from brainbench.scoring.recovery import RecoveryDesign, design_for_networks
 from brainbench.scoring.recovery.motion import _Evaluator, _judge, _Network
 from brainbench.stimuli import PlacedObject, Scene, WhiskerArray, Whisking, simulate, to_grid
-from brainbench.stimuli.design import DesignOptions
+from brainbench.stimuli.fitting.design import DesignOptions
 from brainbench.stimuli.objects.primitives import cylinder
 from brainbench.stimuli.scenes.frames import Frames
 

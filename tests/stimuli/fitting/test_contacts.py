@@ -10,7 +10,7 @@ import pytest
 from brainbench.core.errors import DataError, UsageError
 from brainbench.stimuli import WhiskerArray, references
 from brainbench.stimuli.fitting import ContactOptions, find_contacts, new_shapes
-from brainbench.stimuli.fitting.elastica import STEPS, LoadedWhisker
+from brainbench.stimuli.fitting.curves import STEPS, LoadedWhisker
 from brainbench.stimuli.validation import peg
 from brainbench.stimuli.whiskers.chain import build_chain
 

@@ -8,14 +8,17 @@ from repeats.
 
 from __future__ import annotations
 
+import math
+import os
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.contracts import CHANNELS
-from brainbench.core.errors import DataError, check_each, check_once
+from brainbench.core.errors import DataError, check_each, check_once, shown
 from brainbench.core.reading.ranges import check_number
 
 if TYPE_CHECKING:
@@ -112,3 +115,158 @@ def check_times(times: ArrayLike, count: int) -> NDArray[np.float64]:
         wrong = int(np.argmin(good))
         raise DataError(f"The times of a measurement increase, in seconds; row {wrong + 1} has {values[wrong]:g}.")
     return values
+
+
+MOST_GAPS = 0.5
+"""Share of the frames without a shape up to which a track is used."""
+LONGER = 1.1
+"""Traced length over arc length from which a shape cannot be that whisker: noise lengthens a polyline a little."""
+UNITS = 5.0
+"""The same ratio, or its inverse, from which the unit is wrong and not the whisker."""
+JUMP = 8.0
+"""Step of the base over the usual step from which it is a jump; a jump must also be a share :data:`FAR` of the "
+"length."""
+FAR = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class TrackQuality:
+    """What is wrong with a track, in numbers."""
+
+    frames: int
+    missing_frames: int
+    """Frames without a shape."""
+    longest_gap: int
+    """Frames of the longest gap."""
+    missing_points: float
+    """Share of the points that are missing in the frames that have a shape."""
+    jumps: NDArray[np.int_]
+    """Frames at which the base jumps or the shape turns into its mirror image, as when two whiskers change places."""
+    length: float
+    """Median length of the traced shapes [m]."""
+
+    @property
+    def words(self) -> tuple[str, ...]:
+        """One sentence for each fault."""
+        told = []
+        if self.missing_frames:
+            told.append(
+                f"{self.missing_frames} of {self.frames} frames have no shape, the longest gap is {self.longest_gap} "
+                "frames; they are left out."
+            )
+        if self.missing_points > 0:
+            told.append(f"{100 * self.missing_points:.2g} % of the points in the other frames are missing.")
+        if len(self.jumps):
+            told.append(_swap_words(self.jumps))
+        return tuple(told)
+
+
+def every_frame(frames: NDArray[np.int_], path: str | os.PathLike[str]) -> NDArray[np.int_]:
+    """Return all frame numbers from the first to the last of some, before room is made for their shapes."""
+    first, last, seen = int(frames.min()), int(frames.max()), len(np.unique(frames))
+    if (count := last - first + 1) - seen > MOST_GAPS * count:
+        raise DataError(
+            f"{shown(os.fspath(path))} has shapes in {seen:,} of the {count:,} frames from {first} to {last}; a track "
+            f"is used from {100 * (1 - MOST_GAPS):g} % on: give numbers of frames, not times, or cut it to frames in "
+            "which it was seen."
+        )
+    return np.arange(first, last + 1)
+
+
+def inspect_track(shapes: xr.Dataset) -> TrackQuality:
+    """Return what is wrong with traced shapes."""
+    points = shapes["shape"].values
+    known: NDArray[np.bool_] = np.asarray(np.isfinite(points).all(axis=-1))
+    seen = known.sum(axis=1) >= min(2, points.shape[1])
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], ~seen, [0]]).astype(int)))
+    gaps = np.diff(edges.reshape(-1, 2), axis=1)
+    lengths = traced_lengths(points)
+    length = float(np.nanmedian(lengths)) if np.isfinite(lengths).any() else math.nan
+    return TrackQuality(
+        frames=len(points),
+        missing_frames=int((~seen).sum()),
+        longest_gap=int(gaps.max()) if len(gaps) else 0,
+        missing_points=float(1 - known[seen].mean()) if seen.any() else 1.0,
+        jumps=_jumps(points, seen, length) if math.isfinite(length) else np.zeros(0, dtype=int),
+        length=length,
+    )
+
+
+def check_track(shapes: xr.Dataset) -> TrackQuality:
+    """Return what is wrong with traced shapes that can be used."""
+    found = inspect_track(shapes)
+    if found.missing_frames > MOST_GAPS * found.frames:
+        raise DataError(
+            f"{found.missing_frames} of {found.frames} frames have no shape (the longest gap is {found.longest_gap}); "
+            f"a track is used up to {100 * MOST_GAPS:g} %: trace it again, or cut it to frames in which it was seen."
+        )
+    if len(found.jumps):
+        raise DataError(f"{_swap_words(found.jumps)} Correct the identities, or cut the track there.")
+    return found
+
+
+def check_length(shapes: xr.Dataset, arc_length: float) -> None:
+    """Refuse traced shapes that are no shapes of a whisker of this arc length [m]."""
+    lengths = traced_lengths(shapes["shape"].values)
+    if not np.isfinite(lengths).any():  # single points, as of a tip, have no length
+        return
+    length = float(np.nanmedian(lengths))
+    ratio = length / arc_length
+    if not 1 / UNITS**2 < ratio < UNITS:
+        near = 10.0 ** round(math.log10(ratio))
+        unit = {1e3: " (millimetres taken for metres)", 1e-3: " (metres taken for millimetres)"}.get(near, "")
+        raise DataError(
+            f"The traced shapes are {length:.3g} m long, {ratio:.3g} times the whisker's {arc_length:.3g} m{unit}: the "
+            "scale (metres per pixel or per unit of the file) is wrong."
+        )
+    if ratio > LONGER:
+        raise DataError(
+            f"The traced shapes are {1e3 * length:.3g} mm long and the whisker {1e3 * arc_length:.3g} mm; correct the "
+            "scale or the whisker's arc_length, or fit another whisker."
+        )
+
+
+def traced_lengths(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the length [n] (m) of the polyline through the known points of each frame; NaN below two."""
+    lengths = np.full(len(points), np.nan)
+    for index, frame in enumerate(points):
+        known = frame[np.isfinite(frame).all(axis=-1)]
+        if len(known) >= 2:
+            # At most a dozen chords: noise lengthens a polyline of many points.
+            some = known[np.unique(np.linspace(0, len(known) - 1, min(len(known), 12)).round().astype(int))]
+            lengths[index] = np.linalg.norm(np.diff(some, axis=0), axis=1).sum()
+    return lengths
+
+
+def _jumps(points: NDArray[np.float64], seen: NDArray[np.bool_], length: float) -> NDArray[np.int_]:
+    """Return the frames at which the base jumps far, or the shape is suddenly the mirror image of the one before."""
+    frames = np.flatnonzero(seen)
+    if len(frames) < 3:
+        return np.zeros(0, dtype=int)
+    known = [points[index][np.isfinite(points[index]).all(axis=-1)] for index in frames]
+    base, chord = np.array([one[0] for one in known]), np.array([one[-1] - one[0] for one in known])
+    steps = np.linalg.norm(np.diff(base, axis=0), axis=1)
+    usual = max(float(np.median(steps)), 1e-12)
+    jumped = (steps > JUMP * usual) & (steps > FAR * length)
+    # Signed height of the middle above the chord in the x-y plane, over the length: its sign is the side it curves to.
+    middle = np.array([one[len(one) // 2] - one[0] for one in known])
+    height = (chord[:, 0] * middle[:, 1] - chord[:, 1] * middle[:, 0]) / np.maximum(
+        np.linalg.norm(chord, axis=1) * length, 1e-300
+    )
+    change = np.abs(np.diff(height))
+    mirrored = (
+        (height[1:] * height[:-1] < 0)
+        & (np.minimum(np.abs(height[1:]), np.abs(height[:-1])) > 0.02)
+        & (change > JUMP * max(float(np.median(change)), 1e-12))
+    )
+    # A whisker turned end for end, or one of the other side, also points the other way.
+    turned = np.sum(chord[1:] * chord[:-1], axis=1) < 0
+    return frames[1:][jumped | mirrored | turned]
+
+
+def _swap_words(jumps: NDArray[np.int_]) -> str:
+    shown = ", ".join(map(str, jumps[:5].tolist())) + (" …" if len(jumps) > 5 else "")
+    return (
+        f"The base jumps or the shape turns into its mirror image at {len(jumps)} frames ({shown}), as when the "
+        "whisker changes places with its neighbour or with that of the other side."
+    )

@@ -2,25 +2,240 @@
 
 from __future__ import annotations
 
+import math
 import os
+import pickletools
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.errors import DataError, UsageError, choose_name, listing, shown
+from brainbench.core.errors import DataError, UsageError, check_each, choose_name, listing, shown
 from brainbench.core.reading.hdf5 import open_hdf5
-from brainbench.core.reading.regular import check_file
-from brainbench.core.reading.tables import read_columns, read_rows
-from brainbench.stimuli.fitting.tracks.contract import new_shapes
-from brainbench.stimuli.fitting.tracks.deeplabcut import frame_numbers, pandas_groups, read_deeplabcut
-from brainbench.stimuli.fitting.tracks.options import TrackOptions
-from brainbench.stimuli.fitting.tracks.quality import check_track, every_frame
+from brainbench.core.reading.regular import MOST_TABLE, check_file, readable
+from brainbench.core.reading.tables import read_columns, read_rows, to_numbers
+from brainbench.stimuli.fitting.options import TrackOptions
+from brainbench.stimuli.fitting.tracks.contract import check_track, every_frame, new_shapes
 from brainbench.stimuli.fitting.tracks.whisk import read_whisk
-from brainbench.stimuli.fitting.tracks.whiskerman import read_whiskerman
 
 Array = NDArray[np.float64]
+Columns = dict[tuple[str, str, str], Array]
+"""[n] of each individual ("" without), body part and coordinate."""
+
+
+def read_deeplabcut(path: str | os.PathLike[str], options: TrackOptions) -> tuple[NDArray[np.int_], Array]:
+    """Return frame numbers [n] and points [n, k, 2 or 3] (pixels) of one whisker."""
+    name = shown(os.fspath(path))
+    frames, columns = _read_hdf5(path) if Path(path).suffix in (".h5", ".hdf5") else _read_csv(path)
+    individuals = list(dict.fromkeys(individual for individual, _, _ in columns))
+    wanted = choose_name(f"individual of {name}", options.track, individuals, how="as track")
+    parts = list(dict.fromkeys(part for individual, part, _ in columns if individual == wanted))
+    check_each(f"body part of {name}", options.parts, parts)
+    points = []
+    for part in options.parts or parts:
+        axes = [axis for axis in ("x", "y", "z") if (wanted, part, axis) in columns]
+        if axes[:2] != ["x", "y"]:
+            raise DataError(f"The body part {part!r} of {name} has no columns x and y.")
+        place = np.stack([columns[wanted, part, axis] for axis in axes], axis=-1)
+        likelihood = columns.get((wanted, part, "likelihood"))
+        if likelihood is not None:
+            place = np.where((likelihood >= options.least_likelihood)[:, None], place, np.nan)
+        points.append(place)
+    return frames, np.stack(points, axis=1)
+
+
+def _read_csv(path: str | os.PathLike[str]) -> tuple[NDArray[np.int_], Columns]:
+    kind = "table of DeepLabCut"
+    rows = read_rows(path, kind)
+    heads = {row[0]: row[1:] for row in rows[:4] if row[0] in ("scorer", "individuals", "bodyparts", "coords")}
+    if not {"bodyparts", "coords"} <= set(heads):
+        raise DataError(f"{shown(os.fspath(path))} is no {kind}: its first lines are not scorer, bodyparts and coords.")
+    if len({len(row) for row in heads.values()} | {len(rows[0]) - 1}) > 1:
+        raise DataError(f"{shown(os.fspath(path))} is no {kind}: its lines of names differ in length.")
+    body = rows[len(heads) :]
+    if not body:
+        raise DataError(f"{shown(os.fspath(path))} holds no frame.")
+    table = to_numbers(body, path, kind, first=len(heads) + 1, columns=len(rows[0]), gaps=True)
+    individuals = heads.get("individuals", [""] * len(heads["bodyparts"]))
+    names = zip(individuals, heads["bodyparts"], heads["coords"], strict=True)
+    return frame_numbers(table[:, 0], path), {key: table[:, 1 + index] for index, key in enumerate(names)}
+
+
+def _read_hdf5(path: str | os.PathLike[str]) -> tuple[NDArray[np.int_], Columns]:
+    with open_hdf5(path, "table of DeepLabCut") as file:
+        groups = pandas_groups(file)
+        if not groups:
+            raise DataError(f"{shown(os.fspath(path))} is no table of DeepLabCut: it holds no pandas table.")
+        group: Any = groups[0]
+        if "table" in group:
+            table = group["table"]
+            rows = table[()]
+            names = pickled_names(bytes(table.attrs["values_block_0_kind"]), shown(os.fspath(path)))
+            index, values = rows["index"].astype(float), rows["values_block_0"].astype(float)
+        else:
+            index, values = group["axis1"][()].astype(float), group["block0_values"][()].astype(float)
+            levels = int(group.attrs["block0_items_nlevels"])
+            words = [
+                [group[f"block0_items_level{level}"][code].decode() for code in group[f"block0_items_label{level}"][()]]
+                for level in range(levels)
+            ]
+            names = list(zip(*words, strict=True))
+    if len(names) != values.shape[1]:
+        raise DataError(f"{shown(os.fspath(path))} has {len(names)} names of columns and {values.shape[1]} columns.")
+    # The first level is the scorer; before the last two there may be individuals.
+    keys = [(name[1] if len(name) == 4 else "", name[-2], name[-1]) for name in names]
+    return frame_numbers(index, path), {key: values[:, column] for column, key in enumerate(keys)}
+
+
+def pandas_groups(file: Any) -> list[Any]:
+    """Return the groups of an HDF5 file that hold a table of pandas."""
+    return [item for item in file.values() if hasattr(item, "keys") and ("table" in item or "block0_values" in item)]
+
+
+def frame_numbers(values: Array, path: str | os.PathLike[str]) -> NDArray[np.int_]:
+    """Return frame numbers [n] as integers; others are a :class:`DataError`."""
+    if not np.isfinite(values).all() or (values % 1).any():
+        raise DataError(f"The frame numbers of {shown(os.fspath(path))} are not whole numbers.")
+    return values.astype(int)
+
+
+def pickled_names(data: bytes, name: str) -> list[tuple[str, ...]]:  # noqa: PLR0912 — a branch for each word
+    """Return the list of tuples of texts that a pickle spells out, without loading it."""
+    stack: list[Any] = []
+    memo: dict[int, Any] = {}
+    mark = object()
+
+    def above_mark() -> list[Any]:
+        place = len(stack) - 1 - stack[::-1].index(mark)
+        taken = stack[place + 1 :]
+        del stack[place:]
+        return taken
+
+    try:
+        for code, argument, _ in pickletools.genops(data):
+            match code.name:
+                case "PROTO" | "FRAME" | "STOP":
+                    pass
+                case "UNICODE" | "BINUNICODE" | "SHORT_BINUNICODE":
+                    stack.append(argument)
+                case "MARK":
+                    stack.append(mark)
+                case "LIST":
+                    stack.append(above_mark())
+                case "TUPLE":
+                    stack.append(tuple(above_mark()))
+                case "EMPTY_LIST":
+                    stack.append([])
+                case "TUPLE1" | "TUPLE2" | "TUPLE3":
+                    count = int(code.name[-1])
+                    stack[-count:] = [tuple(stack[-count:])]
+                case "APPEND":
+                    item = stack.pop()
+                    stack[-1].append(item)
+                case "APPENDS":
+                    items = above_mark()
+                    stack[-1].extend(items)
+                case "PUT" | "BINPUT" | "LONG_BINPUT":
+                    memo[int(argument or 0)] = stack[-1]
+                case "MEMOIZE":
+                    memo[len(memo)] = stack[-1]
+                case "GET" | "BINGET" | "LONG_BINGET":
+                    stack.append(memo[int(argument or 0)])
+                case other:
+                    raise DataError(f"The names of the columns of {name} are not plain texts ({other}).")
+    except (ValueError, IndexError, KeyError, AttributeError) as error:
+        raise DataError(f"The names of the columns of {name} cannot be read ({error}).") from error
+    if len(stack) != 1 or not all(
+        isinstance(row, tuple) and len(row) in (3, 4) and all(isinstance(word, str) for word in row) for row in stack[0]
+    ):
+        raise DataError(f"The columns of {name} are not named by scorer, body part and coordinate.")
+    return stack[0]
+
+
+_STRUCT_FIELDS = ("r3all", "tracked", "fp3_all")
+
+
+def read_whiskerman(path: str | os.PathLike[str], options: TrackOptions) -> tuple[NDArray[np.int_], Array]:
+    """Return frame numbers [n] and points [n, k, 2 or 3] (pixels) of one whisker."""
+    name = shown(os.fspath(path))
+    whiskers = _read_structs(path)
+    if not whiskers:
+        raise DataError(f"{name} holds no whisker.")
+    numbers = [str(number) for number in range(1, len(whiskers) + 1)]
+    wanted = choose_name(f"whisker of {name}", options.track, numbers, how="as track")
+    fields = whiskers[int(wanted) - 1]
+    control = np.asarray(fields["r3all"], dtype=float)
+    if control.ndim != 3 or control.shape[1] != 3:
+        raise DataError(f"'r3all' of {name} has the shape {control.shape}; [frame, 3, control point] is needed.")
+    tracked = np.asarray(fields["tracked"], dtype=bool).ravel()
+    if len(tracked) != len(control) or not tracked.any():
+        raise DataError(f"{name} has no tracked frame of whisker {wanted}.")
+    # Without a second view there is no third axis.
+    axes = 3 if np.nan_to_num(control[tracked, 2]).any() else 2
+    points = bezier(control, control.shape[2])[..., :axes]
+    follicle = np.asarray(fields["fp3_all"], dtype=float).reshape(len(control), -1)[:, :axes]
+    far = np.linalg.norm(points[:, [0, -1]] - follicle[:, None], axis=-1)
+    backward = far[:, 1] < far[:, 0]
+    points[backward] = points[backward, ::-1]
+    points[~tracked] = np.nan
+    frames = np.flatnonzero(tracked)
+    kept = slice(frames[0], frames[-1] + 1)
+    return np.arange(len(control))[kept], points[kept]
+
+
+def bezier(control: Array, count: int) -> Array:
+    """Return points [n, count, 3] evenly spaced in the parameter of Bézier curves of control points [n, 3, c]."""
+    degree = control.shape[2] - 1
+    t = np.linspace(0, 1, count)
+    weights = np.stack([math.comb(degree, i) * t**i * (1 - t) ** (degree - i) for i in range(degree + 1)], axis=1)
+    return np.einsum("nac,kc->nka", control, weights)
+
+
+def _read_structs(path: str | os.PathLike[str]) -> list[dict[str, Any]]:
+    found = check_file(path, "track of WhiskerMan", most=4 * MOST_TABLE)
+    with found.open("rb") as stream:
+        head = stream.read(520)
+    if b"\x89HDF\r\n" in head:  # MATLAB 7.3
+        return _structs_of_hdf5(path)
+    from scipy.io import loadmat
+
+    with readable(path, "track of WhiskerMan (MATLAB file)"):
+        data = loadmat(found, variable_names=["whisker"], struct_as_record=True, appendmat=False)
+    if "whisker" not in data or data["whisker"].dtype.names is None:
+        raise DataError(f"{shown(os.fspath(path))} is no track of WhiskerMan: the struct 'whisker' is missing.")
+    _need(data["whisker"].dtype.names, path)
+    return [{name: one[name] for name in _STRUCT_FIELDS} for one in data["whisker"].ravel()]
+
+
+def _structs_of_hdf5(path: str | os.PathLike[str]) -> list[dict[str, Any]]:
+    import h5py
+
+    with open_hdf5(path, "track of WhiskerMan") as file:
+        group = file.get("whisker")
+        if not isinstance(group, h5py.Group):
+            raise DataError(f"{shown(os.fspath(path))} is no track of WhiskerMan: the struct 'whisker' is missing.")
+        _need(tuple(group), path)
+        columns: dict[str, list[Any]] = {}
+        for name in _STRUCT_FIELDS:
+            dataset: Any = group[name]
+            # A struct array of several elements stores references; MATLAB's axes stand in reverse order.
+            cells: list[Any] = (
+                [file[one] for one in dataset[()].ravel()] if dataset.dtype == h5py.ref_dtype else [dataset]
+            )
+            columns[name] = [np.asarray(cell[()]).T for cell in cells]
+    counts = {len(cells) for cells in columns.values()}
+    if len(counts) > 1:
+        raise DataError(f"The fields of 'whisker' in {shown(os.fspath(path))} differ in length.")
+    return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
+
+
+def _need(names: tuple[str, ...], path: str | os.PathLike[str]) -> None:
+    if missing := [name for name in _STRUCT_FIELDS if name not in names]:
+        raise DataError(f"'whisker' of {shown(os.fspath(path))} has no field {missing[0]!r}, which WhiskerMan writes.")
+
+
 _LAYOUTS = {".whiskers": "whisk", **dict.fromkeys((".tr4", ".tr4_2d", ".mat"), "whiskerman")}
 """Layout by the ending of the file."""
 _SEVERAL = (".csv", ".h5", ".hdf5")

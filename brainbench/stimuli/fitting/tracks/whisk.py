@@ -20,8 +20,8 @@ from brainbench.core.errors import DataError, UsageError, choose_name, listing, 
 from brainbench.core.reading.hdf5 import open_hdf5
 from brainbench.core.reading.regular import MOST_TEXT, check_file, readable
 from brainbench.core.reading.tables import read_columns, read_rows
-from brainbench.stimuli.fitting.tracks.options import TrackOptions
-from brainbench.stimuli.fitting.tracks.quality import every_frame
+from brainbench.stimuli.fitting.options import TrackOptions
+from brainbench.stimuli.fitting.tracks.contract import every_frame
 
 Array = NDArray[np.float64]
 Segments = dict[tuple[int, int], Array]

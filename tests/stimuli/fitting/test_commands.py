@@ -1,4 +1,4 @@
-"""``brainbench stimuli fit``: parameters and contacts from files, and its errors."""
+"""``brainbench stimuli fit`` and ``brainbench stimuli design``: results, and errors before anything is simulated."""
 
 from __future__ import annotations
 
@@ -13,6 +13,8 @@ from tests.factories.whisker_tracks import write_points
 
 WHISKER = WhiskerArray.of("mouse")["C2"].whisker
 QUICK = ["--links", "8", "--steps-per-period", "80"]
+QUICK_DESIGN = ("--fidelity", "fast", "--check", "fast", "--iterations", "1", "--starts", "1", "--searches", "1")
+NETWORKS = "zhuang-small.simclr,resnet18-small.supervised"
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +40,7 @@ def test_a_ring_down_is_fitted_written_and_drawn(run, ringdown_file, tmp_path):
 
 
 def test_contacts_of_a_track_are_printed(run, tmp_path):
-    from brainbench.stimuli.fitting.elastica import LoadedWhisker
+    from brainbench.stimuli.fitting.curves import LoadedWhisker
 
     shape = LoadedWhisker(WHISKER).shapes(np.zeros((1, 3)), np.array([0.009]), np.array([8e-5]))
     path = write_points(tmp_path / "track.csv", np.repeat(shape.place[:, ::2], 3, axis=0))
@@ -107,3 +109,51 @@ def test_a_design_is_printed(run, tmp_path):
     wrong = run("stimuli", "design", str(path), "--variables", "protracton")
     assert wrong.status == 2
     assert "protraction" in wrong.err
+
+
+@pytest.fixture
+def poles(tmp_path):
+    """A scene file with eight poles of different radii."""
+    lines = [
+        '[array]\nspecies = "mouse"\nside = "right"\nwhiskers = "C2"\n',
+        "[whisking]\nfrequency_hz = 20\nprotraction_deg = 30\nretraction_deg = 10\n",
+        "[frames]\nfirst_ms = 51\ninterval_ms = 3\ncount = 60\n",
+    ]
+    lines += [
+        f'[[scene]]\nlabel = "r{number}"\n[[scene.object]]\nshape = "cylinder"\nradius_mm = {number / 10}\n'
+        "height_mm = 20\nposition_mm = [10.5, 2, 3]\n"
+        for number in range(2, 10)
+    ]
+    path = tmp_path / "poles.toml"
+    path.write_text("\n".join(lines), encoding="utf-8")
+    return str(path)
+
+
+@pytest.mark.slow
+def test_two_networks_are_told_apart_on_held_out_objects(run, poles):
+    arguments = ("stimuli", "design", poles, "--variables", "object_y", "--networks", NETWORKS, *QUICK_DESIGN)
+    data = json.loads(run(*arguments, "--json").out)
+    assert data["search"] == "gradient"
+    assert data["contrast"][1] >= data["contrast"][0]
+    assert data["gain"]["low"] <= data["leads"][1] - data["leads"][0] <= data["gain"]["high"]
+    assert set(data["layers"]) == set(NETWORKS.split(","))
+
+
+@pytest.mark.slow
+def test_a_design_for_networks_is_told_in_words(run, poles):
+    told = run("stimuli", "design", poles, "--variables", "object_y", "--networks", NETWORKS, *QUICK_DESIGN).out
+    for words in ("lead of the true network, held-out objects", "by gradient", "status", "object_y"):
+        assert words in told
+
+
+def test_without_networks_objects_are_told_apart(run, poles):
+    found = run("stimuli", "design", poles, "--variables", "protraction", *QUICK_DESIGN)
+    assert "whisks" in found.out
+    assert "r2 – r3" in found.out
+
+
+def test_a_wrong_network_is_refused_before_anything_is_simulated(run, poles):
+    found = run("stimuli", "design", poles, "--networks", "zhuang-smal.simclr,resnet18-small.supervised", *QUICK_DESIGN)
+    assert found.status == 2
+    assert "did you mean 'zhuang-small.simclr'" in found.err
+    assert "two networks apart; received 1" in run("stimuli", "design", poles, "--networks", "zhuang-small").err

@@ -9,10 +9,9 @@ import pytest
 
 from brainbench.stimuli import WhiskerArray, references
 from brainbench.stimuli.fitting import FitOptions, Trial, fit
-from brainbench.stimuli.fitting.model import FitModel
+from brainbench.stimuli.fitting.model import FitModel, find_starts
 from brainbench.stimuli.fitting.parameters import FreeParameters, Prior
-from brainbench.stimuli.fitting.starts import find_starts
-from brainbench.stimuli.fitting.synthetic import blank_wrenches, measure_wrenches, simulate_trial
+from tests.factories.whisker_measurements import blank_wrenches, measure_wrenches, simulate_trial
 
 KNOWN = replace(WhiskerArray.of("mouse")["C2"].whisker, damping_ratio=0.05)
 PERIOD = 1 / float(references.natural_frequencies(KNOWN, 1)[0])

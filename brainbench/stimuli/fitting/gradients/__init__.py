@@ -2,11 +2,10 @@
 
 :class:`JobParameters` names parameters of jobs, :class:`GradientRun` simulates and differentiates
 (:mod:`brainbench.stimuli.fitting.derivatives`), :class:`ContactEvents` say where a gradient holds on one side only.
-:func:`brainbench.stimuli.gradients.autograd.simulate_tensors` is the same for PyTorch.
+:func:`brainbench.stimuli.fitting.gradients.autograd.simulate_tensors` is the same for PyTorch.
 """
 
-from brainbench.stimuli.gradients.events import ContactEvents
-from brainbench.stimuli.gradients.parameters import JobParameters
-from brainbench.stimuli.gradients.run import Gradient, GradientRun, Tangents
+from brainbench.stimuli.fitting.gradients.parameters import JobParameters
+from brainbench.stimuli.fitting.gradients.run import ContactEvents, Gradient, GradientRun, Tangents
 
 __all__ = ["ContactEvents", "Gradient", "GradientRun", "JobParameters", "Tangents"]

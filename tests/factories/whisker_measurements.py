@@ -1,7 +1,6 @@
 """Synthetic measurements: what sensors and trackers would have written of a simulated whisker, with noise.
 
-For tests, benchmarks and the planning of an experiment: a trial is simulated at a finer setting than a fit uses, and
-read with white noise.
+A trial is simulated at a finer setting than a fit uses, and read with white noise.
 """
 
 from __future__ import annotations

@@ -9,7 +9,7 @@ import pytest
 
 from brainbench.core.errors import UsageError
 from brainbench.stimuli import PlacedObject, Scene, WhiskerArray, Whisking
-from brainbench.stimuli.design import DesignOptions, _Evaluator, _soft_least, design
+from brainbench.stimuli.fitting.design import DesignOptions, _Evaluator, _soft_least, design
 from brainbench.stimuli.objects.primitives import cylinder
 
 QUICK = DesignOptions(iterations=2, starts=2, check="fast")

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,9 +23,64 @@ from brainbench.stimuli.engines.rod.tasks import JobTask, PackedTasks, make_task
 from brainbench.stimuli.engines.trust import check_jobs
 from brainbench.stimuli.fitting.derivatives.packed_changes import Numbers, PackedPlaces, packed_change, packed_part
 from brainbench.stimuli.fitting.derivatives.recorded_run import RecordingSolver
-from brainbench.stimuli.gradients.events import ContactEvents, contact_events
 from brainbench.stimuli.motion.jobs import Job, Trace
-from brainbench.stimuli.whiskers.chain import build_chain
+
+Nearness = Literal["ending", "beginning", "passing", "slipping", "sticking"]
+SMALL_FORCE = 1e-5
+"""Share of the whisker's largest contact force below which a contact is about to end or has just begun."""
+SMALL_GAP = 1e-5
+"""Gap (mm) at the end of a step up to which an open contact is about to close."""
+SMALL_LEAD = 1e-6
+"""Gap (mm) by which one link is nearer than the next up to which a contact is about to pass from one to the other."""
+FULL_CONE = 1 - 1e-5
+"""Share of the friction cone from which sticking is close to sliding."""
+SMALL_SLIP = 1e-5
+"""Share of the whisker's fastest slip below which sliding is close to sticking."""
+
+
+@dataclass(frozen=True)
+class ContactEvents:
+    """Changes of contact of one whisker in its run."""
+
+    status: Literal["smooth", "one-sided", "degenerate", "unstable"]
+    """``smooth``: the gradient holds on both sides. ``one-sided``: in some step a contact was so near to opening,
+    closing, passing from link to link, sticking or sliding (``close``) that the gradient on the other side is another.
+    ``degenerate``: in some step contacts shared their load in more than one way, or their forces could not be solved to
+    rounding. ``unstable``: the simulation cannot be trusted, and the gradient is NaN."""
+    begun: int
+    """Steps in which more contacts pressed than before."""
+    ended: int
+    """Steps in which fewer did."""
+    slipped: int
+    """Steps in which as many pressed and more, or fewer, of them slid."""
+    close: tuple[Nearness, ...]
+    """What some contact was close to in some step."""
+
+
+def contact_events(summary: Any, reason: str) -> ContactEvents:
+    """Return the events of one job from its ``fitting.derivatives.kernels.contacts.ContactSummary``.
+
+    ``reason`` is why the run cannot be trusted, if so.
+    """
+    close: list[Nearness] = []
+    if summary["least_force"] < SMALL_FORCE * summary["largest_force"]:
+        close.append("ending")
+    if summary["least_gap"] < SMALL_GAP:
+        close.append("beginning")
+    if summary["least_lead"] < SMALL_LEAD:
+        close.append("passing")
+    if summary["fullest_cone"] > FULL_CONE:
+        close.append("slipping")
+    if summary["slowest_slip"] < SMALL_SLIP * summary["fastest_slip"]:
+        close.append("sticking")
+    status: Literal["smooth", "one-sided", "degenerate", "unstable"] = "one-sided" if close else "smooth"
+    if summary["degenerate"]:
+        status = "degenerate"
+    if reason:
+        status = "unstable"
+    begun = int(summary["begun"]) + int(summary["first"] > 0)
+    return ContactEvents(status, begun, int(summary["ended"]), int(summary["slipped"]), tuple(close))
+
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -133,23 +188,6 @@ class GradientRun:
             for hinges in (3 if group.packed.tasks[0].twists else 2,)
         ]
         return f"{len(launches)} launches: {'; '.join(launches)}"
-
-    def traces_at(self, values: Sequence[float] | NDArray[np.float64]) -> list[Trace]:
-        """Return what the jobs of other values give, computed as :attr:`traces` are: for differences and line searches.
-
-        Contacts are solved to rounding here, which the ordinary engine does not do. Links, steps, knots of the bases
-        and whether whiskers twist are those of the run's own values.
-        """
-        tasks, steps = [], []
-        for job, (group, row) in zip(self.build(np.array(values, dtype=float)), self._rows, strict=True):
-            own = group.packed.tasks[row]
-            task = make_task(job, self.fidelity, {}, silent=True)
-            assert task is not None
-            knots = knots_alike(own.base, job.follicle.pose, base_rotation, _span(job), "the base of a whisker")
-            base, chain = replace(own.base, knots=knots), build_chain(job.whisker, own.chain.links)
-            tasks.append(replace(task, chain=chain, base=base, limit=own.limit, twists=own.twists))
-            steps.append(group.solver.steps[group.packed.jobs.whisker[row]])
-        return self._launch(tasks, steps)[0]
 
     @cached_property
     def _rows(self) -> list[tuple[_Group, int]]:

@@ -3,7 +3,7 @@
 Two objects a, b that are felt with white noise of standard deviation σ in each reading are apart by Mahalanobis'
 distance D, D² = Σ ((wₐ − w_b)/σ)² over the readings, whiskers and components of a whisk. D² of n whisks is n times that
 of one, so a motion with twice the D² needs half the whisks. The smallest D² of all pairs is raised by its gradient, for
-which one pass goes back over the simulation (:mod:`brainbench.stimuli.gradients`).
+which one pass goes back over the simulation (:mod:`brainbench.stimuli.fitting.gradients`).
 """
 
 from __future__ import annotations
@@ -12,18 +12,95 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from brainbench.core.errors import DataError, UsageError
+from brainbench.core.errors import DataError, UsageError, check_each, check_once
 from brainbench.core.reading.ranges import check_fields
 from brainbench.core.records import Status
-from brainbench.stimuli.design_variables import Array, changed, read_limits
 from brainbench.stimuli.engines import get_engine
 from brainbench.stimuli.engines.fidelity import DEFAULT_ENGINE, Fidelity
-from brainbench.stimuli.gradients import GradientRun
+from brainbench.stimuli.fitting.gradients import GradientRun
 from brainbench.stimuli.motion.jobs import Job, Trace
+from brainbench.stimuli.motion.trajectories import Whisking
 from brainbench.stimuli.scenes.scene import Scene
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class DesignVariable:
+    """One thing that may be chosen."""
+
+    unit: str
+    low: float
+    high: float
+    """Usual bounds: those of whisking mice and rats, or a shift of objects (m) against the scenes'."""
+    read: Callable[[Scene], float]
+    change: Callable[[Scene, float], Scene]
+
+
+def _whisking(name: str, unit: str, low: float, high: float) -> DesignVariable:
+    def change(scene: Scene, value: float) -> Scene:
+        return replace(scene, whisking=replace(_sinusoid(scene), **{name: value}))
+
+    return DesignVariable(unit, low, high, lambda scene: getattr(_sinusoid(scene), name), change)
+
+
+def _sinusoid(scene: Scene) -> Whisking:
+    if not isinstance(scene.whisking, Whisking):
+        raise UsageError(
+            f"The scene {scene.label!r} does not whisk in a sinusoid; only the place of objects can be chosen."
+        )
+    return scene.whisking
+
+
+def _shift(axis: int) -> DesignVariable:
+    def change(scene: Scene, value: float) -> Scene:
+        def moved(position: Sequence[float]) -> Any:
+            return tuple(one + value * (index == axis) for index, one in enumerate(position))
+
+        return replace(scene, objects=tuple(replace(item, position=moved(item.position)) for item in scene.objects))
+
+    return DesignVariable("m", -0.003, 0.003, lambda scene: 0.0, change)
+
+
+VARIABLES: Mapping[str, DesignVariable] = {
+    "frequency": _whisking("frequency", "Hz", 4.0, 25.0),
+    "protraction": _whisking("protraction", "rad", math.radians(5), math.radians(45)),
+    "retraction": _whisking("retraction", "rad", math.radians(0), math.radians(25)),
+    **{f"object_{name}": _shift(axis) for axis, name in enumerate("xyz")},
+}
+"""What can be chosen, by name."""
+
+
+def read_limits(
+    scenes: Sequence[Scene], variables: Sequence[str], bounds: Mapping[str, tuple[float, float]]
+) -> tuple[Array, Array]:
+    """Return the values [p] of variables in some scenes, and their bounds [p, 2]."""
+    check_once("--variables", variables)
+    check_each("variable of a design", variables, VARIABLES)
+    check_each("chosen variable with bounds", bounds, variables)
+    limits = np.array([bounds.get(name, (VARIABLES[name].low, VARIABLES[name].high)) for name in variables])
+    first = scenes[0]
+    if any(one.names != first.names or one.whisking.config() != first.whisking.config() for one in scenes):
+        raise UsageError("The scenes of a design have the same whiskers and the same whisking; these differ.")
+    begin = np.array([VARIABLES[name].read(first) for name in variables])
+    if not (limits[:, 0] < limits[:, 1]).all():
+        raise UsageError(f"The bounds of {', '.join(variables)} are a lower and a higher number each.")
+    if (begin < limits[:, 0]).any() or (begin > limits[:, 1]).any():
+        raise UsageError(f"The given motion lies outside the bounds of {', '.join(variables)}; widen them.")
+    return begin, limits
+
+
+def changed(scene: Scene, names: Sequence[str], values: Array) -> Scene:
+    """Return a scene with variables at some values [p]."""
+    for name, value in zip(names, values, strict=True):
+        scene = VARIABLES[name].change(scene, float(value))
+    return scene
+
 
 SCALE = 0.05
 """Size of a small change of a variable, as a share of its range."""
@@ -101,7 +178,7 @@ def design(
 
     Args:
         scenes: the same whiskers and motion, each with another object; at least two.
-        variables: names of :data:`brainbench.stimuli.design_variables.VARIABLES`.
+        variables: names of :data:`brainbench.stimuli.fitting.design.VARIABLES`.
         bounds: bounds of single variables, in their units.
         options: sensor, simulation and search.
         backend: physics engine.

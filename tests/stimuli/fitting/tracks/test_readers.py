@@ -9,8 +9,7 @@ import pytest
 
 from brainbench.core.errors import DataError, UsageError
 from brainbench.stimuli.fitting import TrackOptions, read_shapes
-from brainbench.stimuli.fitting.tracks.deeplabcut import pickled_names
-from brainbench.stimuli.fitting.tracks.whiskerman import bezier
+from brainbench.stimuli.fitting.tracks.readers import bezier, pickled_names
 from tests.factories import whisker_tracks as tracks
 
 SCALE, RATE = 5e-5, 500.0

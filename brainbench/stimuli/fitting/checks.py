@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,21 +15,17 @@ from numpy.typing import NDArray
 
 from brainbench.core.contracts import CHANNELS
 from brainbench.core.errors import DataError, listing
+from brainbench.stimuli.fitting.model import Readings
+from brainbench.stimuli.fitting.trials import Trial
+from brainbench.stimuli.motion.jobs import Trace
 
 if TYPE_CHECKING:
-    from brainbench.stimuli.fitting.trials import Trial
-    from brainbench.stimuli.motion.jobs import Trace
+    from scipy.sparse import coo_array
 
 UNITS = 100.0
 """Size of the wrenches over that at the start, or its inverse, from which the unit is wrong and not the start."""
 OPPOSITE = -0.8
 """Correlation with the wrenches at the start from which the sign is wrong."""
-RARE = 10.0
-"""Periods of the first mode between two readings from which the clock is wrong."""
-SHORT = 0.02
-"""Share of a period of the first mode that the readings last from which the clock or the whisker is wrong."""
-SPENT = 25.0
-"""Decay times of the first mode after which nothing is left of a swing: e⁻²⁵."""
 MULTIPLE = 1.5
 """Size of the forces (moments) over that of the fitted whisker, or its inverse, from which one of the kinds has another
 unit: where they disagree, a fit follows the one and takes the other for noise."""
@@ -36,27 +33,6 @@ SURE = 5.0
 """Standard deviations by which such a size is known to differ."""
 DEAD = 0.05
 """Share of the largest predicted component of its kind from which one that reads zero throughout is doubtful."""
-
-
-def check_clock(times: NDArray[np.float64], frequency: float, damping_ratio: float) -> None:
-    """Refuse times [n] (s) at which a whisker of this frequency (Hz) cannot be followed as it rings down."""
-    gap, period = float(np.median(np.diff(times))), 1 / frequency
-    if gap > RARE * period:
-        raise DataError(
-            f"Readings are {gap:.3g} s apart, and this whisker swings with a period of {period:.3g} s; times are in "
-            "seconds: call a column of milliseconds time_ms, or correct the frame rate."
-        )
-    if times[-1] < SHORT * period:
-        raise DataError(
-            f"The readings end {times[-1]:.3g} s after the release, and this whisker swings with a period of "
-            f"{period:.3g} s; times are in seconds and properties of the whisker in SI units (lengths in m)."
-        )
-    spent = SPENT / (2 * math.pi * frequency * max(damping_ratio, 0.02))
-    if times[0] > spent:
-        raise DataError(
-            f"The first reading is {times[0]:.3g} s after the release, and nothing is left of the swing after "
-            f"{spent:.2g} s; times count from the release: subtract its time, or give --zero-frame."
-        )
 
 
 def check_wrenches(trials: Sequence[Trial], traces: Sequence[Trace]) -> None:
@@ -129,3 +105,104 @@ def _of_kind(trial: Trial, trace: Trace, kind: str) -> tuple[NDArray[np.float64]
     expected = trace.wrench[:, [CHANNELS.index(trial.channels[place]) for place in columns]]
     known = np.isfinite(measured) & np.isfinite(expected)
     return measured[known], expected[known]
+
+
+Array = NDArray[np.float64]
+LAGS = 3
+"""Places up to which readings are neighbours."""
+SWING_LAGS = 4
+"""Places up to which residuals that swing are looked for."""
+ALPHA = 0.01
+"""Chance that noise alone fails any of the tests of a fit."""
+FEWEST = 20
+"""Pairs from which an ordering is tested."""
+
+
+@dataclass(frozen=True)
+class ResidualTest:
+    """One test of the residuals."""
+
+    what: str
+    """``time``, ``arc`` (serial correlation over time, along the whisker), ``swing`` (of any sign, over time) or
+    ``size`` (against repeat noise)."""
+    statistic: float
+    """Deviation from what noise alone gives, in standard deviations."""
+    p: float
+    """Chance of a larger one under noise alone."""
+    readings: int
+    passed: bool
+
+
+def check_residuals(residual: Array, jacobian: Array, readings: Readings) -> tuple[ResidualTest, ...]:
+    """Return the tests of whitened residuals [m] with their Jacobian [m, p]; each at its share of :data:`ALPHA`."""
+    from scipy.special import chdtrc, ndtr
+
+    basis, _ = np.linalg.qr(jacobian)
+    free = len(residual) - jacobian.shape[1]
+    variance = float(residual @ residual) / free
+    found: list[tuple[str, float, float, int]] = []
+    for what, column in (("time", 0), ("arc", 1)):
+        weights = _neighbours(readings, column, range(1, LAGS + 1))
+        pairs = weights.nnz // 2
+        if pairs >= FEWEST:
+            z = _deviate(residual, basis, weights, variance)
+            found.append((what, z, float(ndtr(-z)), pairs))
+    lags = [_neighbours(readings, 0, [lag]) for lag in range(1, SWING_LAGS + 1)]
+    if min(one.nnz // 2 for one in lags) >= FEWEST:
+        square = sum(_deviate(residual, basis, one, variance) ** 2 for one in lags)
+        p = float(chdtrc(SWING_LAGS, square))
+        found.append(("swing", (square - SWING_LAGS) / math.sqrt(2 * SWING_LAGS), p, len(residual)))
+    known = np.isfinite(readings.noise[readings.group])
+    if known.sum() > jacobian.shape[1] + 1:
+        # Sum of squares over repeat noise is chi-square with n − p degrees of freedom.
+        degrees = int(known.sum()) - jacobian.shape[1]
+        size = float(np.sum(residual[known] ** 2))
+        p = float(chdtrc(degrees, size))
+        found.append(("size", (size - degrees) / math.sqrt(2 * degrees), p, int(known.sum())))
+    level = ALPHA / max(len(found), 1)
+    return tuple(ResidualTest(what, z, p, count, p >= level) for what, z, p, count in found)
+
+
+def _deviate(residual: Array, basis: Array, weights: coo_array, variance: float) -> float:
+    moved = weights @ basis
+    inner = basis.T @ moved
+    mean = -variance * float(np.trace(inner))
+    spread = float(weights.power(2).sum()) - 2 * float(np.sum(moved**2)) + float(np.sum(inner * inner.T))
+    return (float(residual @ (weights @ residual)) - mean) / max(variance * math.sqrt(2 * max(spread, 0.0)), 1e-300)
+
+
+def _neighbours(readings: Readings, column: int, lags: Sequence[int]) -> coo_array:
+    """Return W [m, m], ½ where two readings differ by one of some lags in one place and agree in all else."""
+    from scipy.sparse import coo_array
+
+    count = len(readings)
+    fixed = [readings.trial, *(readings.place[:, other] for other in range(3) if other != column)]
+    # Sorted, readings of one series stand together in order of the place.
+    order = np.lexsort((readings.place[:, column], *fixed[::-1]))
+    rows: list[NDArray[np.int_]] = []
+    columns: list[NDArray[np.int_]] = []
+    for lag in lags:
+        first, second = order[:-lag], order[lag:]
+        near = readings.place[second, column] - readings.place[first, column] == lag
+        for values in fixed:
+            near &= values[first] == values[second]
+        rows += [first[near], second[near]]
+        columns += [second[near], first[near]]
+    row, col = np.concatenate(rows), np.concatenate(columns)
+    return coo_array((np.full(len(row), 0.5), (row, col)), shape=(count, count))
+
+
+def failed_words(tests: Sequence[ResidualTest]) -> tuple[str, ...]:
+    """Return one sentence for each test that failed."""
+    told = {
+        "time": "neighbouring instants leave residuals of the same sign",
+        "arc": "neighbouring points along the whisker leave residuals of the same sign",
+        "swing": "the residuals swing",
+        "size": "the residuals are larger than the noise of repeats",
+    }
+    return tuple(
+        f"The model does not fit: {told[test.what]} ({test.statistic:.1f} standard deviations beyond noise, "
+        f"p = {test.p:.2g}); the shape, the motion or the contact that was assumed is wrong, or the noise is not white."
+        for test in tests
+        if not test.passed
+    )

@@ -1,15 +1,44 @@
 """Named parameters of jobs."""
 
+from __future__ import annotations
+
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from brainbench.core.errors import UsageError
-from brainbench.stimuli.gradients import JobParameters
+from brainbench.stimuli.fitting.gradients import JobParameters
+from brainbench.stimuli.fitting.gradients.parameters import move_obstacle
 from brainbench.stimuli.motion.jobs import Job, StillFollicle
-from brainbench.stimuli.objects.obstacle import Sphere
+from brainbench.stimuli.objects.obstacle import Capsule, Obstacle, Sphere
 from tests.factories.gradients import WHISKER, Swing, gradient_errors, touching_job
+
+PART = Capsule((0.0, 0.0, -1e-3), (2e-3, 0.0, 3e-3), 2e-4)
+
+
+class Slide:
+    finest = 0.02
+
+    def __call__(self, times):
+        return np.outer(times, [0.1, 0.2, 0.0]), np.tile([1.0, 0.0, 0.0, 0.0], (len(times), 1))
+
+
+def test_a_shifted_motion_keeps_its_turn_and_its_shortest_period():
+    times, moved = np.linspace(0, 0.1, 5), move_obstacle(Obstacle((PART,), Slide()), (1e-3, 0.0, -2e-3))
+    place, turn = moved.motion(times)
+    np.testing.assert_array_equal(place, Slide()(times)[0] + [1e-3, 0.0, -2e-3])
+    np.testing.assert_array_equal(turn, Slide()(times)[1])
+    assert moved.motion.finest == Slide.finest
+
+
+def test_an_obstacle_turns_about_its_middle():
+    obstacle = Obstacle((PART,))
+    moved = move_obstacle(obstacle, (0.0, 1e-3, 0.0), (0.0, 0.0, np.pi))
+    shift = moved.bounds.mean(axis=0) - obstacle.bounds.mean(axis=0)
+    assert shift == pytest.approx([0.0, 1e-3, 0.0])
+    assert moved.parts[0] != obstacle.parts[0]
+
 
 BALL = touching_job(Sphere((11e-3, 2.2e-3, 0.0), 1e-3))
 

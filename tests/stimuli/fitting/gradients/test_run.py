@@ -1,5 +1,7 @@
 """Gradients beside central differences in double precision: free, loaded and touching whiskers."""
 
+from __future__ import annotations
+
 from dataclasses import replace
 
 import numpy as np
@@ -10,11 +12,57 @@ from brainbench.core.rotations import euler_matrix
 from brainbench.geometry import Mesh
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.fitting.derivatives.recorded_run import RecordingSolver
-from brainbench.stimuli.gradients import GradientRun, JobParameters
+from brainbench.stimuli.fitting.gradients import GradientRun, JobParameters
+from brainbench.stimuli.fitting.gradients.run import contact_events
 from brainbench.stimuli.motion.jobs import Job, Load, StillFollicle
 from brainbench.stimuli.objects.obstacle import Box, Capsule, Cylinder, Obstacle, Sphere
 from brainbench.stimuli.validation.contact_scenes import contact_jobs
-from tests.factories.gradients import COARSE, WHISKER, Swing, gradient_errors, touching_job
+from tests.factories.gradients import COARSE, WHISKER, Swing, gradient_errors, touching_job, traces_at
+
+SUMMARY = {
+    "first": 0, "begun": 1, "ended": 1, "slipped": 0, "degenerate": 0, "largest_force": 1.0, "least_force": 0.1,
+    "fastest_slip": 1.0, "slowest_slip": 0.1, "fullest_cone": 0.5, "least_gap": 0.01, "least_lead": 0.01,
+}  # fmt: skip
+
+
+def _events(solid, friction: float, *, frames: int = 30, **changes: float):
+    job = touching_job(solid, friction=friction, frames=frames)
+    parameters = JobParameters([job], ["young_modulus"])
+    run = GradientRun(parameters.build, parameters.values, fidelity=replace(COARSE, **changes))
+    return run.gradient([np.ones((frames, 6))]).events[0]
+
+
+def test_beginning_end_and_slip_of_a_contact_are_counted():
+    # This whisker slips off the ball.
+    ball = _events(Sphere((11e-3, 2.2e-3, 0.6e-3), 1e-3), 0.0, frames=39)
+    assert (ball.begun, ball.ended, ball.slipped) == (1, 1, 0)
+    assert ball.status == "smooth"
+    post = _events(Capsule((11e-3, 2.2e-3, -8e-3), (11e-3, 2.7e-3, 8e-3), 5e-4), 0.4, frames=39)
+    assert post.begun == 1
+    assert post.slipped >= 2
+
+
+@pytest.mark.parametrize(
+    ("change", "close"),
+    [
+        ({"least_force": 1e-7}, "ending"),
+        ({"least_gap": 1e-9}, "beginning"),
+        ({"least_lead": 1e-9}, "passing"),
+        ({"fullest_cone": 1 - 1e-7}, "slipping"),
+        ({"slowest_slip": 1e-8}, "sticking"),
+    ],
+)
+def test_a_contact_close_to_another_state_makes_the_gradient_one_sided(change, close):
+    assert contact_events(SUMMARY, "").status == "smooth"
+    found = contact_events(SUMMARY | change, "")
+    assert found.status == "one-sided"
+    assert found.close == (close,)
+
+
+def test_a_shared_load_and_an_unstable_run_are_told():
+    assert contact_events(SUMMARY | {"degenerate": 3}, "").status == "degenerate"
+    assert contact_events(SUMMARY | {"degenerate": 3}, "the state stopped being finite").status == "unstable"
+
 
 MATERIAL = ("young_modulus", "density", "damping_ratio", "base_radius", "tip_radius", "curvature", "arc_length")
 BASE = ("base.x", "base.y", "base.theta", "base.phi", "base.zeta")
@@ -116,7 +164,7 @@ def test_sizes_of_a_primitive_and_its_own_friction_have_gradients():
     np.testing.assert_allclose(run.tangents()[0].wrench[:, :, 3:].sum(axis=(1, 2)), gradient, rtol=1e-8)
     for p, value in enumerate((5e-4, 0.3)):
         shift = 1e-5 * value * (np.arange(2) == p)
-        high, low = (run.traces_at([5e-4, 0.3] + sign * shift)[0].wrench[:, 3:].sum() for sign in (1, -1))
+        high, low = (traces_at(run, [5e-4, 0.3] + sign * shift)[0].wrench[:, 3:].sum() for sign in (1, -1))
         assert gradient[p] == pytest.approx((high - low) / (2 * shift[p]), rel=1e-3)
 
 
