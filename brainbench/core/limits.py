@@ -109,26 +109,29 @@ def limits_of(cls: type) -> dict[str, Any]:
     Raises:
         TypeError: an annotation cannot be resolved, so that nobody knows its limits.
     """
-    texts: dict[str, tuple[type, Any]] = {}
-    for base in reversed(cls.__mro__):
-        texts |= {name: (base, text) for name, text in vars(base).get("__annotations__", {}).items()}
-    limits = {}
-    for field in fields(cls):
-        if field.name in getattr(cls, "__unresolved__", ()):
-            continue
-        owner, annotation = texts[field.name]
-        if isinstance(annotation, str):
-            try:
-                annotation = eval(annotation, vars(sys.modules[owner.__module__]), dict(vars(owner)))
-            except Exception as error:
-                raise TypeError(
-                    f"The limits of {cls.__module__}.{cls.__qualname__}.{field.name} are unknown, since its annotation "
-                    f"{annotation!r} cannot be resolved: {error}. Import what it names at run time, or, if it has no "
-                    f"limits, name the field in @limited(unresolved=…)."
-                ) from error
-        if checker(annotation) is not None:
-            limits[field.name] = annotation
-    return limits
+    loose = getattr(cls, "__unresolved__", ())
+    kinds = {field.name: annotation_of(cls, field.name) for field in fields(cls) if field.name not in loose}
+    return {name: kind for name, kind in kinds.items() if checker(kind) is not None}
+
+
+def annotation_of(cls: type, name: str) -> Any:
+    """Return the annotation of a field as an object.
+
+    Raises:
+        TypeError: it cannot be resolved.
+    """
+    owner = next(base for base in cls.__mro__ if name in vars(base).get("__annotations__", {}))
+    annotation = owner.__annotations__[name]
+    if not isinstance(annotation, str):
+        return annotation
+    try:
+        return eval(annotation, vars(sys.modules[owner.__module__]), dict(vars(owner)))
+    except Exception as error:
+        raise TypeError(
+            f"The limits of {cls.__module__}.{cls.__qualname__}.{name} are unknown, since its annotation "
+            f"{annotation!r} cannot be resolved: {error}. Import what it names at run time, or, if it has no limits, "
+            f"name the field in @limited(unresolved=…)."
+        ) from error
 
 
 def check_value(name: str, value: Any, annotation: Any) -> None:

@@ -16,7 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.errors import DataError, UsageError, check_once
+from brainbench.core.errors import DataError, UsageError
+from brainbench.core.overrides import read_pairs, with_changes
 from brainbench.core.reading.ranges import check_fields, check_number
 from robotics_bridge import hands
 from robotics_bridge.deploy.driver import HandReading
@@ -31,7 +32,6 @@ from robotics_bridge.physics import MujocoEngine
 from robotics_bridge.policies.contract import PolicyContract
 from robotics_bridge.sensors import SensorSuite
 from robotics_bridge.tasks.contact_model import CONTACTS, ContactModel, set_contacts
-from robotics_bridge.tasks.overrides import set_field
 from robotics_bridge.tasks.scenes import drives_of
 
 HOLD_AFTER = 0.25
@@ -70,12 +70,8 @@ class Faults:
     @classmethod
     def parse(cls, texts: list[str]) -> Faults:
         """Return the faults of texts such as ``drop=0.2``."""
-        check_once("--fault", [text.partition("=")[0].replace("-", "_") for text in texts])
-        faults = cls()
-        for text in texts:
-            name, _, value = text.partition("=")
-            faults = set_field(faults, [name.replace("-", "_")], value)
-        return faults
+        words = [name.replace("-", "_") + sign + value for name, sign, value in (text.partition("=") for text in texts)]
+        return with_changes(cls(), read_pairs(words, "--fault", "drop=0.2"))
 
 
 class SimulatedHand:

@@ -129,20 +129,15 @@ def deploy(
 
 def _inputs(deployed: DeployedPolicy, words: list[str]) -> dict[str, Any]:
     """Return group → its constant, as --input gives them."""
-    from brainbench.core.errors import UsageError, check_each, check_once
+    from brainbench.core.errors import check_each
+    from brainbench.core.overrides import read_pairs, read_value
     from robotics_bridge.deploy.session import constant
 
     wanted = [name for name in deployed.contract.inputs if name != "proprio"]
-    found: dict[str, Any] = {}
-    for word in words:
-        name, _, text = word.partition("=")
-        try:
-            found[name] = [float(number) for number in text.split(",")]
-        except ValueError:
-            raise UsageError(f"An input is NAME=NUMBER or NAME=NUMBER,NUMBER…; received {word[:80]!r}.") from None
-    check_once("--input", [word.partition("=")[0] for word in words])
-    check_each("input that the policy reads and a constant can replace", found, wanted)
-    return {name: constant(name, values, deployed.contract.inputs[name]) for name, values in found.items()}
+    pairs = read_pairs(words, "--input", "command=1,0,0")
+    values = {name: list(read_value(name, text, tuple[float, ...])) for name, text in pairs.items()}
+    check_each("input that the policy reads and a constant can replace", values, wanted)
+    return {name: constant(name, numbers, deployed.contract.inputs[name]) for name, numbers in values.items()}
 
 
 def _remote(text: str, key: Path | None, deployed: DeployedPolicy) -> tuple[Any, Any, Any, bytes]:

@@ -7,12 +7,13 @@ Errors and costs are measured, not assumed: ``fidelity_table.json`` beside this 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from functools import cache
 from importlib import resources
-from typing import Any, Literal
+from typing import Literal
 
-from brainbench.core.errors import UsageError, check_name, check_once, shown
+from brainbench.core.errors import UsageError, check_name, shown
+from brainbench.core.overrides import read_pairs, read_value, with_changes
 from brainbench.core.reading.ranges import check_fields, check_number
 from brainbench.core.tradeoffs import TradeoffPoint, cheapest
 from brainbench.stimuli.whiskers.chain import Chain
@@ -83,18 +84,11 @@ class Fidelity:
         Values stand in SI units, as the fields of this class; ``none`` stands for None. ``auto=0.1`` in place of a
         preset is :meth:`auto`.
         """
-        preset, *changes = (item.strip() for item in text.split(","))
-        names = {item.name: item for item in fields(cls)}
-        values: dict[str, Any] = {}
-        check_once(f"The fidelity {shown(text)}", [change.partition("=")[0].strip() for change in changes])
-        for change in changes:
-            name, _, value = (part.strip() for part in change.partition("="))
-            check_name("fidelity setting", name, names)
-            values[name] = _value(name, value)
+        preset, *words = (word.strip() for word in text.split(","))
+        changes = read_pairs(words, f"The fidelity {shown(text)}", "links=12")
         name, _, error = (part.strip() for part in preset.partition("="))
-        if name == "auto":
-            return replace(cls.auto(error=_value("error", error)), **values)
-        return replace(cls.preset(preset), **values)
+        chosen = cls.auto(error=read_value("error", error, float)) if name == "auto" else cls.preset(preset)
+        return with_changes(chosen, changes)
 
     @classmethod
     def auto(cls, *, error: float = 0.1, share: float = 0.9, backend: str = DEFAULT_ENGINE) -> Fidelity:
@@ -140,20 +134,6 @@ class Fidelity:
                 f"at most {MOST_LINKS} are possible; choose fewer per mm."
             )
         return count
-
-
-def _value(name: str, text: str) -> Any:
-    if text == "none":
-        return None
-    if name in ("precision", "solver"):
-        return text
-    if name == "twist":
-        return {"true": True, "false": False}.get(text.lower(), text)
-    try:
-        return int(text) if name == "links" else float(text)
-    except ValueError as error:
-        kind = "a whole number" if name == "links" else "a number"
-        raise UsageError(f"{name} takes {kind}; received {shown(text)}.") from error
 
 
 FINEST_SINGLE = 1e-6

@@ -13,7 +13,8 @@ from brainbench.cli.options import changed, items, option, refuse, with_options
 from brainbench.cli.output import Output, progress_bar, table_of
 from brainbench.cli.stimuli import scenes
 from brainbench.cli.stimuli.scenes import BackendOption, StimulusOption, WhiskersOption
-from brainbench.core.errors import UsageError, check_once, shown
+from brainbench.core.errors import UsageError, shown
+from brainbench.core.overrides import read_pairs, read_value
 from brainbench.core.plugins import OptionalPart
 from brainbench.stimuli.engines.fidelity import DEFAULT_ENGINE
 
@@ -190,17 +191,8 @@ def _whisker(name: str, scene: Any, known: dict[str, Any]) -> Whisker:
 
 def _pairs(given: str, flag: str, *, text: bool = False) -> dict[str, Any]:
     """Return NAME=VALUE pairs with commas between them; values are numbers, or texts."""
-    found: list[tuple[str, Any]] = []
-    for item in items(given):
-        name, sign, value = item.partition("=")
-        try:
-            found.append((name.strip(), value.strip() if text else float(value)))
-        except ValueError:
-            sign = ""
-        if not sign:
-            raise UsageError(f"{flag} takes NAME=VALUE pairs with commas between them; received {shown(item)}.")
-    check_once(flag, [name for name, _ in found])
-    return dict(found)
+    pairs = read_pairs(items(given), flag, "damping_ratio=0.1")
+    return {name: value if text else read_value(name, value, float) for name, value in pairs.items()}
 
 
 def _span(text: str) -> tuple[float, float]:
