@@ -27,8 +27,7 @@ from brainbench.core.statistics import wilson_interval
 from robotics_bridge import tasks
 from robotics_bridge.deploy.controller import Clock, Report
 from robotics_bridge.deploy.driver import HandReading, LinkCounters
-from robotics_bridge.deploy.session import DeployedPolicy, read_deployed
-from robotics_bridge.deploy.touch import PressureCalibration
+from robotics_bridge.deploy.session import DeployedPolicy, PressureCalibration, read_deployed
 from robotics_bridge.envs.env import Env
 from robotics_bridge.envs.observations import VELOCITY
 from robotics_bridge.policies.evaluate import Policy, evaluate, mean_of_episodes

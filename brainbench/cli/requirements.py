@@ -66,7 +66,6 @@ EXTRAS: dict[str, tuple[Requirement, ...]] = {
     "policy play": (
         replace(_PICTURES, when=_given("video", "strip")), replace(_MP4, when=_ends("video", ".mp4")),
     ),
-    "policy report": (replace(_PICTURES, when=_given("picture")),),
     "policy deploy": (Requirement(("pyarrow",), "board", "Writing a LeRobot data set", _given("record")),),
     "stimuli render": (_PICTURES, replace(_MP4, when=_ends("out", ".mp4"))),
     "stimuli plot": (_PICTURES,),
@@ -82,7 +81,7 @@ EXTRAS: dict[str, tuple[Requirement, ...]] = {
 
 CACHED = (
     "score", "recovery", "train", "stimuli simulate", "stimuli render", "stimuli plot", "stimuli separability",
-    "stimuli hand", "tactile demo", "tactile bench", "policy play", "policy train", "policy evaluate", "policy distill",
+    "tactile demo", "tactile bench", "policy play", "policy train", "policy evaluate", "policy distill",
     "tradeoff score", "tradeoff model", "leaderboard add", "leaderboard verify",
 )  # fmt: skip
 """Commands that keep what they compute in the cache."""

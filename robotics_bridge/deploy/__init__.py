@@ -1,7 +1,6 @@
-"""Policies on hands: drivers, safety, the control loop, recorded episodes.
+"""Policies on hands: what a hand offers, the safety of the way to it, the control loop.
 
-``driver`` says what a hand offers, ``udp`` speaks to one over a socket, ``simulated_hand`` stands behind that socket.
-``session`` builds a ``controller`` from an exported policy; it reads the hand, makes observations (``touch`` of what
-the hand measures, ``ShadowTouch`` of what it does not), checks ``safety`` and ``timing``, and sends targets.
-``episodes`` are written for LeRobot.
+``driver`` says what a hand offers and lets only safe and fresh commands pass. ``session`` builds a ``controller`` from
+an exported policy: it reads the hand, makes observations (touch among them), decides, and sends targets. Drivers come
+from entry points, such as those of the optional room ``links``.
 """

@@ -5,10 +5,14 @@ A stop is final for the session: the hand holds where it is, and the reason is k
 
 from __future__ import annotations
 
+import contextlib
+import gc
 import logging
 import math
+import os
 import time
-from collections.abc import Callable, Mapping
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,27 +21,90 @@ from numpy.typing import NDArray
 
 from brainbench.core.errors import UsageError, check_each
 from brainbench.core.reading.ranges import check_number
-from robotics_bridge.deploy.driver import Driver, HandReading, Source
-from robotics_bridge.deploy.safety import ClockOffset, SafetyLimits
-from robotics_bridge.deploy.timing import LatencyHistogram, RateMonitor
+from robotics_bridge.deploy.driver import Clock, Driver, HandReading, Source
+from robotics_bridge.deploy.safety import SafeLink, SafetyLimits
 from robotics_bridge.envs import ActionMap
 from robotics_bridge.envs.observations import VELOCITY
 from robotics_bridge.policies.contract import RATE, PolicyContract
 from robotics_bridge.policies.runners import Runner
 
+PRIORITY = 20
+"""Priority under SCHED_FIFO (1–99); above ordinary threads, below the kernel's own (50)."""
+
+
+@contextlib.contextmanager
+def realtime() -> Iterator[None]:
+    """Run the calling thread ahead of all ordinary ones (SCHED_FIFO) and without garbage collection, until it leaves.
+
+    Processes that it starts meanwhile are ordinary. A loop that never sleeps would keep a processor to itself.
+    """
+    if not hasattr(os, "SCHED_FIFO"):
+        raise UsageError("Real-time scheduling is Linux's; leave realtime out on this system.")
+    before, parameters, collecting = os.sched_getscheduler(0), os.sched_getparam(0), gc.isenabled()
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(PRIORITY))
+    except PermissionError as error:
+        raise UsageError(
+            f"This user may not run threads at real-time priority {PRIORITY}; allow it with the line "
+            f"'{os.environ.get('USER', 'USER')} - rtprio {PRIORITY}' in /etc/security/limits.conf, or leave realtime "
+            "out."
+        ) from error
+    gc.disable()
+    try:
+        yield
+    finally:
+        os.sched_setscheduler(0, before, parameters)
+        if collecting:
+            gc.enable()
+
+
+class LatencyHistogram(list[float]):
+    """Durations of ticks (s) in logarithmic buckets, 10 per decade from 10 µs to 10 s. Percentiles are exact."""
+
+    EDGES = np.logspace(-5, 1, 61)
+    """[61] (s)."""
+
+    def summary(self) -> dict[str, Any]:
+        """Return the number of ticks, percentiles and the longest in milliseconds; NaN without any."""
+        parts = {f"p{share:g}": 1e3 * float(np.percentile(self or [math.nan], share)) for share in (50, 90, 99, 99.9)}
+        return {"ticks": len(self), **parts, "max": 1e3 * max(self, default=math.nan)}
+
+    def text(self, width: int = 40) -> str:
+        """Return the histogram as lines of text, without empty ends."""
+        # Durations below each edge, and beyond the last.
+        counts = np.bincount(np.searchsorted(self.EDGES, self, side="right"), minlength=len(self.EDGES) + 1)
+        used = np.flatnonzero(counts)
+        if not len(used):
+            return "no ticks"
+        lines = []
+        for bucket in range(used[0], used[-1] + 1):
+            top = f"{1e3 * self.EDGES[bucket]:8.3g} ms" if bucket < len(self.EDGES) else "    more    "
+            bar = "█" * round(width * counts[bucket] / counts.max())
+            lines.append(f"< {top} {counts[bucket]:6d} {bar}")
+        return "\n".join(lines)
+
+
+class RateMonitor:
+    """The rate of ticks [Hz] over a sliding window (s), beside a nominal one."""
+
+    def __init__(self, rate: float, window: float = 1.0) -> None:
+        self.rate, self.window = rate, window
+        self._times: deque[float] = deque()
+        self._begun: float | None = None
+
+    def tick(self, now: float) -> float:
+        """Count a tick; return the rate over the window [Hz], the nominal one until a window has passed."""
+        # A window that is not full yet would count too few ticks and stop every session at its beginning.
+        self._begun = now if self._begun is None else self._begun
+        self._times.append(now)
+        while self._times and self._times[0] <= now - self.window:
+            self._times.popleft()
+        if now - self._begun < self.window:
+            return self.rate
+        return len(self._times) / self.window
+
+
 _log = logging.getLogger(__name__)
-
-
-class Clock:
-    """The time of a control loop; tests have one of their own."""
-
-    def __call__(self) -> float:
-        """Return the time (s)."""
-        return time.monotonic()
-
-    def sleep(self, seconds: float) -> None:
-        """Wait."""
-        time.sleep(seconds)
 
 
 @dataclass
@@ -80,7 +147,7 @@ class Controller:
         contract: What the policy reads and moves, and how often.
         limits: One of each kind per joint of the driver, in its order.
         sources: Group → what gives it, for groups other than ``proprio``: for ``tactile`` a
-            :class:`~robotics_bridge.deploy.touch.RealTouch`.
+            :class:`~robotics_bridge.deploy.session.RealTouch`.
         clock: Tells the time and waits.
         record: Called after each tick with (reading, groups, action, targets [J]).
     """
@@ -97,8 +164,10 @@ class Controller:
         record: Callable[..., None] | None = None,
     ) -> None:
         self.run_policy, self.driver, self.contract, self.limits = run, driver, contract, limits
+        self.clock = clock or Clock()
+        self.link = SafeLink(driver, limits, self.clock)
         check_number("control steps per second", contract.rate, least=RATE[0], most=RATE[1])
-        self.rate, self.sources, self.clock, self.record = contract.rate, dict(sources or {}), clock or Clock(), record
+        self.rate, self.sources, self.record = contract.rate, dict(sources or {}), record
         if missing := [name for name in contract.inputs if name not in {"proprio", *self.sources}]:
             raise UsageError(f"The policy reads the group {missing[0]!r}, and nothing here gives it.")
         check_each("group of a policy with a source", self.sources, {*contract.inputs} - {"proprio"})
@@ -111,7 +180,7 @@ class Controller:
         self._order = [driver.joints.index(name) for name in contract.joints]
         self._action = np.zeros(len(contract.moved), np.float32)
         self._targets: NDArray[np.float64] | None = None
-        self._offset, self._monitor = ClockOffset(), RateMonitor(self.rate, limits.rate_window)
+        self._monitor = RateMonitor(self.rate, limits.rate_window)
         self.latency, self.processor = LatencyHistogram(), LatencyHistogram()
         self.limited = self.overruns = self.ticks = 0
 
@@ -126,7 +195,7 @@ class Controller:
             due = start
             while reason is None and self.clock() - start < seconds:
                 before = self.clock()
-                reason = self._tick(before)
+                reason = self._tick()
                 spent = self.clock() - before
                 self.overruns += spent > 1 / self.rate
                 # Due times lie on a fixed raster, so late ticks do not lower the rate; after a long stall at most one
@@ -135,7 +204,7 @@ class Controller:
                 self.clock.sleep(max(0.0, due - self.clock()))
         finally:
             # Whatever happened, an exception included: the hand holds.
-            self.driver.stop()
+            self.link.stop()
             if reason:
                 _log.warning("Safe stop: %s.", reason)
         elapsed = self.clock() - begun
@@ -147,19 +216,18 @@ class Controller:
 
     def _wait(self) -> str | None:
         start = self.clock()
-        while self.driver.read() is None:
+        while self.link.read() is None:
             if self.clock() - start > self.limits.start_timeout:
                 return f"the hand said nothing for {self.limits.start_timeout:g} s"
             self.clock.sleep(0.005)
         return None
 
-    def _tick(self, now: float) -> str | None:
-        busy = time.thread_time()
-        reading = self.driver.read()
+    def _tick(self) -> str | None:
+        begun, busy = self.clock(), time.thread_time()
+        reading = self.link.read()
         if reading is None:
             return "the hand gave no report"
-        reason = self.limits.fault(reading, self._offset.age(reading.time, reading.arrived, now))
-        rate = self._monitor.tick(now)
+        reason, rate = self.link.fault(reading), self._monitor.tick(begun)
         if reason is None and rate < self.limits.rate_share * self.rate:
             reason = f"control runs at {rate:.1f} Hz instead of {self.rate:g}"
         if reason is not None:
@@ -178,11 +246,10 @@ class Controller:
         self._action = action.astype(np.float32)
         moved = zip(self.contract.moved, self.actions.targets(action).tolist(), strict=True)
         targets = self._limit({**self.contract.frozen, **dict(moved)}, reading)
-        # The last look before anything moves, whatever the parts before it did.
-        if not self.limits.allows(targets):
-            return "a command would be no numbers or beyond the joints' limits"
-        self.driver.send(targets)
-        self.latency.append(self.clock() - now)
+        # Whatever took its time since the report was read: sources, the policy, or this computer.
+        if (reason := self.link.send(targets, reading)) is not None:
+            return reason
+        self.latency.append(self.clock() - begun)
         self.processor.append(time.thread_time() - busy)
         self.ticks += 1
         if self.record is not None:

@@ -1,13 +1,20 @@
-"""The interface of a robot hand that runs a policy. Radians, seconds; pressure in the maker's unit."""
+"""The interface of a robot hand that runs a policy, and where drivers come from. Radians, seconds."""
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+
+from brainbench.core.errors import unknown_name
+from brainbench.core.plugins import load_optional, optional_parts
+from robotics_bridge.policies.contract import PolicyContract
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,3 +82,46 @@ class Driver(Protocol):
     def close(self) -> None:
         """End the connection."""
         ...
+
+
+class Clock:
+    """The time of a control loop; tests have one of their own."""
+
+    def __call__(self) -> float:
+        """Return the time (s)."""
+        return time.monotonic()
+
+    def sleep(self, seconds: float) -> None:
+        """Wait."""
+        time.sleep(seconds)
+
+
+@dataclass(frozen=True, kw_only=True)
+class DriverRequest:
+    """What a driver is opened for."""
+
+    contract: PolicyContract
+    """Contract of the policy that is to move the hand."""
+    address: str = ""
+    """Where the hand is, as HOST:PORT or :PORT."""
+    key: Path | None = None
+    """File with the key that the hand holds too."""
+    faults: tuple[str, ...] = ()
+    """Faults of a simulated hand, as ``drop=0.2``."""
+    seconds: float = 60.0
+    """For how long the hand is needed."""
+
+
+def open_driver(name: str, request: DriverRequest) -> AbstractContextManager[Driver]:
+    """Return the connection to a hand, not yet opened, by an entry point of :data:`DRIVERS`.
+
+    An entry point is a function of a :class:`DriverRequest`, which checks it and returns a context manager.
+    """
+    opener = load_optional(DRIVERS, name, "driver")
+    if opener is None:
+        raise unknown_name("driver of a hand", name, optional_parts(DRIVERS), hint="Or HOST:PORT, or :PORT.")
+    return opener(request)
+
+
+DRIVERS = "robotics_bridge.drivers"
+"""Group of entry points: name → opener of a driver."""

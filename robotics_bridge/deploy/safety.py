@@ -1,4 +1,7 @@
-"""Limits of safety: when a hand must stop, and what it may be asked for. Radians, seconds."""
+"""Limits of safety, and the one way to a hand on which they are checked. Radians, seconds.
+
+Limits, finiteness and age are checked where a command is sent, after all that could take time.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +13,7 @@ from numpy.typing import NDArray
 
 from brainbench.core.errors import UsageError, check_each
 from brainbench.core.reading.ranges import check_fields
-from robotics_bridge.deploy.driver import HandReading
+from robotics_bridge.deploy.driver import Clock, Driver, HandReading
 from robotics_bridge.hands import Hand
 
 LIMITS = {
@@ -118,3 +121,42 @@ class ClockOffset:
         self._least = min(self._least + DRIFT * max(0.0, now - self._asked), arrived - stamp)
         self._asked = now
         return now - stamp - self._least
+
+
+class SafeLink:
+    """The one way to a hand, which lets no command pass that is unsafe or comes from an old report.
+
+    ``driver`` is the hand, ``clock`` that by which its reports are stamped when they arrive.
+    """
+
+    def __init__(self, driver: Driver, limits: SafetyLimits, clock: Clock) -> None:
+        self._driver, self._limits, self._clock = driver, limits, clock
+        self._offset = ClockOffset()
+
+    def read(self) -> HandReading | None:
+        """Return the newest report, or None before the first."""
+        return self._driver.read()
+
+    def fault(self, reading: HandReading) -> str | None:
+        """Return why a report must not be acted upon now, in words; None if it may."""
+        return self._limits.fault(reading, self._age(reading))
+
+    def send(self, targets: NDArray[np.float64], reading: HandReading) -> str | None:
+        """Send the targets [J] that were decided from a report; return why they were not sent, or None."""
+        if not self._limits.allows(targets):
+            return "a command would be no numbers or beyond the joints' limits"
+        # Measured last: all that happened since the report was read counts, and the hand has moved on meanwhile.
+        if (age := self._age(reading)) > self._limits.timeout:
+            return (
+                f"a command came {1e3 * age:.0f} ms after the report it was decided from (allowed "
+                f"{1e3 * self._limits.timeout:.0f} ms)"
+            )
+        self._driver.send(targets)
+        return None
+
+    def stop(self) -> None:
+        """Tell the hand to hold where it is."""
+        self._driver.stop()
+
+    def _age(self, reading: HandReading) -> float:
+        return self._offset.age(reading.time, reading.arrived, self._clock())

@@ -1,5 +1,5 @@
 """Hands that explore objects: recorded touch that any encoder can be scored or probed on.
 
-``procedures`` are the movements (Lederman & Klatzky 1987), ``record`` moves objects against a hand and keeps what its
-taxels feel, as the encoder's input and as a stimulus set.
+``record`` moves objects against a hand (Lederman & Klatzky 1987) and keeps what its taxels feel, as the encoder's input
+and as a stimulus set. An optional room with its own command.
 """

@@ -1,9 +1,8 @@
-"""``brainbench policy distill|sweep|report|export|deploy``."""
+"""``brainbench policy distill|sweep|export|deploy``."""
 
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
 
 import pytest
 from typer.testing import CliRunner
@@ -13,8 +12,6 @@ from brainbench.core.errors import BrainbenchError, UsageError
 from brainbench.core.files import write_json
 from robotics_bridge import hands
 from robotics_bridge.hands.layouts import write_probes
-from robotics_bridge.policies.training.distill_config import DistillConfig
-from robotics_bridge.tasks.task import TASK_VERSION
 from tests.factories.policies import export_small
 
 
@@ -36,41 +33,9 @@ def test_sweep_counts_table_4_10() -> None:
         _run("sweep", "--shard", "4/4")
 
 
-def test_report_prints_a_table_and_writes_records(tmp_path) -> None:
-    for seed in range(3):
-        config = DistillConfig(task="screwdriver", observe="bool", seed=seed)
-        write_json(tmp_path / config.name / "config.json", {"distill": asdict(config), "task_version": TASK_VERSION})
-        found = [{"seed": 0, "success": [1.0, 0.0, 1.0 * (seed > 0), 1.0], "metric": [1.0] * 4}]
-        write_json(tmp_path / config.name / "evaluation.json", found)
-    text = _run("report", tmp_path, "--records", tmp_path / "records", "--picture", tmp_path / "report.png")
-    assert "0.667" in text
-    assert len(list((tmp_path / "records").glob("*.json"))) == 1
-    assert (tmp_path / "report.png").stat().st_size > 5000
-
-
-def test_report_tests_students_against_each_other_beyond_the_spread_of_seeds(tmp_path) -> None:
-    given = {"bool": (0.75, 0.7), "none": (0.25, 0.3, 0.2), "force": (0.7, 0.75)}
-    for observe, shares in given.items():
-        for seed, share in enumerate(shares):
-            config = DistillConfig(task="screwdriver", observe=observe, seed=seed)
-            write_json(
-                tmp_path / config.name / "config.json", {"distill": asdict(config), "task_version": TASK_VERSION}
-            )
-            found = [{"seed": 0, "success": [float(index < 20 * share) for index in range(20)]}]
-            write_json(tmp_path / config.name / "evaluation.json", found)
-    pairs = json.loads(_run("report", tmp_path, "--differences", "--json"))["differences"]
-    assert len(pairs) == 3
-    assert [item["degrees_of_freedom"] for item in pairs] == pytest.approx([4] * 3)
-    clear = {frozenset((item["first"], item["second"])) for item in pairs if item["p"] < 0.01}
-    assert len(clear) == 2
-    assert all("none" in names for names in clear)
-    text = _run("report", tmp_path, "--differences")
-    assert "First less second" in text
-    with pytest.raises(UsageError, match="one training seed"):
-        _run("report", next(tmp_path.glob("*none_seed0")), "--differences")
-
-
 TOLD = ("--input", "command=1")
+
+
 SHORT = ("--seconds", 2, *TOLD)
 
 
@@ -104,8 +69,8 @@ def test_deploy_asks_for_what_is_missing_before_a_hand_is_started(tmp_path, monk
     def started(*_: object, **__: object) -> None:
         pytest.fail("a hand was started")
 
-    monkeypatch.setattr("robotics_bridge.deploy.simulated_hand.simulated_hand", started)
-    monkeypatch.setattr("robotics_bridge.deploy.udp.UdpDriver", started)
+    monkeypatch.setattr("robotics_bridge.deploy.links.simulated_hand.simulated_hand", started)
+    monkeypatch.setattr("robotics_bridge.deploy.links.udp.UdpDriver", started)
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "file").touch()
     refused = [
@@ -130,7 +95,7 @@ def test_deploy_asks_for_what_is_missing_before_a_hand_is_started(tmp_path, monk
 
 
 @pytest.mark.slow
-def test_a_student_is_distilled_evaluated_exported_and_reported(tmp_path) -> None:
+def test_a_student_is_distilled_evaluated_and_exported(tmp_path) -> None:
     teacher = tmp_path / "teacher"
     _run("train", "in_palm_rotate", "--out", teacher, "--envs", 2, "--iterations", 1, "--steps", 4)
     common = ("--teacher", teacher, "--envs", 2, "--iterations", 1, "--episodes", 2)
@@ -142,21 +107,6 @@ def test_a_student_is_distilled_evaluated_exported_and_reported(tmp_path) -> Non
     )
     assert (found["status"], found["episodes"]) == ("finished", 6)
     assert json.loads(_run("export", run, "--json"))["difference"] < 1e-4
-    assert "agg_bool" in _run("report", tmp_path / "students")
-
-
-def test_a_probe_feels_as_its_student_does(tmp_path, monkeypatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    teacher, small = ("--teacher", "in_palm_rotate.teacher"), ("--envs", 2, "--iterations", 1, "--episodes", 0)
-    senses = ("--noisy", "--placement", "tips", "--resolution", "low", "--encoder", "rnn", "--units", 4)
-    _run("distill", "in_palm_rotate", *teacher, *small, *senses, "--out", "run")
-    felt = []
-    monkeypatch.setattr("robotics_bridge.policies.readouts.probe.probe", lambda env, *_: felt.append(env.options) or [])
-    for name, noisy in (("run", True), ("in_palm_rotate.teacher", False)):
-        assert json.loads(_run("probe", "in_palm_rotate", "--agent", name, "--envs", 2, "--json"))["noisy"] is noisy
-    assert [(one.noisy, one.placement, one.resolution) for one in felt] == [
-        (True, "tips", "low"), (False, "hand", "med"),
-    ]  # fmt: skip
 
 
 @pytest.mark.slow

@@ -3,27 +3,21 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from brainbench.core.files import write_json
 from robotics_bridge import hands, tasks
-from robotics_bridge.deploy.frames import KEY, read_key
-from robotics_bridge.deploy.simulated_hand import Faults
+from robotics_bridge.deploy.links.frames import KEY, read_key
+from robotics_bridge.deploy.links.simulated_hand import Faults
 from robotics_bridge.hands.layouts import read_probes, write_probes
 from robotics_bridge.policies.contract import PolicyContract
-from robotics_bridge.policies.report.results import AGENTS, EVALUATION, read_agents, read_results
-from robotics_bridge.policies.report.tables import agent_rows, rows
-from robotics_bridge.policies.training.distill_config import DistillConfig
 from robotics_bridge.policies.training.student_files import load_student
 from robotics_bridge.policies.training.sweep import StudentSweep, read_sweep
 from robotics_bridge.sensors.calibration.log import read_log
 from robotics_bridge.sensors.noise.model import Noise
 from robotics_bridge.tasks.overrides import apply_overrides
-from robotics_bridge.tasks.task import TASK_VERSION
 from tests.factories.policies import contract_of, student_folder
 from tests.factories.reading_trials import Surface, not_finite, numbers, typed, written, written_json
 
@@ -158,34 +152,6 @@ def _bad_sweep(sweep: StudentSweep) -> bool:
     )
 
 
-def _evaluation(folder: Path) -> Path:
-    config = DistillConfig(task="in_palm_rotate")
-    write_json(folder / "config.json", {"distill": asdict(config), "task_version": TASK_VERSION})
-    found = {"seed": 0, "success": [1.0, 0.0, 1.0], "goals": [2.0, None, 3.5], "iterations": 30}
-    return write_json(folder / EVALUATION, [found, {**found, "seed": 1}])
-
-
-def _read_evaluation(path: Path) -> Any:
-    (result,) = read_results([path.parent])
-    rows([result])
-    return result
-
-
-def _bad_agents(found: Any) -> bool:
-    return not_finite(found) or any(not 0 <= n <= 1 for item in found for n in numbers(item["success_interval"]))
-
-
-def _bad_result(result: Any) -> bool:
-    known = [value for value, _ in result.graded.values()]
-    return not 0 <= result.value <= 1 or not_finite(known) or min(result.learned) < 0
-
-
-def _read_agents(path: Path) -> Any:
-    found = read_agents([path.parent])
-    agent_rows(found)
-    return found
-
-
 def _key(folder: Path) -> Path:
     path = folder / "hand.key"
     path.write_text("0f" * KEY)
@@ -214,7 +180,5 @@ ROBOTS = (
     Surface("student, configuration", _student("config.json"), _load_student, not_finite),
     Surface("student, weights", _student("model.safetensors"), _load_student, not_finite),
     Surface("sweep of students", written("students.toml", STUDENTS), read_sweep, _bad_sweep),
-    Surface("evaluations of a student", _evaluation, _read_evaluation, _bad_result),
-    Surface("evaluated agents", written_json(AGENTS, [AGENT, AGENT]), _read_agents, _bad_agents),
     Surface("key of a hand", _key, read_key, lambda key: len(key) != KEY),
 )

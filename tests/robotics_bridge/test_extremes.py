@@ -12,12 +12,11 @@ from brainbench.core.errors import UsageError
 from robotics_bridge import hands, tasks
 from robotics_bridge.deploy.controller import Clock, Controller
 from robotics_bridge.deploy.driver import HandReading, LinkCounters
-from robotics_bridge.deploy.frames import new_key
+from robotics_bridge.deploy.links.frames import new_key
+from robotics_bridge.deploy.links.simulated_hand import Faults
+from robotics_bridge.deploy.links.udp import UdpDriver
 from robotics_bridge.deploy.safety import LIMITS, SafetyLimits
-from robotics_bridge.deploy.session import constant
-from robotics_bridge.deploy.simulated_hand import Faults
-from robotics_bridge.deploy.touch import PressureCalibration
-from robotics_bridge.deploy.udp import UdpDriver
+from robotics_bridge.deploy.session import PressureCalibration, constant
 from robotics_bridge.hands.scenes import holding
 from robotics_bridge.physics import Geometry, HandState, MujocoEngine
 from robotics_bridge.policies.contract import PolicyContract

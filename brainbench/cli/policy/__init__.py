@@ -5,7 +5,7 @@ from __future__ import annotations
 import typer
 
 from brainbench.cli.output import list_without_command
-from brainbench.cli.policy import deploy, play, probe, report, train
+from brainbench.cli.policy import deploy, play, train
 
 app = typer.Typer(help="Dexterous tasks of robot hands: play, train, evaluate, deploy.")
 app.command("tasks")(play.list_tasks)
@@ -14,10 +14,8 @@ for _command in (
     play.play,
     train.train,
     play.evaluate,
-    probe.probe,
     train.distill,
     train.sweep,
-    report.report,
     deploy.export,
     deploy.deploy,
 ):

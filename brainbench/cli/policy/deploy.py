@@ -15,6 +15,10 @@ if TYPE_CHECKING:
     from robotics_bridge.deploy.session import DeployedPolicy
 
 
+LINKS = "robotics_bridge.links"
+"""Entry points of what a hand's link adds: touch simulated beside it, and recorders of sessions."""
+
+
 def export(
     run: Annotated[Path, typer.Argument(help="A shipped student, or a folder of brainbench policy distill.")],
     out: Annotated[
@@ -71,52 +75,44 @@ def deploy(
 
     Exit status 1: it was stopped for safety.
     """
-    from brainbench.core.errors import UsageError
+    from brainbench.core.plugins import load_optional
     from robotics_bridge.deploy import session
-    from robotics_bridge.deploy.controller import check_duration
-    from robotics_bridge.deploy.episodes import SessionRecorder, check_folder
-    from robotics_bridge.deploy.simulated_hand import Faults, ShadowTouch, simulated_hand
-    from robotics_bridge.deploy.timing import realtime
-    from robotics_bridge.deploy.udp import UdpDriver
+    from robotics_bridge.deploy.controller import check_duration, realtime
+    from robotics_bridge.deploy.driver import DriverRequest, open_driver
     from robotics_bridge.tasks.contact_model import contacts_name
 
     deployed = session.read_deployed(policy)
     contract = deployed.contract
     check_duration(seconds)
-    if record is not None:
-        check_folder(record, contract.rate)
-    faults = Faults.parse(fault or [])
+    recorder = None if record is None else load_optional(LINKS, "lerobot", "recorder")(contract, record)
+    shadow_touch = load_optional(LINKS, "shadow", "touch") if shadow else None
     given = _inputs(deployed, inputs or [])
-    contacts = contract.more["contacts"]
-    if fault and driver != "sim":
-        raise UsageError("--fault is of the simulated hand; a hand behind a socket has faults of its own.")
-    remote = None if driver == "sim" else _remote(driver, key, deployed)
     # What is missing is said before a hand is started or greeted.
-    beside = f"simulated beside the hand, {contacts_name(contacts)} contacts"
-    told = {
+    opened = open_driver(
+        "udp" if ":" in driver else driver,
+        DriverRequest(contract=contract, address=driver, key=key, faults=tuple(fault or ()), seconds=seconds + 60),
+    )
+    beside = f"simulated beside the hand, {contacts_name(contract.more['contacts'])} contacts"
+    unmeasured = {
         name: f"{what}: {beside if shadow and name == 'tactile' else 'constant'}"
         for name, what in deployed.require({*given, *(("tactile",) if shadow else ())}).items()
     }
-    with contextlib.ExitStack() as stack:
-        simulated = simulated_hand(contract.hand, contacts=contacts, faults=faults, seconds=seconds + 60)
-        address, joints, fingers, secret = remote or stack.enter_context(simulated)
-        link = stack.enter_context(UdpDriver(address, joints, fingers, secret))
-        recorder = SessionRecorder(contract, fingers) if record is not None else None
-        fallback = ShadowTouch(contract, joints) if shadow else given.pop("tactile", None)
+    with opened as link:
+        fallback = shadow_touch(contract, link.joints) if shadow_touch is not None else given.pop("tactile", None)
         controller = deployed.controller(
             link, limits={"timeout": timeout, "pressure": pressure}, sources=given, fallback=fallback,
-            threads=threads, record=recorder,
+            threads=threads, record=None if recorder is None else recorder.begin(link.joints, link.fingers),
         )  # fmt: skip
         with realtime() if ahead else contextlib.nullcontext():
             report = controller.run(seconds)
-    facts: dict[str, Any] = {**vars(report), "unmeasured": told}
-    if record is not None and recorder is not None and recorder.frames:
-        facts["episode"] = str(recorder.write(record, joints))
+    facts: dict[str, Any] = {**vars(report), "unmeasured": unmeasured}
+    if recorder is not None and (episode := recorder.write()) is not None:
+        facts["episode"] = str(episode)
     reason = f" ({report.reason})" if report.reason else ""
     latency = report.latency
-    unmeasured = "".join(f"not measured by the hand: {name} ({what})\n" for name, what in told.items())
+    absent = "".join(f"not measured by the hand: {name} ({what})\n" for name, what in unmeasured.items())
     text = (
-        f"{unmeasured}{report.status}{reason}: {report.ticks} ticks in {report.seconds:.1f} s\n"
+        f"{absent}{report.status}{reason}: {report.ticks} ticks in {report.seconds:.1f} s\n"
         f"control tick: p50 {latency['p50']:.2f} ms, p99 {latency['p99']:.2f} ms, max {latency['max']:.2f} ms; "
         f"{report.overruns} longer than a control step\n"
         f"reports: {report.link['received']} received, {report.link['lost']} lost, {report.link['late']} late, "
@@ -138,17 +134,3 @@ def _inputs(deployed: DeployedPolicy, words: list[str]) -> dict[str, Any]:
     values = {name: list(read_value(name, text, tuple[float, ...])) for name, text in pairs.items()}
     check_each("input that the policy reads and a constant can replace", values, wanted)
     return {name: constant(name, numbers, deployed.contract.inputs[name]) for name, numbers in values.items()}
-
-
-def _remote(text: str, key: Path | None, deployed: DeployedPolicy) -> tuple[Any, Any, Any, bytes]:
-    from brainbench.core.errors import UsageError
-    from robotics_bridge import hands
-    from robotics_bridge.deploy.frames import read_key
-
-    host, _, port = text.rpartition(":")
-    if not (port.isascii() and port.isdigit() and 0 < int(port[:6]) < 65536):
-        raise UsageError(f"A driver is 'sim', HOST:PORT, or :PORT on this computer; received {text[:80]!r}.")
-    if key is None:
-        raise UsageError("A hand behind a socket needs --key FILE: the key that its computer holds too.")
-    hand = hands.load(deployed.contract.hand)
-    return (host, int(port)), hand.joints, tuple(hand.fingers), read_key(key)

@@ -10,7 +10,7 @@ import typer
 
 from brainbench.cli.destinations import out_folder, out_folder_option
 from brainbench.cli.options import part_of, with_options
-from brainbench.cli.output import Output, facts, progress_bar, table
+from brainbench.cli.output import Output, facts, progress_bar, table, table_of
 from brainbench.cli.policy.options import DeviceOption, TaskArgument, TaskFileOption, World, in_world, read_task_file
 
 
@@ -116,17 +116,16 @@ def distill(
         student = train_student(
             config, folder, device=device, episodes=episodes, stop_after=stop_after, stop_at=stop_at, progress=progress
         )
-    success = [value for item in student.evaluations for value in item["success"]]
-    told = {
+    result = {
         "folder": str(student.folder),
         **{name: getattr(student.result, name) for name in ("status", "reason", "iterations", "loss")},
-        "success": sum(success) / len(success) if success else None,
-        "episodes": len(success),
+        "success": student.success,
+        "episodes": sum(len(evaluation["success"]) for evaluation in student.evaluations),
         "seconds": round(student.result.seconds, 1),
     }
-    lines = [f"{key}: {value}" for key, value in told.items() if value not in ("", None)]
+    lines = [f"{key}: {value}" for key, value in result.items() if value not in ("", None)]
     failure = typer.Exit(1) if student.result.status == "diverged" else None
-    return Output(told, "\n".join(lines), failure=failure)
+    return Output(result, "\n".join(lines), failure=failure)
 
 
 def sweep(
@@ -143,7 +142,8 @@ def sweep(
     task_file: TaskFileOption = None,
 ) -> Output:
     """Distil every student of a sweep that is not finished yet; what was interrupted goes on."""
-    from robotics_bridge.policies.training.students import is_done, train_student
+    from brainbench.core.files import read_json
+    from robotics_bridge.policies.training.students import EVALUATION, is_done, success_of, train_student
     from robotics_bridge.policies.training.sweep import PUBLISHED, read_sweep
 
     read_task_file(task_file)
@@ -165,9 +165,20 @@ def sweep(
     for student in students:
         folder = out / student.name
         if is_done(student, folder):
-            results.append({"student": student.name, "status": "there already"})
+            results.append(
+                {
+                    "student": student.name,
+                    "status": "there already",
+                    "success": success_of(read_json(folder / EVALUATION)),
+                }
+            )
             continue
         with progress_bar() as progress:
             done = train_student(student, folder, device=device, episodes=episodes, progress=progress)
-        results.append({"student": student.name, "status": done.result.status})
-    return Output(results, "\n".join(f"{item['student']}: {item['status']}" for item in results))
+        results.append({"student": student.name, "status": done.result.status, "success": done.success})
+    columns = {
+        "student": "{0[student]}",
+        "status": "{0[status]}",
+        ">success": lambda row: "–" if row["success"] is None else f"{row['success']:.3f}",
+    }
+    return Output(results, table_of("", results, columns))

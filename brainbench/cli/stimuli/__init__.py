@@ -8,7 +8,7 @@ from __future__ import annotations
 import typer
 
 from brainbench.cli.output import list_without_command
-from brainbench.cli.stimuli import draw, hand, objects, scenes, simulate, sweep
+from brainbench.cli.stimuli import draw, objects, scenes, simulate, sweep
 
 app = typer.Typer(help="Simulate whiskers on objects; look at scenes and forces.")
 app.command("list")(scenes.list_)
@@ -21,6 +21,5 @@ for _command in (
     draw.render,
     draw.plot,
     objects.objects,
-    hand.hand,
 ):
     app.command(_command.__name__)(_command)

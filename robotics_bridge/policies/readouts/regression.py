@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.special import stdtrit
 
-from robotics_bridge.policies.readouts.rollout import TARGETS
+from robotics_bridge.policies.readouts.features import TARGETS
 
 FOLDS = 5
 FARTHEST = 10.0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,6 @@ from robotics_bridge.policies.encoders.calibration import HandCalibration
 from robotics_bridge.policies.encoders.timing import CONTROL_SUB_STEP
 from robotics_bridge.policies.evaluate import Policy, evaluate
 from robotics_bridge.policies.fit import with_contacts_of
-from robotics_bridge.policies.report.results import EVALUATION, GRADED
 from robotics_bridge.policies.shipped import list_policies
 from robotics_bridge.policies.training.distill import DistillResult, distill
 from robotics_bridge.policies.training.distill_config import DistillConfig
@@ -28,6 +28,10 @@ from robotics_bridge.tasks.contact_model import CONTACTS, contacts_name
 
 _log = logging.getLogger(__name__)
 
+EVALUATION = "evaluation.json"
+"""File of a student's evaluations."""
+GRADED = ("metric", "goals", "turn_rate", "seconds", "returns", "dropped")
+"""Quantities of an episode beside its success."""
 SEEDS = (1000, 1001, 1002)
 """Seeds of the environments in which students are evaluated; none of them is one of training."""
 _CALIBRATION_STEPS, _CALIBRATION_ENVS = 80, 64
@@ -42,6 +46,17 @@ class Student:
     result: DistillResult
     evaluations: tuple[dict[str, Any], ...]
     """One per evaluation seed; empty when none was asked for, or the run diverged."""
+
+    @property
+    def success(self) -> float | None:
+        """Share of successful episodes; None without any."""
+        return success_of(self.evaluations)
+
+
+def success_of(evaluations: Sequence[Mapping[str, Any]]) -> float | None:
+    """Return the share of successful episodes of some evaluations; None without any."""
+    episodes = [value for evaluation in evaluations for value in evaluation["success"]]
+    return sum(episodes) / len(episodes) if episodes else None
 
 
 def train_student(

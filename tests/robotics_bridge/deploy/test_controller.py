@@ -2,19 +2,59 @@
 
 from __future__ import annotations
 
+import gc
+import itertools
+import os
 import re
+from collections import Counter
+from collections.abc import Callable
 
 import numpy as np
 import pytest
 
 from brainbench.core.errors import UsageError
 from robotics_bridge import hands
-from robotics_bridge.deploy.controller import Clock, Controller
+from robotics_bridge.deploy.controller import PRIORITY, Clock, Controller, LatencyHistogram, RateMonitor, realtime
 from robotics_bridge.deploy.driver import HandReading, LinkCounters
 from robotics_bridge.deploy.safety import ClockOffset, SafetyLimits
-from robotics_bridge.deploy.timing import LatencyHistogram, RateMonitor
-from robotics_bridge.deploy.touch import PressureCalibration, RealTouch
+from robotics_bridge.deploy.session import PressureCalibration, RealTouch
 from robotics_bridge.policies.contract import PolicyContract
+
+linux = pytest.mark.skipif(not hasattr(os, "SCHED_FIFO"), reason="SCHED_FIFO is Linux's")
+
+
+@linux
+def test_a_thread_goes_ahead_and_comes_back_also_after_an_error() -> None:
+    try:
+        with realtime():
+            assert os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK == os.SCHED_FIFO
+            assert os.sched_getparam(0).sched_priority == PRIORITY
+            assert not gc.isenabled()
+            raise KeyError
+    except KeyError:
+        pass
+    except UsageError as error:
+        pytest.skip(str(error))
+    assert os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK == os.SCHED_OTHER
+    assert gc.isenabled()
+
+
+@linux
+def test_a_user_who_may_not_is_told_how_to_be_allowed(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object) -> None:
+        raise PermissionError
+
+    monkeypatch.setattr(os, "sched_setscheduler", refuse)
+    with pytest.raises(UsageError, match=r"rtprio 20' in .*limits\.conf"), realtime():
+        pass
+    assert gc.isenabled()
+
+
+def test_other_systems_are_told_that_they_have_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delattr(os, "SCHED_FIFO", raising=False)
+    with pytest.raises(UsageError, match="Linux's"), realtime():
+        pass
+
 
 JOINTS = ("a", "b", "c")
 
@@ -275,3 +315,74 @@ def test_limits_are_of_the_joints_of_the_hand() -> None:
 def test_a_source_that_the_policy_does_not_read_is_refused() -> None:
     with pytest.raises(UsageError, match=r"'comand'.*did you mean 'command'"):
         _control(groups=("proprio", "command"), sources={"comand": None, "command": lambda reading: np.zeros(1)})
+
+
+class StallingHand(PaperHand):
+    """Stalls once after it took a report; notes how old the newest report is at each command."""
+
+    def __init__(self, clock: OwnClock, stall: Callable[[str], None]) -> None:
+        super().__init__(clock)
+        self.stall, self.ages = stall, []
+
+    def read(self) -> HandReading | None:
+        reading = super().read()
+        self.stall("read")
+        return reading
+
+    def send(self, targets) -> None:
+        super().send(targets)
+        self.ages.append(self.clock() - self.last.arrived)
+
+
+STALLS = (0.05, 0.09, 0.2, 0.5, 1.0, 2.0, 5.0, 20.0)
+TIMEOUTS = (0.06, 0.1, 0.3, 1.0, 2.0)
+
+
+@pytest.mark.parametrize("place", ["read", "source", "policy", "record"])
+@pytest.mark.parametrize("call", [1, 30], ids=["first", "later"])
+def test_no_command_comes_from_an_old_report_wherever_time_is_lost(place: str, call: int) -> None:
+    for stall, timeout in itertools.product(STALLS, TIMEOUTS):
+        clock, calls = OwnClock(), Counter()
+
+        def lose_time(where: str, stall=stall, clock=clock, calls=calls) -> None:
+            calls[where] += 1
+            # The first report is only waited for.
+            if where == place and calls[where] == call + (where == "read"):
+                clock.now += stall
+
+        def policy(obs, forget, lose_time=lose_time):
+            lose_time("policy")
+            return np.zeros(2, np.float32)
+
+        def source(reading, lose_time=lose_time):
+            lose_time("source")
+            return np.zeros(1)
+
+        hand = StallingHand(clock, lose_time)
+        controller = Controller(
+            policy, hand, _contract(("proprio", "goal")), _limits(timeout=timeout), sources={"goal": source},
+            clock=clock, record=lambda *_, lose_time=lose_time: lose_time("record"),
+        )  # fmt: skip
+        report, case = controller.run(2.0), (stall, timeout)
+        assert max(hand.ages, default=0.0) <= timeout, case
+        assert hand.stops == 1, case
+        if place != "record" and stall > timeout:
+            # The place alone says in which words: a report that is old when it is read, or a command.
+            assert report.status == "stopped", case
+            assert re.search(rf"{1e3 * stall:.0f} ms .*allowed {1e3 * timeout:.0f} ms", report.reason), case
+            assert len(hand.sent) == report.ticks == call - 1, case
+        elif stall <= 0.1:
+            assert report.status == "finished", case
+
+
+def test_a_stall_before_every_command_sends_none() -> None:
+    clock = OwnClock()
+    hand = PaperHand(clock)
+
+    def slow(obs, forget):
+        clock.now += 0.101
+        return np.zeros(2)
+
+    report = Controller(slow, hand, _contract(), _limits(), clock=clock).run(5.0)
+    assert (report.status, hand.sent, hand.stops) == ("stopped", [], 1)
+    assert report.reason == "a command came 101 ms after the report it was decided from (allowed 100 ms)"

@@ -15,8 +15,7 @@ from brainbench.core.errors import UsageError
 from robotics_bridge import tasks
 from robotics_bridge.deploy.controller import Clock
 from robotics_bridge.deploy.driver import Driver, HandReading, LinkCounters
-from robotics_bridge.deploy.session import DeployedPolicy, read_deployed
-from robotics_bridge.deploy.touch import PressureCalibration
+from robotics_bridge.deploy.session import DeployedPolicy, PressureCalibration, read_deployed
 from robotics_bridge.policies.contract import PolicyContract
 from robotics_bridge.policies.evaluate import Policy
 from robotics_bridge.policies.export import export_policy

@@ -11,8 +11,7 @@ from brainbench.core.errors import DataError, UsageError
 from brainbench.stimuli import load_stimuli
 from brainbench.stimuli.stimulus_set import hash_stimulus_set
 from robotics_bridge import hands
-from robotics_bridge.exploration.procedures import PROCEDURES
-from robotics_bridge.exploration.record import Explored, record_exploration
+from robotics_bridge.exploration.record import PROCEDURES, Explored, record_exploration
 from robotics_bridge.hands.scenes import closing
 from robotics_bridge.physics import Geometry, MujocoEngine
 from robotics_bridge.policies.encoders.taxel_grid import TaxelGrid

@@ -10,8 +10,8 @@ import pytest
 from brainbench.core.errors import UsageError
 from robotics_bridge import hands
 from robotics_bridge.deploy.driver import HandReading
-from robotics_bridge.deploy.simulated_hand import ShadowTouch, SimulatedHand, simulated_hand
-from robotics_bridge.deploy.touch import RealTouch
+from robotics_bridge.deploy.links.simulated_hand import ShadowTouch, SimulatedHand, simulated_hand
+from robotics_bridge.deploy.session import RealTouch
 from robotics_bridge.hands.scenes import closing
 from robotics_bridge.policies.contract import PolicyContract
 from robotics_bridge.tasks.contact_model import CONTACTS

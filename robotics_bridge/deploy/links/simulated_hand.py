@@ -20,11 +20,10 @@ from brainbench.core.errors import DataError, UsageError
 from brainbench.core.overrides import read_pairs, with_changes
 from brainbench.core.reading.ranges import check_fields, check_number
 from robotics_bridge import hands
-from robotics_bridge.deploy.driver import HandReading
-from robotics_bridge.deploy.frames import new_key
-from robotics_bridge.deploy.hand_link import HandLink
-from robotics_bridge.deploy.touch import PressureCalibration
-from robotics_bridge.deploy.udp import LOOPBACK
+from robotics_bridge.deploy.driver import DriverRequest, HandReading
+from robotics_bridge.deploy.links.frames import new_key
+from robotics_bridge.deploy.links.udp import LOOPBACK, HandEnd, HandLink, UdpDriver
+from robotics_bridge.deploy.session import PressureCalibration
 from robotics_bridge.hands.layouts import check_probes
 from robotics_bridge.hands.observations import observation_type, observe, sensors_for
 from robotics_bridge.hands.scenes import ARMATURE, OBJECT, holding
@@ -257,12 +256,25 @@ def _process(name: str, contacts: ContactModel, faults: Faults, seconds: float, 
         serve(hand, HandLink(link, key, len(hand.joints), len(hand.fingers)), faults, seconds)
 
 
+def open_simulated(request: DriverRequest) -> contextlib.AbstractContextManager[UdpDriver]:
+    """Return the driver of a simulated hand, which starts with it and has the contacts of the policy's training."""
+    return _simulated(request, Faults.parse([*request.faults]))
+
+
+@contextlib.contextmanager
+def _simulated(request: DriverRequest, faults: Faults) -> Iterator[UdpDriver]:
+    contract = request.contract
+    end = simulated_hand(contract.hand, contacts=contract.more["contacts"], faults=faults, seconds=request.seconds)
+    with end as there, UdpDriver(*there) as driver:
+        yield driver
+
+
 @contextlib.contextmanager
 def simulated_hand(
     hand: str = "xhand1", *, contacts: ContactModel = CONTACTS["firm"], faults: Faults | None = None,
     seconds: float = 600.0,
-) -> Iterator[tuple[tuple[str, int], tuple[str, ...], tuple[str, ...], bytes]]:  # fmt: skip
-    """Run a simulated hand in a process of its own; yield its address, joints, fingers and key."""
+) -> Iterator[HandEnd]:  # fmt: skip
+    """Run a simulated hand in a process of its own; yield its end of the link."""
     check_number("seconds of a simulated hand", seconds, above=0)
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()
@@ -278,7 +290,7 @@ def simulated_hand(
             port, joints, fingers = ours.recv()
         except EOFError:
             raise DataError("The simulated hand ended while it started.") from None
-        yield (LOOPBACK, port), joints, fingers, key
+        yield HandEnd((LOOPBACK, port), joints, fingers, key)
     finally:
         process.terminate()
         process.join(5)

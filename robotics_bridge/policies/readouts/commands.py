@@ -75,7 +75,7 @@ def probe(
 
 
 def _table(title: str, rows: list[dict[str, Any]], *more: str, sign: str = "") -> str:
-    from robotics_bridge.policies.readouts.rollout import TARGETS
+    from robotics_bridge.policies.readouts.features import TARGETS
 
     columns: dict[str, Any] = {"arm": "{0[arm]}"} | {
         f">{name}" * (name != "less") or name: f"{{0[{name}]}}" for name in more

@@ -1,25 +1,27 @@
 """The driver of a hand behind a UDP socket, local or remote; frames are authenticated with a key that both sides hold.
 
 A session begins with three frames: greeting, welcome, start. Its keys come from the shared key and a fresh nonce of
-either side (:mod:`~robotics_bridge.deploy.frames`).
+either side (:mod:`~robotics_bridge.deploy.links.frames`).
 """
 
 from __future__ import annotations
 
 import contextlib
+import math
 import secrets
 import socket
 import time
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.errors import UsageError, check_once
 from brainbench.core.reading.ranges import check_number
-from robotics_bridge.deploy import frames
-from robotics_bridge.deploy.driver import HandReading, LinkCounters
-from robotics_bridge.deploy.frames import Frame
-from robotics_bridge.deploy.receiver import Receiver
+from robotics_bridge import hands
+from robotics_bridge.deploy.driver import DriverRequest, HandReading, LinkCounters
+from robotics_bridge.deploy.links import frames
+from robotics_bridge.deploy.links.frames import Frame, Receiver
 from robotics_bridge.deploy.safety import ClockOffset
 
 LOOPBACK = "127.0.0.1"
@@ -27,19 +29,40 @@ GREET_EVERY = 0.2
 """Seconds from one greeting to the next, until the hand reports. An answer that takes longer is not accepted."""
 MOST_AT_ONCE = 256
 """Datagrams read at once; a flood must not hold the control loop up."""
+FARTHEST = 4 * math.pi
+"""Targets further from zero have no effect (rad or m): no joint of a hand has such a range."""
 _ERRORS = 8
 """Errors of the connection that are kept."""
 
 
-class UdpDriver:
-    """Speaks to a hand that holds the same key.
+class HandEnd(NamedTuple):
+    """A hand's end of a link."""
 
-    Args:
-        address: Host and port of the hand; without a host, this computer.
-        joints: Names of its joints, in its order.
-        fingers: Names of its sensing fingers, in its order.
-        key: Shared key (:func:`~robotics_bridge.deploy.frames.read_key`).
-    """
+    address: tuple[str, int]
+    """Host and port; without a host, this computer."""
+    joints: tuple[str, ...]
+    """Names of its joints, in its order."""
+    fingers: tuple[str, ...]
+    """Names of its sensing fingers, in its order."""
+    key: bytes
+    """Shared key (:func:`~robotics_bridge.deploy.links.frames.read_key`)."""
+
+
+def open_remote(request: DriverRequest) -> UdpDriver:
+    """Return the driver of a hand behind a socket; its joints and fingers are those of the contract's hand."""
+    host, _, port = request.address.rpartition(":")
+    if not (port.isascii() and port.isdigit() and 0 < int(port[:6]) < 65536):
+        raise UsageError(f"A driver is 'sim', HOST:PORT, or :PORT on this computer; received {request.address[:80]!r}.")
+    if request.key is None:
+        raise UsageError("A hand behind a socket needs --key FILE: the key that its computer holds too.")
+    if request.faults:
+        raise UsageError("--fault is of the simulated hand; a hand behind a socket has faults of its own.")
+    hand = hands.load(request.contract.hand)
+    return UdpDriver((host, int(port)), hand.joints, tuple(hand.fingers), frames.read_key(request.key))
+
+
+class UdpDriver:
+    """Speaks to a hand that holds the same key; arguments as of :class:`HandEnd`."""
 
     def __init__(self, address: tuple[str, int], joints: tuple[str, ...], fingers: tuple[str, ...], key: bytes) -> None:
         check_number("joints of a hand", len(joints), least=1, most=frames.MOST)
@@ -174,3 +197,97 @@ class UdpDriver:
     def _note(self, error: OSError) -> None:
         if len(self.counters.errors) < _ERRORS:
             self.counters.errors.append(str(error))
+
+
+class HandLink:
+    """Serves one controller at a time that holds the same key; the newest session counts.
+
+    Args:
+        link: A bound UDP socket.
+        key: Shared key (:func:`~robotics_bridge.deploy.links.frames.read_key`).
+        joints: J.
+        fingers: F.
+    """
+
+    def __init__(self, link: socket.socket, key: bytes, joints: int, fingers: int) -> None:
+        frames.check_key(key)
+        link.setblocking(False)
+        self.link, self.joints, self.fingers = link, joints, fingers
+        self.peer: Any = ()
+        """Address of the controller; empty without a session."""
+        self.stopped = True
+        """True until a session begins, and after its stop: the hand holds where it is."""
+        self._key, self._challenge = key, secrets.token_bytes(frames.NONCE)
+        self._offered: tuple[Any, bytes, bytes] = ((), b"", b"")  # who may start a session, and its two keys
+        self._receiver: Receiver | None = None
+        self._send_key = b""
+        self._sequence = 0
+
+    def receive(self, now: float) -> NDArray[np.float64] | None:
+        """Return the newest targets [J] (rad) to follow, or None without any; ``now`` is of the reports' clock (s)."""
+        targets = None
+        for _ in range(MOST_AT_ONCE):
+            try:
+                data, sender = self.link.recvfrom(frames.LARGEST + 1)
+            except ConnectionError:
+                continue
+            except OSError:  # nothing more
+                break
+            if self._start(data, sender, now):
+                targets = None
+            elif (found := self._command(data, sender, now)) is not None:
+                targets = found
+            else:
+                self._offer(data, sender, now)
+        return None if self.stopped else targets
+
+    def report(self, values: ArrayLike, time: float) -> bytes:
+        """Return the frame of a report: positions, velocities and pressures [2J + 3F], measured at a time (s)."""
+        self._sequence += 1
+        state = Frame(frames.STATE, self.joints, self.fingers, self._sequence, time, frames.pack_values(values))
+        return frames.encode(state, self._send_key)
+
+    def send(self, data: bytes) -> None:
+        """Send a frame to the controller, if there is one."""
+        if self.peer:
+            with contextlib.suppress(OSError):
+                self.link.sendto(data, self.peer)
+
+    def _offer(self, data: bytes, sender: Any, now: float) -> None:
+        """Answer a greeting. A greeting that is repeated by a stranger ends no session and begins none."""
+        hello = frames.decode(data, self._key)
+        if hello is None or (hello.kind, hello.joints, hello.fingers) != (frames.HELLO, self.joints, self.fingers):
+            return
+        self._offered = (sender, *frames.session_keys(self._key, hello.body, self._challenge))
+        body = hello.body + self._challenge
+        welcome = frames.encode(Frame(frames.WELCOME, self.joints, self.fingers, 0, now, body), self._key)
+        with contextlib.suppress(OSError):
+            self.link.sendto(welcome, sender)
+
+    def _start(self, data: bytes, sender: Any, now: float) -> bool:
+        """Begin the session that was offered to this sender; return False where the datagram starts none."""
+        offered, ours, theirs = self._offered
+        if sender != offered or (frame := frames.decode(data, ours)) is None or frame.kind != frames.START:
+            return False
+        self._receiver, self._send_key, self._sequence = Receiver(ours), theirs, 0
+        self._receiver.judge(frame, now)
+        self.peer, self.stopped = sender, False
+        # Used once: what was recorded of this session starts no other.
+        self._offered, self._challenge = ((), b"", b""), secrets.token_bytes(frames.NONCE)
+        return True
+
+    def _command(self, data: bytes, sender: Any, now: float) -> NDArray[np.float64] | None:
+        """Return the targets of a command of this session that is new, young and possible; heed its stop."""
+        if self._receiver is None or sender != self.peer:
+            return None
+        frame = frames.decode(data, self._receiver.key)
+        if frame is None or frame.joints != self.joints:
+            return None
+        verdict, _ = self._receiver.judge(frame, now)
+        if frame.kind == frames.STOP:
+            # However late it comes: to hold is safe.
+            self.stopped = True
+        # A comparison with NaN is false.
+        if frame.kind != frames.COMMAND or verdict != "new" or not (np.abs(frame.values) <= FARTHEST).all():
+            return None
+        return frame.values

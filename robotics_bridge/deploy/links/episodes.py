@@ -22,7 +22,7 @@ from brainbench.core.errors import DataError, UsageError, missing_dependency
 from brainbench.core.files import atomic_path, write_json
 from robotics_bridge import hands
 from robotics_bridge.deploy.driver import HandReading
-from robotics_bridge.deploy.touch import PressureCalibration
+from robotics_bridge.deploy.session import PressureCalibration
 from robotics_bridge.policies.contract import PolicyContract
 from robotics_bridge.policies.encoders.finger_axes import FingerAxes, finger_axes_of
 
@@ -57,27 +57,30 @@ def total_wrench(points: NDArray[np.floating], links: Sequence[str], axes: Finge
 
 
 class SessionRecorder:
-    """Keeps a session of a deployed policy; touch is one point per finger tip, where the hand senses it.
+    """Records a session of a deployed policy; touch is one point per finger tip, where the hand senses it.
 
-    Forces stay in the unit in which the hand reports pressure. ``fingers`` are those that the hand senses, in the order
-    of its reports; all of the contract's hand by default.
+    Forces stay in the unit in which the hand reports pressure. The folder is checked at once, and must be empty.
     """
 
-    def __init__(self, contract: PolicyContract, fingers: Sequence[str] | None = None) -> None:
-        self.hand, self.contract = hands.load(contract.hand), contract
-        sensed = tuple(self.hand.fingers) if fingers is None else tuple(fingers)
+    def __init__(self, contract: PolicyContract, folder: Path) -> None:
+        check_folder(folder, contract.rate)
+        self.hand, self.contract, self.folder = hands.load(contract.hand), contract, folder
+        self.frames: list[tuple[NDArray[np.floating], ...]] = []
+        """:data:`PARTS` of each tick."""
+
+    def begin(self, joints: Sequence[str], fingers: Sequence[str]) -> SessionRecorder:
+        """Take in the joints of a hand and the fingers that it senses, in the order of its reports; return itself."""
         finger_of = dict(zip(self.hand.tips, self.hand.fingers, strict=True))
         tips = self.hand.layout("med", "tips")
-        layout = {link: probes for link, probes in tips.items() if finger_of[link] in sensed}
+        layout = {link: probes for link, probes in tips.items() if finger_of[link] in fingers}
+        self.joints, self.rows = tuple(joints), [list(fingers).index(finger_of[link]) for link in layout]
         self.axes = finger_axes_of(self.hand, self.hand.layout("med", "hand"))
-        self.rows = [sensed.index(finger_of[link]) for link in layout]
         position, normal = (
             np.array([getattr(probes, name)[probes.active].mean(axis=0) for probes in layout.values()]).reshape(-1, 3)
             for name in ("position", "normal")
         )
         self.points = TactilePoints(tuple(layout), position, normal)
-        self.frames: list[tuple[NDArray[np.floating], ...]] = []
-        """:data:`PARTS` of each tick."""
+        return self
 
     def __call__(self, reading: HandReading, obs: Any, action: Any, targets: NDArray[np.floating]) -> None:
         """Keep a tick, as a :class:`~robotics_bridge.deploy.controller.Controller` reports it."""
@@ -90,14 +93,34 @@ class SessionRecorder:
         wrench = total_wrench(points, self.points.links, self.axes)
         self.frames.append((reading.position, reading.velocity, targets, points, wrench))
 
-    def write(self, folder: Path, joints: tuple[str, ...]) -> Path:
-        """Write the session as a data set; see :func:`write_lerobot`."""
+    def write(self) -> Path | None:
+        """Write the session as a data set (:func:`write_lerobot`) and return its folder; None if no tick was kept."""
+        if not self.frames:
+            return None
         frames = {name: np.array([frame[part] for frame in self.frames]) for part, name in enumerate(PARTS)}
-        about = {"task": self.contract.more.get("task", "deployed policy"), "robot": self.hand.name}
-        return write_lerobot(
-            folder, frames, fps=self.contract.rate, joints=joints, points=self.points,
-            unit="unit of the hand's pressure", **about,
+        session = SessionFacts(
+            task=self.contract.more.get("task", "deployed policy"), fps=self.contract.rate, joints=self.joints,
+            points=self.points, robot=self.hand.name, unit="unit of the hand's pressure",
         )  # fmt: skip
+        return write_lerobot(self.folder, frames, session)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SessionFacts:
+    """What a data set says of a session beside its frames."""
+
+    task: str
+    """Task that was done, in words."""
+    fps: float
+    """Frames per second; a whole number, as LeRobot demands."""
+    joints: Sequence[str]
+    """Names of the joints J."""
+    points: TactilePoints
+    """Where the tactile points sit."""
+    robot: str
+    """Name of the robot."""
+    unit: str
+    """Unit of forces; torques are in that times metres."""
 
 
 def check_folder(folder: Path, fps: float) -> None:
@@ -110,29 +133,15 @@ def check_folder(folder: Path, fps: float) -> None:
         raise UsageError(f"A data set has a whole number of frames per second; received {fps!r}.")
 
 
-def write_lerobot(
-    folder: Path,
-    frames: Mapping[str, NDArray[np.floating]],
-    *,
-    task: str,
-    fps: float,
-    joints: Sequence[str],
-    points: TactilePoints,
-    robot: str,
-    unit: str,
-) -> Path:
+def write_lerobot(folder: Path, frames: Mapping[str, NDArray[np.floating]], session: SessionFacts) -> Path:
     """Write a session as a data set that LeRobot opens.
 
     Args:
         folder: Where to; must not exist or be empty.
         frames: :data:`PARTS` by name, [T, J], [T, N, 6] and [T, 6]; at least one frame.
-        task: Task that was done, in words.
-        fps: Frames per second; a whole number, as LeRobot demands.
-        joints: Names of the joints J.
-        points: Where the tactile points sit.
-        robot: Name of the robot.
-        unit: Of forces; torques are in that times metres.
+        session: What is said of it.
     """
+    task, fps, joints, points = session.task, session.fps, session.joints, session.points
     check_folder(folder, fps)
     import pandas
 
@@ -144,7 +153,7 @@ def write_lerobot(
     episode = {
         "episode_index": 0, "tasks": [task], "length": length, "dataset_from_index": 0, "dataset_to_index": length,
         "data/chunk_index": 0, "data/file_index": 0, "meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0,
-        **{f"stats/{name}/{key}": value for name, told in stats.items() for key, value in told.items()},
+        **{f"stats/{name}/{key}": value for name, numbers in stats.items() for key, value in numbers.items()},
     }  # fmt: skip
     # LeRobot reads the tasks as the index of a table.
     described = {
@@ -168,7 +177,8 @@ def write_lerobot(
     write_json(
         folder / "meta" / "tactile.json",
         {
-            "frame": "link axes; torques about the link's origin", "units": [unit, f"{unit}·m"], "links": points.links,
+            "frame": "link axes; torques about the link's origin", "links": points.links,
+            "units": [session.unit, f"{session.unit}·m"],
             "link": list(range(len(points.links))), "position": points.position, "normal": points.normal,
         },
     )  # fmt: skip
@@ -176,7 +186,7 @@ def write_lerobot(
     write_json(
         folder / "meta" / "info.json",
         {
-            "codebase_version": VERSION, "robot_type": robot, "total_episodes": 1, "total_frames": length,
+            "codebase_version": VERSION, "robot_type": session.robot, "total_episodes": 1, "total_frames": length,
             "total_tasks": 1, "chunks_size": 1000, "data_files_size_in_mb": 100, "video_files_size_in_mb": 200,
             "fps": round(fps), "splits": {"train": "0:1"}, "data_path": _DATA, "video_path": None,
             "features": features,
@@ -189,22 +199,22 @@ def _columns(
     frames: Mapping[str, NDArray[np.floating]], fps: float, shapes: Mapping[str, tuple[int, ...]]
 ) -> dict[str, NDArray]:
     """Return the checked columns of the table, and those by which LeRobot counts."""
-    length, found = len(frames[PARTS[0]]), dict[str, NDArray]()
+    length, columns = len(frames[PARTS[0]]), dict[str, NDArray]()
     for name, shape in shapes.items():
-        found[name] = np.asarray(frames[name], dtype=np.float32)
-        if not length or found[name].shape != (length, *shape):
-            raise UsageError(f"{name} has the shape {found[name].shape}; expected {(length, *shape)}.")
-        if not np.isfinite(found[name]).all():
+        columns[name] = np.asarray(frames[name], dtype=np.float32)
+        if not length or columns[name].shape != (length, *shape):
+            raise UsageError(f"{name} has the shape {columns[name].shape}; expected {(length, *shape)}.")
+        if not np.isfinite(columns[name]).all():
             raise DataError(f"{name} holds values that are no numbers.")
     frame, none = np.arange(length), np.zeros(length, dtype=np.int64)
     counters = {"frame_index": frame, "episode_index": none, "index": frame, "task_index": none}
-    return {**found, "timestamp": (frame / fps).astype(np.float32), **counters}
+    return {**columns, "timestamp": (frame / fps).astype(np.float32), **counters}
 
 
 def _stats(values: NDArray) -> dict[str, list[Any]]:
     flat = values.astype(np.float64)
-    found = {name: np.atleast_1d(getattr(np, name)(flat, axis=0)).tolist() for name in ("min", "max", "mean", "std")}
-    return {**found, "count": [len(values)]}
+    stats = {name: np.atleast_1d(getattr(np, name)(flat, axis=0)).tolist() for name in ("min", "max", "mean", "std")}
+    return {**stats, "count": [len(values)]}
 
 
 def _write_frames(path: Path, table: Mapping[str, NDArray], shapes: Mapping[str, tuple[int, ...]]) -> None:

@@ -9,6 +9,7 @@ import typer
 
 from brainbench.cli.destinations import out_file_option
 from brainbench.cli.output import Output, progress_bar, table_of
+from brainbench.cli.requirements import needs
 
 if TYPE_CHECKING:
     from robotics_bridge.exploration.record import Explored
@@ -17,6 +18,7 @@ RODGERS = "rodgers"
 _DISTANCES = {"close": 0.0, "medium": 4e-4, "far": 8e-4}
 
 
+@needs(cache=True)
 def hand(
     out: Annotated[Path | None, out_file_option("Stimulus-set file to write (.h5).")] = None,
     objects: Annotated[
@@ -48,8 +50,7 @@ def hand(
     from brainbench.core.errors import UsageError
     from brainbench.stimuli import write_stimulus_set
     from brainbench.stimuli.stimulus_set import hash_stimulus_set
-    from robotics_bridge.exploration.procedures import PROCEDURES
-    from robotics_bridge.exploration.record import record_exploration
+    from robotics_bridge.exploration.record import PROCEDURES, record_exploration
 
     if frames < 5 or frames % 5:
         raise UsageError(f"--frames is a multiple of 5, the sub-steps of a time step; received {frames}.")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -13,8 +14,15 @@ from pyarrow import parquet
 from brainbench.core.errors import DataError, UsageError
 from robotics_bridge import hands
 from robotics_bridge.deploy.driver import HandReading
-from robotics_bridge.deploy.episodes import PARTS, SessionRecorder, TactilePoints, total_wrench, write_lerobot
-from robotics_bridge.deploy.touch import PressureCalibration
+from robotics_bridge.deploy.links.episodes import (
+    PARTS,
+    SessionFacts,
+    SessionRecorder,
+    TactilePoints,
+    total_wrench,
+    write_lerobot,
+)
+from robotics_bridge.deploy.session import PressureCalibration
 from robotics_bridge.hands.observations import observe
 from robotics_bridge.policies.contract import PolicyContract
 from robotics_bridge.policies.encoders.finger_axes import finger_axes_of
@@ -26,7 +34,8 @@ PROBES = HAND.layout("low", "tips")
 PLACES = [[getattr(probes, name)[probes.active] for probes in PROBES.values()] for name in ("position", "normal")]
 LINKS = tuple(np.repeat(list(PROBES), list(map(len, PLACES[0]))).tolist())
 POINTS = TactilePoints(LINKS, *map(np.concatenate, PLACES))
-SETTINGS = {"task": "turn the ball", "fps": 40, "joints": HAND.joints, "points": POINTS, "robot": "xhand1", "unit": "N"}
+SESSION = SessionFacts(task="turn the ball", fps=40, joints=HAND.joints, points=POINTS, robot="xhand1", unit="N")
+CONTRACT = PolicyContract({}, 40.0, "xhand1", HAND.joints, HAND.joints, {}, {})
 
 
 def _frames(length: int) -> dict[str, np.ndarray]:
@@ -37,7 +46,7 @@ def _frames(length: int) -> dict[str, np.ndarray]:
 
 @pytest.fixture
 def folder(tmp_path):
-    return write_lerobot(tmp_path / "set", _frames(4), **SETTINGS)
+    return write_lerobot(tmp_path / "set", _frames(4), SESSION)
 
 
 def test_frames_are_those_that_were_recorded(folder) -> None:
@@ -82,21 +91,22 @@ def test_episodes_and_tasks_are_found_as_lerobot_looks_for_them(folder) -> None:
 
 
 def test_a_session_states_forces_in_the_unit_of_the_hand(tmp_path) -> None:
-    recorder = SessionRecorder(PolicyContract({}, 40.0, "xhand1", HAND.joints, HAND.joints, {}, {}))
+    recorder = SessionRecorder(CONTRACT, tmp_path / "set").begin(HAND.joints, HAND.fingers)
+    assert recorder.write() is None
     pressure = np.zeros((5, 3))
     pressure[0] = 0.2
     reading = HandReading(1, 0.0, 0.0, np.zeros(12), np.zeros(12), pressure)
     recorder(reading, None, None, np.zeros(12))
-    folder = recorder.write(tmp_path / "set", HAND.joints)
+    folder = recorder.write()
     points = json.loads((folder / "meta" / "tactile.json").read_text())
     assert all("pressure" in unit for unit in points["units"])
 
 
 @pytest.mark.parametrize("fingers", [None, ("thumb", "pinky", "index"), ()])
-def test_recorded_forces_are_those_of_pressed_skin(fingers) -> None:
+def test_recorded_forces_are_those_of_pressed_skin(tmp_path, fingers) -> None:
     """Pressed along its normal, each tip is pushed inward, whatever the order of the fingers in the reports."""
-    recorder = SessionRecorder(PolicyContract({}, 40.0, "xhand1", HAND.joints, HAND.joints, {}, {}), fingers)
     layout, order = HAND.layout("med", "tips"), tuple(HAND.fingers) if fingers is None else fingers
+    recorder = SessionRecorder(CONTRACT, tmp_path / "set").begin(HAND.joints, order)
     depth = {link: torch.rand(1, *layout[link].shape) for link in TIPS}
     felt = observe("agg_force", depth, {link: layout[link] for link in TIPS})
     pressure = PressureCalibration().pressure(tuple(HAND.fingers), felt.reshape(-1, 3).numpy())
@@ -125,12 +135,12 @@ def test_sessions_that_do_not_fit_are_refused(tmp_path) -> None:
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "x").write_text("")
     with pytest.raises(UsageError, match=r"/full' .*empty"):
-        write_lerobot(tmp_path / "full", _frames(2), **SETTINGS)
+        write_lerobot(tmp_path / "full", _frames(2), SESSION)
     with pytest.raises(UsageError, match=r"whole number.* 33\.3"):
-        write_lerobot(tmp_path / "a", _frames(2), **{**SETTINGS, "fps": 33.3})
+        write_lerobot(tmp_path / "a", _frames(2), replace(SESSION, fps=33.3))
     with pytest.raises(UsageError, match=r"observation.state .*\(0, 12\)"):
-        write_lerobot(tmp_path / "b", _frames(0), **SETTINGS)
+        write_lerobot(tmp_path / "b", _frames(0), SESSION)
     spoiled = _frames(2)
     spoiled["observation.wrench"][1][0] = np.nan
     with pytest.raises(DataError, match=r"observation.wrench .* no numbers"):
-        write_lerobot(tmp_path / "c", spoiled, **SETTINGS)
+        write_lerobot(tmp_path / "c", spoiled, SESSION)

@@ -1,4 +1,4 @@
-"""Placement of few taxels: those that tell of the object are found, and read on other environments."""
+"""Read-outs: what is linear in features is found on environments left out, what is not there is not."""
 
 from __future__ import annotations
 
@@ -7,14 +7,57 @@ import pytest
 import torch
 
 from brainbench.core.errors import UsageError
+from brainbench.models.training.checkpoints import shipped
 from robotics_bridge import hands, tasks
 from robotics_bridge.hands.layouts import active_count, write_probes
 from robotics_bridge.policies.evaluate import agent
-from robotics_bridge.policies.readouts import placement
-from robotics_bridge.policies.readouts.probe import ProbeOptions, place, placements
+from robotics_bridge.policies.readouts import features
+from robotics_bridge.policies.readouts.features import TARGETS, TouchRollout
+from robotics_bridge.policies.readouts.probe import (
+    ProbeOptions,
+    _Elimination,
+    choose_taxels,
+    differences,
+    even_taxels,
+    part_of_layout,
+    place,
+    placements,
+    probe,
+    read_placements,
+    taxel_features,
+)
 from robotics_bridge.policies.readouts.regression import read_targets
-from robotics_bridge.policies.readouts.rollout import TouchRollout
 from robotics_bridge.sensors.probes.placement import Probes
+
+
+def test_a_rollout_in_a_task_is_read_from_every_arm_of_a_probe() -> None:
+    env = tasks.make(
+        "in_palm_rotate", num_envs=10, observe="force_torque", placement="tips", resolution="low", threads=1
+    )
+    names = ("none", "bits", "graph, memory", "reservoir", "simclr")
+    own = f"local-dir:{shipped()[f'{features.NETWORK}.simclr']}"
+    options = ProbeOptions(seconds=1.0, arms=names, reservoirs=2, networks=("s4-small", own))
+    read = probe(env, agent("random", env), options)
+    found = {one.arm: one for one in read}
+    assert [len(one.errors) for one in found.values()] == [1, 1, 1, 2, 1, 1, 1]
+    # A folder of the same weights is the same network.
+    assert found[own].r2("position") == found["simclr"].r2("position") != found["s4-small"].r2("position")
+    assert {(row["arm"], row["less"]) for row in differences(read)} >= {("s4-small", "reservoir"), (own, "reservoir")}
+    assert found["none"].features == 0
+    assert all(np.isfinite([one.r2(name) for name in TARGETS]).all() for one in found.values())
+    with pytest.raises(UsageError, match="runs without end"):
+        probe(env, agent("random", env), ProbeOptions(networks=("zhuang-small+gpt",)))
+    with pytest.raises(UsageError, match="observe='force_torque'"):
+        probe(tasks.make("in_palm_rotate", num_envs=10, threads=1), agent("zero", env), options)
+    with pytest.raises(UsageError, match="at least 10 environments; received 2"):
+        probe(tasks.make("in_palm_rotate", num_envs=2, threads=1), agent("zero", env), options)
+
+
+def test_options_of_a_probe_name_the_culprit() -> None:
+    with pytest.raises(UsageError, match="did you mean 'reservoir'"):
+        ProbeOptions(arms=("resevoir",))
+    with pytest.raises(UsageError, match=r"received 0\.1 s"):
+        ProbeOptions(seconds=0.1)
 
 
 def _telling(taxels: int = 12, telling: tuple[int, ...] = (3, 7, 8), noise: float = 0.3, envs: int = 20):
@@ -30,13 +73,13 @@ def _telling(taxels: int = 12, telling: tuple[int, ...] = (3, 7, 8), noise: floa
 
 def test_the_taxels_that_tell_are_chosen_first() -> None:
     proprio, features, wanted, valid = _telling()
-    assert set(placement.choose_taxels(proprio, features, wanted, valid, 3)) == {3, 7, 8}
+    assert set(choose_taxels(proprio, features, wanted, valid, 3)) == {3, 7, 8}
 
 
 def test_a_taxel_that_repeats_another_is_chosen_last() -> None:
     proprio, features, wanted, valid = _telling()
     features = torch.cat((features, features[:, :, :1] * 0 + features[:, :, 3:4] + 1e-3), 2)
-    chosen = placement.choose_taxels(proprio, features, wanted, valid, 4)
+    chosen = choose_taxels(proprio, features, wanted, valid, 4)
     assert not {3, 12} <= set(chosen[:3])
 
 
@@ -44,7 +87,7 @@ def test_elimination_gains_as_much_as_a_regression_on_all_that_is_chosen() -> No
     _, features, wanted, valid = _telling(envs=8)
     x = features.flatten(2)
     learning = torch.arange(8) % 4 != 0
-    part = placement._Elimination(x, wanted, valid, learning)
+    part = _Elimination(x, wanted, valid, learning)
     before = float((1 - part._error / part._spread).mean())
     part.take(slice(12, 16))
     gain = part.gains(0, 12, 4)[7]
@@ -74,29 +117,29 @@ def test_nothing_is_gained_by_choosing_from_noise() -> None:
     begun = torch.zeros(60, 40, dtype=torch.bool)
     rollout = TouchRollout(torch.zeros(60, 40, 1), touch, begun, targets, ~begun, torch.empty(0))
     layout = {"link": Probes(np.zeros((40, 3)), np.tile([0.0, 0.0, 1.0], (40, 1)), np.full(40, 1e-3), (40,))}
-    found = {one.name: one.readout for one in placement.read_placements(rollout, layout, 10, draws=3)}
+    found = {one.name: one.readout for one in read_placements(rollout, layout, 10, draws=3)}
     assert abs(found["chosen"].r2("position") - found["random"].r2("position")) < 0.02
 
 
 def test_chosen_taxels_are_read_on_environments_that_did_not_choose_them(monkeypatch) -> None:
     seen = []
-    choose = placement.choose_taxels
+    choose = choose_taxels
 
     def watched(proprio, features, wanted, valid, count):
         seen.append(float(wanted.mean()))
         return choose(proprio, features, wanted, valid, count)
 
-    monkeypatch.setattr(placement, "choose_taxels", watched)
+    monkeypatch.setattr(probe, "choose_taxels", watched)
     begun = torch.zeros(30, 20, dtype=torch.bool)
     half = (torch.arange(20) >= 10).float()[None, :, None].expand(30, 20, 3)
     targets = {name: half + 0.01 * torch.randn(30, 20, 3) for name in ("position", "velocity", "spin", "contact")}
     rollout = TouchRollout(torch.zeros(30, 20, 1), torch.randn(30, 20, 1, 8, 6), begun, targets, ~begun, torch.empty(0))
     layout = {"link": Probes(np.zeros((8, 3)), np.tile([0.0, 0.0, 1.0], (8, 1)), np.full(8, 1e-3), (8,))}
-    found = {one.name: one for one in placement.read_placements(rollout, layout, 2, draws=1)}
+    found = {one.name: one for one in read_placements(rollout, layout, 2, draws=1)}
     # The first half (targets near 0) is read from what the second (near 1) chose, and the other way round.
     assert seen == pytest.approx([1.0, 0.0], abs=0.05)
     first, second = found["chosen"].taxels
-    features = placement.taxel_features(rollout)
+    features = taxel_features(rollout)
     reading = [read_targets(rollout.proprio[:, part], features[:, part][:, :, list(taxels)].flatten(2),
                             rollout.wanted[:, part], rollout.valid[:, part])[0]
                for part, taxels in ((slice(0, 10), first), (slice(10, 20), second))]  # fmt: skip
@@ -105,7 +148,7 @@ def test_chosen_taxels_are_read_on_environments_that_did_not_choose_them(monkeyp
 
 def test_even_taxels_are_the_share_of_every_link_far_apart() -> None:
     layout = hands.load("xhand1").layout("med", "hand")
-    found = placement.even_taxels(layout, 50)
+    found = even_taxels(layout, 50)
     assert len(set(found)) == 50
     owner = np.repeat(np.arange(len(layout)), [active_count({"": one}) for one in layout.values()])
     counts = np.bincount(owner[found], minlength=len(layout))
@@ -121,7 +164,7 @@ def test_even_taxels_are_the_share_of_every_link_far_apart() -> None:
 
 def test_a_chosen_layout_is_one_that_a_task_can_feel_with(tmp_path) -> None:
     layout = hands.load("xhand1").layout("med", "hand")
-    part = placement.part_of_layout(layout, [0, 40, 198])
+    part = part_of_layout(layout, [0, 40, 198])
     assert active_count(part) == 3
     points = np.concatenate([one.position[one.active] for one in layout.values()])
     np.testing.assert_array_equal(
