@@ -77,10 +77,6 @@ task = "in_palm_rotate"
 hand = "xhand1"
 placements = ["tips", "hand"]
 """
-AGENT = {
-    "agent": "random", "task": "in_palm_rotate", "success_rate": 0.5, "success_interval": [0.4, 0.6], "goals": 1.5,
-    "goals_half_width": 0.2,
-}  # fmt: skip
 _MODEL = (
     "body_pos", "body_quat", "body_mass", "body_inertia", "geom_size", "geom_pos", "geom_friction", "jnt_range",
     "jnt_axis", "dof_damping", "dof_armature", "actuator_gainprm", "actuator_ctrlrange",
