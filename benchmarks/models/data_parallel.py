@@ -18,9 +18,9 @@ from pathlib import Path
 
 import torch
 
+from brainbench.core.runs.log import read_log
 from brainbench.datasets import WhiskingDataset
 from brainbench.models.training.config import TrainingConfig
-from brainbench.models.training.run_folder import read_log
 from brainbench.models.training.trainer import train
 from tests.factories.array_data import ArrayData
 

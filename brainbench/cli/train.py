@@ -54,8 +54,8 @@ def train(
     """
     from brainbench.models.training.config import TrainingConfig
     from brainbench.models.training.evaluation import RANDOM, RAW, TWIN
-    from brainbench.models.training.run_folder import BEST
     from brainbench.models.training.search_space import best_run, sweep_runs
+    from brainbench.models.training.trainer import BEST
     from brainbench.models.training.trainer import train as run
 
     options = (read_mapping(config) if config is not None else {}) | options

@@ -310,7 +310,7 @@ JOBS = (
         "stimulus generation", 12, _generate, modules=("brainbench.stimuli.sweeps.generation", "mujoco"), resumes=True
     ),
     KillJob("train", 12, _train, modules=_TRAINER, resumes=True),
-    KillJob("policy train", 10, _train_policy, modules=_TEACHER, resumes=True, part="resume.safetensors"),
+    KillJob("policy train", 10, _train_policy, modules=_TEACHER, resumes=True, part="state.safetensors"),
     KillJob(
         "leaderboard add", 16, lambda inputs, out: _command("leaderboard", "add", inputs / "records", "--to", out),
         _write_records, (*_CLI, "leaderboards"), resumes=True,

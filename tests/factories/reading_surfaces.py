@@ -20,6 +20,7 @@ from brainbench.core.errors import DataError
 from brainbench.core.files import read_mapping, write_json
 from brainbench.core.labels import read_match
 from brainbench.core.records import ResultRecord, record_identity
+from brainbench.core.runs.state import STATE
 from brainbench.datasets import export, open_recordings, write_recordings
 from brainbench.datasets.trials.selection import Selection
 from brainbench.datasets.trials.windows import Window
@@ -30,7 +31,6 @@ from brainbench.models.graph.tnn_import import read_graph
 from brainbench.models.training.checkpoints import load_weights, read_config
 from brainbench.models.training.config import TrainingConfig
 from brainbench.models.training.processes import Processes
-from brainbench.models.training.run_folder import STATE
 from brainbench.models.training.trainer import _Run
 from brainbench.published.whiskit import read_runs
 from brainbench.scoring.jobs import parse_seeds, read_batch

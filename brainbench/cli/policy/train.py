@@ -51,7 +51,7 @@ def train(
         result = teacher.train(env, run, options, settings=settings, progress=progress)
     last = dict(result.history[-1]) if result.history else {}
     told = {
-        "run": result.run, "iterations": result.iterations, "control_steps": result.steps, "seconds": result.seconds,
+        "run": result.folder, "iterations": result.iterations, "control_steps": result.steps, "seconds": result.seconds,
         "reward": last.get("reward"), "success": last.get("episode/success"),
     }  # fmt: skip
     shown = {key: f"{value:.4g}" if isinstance(value, float) else value for key, value in told.items()}

@@ -41,7 +41,8 @@ def best_run(out: str | Path) -> tuple[Path, dict[str, float]]:
     say.
     """
     from brainbench.core.files import read_mapping
-    from brainbench.models.training.run_folder import RUN, read_log
+    from brainbench.core.runs.log import read_log
+    from brainbench.models.training.trainer import RUN
 
     scores: dict[str, float] = {}
     costs: dict[str, float] = {}

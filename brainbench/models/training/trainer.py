@@ -15,7 +15,7 @@ from collections.abc import Mapping
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import msgspec
 import torch
@@ -24,9 +24,19 @@ from torch import nn
 from brainbench.core.errors import DataError, UsageError
 from brainbench.core.files import read_mapping, write_json
 from brainbench.core.progress import Progress
-from brainbench.core.reading.ranges import check_number
 from brainbench.core.reading.regular import readable
-from brainbench.core.writing.locks import lock_folder
+from brainbench.core.runs.folder import RESTART, RunEnd, claim, mark
+from brainbench.core.runs.log import RunLog
+from brainbench.core.runs.state import (
+    STATE,
+    learner_state,
+    load_state,
+    random_state,
+    restore_learner,
+    save_state,
+    set_random_state,
+)
+from brainbench.core.runs.stopping import Stop, occupied
 from brainbench.core.writing.tensors import write_tensors
 from brainbench.models.activations import evaluating
 from brainbench.models.ops.parameters import seeded
@@ -49,35 +59,18 @@ from brainbench.models.training.gradients import Gradients, compiled
 from brainbench.models.training.objectives import make_learner
 from brainbench.models.training.optimizers import make_optimizer, rate_factor
 from brainbench.models.training.processes import Processes, processes
-from brainbench.models.training.run_folder import (
-    BEST,
-    CONTROLS_FILE,
-    FAILED,
-    RESTART,
-    RUN,
-    STATE,
-    RunLog,
-    claim,
-    load_state,
-    mark,
-    save_state,
-)  # fmt: skip
 from brainbench.models.training.twins import describe_twin, difference, draw_twin
 
 _log = logging.getLogger(__name__)
 
+RUN, BEST, FAILED, CONTROLS_FILE = "run.json", "best", "failed-batch.safetensors", "controls.json"
 _LOG_STEPS = 50
 
 
 @dataclass(frozen=True)
-class TrainingResult:
-    """End of a run."""
+class TrainingResult(RunEnd):
+    """End of a run; its folder is that of the model, for ``local-dir:``."""
 
-    status: Literal["finished", "stopped", "diverged"]
-    """``stopped``: the time allowed was over; start it again to go on."""
-    reason: str
-    folder: Path
-    """The model's folder, for ``local-dir:``."""
     steps: int
     epochs: int
     best_epoch: int | None
@@ -119,16 +112,11 @@ def train(
         How it ended. A loss or gradient that is not finite ends it as ``diverged``: the last good state and model
         stay, and the batch is kept in ``failed-batch.safetensors``.
     """
-    if stop_after is not None:
-        check_number("stop_after", stop_after, least=0)
-    with (
-        processes(device) as where,
-        lock_folder(Path(out), wait=False) if where.first else nullcontext(),
-        seeded(config.seed),
-    ):
+    stop = Stop(stop_after)
+    with processes(device) as where, occupied(Path(out), stop, lock=where.first), seeded(config.seed):
         run = _Run(config, data, Path(out), where, progress, Path(controls or out) / CONTROLS_FILE)
         try:
-            return run.run(math.inf if stop_after is None else stop_after)
+            return run.run(stop)
         finally:
             run.log.close()
 
@@ -156,10 +144,9 @@ class _Run:
         self.config, self.data, self.out, self.where = config, data, out, where
         self.controls_file, self.controls = controls, {}
         self.progress = progress if progress is not None and where.first else (lambda done, total, what: None)
-        self.started = self.saved = time.monotonic()
+        self.saved = time.monotonic()
         self.options: dict[str, Any] = {"classes": len(data.classes), "decoder": config.decoder}
-        identity = {**config.identity, "classes": list(data.classes)}
-        claim(out, identity, write=False)
+        self._claim(write=False)
         model = load_model(config.model, seed=config.seed, **self.options).train()
         start = describe_twin(config.model, config.seed, model)
         learner = make_learner(config.objective, model)
@@ -185,15 +172,20 @@ class _Run:
             raise DataError("The data set has no split 'train', so there is nothing to train on.")
         self.batches: Batches = batches
         # What cannot be trained has ended by now, and takes no folder.
-        claim(out, identity, write=where.first)
+        self._claim(write=where.first)
         where.wait()
         self.twin = self._twin(start)
         self.at = _Position()
         if (out / STATE).exists():  # what is no file is refused there
             self._restore()
-        self.log = RunLog(out, step=self.at.step, active=where.first)
+        self.log = RunLog(out, "step", self.at.step, active=where.first)
         for warning in config_warnings(config, self.model) if where.first else ():
             _log.warning("%s", warning)
+
+    def _claim(self, *, write: bool) -> None:
+        identity = {**self.config.identity, "classes": list(self.data.classes)}
+        begin = {"run": identity, "status": "running"}
+        claim(self.out / RUN, identity, lambda: begin, stated=lambda document: document.get("run"), write=write)
 
     def _twin(self, now: dict[str, Any]) -> dict[str, Any]:
         """Return what is told of the network that the run started from, which may have been drawn elsewhere."""
@@ -201,37 +193,37 @@ class _Run:
             return now
         kept = read_mapping(self.out / RUN).get("twin")
         if kept is None:
-            mark(self.out, twin=now)
+            mark(self.out / RUN, twin=now)
         elif told := difference(kept, now):
             _log.warning("The run goes on, but without its untrained twin: %s.", told)
         return kept or now
 
-    def run(self, allowed: float) -> TrainingResult:
-        """Train until all epochs are done or ``allowed`` seconds are over; return how it ended."""
+    def run(self, stop: Stop) -> TrainingResult:
+        """Train until all epochs are done or it is to stop; return how it ended."""
+        self.stop = stop
         steps = len(self.batches)
         if self.where.first and self.at.epoch < self.config.epochs:
             _log.info("%s %s: step %d of %d.", self.config.model, self.config.objective, self.at.step, self._steps)
         while self.at.epoch < self.config.epochs:
             self.learner.train()
-            over, stopped = False, f"the {allowed:g} s allowed are over; start it again to go on"
+            over, reason = False, ""
             self.began, self.seen = time.monotonic(), 0
             for x, labels in self.batches:
                 failure = self._advance(x, labels, steps)
                 if failure:
                     return self._result("diverged", failure)
                 self.progress(self.at.step, self._steps, f"training {self.config.model}")
-                now = time.monotonic()
-                late = now - self.saved > self.config.checkpoint_seconds
-                over, due = self.where.any(now - self.started > allowed, late)
+                late, reason = time.monotonic() - self.saved > self.config.checkpoint_seconds, stop.reason()
+                over, due = self.where.any(bool(reason), late)
                 # After an epoch's last batch the end of the epoch saves; a state between the two would lose it.
                 if (over or due) and self.at.step % steps:
                     self._save()
                     if over:
-                        return self._result("stopped", stopped)
+                        return self._result("stopped", reason)
             self.at.epoch += 1
             self._end_epoch()
             if over and self.at.epoch < self.config.epochs:
-                return self._result("stopped", stopped)
+                return self._result("stopped", reason)
         return self._finish()
 
     @property
@@ -357,7 +349,7 @@ class _Run:
                 if result.collapsed:
                     _log.warning("%s has collapsed: %s.", self.config.model, result.reason)
             found = {name: asdict(item) for name, item in self.controls.items()}
-            mark(self.out, evaluation=asdict(result) if result else None, controls=found, status="finished")
+            mark(self.out / RUN, evaluation=asdict(result) if result else None, controls=found, status="finished")
         self.where.wait()
         return self._result("finished", "", result)
 
@@ -401,17 +393,21 @@ class _Run:
         self.saved = time.monotonic()
         if not self.where.first:
             return
-        plain = {**asdict(self.at), "batches": self.batches.state_dict()}
-        save_state(self.out / STATE, self.learner, self.optimizer, plain)
+        progress = {"position": asdict(self.at), "batches": self.batches.state_dict()}
+        # Dropout draws random numbers; augmentation does not, its numbers depend on seed, step and view alone.
+        random = random_state(self.where.device)
+        save_state(self.out / STATE, {**learner_state(self.learner, self.optimizer), **progress, "random": random})
 
     def _restore(self) -> None:
-        plain = load_state(self.out / STATE, self.learner, self.optimizer)
+        state = load_state(self.out / STATE)
         with readable(self.out / STATE, "training state", RESTART):
-            state = dict(plain.pop("batches"))
-            if "part" in state:  # every process reads its own part, and the first one's state was saved
-                state["part"] = list(self.where.part)
-            self.batches.load_state_dict(state)
-            self.at = msgspec.convert(plain, _Position)
+            restore_learner(state, self.learner, self.optimizer, self.out / STATE)
+            batches = dict(state["batches"])
+            if "part" in batches:  # every process reads its own part, and the first one's state was saved
+                batches["part"] = list(self.where.part)
+            self.batches.load_state_dict(batches)
+            self.at = msgspec.convert(state["position"], _Position)
+            set_random_state(state["random"], self.where.device)
 
     def _keep_failure(self, views: tuple[torch.Tensor, ...], labels: torch.Tensor, loss: float, norm: float) -> str:
         reason = (
@@ -424,16 +420,16 @@ class _Run:
             write_tensors(self.out / FAILED, {**tensors, "labels": labels}, step=str(self.at.step))
             # Before the first validation there is no best model: the last saved state takes its place.
             if not (self.out / BEST / WEIGHTS).is_file() and (self.out / STATE).is_file():
-                load_state(self.out / STATE, self.learner, self.optimizer)
+                restore_learner(load_state(self.out / STATE), self.learner, self.optimizer, self.out / STATE)
                 self._publish(None)
-            mark(self.out, status="diverged", reason=reason)
+            mark(self.out / RUN, status="diverged", reason=reason)
         return reason
 
     def _result(self, status: Any, reason: str, evaluation: Evaluation | None = None) -> TrainingResult:
-        seconds = round(time.monotonic() - self.started, 3)
-        at = self.at
-        done = (at.step, at.epoch, at.best_epoch, evaluation, self.controls)
-        return TrainingResult(status, reason, self.out / BEST, *done, seconds)
+        at, seconds = self.at, round(self.stop.elapsed, 3)
+        return TrainingResult(
+            status, reason, self.out / BEST, at.step, at.epoch, at.best_epoch, evaluation, self.controls, seconds
+        )
 
     def _batches(self, split: str, *, shuffle: bool, part: bool = True) -> Batches | None:
         mine = self.where.part if part else (0, 1)

@@ -18,7 +18,7 @@ from brainbench.core.progress import Progress, track
 from brainbench.core.reading.ranges import check_number
 from brainbench.core.reading.regular import readable
 from brainbench.core.records import Interval
-from brainbench.core.writing.same_run import begin_run
+from brainbench.core.runs.folder import begin_run
 from brainbench.metrics.measures.metric import get_metric
 from brainbench.scoring.recovery.boards import Candidate, RecoveryBoard, RecoveryDesign, make_board
 from brainbench.scoring.recovery.confusion import Recovery

@@ -16,8 +16,8 @@ from brainbench.core.errors import DataError, UsageError
 from brainbench.core.files import write_json
 from brainbench.core.progress import Progress
 from brainbench.core.reading.ranges import check_number
+from brainbench.core.runs.folder import begin_run
 from brainbench.core.writing.locks import lock_folder
-from brainbench.core.writing.same_run import begin_run
 from brainbench.core.writing.temporaries import is_temporary
 from brainbench.stimuli.engines import get_engine
 from brainbench.stimuli.sweeps import running

@@ -23,13 +23,22 @@ import torch
 from torch import nn
 
 from brainbench.core.errors import needing
-from brainbench.core.files import file_hash, provenance, read_mapping, to_plain, write_json
+from brainbench.core.files import file_hash, provenance
 from brainbench.core.progress import Progress
-from brainbench.core.reading.ranges import check_number
-from brainbench.core.writing.locks import lock_folder
-from brainbench.core.writing.same_run import check_same
+from brainbench.core.reading.regular import readable
+from brainbench.core.runs.folder import RESTART, RunEnd, claim
+from brainbench.core.runs.log import RunLog
+from brainbench.core.runs.state import (
+    STATE,
+    learner_state,
+    load_state,
+    random_state,
+    restore_learner,
+    save_state,
+    set_random_state,
+)
+from brainbench.core.runs.stopping import Stop, occupied
 from brainbench.core.writing.tensors import write_tensors
-from brainbench.models.training.run_folder import RunLog, load_state, save_state
 from robotics_bridge.hands.layouts import check_probes, is_probe_file
 from robotics_bridge.policies.encoders.arms import perceptron
 from robotics_bridge.policies.evaluate import Policy
@@ -43,18 +52,13 @@ from robotics_bridge.tasks.task import TASK_VERSION, check_measured
 
 _log = logging.getLogger(__name__)
 
-STATE = "state.safetensors"
 _LEAST_VARIANCE = 1e-4
 
 
 @dataclass(frozen=True)
-class DistillResult:
+class DistillResult(RunEnd):
     """Outcome of a run."""
 
-    status: Literal["finished", "stopped", "diverged"]
-    """``stopped``: the time or the iterations allowed were over; start it again to go on."""
-    reason: str
-    folder: Path
     iterations: int
     """Iterations done in all."""
     loss: float
@@ -86,13 +90,12 @@ def distill(
         stop_after, stop_at: When to stop, where that is before the end.
         progress: Called with (iterations done, iterations in all, what).
     """
-    if stop_after is not None:
-        check_number("stop_after", stop_after, least=0)
+    stop = Stop(stop_after, stop_at, "iterations")
     # Without it a student can act, but not learn.
     with needing("rsl-rl-lib", extra="policies", purpose="Training policies"):
         import rsl_rl.models  # noqa: F401
     devices = [env.device] if torch.device(env.device).type == "cuda" else []
-    with lock_folder(Path(out), wait=False), torch.random.fork_rng(devices=devices):
+    with occupied(Path(out), stop), torch.random.fork_rng(devices=devices):
         torch.manual_seed(config.seed)
         run = _Run(config.resolved(env.task.student), Path(out), env, teacher)
         # Products as exact as PyTorch's convolutions are by default.
@@ -100,35 +103,19 @@ def distill(
         if devices:
             torch.set_float32_matmul_precision("high")
         try:
-            allowed = math.inf if stop_after is None else stop_after
-            return run.run(allowed, stop_at, progress or (lambda done, total, what: None))
+            return run.run(stop, progress or (lambda done, total, what: None))
         finally:
             torch.set_float32_matmul_precision(before)
             run.log.close()
 
 
 class _Learner(nn.Module):
-    """All that a state file holds as weights: student, decoders, and the environments as buffers."""
+    """What learns: the student, and decoders that read its latent."""
 
     def __init__(self, student: TactilePolicy, decoders: nn.ModuleDict) -> None:
         super().__init__()
         self.student: TactilePolicy = student
         self.decoders: nn.ModuleDict = decoders
-        self.world = nn.Module()
-
-    def keep(self, tensors: Mapping[str, torch.Tensor]) -> None:
-        """Hold tensors of the world by name, for the file of a state."""
-        for name, value in tensors.items():
-            if value.is_floating_point():
-                # Files hold finite numbers alone; a deadline that never comes is as far away at the largest of them.
-                most = torch.finfo(value.dtype).max
-                value = value.clamp(-most, most)
-            self.world.register_buffer(name.replace(".", "/"), value)
-
-    def kept(self, prefix: str) -> dict[str, torch.Tensor]:
-        """Return the held tensors whose names begin with a prefix, without it."""
-        found = {name.replace("/", "."): value for name, value in self.world.named_buffers(recurse=False)}
-        return {name.removeprefix(prefix): value for name, value in found.items() if name.startswith(prefix)}
 
 
 class _Run:
@@ -164,11 +151,11 @@ class _Run:
         self._claim()
         if (out / STATE).exists():
             self._restore()
-        self.log = RunLog(out, step=self.iteration)
+        self.log = RunLog(out, "step", self.iteration)
 
-    def run(self, allowed: float, stop_at: int | None, progress: Progress) -> DistillResult:
-        """Learn to the last iteration, for ``allowed`` seconds, or up to ``stop_at`` iterations in all."""
-        started, total = time.monotonic(), self.config.iterations or 0
+    def run(self, stop: Stop, progress: Progress) -> DistillResult:
+        """Learn to the last iteration, or until it is to stop."""
+        total = self.config.iterations or 0
         status: Literal["finished", "stopped", "diverged"] = "finished"
         reason = ""
         while self.iteration < total:
@@ -184,15 +171,13 @@ class _Run:
             self._report(losses, acted - begun, time.perf_counter() - acted, rollout)
             progress(self.iteration, total, "distilling")
             last = self.iteration == total
-            late = time.monotonic() - started > allowed and not last
-            enough = stop_at is not None and self.iteration >= stop_at and not last
-            if last or late or enough or self.iteration % self.config.save_interval == 0:
+            reason = "" if last else stop.reason(self.iteration)
+            if last or reason or self.iteration % self.config.save_interval == 0:
                 self._save()
-            if late or enough:
+            if reason:
                 status = "stopped"
-                reason = f"{allowed:g} seconds were over." if late else f"{stop_at} iterations were asked for."
                 break
-        return DistillResult(status, reason, self.out, self.iteration, self.loss, time.monotonic() - started)
+        return DistillResult(status, reason, self.out, self.iteration, self.loss, stop.elapsed)
 
     @torch.no_grad()
     def _act(self, share: float) -> Rollout:
@@ -288,56 +273,63 @@ class _Run:
 
     def _claim(self) -> None:
         """Write the run's configuration, or check that the folder holds this run."""
-        path = self.out / CONFIG
-        mine = to_plain(asdict(self.config))
-        if path.is_file():
-            known = read_mapping(path)
-            check_version(known, str(self.out))
-            check_same(self.out, known.get("distill"), mine, "student")
-            check_hand(known, self.env, str(self.out))
-            check_probes(self.config.resolution, known.get("deployment", {}).get("probes"))
-        else:
-            write_json(path, describe_run(self.config, self.student, self.env))
+        earlier: dict[str, Any] = {}
 
-    def _world(self) -> dict[str, torch.Tensor]:
+        def stated(document: dict[str, Any]) -> object:
+            check_version(document, str(self.out))
+            earlier.update(document)
+            return document.get("distill")
+
+        def begin() -> dict[str, Any]:
+            return describe_run(self.config, self.student, self.env)
+
+        claim(self.out / CONFIG, asdict(self.config), begin, stated=stated, what="student")
+        if earlier:
+            check_hand(earlier, self.env, str(self.out))
+            check_probes(self.config.resolution, earlier.get("deployment", {}).get("probes"))
+
+    def _save(self) -> None:
         # The memory of noisy sensors is in no file, so such a run starts new episodes at every state it saves.
         if self.config.noisy:
             self.observations = self.env.reset()
             self.memory, self.touched = torch.zeros_like(self.memory), torch.zeros_like(self.touched)
-        own = {f"env.{name}": value for name, value in self.env.state_dict().items()}
-        return {**own, "run.memory": self.memory, "run.touched": self.touched}
-
-    def _save(self) -> None:
-        self.learner.keep(self._world())
         numbers = [number for number, _ in self.kept]
         for number, rollout in self.kept:
             path = self.out / "rollouts" / f"{number}.safetensors"
             if not path.is_file():
                 rollout.save(path)
-        plain = {"iteration": self.iteration, "loss": self.loss, "rollouts": numbers}
-        save_state(self.out / STATE, self.learner, self.optimizer, plain)
+        reached = {"iteration": self.iteration, "loss": self.loss, "rollouts": numbers}
+        world = {"env": self.env.state_dict(), "memory": self.memory, "touched": self.touched}
+        random = random_state(self.device)
+        save_state(
+            self.out / STATE, {**learner_state(self.learner, self.optimizer), **reached, **world, "random": random}
+        )
         write_tensors(self.out / MODEL, self.student.state_dict())
         for path in (self.out / "rollouts").glob("*.safetensors"):
             if int(path.stem) not in numbers:
                 path.unlink()
 
     def _restore(self) -> None:
-        self.learner.keep(self._world())
-        plain = load_state(self.out / STATE, self.learner, self.optimizer)
-        self.iteration, self.loss = int(plain["iteration"]), float(plain["loss"])
+        state = load_state(self.out / STATE)
+        with readable(self.out / STATE, "training state", RESTART):
+            self._go_on(state)
+
+    def _go_on(self, state: Mapping[str, Any]) -> None:
+        restore_learner(state, self.learner, self.optimizer, self.out / STATE)
+        self.iteration, self.loss = int(state["iteration"]), float(state["loss"])
         cuda = self.device.type == "cuda"
         for group in self.optimizer.param_groups:
             group |= {"fused": cuda, "capturable": cuda}
         for entries in self.optimizer.state.values():
             entries["step"] = entries["step"].to(self.device)
-        self.env.load_state_dict(self.learner.kept("env."))
+        self.env.load_state_dict(state["env"])
         self.observations = self.env.observations
-        own = self.learner.kept("run.")
-        self.memory, self.touched = own["memory"].clone(), own["touched"].clone()
+        self.memory, self.touched = (state[name].to(self.device) for name in ("memory", "touched"))
         self.kept = [
             (number, Rollout.load(self.out / "rollouts" / f"{number}.safetensors", self.device))
-            for number in plain["rollouts"]
+            for number in state["rollouts"]
         ]
+        set_random_state(state["random"], self.device)
 
 
 def describe_run(config: DistillConfig, student: TactilePolicy, env: Any) -> dict[str, Any]:

@@ -15,6 +15,7 @@ from brainbench.core.errors import DataError
 from brainbench.core.files import read_mapping
 from brainbench.core.reading.regular import readable
 from brainbench.core.reading.tensors import read_tensors
+from brainbench.core.runs.state import odd_shape
 from robotics_bridge.hands.layouts import check_probes
 from robotics_bridge.policies.encoders.arms import EncoderConfig
 from robotics_bridge.policies.fit import check_version
@@ -22,7 +23,6 @@ from robotics_bridge.policies.schema import JOINTS, Groups, from_json, shapes_of
 from robotics_bridge.policies.shipped import policy_path, student_folder
 from robotics_bridge.policies.student import TACTILE, TactilePolicy
 from robotics_bridge.policies.training.distill_config import DistillConfig
-from robotics_bridge.policies.training.state_tree import odd_shape
 
 CONFIG, MODEL = "config.json", "model.safetensors"
 

@@ -1,7 +1,7 @@
 """The privileged teacher: PPO with curiosity (RND) and a critic that sees more, through rsl_rl (thesis, table 4.4).
 
-A run is a folder: ``config.json``, ``model_<iteration>.safetensors`` (actor and critic), ``resume.safetensors``
-(all that the next iteration depends on), ``log.jsonl`` and TensorBoard events. Started again, it goes on exactly.
+A run is a folder: ``config.json``, ``model_<iteration>.safetensors`` (actor and critic), ``state.safetensors``
+(all that the next iteration depends on), ``log.jsonl`` and ``tensorboard/``. Started again, it goes on exactly.
 """
 
 from __future__ import annotations
@@ -25,19 +25,18 @@ from brainbench.core.progress import Progress
 from brainbench.core.reading.ranges import check_fields
 from brainbench.core.reading.regular import readable
 from brainbench.core.reading.tensors import check_finite
-from brainbench.core.writing.locks import lock_folder
-from brainbench.core.writing.same_run import check_same
+from brainbench.core.runs.folder import RESTART, RunEnd, claim
+from brainbench.core.runs.log import RunLog, check_sinks
+from brainbench.core.runs.state import STATE, load_state, odd_shape, random_state, save_state, set_random_state
+from brainbench.core.runs.stopping import Stop, occupied
 from brainbench.core.writing.tensors import write_tensors
-from brainbench.models.training.run_folder import LOG, RESTART, trim_log
 from robotics_bridge.envs.rsl_rl import RslRlEnv
 from robotics_bridge.policies.acting import ActingModel
 from robotics_bridge.policies.evaluate import Policy
 from robotics_bridge.policies.fit import check_fit, check_version
 from robotics_bridge.policies.schema import from_json
 from robotics_bridge.policies.shipped import SENSING, policy_path
-from robotics_bridge.policies.training import state_tree
 from robotics_bridge.policies.training.distill import describe_run
-from robotics_bridge.policies.training.loggers import Loggers, check_loggers
 from robotics_bridge.policies.training.sensing import sensed_groups, sensing_policy
 from robotics_bridge.policies.training.student_files import CONFIG, MODEL
 from robotics_bridge.tasks.settings import TeacherSettings
@@ -47,14 +46,16 @@ if TYPE_CHECKING:
     from robotics_bridge.envs.env import Env
 
 _LOG = logging.getLogger(__name__)
-RESUME = "resume.safetensors"
+_IDENTITY = (
+    "task", "hand", "num_envs", "seed", "settings", "observe", "contacts", "rate", "world", "sensing", "hand_physics",
+)  # fmt: skip
+"""Facts that must be equal for a run to go on."""
 
 
 @dataclass(frozen=True)
-class TeacherResult:
+class TeacherResult(RunEnd):
     """Outcome of a training run."""
 
-    run: Path
     iterations: int
     """Done since the run began."""
     steps: int
@@ -107,7 +108,7 @@ class Trainer:
         self.algorithm.train_mode()
 
     def iterate(self) -> dict[str, float]:
-        """Collect steps, learn from them, and return losses, episode means and seconds spent."""
+        """Collect steps, learn from them, and return steps in all, losses, episode means and seconds spent."""
         env, algorithm, steps = self.env, self.algorithm, self.config["num_steps_per_env"]
         start = _now(env.device)
         reward = torch.zeros((), device=env.device)
@@ -134,7 +135,7 @@ class Trainer:
             torch.cuda.empty_cache()
         self.iteration += 1
         row = {
-            "iteration": self.iteration, "steps": self.iteration * steps * env.num_envs,
+            "steps": self.iteration * steps * env.num_envs,
             "reward": float(reward) / steps, "collect_s": collected - start, "learn_s": _now(env.device) - collected,
             **{f"loss/{name}": float(value) for name, value in losses.items()},
             "learning_rate": float(algorithm.learning_rate),
@@ -170,10 +171,10 @@ class Trainer:
         Actions begin with the standard deviation ``std``; None takes that of the other run.
         """
         file = model_file(path)
-        found, own = state_tree.load(file), self.algorithm.save()
+        found, own = load_state(file), self.algorithm.save()
         for name in ("actor", "critic"):
             trees = (found[name], own[f"{name}_state_dict"])
-            if odd := state_tree.odd_shape(*trees):
+            if odd := odd_shape(*trees):
                 key, theirs, mine = odd
                 raise DataError(
                     f"The {name} of {str(file)!r} does not fit: {key!r} has the shape {theirs}, here {mine}. Take a "
@@ -191,11 +192,9 @@ class Trainer:
         """Return all that the next iteration depends on, random numbers included."""
         state = {"algorithm": self.algorithm.save(), "env": self.env.unwrapped.state_dict()}
         state |= {name: value.clone() for name, value in self._curriculum.items()}
-        state |= {"iteration": self.iteration, "torch_rng": torch.get_rng_state()}
+        state |= {"iteration": self.iteration, "random": random_state(self.env.device)}
         if self.sensing is not None:
             state["memory"] = self.algorithm.get_policy().get_hidden_state()
-        if self.env.device.type == "cuda":
-            state["cuda_rng"] = torch.cuda.get_rng_state(self.env.device)
         if self.algorithm.rnd:
             normaliser = self.algorithm.rnd.reward_normalizer
             # rsl_rl keeps these two outside its state_dict.
@@ -219,9 +218,7 @@ class Trainer:
             if average is not None:
                 self.algorithm.rnd.reward_normalizer.disc_avg.avg = average.to(self.env.device)  # type: ignore[union-attr]
         self._observations = self.env.get_observations()
-        torch.set_rng_state(state["torch_rng"].cpu())
-        if "cuda_rng" in state:
-            torch.cuda.set_rng_state(state["cuda_rng"].cpu(), self.env.device)
+        set_random_state(state["random"], self.env.device)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -256,7 +253,7 @@ class TeacherRun:
         if self.start_std is not None and self.start is None:
             raise UsageError(f"start_std goes with a run to start from; received {self.start_std!r} alone.")
         sensed_groups(self.observe)
-        check_loggers(self.loggers)
+        check_sinks(self.loggers)
 
 
 def train(
@@ -272,18 +269,19 @@ def train(
     The settings of the optimisation are those of the task by default.
     """
     settings, options = settings or env.task.teacher, options or TeacherRun()
-    with lock_folder(run, wait=False):
-        return _train(env, run, options, settings, progress)
+    stop = Stop(None if options.minutes is None else 60 * options.minutes)
+    with occupied(run, stop):
+        return _train(env, run, options, settings, stop, progress)
 
 
 def _train(
-    env: Env, run: Path, options: TeacherRun, settings: TeacherSettings, progress: Progress | None
+    env: Env, run: Path, options: TeacherRun, settings: TeacherSettings, stop: Stop, progress: Progress | None
 ) -> TeacherResult:
     total = options.iterations or settings.iterations
     trainer = Trainer(env, settings, seed=options.seed, observe=options.observe, encoder=options.encoder)
     env.goals.start_curriculum()
     origin = None
-    if options.start is not None and not (run / RESUME).is_file():
+    if options.start is not None and not (run / STATE).is_file():
         start = model_file(options.start)
         trainer.begin_from(start, std=options.start_std)
         origin = {"file": str(start), "hash": file_hash(start)}
@@ -297,47 +295,41 @@ def _train(
         "rate": 1 / env.step_dt, "world": _plain(env.task), "sensing": to_plain(trainer.sensing),
     }  # fmt: skip
     _resume(trainer, run, facts)
-    writer = Loggers(run, options.loggers, facts)
-    began, rows = time.monotonic(), []
-    over = False
-    while trainer.iteration < total and not over:
-        row = trainer.iterate()
-        rows.append(row)
-        with (run / LOG).open("a", encoding="utf-8") as file:
-            file.write(json.dumps(row) + "\n")
-        writer.write(row, trainer.iteration)
-        if progress:
-            progress(trainer.iteration, total, "training")
-        over = options.minutes is not None and time.monotonic() - began > 60 * options.minutes
-        if over or trainer.iteration % options.save_every == 0 or trainer.iteration == total:
-            _save(trainer, run)
-            writer.save()
-    writer.close()
+    # Iterations after the last checkpoint are done again.
+    rows, reason = [], ""
+    with contextlib.closing(RunLog(run, "iteration", trainer.iteration, sinks=options.loggers, facts=facts)) as log:
+        while trainer.iteration < total and not reason:
+            row = trainer.iterate()
+            rows.append({"iteration": trainer.iteration, **row})
+            log.write("", trainer.iteration, **row)
+            if progress:
+                progress(trainer.iteration, total, "training")
+            reason = "" if trainer.iteration == total else stop.reason()
+            if reason or trainer.iteration % options.save_every == 0 or trainer.iteration == total:
+                _save(trainer, run)
+                log.save()
     steps = trainer.iteration * settings.steps_per_env * env.num_envs
-    return TeacherResult(run, trainer.iteration, steps, time.monotonic() - began, tuple(rows))
+    status = "stopped" if reason else "finished"
+    return TeacherResult(status, reason, run, trainer.iteration, steps, stop.elapsed, tuple(rows))
 
 
 def _resume(trainer: Trainer, run: Path, facts: dict[str, Any]) -> None:
-    config = run / "config.json"
-    if not config.is_file():
-        write_json(config, facts | {"provenance": provenance()})
+    document = run / "config.json"
+
+    def stated(document_of_run: dict[str, Any]) -> object:
+        check_version(document_of_run, str(run))
+        # Settings that came later than the run had their defaults in it.
+        settings = from_json(TeacherSettings, document_of_run.get("settings"), f"settings of {document}")
+        return {**document_of_run, "settings": to_plain(settings)}
+
+    claim(
+        document, {name: facts[name] for name in _IDENTITY}, lambda: facts | {"provenance": provenance()}, stated=stated
+    )
+    if not (run / STATE).exists():
         return
-    known = read_mapping(config)
-    check_version(known, str(run))
-    # Settings that came later than the run had their defaults in it.
-    known["settings"] = asdict(from_json(TeacherSettings, known.get("settings"), f"settings of {config}"))
-    names = ["task", "hand", "num_envs", "seed", "settings", "observe", "contacts"]
-    # Earlier runs do not state these.
-    names += [name for name in ("rate", "world", "sensing", "hand_physics") if name in known]
-    check_same(run, json.loads(json.dumps(known)), {name: json.loads(json.dumps(facts[name])) for name in names})
-    if not (run / RESUME).exists():
-        trim_log(run / LOG, "iteration", 0)
-        return
-    state = state_tree.load(run / RESUME)
-    with readable(run / RESUME, "training state", RESTART):
+    state = load_state(run / STATE)
+    with readable(run / STATE, "training state", RESTART):
         trainer.load(state)
-    # Iterations after the last checkpoint are done again.
-    trim_log(run / LOG, "iteration", trainer.iteration)
 
 
 def _plain(task: Task) -> dict[str, Any]:
@@ -349,13 +341,13 @@ def _plain(task: Task) -> dict[str, Any]:
 
 def _save(trainer: Trainer, run: Path) -> None:
     models = {name: trainer.algorithm.save()[f"{name}_state_dict"] for name in ("actor", "critic")}
-    state_tree.save(run / f"model_{trainer.iteration}.safetensors", models)
+    save_state(run / f"model_{trainer.iteration}.safetensors", models)
     if trainer.sensing is not None:
         actor: Any = trainer.algorithm.get_policy()
         weights = {name: value for name, value in actor.state_dict().items() if not name.startswith("distribution.")}
         write_tensors(run / SENSING / MODEL, weights)
         write_json(run / SENSING / CONFIG, describe_run(trainer.sensing, actor, trainer.env.unwrapped))
-    state_tree.save(run / RESUME, trainer.state())
+    save_state(run / STATE, trainer.state())
 
 
 def newest(run: Path) -> Path:
@@ -387,7 +379,7 @@ def load_teacher(run: str | Path, env: Env) -> Policy:
     facts = read_mapping(file.parent / "config.json", "configuration of a teacher")
     check_fit(facts, env, str(run))
     hidden = from_json(TeacherSettings, facts.get("settings"), "settings of config.json").hidden
-    weights = state_tree.load(file).get("actor")
+    weights = load_state(file).get("actor")
     weights = weights if isinstance(weights, dict) else {}
     check_finite(weights, str(file))
     biases = [weights.get(f"mlp.{2 * layer}.bias") for layer in range(len(hidden))]

@@ -5,10 +5,10 @@ import pytest
 import torch
 
 from brainbench.core.errors import UsageError
+from brainbench.core.runs.folder import claim
 from brainbench.models.registry import load_model
 from brainbench.models.training.augmentation import reverse_time
 from brainbench.models.training.config import TrainingConfig, config_warnings
-from brainbench.models.training.run_folder import claim
 from brainbench.models.training.trainer import train
 from tests.factories.training_sweeps import sweeps, tiny
 
@@ -117,8 +117,9 @@ def test_validation_of_a_contrastive_run_mixes_the_classes(objective, mixed, tmp
 
 
 def test_a_run_of_an_older_version_of_its_architecture_is_another_run(tmp_path):
-    known = TrainingConfig("s4-small").identity
-    claim(tmp_path, {name: value for name, value in known.items() if name != "version"}, write=True)
+    identity = TrainingConfig("s4-small").identity
+    older = {name: value for name, value in identity.items() if name != "version"}
+    claim(tmp_path / "run.json", older, lambda: older, stated=dict)
     with pytest.raises(UsageError, match=r"version None \(now 2\)"):
-        claim(tmp_path, known, write=True)
+        claim(tmp_path / "run.json", identity, lambda: identity, stated=dict)
     assert "version" not in TrainingConfig("zhuang-small").identity

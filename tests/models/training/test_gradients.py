@@ -3,6 +3,7 @@ from contextlib import nullcontext
 import pytest
 import torch
 
+from brainbench.core.runs.log import read_log
 from brainbench.models import load_model
 from brainbench.models.cells import CELLS
 from brainbench.models.ops.parameters import copy_named
@@ -10,7 +11,6 @@ from brainbench.models.training import gradients
 from brainbench.models.training.config import TrainingConfig
 from brainbench.models.training.gradients import Gradients, fuse
 from brainbench.models.training.objectives import make_learner
-from brainbench.models.training.run_folder import read_log
 from brainbench.models.training.trainer import train
 from tests.factories.training_sweeps import sweeps, tiny
 

@@ -12,13 +12,13 @@ import torch
 from safetensors.torch import load_file
 
 from brainbench.core.errors import DataError, UsageError
+from brainbench.core.runs.log import read_log
 from brainbench.models.registry import describe_model, load_model
 from brainbench.models.training import trainer
 from brainbench.models.training.batches import BatchOptions
 from brainbench.models.training.config import TrainingConfig
 from brainbench.models.training.evaluation import evaluate, fit_probe
 from brainbench.models.training.objectives import make_learner
-from brainbench.models.training.run_folder import read_log
 from brainbench.models.training.trainer import train
 from brainbench.scoring.model_responses import resolve_model
 from tests.factories.training_sweeps import CLASSES, sweeps, tiny

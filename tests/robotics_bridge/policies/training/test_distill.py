@@ -88,7 +88,8 @@ def test_a_killed_run_goes_on_exactly(tmp_path, changes) -> None:
 def test_a_run_that_stops_after_some_iterations_goes_on_exactly(tmp_path) -> None:
     whole = _run(tmp_path / "a", iterations=4)
     first = distill(_config(iterations=4), tmp_path / "b", env=TouchWorld(16), teacher=Follower(), stop_at=3)
-    assert (first.status, first.iterations, first.reason) == ("stopped", 3, "3 iterations were asked for.")
+    assert (first.status, first.iterations) == ("stopped", 3)
+    assert first.reason.startswith("3 iterations are done, as many as were allowed")
     assert _run(tmp_path / "b", iterations=4).loss == whole.loss
 
 

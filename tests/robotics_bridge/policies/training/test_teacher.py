@@ -17,11 +17,11 @@ import pytest
 import torch
 
 from brainbench.core.errors import BrainbenchError, DataError, UsageError
+from brainbench.core.runs.state import STATE, load_state
 from robotics_bridge import tasks
 from robotics_bridge.envs import Env
 from robotics_bridge.policies.shipped import FOLDER
-from robotics_bridge.policies.training import state_tree
-from robotics_bridge.policies.training.teacher import RESUME, TeacherRun, Trainer, load_teacher, newest
+from robotics_bridge.policies.training.teacher import TeacherRun, Trainer, load_teacher, newest
 from robotics_bridge.policies.training.teacher import train as train_teacher
 from robotics_bridge.tasks.goals import SteppingRotation
 from robotics_bridge.tasks.settings import TeacherSettings
@@ -55,16 +55,16 @@ def test_a_run_that_stops_halfway_goes_on_exactly(tmp_path: Path) -> None:
     for one, two in zip(whole.history[2:], rest.history, strict=True):
         for name in ("reward", "loss/value", "loss/rnd", "curiosity", "std"):
             assert one[name] == two[name], name
-    first, second = (state_tree.load(newest(tmp_path / part))["actor"] for part in ("whole", "parts"))
+    first, second = (load_state(newest(tmp_path / part))["actor"] for part in ("whole", "parts"))
     assert all(torch.equal(first[name], second[name]) for name in first)
     log = [json.loads(line) for line in (tmp_path / "parts" / "log.jsonl").read_text().splitlines()]
     assert [row["iteration"] for row in log] == [1, 2, 3, 4]
-    assert list((tmp_path / "parts").glob("events.out.tfevents*"))
+    assert list((tmp_path / "parts" / "tensorboard").iterdir())
 
 
 def test_a_run_killed_before_its_first_checkpoint_begins_its_log_anew(tmp_path: Path) -> None:
     train(_env(), tmp_path, settings=SMALL, iterations=1)
-    (tmp_path / RESUME).unlink()
+    (tmp_path / STATE).unlink()
     with (tmp_path / "log.jsonl").open("a") as log:
         log.write('{"iteration": 2, "rew')
     train(_env(), tmp_path, settings=SMALL, iterations=2)
@@ -81,13 +81,13 @@ train(_env(), Path({str(tmp_path / "killed")!r}), settings=SMALL, iterations=100
 """
     root = Path(__file__).parents[4]
     process = subprocess.Popen([sys.executable, "-c", text], env={**os.environ, "PYTHONPATH": str(root)})
-    resume = tmp_path / "killed" / RESUME
+    resume = tmp_path / "killed" / STATE
     deadline = time.monotonic() + 240
     while time.monotonic() < deadline and not (resume.is_file() and len(list(resume.parent.glob("model_*"))) > 2):
         time.sleep(0.2)
     process.send_signal(signal.SIGKILL)
     process.wait()
-    done = int(state_tree.load(resume)["iteration"])
+    done = int(load_state(resume)["iteration"])
     rest = train(_env(), tmp_path / "killed", settings=SMALL, iterations=done + 1, save_every=1)
     whole = train(_env(), tmp_path / "whole", settings=SMALL, iterations=done + 1, save_every=100)
     assert rest.history[-1]["reward"] == whole.history[-1]["reward"]
@@ -121,7 +121,7 @@ def test_a_run_may_begin_with_the_networks_of_another(tmp_path: Path) -> None:
     settings = replace(SMALL, rnd_weight=0.0)
     trainer = Trainer(env, settings)
     trainer.begin_from(tmp_path / "first")
-    given = state_tree.load(newest(tmp_path / "first"))
+    given = load_state(newest(tmp_path / "first"))
     own = trainer.algorithm.save()
     for name in ("actor", "critic"):
         assert all(torch.equal(value, own[f"{name}_state_dict"][key]) for key, value in given[name].items())
@@ -189,7 +189,7 @@ def test_learning_begins_with_the_wide_goal_and_goes_on_with_the_one_it_reached(
     train(_env(**changes), tmp_path / "parts", settings=SMALL, iterations=2, save_every=1)
     env = _env(**changes)
     assert float(env.goals.threshold) == pytest.approx(0.1)
-    Trainer(env, SMALL).load(state_tree.load(tmp_path / "parts" / RESUME))
+    Trainer(env, SMALL).load(load_state(tmp_path / "parts" / STATE))
     assert float(env.goals.threshold) == pytest.approx(found[1])
 
 
@@ -239,19 +239,6 @@ def test_curiosity_is_scaled_by_the_control_step() -> None:
     trainer = Trainer(_env(), replace(SMALL, rnd_weight=100.0))
     assert trainer.algorithm.rnd is not None
     assert trainer.algorithm.rnd.initial_weight == pytest.approx(100.0 * 0.025)
-
-
-def test_trees_of_tensors_and_numbers_survive_a_file(tmp_path: Path) -> None:
-    tree = {"a": torch.arange(3), "b": [1.5, None, (torch.ones(2, 2), "x")], "state": {0: {"step": torch.tensor(2.0)}}}
-    state_tree.save(tmp_path / "tree.safetensors", tree)
-    back = state_tree.load(tmp_path / "tree.safetensors")
-    assert torch.equal(back["a"], tree["a"])
-    assert back["b"][:2] == [1.5, None]
-    assert torch.equal(back["b"][2][0], torch.ones(2, 2))
-    assert float(back["state"][0]["step"]) == 2.0
-    (tmp_path / "broken.safetensors").write_bytes(b"no tensors")
-    with pytest.raises(DataError, match=r"broken\.safetensors"):
-        state_tree.load(tmp_path / "broken.safetensors")
 
 
 def _check_mutants(folder, cases: int) -> None:

@@ -1,0 +1,86 @@
+import json
+
+import pytest
+import torch
+from safetensors.torch import save_file
+
+from brainbench.core.errors import DataError
+from brainbench.core.runs.state import (
+    learner_state,
+    load_state,
+    odd_shape,
+    random_state,
+    restore_learner,
+    save_state,
+    set_random_state,
+)
+
+
+def _make_training(width=3):
+    torch.manual_seed(0)
+    model = torch.nn.Linear(width, 2)
+    return model, torch.optim.AdamW(model.parameters(), lr=0.1)
+
+
+def _step(model, optimizer):
+    optimizer.zero_grad()
+    model(torch.randn(4, model.in_features)).square().mean().backward()
+    optimizer.step()
+
+
+def test_trees_of_tensors_and_numbers_survive_a_file(tmp_path):
+    tree = {"a": torch.arange(3), "b": [1.5, None, (torch.ones(2, 2), "x")], "state": {0: {"step": torch.tensor(2.0)}}}
+    save_state(tmp_path / "tree.safetensors", tree)
+    back = load_state(tmp_path / "tree.safetensors")
+    assert torch.equal(back["a"], tree["a"])
+    assert back["b"][:2] == [1.5, None]
+    assert isinstance(back["b"][2], tuple)
+    assert torch.equal(back["b"][2][0], torch.ones(2, 2))
+    assert float(back["state"][0]["step"]) == 2.0
+
+
+def test_a_training_goes_on_to_the_last_bit(tmp_path):
+    model, optimizer = _make_training()
+    _step(model, optimizer)
+    device = torch.device("cpu")
+    save_state(tmp_path / "state", {**learner_state(model, optimizer), "random": random_state(device)})
+    _step(model, optimizer)
+
+    resumed, moments = _make_training()
+    state = load_state(tmp_path / "state")
+    restore_learner(state, resumed, moments, tmp_path / "state")
+    set_random_state(state["random"], device)
+    _step(resumed, moments)
+    assert torch.equal(resumed.weight, model.weight)
+
+
+def test_states_that_do_not_fit_or_are_damaged_are_refused(tmp_path):
+    model, optimizer = _make_training()
+    _step(model, optimizer)
+    path = tmp_path / "state.safetensors"
+    save_state(path, learner_state(model, optimizer))
+    with pytest.raises(DataError, match=r"belongs to another network .*Delete it to start anew"):
+        restore_learner(load_state(path), *_make_training(5), path)
+    state = load_state(path)
+    state["optimizer"]["state"][0]["exp_avg"] = torch.zeros(7)
+    with pytest.raises(DataError, match=r"'exp_avg' of the optimiser .*fits no weights"):
+        restore_learner(state, *_make_training(), path)
+    state["learner"]["weight"][0, 0] = torch.nan
+    with pytest.raises(DataError, match="not finite"):
+        restore_learner(state, *_make_training(), path)
+    path.write_bytes(b"no tensors")
+    with pytest.raises(DataError, match=r"state\.safetensors"):
+        load_state(path)
+
+
+def test_the_format_of_earlier_states_is_refused_in_one_sentence(tmp_path):
+    save_file({"learner.weight": torch.zeros(2)}, tmp_path / "state.safetensors", {"state": json.dumps({"plain": {}})})
+    with pytest.raises(DataError, match="was saved by an earlier brainbench, and this one cannot go on from it"):
+        load_state(tmp_path / "state.safetensors")
+
+
+def test_the_first_odd_shape_is_named():
+    same = {"a": torch.zeros(2)}
+    assert odd_shape(same, same) is None
+    assert odd_shape(same, {"a": torch.zeros(3)}) == ("a", (2,), (3,))
+    assert odd_shape(same, {**same, "b": torch.zeros(3)}) == ("b", None, (3,))
