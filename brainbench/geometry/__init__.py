@@ -1,15 +1,15 @@
 """Triangle meshes, in metres: files with units, diagnosis, repair, distances, hulls and convex decomposition.
 
-A mesh is loaded (``mesh``), repaired (``mesh_repair``), cut into convex pieces by a process of its own
-(``decomposition``), and the pieces are held against it (``distance``).
+A mesh is loaded (``mesh``), repaired (``mesh_repair``), and cut into convex ``pieces`` by the optional folder
+``decomposition``; ``distance`` measures how far the pieces are from it.
 """
 
 from __future__ import annotations
 
-from brainbench.geometry.decomposition import Decomposition, DecompositionSettings, decompose
 from brainbench.geometry.distance import Deviation, deviation, hausdorff, winding_number
 from brainbench.geometry.mesh import UNITS, Diagnosis, Mesh, convex_hull, load_mesh, save_mesh
 from brainbench.geometry.mesh_repair import Repair, repair
+from brainbench.geometry.pieces import Decomposition, DecompositionSettings, decompose
 
 __all__ = [
     "UNITS",

@@ -9,20 +9,19 @@ import sys
 import tempfile
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
 from importlib import metadata
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
-from brainbench.core.errors import DataError, UsageError, check_name, missing_dependency
+from brainbench.core.errors import DataError, missing_dependency
 from brainbench.core.files import cache_dir, content_hash
-from brainbench.core.reading.ranges import check_fields
 from brainbench.core.reading.sealed import read_sealed, write_sealed
 from brainbench.geometry.distance import Deviation, deviation, hausdorff
 from brainbench.geometry.mesh import Mesh, convex_hull
+from brainbench.geometry.pieces import Decomposition, DecompositionSettings
 
 _LOG = logging.getLogger(__name__)
 
@@ -41,75 +40,20 @@ _VERSION = 1
 """Raised when results of this module change, so that cached ones are made again."""
 
 
-@dataclass(frozen=True)
-class DecompositionSettings:
-    """Method and limits by which a mesh is cut; a value outside its range is a :class:`UsageError`."""
-
-    method: Literal["coacd", "vhacd"] = "coacd"
-    """``coacd`` (Wei et al. 2022) or ``vhacd`` (Mamou 2016, as PyBullet carries it; what the thesis used)."""
-    threshold: float = 0.05
-    """Concavity that may remain, relative to the size of the mesh, 0.01 (fine) … 1; CoACD only."""
-    most_pieces: int | None = None
-    """Largest number of pieces; None for as many as the threshold asks for; CoACD only."""
-    seed: int = 0
-    """Seed of CoACD's search."""
-    most_faces: int = 50_000
-    """A mesh of more triangles is first simplified, to a fifth of this many; the deviation of the pieces is still
-    measured against the original."""
-    seconds: float = 120.0
-    """Limit of wall time; the work is stopped beyond it. Does not change a result."""
-    memory: float = 4e9
-    """Limit of memory [bytes]; the work is stopped beyond it. Does not change a result."""
-
-    def __post_init__(self) -> None:
-        check_name("decomposition method", self.method, METHODS)
-        check_fields(self, "threshold", least=0.01, most=1)
-        check_fields(self, "most_pieces", least=1, whole=True)
-        if self.most_pieces is not None and self.method == "vhacd":
-            raise UsageError("V-HACD in PyBullet has no limit on the number of pieces; use method = 'coacd' for one.")
-        check_fields(self, "seed", least=0, whole=True)
-        check_fields(self, "most_faces", least=500, whole=True)
-        check_fields(self, "seconds", "memory", above=0)
-
-    def config(self) -> dict[str, Any]:
-        """Return the plain values that determine the pieces."""
-        if self.method == "vhacd":
-            return {"method": self.method, "most_faces": self.most_faces}
-        names = ("method", "threshold", "most_pieces", "seed", "most_faces")
-        return {name: getattr(self, name) for name in names}
-
-
-@dataclass(frozen=True, eq=False)
-class Decomposition:
-    """Convex pieces that stand for a mesh."""
-
-    pieces: tuple[Mesh, ...]
-    """Convex, closed, outward."""
-    deviation: Deviation
-    """Deviation of the union of the pieces from the solid inside the mesh [m]."""
-    notes: tuple[str, ...]
-    """Sentences on what was done and how far the pieces are from the mesh; relative, so scaling keeps them true."""
-    key: str = ""
-    """Names what the pieces were computed from: the shape of the mesh, the settings, the versions of the packages."""
-    cached: bool = False
-    """True when the pieces were found in the cache."""
-
-
-def decompose(mesh: Mesh, settings: DecompositionSettings | None = None) -> Decomposition:
+def cut(mesh: Mesh, settings: DecompositionSettings) -> Decomposition:
     """Cut a mesh into convex pieces; holes of the surface are closed by CoACD's remeshing.
 
     The pieces are computed for the mesh at a diagonal of 1 and kept under
     ``brainbench.core.files.cache_dir("collision")`` by the hash of that mesh, the settings and the versions
     of the packages, so that one decomposition serves every size.
     """
-    settings = settings or DecompositionSettings()
     diagonal, centre = mesh.diagonal, mesh.bounds.mean(axis=0)
     # Rounded, so that one shape at two sizes has one name in the cache.
     unit = Mesh(np.round((mesh.vertices - centre) / diagonal, 9), mesh.faces, mesh.name)
     key = _key(unit, settings)
     path = cache_dir("collision") / f"{key}.npz"
-    found = _read(path, mesh.name)
-    pieces, numbers = found or _compute(unit, settings, path)
+    stored = _read(path, mesh.name)
+    pieces, numbers = stored or _compute(unit, settings, path)
     outward, inward, samples, decimated = (float(value) for value in numbers)
     # Convexity and relative deviation do not change with scale, so the unit pieces are only scaled back.
     placed = tuple(Mesh(piece.vertices * diagonal + centre, piece.faces, mesh.name) for piece in pieces)
@@ -118,7 +62,7 @@ def decompose(mesh: Mesh, settings: DecompositionSettings | None = None) -> Deco
         deviation=Deviation(outward * diagonal, inward * diagonal, int(samples)),
         notes=_notes(unit, settings, len(pieces), (outward, inward, decimated)),
         key=key,
-        cached=found is not None,
+        cached=stored is not None,
     )
 
 
@@ -129,9 +73,9 @@ def _compute(unit: Mesh, settings: DecompositionSettings, path: Path) -> tuple[t
     reduced, decimated = _decimated(unit, settings.most_faces)
     pieces = tuple(convex_hull(points, unit.name) for points in _run(reduced, settings))
     # Measured against the whole mesh; the simplified one decides what is inside, to save time.
-    found = deviation(unit, pieces, inside=reduced)
+    gap = deviation(unit, pieces, inside=reduced)
     # Relative to a diagonal of 1, so that the cached numbers serve every size.
-    numbers = np.array([found.outward, found.inward, found.samples, decimated])
+    numbers = np.array([gap.outward, gap.inward, gap.samples, decimated])
     _write(path, pieces, numbers)
     return pieces, numbers
 
@@ -153,7 +97,7 @@ def _decimated(mesh: Mesh, most: int) -> tuple[Mesh, float]:
 
 
 def _run(mesh: Mesh, settings: DecompositionSettings) -> list[np.ndarray]:
-    worker = Path(__file__).with_name("decomposition_worker.py")
+    worker = Path(__file__).with_name("worker.py")
     with tempfile.TemporaryDirectory(prefix="brainbench-") as folder:
         source, target = Path(folder, "mesh.npz"), Path(folder, "pieces.npz")
         np.savez(source, vertices=mesh.vertices, faces=mesh.faces)
