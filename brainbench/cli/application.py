@@ -17,7 +17,6 @@ from brainbench.core.version import __version__
 
 COMMANDS = {
     "score": "Score a model against neural recordings and write a result record and an HTML report.",
-    "recovery": "Say whether an experiment could tell networks apart: each network in turn makes the animals.",
     "train": "Train a model with its published recipe, or go on with a run that was interrupted.",
     "export": "Export one step, obs and h_in to features and h_out, with its contract, and check the written file.",
     "doctor": "Show versions, devices, folders and optional parts.",

@@ -71,7 +71,6 @@ EXTRAS: dict[str, tuple[Requirement, ...]] = {
     "stimuli plot": (_PICTURES,),
     "stimuli separability": (Requirement(("sklearn",), "learn", "Separability"),),
     "stimuli sweep": (_CLUSTER,),
-    "recovery": (_CLUSTER, replace(_PICTURES, when=_given("out"))),
     "leaderboard add": (_CLUSTER,),
     "leaderboard report": (_PDF,),
     "tradeoff whisker": (replace(_PICTURES, when=_given("plot")),),
@@ -80,7 +79,7 @@ EXTRAS: dict[str, tuple[Requirement, ...]] = {
 }  # fmt: skip
 
 CACHED = (
-    "score", "recovery", "train", "stimuli simulate", "stimuli render", "stimuli plot", "stimuli separability",
+    "score", "train", "stimuli simulate", "stimuli render", "stimuli plot", "stimuli separability",
     "tactile demo", "tactile bench", "policy play", "policy train", "policy evaluate", "policy distill",
     "tradeoff score", "tradeoff model", "leaderboard add", "leaderboard verify",
 )  # fmt: skip

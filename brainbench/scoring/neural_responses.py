@@ -26,6 +26,9 @@ if TYPE_CHECKING:
     from brainbench.metrics import Metric
     from brainbench.scoring.options import ScoreOptions
 
+PUBLISHED_LAYOUT = "published-npz"
+"""Layout of files of rates whose zeros the published estimators count."""
+
 
 @dataclass(frozen=True)
 class NeuralResponses:
@@ -110,9 +113,7 @@ class NeuralResponses:
     @property
     def published(self) -> bool:
         """True for a published file of rates, whose zeros the published estimators count."""
-        from brainbench.datasets.layouts.published_npz import LAYOUT
-
-        return self.dataset.attrs.get("layout") == LAYOUT.name
+        return self.dataset.attrs.get("layout") == PUBLISHED_LAYOUT
 
     def stated_pairs(self, pairs: Mapping[str, str]) -> dict[str, str | None]:
         """Return pairs of labels as a record states them: None for labels that were dropped."""
@@ -129,16 +130,6 @@ class NeuralResponses:
                 )
             match = dict(zip(self.vocabulary, stimuli, strict=True))
         return join_labels(self.vocabulary, stimuli, match)
-
-    def zero_filled(self, kept: tuple[str, ...]) -> dict[str, NDArray[np.float64]] | None:
-        """Return each animal's rates [R, K, U] as a published file holds them; None for other recordings."""
-        from brainbench.datasets.layouts.published_npz import read_arrays
-
-        if not self.published:
-            return None
-        slots = [self.vocabulary.index(label) for label in kept]
-        arrays, _ = read_arrays(Path(self.dataset.attrs["source"]))
-        return {name: array[:, slots] for name, array in arrays.items()}
 
     def reliable_trials(
         self, kept: tuple[str, ...], options: ScoreOptions, *, averaged: bool = False

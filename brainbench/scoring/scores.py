@@ -9,11 +9,13 @@ from __future__ import annotations
 
 import time as clock
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
-from brainbench.core.errors import UsageError, check_name
-from brainbench.core.files import provenance, to_plain
+from brainbench.core.errors import MissingDependencyError, UsageError, check_name
+from brainbench.core.files import provenance
+from brainbench.core.plugins import load_optional
 from brainbench.core.progress import Progress, stages
 from brainbench.core.provenance import Provenance
 from brainbench.core.records import ESTIMATOR_VERSION, ResultRecord, Score
@@ -21,11 +23,36 @@ from brainbench.scoring.options import ScoreOptions
 
 if TYPE_CHECKING:
     from brainbench.metrics import Metric
-    from brainbench.scoring.model_responses import ResolvedModel
+    from brainbench.scoring.model_responses import ModelResponses, ResolvedModel
     from brainbench.scoring.neural_responses import NeuralResponses
 
+PARTS = "brainbench.scoring"
+"""Entry points of what stands in optional folders: additions to a record's statistics by the name of their option, and
+``published_arrays``, the comparison of a published file as its authors' code takes it."""
+_ADDITIONS = ("explain", "over_time")
 STAGES = 5
 """Stages of a score that progress is told of: model, recordings, its responses, the animals' RDMs, comparisons."""
+
+
+@dataclass(frozen=True)
+class ScoreInputs:
+    """Both sides of a score, ready to be compared."""
+
+    brain: NeuralResponses
+    network: ModelResponses
+    metric: Metric
+    labels: tuple[str, ...]
+    """[K] labels that are compared, in order."""
+    rows: list[int]
+    """[K] their rows in the activations."""
+    animals: tuple[Any, ...]
+    """What the metric made of each animal."""
+    options: ScoreOptions
+
+    @cached_property
+    def features(self) -> dict[str, Any]:
+        """Features [K, F] of every layer of the model."""
+        return self.network.features(self.rows)
 
 
 def score(
@@ -74,8 +101,6 @@ def score_record(
     Returns:
         The result record; its scores share one brain side.
     """
-    from brainbench import metrics
-    from brainbench.metrics.measures.rsa import RSA
     from brainbench.scoring.model_responses import resolve_model
     from brainbench.scoring.neural_responses import open_neural_responses
 
@@ -97,15 +122,12 @@ def score_record(
     network = resolved.respond(options, progress=progress)
     stage_done()
     pairs = brain.pairs(network.labels, options.match)
-    kept = tuple(pairs)
+    labels = tuple(pairs)
     rows = [network.labels.index(label) for label in pairs.values()]
-    animals = brain.animals(kept, metric, options)
+    inputs = ScoreInputs(brain, network, metric, labels, rows, brain.animals(labels, metric, options), options)
     stage_done()
 
-    features = network.features(rows)
-    named = {network.card.name: features, **(network.baseline_features(rows, options.seed) if baselines else {})}
-    layer = network.card.layer
-    scores, between = _compare(named, brain, animals, metric, kept, options, layer=layer, agreement=baselines)
+    scores, between = _compare(inputs, baselines=baselines)
     stage_done()
     settings = {"estimator_version": ESTIMATOR_VERSION, "model": model if isinstance(model, str) else None}
     # Features with labels of their own were computed elsewhere, of stimuli unknown here.
@@ -121,26 +143,19 @@ def score_record(
             **({"command": command} if command else {}),
         )
     )
-    statistics = [item.provenance.statistics for item in scores]
-    if options.explain:
-        from brainbench.metrics.explain import explain_score
-
-        rdms = {layer: metrics.rdm(values) for layer, values in features.items()}
-        statistics[0] = {**statistics[0], "estimator_walk": to_plain(explain_score(rdms, animals))}
-    if options.over_time and isinstance(metric, RSA):
-        from brainbench.scoring.over_time.course import time_course
-
-        course = time_course(brain, network, metric, kept, rows, options, progress=progress)
-        statistics[0] = {**statistics[0], "time_course": to_plain(course)}
-    first, *others = (
-        replace(item, provenance=replace(origin, statistics=found))
-        for item, found in zip(scores, statistics, strict=True)
+    statistics = [score.provenance.statistics for score in scores]
+    for name in _ADDITIONS:
+        if getattr(options, name):
+            statistics[0] = {**statistics[0], **_optional(name)(inputs, progress=progress)}
+    first, *rest = (
+        replace(score, provenance=replace(origin, statistics=stated))
+        for score, stated in zip(scores, statistics, strict=True)
     )
     # The animals' RDM stands in the record once.
-    others = [replace(item, brain_rdm=()) for item in others]
+    rest = [replace(score, brain_rdm=()) for score in rest]
     if between is not None:
         between = replace(between, brain_rdm=(), provenance=replace(origin, statistics=between.provenance.statistics))
-    return ResultRecord(first, between, {item.name: item for item in others}, network.card, brain.synthetic)
+    return ResultRecord(first, between, {score.name: score for score in rest}, network.card, brain.synthetic)
 
 
 def _options(model: Any, values: Mapping[str, Any]) -> ScoreOptions:
@@ -177,10 +192,10 @@ def _check_inputs(resolved: ResolvedModel, brain: NeuralResponses, options: Scor
     if resolved.activations is not None and (options.whiskers != "all" or options.fidelity not in (None, "balanced")):
         raise UsageError("whiskers and fidelity are of a simulation, and these features were computed elsewhere.")
     source = DEFAULT_STIMULI if options.stimuli is None else options.stimuli
-    if resolved.labels is not None or (shown := known_labels(source)) is None:
+    if resolved.labels is not None or (labels := known_labels(source)) is None:
         return
     try:
-        brain.pairs(shown, options.match)
+        brain.pairs(labels, options.match)
     except UsageError as error:
         if options.stimuli is not None:
             raise
@@ -190,45 +205,46 @@ def _check_inputs(resolved: ResolvedModel, brain: NeuralResponses, options: Scor
         ) from error
 
 
-def _compare(
-    named: Mapping[str, Mapping[str, Any]],
-    brain: NeuralResponses,
-    animals: tuple[Any, ...],
-    metric: Metric,
-    kept: tuple[str, ...],
-    options: ScoreOptions,
-    *,
-    layer: str | None,
-    agreement: bool,
-) -> tuple[list[Score], Score | None]:
-    """Score the features of the model (the first) and of baselines, and the animals against one another if asked.
+def _compare(inputs: ScoreInputs, *, baselines: bool) -> tuple[list[Score], Score | None]:
+    """Score the features of the model (the first) and, if asked, of baselines and the animals against one another.
 
     The published estimators take a published file as its authors' code does: zeros kept, the maximum over all layers.
     """
-    how: dict[str, Any] = {"stimuli": kept, "estimator": options.estimator}
-    arrays = None if options.estimator == "default" else brain.zero_filled(kept)
-    if arrays is None:
-        how |= {"seed": options.seed}
-        chosen = {next(iter(named)): layer}
-        scores = [metric.score(one, animals, name=name, layer=chosen.get(name), **how) for name, one in named.items()]
-        between = metric.score_animals(animals, **how) if agreement else None
+    brain, network, options = inputs.brain, inputs.network, inputs.options
+    features = {network.card.name: inputs.features}
+    features |= network.baseline_features(inputs.rows, options.seed) if baselines else {}
+    if brain.published and options.estimator != "default":
+        scores, between = _optional("published_arrays")(inputs, features, agreement=baselines)
     else:
-        from brainbench.metrics.published import make_targets, score_published, score_published_animals
-
-        targets = make_targets(arrays)
-        if options.layer is not None:
-            model = next(iter(named))
-            named = {**named, model: {options.layer: named[model][options.layer]}}
-        scores = [score_published(features, targets, name=name, **how) for name, features in named.items()]
-        between = score_published_animals(arrays, stimuli=kept) if agreement else None
+        how: dict[str, Any] = {"stimuli": inputs.labels, "estimator": options.estimator, "seed": options.seed}
+        committed = {network.card.name: network.card.layer}
+        scores = [
+            inputs.metric.score(layers, inputs.animals, name=name, layer=committed.get(name), **how)
+            for name, layers in features.items()
+        ]
+        between = inputs.metric.score_animals(inputs.animals, **how) if baselines else None
     if brain.label_doubt:
-        scores = [_doubted(item, brain.label_doubt) for item in scores]
+        scores = [_doubted(score, brain.label_doubt) for score in scores]
         between = between and _doubted(between, brain.label_doubt)
     if brain.dependent:
-        told = "many trials share spikes with another one of their stimulus, which makes noise look reliable"
-        scores, between = [_doubted(item, told) for item in scores], between and _doubted(between, told)
-    scores = [replace(item, reasons=(*item.reasons, *brain.doubts)) for item in scores]
+        doubt = "many trials share spikes with another one of their stimulus, which makes noise look reliable"
+        scores, between = [_doubted(score, doubt) for score in scores], between and _doubted(between, doubt)
+    scores = [replace(score, reasons=(*score.reasons, *brain.doubts)) for score in scores]
     return scores, between and replace(between, reasons=(*between.reasons, *brain.doubts))
+
+
+def _optional(name: str) -> Any:
+    """Return a part of a score that stands in an optional folder, by its entry point.
+
+    Raises:
+        MissingDependencyError: the folder was taken off.
+    """
+    part = load_optional(PARTS, name, "part of a score")
+    if part is None:
+        raise MissingDependencyError(
+            f"No installed package has the part {name!r} of a score; install brainbench again."
+        )
+    return part
 
 
 def _doubted(score: Score, doubt: str) -> Score:
@@ -250,6 +266,9 @@ def metric_of(options: ScoreOptions) -> Metric:
     if options.explain and metric.name != "rsa-correlation":
         raise UsageError(f"The published estimator is one of RSA; the metric {metric.name!r} has none to explain.")
     if options.over_time and not isinstance(metric, RSA):
-        known = [name for name in list_metrics() if isinstance(get_metric(name), RSA)]
-        raise UsageError(f"Scores over time compare RDMs; the metric {metric.name!r} has none; choose from {known}.")
+        choices = [name for name in list_metrics() if isinstance(get_metric(name), RSA)]
+        raise UsageError(f"Scores over time compare RDMs; the metric {metric.name!r} has none; choose from {choices}.")
+    for name in _ADDITIONS:
+        if getattr(options, name):
+            _optional(name)
     return metric

@@ -13,7 +13,7 @@ from typing import Any
 from numpy.typing import ArrayLike
 
 from brainbench.core.errors import UsageError, unknown_name
-from brainbench.core.plugins import load_object
+from brainbench.core.plugins import load_entry_points, load_object, load_optional
 from brainbench.core.records import Score
 from brainbench.metrics.hooks import MetricHooks
 from brainbench.metrics.reliability.subject_rdm import SubjectRDM
@@ -56,6 +56,8 @@ def check_features(features: Mapping[str, Any], stimuli: Sequence[str]) -> None:
             raise UsageError(f"Features of layer {layer!r} have {len(values)} rows; {len(stimuli)} stimuli are scored.")
 
 
+ENTRY_POINTS = "brainbench.metrics"
+"""Group of entry points by which another package adds a metric: its name, and what is or makes it."""
 _METRICS: dict[str, Metric] = {}
 
 
@@ -80,20 +82,40 @@ def get_metric(name: str | Metric) -> Metric:
         check_metric(name)
         return name
     if ":" not in name:
+        if name not in _METRICS and (target := load_optional(ENTRY_POINTS, name, "metric")) is not None:
+            _enter(name, target)
         if name not in _METRICS:
             raise unknown_name("metric", name, list_metrics(), hint="Your own: FILE.py:CLASS.")
         return _METRICS[name]
-    found = load_object(name, "metric")
+    metric = _instance(load_object(name, "metric"))
+    if metric.name in _METRICS and metric is not _METRICS[metric.name]:  # a record could not tell the two apart
+        raise UsageError(f"A metric named {metric.name!r} exists already; give the one in {name!r} another name.")
+    return metric
+
+
+def _instance(target: Any) -> Metric:
+    """Return a metric from itself, or from a class or function that makes one."""
     # A class has the names of its instances, so it must be told from an instance first.
-    made: Any = found() if isinstance(found, type) or (not hasattr(found, "title") and callable(found)) else found
-    check_metric(made)
-    if made.name in _METRICS and made is not _METRICS[made.name]:  # a record could not tell the two apart
-        raise UsageError(f"A metric named {made.name!r} exists already; give the one in {name!r} another name.")
-    return made
+    makes = isinstance(target, type) or (not hasattr(target, "title") and callable(target))
+    metric: Any = target() if makes else target
+    check_metric(metric)
+    return metric
+
+
+def _enter(name: str, target: Any) -> None:
+    """Register the metric of an entry point, once."""
+    metric = _instance(target)
+    if metric.name != name:
+        raise UsageError(
+            f"The entry point {name!r} of {ENTRY_POINTS} makes a metric named {metric.name!r}; use one name."
+        )
+    if name not in _METRICS:
+        _METRICS[name] = metric
 
 
 def list_metrics() -> tuple[str, ...]:
-    """Return the names of the registered metrics, RSA first."""
+    """Return the names of the registered metrics, RSA first; those of installed packages are among them."""
+    load_entry_points(ENTRY_POINTS, _enter)
     return tuple(sorted(_METRICS, key=lambda name: (name != "rsa", name)))
 
 

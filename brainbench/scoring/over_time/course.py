@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from brainbench.core.errors import DataError, UsageError, listing
+from brainbench.core.files import to_plain
 from brainbench.core.progress import Progress, stages
 from brainbench.core.reading.ranges import check_number
 from brainbench.core.records import Interval
@@ -30,9 +31,6 @@ from brainbench.metrics.measures.rsa import RSA
 from brainbench.metrics.rdms.comparison import check_comparison
 from brainbench.metrics.rdms.pairs import Floats, rdm_stack
 from brainbench.metrics.reliability.noise_correction import RELIABILITY_GATE
-from brainbench.scoring.model_responses import ModelResponses
-from brainbench.scoring.neural_responses import NeuralResponses
-from brainbench.scoring.options import ScoreOptions
 from brainbench.scoring.over_time.lags import (
     LaggedRDMs,
     LayerLatency,
@@ -42,6 +40,7 @@ from brainbench.scoring.over_time.lags import (
     votes,
 )
 from brainbench.scoring.over_time.movies import AnimalMovie, animal_movie, layer_movie
+from brainbench.scoring.scores import ScoreInputs
 
 PERMUTATIONS = 1000
 """Random orders of the stimuli, above six stimuli; all orders up to six."""
@@ -205,23 +204,21 @@ def _reasons(animals: Sequence[AnimalMovie], points: tuple[TimePoint, ...], stim
     return tuple(reasons)
 
 
-def time_course(
-    brain: NeuralResponses,
-    network: ModelResponses,
-    metric: RSA,
-    kept: tuple[str, ...],
-    rows: list[int],
-    options: ScoreOptions,
-    *,
-    progress: Progress | None = None,
-) -> TimeCourse:
+def add_time_course(inputs: ScoreInputs, *, progress: Progress | None = None) -> dict[str, Any]:
+    """Return what ``--over-time`` adds to the statistics of a record."""
+    return {"time_course": to_plain(time_course(inputs, progress=progress))}
+
+
+def time_course(inputs: ScoreInputs, *, progress: Progress | None = None) -> TimeCourse:
     """Return the score over time of a model against recordings in bins.
 
     The window of the recordings begins when the stimuli do. Where the stimuli do not state their duration, they last as
-    long as the window of most trials (the median). Recordings have bins of one width; ``kept`` are the labels that are
-    scored, in order, and ``rows`` those of the activations. The options hold the seed, and the reliability that units
-    must have.
+    long as the window of most trials (the median). Recordings have bins of one width.
     """
+    brain, network, options = inputs.brain, inputs.network, inputs.options
+    metric, labels = inputs.metric, inputs.labels
+    if not isinstance(metric, RSA):
+        raise UsageError(f"Scores over time compare RDMs; the metric {metric.name!r} has none.")
     if "time" not in brain.dataset.coords or brain.dataset.sizes["time"] < 3:
         raise DataError(
             "Scores over time need recordings in at least 3 bins of time; give a smaller bin (--bin, seconds) or a "
@@ -242,18 +239,18 @@ def time_course(
         # The last bin may be shorter than the others, and a single trial longer than the others.
         window, whole = float(np.median(brain.dataset["duration"].values.sum(axis=1))), width * len(begins)
         seconds = whole if math.isclose(window, whole, rel_tol=1e-6) else window
-    sessions = brain.reliable_trials(kept, options)
+    sessions = brain.reliable_trials(labels, options)
     how: dict[str, Any] = {"method": metric.brain_method, "noise": metric.noise, "comparison": metric.comparison}
     stage_done = stages(len(sessions) + len(network.activations), "RDMs over time", progress)
     animals, layers = [], {}
     for subject, (blocks, note) in sessions.items():
         if blocks:
-            animals.append(animal_movie(subject, blocks, len(kept), stimuli=kept, seed=options.seed, **how))
+            animals.append(animal_movie(subject, blocks, len(labels), stimuli=labels, seed=options.seed, **how))
         else:
-            nothing = np.full((len(begins), math.comb(len(kept), 2)), np.nan)
+            nothing = np.full((len(begins), math.comb(len(labels), 2)), np.nan)
             animals.append(AnimalMovie(subject, nothing, nothing[:, 0], (note,) * len(begins)))
         stage_done()
     for name, values in network.activations.items():
-        layers[name] = layer_movie(values[rows], seconds / values.shape[1], width, method=metric.model_method)
+        layers[name] = layer_movie(values[inputs.rows], seconds / values.shape[1], width, method=metric.model_method)
         stage_done()
     return score_over_time(layers, animals, width=width, comparison=metric.comparison, seed=options.seed)

@@ -15,6 +15,7 @@ import typer
 from brainbench.cli.destinations import out_folder_option
 from brainbench.cli.options import SCORE, SchedulerOption, WorkersOption, option, with_options
 from brainbench.cli.output import Output, progress_bar, table_of
+from brainbench.cli.requirements import Requirement, needs
 from brainbench.core.errors import UsageError
 from brainbench.core.files import provenance, to_plain, write_json
 from brainbench.core.reading.ranges import check_number
@@ -23,10 +24,13 @@ if TYPE_CHECKING:
     from brainbench.scoring.recovery import Candidate, Recovery, RecoveryDesign
 
 POPULATION = "brainbench.datasets.synthetic.design:PopulationDesign"
+_CLUSTER = Requirement(("distributed",), "cluster", "A --scheduler", lambda values: values.get("scheduler") is not None)
+_PICTURE = Requirement(("matplotlib",), "report", "Drawing pictures", lambda values: values.get("out") is not None)
 _NOISE = ("animals", "units", "rate", "window", "modulation", "individual", "emphasis", "dispersion", "shared_gain")
 _DESIGN = "brainbench.scoring.recovery.boards:RecoveryDesign"
 
 
+@needs(_CLUSTER, _PICTURE, cache=True)
 @with_options(POPULATION, _NOISE, build=False)
 def recovery(
     options: dict[str, Any],
@@ -89,18 +93,18 @@ def recovery(
     with progress_bar() as progress:
         candidates, origin = open_candidates(_find(models), chosen, progress=progress)
         data: dict[str, Any] = {}
-        told = ""
+        picked = ""
         if keep is not None:
-            told, data["selection"], picked = _pick(candidates, keep, design, boards, where | {"progress": progress})
-            candidates, design = picked, replace(design, stimuli=None)
+            picked, data["selection"], candidates = _pick(candidates, keep, design, boards, where | {"progress": progress})
+            design = replace(design, stimuli=None)
         folder = None if out is None else out / "boards"
-        found = recover(candidates, design, boards=boards, folder=folder, **where, progress=progress)
+        result = recover(candidates, design, boards=boards, folder=folder, **where, progress=progress)
         if want is not None:
             # About sixty boards of each design, however few the candidates.
             each = max(5, 60 // len(candidates))
             best, tried = find_cheapest(candidates, design, want, boards=each, **where, progress=progress)
             data["cheapest"] = {"wanted": want, "design": best, "tried": tried}
-    data |= _facts(found, want)
+    data |= _facts(result, want)
     data["provenance"] = provenance(
         stimuli=origin,
         weights={item.name: item.weights for item in candidates},
@@ -108,10 +112,10 @@ def recovery(
         command=shlex.join(["brainbench", *sys.argv[1:]]),
         seconds=round(time.perf_counter() - started, 1),
     )
-    text = f"{_text(found, want, data.get('cheapest'))}{told}"
+    text = f"{_text(result, want, data.get('cheapest'))}{picked}"
     if out is not None:
         text += f"\n\nresult   {write_json(out / 'recovery.json', data)}"
-        text += f"\npicture  {plot_confusion(found, out / 'recovery.png')}"
+        text += f"\npicture  {plot_confusion(result, out / 'recovery.png')}"
     return Output(data, text)
 
 
@@ -122,11 +126,11 @@ def _find(patterns: Sequence[str] | None) -> list[str]:
 
     if not patterns:
         return list(shipped())
-    found: dict[str, None] = {}
+    models: dict[str, None] = {}
     for pattern in patterns:
         file = Path(pattern).suffix.lower() in (".h5", ".hdf5")
-        found |= dict.fromkeys([pattern] if file else find_models([pattern]))
-    return list(found)
+        models |= dict.fromkeys([pattern] if file else find_models([pattern]))
+    return list(models)
 
 
 def _pick(
@@ -148,21 +152,23 @@ def _pick(
     return text, {**asdict(chosen), "random": rates}, keep_stimuli(candidates, chosen.rows)
 
 
-def _facts(found: Recovery, want: float | None) -> dict[str, Any]:
+def _facts(recovery: Recovery, want: float | None) -> dict[str, Any]:
     """Return what --json and the file say of a recovery."""
-    told = ("win_rate", "outcomes", "reliability", "stimuli", "names", "made", "firsts", "lost", "notes", "boards")
-    return {name: getattr(found, name) for name in told} | {
-        "answer": found.answer(*([] if want is None else [want])),
-        "interval": found.wins(),
-        "told_apart": found.told,
-        "intervals": {name: found.wins(place) for place, name in enumerate(found.names)},
-        "hardest": found.hardest(10),
+    names = ("win_rate", "outcomes", "reliability", "stimuli", "names", "firsts", "lost", "notes")
+    return {name: getattr(recovery, name) for name in names} | {
+        "answer": recovery.answer(*([] if want is None else [want])),
+        "interval": recovery.wins(),
+        "made": recovery.counts,
+        "told_apart": recovery.won,
+        "boards": [board.stored for board in recovery.boards],
+        "intervals": {name: recovery.wins(place) for place, name in enumerate(recovery.names)},
+        "hardest": recovery.hardest(10),
     }
 
 
-def _text(found: Recovery, want: float | None, cheapest: dict[str, Any] | None) -> str:
+def _text(recovery: Recovery, want: float | None, cheapest: dict[str, Any] | None) -> str:
     """Return what people read, the answer first."""
-    lines = [found.answer(*([] if want is None else [want]))]
+    lines = [recovery.answer(*([] if want is None else [want]))]
     if cheapest is not None:
         best = cheapest["design"]
         lines.append(
@@ -172,29 +178,29 @@ def _text(found: Recovery, want: float | None, cheapest: dict[str, Any] | None) 
             f"{best.stimuli} stimuli, {best.trials} trials of each ({best.win_rate:.0%} of its boards "
             f"[{best.interval.low:.0%}, {best.interval.high:.0%}])."
         )
-    population = found.design.population
+    population = recovery.design.population
     low, high = population.trial_range
     lines.append(
-        f"Design: {found.stimuli} stimuli, {population.animals} animals of {population.units} units, "
-        f"{low if low == high else f'{low}–{high}'} trials; reliability {found.reliability:.2f}; metric "
-        f"{found.design.metric}."
+        f"Design: {recovery.stimuli} stimuli, {population.animals} animals of {population.units} units, "
+        f"{low if low == high else f'{low}–{high}'} trials; reliability {recovery.reliability:.2f}; metric "
+        f"{recovery.design.metric}."
     )
-    shares = found.outcomes
+    shares = recovery.outcomes
     lines.append(
         f"Pairs with the true network, tested over animals and stimuli: {shares['win']:.0%} won, {shares['tie']:.0%} "
         f"tied, {shares['loss']:.0%} lost."
     )
-    lines += found.notes
+    lines += recovery.notes
 
     def mistaken(place: int) -> str:
-        firsts = zip(found.firsts[place], found.names, strict=True)
-        count, other = max((int(count), other) for count, other in firsts if other != found.names[place])
-        return f"{other} ({count})" if count else ""
+        firsts = zip(recovery.firsts[place], recovery.names, strict=True)
+        count, rival = max((int(count), name) for count, name in firsts if name != recovery.names[place])
+        return f"{rival} ({count})" if count else ""
 
     columns = {
-        "true network": lambda place: found.names[place],
-        "first": lambda place: f"{found.firsts[place, place]} of {found.made[place]}",
-        "interval": lambda place: "[{0.low:.0%}, {0.high:.0%}]".format(found.wins(place)),
+        "true network": lambda place: recovery.names[place],
+        "first": lambda place: f"{recovery.firsts[place, place]} of {recovery.counts[place]}",
+        "interval": lambda place: "[{0.low:.0%}, {0.high:.0%}]".format(recovery.wins(place)),
         "most often mistaken for": mistaken,
     }
-    return "\n".join(lines) + "\n\n" + table_of("", range(len(found.names)), columns)
+    return "\n".join(lines) + "\n\n" + table_of("", range(len(recovery.names)), columns)

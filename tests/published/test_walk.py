@@ -10,7 +10,8 @@ import pytest
 
 from brainbench.core.errors import UsageError
 from brainbench.metrics import noise_corrected
-from brainbench.metrics.explain import (
+from brainbench.metrics.measures.rsa import score_rdms
+from brainbench.published.walk import (
     CORRECTED,
     PUBLISHED,
     PUBLISHED_INPUT,
@@ -19,7 +20,6 @@ from brainbench.metrics.explain import (
     explain_score,
     explain_splits,
 )
-from brainbench.metrics.measures.rsa import score_rdms
 from tests.factories.animals import STIMULI, make_rdm, make_subject
 
 

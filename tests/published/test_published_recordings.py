@@ -9,7 +9,7 @@ import pytest
 
 import brainbench
 from brainbench.core.errors import UsageError
-from brainbench.metrics.published import POOL, make_targets, score_published
+from brainbench.published.estimator import POOL, make_targets, score_published
 from brainbench.scoring.neural_responses import open_neural_responses
 from brainbench.scoring.scores import score_record
 from tests.factories.published_recordings import make_zero_filled, write_published

@@ -12,12 +12,15 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.provenance import Provenance
 from brainbench.core.records import LayerScore, Score, SubjectScore
+from brainbench.datasets.layouts.published_npz import read_arrays
 from brainbench.metrics.animals import recorded_rdm
 from brainbench.metrics.inference.permutation import EXACT_STIMULI, make_test, permuted_values
 from brainbench.metrics.rdms.comparison import compare
@@ -30,6 +33,25 @@ POOL = "concatenated"
 SPLITS, FIRST_SEED = 1000, 1234
 """Random halves, and the seed of the first; every split has a seed of its own."""
 _CHUNK = 1 << 24
+
+
+def compare_published(
+    inputs: Any, features: Mapping[str, Mapping[str, ArrayLike]], *, agreement: bool
+) -> tuple[list[Score], Score | None]:
+    """Score features by model, and the animals against one another, on the arrays of the published file.
+
+    ``inputs`` are those of :class:`brainbench.scoring.scores.ScoreInputs`; the first of the features are its model's.
+    """
+    brain, labels, options = inputs.brain, inputs.labels, inputs.options
+    arrays, _ = read_arrays(Path(brain.dataset.attrs["source"]))
+    slots = [brain.vocabulary.index(label) for label in labels]
+    arrays = {name: array[:, slots] for name, array in arrays.items()}
+    if options.layer is not None:
+        model = next(iter(features))
+        features = {**features, model: {options.layer: features[model][options.layer]}}
+    targets, how = make_targets(arrays), {"stimuli": labels, "estimator": options.estimator}
+    scores = [score_published(layers, targets, name=name, **how) for name, layers in features.items()]
+    return scores, score_published_animals(arrays, stimuli=labels) if agreement else None
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,7 @@ import pytest
 
 from brainbench.core.errors import UsageError
 from brainbench.metrics import get_metric, list_metrics
+from brainbench.metrics.measures import metric
 
 CODE = "class Mine:\n    name, title = {name!r}, 'mine'\n    animal = score = score_animals = None\n"
 
@@ -18,6 +19,25 @@ def test_a_metric_of_a_file_may_not_take_a_built_in_name(tmp_path):
     path.write_text(CODE.format(name="mine"))
     (tmp_path / "other.py").write_text(CODE.format(name="mine"))
     assert get_metric(f"{tmp_path / 'other.py'}:Mine").name == "mine"
+
+
+def test_metrics_of_other_packages_arrive_by_their_entry_points(tmp_path, monkeypatch):
+    (tmp_path / "metric_elsewhere.py").write_text(CODE.format(name="theirs"))
+    info = tmp_path / "metric_elsewhere-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: metric-elsewhere\nVersion: 1.0\n")
+    entries = "[brainbench.metrics]\ntheirs = metric_elsewhere:Mine\nwrong = metric_elsewhere:Mine\n"
+    (info / "entry_points.txt").write_text(entries)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(metric, "_METRICS", dict(metric._METRICS))
+    assert get_metric("theirs").name == "theirs"
+    assert get_metric("theirs") is get_metric("theirs")
+    with pytest.raises(UsageError, match="makes a metric named 'theirs'"):
+        get_metric("wrong")
+    names = list_metrics()
+    assert names[0] == "rsa"
+    assert "theirs" in names
+    assert "wrong" not in names
 
 
 def test_every_metric_has_words_of_its_own():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import pearsonr
 
-from brainbench.metrics.published import (
+from brainbench.published.estimator import (
     FIRST_SEED,
     POOL,
     concatenate,

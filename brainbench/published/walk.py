@@ -22,17 +22,21 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from brainbench.core.errors import DataError, UsageError, shown
+from brainbench.core.files import to_plain
+from brainbench.core.progress import Progress
 from brainbench.core.reading.archives import read_npz
 from brainbench.core.records import Status
 from brainbench.metrics.animals import gather
 from brainbench.metrics.evaluation import held_out
 from brainbench.metrics.measures.rsa import RSA
 from brainbench.metrics.rdms.comparison import compare
+from brainbench.metrics.rdms.dissimilarity import rdm
 from brainbench.metrics.rdms.pairs import Floats, rdm_stack, stimulus_count
 from brainbench.metrics.reliability.noise_correction import (
     RELIABILITY_GATE,
@@ -105,6 +109,15 @@ def corrected_value(
     if not real.size:
         return math.nan, 0
     return float(np.median(real) if switches.median else real.mean()), real.size
+
+
+def add_walk(inputs: Any, *, progress: Progress | None = None) -> dict[str, Any]:
+    """Return what ``--explain-estimator`` adds to the statistics of a record.
+
+    ``inputs`` are those of :class:`brainbench.scoring.scores.ScoreInputs`.
+    """
+    rdms = {layer: rdm(values) for layer, values in inputs.features.items()}
+    return {"estimator_walk": to_plain(explain_score(rdms, inputs.animals))}
 
 
 def explain_file(path: str | Path) -> tuple[Step, ...]:
