@@ -95,7 +95,9 @@ def recovery(
         data: dict[str, Any] = {}
         picked = ""
         if keep is not None:
-            picked, data["selection"], candidates = _pick(candidates, keep, design, boards, where | {"progress": progress})
+            picked, data["selection"], candidates = _pick(
+                candidates, keep, design, boards, where | {"progress": progress}
+            )
             design = replace(design, stimuli=None)
         folder = None if out is None else out / "boards"
         result = recover(candidates, design, boards=boards, folder=folder, **where, progress=progress)
