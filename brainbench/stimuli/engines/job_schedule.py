@@ -44,7 +44,9 @@ def plan(scenes: Sequence[Scene], *, surfaces: bool = False) -> JobSchedule:
             reach = reach_of(job, surfaces=surfaces)
             travels = not isinstance(owner.head.motion, Still)
             seen = owner.config() if travels or reach else {"whisking": owner.whisking.config()}
-            key = content_hash(mount, {**seen, "label": None})
+            # A head that is turned otherwise feels gravity in another direction.
+            pull = {"pull": job.gravity} if any(job.gravity) else {}
+            key = content_hash(mount, {**seen, "label": None, **pull})
             if key not in distinct:
                 distinct[key] = len(jobs)
                 jobs.append(job)

@@ -76,12 +76,15 @@ class Scene:
     twist: bool = True
     """Twist of whiskers when :attr:`Fidelity.twist` leaves it open. False in recipes with shipped recordings or
     networks, which were made before whiskers could twist."""
+    gravity: Vector = (0.0, 0.0, 0.0)
+    """Gravitational acceleration [m/s², world axes]; none by default, since a whisker weighs micrograms."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "objects", tuple(self.objects))
         object.__setattr__(self, "others", tuple(self.others))
         if not self.label:
             raise UsageError("A scene needs a label: it names the stimulus in every table.")
+        check_fields(self, "gravity", items=3, of="{} of a scene (m/s²)")
         names = [self.animal, *(other.name for other in self.others)]
         if len(set(names)) < len(names) or not all(names) or any(":" in name for name in names):
             raise UsageError(f"The animals of a scene need different names without a colon; received {names}.")
@@ -153,12 +156,14 @@ class Scene:
         travel = None if isinstance(motion, Still) else lambda times: motion.displacement(times) @ axes
         turn = (lambda times: axes.T @ motion.turn(times) @ axes) if isinstance(motion, Path) else None
         finest = min(self.whisking.finest, motion.finest)
+        x, y, z = (np.asarray(self.gravity) @ axes).tolist() if any(self.gravity) else (0.0, 0.0, 0.0)
         return [
             Job(
                 mount.whisker,
                 ArrayFollicle(mount, self.whisking, travel, turn, finest),
                 obstacles,
                 self.frames.readings,
+                gravity=(x, y, z),
             )
             for mount in self.array
         ]
@@ -171,13 +176,16 @@ class Scene:
 
     def config(self) -> dict[str, Any]:
         """Return plain values that determine the result, for hashing and for the data set's attributes."""
-        config = {
+        config: dict[str, Any] = {
             "label": self.label,
             "objects": [item.config() for item in self.objects],
             "whisking": self.whisking.config(),
             "head": self.head.config(),
             "frames": self.frames.config(),
         }
+        # What was added later appears only where it is used, so that older hashes hold.
+        if any(self.gravity):
+            config["gravity"] = list(self.gravity)
         if self.others:
             config["animal"] = self.animal
             config["others"] = [

@@ -37,6 +37,7 @@
 
     [[scene]]                    # a scene's own [scene.head], [scene.whisking] win key by key
     label = "pole"
+    gravity_m_s2 = [0, 0, -9.81] # optional, in world axes; at the top level for all scenes; without it nothing weighs
     [[scene.object]]             # position and rotation as for the head
     shape = "cylinder"
     radius_mm = 0.5
@@ -55,33 +56,164 @@ names: ``brainbench stimuli objects``). A decomposition takes ``method`` = "coac
 
 from __future__ import annotations
 
+import math
 import os
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, TypeVar
 
-from brainbench.core.errors import BrainbenchError, UsageError, repeats
+import msgspec
+
+from brainbench.core.errors import BrainbenchError, UsageError, check_name, repeats, shown, unknown_name
+from brainbench.core.limits import Limit, check_value
 from brainbench.core.reading.regular import readable
 from brainbench.core.reading.texts import read_toml
+from brainbench.geometry import DecompositionSettings
+from brainbench.stimuli.motion import trajectories
+from brainbench.stimuli.motion.recorded import Recorded, load_initial_angles, load_trajectory
+from brainbench.stimuli.motion.trajectories import ROTATIONS, Spin, Still, Translation, Vector, Whisking
+from brainbench.stimuli.objects import procedural
+from brainbench.stimuli.objects.mesh_solids import mesh_solid, shape_solid
+from brainbench.stimuli.objects.placed_object import PlacedObject
+from brainbench.stimuli.objects.primitives import box, capsule, cylinder, rodgers_solid, sphere
+from brainbench.stimuli.objects.solid import Solid
 from brainbench.stimuli.scenes.frames import Frames
-from brainbench.stimuli.scenes.motion_tables import read_head_motion, read_whisking
-from brainbench.stimuli.scenes.object_tables import PLACE, read_object
 from brainbench.stimuli.scenes.scene import Animal, Head, Scene
-from brainbench.stimuli.scenes.toml_tables import MILLI, Keys, TomlTable, boolean, mapping, number, tables, text, whole
 from brainbench.stimuli.sweeps.sweep_scenes import SweepScenes
 from brainbench.stimuli.whiskers.array import WhiskerArray
 
-_NOTHING: Mapping[str, Any] = {}
-_FRAMES: Keys = {
-    "first": ("first_ms", number(MILLI)),
-    "count": ("count", whole),
-    "average": ("average", whole),
-    "lowpass": ("lowpass_hz", number()),
-    "phase": ("phase", text),
-    "axes": ("axes", text),
-    "clip": ("clip_newton", number()),
+MILLI = 1e-3
+"""Metres in a millimetre, seconds in a millisecond."""
+_UNITS = {
+    "_mm_s": MILLI, "_deg_s": math.pi / 180, "_m_s2": 1, "_mm": MILLI, "_ms": MILLI, "_deg": math.pi / 180, "_hz": 1,
+    "_newton": 1,
+}  # fmt: skip
+"""Ends of keys → what their numbers are multiplied by to be in SI units."""
+_FAMILY = "family:"
+
+
+class Table(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
+    """Table of a TOML file, whose keys end in their unit; a key that is missing is None."""
+
+    def si(self, *keys: str, **renamed: str) -> dict[str, Any]:
+        """Return what the file says of some keys, in SI units, by the keys without their units or by other names."""
+        names = {**{_unit_of(key)[0]: key for key in keys}, **renamed}
+        values = {name: (getattr(self, key), _unit_of(key)[1]) for name, key in names.items()}
+        return {name: _scaled(value, factor) for name, (value, factor) in values.items() if value is not None}
+
+
+class _Moving(Table):
+    position_mm: Vector | None = None
+    rotation_deg: Vector | None = None
+    velocity_mm_s: Vector | None = None
+    velocity_onset_ms: float | None = None
+    times_ms: tuple[float, ...] | None = None
+    path_mm: tuple[Vector, ...] | None = None
+    path_deg: tuple[Vector, ...] | None = None
+
+
+class _Object(_Moving, kw_only=True):
+    shape: str
+    spin_deg_s: Vector | None = None
+    spin_onset_ms: float | None = None
+    friction: float | None = None
+
+
+class _Surface(_Object):
+    diagonal_mm: float | None = None
+    collision: str | None = None
+    method: str | None = None
+    threshold: float | None = None
+    most_pieces: int | None = None
+
+
+class _Mesh(_Surface, kw_only=True):
+    path: str
+    unit: str
+
+
+class _Family(_Surface):
+    seed: int | None = None
+    detail: int | None = None
+
+
+class _Whisking(Table):
+    kind: str | None = None
+    rotations: str | None = None
+    frequency_hz: float | None = None
+    protraction_deg: float | None = None
+    retraction_deg: float | None = None
+    onset_ms: float | None = None
+
+
+class _Recorded(_Whisking, kw_only=True):
+    path: str
+    rate_hz: float | None = None
+    layout: str | None = None
+    initial_path: str | None = None
+    start_deg: float | None = None
+
+
+class _Frames(Table):
+    first_ms: float | None = None
+    interval_ms: float | None = None
+    rate_hz: Annotated[float, Limit(above=0)] | None = None
+    count: int | None = None
+    average: int | None = None
+    lowpass_hz: float | None = None
+    phase: str | None = None
+    axes: str | None = None
+    clip_newton: float | None = None
+
+
+class _Array(Table):
+    species: str | None = None
+    side: str | None = None
+    whiskers: str = "all"
+    replace: dict[str, dict[str, Any]] = {}
+
+
+class _Animal(Table):
+    name: str
+    array: dict[str, Any] = {}
+    head: dict[str, Any] = {}
+    whisking: dict[str, Any] = {}
+
+
+class _Scene(Table):
+    label: str
+    head: dict[str, Any] = {}
+    whisking: dict[str, Any] = {}
+    object: list[dict[str, Any]] = []
+    gravity_m_s2: Vector | None = None
+
+
+class _File(Table):
+    description: str = ""
+    twist: bool = True
+    array: dict[str, Any] = {}
+    head: dict[str, Any] = {}
+    whisking: dict[str, Any] = {}
+    frames: dict[str, Any] = {}
+    animal: list[dict[str, Any]] = []
+    object: list[dict[str, Any]] = []
+    gravity_m_s2: Vector | None = None
+    scene: list[dict[str, Any]] = []
+
+
+_WHISKINGS: dict[str, type[_Whisking]] = {"sinusoid": _Whisking, "still": _Whisking, "recorded": _Recorded}
+_PRIMITIVES: dict[str, tuple[Callable[..., Solid], list[Any]]] = {
+    "sphere": (sphere, [("radius_mm", float)]),
+    "box": (box, [("size_mm", Vector)]),
+    "cylinder": (cylinder, [("radius_mm", float), ("height_mm", float)]),
+    "capsule": (capsule, [("radius_mm", float), ("length_mm", float)]),
+    "rodgers": (rodgers_solid, [("diagonal_mm", float | None, None), ("segments", int | None, None)]),
 }
+"""Shape → function, and keys with their types and defaults."""
+_WORDS = {"list": "a list of tables in double brackets", "dict": "a table", "str": "a text"}
+"""Beginnings of types that hold no numbers, in words."""
+Kind = TypeVar("Kind", bound=Table)
 
 
 @dataclass(frozen=True)
@@ -115,84 +247,165 @@ def load_scene(path: str | os.PathLike[str], *, whiskers: str = "all") -> Recipe
         raise type(error)(f"{os.fspath(path)}: {error}") from error
 
 
+def read_table(kind: type[Kind], data: Any, name: str) -> Kind:
+    """Convert the data of one table; errors say which key of ``name`` is unknown, missing or of another kind."""
+    if not isinstance(data, Mapping):
+        raise UsageError(f"{name} must be a table; received {shown(data)}.")
+    fields = {field.name: field for field in msgspec.structs.fields(kind)}
+    for key in data:
+        if key not in fields:
+            raise unknown_name(f"key of {name}", key, sorted(fields))
+    for key, field in fields.items():
+        if field.required and key not in data:
+            raise UsageError(f"{name} needs the key {key!r}.")
+    values = {}
+    for key, value in data.items():
+        check_value(f"{key!r} of {name}", value, fields[key].type)
+        try:
+            values[key] = msgspec.convert(value, fields[key].type)
+        except msgspec.ValidationError as error:
+            word = next(word for kind, word in _WORDS.items() if kind in str(fields[key].type))
+            raise UsageError(f"{key!r} of {name} must be {word}; received {shown(value)}.") from error
+    return kind(**values)
+
+
+def _unit_of(key: str) -> tuple[str, float | None]:
+    """Return a key without its unit, and the factor to SI units; None for what is no number with a unit."""
+    unit = next((unit for unit in _UNITS if key.endswith(unit)), "")
+    return key.removesuffix(unit), _UNITS.get(unit)
+
+
+def _scaled(value: Any, factor: float | None) -> Any:
+    if factor is None:
+        return value
+    return tuple(_scaled(inner, factor) for inner in value) if isinstance(value, tuple) else value * factor
+
+
 def _recipe(path: Path, data: dict[str, Any], whiskers: str) -> Recipe:
-    top = TomlTable("the scene file", data)
-    description = top.take("description", text, "")
-    array = _array(top.table("array"))
-    twist = top.take("twist", boolean, True)
-    others = tuple(_animal(TomlTable("[[animal]]", item), path.parent) for item in top.take("animal", tables, []))
-    shared = {name: top.take(name, mapping, _NOTHING) for name in ("head", "whisking", "frames")}
-    common = top.take("object", tables, [])
-    entries = top.take("scene", tables, [])
-    top.finish()
-    if not entries:
+    file = read_table(_File, data, "the scene file")
+    array = _array(file.array)
+    others = tuple(_animal(read_table(_Animal, animal, "[[animal]]"), path.parent) for animal in file.animal)
+    if not file.scene:
         raise UsageError("the file has no [[scene]].")
-    whole = [_scene(entry, array, others, shared, common, path.parent) for entry in entries]
-    scenes = [replace(scene, twist=twist).select(whiskers) for scene in whole]
+    scenes = []
+    for entry in file.scene:
+        table = read_table(_Scene, entry, "[[scene]]")
+        name = f"[[object]] of scene {table.label!r}"
+        scene = Scene(
+            label=table.label,
+            array=array,
+            objects=tuple(_object(entry, name, path.parent) for entry in (*file.object, *table.object)),
+            whisking=_whisking({**file.whisking, **table.whisking}, path.parent),
+            head=_head({**file.head, **table.head}),
+            frames=_frames(file.frames),
+            others=others,
+            twist=file.twist,
+            **{**file.si("gravity_m_s2"), **table.si("gravity_m_s2")},
+        )
+        scenes.append(scene.select(whiskers))
     if twice := repeats(scene.label for scene in scenes):
         raise UsageError(f"several scenes have the label {twice[0]!r}; labels must differ.")
-    return Recipe(path.stem, description, tuple(scenes))
+    return Recipe(path.stem, file.description, tuple(scenes))
 
 
-def _scene(
-    entry: Mapping[str, Any],
-    array: WhiskerArray,
-    others: tuple[Animal, ...],
-    shared: Mapping[str, Mapping[str, Any]],
-    common: list[Mapping[str, Any]],
-    folder: Path,
-) -> Scene:
-    table = TomlTable("[[scene]]", entry)
-    label = table.take("label", text)
-    merged = {name: {**shared[name], **table.take(name, mapping, _NOTHING)} for name in ("head", "whisking")}
-    objects = [*common, *table.take("object", tables, [])]
-    table.finish()
-    return Scene(
-        label=label,
-        array=array,
-        objects=tuple(read_object(TomlTable(f"[[object]] of scene {label!r}", item), folder) for item in objects),
-        whisking=read_whisking(TomlTable("[whisking]", merged["whisking"]), folder),
-        head=_head(TomlTable("[head]", merged["head"])),
-        frames=_frames(TomlTable("[frames]", shared["frames"])),
-        others=others,
-    )
+def _animal(table: _Animal, folder: Path) -> Animal:
+    return Animal(table.name, _array(table.array), _whisking(table.whisking, folder), _head(table.head))
 
 
-def _animal(table: TomlTable, folder: Path) -> Animal:
-    animal = Animal(
-        name=table.take("name", text),
-        array=_array(table.table("array")),
-        whisking=read_whisking(table.table("whisking"), folder),
-        head=_head(table.table("head")),
-    )
-    table.finish()
-    return animal
+def _array(data: Mapping[str, Any]) -> WhiskerArray:
+    table = read_table(_Array, data, "[array]")
+    array = WhiskerArray.of(**table.si("species", "side"))
+    for pattern, changes in table.replace.items():
+        array = array.replace(pattern, **changes)
+    return array.select(table.whiskers)
 
 
-def _array(table: TomlTable) -> WhiskerArray:
-    array = table.build(WhiskerArray.of, {"species": ("species", text), "side": ("side", text)})
-    for pattern, changes in table.take("replace", mapping, _NOTHING).items():
-        array = array.replace(pattern, **mapping(changes))
-    array = array.select(table.take("whiskers", text, "all"))
-    table.finish()
-    return array
-
-
-def _head(table: TomlTable) -> Head:
-    head = table.build(Head, PLACE, motion=read_head_motion(table))
-    table.finish()
-    return head
-
-
-def _frames(table: TomlTable) -> Frames:
-    given = table.read({"interval": ("interval_ms", number(MILLI)), "rate": ("rate_hz", number())})
-    if len(given) > 1:
+def _frames(data: Mapping[str, Any]) -> Frames:
+    table = read_table(_Frames, data, "[frames]")
+    if table.interval_ms is not None and table.rate_hz is not None:
         raise UsageError("[frames] takes interval_ms or rate_hz, not both.")
-    if "rate" in given:
-        rate = given.pop("rate")
-        if rate <= 0:
-            raise UsageError(f"'rate_hz' of [frames] must be positive; received {rate:g}.")
-        given["interval"] = 1 / rate
-    frames = table.build(Frames, _FRAMES, **given)
-    table.finish()
-    return frames
+    given = table.si("first_ms", "interval_ms", "count", "average", "lowpass_hz", "phase", "axes", "clip_newton")
+    if table.rate_hz is not None:
+        given["interval"] = 1 / table.rate_hz
+    return Frames(**given)
+
+
+def _whisking(data: Mapping[str, Any], folder: Path) -> Still | Whisking | Recorded:
+    """Return what ``[whisking]`` says; paths are relative to ``folder``."""
+    kind = str(data.get("kind", "sinusoid"))
+    check_name("kind of whisking", kind, _WHISKINGS)
+    table = read_table(_WHISKINGS[kind], data, "[whisking]")
+    given = table.si("rotations", "frequency_hz", "protraction_deg", "retraction_deg", "onset_ms")
+    if table.rotations is not None:
+        check_name("set of rotations", table.rotations, ROTATIONS)
+        given["rotations"] = ROTATIONS[table.rotations]
+    whisking = Whisking(**given)
+    if not isinstance(table, _Recorded):
+        return whisking if kind == "sinusoid" else Still()
+    angles = table.initial_path and load_initial_angles(folder / table.initial_path, layout=table.layout)
+    played = load_trajectory(folder / table.path, layout=table.layout, **table.si(rate="rate_hz"))
+    return Recorded(played, rotations=whisking.rotations, initial=angles or {}, **table.si("start_deg"))
+
+
+def _head(data: Mapping[str, Any]) -> Head:
+    table = read_table(_Moving, data, "[head]")
+    # The keys of several tables are joined here: an onset for all scenes moves nothing in a scene without velocity.
+    motions = [_steady(Translation, table, "velocity_mm_s", "velocity_onset_ms"), _keyframes(table, "[head]")]
+    return Head(**table.si("position_mm", "rotation_deg"), motion=_only(motions, "[head]", "a velocity or keyframes"))
+
+
+def _object(data: Mapping[str, Any], name: str, folder: Path) -> PlacedObject:
+    """Return the object that a table describes; paths are relative to ``folder``."""
+    table, solid = _solid(data, name, folder)
+    motions: list[Any] = [_keyframes(table, name)]
+    for kind, velocity, onset in (
+        (Translation, "velocity_mm_s", "velocity_onset_ms"),
+        (Spin, "spin_deg_s", "spin_onset_ms"),
+    ):
+        motions.append(_steady(kind, table, velocity, onset))
+        if onset in data and velocity not in data:
+            raise UsageError(f"{name} needs the key {velocity!r} beside {onset!r}.")
+    motion = _only(motions, name, "a velocity, a spin or keyframes")
+    return PlacedObject(solid, motion=motion, **table.si("position_mm", "rotation_deg", "friction"))
+
+
+def _steady(kind: type[Any], table: Table, velocity: str, onset: str) -> Any:
+    given = table.si(velocity=velocity, onset=onset)
+    return kind(**given) if "velocity" in given else None
+
+
+def _keyframes(table: _Moving, name: str) -> trajectories.Path | None:
+    given = table.si(times="times_ms", displacements="path_mm", rotations="path_deg")
+    if not given:
+        return None
+    if "times" not in given:
+        raise UsageError(f"{name} needs the key 'times_ms' beside its path.")
+    still = ((0.0, 0.0, 0.0),) * len(given["times"])
+    return trajectories.Path(**{"displacements": still, "rotations": still, **given})
+
+
+def _only(motions: Sequence[Any], name: str, choice: str) -> Any:
+    given = [motion for motion in motions if motion is not None]
+    if len(given) > 1:
+        raise UsageError(f"{name} takes {choice}, not several; keyframes can do all of it.")
+    return given[0] if given else Still()
+
+
+def _solid(data: Mapping[str, Any], name: str, folder: Path) -> tuple[_Object, Solid]:
+    """Return the table of an object, and the solid that it describes."""
+    shape = str(data.get("shape", ""))
+    if shape in _PRIMITIVES:
+        make, kinds = _PRIMITIVES[shape]
+        primitive: Any = msgspec.defstruct("Primitive", kinds, bases=(_Object,), kw_only=True)
+        table = read_table(primitive, data, name)
+        return table, make(**table.si(*(key for key, *_ in kinds)))
+    kind = _Mesh if shape == "mesh" else _Family if shape.startswith(_FAMILY) else _Object
+    table = read_table(kind, data, name)
+    if not isinstance(table, _Surface):
+        raise unknown_name("shape", shape, [*_PRIMITIVES, "mesh", f"{_FAMILY}NAME"])
+    cut = DecompositionSettings(**table.si("method", "threshold", "most_pieces"))
+    options = {**table.si("diagonal_mm", "collision"), "decomposition": cut}
+    if isinstance(table, _Mesh):
+        return table, mesh_solid(folder / table.path, unit=table.unit, **options)
+    member = procedural.make(shape.removeprefix(_FAMILY), **table.si("seed", "detail"))
+    return table, shape_solid(member, **options)
