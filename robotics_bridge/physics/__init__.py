@@ -9,12 +9,10 @@ from __future__ import annotations
 from robotics_bridge.physics.cpu import MujocoEngine
 from robotics_bridge.physics.gpu import MujocoWarpEngine
 from robotics_bridge.physics.scene import KINDS, Geometry, TouchScene
-from robotics_bridge.physics.state import CROWDED, DIVERGED, HandState
+from robotics_bridge.physics.state import HandState
 from robotics_bridge.physics.variants import compile_variants
 
 __all__ = [
-    "CROWDED",
-    "DIVERGED",
     "KINDS",
     "Geometry",
     "HandState",

@@ -19,12 +19,6 @@ from brainbench.core.errors import UsageError, check_each
 from brainbench.core.reading.ranges import check_number
 from robotics_bridge.physics.kernels.state import StateArrays
 
-DIVERGED = 1
-"""Bit of :attr:`HandState.status`: a pose or velocity is not a finite number, or a quaternion not of unit length."""
-CROWDED = 2
-"""Bit of :attr:`HandState.status`: contacts were lost because there was no room for them."""
-UNFELT = 4
-"""Bit of :attr:`HandState.status`: a contact pushed a link with taxels of ``total="engine"`` where none felt it."""
 _CONTACT = {"distance": 0.0, "force": float("nan"), "position": 0.0, "normal": 0.0, "friction": 0.0}
 """Quantities of a contact, and their values where nobody tells them."""
 MOST_ENVS = 1_000_000
@@ -58,8 +52,6 @@ class HandState:
     """Warp array [1] int32: contacts found, which may exceed the room C."""
     time: Any
     """Warp array [B] float32 (s)."""
-    status: Any
-    """Warp array [B] int32 of :data:`DIVERGED`, :data:`CROWDED` and :data:`UNFELT`, as of a suite's last update."""
 
     @classmethod
     def empty(cls, num_envs: int, num_links: int, contacts: int = 0, device: Any = "cpu") -> HandState:
@@ -74,7 +66,7 @@ class HandState:
         room = max(contacts, 1)
         sizes = {
             "velocity": ((num_envs, num_links), wp.spatial_vectorf), "time": (num_envs, wp.float32),
-            "status": (num_envs, wp.int32), "contact_count": (1, wp.int32), "contact_env": (room, wp.int32),
+            "contact_count": (1, wp.int32), "contact_env": (room, wp.int32),
             "contact_geom": (room, wp.vec2i), "contact_distance": (room, wp.float32),
             **{f"contact_{name}": (room, wp.vec3f) for name in ("position", "normal", "friction")},
         }  # fmt: skip
@@ -112,7 +104,7 @@ class HandState:
         """World poses [B, L, 7] as Warp stores them (x, y, z, qx, qy, qz, qw), a view of the same memory.
 
         What is written here is not normalised: an environment with a quaternion whose length differs from 1 by more
-        than .001 counts as :data:`DIVERGED`.
+        than .001 counts as diverged.
         """
         return warp().to_torch(self.pose)
 

@@ -99,7 +99,7 @@ class Runtime(abc.ABC):
         io.truth = planes(True)
         io.measured = planes(True) if self.noisy else io.truth
         io.hysteresis, io.walk = (planes(wanted) for wanted in self.stores)
-        io.age, io.episode = context.age, context.episode
+        io.age, io.episode, io.status = context.age, context.episode, context.pairs.status
         io.knobs, io.env_offset = self._noise.params, context.env_offset
         self.io = io
         """Warp structure of the readings: ``truth`` and ``measured``, planar."""
@@ -109,10 +109,12 @@ class Runtime(abc.ABC):
         wanted = (True, self.noisy, *self.stores)
         self.readings = [array for array, stored in zip(kept, wanted, strict=True) if stored] + self._noise.lasting
         """Those of readings and their noise."""
+        self.readable: list[Any] = [io.truth, *([io.measured] if self.noisy else []), self._noise.late]
+        """Those that can be read, planar, which a reset clears."""
 
     def update(self, state: HandState, dt: float) -> None:
         """Read the state; ``dt`` seconds have passed since the last update."""
-        self.io.status, self.io.dt = state.status, dt
+        self.io.dt = dt
         self.run_kernels(state, dt)
         self._noise.launch(self.io.measured, self.io.measured, dt)
 
@@ -217,4 +219,4 @@ class History:
         """Append the reading of this update; ``counter`` [1] counts updates on the device."""
         c = self._context
         dim = (c.num_envs, self.part.count)
-        c.launch(append_history, dim, value, self.part.start, counter, c.age, self.ring)
+        c.launch(append_history, dim, value, self.part.start, counter, self.ring)

@@ -6,6 +6,7 @@ import warnings
 from collections.abc import Callable, Mapping
 from typing import Any, cast
 
+import numpy as np
 import torch
 
 from brainbench.core.cuda_graphs import record_launches
@@ -15,14 +16,14 @@ from brainbench.core.plugins import load_object
 from brainbench.core.reading.ranges import check_number
 from robotics_bridge.physics.scene import TouchScene
 from robotics_bridge.physics.selection import EnvIds, select_envs
-from robotics_bridge.physics.state import DIVERGED, MOST_ENVS, UNFELT, HandState
+from robotics_bridge.physics.state import MOST_ENVS, HandState
 from robotics_bridge.sensors.context import memory_of
 from robotics_bridge.sensors.fidelity import SensorFidelity
 from robotics_bridge.sensors.plausibility import warn_of
 from robotics_bridge.sensors.probes.runtime import DistanceRuntime
 from robotics_bridge.sensors.probes.sensors import SurfaceDistanceProbe
-from robotics_bridge.sensors.queries.kernels.pairs import count_update, reset_clock
-from robotics_bridge.sensors.queries.pairs import PairTable
+from robotics_bridge.sensors.queries.kernels.pairs import clear_readings, count_update, reset_clock
+from robotics_bridge.sensors.queries.pairs import DIVERGED, OVERFULL, UNFELT, PairTable
 from robotics_bridge.sensors.queries.solids import Solids
 from robotics_bridge.sensors.runtime import History, Runtime, SuiteContext
 from robotics_bridge.sensors.sensor import Sensor
@@ -114,14 +115,20 @@ class SensorSuite:
                 for name, sensor in self.sensors.items()
                 if sensor.history
             }
+        # What reset() clears: every reading that can be asked for, and the windows of histories.
+        readable = [planes for runtime in self.runtimes for planes in runtime.readable]
+        readable += [history.ring.reshape((-1, *history.ring.shape[2:])) for history in self._histories.values()]
+        self._readable = [planes for planes in readable if planes.size]
+        self._resets = context.array(np.zeros(num_envs, bool), wp.bool)
         # An update as a CUDA graph, for one state and time step (s).
         self._recorded: tuple[Callable[[], None], HandState, float] | None = None
-        self._status: Any = None
+        self._pose: Any = None
+        """Poses of the last update; None before the first."""
         self._warned = False
 
     def update(self, state: HandState, dt: float = 0.01) -> None:
         """Read the state of ``num_envs`` environments with every sensor, ``dt`` seconds after the last update."""
-        if self._status is None or state.status is not self._status:
+        if state.pose is not self._pose:
             self._check(state)
         check_number("dt (time since the last update, s)", dt, above=0)
         if not self.device.is_cuda:
@@ -133,7 +140,7 @@ class SensorSuite:
             self._launch(state, dt)
         elif self._recorded and self._recorded[1] is state and self._recorded[2] == dt:
             self._recorded[0]()
-        elif self._recorded is None and self._status is state.status and all(r.recordable for r in self.runtimes):
+        elif self._recorded is None and self._pose is state.pose and all(r.recordable for r in self.runtimes):
             replay = record_launches(lambda: self._launch(state, dt), self.device)
             self._recorded = (replay, state, dt)
             replay()
@@ -142,14 +149,13 @@ class SensorSuite:
             with wp.ScopedDevice(self.device):
                 self._launch(state, dt)
             self._recorded = None
-        self._status = state.status
+        self._pose = state.pose
         self._updates += 1
 
     def read(self, name: str) -> torch.Tensor:
         """Return the measured reading of a sensor, [B, N] or [B, rows, columns], and channels last; a view.
 
-        It is that of the last update: zero before the first, and until the next one after a reset that of the episode
-        before.
+        It is that of the last update; zero before the first one, and after a reset until the next.
         """
         return self._view(name, self.runtime_of(name).measured())
 
@@ -180,8 +186,11 @@ class SensorSuite:
 
     def reset(self, env_ids: EnvIds | None = None) -> None:
         """Start a new episode in some environments (all by default): memories are cleared, new errors drawn."""
-        mask = wp.from_torch(select_envs(env_ids, self.num_envs, wp.device_to_torch(self.device)))
-        self.context.launch(reset_clock, self.num_envs, mask, self.context.age, self.context.episode)
+        c, mask = self.context, self._resets
+        wp.to_torch(mask).copy_(select_envs(env_ids, self.num_envs, wp.device_to_torch(self.device)))
+        c.launch(reset_clock, self.num_envs, mask, c.age, c.episode, self.pairs.status)
+        for planes in self._readable:
+            c.launch(clear_readings, planes.shape[1:], mask, planes)
 
     def seed(self, seed: int) -> None:
         """Begin the random numbers of noise and sound anew, from the next reset of each environment on."""
@@ -203,15 +212,16 @@ class SensorSuite:
         return self._flagged(UNFELT)
 
     def _flagged(self, bit: int) -> torch.Tensor:
-        if self._status is None:
+        if self._pose is None:
             raise UsageError("Nothing was read yet; call update(state) first.")
-        return (wp.to_torch(self._status) & bit) != 0
+        return (wp.to_torch(self.pairs.status) & bit) != 0
 
     @property
     def crowded(self) -> torch.Tensor:
-        """Mask [B] of environments that ever had more geometries in contact with one sensor link than are looked at."""
+        """Mask [B] of environments that ever had more geometries in contact with one sensor link than are looked at, or
+        at the last update more contacts than the state has room for."""
         self._warn_crowded()
-        return wp.to_torch(self.pairs.crowded) != 0
+        return (wp.to_torch(self.pairs.crowded) != 0) | ((wp.to_torch(self.pairs.status) & OVERFULL) != 0)
 
     def _warn_crowded(self) -> None:
         if not self._warned and (most := int(self.pairs.crowded.numpy().max())):

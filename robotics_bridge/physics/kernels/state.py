@@ -34,8 +34,6 @@ class StateArrays:
     """[C] from the first geometry to the second."""
     contact_force: wp.array(dtype=wp.float32)
     """[C] normal force; NaN where the engine does not tell."""
-    status: wp.array(dtype=wp.int32)
-    """[B] bits: 1 diverged (:func:`link_fails`), 2 more contacts than room."""
 
 
 @wp.func
@@ -61,7 +59,7 @@ def link_fails(state: StateArrays, env: int, link: int) -> bool:
 
 @wp.func
 def status_of(state: StateArrays, env: int) -> int:
-    """Return the status bits of an environment."""
+    """Return the status bits of an environment: 1 diverged (:func:`link_fails`), 2 more contacts than room."""
     bits = int(0)
     for link in range(state.pose.shape[1]):
         if link_fails(state, env, link):

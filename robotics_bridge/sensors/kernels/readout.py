@@ -59,7 +59,7 @@ class ReadoutArrays:
     episode: wp.array(dtype=wp.int32)
     """[B] resets so far."""
     status: wp.array(dtype=wp.int32)
-    """[B] bits of the hand state; 1 is diverged."""
+    """[B] bits of the suite; 1 is diverged."""
     knobs: wp.array(dtype=NoiseParams)
     """[S] noise of each sensor."""
     env_offset: wp.int32
@@ -168,21 +168,14 @@ def append_history(
     value: wp.array3d(dtype=wp.float32),
     start: int,
     count: wp.array(dtype=wp.int32),
-    age: wp.array(dtype=wp.int32),
     ring: wp.array4d(dtype=wp.float32),
 ):
-    """Append readings to a ring [2 T, C, B, N] written twice, so that any window of T is contiguous. Thread: [B, N].
-
-    An environment that starts anew clears its past.
-    """
+    """Append readings to a ring [2 T, C, B, N] written twice, so that any window of T is contiguous. Thread: [B, N]."""
     env, n = wp.tid()
     length = ring.shape[0] // 2
     # Each value is written at two places one window apart: any window of T updates is then one contiguous slice.
     at = count[0] % length
     for channel in range(value.shape[0]):
-        if age[env] == 0:
-            for slot in range(2 * length):
-                ring[slot, channel, env, n] = 0.0
         x = value[channel, env, start + n]
         ring[at, channel, env, n] = x
         ring[at + length, channel, env, n] = x

@@ -68,8 +68,9 @@ class ReadingNoise:
         self._delay = context.array([noise.read_delay for noise in noises], float)
         self._jitter = context.array([noise.jitter for noise in noises], float)
         self._longest = max(noise.read_delay + noise.jitter for noise in noises)
-        self._late, self._ring = self._zeros(self._longest > 0), None
-        self.rings = [self._late]
+        self.late, self._ring = self._zeros(self._longest > 0), None
+        """Warp array of late readings; empty without a delay."""
+        self.rings = [self.late]
         """Warp arrays of the delay; its ring exists from the first launch on."""
 
     def _draw_keys(self) -> Any:
@@ -129,12 +130,12 @@ class ReadingNoise:
                     f"A delay of {self._longest:g} s needs {slots} readings at a time step of {dt:g} s, but the first "
                     f"update made room for {self._ring.shape[0]}; build the sensors anew for the shorter step."
                 )
-            inputs = [*known, self._delay, self._jitter, *now, out, self._ring, self._late]
+            inputs = [*known, self._delay, self._jitter, *now, out, self._ring, self.late]
             context.launch(delay_line, self._shape[1:], *inputs)
 
     def read(self, measured: Any) -> Any:
         """Return what is read where ``measured`` [C, B, N] is newest: an earlier reading if there is a delay."""
-        return self._late if self._longest > 0 else measured
+        return self.late if self._longest > 0 else measured
 
 
 def noise_params(noise: Noise, seed: int, name: str) -> Any:

@@ -25,6 +25,7 @@ class DistanceRuntime(ProbeRuntime):
         self.points: Any = context.zeros((3, context.num_envs, self.count) if first.nearest else (1, 1, 1))
         """Nearest points [3, B, N] in the link frame (m)."""
         self.lasting = [self.points] if first.nearest else []
+        self.readable += self.lasting
 
     def run_kernels(self, state: HandState, dt: float) -> None:
         """Run the kernels."""

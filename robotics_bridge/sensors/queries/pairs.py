@@ -14,6 +14,12 @@ from robotics_bridge.sensors.context import LaunchContext
 from robotics_bridge.sensors.queries.kernels.pairs import CONTACTS, PairArrays, SlotArrays, pair_kernel, start_kernel
 from robotics_bridge.sensors.queries.solids import Solids
 
+DIVERGED = 1
+"""Status of an environment: since its reset, a pose or velocity was not finite, or a quaternion not of unit length."""
+OVERFULL = 2
+"""Status of an environment: the state had no room for some contacts."""
+UNFELT = 4
+"""Status of an environment: a contact pushed a link with taxels of ``total="engine"`` where none of them lies."""
 _LISTED = 16
 """Geometries in contact with one link that are listed where lists of all would be too long."""
 _LIST_BYTES = 2**28
@@ -42,8 +48,8 @@ class PairTable:
         """The Warp structure ``SlotArrays``; None before :meth:`freeze`."""
         self.crowded: Any = None
         """Warp array [B]: the most geometries that ever met a sensor whose list holds fewer; 0 where none was lost."""
-        self.diverged: Any = None
-        """Warp array [B]: 1 where the state held numbers that are not finite since the last reset."""
+        self.status: Any = context.zeros(context.num_envs, int)
+        """Warp array [B] of :data:`DIVERGED`, :data:`OVERFULL` and :data:`UNFELT`, as of the last update."""
 
     def slot(
         self,
@@ -116,15 +122,15 @@ class PairTable:
             setattr(found, name, c.zeros(listed, warp().vec3f))
         self.struct = found
         self._bits = c.zeros((envs, count * self._words), int)
-        self.crowded, self.diverged = (c.zeros(envs, int) for _ in range(2))
+        self.crowded = c.zeros(envs, int)
 
     def update(self, state: HandState) -> None:
         """Count an update, refresh the state's status, mark contacts, and list what every slot meets now."""
         c, envs, room = self._context, self._context.num_envs, state.contact_env.shape[0]
-        inputs = [self.plan, state.arrays, self._words, self._bits, c.age, self.diverged]
+        inputs = [self.plan, state.arrays, self._words, self._bits, c.age, self.status]
         dim = max(envs, -(-room // CONTACTS)) if self._contacts else envs
         c.launch(start_kernel(self._contacts, self._apart), dim, *inputs)
         if self._slots:
             inputs = [self.plan, self._solids.struct, state.arrays, self._words, self._bits, self.struct]
             dim = envs * (len(self._slots) + self._apart * state.num_links)
-            c.launch(pair_kernel(self._apart), dim, *inputs, self.crowded, self.diverged)
+            c.launch(pair_kernel(self._apart), dim, *inputs, self.crowded, self.status)

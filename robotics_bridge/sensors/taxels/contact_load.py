@@ -38,6 +38,7 @@ class ContactLoadRuntime(KinematicRuntime):
         plan.order, plan.spans = context.array(order, int), context.array(spans, wp.vec3i)
         plan.reach = context.array(np.concatenate([contact_reach(sensor.probes) for sensor in configs]), float)
         plan.row_first = context.array(np.searchsorted(self.rows.numpy()[:, 3], np.arange(len(spans) + 1)), int)
+        plan.status = context.pairs.status
         plan.slip = 1.0 if configs[0].convention == "physical" else -1.0
         shape, press = (context.num_envs, self.count), self.press
         press.weight, press.total = context.zeros(shape), context.zeros(shape)

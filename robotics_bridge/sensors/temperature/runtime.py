@@ -31,6 +31,11 @@ from robotics_bridge.sensors.temperature.materials import ThermalBody, material
 
 wp = warp()
 
+SPREAD = 0.1
+"""Largest α Δt / edge² of a cell that is stepped at once: what a face takes up must not stay in the outermost cell."""
+PARTS = 64
+"""Most parts into which an update is split."""
+
 
 class TemperatureRuntime(Runtime):
     """Serves temperature grids."""
@@ -78,6 +83,7 @@ class TemperatureRuntime(Runtime):
         limits = [value for sensor in self._sensors for value in (sensor.warm_range, sensor.cold_range)]
         if not self.noisy and (min(limits) < math.inf or any(sensor.tau > 0 for sensor in self._sensors)):
             self.io.measured = wp.zeros_like(self.io.truth)
+            self.readable.append(self.io.measured)
         self._warned = False
         self._dt = math.nan
         self._set_step(1e-2)
@@ -104,13 +110,21 @@ class TemperatureRuntime(Runtime):
         # Exponentials are taken on the host and only when the step changes.
         if dt == self._dt:
             return
+        spreads = [
+            material(sensor.material).diffusivity * dt / edges[axis] ** 2
+            for sensor, edges in zip(self._sensors, self._edges, strict=True)
+            for axis in range(3)
+            if sensor.cells[axis] > 1
+        ]
+        # Rounding must not split a step that is just as long as it may be.
+        parts = min(max(1, math.ceil(max(spreads, default=0.0) / SPREAD - 1e-6)), PARTS)
         matrices = [
-            diffusion(cells, edge, material(sensor.material).diffusivity * dt).ravel()
+            diffusion(cells, edge, material(sensor.material).diffusivity * dt / parts).ravel()
             for sensor, edges in zip(self._sensors, self._edges, strict=True)
             for cells, edge in zip(sensor.cells, edges, strict=True)
         ]
         self.heat.matrix.assign(np.concatenate(matrices).astype(np.float32))
-        self._dt = dt
+        self._dt, self._parts = dt, parts
 
     def run_kernels(self, state: HandState, dt: float) -> None:
         """Run the kernels; a new time step re-computes the diffusion matrices first."""
@@ -127,16 +141,19 @@ class TemperatureRuntime(Runtime):
                 RuntimeWarning,
                 stacklevel=5,
             )
-        for measure in (1, 0):
-            c.launch(conduct_contacts, heat.kept.shape, measure, state.arrays, heat, self.io)
-        # Sources, contacts and surfaces first, then diffusion axis by axis: the exponentials of the axes commute, so
-        # their order does not matter. Cells read their neighbours, hence two buffers in turn.
-        now, spare = self._buffers
-        c.launch(exchange_heat, cells, heat, self.io, now)
-        for axis in self._axes:
-            c.launch(diffuse_heat, cells, axis, heat, now, spare)
-            now, spare = spare, now
-        c.launch(sense_temperature, cells, heat, self.io, now)
+        self.io.dt = dt / self._parts
+        for part in range(self._parts):
+            heat.begins = int(part == 0)
+            for measure in (1, 0):
+                c.launch(conduct_contacts, heat.kept.shape, measure, state.arrays, heat, self.io)
+            # Sources, contacts and surfaces first, then diffusion axis by axis: the exponentials of the axes commute,
+            # so their order does not matter. Cells read their neighbours, hence two buffers in turn.
+            now, spare = self._buffers
+            c.launch(exchange_heat, cells, heat, self.io, now)
+            for axis in self._axes:
+                c.launch(diffuse_heat, cells, axis, heat, now, spare)
+                now, spare = spare, now
+            c.launch(sense_temperature, cells, heat, self.io, now)
 
 
 def link_temperature(suite: SensorSuite, name: str) -> torch.Tensor:

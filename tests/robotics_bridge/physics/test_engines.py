@@ -166,17 +166,19 @@ def test_states_refuse_what_does_not_fit() -> None:
         state.set_contacts([0], [[0, 1]], colour=[1])
 
 
-def test_a_state_tells_which_environments_diverged_and_when_contacts_were_lost() -> None:
+def test_a_suite_tells_which_environments_diverged_and_when_contacts_were_lost() -> None:
     state = HandState.empty(3, 2, contacts=2)
     velocity = np.zeros((3, 2, 6))
     velocity[1, 1, 4] = np.inf
     state.set_velocity(velocity)
     suite = SensorSuite(TouchScene(("a", "b")), {}, num_envs=3)
     suite.update(state)
-    assert state.status.numpy().tolist() == [0, 1, 0]
+    assert suite.diverged.tolist() == [False, True, False]
+    assert not suite.crowded.any()
     state.contact_count.fill_(3)
     suite.update(state)
-    assert state.status.numpy().tolist() == [2, 3, 2]
+    assert suite.diverged.tolist() == [False, True, False]
+    assert suite.crowded.all()
 
 
 def test_an_engine_leaves_the_model_that_it_is_given_as_it_is() -> None:

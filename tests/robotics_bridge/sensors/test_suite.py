@@ -42,6 +42,12 @@ def _touching(envs: int = 1, height: float = 0.0145) -> np.ndarray:
     return poses_at(3, {2: (0.001, -0.002, height)}, envs)
 
 
+def _press(state: HandState, envs: int = 1) -> None:
+    """Let the ball press the pad with 1 N in every environment."""
+    contact = {"force": [1.0], "distance": [-5e-4], "position": [[0.001, -0.002, 0.005]], "normal": [[0, 0, 1.0]]}
+    state.set_contacts(np.arange(envs), [[0, 1]] * envs, **{name: value * envs for name, value in contact.items()})
+
+
 def test_readings_have_the_shapes_of_their_layouts_and_share_memory() -> None:
     line = Probes([[0, 0, 0.005]] * 7, [[0, 0, 1.0]] * 7, 0.003)
     suite = _suite(
@@ -148,6 +154,54 @@ def test_a_diverged_environment_reads_nan_and_harms_no_other() -> None:
     suite.reset([1])
     suite.update(state_of(suite.scene, _touching(3)))
     assert torch.equal(suite.read("depth")[1], alone.read("depth")[0])
+
+
+def test_flags_belong_to_the_suite_that_raised_them() -> None:
+    scene, far = pad_scene(BALL), replace(GRID, position=np.array(GRID.position) + (0.1, 0, 0))
+    lost = _suite({"f": KinematicTaxel(link="hand", probes=far, total="engine")}, scene=scene)
+    other = _suite({"c": ContactProbe(link="hand", probes=GRID)}, scene=scene)
+    state = state_of(scene, _touching())
+    _press(state)
+    lost.update(state)
+    other.update(state)
+    assert (lost.unfelt.item(), other.unfelt.item()) == (True, False)
+    state.velocity_torch[0, 2, 0] = np.inf
+    lost.update(state)
+    state.velocity_torch[0, 2, 0] = 0.0
+    other.update(state)
+    assert (lost.diverged.item(), other.diverged.item()) == (True, False)
+    lost.reset()
+    assert not lost.diverged.item()
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.02])
+def test_after_a_reset_nothing_of_the_old_episode_can_be_read(delay: float) -> None:
+    noise = Noise(white=1e-4, read_delay=delay)
+    sensors = {
+        "depth": ContactDepthProbe(link="hand", probes=GRID, noise=noise, history=3),
+        "near": SurfaceDistanceProbe(link="hand", probes=GRID, nearest=True),
+        "load": KinematicTaxel(link="hand", probes=GRID, total="engine"),
+        "warm": TemperatureGrid(link="hand", tau=0.1),
+    }
+    suite = _suite(sensors, envs=3)
+    state = state_of(suite.scene, _touching(3))
+    _press(state, 3)
+    for _ in range(5):
+        suite.update(state)
+
+    def readings() -> list[torch.Tensor]:
+        values = [read(name) for name in sensors for read in (suite.read, suite.read_ground_truth)]
+        return [*values, suite.read_history("depth"), suite.read_nearest("near")]
+
+    before = [values.clone() for values in readings()]
+    assert all(values[1].any() for values in before)
+    suite.reset([1])
+    for values, old in zip(readings(), before, strict=True):
+        assert not values[1].any()
+        assert torch.equal(values[[0, 2]], old[[0, 2]])
+    suite.update(state)
+    assert suite.read_history("depth")[1, :2].count_nonzero() == 0
+    assert suite.read_history("depth")[1, 2].any()
 
 
 def test_history_holds_the_last_readings_oldest_first_and_is_cleared_by_reset() -> None:

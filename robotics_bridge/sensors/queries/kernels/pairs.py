@@ -75,12 +75,27 @@ def count_update(age: wp.array(dtype=wp.int32)):
 
 
 @wp.kernel(module="unique")
-def reset_clock(mask: wp.array(dtype=wp.bool), age: wp.array(dtype=wp.int32), episode: wp.array(dtype=wp.int32)):
+def reset_clock(
+    mask: wp.array(dtype=wp.bool),
+    age: wp.array(dtype=wp.int32),
+    episode: wp.array(dtype=wp.int32),
+    status: wp.array(dtype=wp.int32),
+):
     """Start an episode in chosen environments. Thread: environment [B]."""
     env = wp.tid()
     if mask[env]:
         age[env] = -1
         episode[env] = episode[env] + 1
+        status[env] = 0
+
+
+@wp.kernel(module="unique")
+def clear_readings(mask: wp.array(dtype=wp.bool), planes: wp.array3d(dtype=wp.float32)):
+    """Set readings [C, B, N] of chosen environments to zero. Thread: environment and probe [B, N]."""
+    env, n = wp.tid()
+    if mask[env]:
+        for channel in range(planes.shape[0]):
+            planes[channel, env, n] = float(0.0)
 
 
 @wp.func
@@ -118,7 +133,7 @@ def start_kernel(contacts: bool, apart: bool) -> Any:
         words: int,
         bits: wp.array2d(dtype=wp.int32),
         age: wp.array(dtype=wp.int32),
-        diverged: wp.array(dtype=wp.int32),
+        status: wp.array(dtype=wp.int32),
     ):
         tid = wp.tid()
         room = state.contact_env.shape[0]
@@ -131,9 +146,8 @@ def start_kernel(contacts: bool, apart: bool) -> Any:
             # An environment that was lost once stays so until its reset: engines put it back in ways of their own, and
             # memories of sensors would mix what was before with what is now.
             if age[tid] > 0:
-                flags = flags | diverged[tid]
-            diverged[tid] = flags & 1
-            state.status[tid] = flags
+                flags = flags | (status[tid] & 1)
+            status[tid] = flags
         if wp.static(contacts):
             # All is asked for before anything is looked at: two neighbouring contacts by each access of memory, and
             # neighbouring threads read neighbouring ones.
@@ -208,7 +222,7 @@ def pair_kernel(apart: bool) -> Any:
         bits: wp.array2d(dtype=wp.int32),
         out: PairArrays,
         crowded: wp.array(dtype=wp.int32),
-        diverged: wp.array(dtype=wp.int32),
+        status: wp.array(dtype=wp.int32),
     ):
         tid = wp.tid()
         listed = state.pose.shape[0] * slots.link.shape[0]
@@ -216,8 +230,7 @@ def pair_kernel(apart: bool) -> Any:
             if tid >= listed:
                 owner = (tid - listed) // state.pose.shape[1]
                 if link_fails(state, owner, (tid - listed) % state.pose.shape[1]):
-                    wp.atomic_or(state.status, owner, 1)
-                    wp.atomic_or(diverged, owner, 1)
+                    wp.atomic_or(status, owner, 1)
                 return
         env = tid // slots.link.shape[0]
         slot = tid % slots.link.shape[0]

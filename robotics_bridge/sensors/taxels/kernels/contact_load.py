@@ -38,6 +38,8 @@ class SpreadPlan:
     """[N] a contact this near is felt (m); negative for fillers."""
     slip: wp.float32
     """Sign of friction: 1 as it acts on the sensor, −1 as published."""
+    status: wp.array(dtype=wp.int32)
+    """[B] bits of the suite; 4 is a force that no taxel carries."""
 
 
 @wp.struct
@@ -130,7 +132,7 @@ def list_contacts(
                         break
     load = state.contact_force[c]
     if felt != tracked and load > 0.0:
-        wp.atomic_or(state.status, env, 4)
+        wp.atomic_or(plan.status, env, 4)
     if felt == 0:
         return
     normal = wp.quat_rotate_inv(turn, sign * state.contact_normal[c])
@@ -240,7 +242,7 @@ def share_contacts(
         rest = (nodes.force[node] - scale * field) / whole
         share = wp.vec4f(scale, rest[0], rest[1], rest[2])
     elif load > 0.0:
-        wp.atomic_or(state.status, env, 4)
+        wp.atomic_or(plan.status, env, 4)
     nodes.share[node, k] = share
 
 

@@ -97,6 +97,8 @@ class HeatArrays:
     """Exponentials of the diffusion along each axis of each grid."""
     offset: wp.array2d(dtype=wp.int32)
     """[S, 3] where each begins."""
+    begins: wp.int32
+    """1 in the first part of an update, in which fields begin where the environment was reset."""
 
 
 @wp.kernel
@@ -189,7 +191,7 @@ def conductance_of(
     across = wp.abs(facing[0]) * grid.cell[0] + wp.abs(facing[1]) * grid.cell[1] + wp.abs(facing[2]) * grid.cell[2]
     share = wp.min(heat.covered[env, index] * across / volume, float(1.0))
     # Mean of 1/√t over the step, which its middle misses by 29 % in the first one.
-    past = wp.where(io.age[env] > 0, heat.touched[env, index], float(0.0))
+    past = wp.where(heat.begins == 1 and io.age[env] == 0, float(0.0), heat.touched[env, index])
     root = float(0.5) * (wp.sqrt(past) + wp.sqrt(past + io.dt))
     spread = root * wp.sqrt(grid.diffusivity)
     length = slab_length(spread, across, share)
@@ -344,7 +346,8 @@ def exchange_heat(heat: HeatArrays, io: ReadoutArrays, out: wp.array2d(dtype=wp.
     env, n = wp.tid()
     grid = heat.sensors[heat.part[n]]
     t = heat.temperature[env, n]
-    if io.age[env] == 0:
+    begins = heat.begins == 1 and io.age[env] == 0
+    if begins:
         t = wp.float64(grid.base)
     g = heat.conductance[env, n]
     inflow = heat.inflow[env, n]
@@ -354,7 +357,7 @@ def exchange_heat(heat: HeatArrays, io: ReadoutArrays, out: wp.array2d(dtype=wp.
     if (io.status[env] & 1) != 0 or not wp.isfinite(inflow):
         out[env, n] = t
         return
-    past = wp.where(io.age[env] > 0, heat.touched[env, n], float(0.0))
+    past = wp.where(begins, float(0.0), heat.touched[env, n])
     heat.touched[env, n] = wp.where(g > float(0.0), past + io.dt, float(0.0))
     # Steps as short as 1e-5 s change less than single precision can hold.
     surroundings = grid.ambient + float(273.15)
@@ -412,7 +415,7 @@ def sense_temperature(heat: HeatArrays, io: ReadoutArrays, fresh: wp.array2d(dty
     # Δt = 2 τ, and a temperature held at its last value is read too early by Δt/2.
     if grid.tau > float(0.0):
         before = heat.element[env, n]
-        if io.age[env] == 0:
+        if heat.begins == 1 and io.age[env] == 0:
             before = wp.float64(grid.base)
             earlier = before
         part_of = wp.float64(io.dt) / wp.float64(grid.tau)
