@@ -157,7 +157,7 @@ def test_a_diverged_environment_reads_nan_and_harms_no_other() -> None:
 
 
 def test_flags_belong_to_the_suite_that_raised_them() -> None:
-    scene, far = pad_scene(BALL), replace(GRID, position=np.array(GRID.position) + (0.1, 0, 0))
+    scene, far = pad_scene(BALL), replace(GRID, position=np.add(GRID.position, (0.1, 0, 0)))
     lost = _suite({"f": KinematicTaxel(link="hand", probes=far, total="engine")}, scene=scene)
     other = _suite({"c": ContactProbe(link="hand", probes=GRID)}, scene=scene)
     state = state_of(scene, _touching())
