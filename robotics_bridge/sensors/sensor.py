@@ -49,6 +49,11 @@ class Sensor(abc.ABC):
     def layout(self) -> tuple[int, ...]:
         """Return the shape (N,) or (rows, columns) of the reading of one environment, without channels."""
 
+    @property
+    def ignores_load(self) -> bool:
+        """True if it reads forces that do not follow the forces of the engine, which users are told of once."""
+        return False
+
     def group(self) -> Hashable:
         """Return the values of :attr:`shared`."""
         return tuple(getattr(self, name) for name in self.shared)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import warnings
 from collections.abc import Callable, Mapping
 from typing import Any, cast
@@ -11,7 +12,7 @@ import torch
 
 from brainbench.core.cuda_graphs import record_launches
 from brainbench.core.devices import pick_device, warp
-from brainbench.core.errors import UsageError, check_kind, unknown_name
+from brainbench.core.errors import UsageError, check_kind, listing, unknown_name
 from brainbench.core.plugins import load_object
 from brainbench.core.reading.ranges import check_number
 from robotics_bridge.physics.scene import TouchScene
@@ -29,6 +30,7 @@ from robotics_bridge.sensors.runtime import History, Runtime, SuiteContext
 from robotics_bridge.sensors.sensor import Sensor
 
 wp = warp()
+_log = logging.getLogger(__name__)
 
 
 class SensorSuite:
@@ -125,6 +127,7 @@ class SensorSuite:
         self._pose: Any = None
         """Poses of the last update; None before the first."""
         self._warned = False
+        self._by_depth = [name for name, sensor in self.sensors.items() if sensor.ignores_load]
 
     def update(self, state: HandState, dt: float = 0.01) -> None:
         """Read the state of ``num_envs`` environments with every sensor, ``dt`` seconds after the last update."""
@@ -134,6 +137,7 @@ class SensorSuite:
         if not self.device.is_cuda:
             self._launch(state, dt)
             self._warn_crowded()
+            self._tell_of_depth(state)
         elif self.device.is_capturing:
             if self._histories or not all(runtime.recordable for runtime in self.runtimes):
                 raise UsageError("Sensors with a history or with meshes that move cannot be part of another recording.")
@@ -149,6 +153,7 @@ class SensorSuite:
             with wp.ScopedDevice(self.device):
                 self._launch(state, dt)
             self._recorded = None
+            self._tell_of_depth(state)
         self._pose = state.pose
         self._updates += 1
 
@@ -232,6 +237,22 @@ class SensorSuite:
                 RuntimeWarning,
                 stacklevel=3,
             )
+
+    def _tell_of_depth(self, state: HandState) -> None:
+        """Say once which taxels read the depth of a contact although the engine knows its force."""
+        if not (self._by_depth and (count := int(state.contact_count.numpy()[0]))):
+            return
+        forces = wp.to_torch(state.contact_force)[:count]
+        if bool(forces.isnan().all()):
+            # An engine that knows no forces has nothing better to offer.
+            self._by_depth = []
+        elif bool((forces > 0).any()):
+            _log.warning(
+                "%s read forces by a law of depths, which do not follow the load: engines let a heavy and a light body "
+                "sink in by nearly the same depth. Use total='engine' for forces that add up to the engine's.",
+                listing(self._by_depth),
+            )
+            self._by_depth = []
 
     @property
     def state_bytes(self) -> dict[str, int]:

@@ -51,7 +51,7 @@ class KinematicTaxel(QuerySensor):
     rest included, of the engine's contacts between its link and what it tracks. Each contact is spread over the taxels
     that feel that body from that side, by d^α and, with ``friction``, by their springs; stiffness, damping, shear and
     twist play no part. A taxel without such
-    a contact reads 0, and a contact with no taxel near it is felt by none (``SensorSuite.unfelt``)."""
+    a contact reads 0; the force of a contact beside all taxels is missing (``SensorSuite.unfelt``)."""
 
     channels: ClassVar[int] = 6
     units: ClassVar[str] = "N, N m"
@@ -72,6 +72,11 @@ class KinematicTaxel(QuerySensor):
         """``package.module:Class`` of the runtime that serves it."""
         own = "contact_load:ContactLoadRuntime" if self.total == "engine" else "runtime:KinematicRuntime"
         return f"robotics_bridge.sensors.taxels.{own}"
+
+    @property
+    def ignores_load(self) -> bool:
+        """True if it reads a law of depths in newtons, published signs aside."""
+        return self.total == "law" and self.convention == "physical"
 
     @property
     def torsion(self) -> float:

@@ -204,6 +204,23 @@ def test_after_a_reset_nothing_of_the_old_episode_can_be_read(delay: float) -> N
     assert suite.read_history("depth")[1, 2].any()
 
 
+@pytest.mark.parametrize(
+    ("settings", "advised"), [({}, True), ({"total": "engine"}, False), ({"convention": "thesis"}, False)]
+)
+def test_a_law_of_depths_says_once_that_it_does_not_follow_the_load(settings, advised, caplog) -> None:
+    suite = _suite({"f": KinematicTaxel(link="hand", probes=GRID, **settings)})
+    state = state_of(suite.scene, poses_at(3, {2: (0.001, -0.002, 0.1)}))
+    state.contact_count.zero_()
+    suite.update(state)
+    assert not caplog.records
+    _press(state)
+    for _ in range(3):
+        suite.update(state)
+    messages = [record.getMessage() for record in caplog.records]
+    assert len(messages) == advised
+    assert not advised or messages[0].startswith("'f' read forces by a law of depths")
+
+
 def test_history_holds_the_last_readings_oldest_first_and_is_cleared_by_reset() -> None:
     suite = _suite({"depth": ContactDepthProbe(link="hand", probes=GRID, history=3)}, envs=2)
     read = []
