@@ -17,11 +17,10 @@ from numpy.typing import NDArray
 
 from brainbench.core.errors import DataError, UsageError, check_each
 from brainbench.datasets.hdf5 import write_recordings
-from brainbench.datasets.nwb_writer import write_nwb
+from brainbench.datasets.nwb import write_nwb
 from brainbench.datasets.reading import Source, each_session, find_recordings, open_file, resolve_selection
 from brainbench.datasets.sessions import OBSERVED, SPIKES, Session, SessionTable, decode, ragged
-from brainbench.datasets.trials.counting import has_units, read_spikes, recorded_span
-from brainbench.datasets.trials.covariates import LICKS, lick_times
+from brainbench.datasets.trials.counting import LICKS, has_units, lick_times, read_spikes, recorded_span
 from brainbench.datasets.trials.selection import EVERYTHING, Selection, Tally, check_values
 
 

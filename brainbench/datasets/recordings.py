@@ -29,8 +29,8 @@ from brainbench.datasets.reading import (
 from brainbench.datasets.sessions import Session
 from brainbench.datasets.trials.conditions import Conditions
 from brainbench.datasets.trials.counting import ReadingOptions, SessionCounts, count_session, has_units, no_units
-from brainbench.datasets.trials.joining import join_sessions
 from brainbench.datasets.trials.selection import DEFAULT, Selection
+from brainbench.datasets.trials.session_trials import join_sessions
 from brainbench.datasets.trials.windows import WHOLE, Window
 
 if TYPE_CHECKING:

@@ -55,7 +55,7 @@ def convert(
 
     Numbers become N and N·m, or mN and µN·m in a run; axes and signs are alike. What cannot be trusted is counted.
     """
-    from brainbench.datasets.whisking.files import is_sweep_tree
+    from brainbench.datasets.whisking.dataset import is_sweep_tree
     from brainbench.published.whiskit import find_runs, read_runs
 
     if not source.exists():

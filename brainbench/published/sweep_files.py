@@ -29,7 +29,7 @@ from brainbench.core.files import cache_dir, content_hash, file_hash, read_json
 from brainbench.core.reading.archives import read_npz
 from brainbench.core.reading.sealed import read_sealed, write_sealed
 from brainbench.core.reading.texts import check_values
-from brainbench.datasets.whisking.files import FOLDERS, Shard
+from brainbench.datasets.whisking.dataset import FOLDERS, Shard
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

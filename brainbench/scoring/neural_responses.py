@@ -66,7 +66,7 @@ class NeuralResponses:
 
         That of covariates is part of it where the metric takes them.
         """
-        from brainbench.datasets.trials.covariates import COVARIATES
+        from brainbench.datasets.trials.counting import COVARIATES
         from brainbench.datasets.trials.session_trials import NAMES, fingerprint
 
         data, found = self.dataset, str(self.dataset.attrs["content_hash"])

@@ -6,8 +6,7 @@ from pathlib import Path
 import h5py
 import pytest
 
-from brainbench.datasets.whisking.dataset import WhiskingDataset
-from brainbench.datasets.whisking.files import Shard
+from brainbench.datasets.whisking.dataset import Shard, WhiskingDataset
 from brainbench.models.training import search_space, trainer
 from brainbench.models.training.augmentation import Augmentation
 from brainbench.stimuli.sweeps.generation import generate

@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 
 from brainbench.core.errors import DataError, UsageError
 from brainbench.datasets import write_recordings
-from brainbench.datasets.nwb_writer import write_nwb
+from brainbench.datasets.nwb import write_nwb
 from brainbench.datasets.sessions import SessionTable, as_labels, decode, make_session, natural_key
 
 

@@ -8,7 +8,7 @@ import h5py
 import numpy as np
 
 from brainbench.datasets import write_recordings
-from brainbench.datasets.nwb_writer import write_nwb as save_nwb
+from brainbench.datasets.nwb import write_nwb as save_nwb
 from brainbench.datasets.sessions import SPIKES, Session, SessionTable, make_session, ragged
 
 HUMAN = "pynapple_sub-4_ses-4_ecephys+image.nwb"

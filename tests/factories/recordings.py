@@ -11,8 +11,8 @@ from brainbench.datasets.synthetic.populations import draw_sessions
 from brainbench.datasets.synthetic.sessions import spike_session, trial_times
 from brainbench.datasets.trials.conditions import Conditions
 from brainbench.datasets.trials.counting import UNIT_COLUMNS, ReadingOptions, SessionCounts, missing_column
-from brainbench.datasets.trials.joining import join_sessions
 from brainbench.datasets.trials.selection import EVERYTHING, Tally
+from brainbench.datasets.trials.session_trials import join_sessions
 from brainbench.datasets.trials.windows import Window
 
 LABELS = ("convex-close", "convex-medium", "convex-far", "concave-close", "concave-medium", "concave-far")

@@ -15,12 +15,10 @@ from pathlib import Path
 from brainbench.core.errors import DataError, repeats
 from brainbench.core.progress import Progress, track
 from brainbench.datasets import hdf5
-from brainbench.datasets.checks.clock import check_clock
 from brainbench.datasets.checks.findings import SEVERITIES, Finding, some
-from brainbench.datasets.checks.labels import check_labels
 from brainbench.datasets.checks.published import check_published
-from brainbench.datasets.checks.spikes import check_spikes
-from brainbench.datasets.checks.tables import check_coverage, check_tables
+from brainbench.datasets.checks.tables import check_coverage, check_labels, check_tables
+from brainbench.datasets.checks.timing import check_clock, check_spikes
 from brainbench.datasets.layouts.published_npz import is_published
 from brainbench.datasets.layouts.registry import RecordingLayout
 from brainbench.datasets.reading import Source, each_session, find_recordings, open_file

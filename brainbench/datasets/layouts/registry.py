@@ -15,7 +15,7 @@ from brainbench.core.errors import UsageError, check_name
 from brainbench.core.plugins import load_entry_points, load_module
 from brainbench.datasets.sessions import Session
 from brainbench.datasets.trials.conditions import Conditions
-from brainbench.datasets.trials.selection import Selection
+from brainbench.datasets.trials.selection import DEFAULT, Selection
 from brainbench.datasets.trials.windows import FIRST_CONTACT, Window
 
 ENTRY_POINTS = "brainbench.recordings"
@@ -156,3 +156,17 @@ def _known() -> dict[str, RecordingLayout]:
 def _take(_: str, found: Any) -> None:
     if isinstance(found, RecordingLayout):
         register_layout(found)
+
+
+SYNTHETIC = RecordingLayout(
+    name="synthetic",
+    title="animals drawn by brainbench.datasets.synthetic; no animal was recorded",
+    citation="brainbench, this version",
+    conditions=Conditions("trials", ("stimulus",)),
+    orders={},
+    selection=DEFAULT,
+    window=Window(FIRST_CONTACT, stop="choice"),
+    columns=("stimulus", "choice_time"),
+    synthetic=True,
+    remarks=("truth: truth.json beside the files says what the neurons encode",),
+)

@@ -13,13 +13,10 @@ from typing import TYPE_CHECKING
 from brainbench.core.lazy import lazy_exports
 
 if TYPE_CHECKING:
-    from brainbench.datasets.synthetic.animals import calibrate, measure_ceiling
-    from brainbench.datasets.synthetic.design import PopulationDesign
-    from brainbench.datasets.synthetic.geometry import ResponseGeometry
-    from brainbench.datasets.synthetic.populations import draw_animals
+    from brainbench.datasets.synthetic.populations import PopulationDesign, ResponseGeometry, draw_animals
     from brainbench.datasets.synthetic.rodgers_demo import ensure_rodgers_demo, make_rodgers_demo
     from brainbench.datasets.synthetic.sessions import write_files
-    from brainbench.datasets.synthetic.truth import read_truth
+    from brainbench.datasets.synthetic.truth import calibrate, measure_ceiling, read_truth
 
 __all__ = [
     "PopulationDesign",

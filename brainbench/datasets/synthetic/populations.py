@@ -21,11 +21,141 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from brainbench.core.errors import UsageError
-from brainbench.core.reading.ranges import check_number
+from brainbench.core.errors import DataError, UsageError
+from brainbench.core.reading.ranges import check_fields, check_number
 from brainbench.core.trials import Trials
-from brainbench.datasets.synthetic.design import PopulationDesign
-from brainbench.datasets.synthetic.geometry import ResponseGeometry
+
+MODULATION = 0.4
+"""Largest modulation: beyond it too many rates would be cut off at zero for the truth to hold."""
+
+
+@dataclass(frozen=True)
+class PopulationDesign:
+    """Size of synthetic recordings, and how noisy they are; the defaults make RDMs of about half reliability."""
+
+    animals: int = 10
+    sessions: int = 1
+    """Sessions per animal; each has its own units."""
+    units: int = 60
+    """Units per session."""
+    trials: int | tuple[int, int] = (16, 20)
+    """Trials of each stimulus in a session: one number, or the fewest and the most, drawn evenly."""
+    rate: float = 6.0
+    """Mean rate of a unit, Hz."""
+    window: float = 0.5
+    """Duration in which spikes are counted, s."""
+    modulation: float = 0.2
+    """Standard deviation of a unit's rate over stimuli, as a share of its mean; 0 is the null."""
+    individual: float = 0.0
+    """Share of the tuning variance that is an animal's own and not the shared geometry."""
+    emphasis: float = 0.3
+    """Standard deviation over animals of the logarithm of the weight of each axis of the geometry."""
+    spread: float = 0.4
+    """Standard deviation of the logarithm of mean rates over units."""
+    dispersion: float = 0.2
+    """φ of the negative binomial: variance = mean + φ mean² per unit and trial; 0 is Poisson."""
+    shared_gain: float = 0.2
+    """Standard deviation of a gain (mean one) that all units of a trial share."""
+    session_gain: float = 0.0
+    """Standard deviation of the logarithm of each session's overall rate."""
+    drift: float = 0.0
+    """Relative change of all rates from the first trial of a session to the last, above −1."""
+    missing: tuple[tuple[int, int], ...] = ()
+    """Pairs (animal, stimulus) without any trial."""
+
+    def __post_init__(self) -> None:
+        check_fields(self, "animals", "sessions", "units", least=1, whole=True)
+        fewest, most = self.trial_range
+        if not 1 <= fewest <= most:
+            raise UsageError(f"A design needs at least one of trials, fewest before most; received {self.trials}.")
+        check_fields(self, "rate", "window", above=0)
+        check_fields(self, "emphasis", "spread", "dispersion", "shared_gain", "session_gain", least=0)
+        check_fields(self, "modulation", least=0, most=MODULATION)
+        check_fields(self, "individual", least=0, most=1)
+        check_fields(self, "drift", above=-1)
+
+    @property
+    def trial_range(self) -> tuple[int, int]:
+        """Fewest and most trials of a stimulus in a session."""
+        return (self.trials, self.trials) if isinstance(self.trials, int) else self.trials
+
+
+@dataclass(frozen=True)
+class ResponseGeometry:
+    """Directions of K stimuli in tuning space; the distances between them are the truth of synthetic recordings."""
+
+    directions: NDArray[np.float64]
+    """[K, D] on their principal axes, D < K or so; the mean of their squared lengths is one."""
+    labels: tuple[str, ...]
+    """[K] names of the stimuli."""
+
+    @classmethod
+    def from_features(cls, features: ArrayLike, labels: Sequence[str] | None = None) -> ResponseGeometry:
+        """Take the correlations between the rows of features [K, F], such as a model's activations.
+
+        The truth is then 1 − Pearson between rows, the model's own correlation-distance RDM.
+        """
+        values = _checked(features, 2)
+        # Inner products of centred rows of length one are Pearson correlations (r), so the RDM below is 1 − r.
+        centred = values - values.mean(axis=1, keepdims=True)
+        norms = np.linalg.norm(centred, axis=1)
+        if np.any(norms <= 1e-12 * np.maximum(np.abs(values).max(axis=1), 1e-300)):
+            raise DataError(f"The features of stimulus {int(np.argmin(norms))} are constant, so it has no direction.")
+        return cls(principal_axes(centred / norms[:, None]), _check_labels(labels, len(values)))
+
+    @classmethod
+    def from_activations(cls, features: ArrayLike, labels: Sequence[str] | None = None) -> ResponseGeometry:
+        """Take the Euclidean distances between stimuli over features [K, F], each standardised over the stimuli.
+
+        Constant features are left out. Unlike :meth:`from_features`, stimuli may be near to the mean response. Raises
+        UsageError: the features are not [K, F] with K ≥ 2, or labels do not fit; DataError: a value is not finite, or
+        every feature is constant.
+        """
+        values = _checked(features, 1)
+        spread = values.std(axis=0)
+        varied = spread > 1e-9 * np.maximum(np.abs(values).max(axis=0), 1e-300)
+        if not varied.any():
+            raise DataError("Every feature is the same for all stimuli, so there is nothing for neurons to encode.")
+        standard = (values[:, varied] - values[:, varied].mean(axis=0)) / spread[varied]
+        # Each standardised feature has a mean square of one over stimuli, so /√F makes the mean squared length one.
+        return cls(principal_axes(standard / np.sqrt(standard.shape[1])), _check_labels(labels, len(values)))
+
+    @property
+    def rdm(self) -> NDArray[np.float64]:
+        """The truth [P]: half the squared distance between directions, for unit vectors one minus their cosine."""
+        rows, columns = np.triu_indices(len(self.directions), 1)
+        return 0.5 * np.sum((self.directions[rows] - self.directions[columns]) ** 2, axis=1)
+
+
+def _checked(features: ArrayLike, width: int) -> NDArray[np.float64]:
+    """Return features [K, F] as finite numbers, K ≥ 2 and F ≥ width."""
+    given = np.asarray(features)
+    if given.dtype.kind not in "biuf":
+        raise UsageError(f"Features are real numbers; received {given.dtype}.")
+    values = given.astype(np.float64)
+    if values.ndim != 2 or len(values) < 2 or values.shape[1] < width:
+        raise UsageError(f"Features are [stimulus, feature], at least 2 × {width}; received shape {values.shape}.")
+    if not np.isfinite(values).all():
+        raise DataError(f"{int((~np.isfinite(values)).sum())} feature values are not finite.")
+    return values
+
+
+def principal_axes(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Rotate K vectors [K, F] into the at most K axes that they span; every angle and length stays."""
+    # X = U S Vᵀ: the rows of U S have the same inner products as those of X, and no more axes than its rank.
+    left, values, _ = np.linalg.svd(vectors, full_matrices=False)
+    kept = values > 1e-9 * values[0]
+    # A singular vector's sign is the machine's choice; the largest entry is made positive.
+    signs = np.sign(left[np.abs(left).argmax(axis=0), np.arange(left.shape[1])])
+    return (left * signs * values)[:, kept]
+
+
+def _check_labels(labels: Sequence[str] | None, stimuli: int) -> tuple[str, ...]:
+    if labels is None:
+        return tuple(f"s{index + 1}" for index in range(stimuli))
+    if len(labels) != stimuli or len(set(labels)) != stimuli:
+        raise UsageError(f"{stimuli} stimuli need as many different labels; received {len(set(labels))}.")
+    return tuple(str(label) for label in labels)
 
 
 @dataclass(frozen=True)

@@ -24,8 +24,7 @@ from brainbench.core.progress import Progress, track
 from brainbench.core.reading.ranges import check_fields, check_number
 from brainbench.core.records import Score
 from brainbench.core.statistics import compare_scores
-from brainbench.datasets.synthetic.design import PopulationDesign
-from brainbench.datasets.synthetic.geometry import ResponseGeometry, principal_axes
+from brainbench.datasets.synthetic.populations import PopulationDesign, ResponseGeometry, principal_axes
 from brainbench.metrics.inference.multiple import adjust
 from brainbench.metrics.measures.metric import Metric, get_metric
 from brainbench.metrics.rdms.pairs import Ints

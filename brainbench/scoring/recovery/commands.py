@@ -23,7 +23,7 @@ from brainbench.core.reading.ranges import check_number
 if TYPE_CHECKING:
     from brainbench.scoring.recovery import Candidate, Recovery, RecoveryDesign
 
-POPULATION = "brainbench.datasets.synthetic.design:PopulationDesign"
+POPULATION = "brainbench.datasets.synthetic.populations:PopulationDesign"
 _CLUSTER = Requirement(("distributed",), "cluster", "A --scheduler", lambda values: values.get("scheduler") is not None)
 _PICTURE = Requirement(("matplotlib",), "report", "Drawing pictures", lambda values: values.get("out") is not None)
 _NOISE = ("animals", "units", "rate", "window", "modulation", "individual", "emphasis", "dispersion", "shared_gain")

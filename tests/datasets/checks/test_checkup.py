@@ -9,7 +9,7 @@ import pytest
 from brainbench.core.errors import DataFileNotFoundError, UsageError
 from brainbench.core.files import to_json
 from brainbench.datasets import check, write_recordings
-from brainbench.datasets.checks.spikes import coincidences
+from brainbench.datasets.checks.timing import coincidences
 from brainbench.datasets.exports import subset
 from brainbench.datasets.reading import each_session, open_file
 from brainbench.datasets.sessions import SPIKES, Session, SessionTable, make_session, ragged
@@ -122,7 +122,7 @@ def test_a_clock_without_touch_or_without_an_answer_is_not_called_right(tmp_path
 @pytest.mark.parametrize("units", [3, 30])
 def test_in_sixty_sessions_no_clock_is_misjudged(units):
     """Over-dispersed, drifting neurons; the shifts include one within the rhythm of touches."""
-    from brainbench.datasets.checks.clock import check_clock
+    from brainbench.datasets.checks.timing import check_clock
     from brainbench.datasets.trials.counting import read_spikes
 
     random = np.random.default_rng(0)

@@ -1,10 +1,62 @@
+from __future__ import annotations
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from brainbench.core.errors import UsageError
+from brainbench.datasets import export, open_recordings, write_recordings
+from brainbench.datasets.sessions import make_session
 from brainbench.datasets.trials.counting import count
+from brainbench.datasets.trials.session_trials import trials_by_subject
+
+
+def _make_file(path, choices):
+    starts = np.arange(1.0, 9.0)
+    tables = {
+        "trials": {
+            "start_time": starts,
+            "stop_time": starts + 0.5,
+            "stimulus": list("abababab"),
+            "choice": choices,
+        },
+        "contacts_by_whisker_C1": {"start_time": [1.1, 1.2, 2.1, 2.2], "stop_time": [1.11, 1.2, 2.11, 2.21]},
+        "contacts_by_whisker_C2": {"start_time": [1.3, 3.6], "stop_time": [1.31, 3.7]},
+        "licks": {"start_time": [1.4, 8.1, 8.2], "stop_time": [1.4, 8.1, 8.2]},
+    }
+    spikes = [np.sort(np.random.default_rng(i).uniform(0.5, 9.5, 200)) for i in range(3)]
+    return write_recordings(path, make_session("m", "1", spikes, tables))
+
+
+def test_contacts_licks_and_choices_are_counted_inside_the_window(tmp_path):
+    path = _make_file(tmp_path / "a.h5", ["left", "right", "nogo", "left", "right", "left", "right", "left"])
+    dataset = open_recordings(path, conditions="trials:stimulus", window="start..stop")
+    # A contact of no duration is an empty interval, and 3.6 s lies between two trials.
+    assert dataset["contacts"].values.tolist() == [2, 2, 0, 0, 0, 0, 0, 0]
+    assert dataset["licks"].values.tolist() == [1, 0, 0, 0, 0, 0, 0, 2]
+    np.testing.assert_array_equal(dataset["choice"].values, [0, 1, np.nan, 0, 1, 0, 1, 0])
+    (block,) = trials_by_subject(dataset)["m"]
+    assert {name: len(values) for name, values in block.covariates.items()} == dict.fromkeys(
+        ("contacts", "licks", "choice"), len(block.labels)
+    )
+
+
+def test_what_a_file_does_not_tell_is_left_out(tmp_path):
+    path = _make_file(tmp_path / "a.h5", ["yes"] * 8)
+    dataset = open_recordings(path, conditions="trials:stimulus")
+    assert "choice" not in dataset.coords
+
+
+@pytest.mark.parametrize("name", ["copy.h5", "copy.nwb"])
+def test_copies_keep_them(tmp_path, name):
+    path = _make_file(tmp_path / "a.h5", ["left", "right"] * 4)
+    (copy,) = export(path, tmp_path / name)
+    one, two = (open_recordings(item, conditions="trials:stimulus") for item in (path, copy))
+    for covariate in ("contacts", "licks", "choice"):
+        np.testing.assert_array_equal(one[covariate].values, two[covariate].values)
+    assert one.attrs["content_hash"] == two.attrs["content_hash"]
+
 
 TIMES = st.lists(st.floats(0, 10, width=32), max_size=40).map(sorted).map(np.array)
 

@@ -1,3 +1,5 @@
+from __future__ import annotations
+
 from dataclasses import replace
 
 import numpy as np
@@ -17,7 +19,7 @@ from brainbench.datasets.synthetic import (
     read_truth,
     write_files,
 )
-from brainbench.datasets.synthetic.animals import stimulus_means
+from brainbench.datasets.synthetic.truth import stimulus_means
 from brainbench.datasets.trials.session_trials import trials_by_subject
 from brainbench.metrics import noise_ceiling, rdm
 from brainbench.metrics.reliability.subject_rdm import subject_rdm
