@@ -42,11 +42,11 @@ def export(source: Source, target: str | os.PathLike[str], *, select: Selection 
     sessions, subjects, tallies = [], set(), []
     for path in paths:
         with open_file(path) as file:
-            for session, found in each_session(file, path, layout):
+            for session, session_layout in each_session(file, path, layout):
                 subjects.add(session.subject)
                 if has_units(session) and session.subject in (chosen.subjects or subjects):
                     tallies.append(Tally())
-                    table = found.conditions.table if found else "trials"
+                    table = session_layout.conditions.table if session_layout else "trials"
                     sessions.append(subset(session, chosen, table, tallies[-1]))
     check_each("subject", chosen.subjects, sorted(subjects))
     check_values(tallies)
@@ -80,19 +80,21 @@ def subset(
         raise DataError(f"{session.source} has no units table; there are no spikes to copy.")
     tally = tally or Tally()
     spikes = read_spikes(units, tally.notes)
-    kept = tally.select(units, selection.units, "units")
-    kept &= np.array([len(times) for times in spikes]) >= selection.min_spikes
-    if not kept.any():
+    chosen = tally.select(units, selection.units, "units")
+    chosen &= np.array([len(times) for times in spikes]) >= selection.min_spikes
+    if not chosen.any():
         raise DataError(f"No unit of {session.source} passes {'; '.join(selection.lines())}; nothing to copy.")
-    columns = _plain(units, kept)
-    columns |= ragged(SPIKES, [times for times, keep in zip(spikes, kept, strict=True) if keep])
-    if not kept.all() and OBSERVED not in columns and (span := recorded_span(spikes)) is not None:
+    columns = _plain(units, chosen)
+    columns |= ragged(SPIKES, [times for times, keep in zip(spikes, chosen, strict=True) if keep])
+    if not chosen.all() and OBSERVED not in columns and (span := recorded_span(spikes)) is not None:
         # The span was that of all units; the copy must not shrink it to that of those it holds.
-        columns |= ragged(OBSERVED, [np.array([span])] * int(kept.sum()))
+        columns |= ragged(OBSERVED, [np.array([span])] * int(chosen.sum()))
     tables = {}
-    for name, item in session.tables.items():
-        rows = tally.select(item, selection.trials, "trials") if name == table else np.ones(len(item), dtype=bool)
-        tables[name] = SessionTable(name, _plain(item, rows), item.where)
+    for name, original in session.tables.items():
+        rows = (
+            tally.select(original, selection.trials, "trials") if name == table else np.ones(len(original), dtype=bool)
+        )
+        tables[name] = SessionTable(name, _plain(original, rows), original.where)
     if LICKS not in tables and (licks := lick_times(session)) is not None:
         tables[LICKS] = SessionTable(LICKS, {"start_time": licks, "stop_time": licks}, session.source)
     return replace(session, units=SessionTable("units", columns, units.where), tables=tables, series={})
@@ -100,7 +102,7 @@ def subset(
 
 def _plain(table: SessionTable, rows: NDArray[np.bool_]) -> dict[str, NDArray[Any]]:
     """Return the columns that mean something outside their file, of the rows kept; references do not."""
-    made: dict[str, NDArray[Any]] = {"id": table.ids()[rows]}
+    columns: dict[str, NDArray[Any]] = {"id": table.ids()[rows]}
     for name in table.columns:
         raw = table.data[name]
         region = decode(getattr(raw, "attrs", {}).get("neurodata_type", "")).tolist() == "DynamicTableRegion"
@@ -111,13 +113,13 @@ def _plain(table: SessionTable, rows: NDArray[np.bool_]) -> dict[str, NDArray[An
         if values.dtype.kind not in "biufU":
             continue
         if f"{name}_index" not in table.data:
-            made[name] = table.column(name)[rows]
+            columns[name] = table.column(name)[rows]
             continue
         parts = np.split(values, table.ends(name)[:-1]) if len(table) else []
         parts = [part for part, keep in zip(parts, rows, strict=True) if keep]
-        made[name] = np.concatenate(parts) if parts else values[:0]
-        made[f"{name}_index"] = np.cumsum([len(part) for part in parts], dtype=np.int64)
-    return made
+        columns[name] = np.concatenate(parts) if parts else values[:0]
+        columns[f"{name}_index"] = np.cumsum([len(part) for part in parts], dtype=np.int64)
+    return columns
 
 
 def _file_name(session: Session) -> str:

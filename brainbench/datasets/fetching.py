@@ -48,8 +48,8 @@ def fetch(name: str, folder: str | os.PathLike[str] = ".", *, assets: str | None
 
 def _dandiset(name: str) -> tuple[str, str]:
     if match := re.fullmatch(r"(?:DANDI:)?(\d{6})", name, re.IGNORECASE):
-        known = [get_layout(item) for item in list_layouts()]
-        return match[1], next((item.assets for item in known if item.dandiset == match[1]), "")
+        layouts = [get_layout(item) for item in list_layouts()]
+        return match[1], next((item.assets for item in layouts if item.dandiset == match[1]), "")
     public = [item for item in list_layouts() if get_layout(item).dandiset]
     if name not in list_layouts():
         raise unknown_name("data set", name, public, hint="Or give the six digits of a dandiset, such as 000231.")

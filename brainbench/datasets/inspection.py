@@ -145,11 +145,15 @@ class Inspection:
         yield from (f"! skipped: {reason}" for reason in self.skipped)
         if self.proposals:
             yield "conditions that can be scored, the likeliest marked with →:"
-            for place, item in enumerate(self.proposals):
-                shown = ", ".join(item.labels[:EXAMPLES]) + (" …" if len(item.labels) > EXAMPLES else "")
-                few = f" (fewer than {ENOUGH_TRIALS}: --metric rsa-correlation)" if item.fewest < ENOUGH_TRIALS else ""
-                counted = f"{len(item.labels)} labels, ≥ {item.fewest} trials{few}: {shown}"
-                yield f"{' ' if place else '→'} --conditions {item.conditions}   {counted}"
+            for place, proposal in enumerate(self.proposals):
+                examples = ", ".join(proposal.labels[:EXAMPLES]) + (" …" if len(proposal.labels) > EXAMPLES else "")
+                few = (
+                    f" (fewer than {ENOUGH_TRIALS}: --metric rsa-correlation)"
+                    if proposal.fewest < ENOUGH_TRIALS
+                    else ""
+                )
+                counted = f"{len(proposal.labels)} labels, ≥ {proposal.fewest} trials{few}: {examples}"
+                yield f"{' ' if place else '→'} --conditions {proposal.conditions}   {counted}"
 
 
 def inspect(path: str | os.PathLike[str], *, strict: bool = False, progress: Progress | None = None) -> Inspection:
@@ -170,7 +174,7 @@ def inspect(path: str | os.PathLike[str], *, strict: bool = False, progress: Pro
     proposals: list[Proposal] = []
     formats: dict[str, None] = {}
     layouts: set[str | None] = set()
-    named, files = find_recordings(path)
+    layout_named, files = find_recordings(path)
     paths, skipped = suitable_files(files, strict=strict)
     for file_path in track(paths, "reading recordings", progress):
         if is_published(file_path):
@@ -178,26 +182,26 @@ def inspect(path: str | os.PathLike[str], *, strict: bool = False, progress: Pro
         with open_file(file_path) as file:
             if hdf5.holds_counts(file, file_path):
                 return _counted(hdf5.read_counts(file, file_path), file_path)
-            for session, found in each_session(file, file_path, named):
-                layouts.add(found.name if found else None)
+            for session, session_layout in each_session(file, file_path, layout_named):
+                layouts.add(session_layout.name if session_layout else None)
                 formats[session.format] = None
-                own = propose(session, found)
-                summaries.append(_summary(session, bool(own)))
-                proposals += own
+                session_proposals = propose(session, session_layout)
+                summaries.append(_summary(session, bool(session_proposals)))
+                proposals += session_proposals
     layout = layouts.pop() if len(layouts) == 1 else None
-    told = ", ".join(formats)
-    return Inspection(os.fspath(path), told, layout, tuple(summaries), _merged(proposals), tuple(skipped))
+    format_names = ", ".join(formats)
+    return Inspection(os.fspath(path), format_names, layout, tuple(summaries), _merged(proposals), tuple(skipped))
 
 
 def _merged(proposals: list[Proposal]) -> tuple[Proposal, ...]:
     """Join equal proposals of several files: all labels, the fewest trials."""
     merged: dict[str, Proposal] = {}
-    for item in proposals:
-        known = merged.get(item.conditions, item)
-        labels = known.labels
-        if more := set(item.labels).difference(labels):
+    for proposal in proposals:
+        earlier = merged.get(proposal.conditions, proposal)
+        labels = earlier.labels
+        if more := set(proposal.labels).difference(labels):
             labels = tuple(sorted({*labels, *more}, key=natural_key))
-        merged[item.conditions] = Proposal(item.conditions, labels, min(known.fewest, item.fewest))
+        merged[proposal.conditions] = Proposal(proposal.conditions, labels, min(earlier.fewest, proposal.fewest))
     return tuple(merged.values())
 
 
@@ -274,8 +278,8 @@ def _counted(
 
 
 def _session_lines(session: SessionSummary) -> Iterator[str]:
-    made = "  SYNTHETIC" if session.synthetic else ""
-    yield f"subject {session.subject}, session {session.session}, started {session.start or 'unknown'}{made}"
+    origin = "  SYNTHETIC" if session.synthetic else ""
+    yield f"subject {session.subject}, session {session.session}, started {session.start or 'unknown'}{origin}"
     if session.units is not None:
         units = session.units
         span = f"{units.first:.3f}–{units.last:.3f} s" if np.isfinite(units.first) else "no span"
@@ -288,14 +292,14 @@ def _session_lines(session: SessionSummary) -> Iterator[str]:
             yield f"    {column.name} ({column.kind}) {values}{' …' if column.distinct > EXAMPLES else ''}"
     for name, contents in session.modules:
         yield f"  processing/{name}: {', '.join(contents)}"
-    for (kind, shape), found in groupby(session.acquired, key=lambda item: (item.kind, item.shape)):
-        items = list(found)
+    for (kind, shape), series in groupby(session.acquired, key=lambda item: (item.kind, item.shape)):
+        items = list(series)
         gigabytes = sum(item.gigabytes for item in items)
         size = f"{gigabytes:.3g} GB" if gigabytes >= 0.1 else f"{gigabytes * 1e3:.3g} MB"
         names = items[0].name if len(items) == 1 else f"{items[0].name} … {items[-1].name}, {len(items)} series"
         yield f"  {names} ({kind}): {' × '.join(map(str, shape))} samples{' each' * (len(items) > 1)}, {size}, not read"
-    for item in (*session.missing, *session.notes):
-        yield f"  ! {item}"
+    for remark in (*session.missing, *session.notes):
+        yield f"  ! {remark}"
 
 
 def propose(session: Session, layout: RecordingLayout | None = None) -> list[Proposal]:
@@ -309,7 +313,7 @@ def propose(session: Session, layout: RecordingLayout | None = None) -> list[Pro
     ranked: list[tuple[tuple[float, ...], Proposal]] = []
     for name, table in session.tables.items():
         ours = layout if layout is not None and name == layout.conditions.table else None
-        kept = slice(None) if ours is None else _selected(table, ours)
+        chosen = slice(None) if ours is None else _selected(table, ours)
         for column in summarise_columns(table):
             # A column named like a stimulus may have thousands of values; others would be mere numbers.
             most = np.inf if _STIMULUS.search(column.name) else _MOST_VALUES
@@ -318,11 +322,11 @@ def propose(session: Session, layout: RecordingLayout | None = None) -> list[Pro
                 and column.fewest >= 2
                 and not column.name.endswith(("_time", "_times"))
             ):
-                labels = as_labels(table.column(column.name))[kept].tolist()
+                labels = as_labels(table.column(column.name))[chosen].tolist()
                 order = None if ours is None else ours.orders.get(column.name)
-                found = _proposal(f"{name}:{column.name}", [one for one in labels if order is None or one in order])
-                if len(found.labels) >= FEWEST_LABELS and found.fewest >= 2:
-                    ranked.append((_rank(name, column, len(table)), found))
+                candidate = _proposal(f"{name}:{column.name}", [one for one in labels if order is None or one in order])
+                if len(candidate.labels) >= FEWEST_LABELS and candidate.fewest >= 2:
+                    ranked.append((_rank(name, column, len(table)), candidate))
     if layout is not None:
         table = session.table(layout.conditions.table)
         if all(name in table for name in layout.conditions.columns):

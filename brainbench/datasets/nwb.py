@@ -131,9 +131,9 @@ def _groups(parent: Any) -> list[tuple[str, h5py.Group]]:
     for name in parent:
         # A link into a file that is not there (raw data kept apart) must not hide the rest.
         with contextlib.suppress(KeyError, OSError):
-            item = parent[name]
-            if isinstance(item, h5py.Group):
-                groups.append((name, item))
+            child = parent[name]
+            if isinstance(child, h5py.Group):
+                groups.append((name, child))
     return groups
 
 
@@ -192,12 +192,12 @@ def write_nwb(
     if session.units is None:
         raise DataError(f"{session.source} has no units table; there are no spikes to write.")
     session.units.rows(SPIKES)  # what no reader takes is not written
-    made = "SYNTHETIC: " if session.synthetic else ""
+    origin = "SYNTHETIC: " if session.synthetic else ""
     identifier, start = session.identifier or f"{session.subject}-{session.session}", session.start or _NO_START
     stated = {"session_id": session.session, "keywords": ["synthetic"] * session.synthetic + ["brainbench"]}
     stated |= {"stimulus": STIMULI + session.stimuli} if session.stimuli else {}
     texts: dict[str, Any] = {"file_create_date": [start], "identifier": identifier}
-    texts |= {"session_description": f"{made}{description}"}
+    texts |= {"session_description": f"{origin}{description}"}
     texts |= dict.fromkeys(("session_start_time", "timestamps_reference_time"), start)
     texts |= {f"general/{name}": value for name, value in {**stated, **(general or {})}.items()}
     about = {"subject_id": session.subject, **(subject or {})}
@@ -211,16 +211,16 @@ def write_nwb(
         _describe(file.create_group("general/subject"), "core", "Subject")
         for name, value in texts.items():
             file.create_dataset(name, data=value, dtype=h5py.string_dtype())
-        _write_table(_group(file, "units", "Units", f"{made}Units with their spike times."), session.units, meanings)
+        _write_table(_group(file, "units", "Units", f"{origin}Units with their spike times."), session.units, meanings)
         for name, table in session.tables.items():
             for column in ("start_time", "stop_time"):
                 if column not in table:
                     raise DataError(f"{table.label} has no {column}, which NWB needs; export to .h5 instead.")
             place = f"processing/{name}" if "/" in name else f"intervals/{name}"
-            _write_table(_group(file, place, "TimeIntervals", f"{made}Table {name}."), table, meanings)
+            _write_table(_group(file, place, "TimeIntervals", f"{origin}Table {name}."), table, meanings)
         for name, series in session.series.items():
             if series.timestamps is not None:
-                _write_events(_group(file, name, "TimeSeries", f"{made}Events {name}."), series)
+                _write_events(_group(file, name, "TimeSeries", f"{origin}Events {name}."), series)
         # Every object has an identifier; the file itself is visited by no walk through it.
         file.visititems(lambda _, item: _identify(item, identifier))
         _identify(file, identifier)
@@ -268,13 +268,13 @@ def _group(file: h5py.File, path: str, kind: str, description: str) -> h5py.Grou
     return group
 
 
-def _describe(item: h5py.Group | h5py.Dataset, namespace: str, kind: str, description: str = "") -> None:
-    item.attrs.update({"namespace": namespace, "neurodata_type": kind})
+def _describe(node: h5py.Group | h5py.Dataset, namespace: str, kind: str, description: str = "") -> None:
+    node.attrs.update({"namespace": namespace, "neurodata_type": kind})
     if description:
-        item.attrs["description"] = description
+        node.attrs["description"] = description
 
 
-def _identify(item: h5py.Group | h5py.Dataset, identifier: str) -> None:
+def _identify(node: h5py.Group | h5py.Dataset, identifier: str) -> None:
     """Derive the identifier of an NWB object from that of the file and the object's path."""
-    if "neurodata_type" in item.attrs:
-        item.attrs["object_id"] = str(uuid.uuid5(_SPACE, f"{identifier}{item.name}"))
+    if "neurodata_type" in node.attrs:
+        node.attrs["object_id"] = str(uuid.uuid5(_SPACE, f"{identifier}{node.name}"))

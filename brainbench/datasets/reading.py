@@ -102,19 +102,19 @@ def suitable_files(paths: Sequence[Path], *, strict: bool = False) -> tuple[list
     """
     if len(paths) < 2:
         return list(paths), []
-    kept, skipped = [], []
+    readable, skipped = [], []
     for path in paths:
         try:
             with open_file(path) as file:
                 _check_kind(file, path)
-            kept.append(path)
+            readable.append(path)
         except DataError as error:
             if strict:
                 raise
             skipped.append(str(error))
-    if not kept:
+    if not readable:
         raise DataError(f"None of {len(paths)} files holds recordings; the first: {skipped[0]}")
-    return kept, skipped
+    return readable, skipped
 
 
 def each_session(
@@ -127,8 +127,8 @@ def each_session(
     """
     _check_kind(file, path)
     for session in hdf5.read_sessions(file, path) if hdf5.is_ours(file) else [nwb.read_nwb(file, path)]:
-        found = layout or detect_layout(session)
-        yield (session if found is None else found.adapted(session)), found
+        session_layout = layout or detect_layout(session)
+        yield (session if session_layout is None else session_layout.adapted(session)), session_layout
 
 
 def _check_kind(file: h5py.File, path: Path) -> None:
@@ -152,14 +152,14 @@ def _expand(source: str) -> list[Path]:
         inside = [item for item in path.rglob("*") if item.is_file()]
         visible = [item for item in inside if not any(part.startswith(".") for part in item.relative_to(path).parts)]
         for endings in SUFFIXES:
-            if found := [item for item in visible if item.suffix.lower() in endings]:
-                return found
+            if files := [item for item in visible if item.suffix.lower() in endings]:
+                return files
         raise DataFileNotFoundError(f"The folder {source!r} holds no recordings (*.nwb, *.h5, *.hdf5).")
     if glob.has_magic(source):
         matches = map(Path, glob.glob(str(path), recursive=True))  # noqa: PTH207 (absolute patterns)
-        if not (found := [item for item in matches if item.is_file()]):
+        if not (files := [item for item in matches if item.is_file()]):
             raise DataFileNotFoundError(f"The pattern {source!r} matches no file.")
-        return found
+        return files
     if source in _DEMOS:
         raise UsageError(
             f"The demo recordings are made from simulated stimuli on first use: ask for recordings={source!r} in "

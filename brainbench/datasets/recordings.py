@@ -90,7 +90,7 @@ def open_recordings(
         window=Window.parse(window) if isinstance(window, str) else window,
         bin=bin,
         layout=layout,
-        named=layout is not None,
+        layout_given=layout is not None,
         strict=strict,
     )
     suitable, reader.skipped = suitable_files(paths, strict=strict)
@@ -110,7 +110,7 @@ class _Reader:
     bin: float | None
     layout: RecordingLayout | None
     """The layout that the source named; else the one by which the first session was recognised."""
-    named: bool
+    layout_given: bool
     strict: bool = False
     lenient: bool = False
     """Skip sessions without the table of the conditions, because others may have it."""
@@ -131,7 +131,7 @@ class _Reader:
     def read(self, path: Path) -> None:
         """Count the sessions of one file."""
         with open_file(path) as file:
-            for session, found in each_session(file, path, self.layout if self.named else None):
+            for session, session_layout in each_session(file, path, self.layout if self.layout_given else None):
                 self.subjects.add(session.subject)
                 if not has_units(session):
                     if self.strict:
@@ -144,7 +144,7 @@ class _Reader:
                     self.other_tables |= dict.fromkeys(session.tables or ("none",), why)
                     continue
                 self._refuse_twins(session)
-                options = self._options_for(session, found)
+                options = self._options_for(session, session_layout)
                 if options.selection.subjects and session.subject not in options.selection.subjects:
                     continue
                 self.notes += session.notes
@@ -161,18 +161,22 @@ class _Reader:
                 )
             self.seen[key] = session.source
 
-    def _options_for(self, session: Session, found: RecordingLayout | None) -> ReadingOptions:
+    def _options_for(self, session: Session, session_layout: RecordingLayout | None) -> ReadingOptions:
         """Return the options of all sessions, made for the first one; a later one must have its layout."""
-        if not self.named:
-            if found is not None and self.conditions is not None and self.conditions.table != found.conditions.table:
-                found = None
-            if self.options is not None and found is not self.layout:
+        if not self.layout_given:
+            if (
+                session_layout is not None
+                and self.conditions is not None
+                and self.conditions.table != session_layout.conditions.table
+            ):
+                session_layout = None
+            if self.options is not None and session_layout is not self.layout:
                 # Going on with the first file's layout would make the result depend on the order of files.
                 raise UsageError(
                     f"{session.source} has another layout than {next(iter(self.seen.values()))}; open them apart, or "
                     f"name the layout for both: {listing(f'{name}:PATH' for name in list_layouts())}."
                 )
-            self.layout = found
+            self.layout = session_layout
         if self.options is None:
             layout = self.layout
             conditions = self.conditions or (layout.conditions if layout else _no_conditions(session))
@@ -197,15 +201,15 @@ class _Reader:
         if not self.counted:
             raise DataError(f"No session of the chosen subjects can be counted. {skipped[0]}")
         name = self.layout.name if self.layout else ""
-        name += "" if self.named or not name else " (detected from its columns)"
-        made = join_sessions(self.counted, self.options, source=source, layout=name, notes=self.notes + skipped)
-        if self.bin is not None and (longest := float(made["duration"].max())) < (1 - 1e-6) * self.bin:
+        name += "" if self.layout_given or not name else " (detected from its columns)"
+        joined = join_sessions(self.counted, self.options, source=source, layout=name, notes=self.notes + skipped)
+        if self.bin is not None and (longest := float(joined["duration"].max())) < (1 - 1e-6) * self.bin:
             raise UsageError(
                 f"A bin of {self.bin:g} s is longer than every window (up to {longest:g} s), so it cuts nothing; leave "
                 "it out, or give it in seconds."
             )
-        made.attrs["skipped"] = skipped
-        return check_recordings(made)
+        joined.attrs["skipped"] = skipped
+        return check_recordings(joined)
 
 
 def _no_conditions(session: Session) -> NoReturn:

@@ -58,8 +58,8 @@ class SessionTable:
         values = self.data[name][...]
         if (names := (values.dtype.metadata or {}).get("enum")) is not None:
             # The numbers of an HDF5 enumeration may differ between files; its names are what was meant.
-            known = {number: word for word, number in names.items()}
-            words = [known.get(number, str(number)) for number in values.ravel().tolist()]
+            word_of = {number: word for word, number in names.items()}
+            words = [word_of.get(number, str(number)) for number in values.ravel().tolist()]
             values = np.array(words, dtype=str).reshape(values.shape)
         values = decode(values)
         if values.ndim != 1 or values.dtype.kind not in "biufU":
@@ -239,9 +239,9 @@ def make_session(
     if observed is not None:
         data |= ragged(OBSERVED, [np.reshape(item, (-1, 2)) for item in observed])
     arrays = {name: {key: np.asarray(item) for key, item in table.items()} for name, table in tables.items()}
-    made = {name: SessionTable(name, columns, session) for name, columns in arrays.items()}
+    named_tables = {name: SessionTable(name, columns, session) for name, columns in arrays.items()}
     units = SessionTable("units", data, session)
-    for table in (units, *made.values()):
+    for table in (units, *named_tables.values()):
         for name in table.columns:
             if f"{name}_index" not in table and len(table.data[name]) != len(table):
                 raise DataError(f"Column {name!r} of {table.label} has {len(table.data[name])} of {len(table)} rows.")
@@ -250,10 +250,10 @@ def make_session(
         units.ends(OBSERVED)
         if not (data[OBSERVED][:, 0] <= data[OBSERVED][:, 1]).all():
             raise DataError(f"Recorded spans of {units.label} must be [begin, end] in seconds, the earlier time first.")
-    for table in made.values():
+    for table in named_tables.values():
         table.require("start_time")
     stated = {"source": session, "start": start, "synthetic": synthetic, "stimuli": stimuli}
-    return Session(subject, session, units, made, format="arrays", **stated)
+    return Session(subject, session, units, named_tables, format="arrays", **stated)
 
 
 def ragged(name: str, rows: Sequence[NDArray[Any]]) -> dict[str, NDArray[Any]]:

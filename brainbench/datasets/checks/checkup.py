@@ -52,8 +52,8 @@ class Checkup:
         return "\n".join(self._lines())
 
     def _lines(self) -> Iterator[str]:
-        found = ", ".join(f"{self.count(level)} {level}{'s' * (self.count(level) != 1)}" for level in SEVERITIES)
-        yield f"{self.source}: {len(self.sessions)} session{'s' * (len(self.sessions) != 1)}, {found}"
+        counts = ", ".join(f"{self.count(level)} {level}{'s' * (self.count(level) != 1)}" for level in SEVERITIES)
+        yield f"{self.source}: {len(self.sessions)} session{'s' * (len(self.sessions) != 1)}, {counts}"
         for items in _alike(self.findings):
             first, names = items[0], [item.where for item in items]
             where = names[0] if len(names) == 1 else f"{len(names)} sessions ({some(names, 3)})"
@@ -65,9 +65,9 @@ class Checkup:
 def _alike(findings: Iterable[Finding]) -> Iterable[list[Finding]]:
     """Return findings in groups: notes that differ in numbers alone stand together, others for themselves."""
     groups: dict[object, list[Finding]] = {}
-    for place, item in enumerate(findings):
-        note = (item.check, _NUMBER.sub("#", item.message), item.advice)
-        groups.setdefault(note if item.severity == "note" else place, []).append(item)
+    for place, finding in enumerate(findings):
+        note = (finding.check, _NUMBER.sub("#", finding.message), finding.advice)
+        groups.setdefault(note if finding.severity == "note" else place, []).append(finding)
     return groups.values()
 
 
@@ -104,9 +104,9 @@ def check(source: Source, *, conditions: str | Conditions | None = None, progres
     for name in repeats(names):
         message = f"{names.count(name)} files hold this session; its trials would count more than once"
         findings.append(Finding("error", "file", message, "Leave all but one of them out.", where=name))
-    shown = str(source) if not isinstance(source, (list, tuple)) else ", ".join(map(str, source))
+    place = str(source) if not isinstance(source, (list, tuple)) else ", ".join(map(str, source))
     worst_first = sorted(findings, key=lambda item: SEVERITIES.index(item.severity))
-    return Checkup(shown, len(paths), tuple(names), tuple(worst_first))
+    return Checkup(place, len(paths), tuple(names), tuple(worst_first))
 
 
 def _check_file(
@@ -121,9 +121,9 @@ def _check_file(
             message = "holds responses that are already counted; spikes, clock and tables cannot be checked"
             yield Finding("note", "file", message, where=path.name)
             return
-        for session, found in each_session(file, path, layout):
+        for session, session_layout in each_session(file, path, layout):
             names.append(session.subject + f" / {session.session}" * (session.session != session.subject))
-            for finding in check_session(session, found, conditions):
+            for finding in check_session(session, session_layout, conditions):
                 yield replace(finding, where=names[-1])
 
 

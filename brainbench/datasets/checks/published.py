@@ -25,19 +25,19 @@ _ORDERS = np.array(list(permutations(range(len(SLOTS)))))
 def check_published(path: Path, names: list[str]) -> Iterator[Finding]:
     """Yield the findings about a file, and add its sessions to ``names``."""
     arrays, stray = read_arrays(path)
-    found = {name: recover_sessions(name, array) for name, array in arrays.items()}
-    sessions = [item for items in found.values() for item in items]
+    sessions_of = {name: recover_sessions(name, array) for name, array in arrays.items()}
+    sessions = [item for items in sessions_of.values() for item in items]
     names += [f"{item.subject} / {item.session}" for item in sessions]
-    for finding in _of_file(arrays, found, sessions, stray=stray):
+    for finding in _of_file(arrays, sessions_of, sessions, stray=stray):
         yield replace(finding, where=path.name)
-    for name, items in found.items():
+    for name, items in sessions_of.items():
         for finding in _of_animal(arrays[name], items):
             yield replace(finding, where=name)
 
 
 def _of_file(
     arrays: dict[str, NDArray[np.float64]],
-    found: dict[str, list[ZeroFilledSession]],
+    sessions_of: dict[str, list[ZeroFilledSession]],
     sessions: Sequence[ZeroFilledSession],
     *,
     stray: bool,
@@ -45,10 +45,11 @@ def _of_file(
     if stray:
         message = "the entry 'allow_pickle' is a keyword that numpy before 2.2 stored by mistake"
         yield Finding("note", "file", message, "It is skipped; code that takes every entry for an animal fails.")
-    split = sum(len(a.slots) == len(b.slots) for items in found.values() for a, b in pairwise(items))
+    split = sum(len(a.slots) == len(b.slots) for items in sessions_of.values() for a, b in pairwise(items))
     message = (
-        f"{len(sessions) - len(found) - split} borders between sessions are changes of the number of trials, {split} "
-        "are contradicting slots of sessions of equal length; where those never contradict, two sessions look like one"
+        f"{len(sessions) - len(sessions_of) - split} borders between sessions are changes of the number of trials, "
+        f"{split} are contradicting slots of sessions of equal length; where those never contradict, "
+        "two sessions look like one"
     )
     yield Finding("note", "sessions", message, "Only the original files tell all borders.")
     recorded = sum(int(np.isfinite(array).sum()) for array in arrays.values())
@@ -77,12 +78,12 @@ def _of_file(
 
 def _of_animal(array: NDArray[np.float64], sessions: Sequence[ZeroFilledSession]) -> Iterator[Finding]:
     """Yield the trials, borders and silent trials of one animal."""
-    told = "; ".join(
+    listing = "; ".join(
         f"{item.session}: {item.units} units, {len(item.slots)} trials, "
         f"{'/'.join(map(str, _trials_of_slots(item)))} per slot"
         for item in sessions
     )
-    yield Finding("note", "sessions", f"{len(sessions)} session{'s' * (len(sessions) > 1)} found ({told})")
+    yield Finding("note", "sessions", f"{len(sessions)} session{'s' * (len(sessions) > 1)} found ({listing})")
     if silent := sum(int((item.slots < 0).sum()) for item in sessions):
         message = f"{share(silent, sum(len(item.slots) for item in sessions))} trials are 0 in all slots"
         yield Finding("warning", "silent", message, "Their stimulus cannot be known; scores leave them out.")

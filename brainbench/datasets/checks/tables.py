@@ -178,10 +178,10 @@ def _times(table: SessionTable) -> Iterator[Finding]:
             message = f"{share(int(bad.sum()), rows)} rows of {name} have {what}"
             yield Finding(severity, "times", message, "Such rows cannot be counted.")
     duration = stop - start
-    known = np.isfinite(duration)
-    if not known.any():
+    finite = np.isfinite(duration)
+    if not finite.any():
         return
-    middle, last = float(np.median(duration[known])), float(stop[known].max())
+    middle, last = float(np.median(duration[finite])), float(stop[finite].max())
     if (rows >= _MANY_ROWS and middle > _LONGEST_TRIAL) or last > LONGEST_SESSION:
         message = f"{name} runs to {last:g} s with rows of {middle:g} s (median)"
         yield Finding("error", "times", message, "Its times look like milliseconds or samples, not seconds.")
@@ -198,8 +198,8 @@ def _events(trials: SessionTable) -> Iterator[Finding]:
         if name.endswith("_time") and name not in ("start_time", "stop_time"):
             with contextlib.suppress(BrainbenchError):
                 events = trials.times(name)
-        known = np.isfinite(events)
-        if known.sum() < 5:
+        finite = np.isfinite(events)
+        if finite.sum() < 5:
             continue
         inside = {shift: _inside(events, start, stop, shift) for shift in _SHIFTS}
         # Of shifts that fit equally well the smallest: events that fit every row have not slipped.
@@ -213,9 +213,9 @@ def _events(trials: SessionTable) -> Iterator[Finding]:
             yield Finding("error", "tables", message, f"The column {name!r} has slipped against the others.", values)
         elif inside[0] < 0.5:
             advice = "The column may be on another clock; do not use it as an edge of windows."
-            if np.mean((events[known] >= 0) & (events[known] <= (stop - start)[known])) > 0.8:
+            if np.mean((events[finite] >= 0) & (events[finite] <= (stop - start)[finite])) > 0.8:
                 advice = "Its times look relative to the trial's start; windows need times of the session."
-            outside = share(int(np.sum(known) * (1 - inside[0])), int(known.sum()))
+            outside = share(int(np.sum(finite) * (1 - inside[0])), int(finite.sum()))
             yield Finding("warning", "tables", f"{name} lies outside its own trial in {outside} rows", advice, values)
 
 
@@ -292,8 +292,10 @@ def check_coverage(
     gaps = _gaps(spikes, low, high)
     if gaps:
         hit = sum(bool(np.any((start < end) & (stop > begin))) for begin, end in gaps)
-        shown = some([f"{begin:.0f}–{end:.0f} s" for begin, end in gaps], 3)
-        message = f"no unit fires for more than {_GAP:g} s in {len(gaps)} places ({shown}), {hit} of them during trials"
+        examples = some([f"{begin:.0f}–{end:.0f} s" for begin, end in gaps], 3)
+        message = (
+            f"no unit fires for more than {_GAP:g} s in {len(gaps)} places ({examples}), {hit} of them during trials"
+        )
         advice = "If recording stopped, put these spans into an invalid_times table or leave them out of obs_intervals."
         yield Finding("warning" if hit else "note", "coverage", message, advice, {"gaps": gaps})
 

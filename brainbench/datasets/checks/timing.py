@@ -47,12 +47,12 @@ def check_clock(
     session: Session, spikes: list[NDArray[np.float64]], layout: RecordingLayout | None
 ) -> Iterator[Finding]:
     """Yield what can be said about the clock of one session."""
-    found = touches(session, layout)
-    if found is None:
+    contacts = touches(session, layout)
+    if contacts is None:
         message = "no touch times (tables contacts_by_whisker_*, or a layout's event), so the clock cannot be checked"
         yield Finding("note", "clock", message, "Look at spike rates around a known event before scoring.")
         return
-    times, event = found
+    times, event = contacts
     every = np.concatenate(spikes) if spikes else np.zeros(0)
     span = float(np.ptp(every)) if len(every) else 0.0
     if len(every) and span <= _LONGEST:
@@ -248,23 +248,25 @@ def _refractory(spikes: Spikes, names: list[str]) -> Iterator[Finding]:
     for severity, low, high, advice in bands:
         bad = {name: rate for name, rate in rates.items() if low <= rate < high}
         if bad:
-            shown = some([f"{name}: {100 * bad[name]:.1f} %" for name in sorted(bad, key=lambda name: -bad[name])], 3)
-            message = f"{share(len(bad), len(names))} units fire again within {1e3 * REFRACTORY:g} ms ({shown})"
+            examples = some(
+                [f"{name}: {100 * bad[name]:.1f} %" for name in sorted(bad, key=lambda name: -bad[name])], 3
+            )
+            message = f"{share(len(bad), len(names))} units fire again within {1e3 * REFRACTORY:g} ms ({examples})"
             yield Finding(severity, "refractory", message, advice, {"share": bad})
 
 
 def _duplicates(spikes: Spikes, names: list[str]) -> Iterator[Finding]:
-    found = coincidences(spikes)
+    pairs_alike = coincidences(spikes)
     bands: tuple[tuple[Severity, float, float, str], ...] = (
         ("error", SAME, np.inf, "Remove one of each pair: twins count twice in every RDM."),
         ("warning", SIMILAR, SAME, "Was one neuron split, or sorted on two channels? Twins count twice in every RDM."),
     )
     for severity, low, high, advice in bands:
-        pairs = [(one, two, part) for one, two, part in found if low <= part < high]
+        pairs = [(one, two, part) for one, two, part in pairs_alike if low <= part < high]
         if pairs:
-            shown = some([f"{names[one]} = {names[two]}: {100 * part:.0f} %" for one, two, part in pairs], 3)
+            examples = some([f"{names[one]} = {names[two]}: {100 * part:.0f} %" for one, two, part in pairs], 3)
             what = f"{len(pairs)} pair{'s' * (len(pairs) > 1)} of units"
-            message = f"{what} have the same spikes within {1e3 * COINCIDENT:g} ms ({shown})"
+            message = f"{what} have the same spikes within {1e3 * COINCIDENT:g} ms ({examples})"
             values = {"pairs": [[names[one], names[two], part] for one, two, part in pairs]}
             yield Finding(severity, "duplicates", message, advice, values)
 
@@ -291,21 +293,21 @@ def coincidences(spikes: Spikes) -> list[tuple[int, int, float]]:
         near = np.flatnonzero(times[step:] - times[:-step] <= COINCIDENT)
         if not len(near):
             break
-        one, two = units[near], units[near + step]
-        other = one != two
+        left, right = units[near], units[near + step]
+        distinct = left != right
         # One number per pair of units in either order; how often it occurs is how often they coincide.
-        codes.append(np.minimum(one, two)[other] * size + np.maximum(one, two)[other])
+        codes.append(np.minimum(left, right)[distinct] * size + np.maximum(left, right)[distinct])
         step += 1
     if not codes:
         return []
     pairs, number = np.unique(np.concatenate(codes), return_counts=True)
-    one, two = pairs // size, pairs % size
-    fewer, more = np.minimum(lengths[one], lengths[two]), np.maximum(lengths[one], lengths[two])
+    left, right = pairs // size, pairs % size
+    fewer, more = np.minimum(lengths[left], lengths[right]), np.maximum(lengths[left], lengths[right])
     span = max(float(times[-1] - times[0]), COINCIDENT)
     # An unrelated train of n spikes in T seconds has one within ±δ of a given time with probability 2 δ n/T or so.
     chance = np.minimum(2 * COINCIDENT * more / span, 1.0)
     # Corrected for chance as Cohen's kappa (1960) is: about 0 for unrelated units, 1 where every spike coincides.
     part = (number / fewer - chance) / np.maximum(1 - chance, 1e-9)
-    kept = np.flatnonzero(part >= SIMILAR)
-    kept = kept[np.argsort(-part[kept], kind="stable")]
-    return [(int(one[index]), int(two[index]), float(min(part[index], 1.0))) for index in kept]
+    similar = np.flatnonzero(part >= SIMILAR)
+    similar = similar[np.argsort(-part[similar], kind="stable")]
+    return [(int(left[index]), int(right[index]), float(min(part[index], 1.0))) for index in similar]

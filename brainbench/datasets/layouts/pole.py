@@ -35,12 +35,12 @@ SELECTION = (Rule("type", refuse=("N/A",)), Rule("stim_present", refuse=("true",
 
 def adapt_hires(session: Session) -> Session:
     """Turn the spike train into a unit and the touches into ``contacts_by_whisker_C2``."""
-    made = session
+    sorted_session = session
     if session.units is None and TRAIN in session.series:
-        made = replace(made, units=_unit(session.series[TRAIN], session.source), intracellular={})
+        sorted_session = replace(sorted_session, units=_unit(session.series[TRAIN], session.source), intracellular={})
         note = f"{session.source}: the unit was made from the 0/1 signal {TRAIN}"
-        made = replace(made, notes=(*made.notes, note))
-    return with_contacts(made, "acquisition/behavior/", WHISKER)
+        sorted_session = replace(sorted_session, notes=(*sorted_session.notes, note))
+    return with_contacts(sorted_session, "acquisition/behavior/", WHISKER)
 
 
 def adapt_yu(session: Session) -> Session:

@@ -135,13 +135,13 @@ def recover_sessions(subject: str, array: NDArray[np.float64]) -> list[ZeroFille
     lengths = (~np.isnan(array).all(axis=1)).sum(axis=0)
     # One slot at most is not 0. A rate that is NaN there (a window of no length) stays missing.
     rates = array.sum(axis=1)
-    firsts, known = [0], slots[:, 0]
+    firsts, shared = [0], slots[:, 0]
     for unit in range(1, array.shape[2]):
-        own = slots[:, unit]
-        if lengths[unit] != lengths[unit - 1] or ((own >= 0) & (known >= 0) & (own != known)).any():
+        slots_of = slots[:, unit]
+        if lengths[unit] != lengths[unit - 1] or ((slots_of >= 0) & (shared >= 0) & (slots_of != shared)).any():
             firsts.append(unit)
-            known = own
-        known = np.where(own >= 0, own, known)
+            shared = slots_of
+        shared = np.where(slots_of >= 0, slots_of, shared)
     sessions = []
     for number, (first, last) in enumerate(pairwise([*firsts, array.shape[2]]), 1):
         place = (slice(lengths[first]), slice(first, last))
@@ -176,25 +176,25 @@ def open_published(path: Path, **options: object) -> xr.Dataset:
     return dataset
 
 
-def _session_counts(item: ZeroFilledSession, path: Path) -> SessionCounts:
-    kept = np.flatnonzero(item.slots >= 0)
-    labels = tuple(SLOTS[slot] for slot in item.slots[kept].tolist())
+def _session_counts(session: ZeroFilledSession, path: Path) -> SessionCounts:
+    recorded = np.flatnonzero(session.slots >= 0)
+    labels = tuple(SLOTS[slot] for slot in session.slots[recorded].tolist())
     return SessionCounts(
-        subject=item.subject,
-        session=item.session,
-        source=f"{path}:{item.subject}/{item.session}",
+        subject=session.subject,
+        session=session.session,
+        source=f"{path}:{session.subject}/{session.session}",
         values=tuple((label,) for label in labels),
         labels=labels,
-        trial_ids=tuple(map(str, kept.tolist())),
-        unit_ids=tuple(map(str, range(item.first, item.first + item.units))),
-        edges=np.full((len(kept), 2), np.nan),
-        counts=item.rates[kept][:, None].astype(np.float32),
-        duration=np.ones((len(kept), 1)),
-        columns={name: missing_column(kind, item.units) for name, kind in UNIT_COLUMNS.items()},
+        trial_ids=tuple(map(str, recorded.tolist())),
+        unit_ids=tuple(map(str, range(session.first, session.first + session.units))),
+        edges=np.full((len(recorded), 2), np.nan),
+        counts=session.rates[recorded][:, None].astype(np.float32),
+        duration=np.ones((len(recorded), 1)),
+        columns={name: missing_column(kind, session.units) for name, kind in UNIT_COLUMNS.items()},
         covariates={},
-        tally=Tally(removed={SILENT: len(item.slots) - len(kept)}),
-        trials=len(item.slots),
-        units=item.units,
+        tally=Tally(removed={SILENT: len(session.slots) - len(recorded)}),
+        trials=len(session.slots),
+        units=session.units,
         synthetic=False,
         stimuli=LAYOUT.stimuli,
     )

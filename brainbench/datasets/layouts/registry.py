@@ -55,13 +55,13 @@ class RecordingLayout:
     def matches(self, session: Session) -> bool:
         """Return whether a session's condition table has the columns of this data set."""
         table = session.tables.get(self.conditions.table)
-        known = table is not None and all(column in table for column in self.columns)
-        return bool(self.columns) and known and (session.synthetic or not self.synthetic)
+        complete = table is not None and all(column in table for column in self.columns)
+        return bool(self.columns) and complete and (session.synthetic or not self.synthetic)
 
     def adapted(self, session: Session) -> Session:
         """Return the session with the units and tables that this data set stores in its own way."""
-        named = session if session.stimuli else replace(session, stimuli=self.stimuli)
-        return named if self.adapt is None else self.adapt(named)
+        with_stimuli = session if session.stimuli else replace(session, stimuli=self.stimuli)
+        return with_stimuli if self.adapt is None else self.adapt(with_stimuli)
 
     def vocabulary(self, conditions: Conditions) -> tuple[str, ...] | None:
         """Return the fixed labels, or None if a column's values are not declared here."""
@@ -101,9 +101,11 @@ def register_layout(layout: RecordingLayout) -> RecordingLayout:
             f"A layout's name is a word of at least two letters, digits, '-' or '_', beginning with a letter; "
             f"received {layout.name!r}."
         )
-    known = _LAYOUTS.setdefault(layout.name, layout)
-    if known != layout:
-        raise UsageError(f"There is already a recording layout {layout.name!r} ({known.title}); choose another name.")
+    registered = _LAYOUTS.setdefault(layout.name, layout)
+    if registered != layout:
+        raise UsageError(
+            f"There is already a recording layout {layout.name!r} ({registered.title}); choose another name."
+        )
     return layout
 
 
@@ -120,8 +122,8 @@ def list_layouts() -> list[str]:
 
 def detect_layout(session: Session) -> RecordingLayout | None:
     """Return the layout that a session has, if any; of several the most specific one."""
-    found = [layout for layout in _known().values() if layout.matches(session)]
-    return max(found, key=lambda layout: len(layout.columns), default=None)
+    matching = [layout for layout in _known().values() if layout.matches(session)]
+    return max(matching, key=lambda layout: len(layout.columns), default=None)
 
 
 def load_layout(path: str) -> RecordingLayout:
@@ -131,13 +133,13 @@ def load_layout(path: str) -> RecordingLayout:
         DataFileNotFoundError: there is no such file.
     """
     module = load_module(path)
-    found = getattr(module, "LAYOUT", getattr(module, "RECIPE", None))
-    if not isinstance(found, RecordingLayout):
+    candidate = getattr(module, "LAYOUT", getattr(module, "RECIPE", None))
+    if not isinstance(candidate, RecordingLayout):
         raise UsageError(
             f"The file {path!r} defines no LAYOUT = brainbench.datasets.RecordingLayout(…); "
             f"docs/recordings.md shows one."
         )
-    return register_layout(found)
+    return register_layout(candidate)
 
 
 def is_name(word: str) -> bool:
@@ -153,9 +155,9 @@ def _known() -> dict[str, RecordingLayout]:
     return _LAYOUTS
 
 
-def _take(_: str, found: Any) -> None:
-    if isinstance(found, RecordingLayout):
-        register_layout(found)
+def _take(_: str, candidate: Any) -> None:
+    if isinstance(candidate, RecordingLayout):
+        register_layout(candidate)
 
 
 SYNTHETIC = RecordingLayout(

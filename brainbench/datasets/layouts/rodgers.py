@@ -77,11 +77,11 @@ def adapt(session: Session) -> Session:
     objects = (
         np.where(values[:, 0] == NOTHING, NOTHING, joined_labels(values)) if len(table) else np.zeros(0, dtype="U1")
     )
-    made = table.with_columns(task=np.full(len(table), task(session)), object=objects)
+    trials = table.with_columns(task=np.full(len(table), task(session)), object=objects)
     have = {match["whisker"] for match in map(CONTACTS.match, session.tables) if match}
     lost = [name for name in TRACKED if name not in have]
     note = f"{session.source}: no contact table of {listing(lost)}; the first contact is that of the other whiskers"
-    return session.with_table(made, *([note] if have and lost else []))
+    return session.with_table(trials, *([note] if have and lost else []))
 
 
 LAYOUT = RecordingLayout(

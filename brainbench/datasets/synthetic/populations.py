@@ -144,10 +144,10 @@ def principal_axes(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
     """Rotate K vectors [K, F] into the at most K axes that they span; every angle and length stays."""
     # X = U S Vᵀ: the rows of U S have the same inner products as those of X, and no more axes than its rank.
     left, values, _ = np.linalg.svd(vectors, full_matrices=False)
-    kept = values > 1e-9 * values[0]
+    present = values > 1e-9 * values[0]
     # A singular vector's sign is the machine's choice; the largest entry is made positive.
     signs = np.sign(left[np.abs(left).argmax(axis=0), np.arange(left.shape[1])])
-    return (left * signs * values)[:, kept]
+    return (left * signs * values)[:, present]
 
 
 def _check_labels(labels: Sequence[str] | None, stimuli: int) -> tuple[str, ...]:
@@ -217,9 +217,9 @@ def _draw_session(
     if any(not 0 <= which < stimuli for which in absent):
         raise UsageError(f"Missing stimuli are numbered 0 to {stimuli - 1}; received {absent} for animal {animal}.")
     # One stream for each animal and each session: a larger design begins with the animals of a smaller one.
-    own = np.random.default_rng([*seed, animal])
+    animal_random = np.random.default_rng([*seed, animal])
     random = np.random.default_rng([*seed, animal, session])
-    expected = expected_rates(geometry, design, own, random)
+    expected = expected_rates(geometry, design, animal_random, random)
     labels = _labels(design, stimuli, absent, random)
     counts = draw_counts(random, design, expected[labels], design.window)
     names = {"subject": f"synthetic{animal + 1:02d}", "session": f"{session + 1:02d}"}
@@ -228,7 +228,10 @@ def _draw_session(
 
 
 def expected_rates(
-    geometry: ResponseGeometry, design: PopulationDesign, own: np.random.Generator, random: np.random.Generator
+    geometry: ResponseGeometry,
+    design: PopulationDesign,
+    traits: np.random.Generator,
+    random: np.random.Generator,
 ) -> NDArray[np.float64]:
     """Draw units and return their expected rates [K, U], Hz.
 
@@ -237,13 +240,13 @@ def expected_rates(
     """
     stimuli = len(geometry.labels)
     # Log-normal weights of the axes; their mean square is one, so that the depth of tuning does not depend on them.
-    weight = np.exp(design.emphasis * own.standard_normal(geometry.directions.shape[1]))
+    weight = np.exp(design.emphasis * traits.standard_normal(geometry.directions.shape[1]))
     axes = geometry.directions * weight
     axes *= np.sqrt(np.sum(geometry.directions**2) / np.sum(axes**2))
     # Variances add up to one: 1 − ι of the shared geometry and ι of the animal's own.
     tuning = np.sqrt(1 - design.individual) * _project(axes, design.units, random)
     if design.individual:
-        private = own.standard_normal((stimuli, stimuli + 1))
+        private = traits.standard_normal((stimuli, stimuli + 1))
         # Length one, the root mean square length of the shared axes: before ι weighs them both parts have variance one.
         private /= np.linalg.norm(private, axis=1, keepdims=True)
         tuning += np.sqrt(design.individual) * _project(private, design.units, random)

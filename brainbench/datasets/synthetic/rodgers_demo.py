@@ -114,10 +114,10 @@ def draw_session(
     low, high = behaviour.recorded
     # Responses need a shape and a window inside the recorded span; in other trials units fire as between windows.
     answered = (behaviour.stimulus >= 0) & (behaviour.onset > low) & (behaviour.lick < high)
-    shown = behaviour.stimulus[answered]
-    begin = behaviour.onset[answered] + first[shown]
+    presented = behaviour.stimulus[answered]
+    begin = behaviour.onset[answered] + first[presented]
     length = behaviour.lick[answered] - begin
-    counts = draw_counts(random, plan.design, expected[shown], length[:, None])
+    counts = draw_counts(random, plan.design, expected[presented], length[:, None])
     rest = REST * expected.mean(axis=0)
     spikes = spike_trains(random, counts, begin, length, rest, behaviour.recorded)
     contacts = draw_contacts(random, behaviour, runs)
@@ -143,8 +143,8 @@ def draw_session(
         if whisker != plan.lost_whisker
     }
     about = {"start": "2025-01-01T12:00:00+00:00", "synthetic": True}
-    named = (plan.subject, plan.session)
-    session = make_session(*named, spikes, tables, unit_columns=units, observed=observed, **about)
+    names = (plan.subject, plan.session)
+    session = make_session(*names, spikes, tables, unit_columns=units, observed=observed, **about)
     choice = behaviour.columns["choice"]
     licked = choice != "nogo"
     # 1 left, 2 right.
@@ -174,7 +174,7 @@ def draw_behaviour(random: np.random.Generator, plan: SessionPlan, labels: tuple
     shape, place = zip(*(label.split("-") for label in labels), strict=True)
     side = np.where(np.array([(*shape, "nothing")[index] == "convex" for index in stimulus]), "left", "right")
     right = random.random(number) < 0.78
-    other = np.where(side == "left", "right", "left")
+    opposite = np.where(side == "left", "right", "left")
     nowhere = np.array(["close", "medium", "far"])[random.integers(3, size=number)]
     # Numbers of trials with gaps, as in the published files.
     ids = np.cumsum(random.choice([1, 1, 1, 2, 3], size=number)) + 3
@@ -185,7 +185,7 @@ def draw_behaviour(random: np.random.Generator, plan: SessionPlan, labels: tuple
         "stim_is_random": ~shaped,
         "optogenetic": laser,
         "outcome": np.where(spoiled, "spoil", np.where(right, "correct", "error")),
-        "choice": np.where(spoiled, "nogo", np.where(right, side, other)),
+        "choice": np.where(spoiled, "nogo", np.where(right, side, opposite)),
         "rewarded_side": side,
         "servo_position": np.array(
             [place[index] if index >= 0 else nowhere[row] for row, index in enumerate(stimulus)]
@@ -227,27 +227,29 @@ def tracked_contacts(
     whiskers: tuple[str, ...], contact: NDArray[np.bool_], frame: float
 ) -> dict[str, list[NDArray[np.float64]]]:
     """Turn contact per frame [K, T, W] into contacts [n, 2] (s after onset) of every tracked whisker and stimulus."""
-    found = {}
+    contacts = {}
     for name in TRACKED:
         if name in whiskers:
             # Rows of a change lie before their frame, so begin and end come out in pairs.
             change = np.diff(contact[:, :, whiskers.index(name)].astype(np.int8), axis=1, prepend=0, append=0)
             ends = ((np.flatnonzero(row == 1), np.flatnonzero(row == -1)) for row in change)
-            found[name] = [np.stack(pair, axis=1) * frame for pair in ends]
-    return found
+            contacts[name] = [np.stack(pair, axis=1) * frame for pair in ends]
+    return contacts
 
 
 def first_contacts(
     runs: Mapping[str, list[NDArray[np.float64]]], labels: tuple[str, ...], lost: str | None
 ) -> NDArray[np.float64]:
     """Return the first contact [K] (s after onset) of each stimulus with the whiskers whose contacts are told."""
-    known = {name: items for name, items in runs.items() if name != lost}
+    tracked = {name: items for name, items in runs.items() if name != lost}
     first = np.full(len(labels), np.inf)
     for stimulus, label in enumerate(labels):
-        begins = (items[stimulus][0, 0] for items in known.values() if len(items[stimulus]))
+        begins = (items[stimulus][0, 0] for items in tracked.values() if len(items[stimulus]))
         first[stimulus] = min(begins, default=np.inf)
         if first[stimulus] >= CHOICE[0]:
-            raise DataError(f"The stimulus {label!r} touches none of {listing(known)} in time for the demo's choices.")
+            raise DataError(
+                f"The stimulus {label!r} touches none of {listing(tracked)} in time for the demo's choices."
+            )
     return first
 
 
@@ -294,8 +296,8 @@ def make_rodgers_demo(
 
     def draw() -> Iterator[tuple[Session, NDArray[np.float64]]]:
         done, total = 0, sum(map(len, plans))
-        for index, own in enumerate(plans):
-            for number, plan in enumerate(own):
+        for index, animal_plans in enumerate(plans):
+            for number, plan in enumerate(animal_plans):
                 random = np.random.default_rng([seed, VERSION, index, number])
                 # Begun anew for every session: all sessions of an animal draw the same traits (expected_rates).
                 animal = np.random.default_rng([seed, VERSION, index])
@@ -332,8 +334,8 @@ def ensure_rodgers_demo(
 
 def _definition(stimuli: xr.Dataset, seed: int, animals: int) -> str:
     """Return the hash of how recordings are made, equal on every machine where that of the stimuli is."""
-    made = stimuli.attrs.get("config_hash", stimuli.attrs["content_hash"])
-    return content_hash("demo-rodgers", made, seed, animals, VERSION)
+    stimuli_hash = stimuli.attrs.get("config_hash", stimuli.attrs["content_hash"])
+    return content_hash("demo-rodgers", stimuli_hash, seed, animals, VERSION)
 
 
 def wrench_features(stimuli: xr.Dataset) -> NDArray[np.float64]:

@@ -167,12 +167,12 @@ def measure_ceiling(
         for sessions in draw_animals(geometry, design, (*entropy(seed), number)).values():
             means = np.concatenate([stimulus_means(block, stimuli) for block in sessions], axis=1)
             scores.append(_pearson(correlation_rdm(means), truth))
-    known = np.array([score for score in scores if np.isfinite(score)])
-    if not len(known):
+    finite = np.array([score for score in scores if np.isfinite(score)])
+    if not len(finite):
         return float("nan"), float("nan")
     # Animals are drawn independently around a fixed geometry, so their comparisons have a standard error.
-    error = known.std(ddof=1) / np.sqrt(len(known)) if len(known) > 1 else np.nan
-    return float(known.mean()), float(error)
+    error = finite.std(ddof=1) / np.sqrt(len(finite)) if len(finite) > 1 else np.nan
+    return float(finite.mean()), float(error)
 
 
 def calibrate(
@@ -205,12 +205,12 @@ def calibrate(
             f"More units or trials, a higher rate, less dispersion or a smaller individual share raise it."
         )
     # Both ends are known: without modulation the expected comparison is zero.
-    known = {0.0: -ceiling, MODULATION: highest}
+    ends = {0.0: -ceiling, MODULATION: highest}
     # With the same seed at every step the ceiling depends on the modulation alone, as a root finder needs.
-    found = root_scalar(
-        lambda modulation: known.get(modulation) or excess(modulation), bracket=(0.0, MODULATION), xtol=_EXACT
+    root = root_scalar(
+        lambda modulation: ends.get(modulation) or excess(modulation), bracket=(0.0, MODULATION), xtol=_EXACT
     )
-    return replace(design, modulation=float(found.root))
+    return replace(design, modulation=float(root.root))
 
 
 def stimulus_means(block: Trials, stimuli: int) -> NDArray[np.float64]:
@@ -223,7 +223,7 @@ def stimulus_means(block: Trials, stimuli: int) -> NDArray[np.float64]:
     return np.divide(total, number, out=np.full(total.shape, np.nan), where=number > 0)
 
 
-def _pearson(one: NDArray[np.float64], two: NDArray[np.float64]) -> float:
-    a, b = one - one.mean(), two - two.mean()
+def _pearson(first: NDArray[np.float64], second: NDArray[np.float64]) -> float:
+    a, b = first - first.mean(), second - second.mean()
     size = np.sqrt((a @ a) * (b @ b))
     return float(a @ b / size) if size > 0 else float("nan")

@@ -27,23 +27,23 @@ def trial_covariates(
     session: Session, table: SessionTable, rows: NDArray[np.int64], edges: NDArray[np.float64]
 ) -> dict[str, NDArray[np.float64]]:
     """Return what the session tells of the trials ``rows`` [R] with windows ``edges`` [R, 2] (s): name → [R]."""
-    found = {}
+    covariates = {}
     contacts = [item for name, item in session.tables.items() if CONTACTS.match(name)]
     if contacts:
         begin = np.concatenate([item.times("start_time") for item in contacts])
         end = np.concatenate([item.times("stop_time") for item in contacts])
         # Rows of zero duration are empty intervals.
-        found["contacts"] = _inside(begin[end > begin], edges)
+        covariates["contacts"] = _inside(begin[end > begin], edges)
     if (licks := lick_times(session)) is not None:
-        found["licks"] = _inside(licks, edges)
+        covariates["licks"] = _inside(licks, edges)
     if "choice" in table:
         chosen = as_labels(table.column("choice"))
         sides = sorted({side for side in chosen.tolist() if side.lower() not in _NO_CHOICE})
         if len(sides) == 2:
             # Coded in the order of the names, so that 0 and 1 mean the same sides in every session.
             values = np.select([chosen == side for side in sides], [0.0, 1.0], default=np.nan)
-            found["choice"] = values[rows]
-    return found
+            covariates["choice"] = values[rows]
+    return covariates
 
 
 def lick_times(session: Session) -> NDArray[np.float64] | None:
@@ -129,29 +129,29 @@ def count_session(session: Session, options: ReadingOptions) -> SessionCounts:
     values = options.conditions.values(table)
     labels = np.array(joined_labels(values), dtype=str)
     # Each rule counts only rows that no earlier rule removed, so removed and kept rows add up to the table.
-    kept = tally.select(table, options.selection.trials, "trials")
-    kept = tally.apply(kept, labels != "", f"trials: no value of {','.join(options.conditions.columns)}")
+    keep = tally.select(table, options.selection.trials, "trials")
+    keep = tally.apply(keep, labels != "", f"trials: no value of {','.join(options.conditions.columns)}")
     if options.vocabulary is not None:
-        kept = tally.apply(kept, np.isin(labels, options.vocabulary), "trials: label outside the vocabulary")
+        keep = tally.apply(keep, np.isin(labels, options.vocabulary), "trials: label outside the vocabulary")
     edges = options.window.edges(session, table, tally.notes)
-    kept = tally.apply(kept, np.isfinite(edges).all(axis=1), f"trials: no event for the window {options.window}")
-    kept = tally.apply(kept, ~(edges[:, 1] <= edges[:, 0]), "trials: window of no length")
+    keep = tally.apply(keep, np.isfinite(edges).all(axis=1), f"trials: no event for the window {options.window}")
+    keep = tally.apply(keep, ~(edges[:, 1] <= edges[:, 0]), "trials: window of no length")
     invalid = session.tables.get("invalid_times")
     if invalid is not None:
         begin, end = invalid.times("start_time"), invalid.times("stop_time")
         overlap = ((edges[:, :1] < end) & (edges[:, 1:] > begin)).any(axis=1)
-        kept = tally.apply(kept, ~overlap, "trials: overlap with invalid_times")
+        keep = tally.apply(keep, ~overlap, "trials: overlap with invalid_times")
 
     spikes = read_spikes(session.units, tally.notes)
     # A window outside the recorded span is missing data, not silence: zero counts there would lower every mean.
     covered, unit_kept = _coverage(session.units, spikes, edges, options.selection, tally)
-    kept = tally.apply(kept, covered.any(axis=1), "trials: outside the recorded span")
-    unit_kept = tally.apply(unit_kept, covered[kept].any(axis=0) | ~kept.any(), "units: recorded in no kept trial")
+    keep = tally.apply(keep, covered.any(axis=1), "trials: outside the recorded span")
+    unit_kept = tally.apply(unit_kept, covered[keep].any(axis=0) | ~keep.any(), "units: recorded in no kept trial")
 
     # Trials by start time, then id, and units by id, so that the order of rows in the file changes nothing. Equal ids
     # of units (several probes) are told apart by number of spikes and first spike.
     start, ids, unit_ids = table.times("start_time"), as_labels(table.ids()), as_labels(session.units.ids())
-    rows = _sorted(kept, lambda row: (start[row], natural_key(ids[row])))
+    rows = _sorted(keep, lambda row: (start[row], natural_key(ids[row])))
     units = _sorted(unit_kept, lambda one: (natural_key(unit_ids[one]), len(spikes[one]), spikes[one][:1].tolist()))
     counts, duration = count(
         [spikes[unit] for unit in units], edges[rows], covered[np.ix_(rows, units)], options.bin, options.window.length
@@ -247,11 +247,11 @@ def count(
         # The tolerance above may leave the last bound just short of the end, which would lose a spike in between.
         bounds[:, -1] = edges[:, 1]
     duration = np.diff(bounds, axis=1)
-    found = np.empty((len(spikes), *duration.shape), dtype=np.float32)
+    counted = np.empty((len(spikes), *duration.shape), dtype=np.float32)
     for index, times in enumerate(spikes):
         # Differences of the numbers of spikes before each bound; "left" puts a spike on a bound into the later bin.
-        found[index] = np.diff(np.searchsorted(times, bounds, side="left"), axis=1)
-    counts = np.ascontiguousarray(found.transpose(1, 2, 0))
+        counted[index] = np.diff(np.searchsorted(times, bounds, side="left"), axis=1)
+    counts = np.ascontiguousarray(counted.transpose(1, 2, 0))
     # NaN says "not recorded"; zero would say that the unit was silent for a time that nobody observed.
     counts[duration <= 1e-9] = np.nan
     counts[np.broadcast_to(~covered[:, None, :], counts.shape)] = np.nan
@@ -266,11 +266,11 @@ def _coverage(
     tally: Tally,
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Return which windows each unit was recorded in [rows, units] and which units pass [units]."""
-    kept = tally.select(units, selection.units, "units")
+    keep = tally.select(units, selection.units, "units")
     numbers = np.array([len(times) for times in spikes], dtype=np.int64)
     if selection.min_spikes:
         few = "no spikes" if selection.min_spikes == 1 else f"fewer than {selection.min_spikes} spikes"
-        kept = tally.apply(kept, numbers >= selection.min_spikes, f"units: {few}")
+        keep = tally.apply(keep, numbers >= selection.min_spikes, f"units: {few}")
     covered = np.zeros((len(edges), len(spikes)), dtype=bool)
     if (observed := inside_observed_spans(units, edges)) is not None:
         covered = observed
@@ -282,7 +282,7 @@ def _coverage(
             f"{units.label}: no obs_intervals; recorded span taken from first to last spike, {low:.3f}–{high:.3f} s"
         )
     # A trial that only removed units saw is of no use, but with no unit left it is not the trial's fault.
-    return covered & kept if kept.any() else covered, kept
+    return covered & keep if keep.any() else covered, keep
 
 
 def inside_observed_spans(units: SessionTable, edges: NDArray[np.float64]) -> NDArray[np.bool_] | None:
@@ -293,13 +293,13 @@ def inside_observed_spans(units: SessionTable, edges: NDArray[np.float64]) -> ND
     spans = np.asarray(units.data[OBSERVED][...], dtype=np.float64).reshape(-1, 2)
     inside = np.zeros((len(edges), len(units)), dtype=bool)
     # Units of one probe share their spans, so each distinct list is looked at once.
-    known: dict[bytes, NDArray[np.bool_]] = {}
-    for unit, own in enumerate(np.split(spans, ends[:-1]) if len(ends) else []):
-        key = own.tobytes()
-        if key not in known:
-            fits = [(edges[:, 0] >= low) & (edges[:, 1] <= high) for low, high in _merged(own)]
-            known[key] = np.any(fits, axis=0) if fits else inside[:, unit]
-        inside[:, unit] = known[key]
+    inside_of: dict[bytes, NDArray[np.bool_]] = {}
+    for unit, unit_spans in enumerate(np.split(spans, ends[:-1]) if len(ends) else []):
+        key = unit_spans.tobytes()
+        if key not in inside_of:
+            fits = [(edges[:, 0] >= low) & (edges[:, 1] <= high) for low, high in _merged(unit_spans)]
+            inside_of[key] = np.any(fits, axis=0) if fits else inside[:, unit]
+        inside[:, unit] = inside_of[key]
     return inside
 
 
@@ -316,9 +316,9 @@ def _merged(spans: NDArray[np.float64]) -> list[tuple[float, float]]:
     return merged
 
 
-def _sorted(kept: NDArray[np.bool_], key: Callable[[int], Any]) -> NDArray[np.int64]:
+def _sorted(keep: NDArray[np.bool_], key: Callable[[int], Any]) -> NDArray[np.int64]:
     """Return the numbers of the rows that are kept, in order."""
-    return np.array(sorted(np.flatnonzero(kept).tolist(), key=key), dtype=np.int64)
+    return np.array(sorted(np.flatnonzero(keep).tolist(), key=key), dtype=np.int64)
 
 
 def missing_column(kind: type, units: int) -> NDArray[Any]:

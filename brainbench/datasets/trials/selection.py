@@ -127,7 +127,7 @@ class Selection:
         """
         trials: list[Rule] = []
         units: list[Rule] = []
-        own: list[str] = []
+        rule_texts: list[str] = []
         selection = cls(name=source.strip())
         if not source.strip(" ;"):
             raise UsageError(f"The selection {shown(source)} states no rule; leave it out for the usual one.")
@@ -140,7 +140,7 @@ class Selection:
                 )
             column, values = match["column"], match["values"]
             if match["scope"] is None and column in ("min_spikes", "subjects"):
-                own.append(column)
+                rule_texts.append(column)
                 if match["sign"] != "=":
                     raise UsageError(f"{column} is written {column}=…, and cannot be refused; received {shown(part)}.")
             if column == "min_spikes":
@@ -154,7 +154,7 @@ class Selection:
             else:
                 rule = _rule(column, match["sign"], values)
                 (units if match["scope"] == "units" else trials).append(rule)
-        check_once("The selection", own)
+        check_once("The selection", rule_texts)
         return replace(selection, trials=tuple(trials), units=tuple(units))
 
     def __str__(self) -> str:
@@ -188,21 +188,21 @@ class Tally:
     seen: dict[Rule, set[str]] = field(default_factory=dict)
     """Values that the columns of the rules have."""
 
-    def apply(self, kept: NDArray[np.bool_], passes: Any, rule: str) -> NDArray[np.bool_]:
+    def apply(self, keep: NDArray[np.bool_], passes: Any, rule: str) -> NDArray[np.bool_]:
         """Return the rows that remain and count those that only now fell out."""
-        self.removed[rule] = self.removed.get(rule, 0) + int(np.sum(kept & ~passes))
-        return kept & passes
+        self.removed[rule] = self.removed.get(rule, 0) + int(np.sum(keep & ~passes))
+        return keep & passes
 
     def select(self, table: SessionTable, rules: tuple[Rule, ...], scope: str) -> NDArray[np.bool_]:
         """Apply rules in order to all rows of a table; returns which remain [rows]."""
-        kept = np.ones(len(table), dtype=bool)
+        keep = np.ones(len(table), dtype=bool)
         for rule in rules:
             passes = rule.keep(table, self.seen)
             if passes is None:
                 self.notes.append(f"{table.label}: no column {rule.column!r}, so the rule {rule} did not apply")
             else:
-                kept = self.apply(kept, passes, f"{scope}: {rule}")
-        return kept
+                keep = self.apply(keep, passes, f"{scope}: {rule}")
+        return keep
 
 
 def check_values(tallies: Iterable[Tally]) -> list[str]:
@@ -211,34 +211,34 @@ def check_values(tallies: Iterable[Tally]) -> list[str]:
     Returns:
         A note for each value to remove that no row has but that is spelt nearly as one that rows have.
     """
-    found: dict[Rule, set[str]] = {}
+    values_of: dict[Rule, set[str]] = {}
     for tally in tallies:
         for rule, values in tally.seen.items():
-            found.setdefault(rule, set()).update(values)
+            values_of.setdefault(rule, set()).update(values)
     notes = []
-    for rule, values in found.items():
-        known = sorted(values - {""}, key=natural_key)
+    for rule, values in values_of.items():
+        present = sorted(values - {""}, key=natural_key)
         for value in (*rule.allow, *rule.refuse):
             if value in values:
                 continue
             if value in rule.allow:
-                raise unknown_name(f"{rule.column} value", value, known)
-            if guess := nearest(value, known):
+                raise unknown_name(f"{rule.column} value", value, present)
+            if guess := nearest(value, present):
                 notes.append(f"no row has the value {value!r} that the rule {rule} removes; did you mean {guess!r}?")
     return notes
 
 
 def _spellings(value: str, dtype: np.dtype[Any]) -> list[str]:
     """Return the texts, in lower case, that rows of a column may have for the value of a rule."""
-    found = [value.lower()]
+    spellings = [value.lower()]
     if dtype.kind == "f":
         # Single precision holds .1 as another number, which is what its rows say; NaN is a row without a value.
         with np.errstate(over="ignore"):
             number = float(dtype.type(as_number(value)))
-        found += [as_label(number)] if math.isfinite(number) or value.lower() == "nan" else []
+        spellings += [as_label(number)] if math.isfinite(number) or value.lower() == "nan" else []
     elif dtype.kind != "U" and math.isfinite(number := as_number(value)):
-        found.append(as_label(number))
-    return found + [one for pair in _TRUTH for one in pair if {*pair} & {*found}]
+        spellings.append(as_label(number))
+    return spellings + [one for pair in _TRUTH for one in pair if {*pair} & {*spellings}]
 
 
 def _rule(column: str, sign: str, values: str) -> Rule:

@@ -96,23 +96,27 @@ def trials_by_subject(dataset: xr.Dataset, *, averaged: bool = False) -> dict[st
     ids, subjects, sessions, unit_subjects, unit_sessions = (
         dataset[name].values.astype(str) for name in ("trial_id", "subject", "session", "unit_subject", "unit_session")
     )
-    known = [name for name in COVARIATES if name in dataset.coords]
+    covariates = [name for name in COVARIATES if name in dataset.coords]
     start = dataset["window_start"].values if "window_start" in dataset.coords else np.full(len(labels), np.nan)
-    found: dict[str, list[Trials]] = {}
+    by_subject: dict[str, list[Trials]] = {}
     before: dict[str, list[tuple[NDArray[np.int64], Sequence[str]]]] = {}
     for subject, session in dict.fromkeys(zip(subjects.tolist(), sessions.tolist(), strict=True)):
         rows = np.flatnonzero((subjects == subject) & (sessions == session))
         columns = np.flatnonzero((unit_subjects == subject) & (unit_sessions == session))
         # One session of all units is no copy: in narrow bins its counts are many.
         whole = len(rows) == len(counts) and len(columns) == counts.shape[2]
-        own = counts if whole else counts[np.ix_(rows, np.arange(counts.shape[1]), columns)]
-        recorded = np.isfinite(own)
+        part_counts = counts if whole else counts[np.ix_(rows, np.arange(counts.shape[1]), columns)]
+        recorded = np.isfinite(part_counts)
         # Units may be lost in mid-session: only what is missing everywhere is left out, other gaps stay NaN.
         keep, units = recorded.any(axis=(1, 2)), recorded.any(axis=(0, 1))
         if not keep.any():
             continue
         rows = rows[keep]
-        own = own if keep.all() and units.all() else own[np.ix_(keep, np.arange(own.shape[1]), units)]
+        part_counts = (
+            part_counts
+            if keep.all() and units.all()
+            else part_counts[np.ix_(keep, np.arange(part_counts.shape[1]), units)]
+        )
         # Bins past a window's end have NaN counts and duration 0; NaN seconds avoid the division by zero.
         seconds = np.where(duration[rows] > 0, duration[rows], np.nan)
         keys = [f"{subject}/{session}/{ids[row]}" for row in rows]
@@ -124,15 +128,17 @@ def trials_by_subject(dataset: xr.Dataset, *, averaged: bool = False) -> dict[st
                 break
         unique = _unique(keys)
         before[subject].append((rows, unique))
-        found.setdefault(subject, []).append(
+        by_subject.setdefault(subject, []).append(
             Trials(
-                responses=_average(own / seconds[:, :, None], seconds) if averaged else own / seconds[:, :, None],
+                responses=_average(part_counts / seconds[:, :, None], seconds)
+                if averaged
+                else part_counts / seconds[:, :, None],
                 labels=labels[rows],
                 keys=unique,
-                covariates={name: dataset[name].values[rows].astype(np.float64) for name in known},
+                covariates={name: dataset[name].values[rows].astype(np.float64) for name in covariates},
             )
         )
-    return {subject: tuple(items) for subject, items in found.items()}
+    return {subject: tuple(items) for subject, items in by_subject.items()}
 
 
 def same_trials(start: Floats, labels: Any, earlier: Floats, others: Any, *, clocks: bool = True) -> dict[int, int]:
@@ -287,8 +293,8 @@ def _doubtful_names(parts: list[SessionCounts]) -> Iterator[str]:
     subjects = sorted({part.subject for part in parts}, key=natural_key)
     guessed = {part.subject for part in parts if part.guessed}
     if guessed and len(subjects) > 1:
-        named = listing(name for name in subjects if name in guessed)
-        yield f"files that do not name their animal count as an animal each, after their own name: {named}"
+        unnamed = listing(name for name in subjects if name in guessed)
+        yield f"files that do not name their animal count as an animal each, after their own name: {unnamed}"
     folded: dict[str, list[str]] = {}
     for name in subjects:
         folded.setdefault("".join(name.lower().split()), []).append(name)
@@ -298,15 +304,15 @@ def _doubtful_names(parts: list[SessionCounts]) -> Iterator[str]:
     # Equal intervals are those of a fixed protocol; unequal ones at equal times are those of one session.
     uneven = [part for part in parts if len(part.labels) > 2 and np.ptp(np.diff(part.edges[:, 0])) > 0.01]
     for index, part in enumerate(uneven):
-        for other in uneven[:index]:
-            same = other.subject != part.subject and same_trials(
-                part.edges[:, 0], np.array(part.labels), other.edges[:, 0], np.array(other.labels), clocks=False
+        for earlier in uneven[:index]:
+            same = earlier.subject != part.subject and same_trials(
+                part.edges[:, 0], np.array(part.labels), earlier.edges[:, 0], np.array(earlier.labels), clocks=False
             )
             if same:
                 yield (
-                    f"session {other.session} of {other.subject} and {part.session} of {part.subject} have the same "
-                    f"labels at the same times in {len(same)} trials, as two probes or two copies of one session have, "
-                    "and count as two animals"
+                    f"session {earlier.session} of {earlier.subject} and {part.session} of {part.subject} have the "
+                    f"same labels at the same times in {len(same)} trials, as two probes or two copies of one session "
+                    "have, and count as two animals"
                 )
 
 

@@ -77,8 +77,8 @@ class Window:
                 f"The window {shown(source)} has a time with a unit, {with_unit[0]!r}; times are seconds without a "
                 f"unit, here {seconds:+g}."
             )
-        (anchor, offset), (stop, stop_offset), (other, length) = map(_edge, (first, last, most))
-        if not dots or not anchor or not last or other or (most and not stop):
+        (anchor, offset), (stop, stop_offset), (most_anchor, length) = map(_edge, (first, last, most))
+        if not dots or not anchor or not last or most_anchor or (most and not stop):
             raise UsageError(
                 f"The window {shown(source)} cannot be read; write FROM..TO or FROM..+SECONDS, such as "
                 f"'first-contact..choice' or 'start+0.2..+0.5'."
@@ -152,16 +152,16 @@ WHOLE = Window("start", stop="stop")
 def _event(table: SessionTable, anchor: str) -> NDArray[np.float64]:
     column = _ANCHORS.get(anchor, anchor)
     if column not in table:
-        known = [name for name, other in _ANCHORS.items() if other in table]
-        raise unknown_name(f"event of a window in {table.label}", anchor, (*known, FIRST_CONTACT, *table.columns))
+        anchors = [name for name, other in _ANCHORS.items() if other in table]
+        raise unknown_name(f"event of a window in {table.label}", anchor, (*anchors, FIRST_CONTACT, *table.columns))
     return table.times(column)
 
 
 def _edge(text: str) -> tuple[str, str]:
     """Return the name of an event and the signed number behind it; either may be empty."""
-    found = _EDGE.fullmatch(text)
-    assert found is not None, text
-    return found["name"], found["offset"] or ""
+    match = _EDGE.fullmatch(text)
+    assert match is not None, text
+    return match["name"], match["offset"] or ""
 
 
 def _signed(seconds: float) -> str:

@@ -76,8 +76,8 @@ class Shard:
         with open_hdf5(self.path, "shard", _AGAIN) as opened:
             file: Any = opened
             arrays = {name: file[name][()] for name in file if name != "wrench"}
-            found = hash_arrays({**arrays, "wrench": self.forces()})
-        if found != self.content_hash:
+            actual_hash = hash_arrays({**arrays, "wrench": self.forces()})
+        if actual_hash != self.content_hash:
             raise DataError(f"{str(self.path)!r} does not match its hash: it was damaged or edited. {_AGAIN}")
 
     def verify_once(self) -> None:
@@ -108,10 +108,10 @@ def read_manifest(folder: Path) -> Mapping[str, Any]:
             "procedural-24:10 --out FOLDER."
         )
     manifest = read_json(path)
-    found = (manifest.get("format"), manifest.get("schema")) if isinstance(manifest, dict) else (None, None)
-    if found != (SWEEPS_FORMAT, SWEEPS_SCHEMA):
+    version = (manifest.get("format"), manifest.get("schema")) if isinstance(manifest, dict) else (None, None)
+    if version != (SWEEPS_FORMAT, SWEEPS_SCHEMA):
         raise DataError(
-            f"{str(path)!r} has format {found[0]!r} version {found[1]!r}; this brainbench reads {SWEEPS_FORMAT!r} "
+            f"{str(path)!r} has format {version[0]!r} version {version[1]!r}; this brainbench reads {SWEEPS_FORMAT!r} "
             f"version {SWEEPS_SCHEMA}: generate the data again or use the version that wrote it."
         )
     with readable(path, "manifest of a data set", _AGAIN):
@@ -183,9 +183,9 @@ class Buffers:
             for index in range(len(self._held)):
                 if self._held[index].shape == shape and self._references(index) == self._free:
                     return self._held[index]
-            made = np.empty(shape, np.float32)
-            self._held = [*self._held[1 - self._most :], made]
-            return made
+            buffer = np.empty(shape, np.float32)
+            self._held = [*self._held[1 - self._most :], buffer]
+            return buffer
 
     def _references(self, index: int) -> int:
         return sys.getrefcount(self._held[index])
@@ -327,9 +327,9 @@ class WhiskingDataset:
                 "leave them out with unstable='skip', or simulate with a finer fidelity."
             )
         left_out = [shard.empty | shard.broken if self.unstable == "skip" else shard.empty for shard in self._shards]
-        kept = [np.flatnonzero(~rows) for rows in left_out]
-        self._where = np.concatenate([np.full(len(rows), i) for i, rows in enumerate(kept)])
-        self._row = np.concatenate(kept)
+        usable = [np.flatnonzero(~rows) for rows in left_out]
+        self._where = np.concatenate([np.full(len(rows), i) for i, rows in enumerate(usable)])
+        self._row = np.concatenate(usable)
         self.skipped = sum(shard.sweeps for shard in self._shards) - len(self._row)
         """Sweeps of the split that are left out because they are unstable."""
         if not len(self._row):
@@ -371,8 +371,8 @@ class WhiskingDataset:
 
         Time steps [s] and axes are told where they are not the usual ones.
         """
-        step, usual = self.substeps * self._shards[0].interval, SUB_STEPS * SUB_STEP_SECONDS
-        unusual: dict[str, Any] = {} if np.isclose(step, usual, rtol=1e-6) else {"time_step": step}
+        step, default_step = self.substeps * self._shards[0].interval, SUB_STEPS * SUB_STEP_SECONDS
+        unusual: dict[str, Any] = {} if np.isclose(step, default_step, rtol=1e-6) else {"time_step": step}
         if self.axes != "world":
             unusual["axes"] = self.axes
         used = self._splits[self._where].tolist()
@@ -458,10 +458,10 @@ class WhiskingDataset:
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Go on where another data set of the same files and options stood."""
         mine = self._identity()
-        other = [key for key, value in mine.items() if state.get(key) != value]
-        if other:
-            told = ", ".join(f"{key} {state.get(key)!r} (here {mine[key]!r})" for key in other)
-            raise UsageError(f"The saved state belongs to other batches: {told}.")
+        different = [key for key, value in mine.items() if state.get(key) != value]
+        if different:
+            differences = ", ".join(f"{key} {state.get(key)!r} (here {mine[key]!r})" for key in different)
+            raise UsageError(f"The saved state belongs to other batches: {differences}.")
         self.epoch, self._batch = int(state["epoch"]), int(state["batch"])
 
     def verify(self, *, again: bool = True, progress: Progress | None = None) -> None:
@@ -479,9 +479,9 @@ class WhiskingDataset:
         """
         key = content_hash([self.manifest["content_hash"], self.split, self.unstable], length=24)
         path = cache_dir("whisking") / f"{key}.npz"
-        if (kept := read_sealed(path, "statistics of channels")) is not None:
-            mean, std, largest = (tuple(kept[name].tolist()) for name in ("mean", "std", "largest"))
-            return ChannelStatistics(mean, std, largest, int(kept["values"]))
+        if (cached := read_sealed(path, "statistics of channels")) is not None:
+            mean, std, largest = (tuple(cached[name].tolist()) for name in ("mean", "std", "largest"))
+            return ChannelStatistics(mean, std, largest, int(cached["values"]))
         channels = len(CHANNELS)
         total, squares, largest, values = np.zeros(channels), np.zeros(channels), np.zeros(channels), 0
         for first in range(0, self.sweeps, _BLOCK):
@@ -492,14 +492,14 @@ class WhiskingDataset:
             values += len(block)
         mean = total / values
         std = np.sqrt(np.maximum(squares / values - mean**2, 0.0))
-        found = ChannelStatistics(tuple(mean.tolist()), tuple(std.tolist()), tuple(largest.tolist()), values)
-        write_sealed(path, "statistics of channels", vars(found))
-        return found
+        statistics = ChannelStatistics(tuple(mean.tolist()), tuple(std.tolist()), tuple(largest.tolist()), values)
+        write_sealed(path, "statistics of channels", vars(statistics))
+        return statistics
 
     def _identity(self) -> dict[str, Any]:
         options = ("split", "unstable", "seed", "shuffle", "batch_size", "drop_last")
-        own = {name: getattr(self, name) for name in options}
-        return {"content_hash": self.manifest["content_hash"], **own, "part": list(self.part)}
+        choices = {name: getattr(self, name) for name in options}
+        return {"content_hash": self.manifest["content_hash"], **choices, "part": list(self.part)}
 
     def _gathered(self, columns: list[NDArray[Any]]) -> NDArray[Any]:
         """Put per-shard columns together for the sweeps that can be used."""

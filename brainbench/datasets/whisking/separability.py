@@ -83,12 +83,12 @@ def separability(
     rows = [_draw(mine, objects, sweeps_per_class, generator) for mine in owned]
     where = np.concatenate(rows)
     labels = np.repeat(np.arange(len(chosen)), [len(part) for part in rows])
-    told = progress or (lambda done, total, what: None)
-    features, found = _features(data, where, told), []
+    report = progress or (lambda done, total, what: None)
+    features, results = _features(data, where, report), []
     for count in counts:
-        found.append(separate(features, labels, objects[where], count=count, names=chosen, seed=seed))
-        told(len(found), len(counts), "training support vector machines")
-    return tuple(found)
+        results.append(separate(features, labels, objects[where], count=count, names=chosen, seed=seed))
+        report(len(results), len(counts), "training support vector machines")
+    return tuple(results)
 
 
 def separate(
@@ -126,13 +126,13 @@ def separate(
     for choice in choices:
         mine = np.flatnonzero(np.isin(labels, choice))
         kind, machine = labels[mine], SVC(C=_PENALTY, kernel="precomputed")
-        found = cross_val_predict(machine, kernel[np.ix_(mine, mine)], kind, groups=objects[mine], cv=folds)
-        hit = np.asarray(found == kind)
+        predicted = cross_val_predict(machine, kernel[np.ix_(mine, mine)], kind, groups=objects[mine], cv=folds)
+        hit = np.asarray(predicted == kind)
         tallies.append({number: _by_object(objects[mine[kind == number]], hit[kind == number]) for number in choice})
     shares = ([rows[:, 0].sum() / rows[:, 1].sum() for rows in tally.values()] for tally in tallies)
     accuracies = tuple(float(np.mean(share)) for share in shares)
     reason = f"a class has only {fewest} objects; {FEW_OBJECTS} are the least to trust an interval"
-    found = Separability(
+    predicted = Separability(
         count=count,
         accuracy=float(np.mean(accuracies)),
         interval=_interval(tallies, [len(found) for found in members], seed),
@@ -142,22 +142,22 @@ def separate(
         sweeps=len(labels),
         objects=sum(map(len, members)),
     )
-    return replace(found, status="unreliable", reason=reason) if fewest < FEW_OBJECTS else found
+    return replace(predicted, status="unreliable", reason=reason) if fewest < FEW_OBJECTS else predicted
 
 
 def _choose_classes(
-    known: Sequence[str], labels: NDArray[np.int64], objects: NDArray[np.str_], asked: Sequence[str] | None, most: int
+    names: Sequence[str], labels: NDArray[np.int64], objects: NDArray[np.str_], chosen: Sequence[str] | None, most: int
 ) -> tuple[str, ...]:
-    if asked is not None:
-        check_each("class", asked, known)
-        check_once("The list of classes", asked)
-        if len(asked) < most:
-            raise UsageError(f"{most} classes at a time need {most} different classes; received {', '.join(asked)}.")
-        return tuple(asked)
-    sizes = {name: len(np.unique(objects[labels == number])) for number, name in enumerate(known)}
-    largest = sorted(known, key=lambda name: (-sizes[name], name))[: max(4, most)]
+    if chosen is not None:
+        check_each("class", chosen, names)
+        check_once("The list of classes", chosen)
+        if len(chosen) < most:
+            raise UsageError(f"{most} classes at a time need {most} different classes; received {', '.join(chosen)}.")
+        return tuple(chosen)
+    sizes = {name: len(np.unique(objects[labels == number])) for number, name in enumerate(names)}
+    largest = sorted(names, key=lambda name: (-sizes[name], name))[: max(4, most)]
     if len(largest) < most:
-        raise UsageError(f"The data set has {len(known)} classes; {most} at a time cannot be told apart.")
+        raise UsageError(f"The data set has {len(names)} classes; {most} at a time cannot be told apart.")
     return tuple(sorted(largest))
 
 
