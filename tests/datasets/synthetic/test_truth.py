@@ -4,26 +4,20 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import xarray as xr
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from brainbench.core.errors import DataError, UsageError
-from brainbench.core.trials import Trials
-from brainbench.datasets import open_recordings
 from brainbench.datasets.synthetic import (
     PopulationDesign,
     ResponseGeometry,
     calibrate,
     measure_ceiling,
-    read_truth,
-    write_files,
 )
 from brainbench.datasets.synthetic.truth import stimulus_means
 from brainbench.datasets.trials.session_trials import trials_by_subject
 from brainbench.metrics import noise_ceiling, rdm
-from brainbench.metrics.reliability.subject_rdm import subject_rdm
-from tests.factories.recordings import as_recordings, make_sessions, quiet_design
+from tests.factories.recordings import as_recordings, quiet_design
 from tests.factories.synthetic_animals import FAULTS, simulate
 
 SMALL = quiet_design(animals=3, sessions=2, units=12, trials=5)
@@ -36,10 +30,6 @@ def make_geometry(seed=0, stimuli=6, features=4):
 def measured(animals, stimuli=6):
     means = [np.concatenate([stimulus_means(block, stimuli) for block in item.sessions], axis=1) for item in animals]
     return np.stack([rdm(item) for item in means])
-
-
-def pearson(one, two):
-    return float(np.corrcoef(one, two)[0, 1])
 
 
 # Geometry
@@ -76,98 +66,6 @@ def test_the_truth_of_features_is_their_correlation_distance(seed, stimuli, feat
 def test_wrong_requests_say_what_is_allowed(make, error, message):
     with pytest.raises(error, match=message):
         make()
-
-
-# Counts
-
-
-def test_poisson_counts_have_a_variance_equal_to_the_mean():
-    design = quiet_design(animals=1, units=200, trials=400, spread=0.0, modulation=0.0, rate=6.0)
-    (animal,) = simulate(make_geometry(), design)
-    counts = animal.sessions[0].responses[:, 0]
-    assert counts.mean() == pytest.approx(6.0, rel=0.01)
-    assert counts.var(axis=0).mean() == pytest.approx(6.0, rel=0.02)
-
-
-def test_dispersion_is_that_of_the_negative_binomial():
-    design = quiet_design(animals=1, units=200, trials=400, spread=0.0, modulation=0.0, rate=6.0, dispersion=0.25)
-    counts = simulate(make_geometry(), design)[0].sessions[0].responses[:, 0]
-    assert counts.mean() == pytest.approx(6.0, rel=0.01)
-    assert counts.var(axis=0).mean() == pytest.approx(6.0 + 0.25 * 36.0, rel=0.03)
-
-
-def test_a_shared_gain_correlates_units_and_nothing_else_does():
-    design = quiet_design(animals=1, units=60, trials=500, spread=0.0, modulation=0.0, rate=10.0)
-
-    def correlation(**change):
-        counts = simulate(make_geometry(), replace(design, **change))[0].sessions[0].responses[:, 0]
-        return np.corrcoef(counts.T)[np.triu_indices(60, 1)].mean()
-
-    assert abs(correlation()) < 0.005
-    # Covariance of units: rate² var(gain); variance: rate + rate² var(gain).
-    assert correlation(shared_gain=0.3) == pytest.approx(9 / 19, abs=0.03)
-
-
-def test_session_effects_change_rates_as_stated():
-    design = quiet_design(animals=1, units=300, trials=100, rate=10.0, drift=0.5)
-    (animal,) = simulate(make_geometry(), design)
-    rates = animal.sessions[0].responses.mean(axis=(1, 2))
-    slope = np.polyfit(np.linspace(-0.5, 0.5, len(rates)), rates / rates.mean(), 1)[0]
-    assert slope == pytest.approx(0.5, abs=0.02)
-    gains = [
-        np.log(item.sessions[0].responses.mean())
-        for item in simulate(make_geometry(), quiet_design(animals=150, trials=2, session_gain=0.4, spread=0.0))
-    ]
-    assert np.std(gains) == pytest.approx(0.4, rel=0.15)
-
-
-def test_trials_can_be_unbalanced_and_stimuli_missing():
-    design = replace(SMALL, trials=(4, 20), missing=((1, 2), (1, 4)))
-    animals = simulate(make_geometry(), design)
-    number = np.array([[np.bincount(block.labels, minlength=6) for block in item.sessions] for item in animals])
-    assert (number[1][:, [2, 4]] == 0).all()
-    assert (np.delete(number.reshape(6, 6), [2, 3], axis=0) > 0).all()
-    assert number[0].std() > 2
-    # An RDM of an animal that lacks a stimulus has no value for its pairs.
-    assert np.isnan(measured(animals)[1]).sum() == 9
-    assert as_recordings(make_geometry(), design).attrs["missing"] == {"synthetic02": ["s3", "s5"]}
-
-
-def test_animals_do_not_depend_on_how_many_there_are():
-    few, many = (simulate(make_geometry(), replace(SMALL, animals=number), seed=4) for number in (2, 5))
-    for one, two in zip(few, many, strict=False):
-        np.testing.assert_array_equal(one.sessions[1].responses, two.sessions[1].responses)
-    other = simulate(make_geometry(), SMALL, seed=5)
-    assert not np.array_equal(few[0].sessions[0].responses, other[0].sessions[0].responses)
-
-
-# Truth
-
-
-def test_with_many_units_the_noiseless_rdm_is_the_geometry():
-    geometry = make_geometry(3)
-    (animal,) = simulate(geometry, quiet_design(animals=1, units=20_000, trials=1, modulation=0.4))
-    assert pearson(animal.truth, geometry.rdm) > 0.995
-    lines = np.polyfit(geometry.rdm, animal.truth, 1)
-    # Proportional: with mean rates that differ (log-normal s), the factor is m² E b² / (var b + m² E b²).
-    spread = np.exp(0.4**2) - 1
-    assert lines[0] == pytest.approx(0.16 * (1 + spread) / (spread + 0.16 * (1 + spread)), rel=0.06)
-    assert abs(lines[1]) < 0.03
-
-
-def test_individual_geometry_bounds_what_animals_share():
-    geometry = make_geometry()
-    design = quiet_design(animals=40, units=400, trials=1)
-    shared, half, none = (
-        np.mean([pearson(item.truth, geometry.rdm) for item in simulate(geometry, replace(design, individual=share))])
-        for share in (0.0, 0.5, 1.0)
-    )
-    assert shared > 0.95
-    assert 0.4 < half < 0.9
-    # One geometry for the animal, not one per session.
-    (two,) = simulate(geometry, quiet_design(animals=1, sessions=2, units=5000, trials=1, individual=1.0))
-    assert pearson(*measured([replace(two, sessions=two.sessions[:1]), replace(two, sessions=two.sessions[1:])])) > 0.5
-    assert abs(none) < 0.2
 
 
 def test_a_calibrated_design_has_the_ceiling_that_was_asked_for():
@@ -259,50 +157,6 @@ def test_a_data_set_holds_the_counts_of_the_arrays():
             np.testing.assert_array_equal(one.responses, two.responses)
             np.testing.assert_array_equal(one.labels, two.labels)
             assert one.keys == two.keys
-
-
-@pytest.mark.parametrize("format", ["nwb", "h5"])
-def test_files_give_the_same_counts_as_arrays(tmp_path, format):
-    geometry = make_geometry()
-    design = replace(SMALL, animals=2, dispersion=0.3, missing=((0, 1),))
-    paths = write_files(tmp_path, geometry, design, seed=3, format=format)
-    assert len(paths) == 4
-    dataset = open_recordings(tmp_path, conditions="trials:stimulus", window="first-contact..choice")
-    expected = as_recordings(geometry, design, seed=3)
-    xr.testing.assert_equal(dataset["counts"].drop_vars(dataset.coords), expected["counts"].drop_vars(expected.coords))
-    assert dataset.attrs["vocabulary"] == list(geometry.labels)
-    assert dataset.attrs["synthetic"] is True
-    truth = read_truth(tmp_path)
-    np.testing.assert_allclose(truth["shared"], geometry.rdm)
-    for animal in simulate(geometry, design, seed=3):
-        np.testing.assert_allclose(truth["subjects"][animal.subject], animal.truth)
-
-
-@pytest.mark.filterwarnings("ignore")
-def test_files_are_valid_for_pynwb(tmp_path):
-    pynwb = pytest.importorskip("pynwb")
-    (path,) = write_files(tmp_path, make_geometry(), replace(SMALL, animals=1, sessions=1))
-    assert list(pynwb.validate(path=str(path))) == []
-
-
-def test_an_unknown_format_suggests_the_nearest(tmp_path):
-    with pytest.raises(UsageError, match="'nbw'; did you mean 'nwb'"):
-        write_files(tmp_path, make_geometry(), SMALL, format="nbw")
-
-
-def test_no_unit_fires_within_its_refractory_time():
-    for session in make_sessions(make_geometry(), quiet_design(animals=1, units=10, rate=60.0, window=0.4)):
-        units = session.units.data
-        for times in np.split(units["spike_times"], units["spike_times_index"][:-1]):
-            assert np.diff(times).min() > 0.00199
-
-
-def test_trial_blocks_take_simulated_sessions_as_they_are():
-    animal = simulate(make_geometry(), quiet_design(animals=1))[0]
-    trials = [Trials(block.responses[:, 0], block.labels, block.keys) for block in animal.sessions]
-    found = subject_rdm(animal.subject, trials, 6, splits=50)
-    np.testing.assert_allclose(found.rdm, measured([animal])[0])
-    assert found.reliability > 0.8
 
 
 @pytest.mark.parametrize(

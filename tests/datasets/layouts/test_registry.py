@@ -1,28 +1,24 @@
 import logging
-import sys
 
 import numpy as np
 import pytest
 import xarray as xr
 
-from brainbench.core.errors import DataError, MissingDependencyError, UsageError
+from brainbench.core.errors import DataError, UsageError
 from brainbench.datasets import (
     RecordingLayout,
     check,
     export,
-    fetch,
     inspect,
     open_recordings,
     register_layout,
     write_recordings,
 )
-from brainbench.datasets.layouts.pole import recorded_runs
 from brainbench.datasets.layouts.registry import get_layout, list_layouts
-from brainbench.datasets.sessions import Series
 from brainbench.datasets.trials.conditions import Conditions
 from brainbench.datasets.trials.selection import Selection
 from brainbench.datasets.trials.windows import Window
-from tests.factories.dandi_files import make_pole_task, write_area2, write_hires, write_yu
+from tests.factories.dandi_files import write_area2, write_hires, write_yu
 from tests.factories.recordings import make_simple_session
 
 WRITERS = {"yu": write_yu, "hires": write_hires, "area2-bump": write_area2}
@@ -61,82 +57,6 @@ def test_copies_of_each_layout_are_valid_for_pynwb(layout, tmp_path):
     pynwb = pytest.importorskip("pynwb")
     (copy,) = export(layout[1], tmp_path / "copy.nwb")
     assert list(pynwb.validate(path=str(copy))) == []
-
-
-@pytest.mark.parametrize("write", [write_yu, write_hires])
-def test_pole_tasks_are_counted_while_the_pole_is_there(tmp_path, write):
-    spikes, _ = write(tmp_path / "a.nwb")
-    spikes = spikes if write is write_yu else [spikes]
-    columns, _ = make_pole_task()
-    dataset = open_recordings(tmp_path / "a.nwb")
-    assert dataset.attrs["vocabulary"] == ["Go", "Nogo"]
-    assert dataset.attrs["removed"]["trials: stim_present!=true"] == 3
-    kept = columns["stim_present"] == 0
-    low, high = columns["pole_in_time"][kept], columns["pole_out_time"][kept]
-    expected = [
-        [np.sum((times >= begin) & (times < end)) for times in spikes] for begin, end in zip(low, high, strict=True)
-    ]
-    np.testing.assert_array_equal(dataset["counts"].values[:, 0], expected)
-
-
-def test_a_spike_train_of_zeros_and_ones_is_a_unit_recorded_in_trials_only(tmp_path):
-    spikes, touches = write_hires(tmp_path / "a.nwb")
-    dataset = open_recordings(tmp_path / "a.nwb", window="first-contact..+0.1", select="none")
-    assert dataset.sizes["unit"] == 1
-    assert "acquisition/SpikeTrain" in "".join(dataset.attrs["notes"])
-    np.testing.assert_allclose(
-        dataset["window_start"].values, touches[np.searchsorted(touches, make_pole_task()[0]["start_time"])]
-    )
-    low = dataset["window_start"].values
-    np.testing.assert_array_equal(
-        dataset["counts"].values[:, 0, 0], [np.sum((spikes >= begin) & (spikes < begin + 0.1)) for begin in low]
-    )
-    # Between trials nothing was sampled: that is missing, not silence.
-    with pytest.raises(DataError, match=r"a\.nwb: trials: .*span .*24"):
-        open_recordings(tmp_path / "a.nwb", window="stop-0.2..+0.4", select="none")
-
-
-def test_series_of_zeros_and_ones_say_what_is_wrong_with_them():
-    flags, stamps = np.array([0, 1, 0, 1]), np.array([0.0, 0.1, 0.2, 0.3])
-    np.testing.assert_allclose(Series("s", "", flags, stamps).active_times(), [0.1, 0.3])
-    np.testing.assert_allclose(Series("s", "", flags, start=5.0, rate=10.0).active_times(), [5.1, 5.3])
-    with pytest.raises(DataError, match="4 samples"):
-        Series("s", "", flags, stamps[:3]).active_times()
-    with pytest.raises(DataError, match=r"series s .*rate"):
-        Series("s", "", flags).active_times()
-    with pytest.raises(DataError, match="it reaches 7"):
-        Series("s", "", flags * 7, stamps).active_times()
-    np.testing.assert_allclose(recorded_runs(np.array([0, 0.1, 0.2, 5, 5.1])), [[0, 0.3], [5, 5.2]])
-
-
-def test_every_whisker_of_the_probe_recordings_has_its_contacts(tmp_path):
-    _, touches = write_yu(tmp_path / "a.nwb")
-    tables = {table.name: table.rows for table in inspect(tmp_path / "a.nwb").sessions[0].tables}
-    assert tables["contacts_by_whisker_C1"] == len(touches)
-    assert tables["contacts_by_whisker_C2"] == len(touches[::3])
-
-
-def test_bumps_and_reaches_are_told_apart_by_direction(tmp_path):
-    spikes, columns = write_area2(tmp_path / "a.nwb")
-    dataset = open_recordings(tmp_path / "a.nwb")
-    assert len(dataset.attrs["vocabulary"]) == 16
-    assert dataset.attrs["vocabulary"][:2] == ["active-0", "active-45"]
-    removed = {rule: number for rule, number in dataset.attrs["removed"].items() if number}
-    assert removed == {"trials: result=R": 8, "trials: no event for the window move_onset_time-0.1..+0.6": 4}
-    onset = columns["move_onset_time"]
-    kept = (columns["result"] == "R") & np.isfinite(onset)
-    expected = [[np.sum((times >= at - 0.1) & (times < at + 0.5)) for times in spikes] for at in onset[kept]]
-    np.testing.assert_array_equal(dataset["counts"].values[:, 0], expected)
-    bumped = columns["ctr_hold_bump"][kept]
-    np.testing.assert_array_equal(np.char.startswith(dataset["stimulus"].values.astype(str), "passive"), bumped)
-
-
-def test_the_test_trials_of_the_benchmark_are_refused_in_words(tmp_path):
-    write_area2(tmp_path / "a.nwb", test=True)
-    with pytest.raises(DataError, match=r"a\.nwb .*interval .*'trials'"):
-        open_recordings(tmp_path / "a.nwb")
-    with pytest.raises(UsageError, match="column 'movement'"):
-        open_recordings(f"area2-bump:{tmp_path / 'a.nwb'}")
 
 
 # A layout of one's own
@@ -184,7 +104,7 @@ def test_a_layout_in_a_file_of_its_own_works_on_the_command_line(registry, tmp_p
     import re
     from pathlib import Path
 
-    page = (Path(__file__).parents[2] / "docs" / "recordings.md").read_text(encoding="utf-8")
+    page = (Path(__file__).parents[3] / "docs" / "recordings.md").read_text(encoding="utf-8")
     (example,) = re.findall(r"```py\n(.*?)```", page, flags=re.DOTALL)
     (tmp_path / "my_lab.py").write_text(example.replace("LAYOUT =", f"{constant} ="))
     columns = {"texture": np.resize(np.array(["rough", "smooth", "none"]), 12)}
@@ -228,40 +148,3 @@ def test_installed_packages_add_layouts_and_one_that_fails_takes_nothing_away(re
     assert {"their-one", "their-two", "rodgers"} <= set(names)
     assert get_layout("their-one").citation == "Them (2026)"
     assert "'broken' (broken_recordings)" in caplog.text
-
-
-# Fetching
-
-
-def test_without_the_client_nothing_is_tried(monkeypatch, tmp_path):
-    monkeypatch.setenv("PATH", str(tmp_path))
-    with pytest.raises(MissingDependencyError, match=r"\[dandi\].*DANDI:000231"):
-        fetch("rodgers", tmp_path / "data")
-    assert not (tmp_path / "data").exists()
-    with pytest.raises(UsageError, match="'rogers'; did you mean 'rodgers'"):
-        fetch("rogers", tmp_path)
-
-
-@pytest.mark.skipif(sys.platform == "win32", reason="the stand-in client is a shell script")
-@pytest.mark.parametrize(
-    ("name", "assets", "source"),
-    [
-        ("rodgers", None, "dandi://dandi/000231/*ecephys*"),
-        ("000231", "sub-231CR/*", "dandi://dandi/000231/sub-231CR/*"),
-        ("DANDI:000999", None, "DANDI:000999"),
-    ],
-)
-def test_the_client_is_asked_for_the_files_with_units(monkeypatch, tmp_path, name, assets, source):
-    client = tmp_path / "dandi"
-    client.write_text(f'#!/bin/sh\necho "$@" > {tmp_path}/asked\n')
-    client.chmod(0o755)
-    monkeypatch.setenv("PATH", f"{tmp_path}:/usr/bin:/bin")
-    number = "000999" if "999" in source else "000231"
-    assert fetch(name, tmp_path / "data", assets=assets) == tmp_path / "data" / number
-    asked = (tmp_path / "asked").read_text().split()
-    assert asked[0] == "download"
-    assert asked[-1] == source
-    assert ("glob" in asked) == ("dandi://" in source)
-    client.write_text("#!/bin/sh\nexit 3\n")
-    with pytest.raises(DataError, match="status 3"):
-        fetch(name, tmp_path / "data", assets=assets)
