@@ -29,7 +29,7 @@ from robotics_bridge.deploy.controller import Clock, Report
 from robotics_bridge.deploy.driver import HandReading, LinkCounters
 from robotics_bridge.deploy.session import DeployedPolicy, PressureCalibration, read_deployed
 from robotics_bridge.envs.env import Env
-from robotics_bridge.envs.observations import VELOCITY
+from robotics_bridge.envs.step import VELOCITY
 from robotics_bridge.policies.evaluate import Policy, evaluate, mean_of_episodes
 from robotics_bridge.policies.export import export_policy
 from robotics_bridge.policies.fit import with_contacts_of

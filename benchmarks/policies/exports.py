@@ -16,8 +16,7 @@ from tensordict import TensorDict
 
 from benchmarks.report import publish, script_parser, table
 from robotics_bridge.policies.encoders.arms import ARMS, EncoderConfig
-from robotics_bridge.policies.export import STEPS, TOLERANCE, export_policy
-from robotics_bridge.policies.runners import read_policy
+from robotics_bridge.policies.export import STEPS, TOLERANCE, export_policy, read_policy
 from robotics_bridge.policies.student import TactilePolicy
 
 NETWORKS = ("zhuang-intersection-ln-small.simclr", "s4-small", "zhuang-small+mamba")

@@ -24,9 +24,9 @@ from brainbench.core.reading.ranges import check_number
 from robotics_bridge.deploy.driver import Clock, Driver, HandReading, Source
 from robotics_bridge.deploy.safety import SafeLink, SafetyLimits
 from robotics_bridge.envs import ActionMap
-from robotics_bridge.envs.observations import VELOCITY
+from robotics_bridge.envs.step import VELOCITY
 from robotics_bridge.policies.contract import RATE, PolicyContract
-from robotics_bridge.policies.runners import Runner
+from robotics_bridge.policies.export import Runner
 
 PRIORITY = 20
 """Priority under SCHED_FIFO (1–99); above ordinary threads, below the kernel's own (50)."""

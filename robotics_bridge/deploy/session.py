@@ -19,7 +19,7 @@ from robotics_bridge.deploy.controller import Controller
 from robotics_bridge.deploy.driver import Driver, HandReading, Source
 from robotics_bridge.deploy.safety import SafetyLimits
 from robotics_bridge.policies.contract import PolicyContract
-from robotics_bridge.policies.runners import read_policy
+from robotics_bridge.policies.export import read_policy
 from robotics_bridge.tasks.task import check_measured
 
 REAL_TYPES = ("agg_bool", "agg_force")

@@ -15,11 +15,18 @@ from brainbench.core.cuda_graphs import CudaGraphStep, warp_recorder
 from brainbench.core.errors import UsageError, check_kind
 from brainbench.core.reading.ranges import check_number
 from robotics_bridge import hands
-from robotics_bridge.envs.observations import observe
-from robotics_bridge.envs.options import EnvOptions
 from robotics_bridge.envs.reset import EpisodeReset
+from robotics_bridge.envs.simulation import EnvOptions
 from robotics_bridge.envs.state import EnvState
-from robotics_bridge.envs.step import STATISTICS, ActionMap, StepResult, apply_action, compute_step, run_physics
+from robotics_bridge.envs.step import (
+    STATISTICS,
+    ActionMap,
+    StepResult,
+    apply_action,
+    compute_step,
+    observe,
+    run_physics,
+)
 from robotics_bridge.tasks.registry import load
 from robotics_bridge.tasks.task import Task
 
@@ -40,7 +47,7 @@ def make(
         name: of a task (:func:`robotics_bridge.tasks.list_tasks`), or a :class:`~robotics_bridge.tasks.Task`.
         hand: a hand, its name, or the path of a URDF or MJCF file.
         config: configuration of a named task: ``default`` or ``published``.
-        **options: fields of :class:`~robotics_bridge.envs.options.EnvOptions`: ``num_envs``, ``device``, ``observe``, …
+        **options: fields of :class:`~robotics_bridge.envs.EnvOptions`: ``num_envs``, ``device``, ``observe``, …
 
     Example::
 

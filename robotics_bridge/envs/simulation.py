@@ -1,21 +1,83 @@
-"""The physics of a batch of environments as torch tensors, on either engine. Letters: B environment, J joint.
+"""The physics of a batch of environments as torch tensors, on either engine: its options, the engine, the actuators.
 
-With MuJoCo Warp the tensors are views of the engine's own memory; with C MuJoCo they are copies that this class keeps
-in step, so that what stands above knows no engine.
+With MuJoCo Warp the tensors are views of the engine's own memory; with C MuJoCo they are copies that
+:class:`Simulation` keeps in step, so that what stands above knows no engine. Letters: B environment, J joint.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 import torch
 
 from brainbench.core.devices import mujoco_module, pick_device, warp
-from brainbench.core.errors import UsageError
-from robotics_bridge.envs.options import EnvOptions
+from brainbench.core.errors import UsageError, check_kind, check_name
+from brainbench.core.reading.ranges import check_fields
+from robotics_bridge.envs.kernels.actuation import ActuatorArrays, actuate, count_launch
+from robotics_bridge.hands.layouts import check_names
+from robotics_bridge.hands.observations import observation_type
 from robotics_bridge.physics import MujocoEngine, MujocoWarpEngine
+from robotics_bridge.physics.state import MOST_ENVS
+from robotics_bridge.tasks.scenes import TaskModel
+from robotics_bridge.tasks.task import Task
+
+ENGINES = ("mujoco", "warp")
+
+
+@dataclass(frozen=True, kw_only=True)
+class EnvOptions:
+    """Options of the simulation of a task, and of what is observed; a value that is not valid is a UsageError."""
+
+    num_envs: int = 1
+    """Environments B."""
+    device: str = "cpu"
+    """``cpu``, ``cuda`` or ``cuda:1``."""
+    engine: str | None = None
+    """``mujoco`` (C MuJoCo) or ``warp`` (MuJoCo Warp); by default the one for the device."""
+    observe: str = "none"
+    """Tactile observation type (table 4.3); ``none`` builds no tactile sensor."""
+    placement: str = "hand"
+    """Place of the taxels: ``hand``, ``fingers``, ``tips`` or ``palm``."""
+    resolution: str = "med"
+    """Number of taxels: ``low``, ``med`` or ``high``; or a probe file (``.json``)."""
+    noisy: bool = False
+    """Tactile readings with the published imperfections."""
+    seed: int = 0
+    """Seed of all random numbers."""
+    link_pose: bool = False
+    """Also observe the poses of the tactile links in the palm's frame."""
+    keep_final: bool = False
+    """Return the last observations of episodes that ended as ``info["final_observations"]``."""
+    threads: int | None = None
+    """Threads of C MuJoCo; None takes all processors."""
+    knobs: Mapping[str, Any] = field(default_factory=dict)
+    """Further settings of the tactile sensors, e.g. ``{"points": 500}``."""
+    graphs: bool | None = None
+    """Replay what a control step does around physics as CUDA graphs, recorded in the third step; by default on CUDA.
+
+    A task whose terms cannot be recorded runs without, and says so; with ``True`` it is an error.
+    """
+
+    def __post_init__(self) -> None:
+        check_fields(self, "num_envs", least=1, most=MOST_ENVS, whole=True)
+        check_fields(self, "seed", least=0, below=2**63, whole=True)
+        check_fields(self, "threads", least=1, whole=True)
+        check_kind("device", self.device, str, "'cpu', 'cuda' or 'cuda:N'")
+        object.__setattr__(self, "engine", self.engine or ("mujoco" if self.device == "cpu" else "warp"))
+        check_name("engine", self.engine, ENGINES)
+        observation_type(self.observe)
+        check_names("low" if self.resolution == "custom" else self.resolution, self.placement)
+        if self.observe == "none" and (self.noisy or self.knobs):
+            raise UsageError("noisy and knobs are settings of tactile sensors; choose an observation type.")
+        if self.link_pose and self.observe == "none":
+            raise UsageError("Poses of tactile links belong to tactile sensors; choose an observation type.")
+        pick_device(self.device)
+        if self.graphs and not self.device.startswith("cuda"):
+            raise UsageError(f"Graphs are recorded on CUDA only, not on {self.device}; leave it out.")
+
 
 mujoco = mujoco_module()
 
@@ -134,3 +196,100 @@ class Simulation:
             inertia[first : first + 3] = values["body_mass"][body]
             inertia[first + 3 : first + 6] = values["body_inertia"][body]
         self.engine.set_fields(env, {**values, "dof_M0": inertia})
+
+
+_IMPERFECTIONS = ("strength", "bias", "deadband", "backlash", "kick")
+
+
+class Actuators:
+    """Imperfect position actuators of all joints: the published randomisation as one kernel per physics step.
+
+    Torque = strength · (stiffness · e − damping · q̇ + kick · sign e) + noise, held within the joint's effort. The error
+    e is between target and measured position, which carries a bias and the play of the gears (a stop operator on the
+    joint's motion); below the deadband it counts as none.
+    """
+
+    def __init__(self, simulation: Simulation, model: TaskModel, task: Task, *, seed: int) -> None:
+        self._simulation, self._changes, self._substeps = simulation, task.actuators, task.solver.decimation
+        device, first = simulation.device, simulation.model
+        ids = [first.joint(name).id for name in model.joints]
+        self.qpos_columns = torch.as_tensor(np.array(first.jnt_qposadr[ids]), device=device).long()
+        """[J] columns of ``qpos``."""
+        self.qvel_columns = torch.as_tensor(np.array(first.jnt_dofadr[ids]), device=device).long()
+        """[J] columns of ``qvel``."""
+        self.nominal = {
+            name: torch.as_tensor(getattr(model, name), dtype=torch.float32, device=device)
+            for name in ("stiffness", "damping", "effort")
+        }
+
+        self.lever = torch.as_tensor(model.lever, dtype=torch.float32, device=device)
+        """[J] factor on imperfections and noise that are stated for hinges."""
+
+        def zeros() -> torch.Tensor:
+            return torch.zeros(simulation.num_envs, len(ids), device=device)
+
+        names = ("stiffness", "damping", *_IMPERFECTIONS, "play", "before")
+        self.values = {name: zeros() for name in names}
+        """[B, J] gains and imperfections, and what the gears remember (as in ``ActuatorArrays``)."""
+        self.target = zeros()
+        """[B, J] positions that the actuators seek (rad)."""
+        self.power = zeros()
+        """[B, J] mean |torque · speed| over the last control step (W)."""
+        self._noise_state = torch.zeros(2, dtype=torch.int32, device=device)
+        """[2] launches so far, and where the torque noise of the seed begins."""
+        self.seed(seed)
+        self._noise = self.nominal["effort"] * (task.actuators.torque_noise if task.actuators else 0.0)
+        wp = warp()
+        self._actuate, self._count = actuate, count_launch
+        self._arrays = ActuatorArrays()
+        for name, value in self.values.items():
+            setattr(self._arrays, name, wp.from_torch(value, dtype=wp.float32))
+        self._arrays.effort, self._arrays.noise = wp.from_torch(self.nominal["effort"]), wp.from_torch(self._noise)
+        channels = [first.actuator(name).id for name in model.joints]
+        columns = {"position": first.jnt_qposadr[ids], "speed": first.jnt_dofadr[ids], "channel": channels}
+        for name, numbers in columns.items():
+            column = wp.array(np.array(numbers, dtype=np.int32), dtype=wp.int32, device=simulation.warp_device)
+            setattr(self._arrays, name, column)
+        shared = (simulation.qpos, simulation.qvel, self.target, self._noise_state, simulation.ctrl, self.power)
+        self._qpos, self._qvel, self._target, self._random, self._ctrl, self._power = map(wp.from_torch, shared)
+
+    def reset(self, mask: torch.Tensor, draw: Any) -> None:
+        """Draw imperfections anew in some environments [B] bool; ``draw(n, low, high)`` returns numbers [B, n]."""
+        column, joints = mask.unsqueeze(1), self.target.shape[1]
+        position, c = self._simulation.qpos[:, self.qpos_columns], self._changes
+        values = {name: self.nominal[name] for name in ("stiffness", "damping")}
+        values |= {"play": torch.zeros_like(self.target), "before": position, "strength": torch.ones_like(self.target)}
+        if c is not None:
+            # Stated for hinges; a slide moves as the tip of a finger would.
+            lever = self.lever
+            values |= {
+                "stiffness": self.nominal["stiffness"] * draw(joints, *c.stiffness),
+                "damping": self.nominal["damping"] * draw(joints, *c.damping),
+                "strength": draw(joints, *c.strength), "bias": lever * draw(joints, *c.position_bias),
+                "deadband": lever * draw(joints, *c.deadband), "backlash": lever * draw(joints, *c.backlash),
+                "kick": c.kick * draw(joints, *c.kick_ratio) / lever,
+            }  # fmt: skip
+        for name, value in values.items():
+            own = self.values[name]
+            own.copy_(torch.where(column, value, own))
+        self.target.copy_(torch.where(column, position, self.target))
+
+    def seed(self, seed: int) -> None:
+        """Begin the torque noise anew."""
+        self._noise_state[0].fill_(0)
+        # The kernel adds the launch to it. An odd multiplier, 2³² over the golden ratio, keeps streams of neighbouring
+        # seeds apart, which would be the same ones a launch later.
+        self._noise_state[1].fill_(seed * 0x9E3779B1 & 0x3FFFFFFF)
+
+    def launch(self, substep: int) -> None:
+        """Write the torques of one physics step to the simulation's ``ctrl``."""
+        wp, device = warp(), self._simulation.warp_device
+        inputs = [self._arrays, self._qpos, self._qvel, self._target, self._random]
+        inputs += [int(substep == 0), 1.0 / self._substeps, self._ctrl, self._power]
+        wp.launch(self._actuate, dim=self.target.shape, inputs=inputs, device=device)
+        wp.launch(self._count, dim=1, inputs=[self._random], device=device)
+
+    def memory(self) -> dict[str, torch.Tensor]:
+        """Return the tensors themselves that the next launch depends on, by name."""
+        own = {"target": self.target, "power": self.power}
+        return {**self.values, **own, "tick": self._noise_state[:1], "seed": self._noise_state[1]}

@@ -1,5 +1,5 @@
-"""Policies of robot hands: a brain-scored network as tactile front end, teachers, students, deployment.
+"""Policies of robot hands: a brain-scored network as tactile front end, teachers, students, exported files.
 
-``taxel_grid`` lays a hand's taxels on the input of an encoder, ``front_end`` runs the encoder on it, ``encoders`` names
-all arms of the comparison, ``student`` is the rsl_rl model class, ``distill`` teaches it, ``deploy`` runs it on a hand.
+``encoders`` turn taxels into features, ``student`` is the rsl_rl model class that has one, ``training`` teaches it,
+``evaluate`` runs whole episodes, ``export`` writes a file with its ``contract``. ``readouts`` is an optional room.
 """

@@ -10,10 +10,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from brainbench.core.errors import DataError, UsageError, shown
-from robotics_bridge.policies.contract import TrainedMap, trained_contacts
-from robotics_bridge.policies.schema import from_json
+from robotics_bridge.policies.contract import TrainedMap, from_json, trained_contacts
 from robotics_bridge.policies.shipped import stored
-from robotics_bridge.tasks.contact_model import contacts_name
+from robotics_bridge.tasks.settings import contacts_name
 from robotics_bridge.tasks.task import MEASURED, TASK_VERSION, Task
 
 if TYPE_CHECKING:

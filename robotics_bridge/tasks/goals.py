@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from brainbench.core.errors import UsageError
 from brainbench.core.reading.ranges import check_fields, check_number
 from brainbench.core.rotations import TURN, about, constant, multiply, tilted, twist_of
-from robotics_bridge.tasks.checks import check_range, unit_vector
+from robotics_bridge.tasks.settings import check_range, unit_vector
 
 if TYPE_CHECKING:
     import torch

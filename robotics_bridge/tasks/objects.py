@@ -15,7 +15,7 @@ from typing import Any
 from brainbench.core.devices import mujoco_module
 from brainbench.core.errors import UsageError, shown
 from brainbench.core.reading.ranges import check_fields, check_numbers
-from robotics_bridge.tasks.checks import unit_vector
+from robotics_bridge.tasks.settings import unit_vector
 
 GRAIN = 1e-4
 """Half size of the stand-in for a solid that a shape lacks [m]."""

@@ -16,8 +16,8 @@ from brainbench.core.errors import UsageError, check_each, listing, shown
 from robotics_bridge.hands.hand import LEVER, Hand
 from robotics_bridge.hands.scenes import ARMATURE, WEAK_PUSH, WEAK_SERVO, flexed, palm_surface, place_palm
 from robotics_bridge.physics.scene import excluded_links
-from robotics_bridge.tasks.contact_model import ContactModel, set_contacts
 from robotics_bridge.tasks.objects import ObjectShape, add_object, slots, with_sizes
+from robotics_bridge.tasks.settings import ContactModel, set_contacts
 from robotics_bridge.tasks.task import Pose, Task
 
 mujoco = mujoco_module()

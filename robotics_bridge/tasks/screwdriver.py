@@ -2,7 +2,7 @@
 
 Values of ``published`` are those of the thesis (tables 4.4, 4.5, 4.7–4.9) and, where it is silent, of the settings
 released with it (neuroagents-lab/tactile-genesis). Episodes start from sampled grasps
-(:mod:`robotics_bridge.envs.grasps`).
+(:mod:`robotics_bridge.envs.reset`).
 """
 
 from __future__ import annotations

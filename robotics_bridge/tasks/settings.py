@@ -1,14 +1,106 @@
-"""Settings of learning: optimisation of teacher and student (thesis, tables 4.4 and 4.5)."""
+"""Settings of tasks: contacts and the drives that press on them, learning of teachers and students (tables 4.4, 4.5).
+
+SI units, radians.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import inspect
+import math
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from brainbench.core.errors import UsageError, check_name
-from brainbench.core.reading.ranges import check_fields, check_number
-from robotics_bridge.tasks.checks import check_range
+from brainbench.core.errors import UsageError, check_each, check_name, shown
+from brainbench.core.reading.ranges import check_fields, check_number, check_numbers
+
+
+def check_range(name: str, value: Any, **bounds: Any) -> None:
+    """Raise UsageError unless a value is a range (low, high) of numbers in order that :func:`check_number` takes."""
+    fits = isinstance(value, Sequence) and not isinstance(value, str) and len(value) == 2
+    if fits:
+        for end in value:
+            check_number(f"An end of {name}", end, **bounds)
+    if not fits or value[0] > value[1]:
+        raise UsageError(f"{name} is a range (low, high); received {shown(value)}.")
+
+
+def unit_vector(name: str, value: Any, count: int) -> tuple[float, ...]:
+    """Return an axis (3 numbers) or a quaternion (4) of unit length; one that has it stays as it is."""
+    check_numbers(name, value, count)
+    length = math.hypot(*value)
+    if not length > 0:
+        raise UsageError(f"{name} has no length; received {shown(value)}.")
+    # Numbers that are written with a few digits count as they are written.
+    return tuple(value) if abs(length - 1) < 1e-6 else tuple(one / length for one in value)
+
+
+def check_parameters(of: str, function: Callable[..., Any], given: Iterable[str]) -> None:
+    """Check that a function of a :class:`~robotics_bridge.tasks.terms.StepContext` can be called by these names.
+
+    It takes the context first. Messages call it ``of`` (``reward 'work' of task 'mine'``).
+    """
+    if not callable(function):
+        raise UsageError(f"The {of} needs a function of a step; received {shown(function)}.")
+    try:
+        signature = inspect.signature(function)
+    except ValueError:  # Written in C, which tells no parameters.
+        return
+    own = list(signature.parameters.values())[1:]
+    if not any(one.kind is one.VAR_KEYWORD for one in own):
+        check_each(f"parameter of {of}", given, [one.name for one in own if one.kind is not one.VAR_POSITIONAL])
+    try:
+        signature.bind(None, **dict.fromkeys(given))
+    except TypeError as error:
+        raise UsageError(f"The {of} cannot be called: {error}.") from None
+
+
+@dataclass(frozen=True, kw_only=True)
+class ContactModel:
+    """Compliance of all contacts (MuJoCo's ``solref`` and ``solimp``), physics steps, and the scale of the drives."""
+
+    time_constant: float = 0.02
+    """Time in which the solver takes overlap away [s]; the published engine's default."""
+    damping_ratio: float = 1.0
+    """Damping of that approach; 1 is critical."""
+    impedance: tuple[float, float, float] = (0.9, 0.95, 0.001)
+    """Share of the constraint that is enforced at no overlap and at a full one, and the depth of a full one [m]."""
+    substeps: int = 1
+    """Physics steps within the solver's ``timestep``; drives and sensors keep the rate of that."""
+    drive_scale: float = 1.0
+    """Factor on stiffness, damping, effort and armature of the hand's drives. Free motion depends on their ratios
+    alone, so it stays the same; the force of a blocked finger and the blow of a fast one become smaller."""
+
+    def __post_init__(self) -> None:
+        check_fields(self, "time_constant", "damping_ratio", "drive_scale", above=0, of="contacts.{}")
+        check_fields(self, "substeps", least=1, most=100, whole=True, of="contacts.{}")
+        low, high, width = self.impedance
+        if not (0 < low <= high < 1 and width > 0):
+            raise UsageError(
+                "contacts.impedance is two shares between 0 and 1 in order, and a depth above 0 (m); received "
+                f"{self.impedance}."
+            )
+
+
+CONTACTS = {
+    "published": ContactModel(),
+    "firm": ContactModel(time_constant=0.006, substeps=2, drive_scale=0.08),
+}
+"""Named contact models. Under ``published`` a block lies millimetres inside the fingers that press it with the released
+efforts; ``firm``, on which we train, keeps 95 % of the contacts below 1 mm and of the forces below 20 N
+(docs/tasks.md)."""
+
+
+def contacts_name(contacts: ContactModel) -> str:
+    """Return the name of a contact model, ``its own`` for one without."""
+    return next((name for name, model in CONTACTS.items() if model == contacts), "its own")
+
+
+def set_contacts(model: Any, contacts: ContactModel) -> None:
+    """Give all geometries of a ``mujoco.MjModel`` this compliance; MuJoCo's sigmoid keeps its middle and power."""
+    model.geom_solref[:] = contacts.time_constant, contacts.damping_ratio
+    model.geom_solimp[:, :3] = contacts.impedance
+
 
 SCHEDULES = ("adaptive", "fixed")
 BOUNDED = "robotics_bridge.policies.training.bounded_ppo:BoundedPPO"

@@ -12,12 +12,19 @@ from brainbench.core.errors import UsageError, check_each, check_name
 from brainbench.core.reading.ranges import check_fields, check_number, check_numbers
 from brainbench.core.rotations import TURN
 from robotics_bridge.tasks import terms
-from robotics_bridge.tasks.checks import check_parameters, check_range, unit_vector
-from robotics_bridge.tasks.contact_model import CONTACTS, ContactModel
 from robotics_bridge.tasks.goals import Goal
 from robotics_bridge.tasks.objects import PRIMITIVES, ObjectShape
-from robotics_bridge.tasks.settings import AuxiliaryDecoder, StudentSettings, TeacherSettings
-from robotics_bridge.tasks.step_context import TaskScene, TaskState
+from robotics_bridge.tasks.settings import (
+    CONTACTS,
+    AuxiliaryDecoder,
+    ContactModel,
+    StudentSettings,
+    TeacherSettings,
+    check_parameters,
+    check_range,
+    unit_vector,
+)
+from robotics_bridge.tasks.terms import TaskScene, TaskState
 
 Range = tuple[float, float]
 """Lower and upper bound of a uniform distribution."""
@@ -218,7 +225,7 @@ class Task:
     """``grasps``: start from sampled grasps instead of the placement."""
     solver: Solver = Solver()
     contacts: ContactModel = CONTACTS["published"]
-    """Firmness of contacts; names of :data:`~robotics_bridge.tasks.contact_model.CONTACTS` on the command line."""
+    """Firmness of contacts; names of :data:`~robotics_bridge.tasks.settings.CONTACTS` on the command line."""
     taxel_twist: float | None = None
     """Torsional friction of the force taxels [N·m·s], by the published law, where it is 2; None: taxels that hold what
     they touch and add up to the engine's contact forces."""

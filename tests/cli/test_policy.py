@@ -162,7 +162,7 @@ def test_a_policy_plays_in_the_contacts_that_it_was_trained_in_unless_told_other
 
 def test_a_student_plays_with_its_own_touch_and_is_exported(tmp_path: Path) -> None:
     from robotics_bridge.deploy.session import read_deployed
-    from robotics_bridge.tasks.contact_model import CONTACTS
+    from robotics_bridge.tasks.settings import CONTACTS
 
     name, file = "in_palm_rotate.student", tmp_path / "policy.onnx"
     out = json.loads(_run("play", "in_palm_rotate", "--agent", name, "--seconds", "0.2", "--json"))

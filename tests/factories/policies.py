@@ -18,7 +18,7 @@ from robotics_bridge.policies.shipped import FOLDER
 from robotics_bridge.policies.student import TactilePolicy
 from robotics_bridge.policies.training.distill_config import DistillConfig
 from robotics_bridge.policies.training.student_files import build_student
-from robotics_bridge.tasks.contact_model import CONTACTS
+from robotics_bridge.tasks.settings import CONTACTS
 from robotics_bridge.tasks.task import TASK_VERSION
 
 

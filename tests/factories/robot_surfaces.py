@@ -17,7 +17,7 @@ from robotics_bridge.policies.training.student_files import load_student
 from robotics_bridge.policies.training.sweep import StudentSweep, read_sweep
 from robotics_bridge.sensors.calibration.log import read_log
 from robotics_bridge.sensors.noise.model import Noise
-from robotics_bridge.tasks.overrides import apply_overrides
+from robotics_bridge.tasks.registry import apply_overrides
 from tests.factories.policies import contract_of, student_folder
 from tests.factories.reading_trials import Surface, not_finite, numbers, typed, written, written_json
 

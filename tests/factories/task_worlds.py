@@ -11,7 +11,7 @@ import torch
 from robotics_bridge.envs.step import ActionMap
 from robotics_bridge.hands.observations import observation_type
 from robotics_bridge.policies.encoders.arms import EncoderConfig
-from robotics_bridge.tasks.contact_model import ContactModel
+from robotics_bridge.tasks.settings import ContactModel
 
 
 class TouchWorld:

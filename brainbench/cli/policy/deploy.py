@@ -79,7 +79,7 @@ def deploy(
     from robotics_bridge.deploy import session
     from robotics_bridge.deploy.controller import check_duration, realtime
     from robotics_bridge.deploy.driver import DriverRequest, open_driver
-    from robotics_bridge.tasks.contact_model import contacts_name
+    from robotics_bridge.tasks.settings import contacts_name
 
     deployed = session.read_deployed(policy)
     contract = deployed.contract

@@ -21,7 +21,7 @@ HandOption = Annotated[str, typer.Option(help="xhand1, sharpa, or a URDF or MJCF
 EnvsOption = Annotated[int, typer.Option("--envs", help="Environments at once.")]
 DeviceOption = Annotated[str, typer.Option(help="cpu, or cuda for MuJoCo Warp.")]
 TaskFileOption = Annotated[Path | None, typer.Option(help="Python file that registers a task of your own.")]
-ENV = "robotics_bridge.envs.options:EnvOptions"
+ENV = "robotics_bridge.envs.simulation:EnvOptions"
 TOUCH = ("observe", "placement", "resolution", "noisy")
 """Fields of the options of an environment that a student fixes."""
 
@@ -59,7 +59,7 @@ class World:
         """
         from robotics_bridge import tasks
         from robotics_bridge.policies.fit import with_contacts_of
-        from robotics_bridge.tasks.overrides import apply_overrides
+        from robotics_bridge.tasks.registry import apply_overrides
 
         read_task_file(self.task_file)
         task, change = tasks.load(self.task, self.config), self.change or []
@@ -104,7 +104,7 @@ def agent_of(name: str, env: Env, *, seed: int = 0) -> Any:
 def touch_of(names: list[str]) -> dict[str, Any]:
     """Return the tactile options of the student among some agents; nothing if there is none."""
     from brainbench.core.errors import UsageError
-    from robotics_bridge.policies.schema import from_json
+    from robotics_bridge.policies.contract import from_json
     from robotics_bridge.policies.shipped import stored
 
     found: dict[str, dict[str, Any]] = {}

@@ -19,7 +19,7 @@ def list_tasks() -> Output:
     from robotics_bridge import tasks
     from robotics_bridge.policies.contract import trained_contacts
     from robotics_bridge.policies.shipped import list_policies, stored
-    from robotics_bridge.tasks.contact_model import contacts_name
+    from robotics_bridge.tasks.settings import contacts_name
 
     found = []
     for name in tasks.list_tasks():
@@ -69,7 +69,7 @@ def play(
     """Run an agent in one environment of a task and show what happens, as numbers and as a film."""
     from brainbench.core.figures.style import check_format
     from brainbench.core.reading.ranges import check_number
-    from robotics_bridge.tasks.contact_model import contacts_name
+    from robotics_bridge.tasks.settings import contacts_name
 
     for flag, number, bound in (("--seconds", seconds, 0), ("--rate", rate, 0), ("--width (pixels)", width, 63)):
         check_number(flag, number, above=bound)
@@ -156,7 +156,7 @@ def evaluate(
     """
     from brainbench.core.reading.ranges import check_number
     from robotics_bridge.policies.evaluate import evaluate as run
-    from robotics_bridge.tasks.contact_model import contacts_name
+    from robotics_bridge.tasks.settings import contacts_name
 
     check_number("--seeds", seeds, least=1)
     world.check(agents or [])

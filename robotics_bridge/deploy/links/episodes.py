@@ -24,7 +24,7 @@ from robotics_bridge import hands
 from robotics_bridge.deploy.driver import HandReading
 from robotics_bridge.deploy.session import PressureCalibration
 from robotics_bridge.policies.contract import PolicyContract
-from robotics_bridge.policies.encoders.finger_axes import FingerAxes, finger_axes_of
+from robotics_bridge.policies.encoders.taxel_grid import FingerAxes, finger_axes_of
 
 VERSION = "v3.0"
 PARTS = ("observation.state", "observation.velocity", "action", "observation.tactile", "observation.wrench")

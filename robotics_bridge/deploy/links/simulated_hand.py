@@ -30,8 +30,8 @@ from robotics_bridge.hands.scenes import ARMATURE, OBJECT, holding
 from robotics_bridge.physics import MujocoEngine
 from robotics_bridge.policies.contract import PolicyContract
 from robotics_bridge.sensors import SensorSuite
-from robotics_bridge.tasks.contact_model import CONTACTS, ContactModel, set_contacts
 from robotics_bridge.tasks.scenes import drives_of
+from robotics_bridge.tasks.settings import CONTACTS, ContactModel, set_contacts
 
 HOLD_AFTER = 0.25
 """Seconds without a command after which the hand holds by itself."""

@@ -23,13 +23,9 @@ from brainbench.models.cells import GRU
 from brainbench.models.registry import list_models
 from robotics_bridge import hands
 from robotics_bridge.hands.observations import observation_type
-from robotics_bridge.policies.encoders.calibration import HandCalibration
-from robotics_bridge.policies.encoders.conv_gru import MOST_CELLS, ConvGRUProducts
-from robotics_bridge.policies.encoders.front_end import LEARNING, FrontEnd, Learning
-from robotics_bridge.policies.encoders.reservoir import UNITS, EchoState, FeatureNorm
-from robotics_bridge.policies.encoders.taxel_graph import TaxelGraph
-from robotics_bridge.policies.encoders.taxel_grid import TaxelGrid
-from robotics_bridge.policies.encoders.timing import TIMES, Time
+from robotics_bridge.policies.encoders.front_end import LEARNING, TIMES, FrontEnd, HandCalibration, Learning, Time
+from robotics_bridge.policies.encoders.recurrent import MOST_CELLS, UNITS, ConvGRUProducts, EchoState, FeatureNorm
+from robotics_bridge.policies.encoders.taxel_grid import TaxelGraph, TaxelGrid
 
 AUTO = "auto"
 """The published choice: ``tactile_convrnn`` where every link has a grid of taxels, ``rnn`` elsewhere."""
@@ -60,7 +56,7 @@ class EncoderConfig:
     units: int = _HIDDEN
     """Units of the LSTM of the arm ``rnn``."""
     time: Time = "native"
-    """Clock of a network (:mod:`~robotics_bridge.policies.encoders.timing`)."""
+    """Clock of a network (:mod:`~robotics_bridge.policies.encoders.front_end`)."""
     learning: Learning = "frozen"
     """Learning of a network: ``frozen`` or ``finetuned``."""
     seed: int = 0

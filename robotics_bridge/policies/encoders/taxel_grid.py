@@ -18,22 +18,186 @@ Letters: B batch, S sub-step, N item (an active taxel, or a link of the ``agg_``
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.sparse.csgraph import laplacian
+from scipy.spatial.distance import cdist
 from torch import nn
 
 from brainbench.core.contracts import CHANNELS, GRID_SHAPE
+from brainbench.core.devices import mujoco_module
 from brainbench.core.errors import UsageError
 from robotics_bridge import hands
 from robotics_bridge.hands import Hand, layouts
 from robotics_bridge.hands.layouts import Layout
 from robotics_bridge.hands.observations import observation_type
-from robotics_bridge.policies.encoders.finger_axes import FingerAxes, finger_axes_of
 from robotics_bridge.sensors.probes.placement import Probes
+
+mujoco = mujoco_module()
+
+FINGERS = ("thumb", "index", "middle", "ring", "pinky")
+"""Rows of the grid, from the radial side on."""
+_WORDS = {
+    "thumb": ("thumb", "th"),
+    "index": ("index", "ff", "fore"),
+    "middle": ("middle", "mid", "mf"),
+    "ring": ("ring", "rf"),
+    "pinky": ("pinky", "little", "lf", "small"),
+}
+_SAME = 1e-4
+"""Points nearer along a finger axis than this (m) are never parted."""
+
+
+def finger_rows(fingers: Mapping[str, Sequence[str]]) -> dict[str, int]:
+    """Return finger → row of the grid; a finger that the hand lacks leaves its row empty.
+
+    Names are read in English or as the usual two letters (``ff``, ``mf``, ``rf``, ``lf``, ``th``). If one of them says
+    nothing, the fingers take the rows in their own order.
+
+    >>> finger_rows({"index": (), "thumb": ()})
+    {'index': 1, 'thumb': 0}
+    """
+    if len(fingers) > GRID_SHAPE[0]:
+        raise UsageError(f"The grid has rows for {GRID_SHAPE[0]} fingers; this hand has {len(fingers)}.")
+    rows: dict[str, int] = {}
+    for finger in fingers:
+        # Fingers of files are named by their tips: rh_ffdistal, thumbtip.
+        parts = [part.removesuffix("distal").removesuffix("tip") for part in re.findall("[a-z]+", finger.lower())]
+        found = [row for row, name in enumerate(FINGERS) if any(word in parts for word in _WORDS[name])]
+        if len(found) != 1 or found[0] in rows.values():
+            return {name: row for row, name in enumerate(fingers)}
+        rows[finger] = found[0]
+    return rows
+
+
+@dataclass(frozen=True, eq=False)
+class FingerAxes:
+    """The fingers of a hand in its reference posture, and where their sites begin (:func:`finger_axes_of`)."""
+
+    place: Mapping[str, tuple[NDArray[np.float64], NDArray[np.float64]]]
+    """Link → rotation [3, 3] to the palm's axes and origin [3] (m)."""
+    chains: Mapping[int, tuple[str, ...]]
+    """Row → links from palm to tip."""
+    joints: Mapping[int, NDArray[np.float64]]
+    """Row → corners [n, 3] of its axis: the wrist, the origins of its links, and a point beyond the tip."""
+    palm: str
+    edges: NDArray[np.float64]
+    """[5, 6]: lengths along the axis, counted from the far end, at which one site ends and the next begins."""
+    centers: NDArray[np.float64]
+    """[5, 7, 3]: middle of every site; the palm's origin where a site is empty."""
+
+    def to_palm(self, link: str, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return points [N, 3] of a link's frame in that of the palm."""
+        turn, origin = self.place[link]
+        return points @ turn.T + origin
+
+    def sites(self, link: str, points: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return the rows [N] and columns [N] of points [N, 3] on a link (its frame)."""
+        rows, lengths = self.locate(link, self.to_palm(link, points))
+        # The number of edges that a length lies beyond.
+        return rows, (self.edges[rows] <= lengths[:, None]).sum(axis=1)
+
+    def locate(self, link: str, points: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Return the row [N] of points (palm frame) and their lengths [N] along it from its far end."""
+        for row, chain in self.chains.items():
+            if link in chain:
+                start = 1 + chain.index(link)
+                return np.full(len(points), row), _along(self.joints[row], start, points)[0]
+        if link != self.palm:
+            raise UsageError(f"The link {link!r} is neither the palm {self.palm!r} nor part of a finger.")
+        # A taxel of the palm belongs to the finger axis nearest to it, whose first segment leads over the palm.
+        order = sorted(self.chains)
+        found = [_along(self.joints[row], 0, points) for row in order]
+        nearest = np.argmin([distance for _, distance in found], axis=0)
+        lengths = np.stack([length for length, _ in found])[nearest, np.arange(len(points))]
+        return np.array(order)[nearest], lengths
+
+
+def finger_axes_of(hand: Hand, reference: Layout) -> FingerAxes:
+    """Return the finger axes of a hand; sites are the seven quantiles of a reference layout's taxels along it."""
+    data = mujoco.MjData(hand.model)
+    mujoco.mj_kinematics(hand.model, data)
+    palm = hand.model.body(hand.palm).id
+    turn, origin = data.xmat[palm].reshape(3, 3), data.xpos[palm]
+    place = {}
+    for link in (hand.palm, *(name for chain in hand.fingers.values() for name in chain)):
+        body = hand.model.body(link).id
+        place[link] = (turn.T @ data.xmat[body].reshape(3, 3), (data.xpos[body] - origin) @ turn)
+    rows = finger_rows(hand.fingers)
+    chains = {rows[finger]: tuple(chain) for finger, chain in hand.fingers.items()}
+    joints = {row: _corners(chain, place, reference) for row, chain in chains.items()}
+    edges = np.full((GRID_SHAPE[0], GRID_SHAPE[1] - 1), np.inf)
+    axes = FingerAxes(place, chains, joints, hand.palm, edges, np.zeros((*GRID_SHAPE, 3)))
+    _lay_sites(axes, reference)
+    return axes
+
+
+def _corners(chain: tuple[str, ...], place: Mapping[str, Any], reference: Layout) -> NDArray[np.float64]:
+    """Return the corners of a finger axis: wrist, joints, and a point beyond the tip in line with the last phalanx."""
+    corners = [np.zeros(3), *(place[link][1] for link in chain)]
+    steps = [after - before for before, after in pairwise(corners[1:])]
+    # Links whose origins coincide have no direction; the last two that differ show where the finger points.
+    long = [step for step in steps if np.linalg.norm(step) > _SAME]
+    direction = long[-1] if long else corners[-1] - corners[0]
+    tip = reference.get(chain[-1])
+    if not long and tip is not None:
+        turn, origin = place[chain[-1]]
+        direction = tip.position[tip.active].mean(axis=0) @ turn.T + origin - corners[-1]
+    length = np.linalg.norm(direction)
+    unit = direction / length if length > 0 else np.array([0.0, 0.0, 1.0])
+    # Half a metre is beyond the tip of any hand, and sites are quantiles: the origin of the length is free.
+    return np.array([*corners, corners[-1] + 0.5 * unit])
+
+
+def _along(
+    corners: NDArray[np.float64], segment: int, points: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return how far along one segment points [N, 3] lie from the axis's far end, and their distance from it."""
+    lengths = np.linalg.norm(np.diff(corners, axis=0), axis=1)
+    rest = lengths[segment + 1 :].sum()
+    step = corners[segment + 1] - corners[segment]
+    size = lengths[segment]
+    # Nearest point of the segment: projection on it, held between its ends.
+    share = np.clip((points - corners[segment]) @ step / size**2, 0, 1) if size > 0 else np.zeros(len(points))
+    distance = np.linalg.norm(points - corners[segment] - share[:, None] * step, axis=1)
+    return rest + (1 - share) * size, distance
+
+
+def _lay_sites(axes: FingerAxes, reference: Layout) -> None:
+    columns = GRID_SHAPE[1]
+    parts = []
+    for link, probes in reference.items():
+        points = axes.to_palm(link, probes.position[probes.active])
+        row, length = axes.locate(link, points)
+        parts.append(np.column_stack([row, length, points]))
+    table = np.concatenate(parts) if parts else np.zeros((0, 5))
+    for row in axes.chains:
+        mine = table[table[:, 0] == row]
+        if not len(mine):
+            continue
+        steps = np.round(mine[:, 1] / _SAME)
+        values, counts = np.unique(steps, return_counts=True)
+        # Taxels at one length stay together, so a quantile is that of their middle rank.
+        site = np.floor(columns * (np.cumsum(counts) - counts / 2) / counts.sum()).astype(int)
+        for column in range(1, columns):
+            before, after = values[site < column], values[site >= column]
+            # The edge lies half way between the last taxel before it and the first behind, so that rounding parts no
+            # taxels.
+            low = before.max() if len(before) else values.min()
+            high = after.min() if len(after) else np.inf
+            axes.edges[row, column - 1] = _SAME * (low + high) / 2 if len(before) else 0.0
+        for column in range(columns):
+            members = np.isin(steps, values[site == column])
+            if members.any():
+                axes.centers[row, column] = mine[members, 2:].mean(axis=0)
+
 
 SITES = GRID_SHAPE[0] * GRID_SHAPE[1]
 """Cells of the grid."""
@@ -148,3 +312,58 @@ _WRENCHES: Mapping[str, Any] = {
     "agg_force": lambda points, normals: _vector(points, -np.eye(3)[::-1]),
 }
 """Observation type → the maps [N, 6, C] from its values to wrenches about the link's origin, in its axes."""
+
+
+class TaxelGraph(nn.Module):
+    """Taxels by the graph of each link instead of the grid: its :data:`SITES` smoothest patterns, or all if fewer.
+
+    A graph joins the taxels of a link, each pair with the weight exp(−d²/2ℓ²) of its distance d, where ℓ is the
+    distance to the nearest taxel in the median of the link. Eigenvectors φ of its Laplacian D − W are patterns over the
+    link: first the mean of all taxels, then ever finer ones. A pattern carries Σ √n φ_i (f_i, m_i) of the n taxels of
+    its link, so that the first one is the link's wrench. No link knows of another. Letter: K pattern.
+    """
+
+    patterns: torch.Tensor
+    """[K, N]."""
+    middle: torch.Tensor
+    """[N, 3]: mean of the taxels of a taxel's link, about which moments are taken (m, axes of the link)."""
+
+    def __init__(self, layout: Layout, observe: str = "force_torque") -> None:
+        super().__init__()
+        if observe != "force_torque":
+            observation_type(observe)  # an unknown name has an error of its own
+            raise UsageError(f"The graph of taxels reads 'force_torque'; received {observe!r}.")
+        points = [probes.position[probes.active] for probes in layout.values()]
+        sizes = [len(one) for one in points]
+        found: list[tuple[float, NDArray[Any]]] = []
+        for number, one in enumerate(points):
+            for value, pattern in zip(*_patterns(one), strict=True):
+                whole = [np.zeros(size) for size in sizes]
+                whole[number] = np.sqrt(len(one)) * pattern
+                found.append((value, np.concatenate(whole)))
+        # Stable: patterns that are equally smooth keep the order of the links.
+        kept = sorted(found, key=lambda item: item[0])[:SITES]
+        middle = np.concatenate([np.tile(one.mean(0), (len(one), 1)) for one in points if len(one)])
+        # Not weights: they follow from the layout, so files of weights need not hold them.
+        self.cells: int = len(kept)
+        """K."""
+        self.register_buffer("patterns", torch.tensor(np.array([one for _, one in kept])).float(), persistent=False)
+        self.register_buffer("middle", torch.from_numpy(middle).float(), persistent=False)
+
+    def wrenches(self, taxels: torch.Tensor) -> torch.Tensor:
+        """Return the patterns [B, S, K, 6] of readings [B, S, N, 6] (N, N·m)."""
+        force, moment = taxels.split(3, -1)
+        moment = moment - torch.linalg.cross(self.middle.expand_as(force), force)
+        return self.patterns @ torch.cat((force, moment), -1)
+
+
+def _patterns(points: NDArray[np.float64]) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Return eigenvalues [n], from 0 up, and patterns [n, n] of a link's taxels [n, 3]."""
+    if len(points) < 2:
+        return np.zeros(len(points)), np.eye(len(points))
+    distance = cdist(points, points)
+    spacing = np.median(np.sort(distance, axis=1)[:, 1])
+    weight = np.exp(-0.5 * (distance / spacing) ** 2)
+    np.fill_diagonal(weight, 0.0)
+    values, vectors = np.linalg.eigh(laplacian(weight))
+    return np.round(values, 9), vectors.T

@@ -45,7 +45,7 @@ def probe(
     from brainbench.core.errors import UsageError
     from robotics_bridge.hands.layouts import write_probes
     from robotics_bridge.policies.readouts import probe as readouts
-    from robotics_bridge.tasks.contact_model import contacts_name
+    from robotics_bridge.tasks.settings import contacts_name
 
     options = replace(options, arms=tuple(arm or ()), networks=tuple(network or ()))
     if layout is not None and options.place is None:

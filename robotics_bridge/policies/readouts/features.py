@@ -19,12 +19,9 @@ from brainbench.models.graph.temporal_graph import TemporalGraph
 from brainbench.models.registry import locate_model
 from robotics_bridge.envs.env import Env
 from robotics_bridge.hands.observations import TAXELS_IN_CONTACT
-from robotics_bridge.policies.encoders.calibration import HandCalibration
-from robotics_bridge.policies.encoders.front_end import FrontEnd
-from robotics_bridge.policies.encoders.reservoir import EchoState
-from robotics_bridge.policies.encoders.taxel_graph import TaxelGraph
-from robotics_bridge.policies.encoders.taxel_grid import TaxelGrid
-from robotics_bridge.policies.encoders.timing import Time
+from robotics_bridge.policies.encoders.front_end import FrontEnd, HandCalibration, Time
+from robotics_bridge.policies.encoders.recurrent import EchoState
+from robotics_bridge.policies.encoders.taxel_grid import TaxelGraph, TaxelGrid
 from robotics_bridge.policies.evaluate import Acting, forget
 from robotics_bridge.sensors.noise.model import PRESETS
 

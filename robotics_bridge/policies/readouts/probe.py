@@ -18,8 +18,7 @@ from brainbench.core.progress import Progress
 from robotics_bridge.envs.env import Env
 from robotics_bridge.hands.layouts import PLACEMENTS, Layout, active_count
 from robotics_bridge.policies.encoders.front_end import FrontEnd
-from robotics_bridge.policies.encoders.taxel_graph import TaxelGraph
-from robotics_bridge.policies.encoders.taxel_grid import TaxelGrid
+from robotics_bridge.policies.encoders.taxel_grid import TaxelGraph, TaxelGrid
 from robotics_bridge.policies.evaluate import Acting
 from robotics_bridge.policies.readouts.features import (
     ARMS,

@@ -15,8 +15,7 @@ from robotics_bridge.hands.layouts import check_names
 from robotics_bridge.hands.observations import observation_type
 from robotics_bridge.policies.encoders.arms import ARMS, AUTO, EncoderConfig
 from robotics_bridge.policies.student import EMBEDDERS
-from robotics_bridge.tasks.contact_model import CONTACTS
-from robotics_bridge.tasks.settings import LOSSES, StudentSettings, check_widths
+from robotics_bridge.tasks.settings import CONTACTS, LOSSES, StudentSettings, check_widths
 
 _HIDDEN = (512, 256, 128)
 _SHARED = ("hand", "observe", "placement", "resolution")

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any
 from brainbench.core.errors import UsageError, check_name
 from robotics_bridge.policies.student import TACTILE
 from robotics_bridge.policies.training.distill_config import DistillConfig
-from robotics_bridge.tasks.contact_model import CONTACTS, contacts_name
-from robotics_bridge.tasks.settings import TeacherSettings
+from robotics_bridge.tasks.settings import CONTACTS, TeacherSettings, contacts_name
 from robotics_bridge.tasks.task import GROUPS, check_measured
 
 if TYPE_CHECKING:

@@ -17,9 +17,9 @@ from brainbench.core.reading.regular import readable
 from brainbench.core.reading.tensors import read_tensors
 from brainbench.core.runs.state import odd_shape
 from robotics_bridge.hands.layouts import check_probes
+from robotics_bridge.policies.contract import JOINTS, Groups, from_json, shapes_of
 from robotics_bridge.policies.encoders.arms import EncoderConfig
 from robotics_bridge.policies.fit import check_version
-from robotics_bridge.policies.schema import JOINTS, Groups, from_json, shapes_of
 from robotics_bridge.policies.shipped import policy_path, student_folder
 from robotics_bridge.policies.student import TACTILE, TactilePolicy
 from robotics_bridge.policies.training.distill_config import DistillConfig

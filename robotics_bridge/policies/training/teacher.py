@@ -32,9 +32,9 @@ from brainbench.core.runs.stopping import Stop, occupied
 from brainbench.core.writing.tensors import write_tensors
 from robotics_bridge.envs.rsl_rl import RslRlEnv
 from robotics_bridge.policies.acting import ActingModel
+from robotics_bridge.policies.contract import from_json
 from robotics_bridge.policies.evaluate import Policy
 from robotics_bridge.policies.fit import check_fit, check_version
-from robotics_bridge.policies.schema import from_json
 from robotics_bridge.policies.shipped import SENSING, policy_path
 from robotics_bridge.policies.training.distill import describe_run
 from robotics_bridge.policies.training.sensing import sensed_groups, sensing_policy

@@ -27,8 +27,8 @@ from robotics_bridge import tasks
 from robotics_bridge.envs import Env
 from robotics_bridge.envs.simulation import Simulation
 from robotics_bridge.envs.step import apply_action, compute_step
-from robotics_bridge.tasks.step_context import StepContext
 from robotics_bridge.tasks.task import Reward
+from robotics_bridge.tasks.terms import StepContext
 
 TOUCHING = {"observe": "force_torque", "resolution": "low", "noisy": True, "link_pose": True}
 CASES = [("in_palm_rotate", TOUCHING), ("in_hand_repose", {}), ("screwdriver", {}), ("hot_ball", {})]

@@ -9,7 +9,7 @@ import torch
 
 from robotics_bridge import tasks
 from robotics_bridge.envs import Env
-from robotics_bridge.tasks.contact_model import CONTACTS
+from robotics_bridge.tasks.settings import CONTACTS
 
 
 def _pair(contacts: str) -> tuple[Env, Env]:

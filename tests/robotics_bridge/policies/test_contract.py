@@ -11,7 +11,7 @@ import pytest
 
 from brainbench.core.errors import BrainbenchError, DataError, UsageError
 from robotics_bridge.policies.contract import PolicyContract
-from robotics_bridge.tasks.contact_model import CONTACTS
+from robotics_bridge.tasks.settings import CONTACTS
 from tests.factories.mutations import mutate, mutate_text
 from tests.factories.policies import contract_of
 

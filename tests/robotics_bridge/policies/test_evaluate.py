@@ -12,7 +12,7 @@ from brainbench.core.rotations import about, multiply
 from robotics_bridge import tasks
 from robotics_bridge.envs import Env
 from robotics_bridge.policies.evaluate import PolicyEvaluation, agent, evaluate
-from robotics_bridge.tasks.overrides import apply_overrides
+from robotics_bridge.tasks.registry import apply_overrides
 from robotics_bridge.tasks.task import Placement
 
 

@@ -16,8 +16,8 @@ from robotics_bridge import hands, tasks
 from robotics_bridge.policies.contract import trained_contacts
 from robotics_bridge.policies.fit import check_fit, check_hand, with_contacts_of
 from robotics_bridge.policies.shipped import stored
-from robotics_bridge.tasks.contact_model import CONTACTS, ContactModel
-from robotics_bridge.tasks.overrides import apply_overrides
+from robotics_bridge.tasks.registry import apply_overrides
+from robotics_bridge.tasks.settings import CONTACTS, ContactModel
 from robotics_bridge.tasks.task import TASK_VERSION
 from tests.factories.policies import teacher_in
 from tests.factories.robot_surfaces import MJCF

@@ -14,8 +14,7 @@ from tensordict import TensorDict
 from brainbench import load_model
 from brainbench.core.errors import DataError, UsageError
 from robotics_bridge.policies.encoders.arms import ARMS, EncoderConfig, RunningScale
-from robotics_bridge.policies.export import compare, export_policy
-from robotics_bridge.policies.runners import read_policy
+from robotics_bridge.policies.export import compare, export_policy, read_policy
 from robotics_bridge.policies.student import StepPolicy, TactilePolicy
 from robotics_bridge.policies.training.distill_config import DistillConfig
 

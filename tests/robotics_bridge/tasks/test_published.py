@@ -117,8 +117,7 @@ def test_groups_are_those_of_table_4_7(name: str) -> None:
 
 
 def test_hot_ball_is_that_of_section_4_6_3() -> None:
-    from robotics_bridge.tasks.hot_ball import BALLS, DIAMETER, SIDE
-    from robotics_bridge.tasks.thermometers import ThermalSettings
+    from robotics_bridge.tasks.hot_ball import BALLS, DIAMETER, SIDE, ThermalSettings
 
     task, thermal = tasks.load("hot_ball", "published"), ThermalSettings()
     assert (SIDE, BALLS, DIAMETER, task.copies, task.episode) == (0.5, 8, 0.08, 8, 20.0)
@@ -290,7 +289,7 @@ RELEASED_GOALS = {
 @pytest.mark.parametrize("hand", ["xhand1", "sharpa"])
 def test_grasps_are_sought_as_released(reference: Path, hand: str) -> None:
     yaml = pytest.importorskip("yaml")
-    from robotics_bridge.envs.grasps import SETTINGS
+    from robotics_bridge.envs.reset import SETTINGS
     from robotics_bridge.tasks.screwdriver import POSES, REST
 
     c = yaml.safe_load((reference / "tasks" / f"screwdrivers_{hand}.yaml").read_text())

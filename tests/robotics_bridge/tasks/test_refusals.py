@@ -13,11 +13,11 @@ from brainbench.core.errors import UsageError
 from robotics_bridge import hands, tasks
 from robotics_bridge.tasks import terms
 from robotics_bridge.tasks.goals import SteppingRotation, TimedRotation
+from robotics_bridge.tasks.hot_ball import ThermalSettings
 from robotics_bridge.tasks.objects import ObjectPrimitive, ObjectShape, ball
 from robotics_bridge.tasks.scenes import build
 from robotics_bridge.tasks.settings import StudentSettings, TeacherSettings
 from robotics_bridge.tasks.task import ActuatorRandomisation, Ending, ObjectRandomisation, Placement, Push, Success
-from robotics_bridge.tasks.thermometers import ThermalSettings
 
 
 def _changed(**changes: Any) -> tasks.Task:

@@ -1,4 +1,4 @@
-"""Tasks as data: registry, goals, objects, scenes, grasps, thermometers."""
+"""Tasks as data: registry, goals, objects, scenes, reset, thermometers."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ import torch
 from brainbench.core.errors import UsageError
 from brainbench.core.rotations import about, angle_of, conjugate, multiply, rotate, six_numbers, twist_and_swing
 from robotics_bridge import hands, tasks
-from robotics_bridge.envs import grasps
+from robotics_bridge.envs import reset
 from robotics_bridge.envs.step import step_context
 from robotics_bridge.tasks import terms
 from robotics_bridge.tasks.goals import SteppingRotation, TimedRotation
 from robotics_bridge.tasks.objects import CUBES, box, cylinder, screwdriver, slots, with_sizes
-from robotics_bridge.tasks.overrides import apply_overrides
+from robotics_bridge.tasks.registry import apply_overrides
 from robotics_bridge.tasks.scenes import build, drives_of, palm_up
 from robotics_bridge.tasks.task import ObjectRandomisation, Task
 
@@ -227,15 +227,15 @@ def test_grasps_of_another_friction_or_solver_are_sampled_anew(tmp_path, monkeyp
         sampled.append((task.friction, task.solver.timestep))
         return {"joints": np.zeros((16, 12)), "target": np.zeros((16, 12)), "object": np.zeros((16, 7))}
 
-    monkeypatch.setattr(grasps, "sample", sample)
+    monkeypatch.setattr(reset, "sample", sample)
     for changes in ([], ["friction=0.8"], ["solver.timestep=0.004"], [], ["friction=0.8"]):
         changed = apply_overrides(task, changes)
-        grasps.grasps_for(changed, hand, build(changed, hand))
+        reset.grasps_for(changed, hand, build(changed, hand))
     assert sampled == [(1.0, 0.005)] * 4 + [(0.8, 0.005)] * 4 + [(1.0, 0.004)] * 4
 
 
 def test_the_latch_needs_the_heat_of_the_hot_ball() -> None:
-    from robotics_bridge.tasks.thermometers import ThermalSettings, progress
+    from robotics_bridge.tasks.hot_ball import ThermalSettings, progress
 
     thermal = ThermalSettings()
     reading = torch.tensor([10.0, 22.0, 33.5, 42.3, 60.0])
@@ -253,7 +253,7 @@ def test_the_latch_needs_the_heat_of_the_hot_ball() -> None:
 
 @pytest.mark.slow
 def test_a_hand_that_holds_the_hot_ball_succeeds_by_default_alone() -> None:
-    from robotics_bridge.tasks.thermometers import ThermalSettings, Thermometers
+    from robotics_bridge.tasks.hot_ball import ThermalSettings, Thermometers
 
     env = tasks.make("hot_ball", num_envs=2, seed=0, threads=1)
     thermometers: Any = env.state.task_state

@@ -25,8 +25,7 @@ from robotics_bridge.deploy.links.episodes import (
 from robotics_bridge.deploy.session import PressureCalibration
 from robotics_bridge.hands.observations import observe
 from robotics_bridge.policies.contract import PolicyContract
-from robotics_bridge.policies.encoders.finger_axes import finger_axes_of
-from robotics_bridge.policies.encoders.taxel_grid import TaxelGrid
+from robotics_bridge.policies.encoders.taxel_grid import TaxelGrid, finger_axes_of
 
 HAND = hands.load("xhand1")
 TIPS = HAND.tips

@@ -14,7 +14,7 @@ from robotics_bridge.deploy.links.simulated_hand import ShadowTouch, SimulatedHa
 from robotics_bridge.deploy.session import RealTouch
 from robotics_bridge.hands.scenes import closing
 from robotics_bridge.policies.contract import PolicyContract
-from robotics_bridge.tasks.contact_model import CONTACTS
+from robotics_bridge.tasks.settings import CONTACTS
 from tests.robotics_bridge.hands.test_grippers import JAWS, LINK, URDF
 
 HAND = hands.load("xhand1")

@@ -13,7 +13,7 @@ from robotics_bridge import tasks
 from robotics_bridge.policies.contract import trained_contacts
 from robotics_bridge.policies.training.distill_config import DistillConfig
 from robotics_bridge.policies.training.students import calibrated, is_done, train_student
-from robotics_bridge.tasks.contact_model import CONTACTS
+from robotics_bridge.tasks.settings import CONTACTS
 from tests.factories.policies import teacher_in
 from tests.factories.task_worlds import Follower, TouchWorld
 

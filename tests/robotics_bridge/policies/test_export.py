@@ -13,7 +13,7 @@ from onnx import numpy_helper
 from brainbench.core.errors import BrainbenchError, DataError
 from brainbench.core.files import write_json
 from robotics_bridge.deploy.session import read_deployed
-from robotics_bridge.policies.runners import read_policy
+from robotics_bridge.policies.export import read_policy
 from tests.factories.mutations import mutate_text
 from tests.factories.policies import contract_of, export_small
 from tests.factories.reading_trials import time_limit

@@ -6,7 +6,7 @@ import pytest
 
 from brainbench.core.errors import UsageError
 from robotics_bridge import tasks
-from robotics_bridge.tasks.overrides import apply_overrides
+from robotics_bridge.tasks.registry import apply_overrides
 
 TASK = tasks.load("in_palm_rotate")
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from robotics_bridge.policies.encoders.reservoir import EchoState, FeatureNorm
+from robotics_bridge.policies.encoders.recurrent import EchoState, FeatureNorm
 from robotics_bridge.policies.training.distill_config import DistillConfig
 
 

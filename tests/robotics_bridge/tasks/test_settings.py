@@ -10,8 +10,8 @@ import torch
 from brainbench.core.errors import UsageError
 from robotics_bridge import tasks
 from robotics_bridge.envs import Env
-from robotics_bridge.tasks.contact_model import CONTACTS, ContactModel
-from robotics_bridge.tasks.overrides import apply_overrides
+from robotics_bridge.tasks.registry import apply_overrides
+from robotics_bridge.tasks.settings import CONTACTS, ContactModel
 
 TASK = tasks.load("in_palm_rotate")
 
