@@ -1,4 +1,4 @@
-"""``brainbench tactile``: look at tactile sensors, layouts and their speed; calibrate noise."""
+"""``brainbench tactile``: look at tactile sensors, layouts and their speed."""
 
 from __future__ import annotations
 
@@ -7,5 +7,5 @@ import typer
 from brainbench.cli.tactile import commands
 
 app = typer.Typer(no_args_is_help=True, help="Tactile sensors of robot hands: demo, layouts, speed, checks, noise.")
-for _command in (commands.demo, commands.layouts, commands.bench, commands.check, commands.calibrate):
+for _command in (commands.demo, commands.layouts, commands.bench, commands.check):
     app.command(_command.__name__)(_command)

@@ -1,14 +1,13 @@
-"""``brainbench tactile demo | layouts | bench | check | calibrate``."""
+"""``brainbench tactile demo | layouts | bench | check``."""
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from brainbench.cli.destinations import out_file_option, out_folder_option
+from brainbench.cli.destinations import out_folder_option
 from brainbench.cli.output import Output, table, table_of, tracked
 from brainbench.cli.policy.options import HandOption
 
@@ -138,37 +137,3 @@ def check(device: Annotated[str, typer.Option(help="cpu or cuda.")] = "cpu") -> 
     failure = None if all(result["passed"] for result in results) else typer.Exit(1)
     text = table_of(f"Checks on {device}", results, columns)
     return Output({"device": device, "checks": results}, text, failure=failure)
-
-
-def calibrate(
-    log: Annotated[Path, typer.Argument(help="CSV with 'time' (s), probes, and optionally 'reference' and 'episode'.")],
-    out: Annotated[Path | None, out_file_option("Write the preset here (.json).")] = None,
-    max_delay: Annotated[float, typer.Option(help="Longest read delay that is tried (s).")] = 0.5,
-) -> Output:
-    """Fit the noise model to a recording of a real device, with 95 % intervals, and write a preset.
-
-    'reference' holds the true signal in the sensor's unit (a load cell, a stage); without it the device was at rest.
-    Load the preset with robotics_bridge.sensors.Noise.load(path).
-    """
-    from brainbench.core.reading.ranges import check_number
-    from robotics_bridge.sensors.calibration.calibrate import calibrate as fit
-    from robotics_bridge.sensors.calibration.log import read_log
-
-    check_number("--max-delay (s)", max_delay, least=0)
-    found = fit(read_log(log), max_delay=max_delay)
-    if out is not None:
-        found.save(out, log=log.name)
-    columns = {
-        "knob": "{0[0]}",
-        ">value": "{0[1].value:.4g}",
-        "95 % interval": lambda item: (
-            "{0.low:.4g} … {0.high:.4g}".format(item[1]) if math.isfinite(item[1].low + item[1].high) else ""
-        ),
-        "from": "{0[1].how}",
-    }
-    about = found.about
-    title = f"{log.name}: {len(about['probes'])} probes, {about['episodes']} episodes, {about['readings']} readings"
-    text = table_of(title, list(found.estimates.items()), columns)
-    text += "\n\n" + "\n".join(found.notes) + (f"\nWrote {out}." if out is not None else "")
-    data = {"noise": found.noise, "estimates": found.estimates, "notes": found.notes, "about": about}
-    return Output({**data, "preset": out}, text)

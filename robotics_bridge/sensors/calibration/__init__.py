@@ -1,4 +1,5 @@
-"""Noise knobs fitted to a recording of a real device.
+"""Noise knobs fitted to a recording of a real device, an optional room.
 
-``log`` reads it, ``delays`` and ``likelihood`` fit, ``calibrate`` decides and reports.
+``log`` reads the recording, ``likelihood`` fits the dynamics and the delays, ``calibrate`` decides and reports,
+``commands`` brings ``brainbench tactile calibrate``.
 """

@@ -23,8 +23,17 @@ from scipy.stats import beta
 
 from brainbench.core.errors import DataError
 from brainbench.core.reading.ranges import check_number
-from robotics_bridge.sensors.calibration.delays import align, calm, extent, find_delays, find_lags
-from robotics_bridge.sensors.calibration.likelihood import Z95, Estimate, Fit, fit_dynamics
+from robotics_bridge.sensors.calibration.likelihood import (
+    Z95,
+    Estimate,
+    Fit,
+    align,
+    calm,
+    extent,
+    find_delays,
+    find_lags,
+    fit_dynamics,
+)
 from robotics_bridge.sensors.calibration.log import SHORTEST, Episode, Log, find_dead, find_quantum, segments
 from robotics_bridge.sensors.noise.model import Noise
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from brainbench.core.errors import DataError, UsageError
+from brainbench.core.errors import UsageError
 from brainbench.geometry import Mesh
 from robotics_bridge.physics import Geometry
 from robotics_bridge.sensors import (
@@ -28,8 +28,6 @@ from robotics_bridge.sensors import (
 from robotics_bridge.sensors.audio.materials import Modes
 from robotics_bridge.sensors.audio.modes import find_modes
 from robotics_bridge.sensors.audio.runtime import joint_drive
-from robotics_bridge.sensors.calibration.calibrate import calibrate
-from robotics_bridge.sensors.calibration.log import Log
 from robotics_bridge.sensors.elastomer.pressure import contact_pressure
 from robotics_bridge.sensors.temperature.materials import ThermalBody
 from tests.factories.touch_scenes import pad_scene, poses_at, state_of
@@ -37,9 +35,6 @@ from tests.factories.touch_scenes import pad_scene, poses_at, state_of
 BALL = Geometry(name="ball", link="ball", kind="sphere", size=(0.01,))
 PROBE = Probes([[0, 0, 0.005]], [[0, 0, 1.0]], 0.002)
 GRID = {"rows": 2, "columns": 2, "size": (0.01, 0.01)}
-TIME = np.arange(200) * 0.01
-SIGNAL = np.sin(3 * TIME)
-READINGS = SIGNAL[:, None] + 0.01 * np.random.default_rng(0).normal(size=(200, 2))
 
 
 def _suite(*, num_envs: int = 1, **sensors) -> SensorSuite:
@@ -215,40 +210,6 @@ def test_the_pressure_of_an_environment_does_not_depend_on_its_neighbours_and_is
     assert beside[1].isnan().all()
     with pytest.raises(UsageError, match="Nothing was read"):
         contact_pressure(_suite(a=sensor), "a", modulus=1e5)
-
-
-@pytest.mark.parametrize(
-    "parts",
-    [
-        {"readings": np.where(READINGS > 0.9, np.nan, READINGS)},
-        {"reference": np.where(SIGNAL > 0.9, np.nan, SIGNAL)},
-        {"reference": READINGS},
-        {"time": -TIME},
-        {"time": 0 * TIME},
-        {"time": TIME * np.nan},
-        {"readings": READINGS[:, :0]},
-        {"probes": ("a",)},
-        {"episode": np.zeros(3, int)},
-    ],
-)
-def test_a_log_holds_finite_numbers_that_fit_each_other_at_rising_times(parts) -> None:
-    with pytest.raises(UsageError, match=rf"{next(iter(parts))}|Times|names|Readings"):
-        Log(**{"time": TIME, "readings": READINGS, "reference": SIGNAL, **parts})
-
-
-@pytest.mark.parametrize("delay", [np.nan, np.inf, -1.0])
-def test_delays_of_a_calibration_have_a_range(delay) -> None:
-    with pytest.raises(UsageError, match="max_delay"):
-        calibrate(Log(TIME, READINGS, SIGNAL), max_delay=delay)
-
-
-def test_lists_are_a_log_and_short_episodes_are_told() -> None:
-    whole = calibrate(Log(TIME.tolist(), READINGS.tolist(), SIGNAL.tolist()))  # type: ignore[arg-type]
-    assert whole.noise == calibrate(Log(TIME, READINGS, SIGNAL)).noise
-    short = np.repeat([0, 1], [195, 5])
-    assert any("1 episode" in note for note in calibrate(Log(TIME, READINGS, SIGNAL, short)).notes)
-    with pytest.raises(DataError, match="fewer than 10"):
-        calibrate(Log(TIME, READINGS, SIGNAL, np.arange(200) // 8))
 
 
 def test_a_suite_that_is_seeded_anew_repeats_its_noise_whatever_came_before() -> None:
