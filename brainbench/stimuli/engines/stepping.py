@@ -37,6 +37,7 @@ from brainbench.stimuli.engines.trust import (
     passed_unseen,
     roughness,
     strongest_force,
+    without_escape,
 )
 from brainbench.stimuli.motion.jobs import Job, Trace
 from brainbench.stimuli.whiskers.chain import Chain
@@ -186,6 +187,8 @@ class SteppedJob:
             doubt = fault(GOT_INSIDE, self.job.start, penetration)
         if not reason and doubt:
             good, reason = good & False, doubt
+        ended = self.job.times[~frames.good]
+        reason = without_escape(reason, self.job, float(ended[0]) if len(ended) else np.inf)
         trace = Trace(
             wrench=np.where(good[:, None], wrench, np.nan),
             contact=contact & good,

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from brainbench.core.errors import UsageError, listing
 from brainbench.core.reading.ranges import check_number
+from brainbench.core.rotations import base_rotation
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.protocol import WhiskerEngine
 from brainbench.stimuli.engines.reach import Reach, distances
@@ -54,6 +55,8 @@ SUSPICIOUS_ROUGHNESS = 0.05
 follow what they touch stay below .01; those that are thrown off and caught again have .1 to 2."""
 LARGEST_CHANGE = 0.2
 """Share by which the base force (root mean square over the readings) may change when the step is halved."""
+SMALL_FORCE = 1e-9
+"""Base force (N) that does not matter: a thousandth of that of a light touch."""
 LARGEST_CREEP_CHANGE = 0.1
 """The same in soft contacts that hold too little friction, whose force follows the step slowly."""
 LARGEST_STRUCK_CHANGE = 0.1
@@ -68,6 +71,9 @@ HARD_BLOW = 3.0
 BLOW_STRIDE = 0.25
 """Way of an object in a step of such a blow up to which it is followed, in radii of the whisker's base. The median
 whisker is then within 20 % of the force in far shorter steps, up to 25 m/s."""
+
+HEAD_ON = 0.98
+"""Cosine of the angle between an object's way and a straight whisker from which it pushes along it."""
 
 OK, BENT, LOST, STARTED_INSIDE, GOT_INSIDE, AT_BASE = range(6)
 """Ends of an integration: in order; with a joint bent beyond :data:`LARGEST_BEND`; with a value that is no number; in
@@ -244,9 +250,31 @@ def roughness(force: NDArray[np.floating]) -> float:
 
 
 def force_change(force: NDArray[np.floating], half: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Return the difference [row, column] of two forces [row, reading, column, 3] over the larger (rms)."""
-    square = [np.einsum("rtcd,rtcd->rc", x, x, dtype=float) for x in (half - force, force, half)]
-    return np.sqrt(square[0] / np.maximum(np.maximum(square[1], square[2]), 1e-30))
+    """Return the difference [row, column] of two forces [row, reading, column, 3] over the larger (rms).
+
+    Readings of :func:`start_jump` do not count, and forces below :data:`SMALL_FORCE` do not change by any share.
+    """
+    counts = ~start_jump(force, half)
+    least = SMALL_FORCE**2 * counts.sum(axis=1)
+    square = [np.einsum("rtcd,rtcd,rtc->rc", x, x, counts, dtype=float) for x in (half - force, force, half)]
+    return np.sqrt(square[0] / np.maximum(np.maximum(square[1], square[2]), least))
+
+
+def start_jump(force: NDArray[np.floating], half: NDArray[np.floating]) -> NDArray[np.bool_]:
+    """Return which readings [row, reading, column] hold the jump of a whisker that overlaps an object at the start.
+
+    The first step undoes the overlap with a blow that is the larger the shorter the step, and rings off. It is told by
+    the force: largest at the first reading, and within a third of the readings below 1.5 times what comes in the last
+    half. Arguments are two forces [row, reading, column, 3] of one whisker.
+    """
+    sizes = np.linalg.norm(np.stack([force, half]).astype(float), axis=-1)
+    count = sizes.shape[2]
+    late = sizes[:, :, count // 2 :].max(axis=(0, 2))[None, :, None]
+    above = (sizes > 1.5 * late).any(axis=0)
+    falls = (sizes[:, :, 0] >= sizes.max(axis=2)).all(axis=0)
+    # Readings up to the last that is above.
+    jump = np.logical_or.accumulate(above[:, ::-1], axis=1)[:, ::-1]
+    return jump & (falls & (jump.sum(axis=1) <= count // 3))[:, None]
 
 
 def strongest_force(whisker: Whisker) -> float:
@@ -294,6 +322,29 @@ def step_travel(
     # more than 2 R times that.
     chord = np.linalg.norm(np.diff(quaternions, axis=0), axis=1)
     return own + np.linalg.norm(np.diff(places, axis=0), axis=1) + 2 * chord * size
+
+
+def without_escape(reason: str, job: Job, time: float) -> str:
+    """Return the words of a fault at a time (s), which name a straight whisker that an object pushes along itself.
+
+    Such a whisker cannot give way, and no step is short enough for it.
+    """
+    if not reason or job.whisker.curvature or not np.isfinite(time):
+        return reason
+    times = np.array([time - 1e-4, time])
+    position, euler = job.follicle.pose(times)
+    along = base_rotation(euler)[:, :, 0]
+    tip = position + job.whisker.arc_length * along
+    for obstacle in job.obstacles:
+        places = np.zeros((2, 3)) if obstacle.motion is None else np.asarray(obstacle.motion(times)[0], dtype=float)
+        way = np.diff(places - tip, axis=0)[0]
+        near = distances(obstacle, obstacle.bounds, tip, times)[1] <= job.whisker.base_radius
+        if near and -way @ along[1] > HEAD_ON * np.linalg.norm(way):
+            return (
+                f"{reason.partition(';')[0]}; it pushes along the straight whisker, which cannot give way: no shorter "
+                "step helps; give the whisker its curvature, or meet it from the side"
+            )
+    return reason
 
 
 def near_travel(

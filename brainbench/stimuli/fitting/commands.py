@@ -69,7 +69,8 @@ def fit(
     ] = None,
     frames: Annotated[int, option(_CONTACTS, "frames")] = 1,
     first_arc: Annotated[
-        float | None, typer.Option(help="Arc length of the first traced point, mm; nan for anywhere. [default: 0]")
+        float | None,
+        typer.Option(help="Arc length of the first traced point, mm; nan for anywhere. [default: the base]"),
     ] = None,
     out: Annotated[
         Path | None, typer.Option("--out", "-o", callback=out_file, help="Write the result as JSON.")
@@ -101,7 +102,7 @@ def fit(
         refuse(of_tracks, f"with wrenches, which {shown(str(file))} holds")
         measured = read_wrenches(file, whisker=None if scene is None else whisker, stimulus=stimulus)
     if contacts:
-        data, text = _contacts(measured, start, noise, frames, first_arc or 0.0)
+        data, text = _contacts(measured, start, noise, frames, first_arc)
     else:
         from brainbench.stimuli.fitting import Trial
         from brainbench.stimuli.fitting import fit as run
@@ -122,13 +123,15 @@ def fit(
 
 
 def _contacts(
-    measured: xr.Dataset, whisker: Whisker, noise: float | None, frames: int, first_arc: float
+    measured: xr.Dataset, whisker: Whisker, noise: float | None, frames: int, first_arc: float | None
 ) -> tuple[dict[str, Any], str]:
     """Return the contacts of a track as data and as a table."""
     from brainbench.stimuli.fitting import ContactOptions, find_contacts
 
-    known = {"noise": None if noise is None else 1e-6 * noise, "frames": frames}
-    options = ContactOptions(**known, first_arc=None if math.isnan(first_arc) else 1e-3 * first_arc)
+    known: dict[str, Any] = {"noise": None if noise is None else 1e-6 * noise, "frames": frames}
+    if first_arc is not None:
+        known["first_arc"] = None if math.isnan(first_arc) else 1e-3 * first_arc
+    options = ContactOptions(**known)
     with progress_bar("finding contacts"):
         found = find_contacts(measured, whisker, options=options)
     rows = [

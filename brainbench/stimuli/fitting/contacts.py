@@ -12,7 +12,7 @@ import logging
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from brainbench.core.errors import DataError, UsageError
 from brainbench.core.reading.ranges import check_fields, check_number
 from brainbench.stimuli.fitting.curves import STEPS, LoadedShapes, LoadedWhisker, offsets_of_samples
-from brainbench.stimuli.fitting.tracks.contract import check_length, check_track
+from brainbench.stimuli.fitting.tracks.contract import check_length, check_track, traced_lengths
 from brainbench.stimuli.whiskers.whisker import Whisker
 
 if TYPE_CHECKING:
@@ -39,6 +39,11 @@ MISFIT = 1.5
 ALIKE = 4.0
 """Deviations of the serial correlation along the whisker, over all frames, from which residuals are no white noise."""
 FEWEST_POINTS = 6
+WHOLE = 0.95
+"""Share of the whisker's length from which a trace counts as whole."""
+SAMPLE, TURNED = 3, 0.5
+"""Frames in which points are also fitted the other way round, and the share of their distance from the fitted shapes
+below which that is the right way: it is a tenth where the order or the y axis is wrong, above one where it is right."""
 _STEP = 1e-5
 _ARCS = (0.15, 0.3, 0.45, 0.6, 0.75, 0.9)
 _DEFLECTIONS = (0.02, 0.06, 0.15, 0.3)
@@ -53,8 +58,9 @@ class ContactOptions:
 
     noise: float | None = None
     """Standard deviation of a traced coordinate [m]; estimated from each shape when None."""
-    first_arc: float | None = 0.0
-    """Arc length of the first traced point [m]; None when the trace begins anywhere. Frames that lack it go without."""
+    first_arc: float | Literal["base"] | None = "base"
+    """Arc length of the first traced point [m]; None when the trace begins anywhere. Frames that lack it go without.
+    ``base`` is 0 where nobody said so: then the trace must be about as long as the whisker."""
     tip_traced: bool = False
     """True when the last traced point is the tip of the whisker. Frames that lack it go without."""
     contact_noise: float = 5e-5
@@ -115,7 +121,7 @@ def find_contacts(
     import xarray as xr
 
     options = options or ContactOptions()
-    if options.first_arc is not None:
+    if options.first_arc not in (None, "base"):
         check_number("first_arc (m) on this whisker", options.first_arc, least=0, most=whisker.arc_length)
     check_track(shapes)
     check_length(shapes, whisker.arc_length)
@@ -137,15 +143,22 @@ def find_contacts(
         )
     if options.frames > 1:
         fits = solver.even_out(fits, shapes["time"].values.astype(float))
-    found = [solver.estimate(one) for one in fits]
+    records = [solver.estimate(fit) for fit in fits]
+    if fault := solver.track_fault(points, known, fits):
+        for record in records:
+            if np.isfinite(record["force"]):
+                record["status"], record["reason"] = "unreliable", fault
     shape = {"force_vector": ("time", "axis"), "point": ("time", "axis")}
     return xr.Dataset(
         {
             **{
-                name: (shape.get(name, "time"), [one[name] for one in found], {"units": unit})
+                name: (shape.get(name, "time"), [record[name] for record in records], {"units": unit})
                 for name, unit in _UNITS.items()
             },
-            **{name: ("time", np.array([one[name] for one in found], dtype=object)) for name in ("status", "reason")},
+            **{
+                name: ("time", np.array([record[name] for record in records], dtype=object))
+                for name in ("status", "reason")
+            },
         },
         coords={"time": shapes["time"], "axis": np.array(["x", "y"], dtype=object)},
         attrs={"young_modulus": whisker.young_modulus, "arc_length": whisker.arc_length},
@@ -161,6 +174,7 @@ class ContactSolver:
 
     def __init__(self, whisker: Whisker, options: ContactOptions) -> None:
         self.whisker, self.options, self.rod = whisker, options, LoadedWhisker(whisker)
+        self.first_arc = 0.0 if options.first_arc == "base" else options.first_arc
 
     def force(self, arc: Array, deflection: Array) -> Array:
         """Return the force (N) of a small-bending deflection (m) at an arc (m)."""
@@ -181,8 +195,8 @@ class ContactSolver:
         shapes, options, length = self.shapes(unknowns), self.options, self.whisker.arc_length
         traced = np.broadcast_to(points, (len(unknowns), *points.shape))
         rows = [offsets_of_samples(shapes.place, shapes.along, shapes.bend, traced)[..., 0] / noise]
-        if options.first_arc is not None and np.isfinite(frame[0]).all():
-            where = np.clip(options.first_arc / (unknowns[:, 3] * length), 0, 1) * STEPS
+        if self.first_arc is not None and np.isfinite(frame[0]).all():
+            where = np.clip(self.first_arc / (unknowns[:, 3] * length), 0, 1) * STEPS
             low = np.minimum(where.astype(int), STEPS - 1)
             share, pick = (where - low)[:, None], np.arange(len(unknowns))
             start = (1 - share) * shapes.place[pick, low] + share * shapes.place[pick, low + 1]
@@ -228,7 +242,7 @@ class ContactSolver:
         covariance: Any = np.linalg.pinv(matrix.T @ matrix, rcond=1e-14)
         alike = math.sqrt(len(across)) * float(across[1:] @ across[:-1]) / max(float(across @ across), 1e-300)
         reason = "" if best.status > 0 else "The fit of the shape did not converge."
-        known = (self.options.first_arc is not None, self.options.tip_traced)
+        known = (self.first_arc is not None, self.options.tip_traced)
         lost = [end for end, use, point in zip(("first", "last"), known, frame[[0, -1]], strict=True)
                 if use and not np.isfinite(point).all()]  # fmt: skip
         lacks = f" The {' and the '.join(lost)} point was not traced in this frame." if lost else ""
@@ -252,6 +266,40 @@ class ContactSolver:
         cost = np.sum(self.residuals(grid, frame, place, noise) ** 2, axis=1)
         order = np.argsort(np.nan_to_num(cost, nan=np.inf))[:3]
         return [*grid[order], *([] if before is None else [before])]
+
+    def track_fault(self, points: Array, places: Array, fits: Sequence[ShapeFit]) -> str:
+        """Return in a sentence what is wrong with a track [n, k, 2] and its contact points [n, 2]; empty for nothing.
+
+        Points that are listed or mirrored the other way fit a whisker of another taper or curvature at rest: turned
+        back they lie much nearer to one.
+        """
+        fitted = [index for index, fit in enumerate(fits) if math.isfinite(fit.spread)]
+        if not fitted:
+            return ""
+        sample = [fitted[k] for k in np.unique(np.linspace(0, len(fitted) - 1, SAMPLE).astype(int))]
+        spread, mirror = float(np.median([fits[k].spread for k in sample])), np.array([1.0, -1.0])
+        turned = {
+            "listed from the tip to the base: give them from the base on": (points[:, ::-1], places),
+            "mirrored: the y axis of the image runs the other way": (points * mirror, places * mirror),
+        }
+        spreads = {
+            words: float(np.median([self.solve(track[k], contacts[k]).spread for k in sample]))
+            for words, (track, contacts) in turned.items()
+        }
+        words = min(spreads, key=spreads.__getitem__)
+        if spreads[words] < TURNED * spread:
+            return (
+                f"The points are {words}. As they are, they lie {1e6 * spread:.0f} µm from the shapes of this whisker, "
+                f"else {1e6 * spreads[words]:.0f} µm."
+            )
+        length = float(np.nanmedian(traced_lengths(points)))
+        if self.options.first_arc == "base" and length < WHOLE * self.whisker.arc_length:
+            return (
+                f"The trace is {1 - length / self.whisker.arc_length:.0%} shorter than the whisker; where it begins "
+                "off the base forces come out much too large: give the arc length of its first point (first_arc), 0 "
+                "for the base."
+            )
+        return ""
 
     def even_out(self, fits: Sequence[ShapeFit], times: Array) -> list[ShapeFit]:
         """Return fits whose contact changes evenly over neighbouring frames, at ``times`` [n] (s).

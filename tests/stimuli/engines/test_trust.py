@@ -2,12 +2,14 @@
 
 import math
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from brainbench.core.errors import UsageError
 from brainbench.geometry import Mesh
+from brainbench.stimuli import WhiskerArray, references
 from brainbench.stimuli.engines import get_engine
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.reach import reachable
@@ -26,6 +28,7 @@ from brainbench.stimuli.engines.trust import (
     residual,
     step_travel,
     strongest_force,
+    without_escape,
 )
 from brainbench.stimuli.motion.jobs import Job, StillFollicle
 from brainbench.stimuli.objects.obstacle import Capsule, Obstacle, Sphere
@@ -168,3 +171,42 @@ def test_an_engine_whose_whiskers_only_bend_refuses_twist():
     check_jobs(engine, jobs, Fidelity(twist=False), None)
     with pytest.raises(UsageError, match=r"'bullet'.*'rod'"):
         check_jobs(engine, jobs, Fidelity(twist=True), None)
+
+
+def test_forces_that_do_not_matter_do_not_change_by_any_share():
+    force = np.full((1, 30, 1, 3), 1e-11)
+    assert force_change(force, 3 * force)[0, 0] < 0.1
+    assert force_change(1e3 * force, 3e3 * force)[0, 0] > 0.5
+
+
+@pytest.mark.parametrize("fidelity", ["fast", "accurate"])
+@pytest.mark.parametrize("overlap", [0.0, 5e-6])
+def test_a_whisker_that_touches_a_still_object_from_the_start_holds_it(overlap, fidelity):
+    straight = replace(WhiskerArray.rat()["C2"].whisker, curvature=0.0, friction=0.0)
+    middle = straight.arc_length / 2
+    ball = Obstacle((Sphere((middle, overlap - 1e-3 - float(straight.radius(middle)), 0), 1e-3),))
+    job = Job(straight, StillFollicle(), (ball,), np.arange(1, 61) * 1e-3)
+    (trace,) = get_engine("rod").run([job], Fidelity.of(fidelity), workers=1)
+    assert trace.status == "ok", trace.reason
+    expected = overlap / references.point_load_deflection(straight, 1.0, middle)
+    assert np.linalg.norm(trace.wrench[-1, :3]) == pytest.approx(expected, rel=0.1, abs=1e-9)
+
+
+def test_a_blow_at_the_start_of_a_force_that_stays_is_compared():
+    force = np.full((1, 30, 1, 3), 1e-4)
+    half = force.copy()
+    half[0, :20] *= 2
+    assert force_change(force, half)[0, 0] > 0.3
+
+
+@pytest.mark.parametrize("curvature", [0.0, 20.0])
+def test_a_straight_whisker_that_is_pushed_along_itself_is_told_no_shorter_step(curvature):
+    whisker = replace(WHISKER, curvature=curvature)
+    ball = Obstacle((Sphere((whisker.arc_length + 1.2e-3, 0, 0), 1e-3),), _moving((-0.05, 0, 0)))
+    job = Job(whisker, StillFollicle(), (ball,), np.arange(1, 20) * 1e-3)
+    words = "the whisker was 0.5 mm deep in an object at 0.014 s; choose a smaller time step"
+    told = without_escape(words, job, 0.014)
+    assert (told == words) == bool(curvature)
+    if not curvature:
+        assert "no shorter step helps" in told
+        assert "smaller time step" not in told

@@ -177,3 +177,34 @@ def test_a_trace_begins_on_the_whisker(first_arc):
     shapes = new_shapes(np.arange(3.0), np.tile(MOUSE.centre_line(np.linspace(0, 0.01, 8)), (3, 1, 1)))
     with pytest.raises(UsageError, match="first_arc"):
         find_contacts(shapes, MOUSE, options=ContactOptions(first_arc=first_arc))
+
+
+def _track(way, *, begin=0.0, frames=3):
+    """Return noisy shapes of a pressed whisker whose points [n, k, 2] went through ``way``, and the force (N)."""
+    arc, force = _press(RAT, 0.6, 0.15)
+    points, _ = _shape(RAT, arc, force, points=40, traced=1.0)
+    points = points[round(40 * begin) :]
+    noisy = points + np.random.default_rng(6).normal(size=(frames, *points.shape)) * 20e-6
+    return new_shapes(np.arange(frames) / 500, way(noisy)), force
+
+
+@pytest.mark.parametrize(
+    ("way", "words"),
+    [(lambda points: points[:, ::-1], "from the tip to the base"), (lambda points: points * [1, -1], "mirrored")],
+)
+def test_reversed_and_mirrored_tracks_are_named_as_such(way, words):
+    contacts = find_contacts(_track(way)[0], RAT)
+    assert (contacts["status"] == "unreliable").all()
+    assert all(words in reason for reason in contacts["reason"].values)
+
+
+def test_a_trace_that_may_begin_off_the_base_needs_its_first_arc():
+    shapes, force = _track(lambda points: points, begin=0.2)
+    contacts = find_contacts(shapes, RAT)
+    assert (contacts["status"] == "unreliable").all()
+    assert all("first_arc" in reason for reason in contacts["reason"].values)
+    stated = find_contacts(shapes, RAT, options=ContactOptions(first_arc=8 / 39 * RAT.arc_length))
+    assert (stated["status"] == "ok").all()
+    np.testing.assert_allclose(stated["force"], force, rtol=0.25)
+    whole, _ = _track(lambda points: points)
+    assert (find_contacts(whole, RAT)["status"] == "ok").all()

@@ -24,7 +24,7 @@ from brainbench.stimuli.engines.rod.tasks import JobTask, PackedTasks, make_task
 from brainbench.stimuli.engines.rod.tries import Try, run_with_retries, tries_ahead
 from brainbench.stimuli.engines.stepping import silent_trace
 from brainbench.stimuli.engines.sweep_batch import SweepBatch
-from brainbench.stimuli.engines.trust import check_jobs
+from brainbench.stimuli.engines.trust import check_jobs, without_escape
 from brainbench.stimuli.motion.jobs import Job, Trace
 from brainbench.stimuli.objects.solid import Solid
 from brainbench.stimuli.sweeps.sweep_scenes import SweepScenes
@@ -187,7 +187,7 @@ def trace_of(result: LaunchResult, row: int, job: Job, fidelity: Fidelity, secon
     good = job.times < result.verdict.until[row, 0] - 1e-9
     arc = result.contact[row, :, 0].astype(float)
     touching = (arc >= 0) & good
-    reason = str(result.verdict.reasons[row, 0])
+    reason = without_escape(str(result.verdict.reasons[row, 0]), job, float(result.verdict.until[row, 0]))
     shape, felt = result.points, result.contact_wrench
     base = np.asarray(job.follicle.pose(job.times)[0], dtype=float)[:, None]
     nodes = fidelity.link_count(job.whisker.arc_length) + 1
