@@ -172,11 +172,11 @@ def measured(backend: str = DEFAULT_ENGINE, share: float = 0.9) -> tuple[Tradeof
     if share not in SHARES:
         raise UsageError(f"share must be one of {', '.join(map(str, SHARES))}; received {shown(share)}.")
     text = resources.files("brainbench.stimuli").joinpath("fidelity_table.json").read_text(encoding="utf-8")
-    found: dict[str, list[TradeoffPoint]] = {}
+    points: dict[str, list[TradeoffPoint]] = {}
     for point in json.loads(text)["points"]:
         if not point.get("collision") and point.get("solver", "dynamic") == "dynamic":
             error, cost = (math.inf if point[name] is None else point[name] for name in (SHARES[share], "cost"))
             settings = {name: point.get(name) for name in RESOLUTION}
-            found.setdefault(point["backend"], []).append(TradeoffPoint(error / MARGIN, cost, settings))
-    check_name("measured backend", backend, found)
-    return tuple(found[backend])
+            points.setdefault(point["backend"], []).append(TradeoffPoint(error / MARGIN, cost, settings))
+    check_name("measured backend", backend, points)
+    return tuple(points[backend])

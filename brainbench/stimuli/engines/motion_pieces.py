@@ -86,10 +86,10 @@ def side_of(count: NDArray[np.int32] | int) -> NDArray[np.float64]:
 
 
 def _poses(
-    found: tuple[ArrayLike, ArrayLike], times: NDArray[np.float64], width: int, what: str
+    poses: tuple[ArrayLike, ArrayLike], times: NDArray[np.float64], width: int, what: str
 ) -> tuple[NDArray, NDArray]:
     """Return positions [n, 3] and rotations [n, width] that a motion gave; other shapes are a :class:`UsageError`."""
-    place, turn = (np.asarray(values, dtype=float) for values in found)
+    place, turn = (np.asarray(values, dtype=float) for values in poses)
     if place.shape != (len(times), 3) or turn.shape != (len(times), width):
         kind = "quaternions" if width == 4 else "angles"
         raise UsageError(
@@ -185,11 +185,11 @@ class _Sampled:
 
     def at(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return coordinates [..., k] at times [...] (s)."""
-        found = np.asarray(self.path(times.ravel()), dtype=float)
-        if not np.isfinite(found).all():
-            bad = times.ravel()[~np.isfinite(found).all(axis=1)][0]
+        values = np.asarray(self.path(times.ravel()), dtype=float)
+        if not np.isfinite(values).all():
+            bad = times.ravel()[~np.isfinite(values).all(axis=1)][0]
             raise UsageError(f"The motion of {self.what} is not finite at {bad:.6g} s; give finite poses at all times.")
-        return found.reshape(*times.shape, -1)
+        return values.reshape(*times.shape, -1)
 
     def errors(
         self, cells: NDArray[np.int_], pieces: int, looks: int

@@ -68,7 +68,7 @@ def reachable(
     bounds = np.array([obstacle.bounds for obstacle, stands in zip(obstacles, still, strict=True) if stands])
     apart = np.zeros(len(obstacles))
     apart[still] = _box_distances(bounds.reshape(-1, 2, 3), base)
-    kept, indices, nearest = [], [], math.inf
+    touchable, indices, nearest = [], [], math.inf
     for index in np.flatnonzero(apart <= limit).tolist():
         obstacle, distances = touched(obstacles[index], surfaces=surfaces), apart[index : index + 1]
         boxes = obstacle.bounds[None]
@@ -85,10 +85,10 @@ def reachable(
         if obstacle.surface is None and distances.max() > limit:
             near = (part for part, distance in zip(obstacle.parts, distances, strict=True) if distance <= limit)
             obstacle = replace(obstacle, parts=tuple(near))
-        kept.append(obstacle)
+        touchable.append(obstacle)
         indices.append(index)
         nearest = min(nearest, float(distances.min()))
-    return Reach(tuple(kept), nearest, tuple(indices))
+    return Reach(tuple(touchable), nearest, tuple(indices))
 
 
 def _box_distances(boxes: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -97,13 +97,13 @@ def _box_distances(boxes: NDArray[np.float64], points: NDArray[np.float64]) -> N
         points = points[:1]
     # Between two points the way is no further from one of them than half their distance.
     between = float(np.linalg.norm(np.diff(points, axis=0), axis=1).max(initial=0.0)) / 2
-    found = np.empty(len(boxes))
+    nearest = np.empty(len(boxes))
     some = max(1, 100_000 // len(points))
     for first in range(0, len(boxes), some):
         low, high = boxes[first : first + some, 0, None], boxes[first : first + some, 1, None]
         outside = np.maximum(np.maximum(low - points, points - high), 0.0)
-        found[first : first + some] = np.sqrt(np.einsum("bnd,bnd->bn", outside, outside)).min(axis=1)
-    return np.maximum(found - between, 0.0)
+        nearest[first : first + some] = np.sqrt(np.einsum("bnd,bnd->bn", outside, outside)).min(axis=1)
+    return np.maximum(nearest - between, 0.0)
 
 
 def _encloses(obstacle: Obstacle, point: NDArray[np.float64]) -> bool:

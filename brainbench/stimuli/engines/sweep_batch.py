@@ -51,12 +51,12 @@ def describe_unstable(
 
     ``names`` are those of the whiskers; ``unstable`` and ``reasons`` (in words) have shape [sweep, whisker].
     """
-    found = []
+    sentences = []
     for bad, words in zip(unstable, reasons, strict=True):
         first = int(np.argmax(bad))
         more = f" (and {bad.sum() - 1} more whiskers)" if bad.sum() > 1 else ""
-        found.append(f"{names[first]}: {words[first]}{more}" if bad.any() else "")
-    return tuple(found)
+        sentences.append(f"{names[first]}: {words[first]}{more}" if bad.any() else "")
+    return tuple(sentences)
 
 
 def join_batches(parts: Sequence[SweepBatch]) -> SweepBatch:

@@ -313,15 +313,15 @@ def step_travel(
     """
     # A rotation is no larger than its three turns together, and no point is further from the base than the arc length.
     turn = np.abs(np.diff(euler, axis=0)).sum(axis=1) * whisker.arc_length
-    own = np.linalg.norm(np.diff(position, axis=0), axis=1) + turn
+    travel = np.linalg.norm(np.diff(position, axis=0), axis=1) + turn
     if obstacle.motion is None:
-        return own
+        return travel
     places, quaternions = (np.asarray(values, dtype=float) for values in obstacle.motion(times))
     size = float(np.linalg.norm(obstacle.bounds, axis=1).max())
     # Quaternions of rotations θ apart differ by 2 sin(θ/4); a point at distance R moves by 2 R sin(θ/2) at most, no
     # more than 2 R times that.
     chord = np.linalg.norm(np.diff(quaternions, axis=0), axis=1)
-    return own + np.linalg.norm(np.diff(places, axis=0), axis=1) + 2 * chord * size
+    return travel + np.linalg.norm(np.diff(places, axis=0), axis=1) + 2 * chord * size
 
 
 def without_escape(reason: str, job: Job, time: float) -> str:
@@ -367,9 +367,9 @@ def passed_unseen(job: Job, reach: Reach, position: NDArray, euler: NDArray, tim
     for obstacle in reach.obstacles:
         half = float(np.diff(obstacle.bounds, axis=0).min()) / 2 + job.whisker.base_radius
         travel = near_travel(job.whisker, position, euler, obstacle, times)
-        found = np.flatnonzero(travel > half)
-        if len(found) and found[0] < first:
-            first = int(found[0])
+        steps = np.flatnonzero(travel > half)
+        if len(steps) and steps[0] < first:
+            first = int(steps[0])
             reason = (
                 f"an object moves by {travel[first] * MILLI:.3g} mm against the whisker in one step at "
                 f"{times[first]:.6g} s, more than half of its {2 * half * MILLI:.3g} mm, so it may pass without being "

@@ -103,8 +103,8 @@ def _of_kind(trial: Trial, trace: Trace, kind: str) -> tuple[NDArray[np.float64]
     columns = [place for place, name in enumerate(trial.channels) if name.startswith(kind)]
     measured: Any = trial.measured["wrench"].values[:, columns]
     expected = trace.wrench[:, [CHANNELS.index(trial.channels[place]) for place in columns]]
-    known = np.isfinite(measured) & np.isfinite(expected)
-    return measured[known], expected[known]
+    finite = np.isfinite(measured) & np.isfinite(expected)
+    return measured[finite], expected[finite]
 
 
 Array = NDArray[np.float64]
@@ -140,27 +140,27 @@ def check_residuals(residual: Array, jacobian: Array, readings: Readings) -> tup
     basis, _ = np.linalg.qr(jacobian)
     free = len(residual) - jacobian.shape[1]
     variance = float(residual @ residual) / free
-    found: list[tuple[str, float, float, int]] = []
+    results: list[tuple[str, float, float, int]] = []
     for what, column in (("time", 0), ("arc", 1)):
         weights = _neighbours(readings, column, range(1, LAGS + 1))
         pairs = weights.nnz // 2
         if pairs >= FEWEST:
             z = _deviate(residual, basis, weights, variance)
-            found.append((what, z, float(ndtr(-z)), pairs))
+            results.append((what, z, float(ndtr(-z)), pairs))
     lags = [_neighbours(readings, 0, [lag]) for lag in range(1, SWING_LAGS + 1)]
     if min(one.nnz // 2 for one in lags) >= FEWEST:
         square = sum(_deviate(residual, basis, one, variance) ** 2 for one in lags)
         p = float(chdtrc(SWING_LAGS, square))
-        found.append(("swing", (square - SWING_LAGS) / math.sqrt(2 * SWING_LAGS), p, len(residual)))
-    known = np.isfinite(readings.noise[readings.group])
-    if known.sum() > jacobian.shape[1] + 1:
+        results.append(("swing", (square - SWING_LAGS) / math.sqrt(2 * SWING_LAGS), p, len(residual)))
+    stated = np.isfinite(readings.noise[readings.group])
+    if stated.sum() > jacobian.shape[1] + 1:
         # Sum of squares over repeat noise is chi-square with n − p degrees of freedom.
-        degrees = int(known.sum()) - jacobian.shape[1]
-        size = float(np.sum(residual[known] ** 2))
+        degrees = int(stated.sum()) - jacobian.shape[1]
+        size = float(np.sum(residual[stated] ** 2))
         p = float(chdtrc(degrees, size))
-        found.append(("size", (size - degrees) / math.sqrt(2 * degrees), p, int(known.sum())))
-    level = ALPHA / max(len(found), 1)
-    return tuple(ResidualTest(what, z, p, count, p >= level) for what, z, p, count in found)
+        results.append(("size", (size - degrees) / math.sqrt(2 * degrees), p, int(stated.sum())))
+    level = ALPHA / max(len(results), 1)
+    return tuple(ResidualTest(what, z, p, count, p >= level) for what, z, p, count in results)
 
 
 def _deviate(residual: Array, basis: Array, weights: coo_array, variance: float) -> float:
@@ -194,14 +194,14 @@ def _neighbours(readings: Readings, column: int, lags: Sequence[int]) -> coo_arr
 
 def failed_words(tests: Sequence[ResidualTest]) -> tuple[str, ...]:
     """Return one sentence for each test that failed."""
-    told = {
+    faults = {
         "time": "neighbouring instants leave residuals of the same sign",
         "arc": "neighbouring points along the whisker leave residuals of the same sign",
         "swing": "the residuals swing",
         "size": "the residuals are larger than the noise of repeats",
     }
     return tuple(
-        f"The model does not fit: {told[test.what]} ({test.statistic:.1f} standard deviations beyond noise, "
+        f"The model does not fit: {faults[test.what]} ({test.statistic:.1f} standard deviations beyond noise, "
         f"p = {test.p:.2g}); the shape, the motion or the contact that was assumed is wrong, or the noise is not white."
         for test in tests
         if not test.passed

@@ -57,9 +57,11 @@ def fit(
     contacts: Annotated[
         bool, typer.Option("--contacts", help="Estimate contact point and force in each frame of a track instead.")
     ] = False,
-    known: Annotated[
+    properties: Annotated[
         str,
-        typer.Option(help="Properties of the whisker that were measured, as arc_length=0.02,base_radius=5e-5 (SI)."),
+        typer.Option(
+            "--known", help="Properties of the whisker that were measured, as arc_length=0.02,base_radius=5e-5 (SI)."
+        ),
     ] = "",
     bounds: Annotated[
         str, typer.Option(help="Bounds of parameters, as young_modulus=1e9:9e9,damping_ratio=0.05:0.5 (SI).")
@@ -91,7 +93,7 @@ def fit(
         refuse({"--frames": frames != 1, "--first-arc": first_arc is not None}, "without --contacts")
     refuse({"--deflection": deflection} if scene else {}, "with --scene")
     chosen = None if scene is None else scenes.choose_scene(scenes.open_recipe(scene, "all"), stimulus)
-    start = _whisker(whisker, chosen, _pairs(known, "--known"))
+    start = _whisker(whisker, chosen, _pairs(properties, "--known"))
     if holds_shapes(file):
         refuse({} if scene else {"--stimulus": stimulus}, "with a track that has no --scene")
         measured = read_shapes(file, TrackOptions(**{name: one for name, one in scale.items() if one is not None}))
@@ -128,22 +130,24 @@ def _contacts(
     """Return the contacts of a track as data and as a table."""
     from brainbench.stimuli.fitting import ContactOptions, find_contacts
 
-    known: dict[str, Any] = {"noise": None if noise is None else 1e-6 * noise, "frames": frames}
+    options_given: dict[str, Any] = {"noise": None if noise is None else 1e-6 * noise, "frames": frames}
     if first_arc is not None:
-        known["first_arc"] = None if math.isnan(first_arc) else 1e-3 * first_arc
-    options = ContactOptions(**known)
+        options_given["first_arc"] = None if math.isnan(first_arc) else 1e-3 * first_arc
+    options = ContactOptions(**options_given)
     with progress_bar("finding contacts"):
-        found = find_contacts(measured, whisker, options=options)
+        contacts = find_contacts(measured, whisker, options=options)
     rows = [
         {
-            "time": float(found["time"].values[index]),
+            "time": float(contacts["time"].values[index]),
             **{
-                name: found[name].values[index].tolist() for name in found.data_vars if name not in ("status", "reason")
+                name: contacts[name].values[index].tolist()
+                for name in contacts.data_vars
+                if name not in ("status", "reason")
             },
-            "status": str(found["status"].values[index]),
-            "reason": str(found["reason"].values[index]),
+            "status": str(contacts["status"].values[index]),
+            "reason": str(contacts["reason"].values[index]),
         }
-        for index in range(found.sizes["time"])
+        for index in range(contacts.sizes["time"])
     ]
     columns = {
         ">ms": lambda one: f"{1e3 * one['time']:.2f}",
@@ -171,7 +175,7 @@ def _text(result: FitResult, measured: xr.Dataset) -> str:
     return "\n".join(lines)
 
 
-def _whisker(name: str, scene: Any, known: dict[str, Any]) -> Whisker:
+def _whisker(name: str, scene: Any, properties: dict[str, Any]) -> Whisker:
     """Return the whisker that a fit starts from."""
     from dataclasses import fields, replace
 
@@ -188,8 +192,8 @@ def _whisker(name: str, scene: Any, known: dict[str, Any]) -> Whisker:
         array = WhiskerArray.of(species)
         check_name(f"whisker of the {species}", label, array.names)
         whisker = array[label].whisker
-    check_each("property of a whisker", known, [item.name for item in fields(Whisker)])
-    return replace(whisker, **known)
+    check_each("property of a whisker", properties, [item.name for item in fields(Whisker)])
+    return replace(whisker, **properties)
 
 
 def _pairs(given: str, flag: str, *, text: bool = False) -> dict[str, Any]:
@@ -238,15 +242,15 @@ def design(
             part = OptionalPart("", "--networks", "brainbench.scoring.recovery.motion:design_for_networks")
 
             result = part.load("option")(recipe.scenes, items(networks), items(variables), **how)
-            told = _of_networks(result)
+            outcome = _of_networks(result)
         else:
             result = run(recipe.scenes, items(variables), **how)
-            told = _of_objects(result)
+            outcome = _of_objects(result)
     rows = [(name, result.start[name], value, VARIABLES[name].unit) for name, value in result.values.items()]
     chosen = table_of("", rows, {"variable": "{0[0]}", ">given": "{0[1]:.4g}", ">chosen": "{0[2]:.4g} {0[3]}"})
     status = f"status  {result.status} {result.reason}".rstrip()
     data = {name: value for name, value in vars(result).items() if name != "scenes"}
-    return Output({**data, "options": options}, f"{chosen}\n\n{told}\n{status}")
+    return Output({**data, "options": options}, f"{chosen}\n\n{outcome}\n{status}")
 
 
 def _of_objects(result: DesignResult) -> str:

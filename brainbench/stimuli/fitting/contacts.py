@@ -126,12 +126,12 @@ def find_contacts(
     check_track(shapes)
     check_length(shapes, whisker.arc_length)
     points = _in_plane(shapes["shape"].values)
-    known = np.full((len(points), 2), np.nan) if contact_points is None else np.asarray(contact_points, dtype=float)
-    if known.shape != (len(points), 2):
-        raise DataError(f"{len(points)} frames take contact points [{len(points)}, 2]; received {known.shape}.")
+    places = np.full((len(points), 2), np.nan) if contact_points is None else np.asarray(contact_points, dtype=float)
+    if places.shape != (len(points), 2):
+        raise DataError(f"{len(points)} frames take contact points [{len(points)}, 2]; received {places.shape}.")
     solver, fits = ContactSolver(whisker, options), []
     before: Array | None = None
-    for frame, place in zip(points, known, strict=True):
+    for frame, place in zip(points, places, strict=True):
         fits.append(solver.solve(frame, place, before))
         before = fits[-1].unknowns if solver.estimate(fits[-1])["status"] == "ok" else None
     alike = np.array([one.alike for one in fits if not one.reason])
@@ -144,7 +144,7 @@ def find_contacts(
     if options.frames > 1:
         fits = solver.even_out(fits, shapes["time"].values.astype(float))
     records = [solver.estimate(fit) for fit in fits]
-    if fault := solver.track_fault(points, known, fits):
+    if fault := solver.track_fault(points, places, fits):
         for record in records:
             if np.isfinite(record["force"]):
                 record["status"], record["reason"] = "unreliable", fault
@@ -232,9 +232,9 @@ class ContactSolver:
         for start in self._starts(frame, place, noise, before):
             began = np.clip(start, low + 1e-3, high - 1e-3)
             limits = (low, high)
-            found = least_squares(residual, began, jac=jacobian, bounds=limits, max_nfev=60)  # type: ignore[arg-type]
-            if best is None or found.cost < best.cost:
-                best = found
+            minimum = least_squares(residual, began, jac=jacobian, bounds=limits, max_nfev=60)  # type: ignore[arg-type]
+            if best is None or minimum.cost < best.cost:
+                best = minimum
         assert best is not None
         across = residual(best.x)[: len(points)] * noise
         spread = math.sqrt(float(np.sum(across**2)) / max(len(points) - 4, 1))
@@ -242,8 +242,8 @@ class ContactSolver:
         covariance: Any = np.linalg.pinv(matrix.T @ matrix, rcond=1e-14)
         alike = math.sqrt(len(across)) * float(across[1:] @ across[:-1]) / max(float(across @ across), 1e-300)
         reason = "" if best.status > 0 else "The fit of the shape did not converge."
-        known = (self.first_arc is not None, self.options.tip_traced)
-        lost = [end for end, use, point in zip(("first", "last"), known, frame[[0, -1]], strict=True)
+        in_use = (self.first_arc is not None, self.options.tip_traced)
+        lost = [end for end, use, point in zip(("first", "last"), in_use, frame[[0, -1]], strict=True)
                 if use and not np.isfinite(point).all()]  # fmt: skip
         lacks = f" The {' and the '.join(lost)} point was not traced in this frame." if lost else ""
         return ShapeFit(best.x, covariance, spread, math.sqrt(float(np.mean(across**2))), reason, alike, lacks)
@@ -308,8 +308,8 @@ class ContactSolver:
         covariance; the pose of the base follows its regression on them. Frames with forces of the other sign, or with
         no sign of a force by themselves, have no part and stay as they are.
         """
-        some = {k: own for k, one in enumerate(fits) if (own := self._logarithms(one)) is not None}
-        half, found = self.options.frames // 2, list(fits)
+        some = {k: logarithms for k, one in enumerate(fits) if (logarithms := self._logarithms(one)) is not None}
+        half, smoothed = self.options.frames // 2, list(fits)
         for index, (value, spread, slope) in some.items():
             near = range(index - half, index + half + 1)
             use = [k for k in near if k in some and fits[k].unknowns[4] * fits[index].unknowns[4] > 0]
@@ -318,70 +318,70 @@ class ContactSolver:
             design = [np.kron([1.0, times[k] - times[index]], np.eye(2)) for k in use]
             weights = [np.linalg.inv(some[k][1]) for k in use]
             information = sum(d.T @ w @ d for d, w in zip(design, weights, strict=True))
-            asked = sum(d.T @ w @ some[k][0] for d, w, k in zip(design, weights, use, strict=True))
-            line, covariance = np.linalg.solve(information, asked), np.linalg.inv(information)[:2, :2]
+            weighted = sum(d.T @ w @ some[k][0] for d, w, k in zip(design, weights, use, strict=True))
+            line, covariance = np.linalg.solve(information, weighted), np.linalg.inv(information)[:2, :2]
             # Unknowns given the logarithms: the Gaussian law of the frame's own fit, conditioned on them.
             gain = fits[index].covariance @ slope.T @ np.linalg.inv(spread)
             moved = fits[index].unknowns + gain @ (line[:2] - value)
             left = fits[index].covariance - gain @ (spread - covariance) @ gain.T
             moved[3] = np.clip(moved[3], NEAREST, FARTHEST)
-            found[index] = replace(fits[index], unknowns=moved, covariance=left)
-        return found
+            smoothed[index] = replace(fits[index], unknowns=moved, covariance=left)
+        return smoothed
 
-    def _logarithms(self, one: ShapeFit) -> tuple[Array, Array, Array] | None:
+    def _logarithms(self, fit: ShapeFit) -> tuple[Array, Array, Array] | None:
         """Return log arc and log force [2], their covariance [2, 2], and their slope [2, 5] by the unknowns."""
-        force, deviation, slope = self._force(one)
-        if one.reason or not abs(force) >= NO_FORCE * deviation:
+        force, deviation, slope = self._force(fit)
+        if fit.reason or not abs(force) >= NO_FORCE * deviation:
             return None
-        by = np.stack([np.eye(5)[3] / one.unknowns[3], slope / force])
-        return np.log([one.unknowns[3], abs(force)]), by @ one.covariance @ by.T, by
+        by = np.stack([np.eye(5)[3] / fit.unknowns[3], slope / force])
+        return np.log([fit.unknowns[3], abs(force)]), by @ fit.covariance @ by.T, by
 
-    def _force(self, one: ShapeFit) -> tuple[float, float, Array]:
+    def _force(self, fit: ShapeFit) -> tuple[float, float, Array]:
         """Return the force (N) of a fit, its standard deviation, and its derivatives [5] by the unknowns."""
         length = self.whisker.arc_length
-        ends = one.unknowns + np.concatenate([np.zeros((1, 5)), np.eye(5), -np.eye(5)]) * _STEP
+        ends = fit.unknowns + np.concatenate([np.zeros((1, 5)), np.eye(5), -np.eye(5)]) * _STEP
         sizes = self.force(ends[:, 3] * length, ends[:, 4] * length)
         slope = (sizes[1:6] - sizes[6:]) / (2 * _STEP)
-        return float(sizes[0]), math.sqrt(max(float(slope @ one.covariance @ slope), 0.0)), slope
+        return float(sizes[0]), math.sqrt(max(float(slope @ fit.covariance @ slope), 0.0)), slope
 
-    def estimate(self, one: ShapeFit) -> dict[str, Any]:
+    def estimate(self, fit: ShapeFit) -> dict[str, Any]:
         """Return what :func:`find_contacts` gives of a frame from its fit, with a status."""
-        if not np.isfinite(one.unknowns).all():
+        if not np.isfinite(fit.unknowns).all():
             nothing = dict.fromkeys(_UNITS, math.nan) | dict.fromkeys(("force_vector", "point"), (math.nan, math.nan))
-            return {**nothing, "status": "undefined", "reason": one.reason}
+            return {**nothing, "status": "undefined", "reason": fit.reason}
         length = self.whisker.arc_length
-        force, deviation, _ = self._force(one)
-        shape = self.shapes(one.unknowns[None])
-        status, reason = self._judge(one, force, deviation)
-        reason += one.lacks if reason else ""
+        force, deviation, _ = self._force(fit)
+        shape = self.shapes(fit.unknowns[None])
+        status, reason = self._judge(fit, force, deviation)
+        reason += fit.lacks if reason else ""
         return {
             "force": force,
-            "arc": length * float(one.unknowns[3]),
+            "arc": length * float(fit.unknowns[3]),
             "moment": float(shape.moment[0]),
-            "base_angle": float(one.unknowns[2]),
+            "base_angle": float(fit.unknowns[2]),
             "force_deviation": deviation,
-            "arc_deviation": length * math.sqrt(max(float(one.covariance[3, 3]), 0.0)),
-            "residual": one.residual,
+            "arc_deviation": length * math.sqrt(max(float(fit.covariance[3, 3]), 0.0)),
+            "residual": fit.residual,
             "force_vector": (force * shape.force[0]).tolist(),
             "point": shape.contact[0].tolist(),
             "status": status,
             "reason": reason,
         }
 
-    def _judge(self, one: ShapeFit, force: float, deviation: float) -> tuple[str, str]:
+    def _judge(self, fit: ShapeFit, force: float, deviation: float) -> tuple[str, str]:
         """Return the status of a fit and why, from its force and the standard deviation of it (N)."""
         noise = self.options.noise
-        if one.reason:
-            return "undefined", one.reason
+        if fit.reason:
+            return "undefined", fit.reason
         if abs(force) < NO_FORCE * deviation:
             share = abs(force) / max(deviation, 1e-300)
             return "undefined", f"No sign of a contact: the force is {share:.1f} standard deviations from 0."
-        if noise and one.spread > MISFIT * noise:
+        if noise and fit.spread > MISFIT * noise:
             return "unreliable", (
-                f"The shape fits no whisker with one contact: points lie {1e6 * one.spread:.0f} µm from it, the noise "
+                f"The shape fits no whisker with one contact: points lie {1e6 * fit.spread:.0f} µm from it, the noise "
                 f"is {1e6 * noise:.0f} µm."
             )
-        if not NEAREST + 1e-3 < one.unknowns[3] < FARTHEST - 1e-3:
+        if not NEAREST + 1e-3 < fit.unknowns[3] < FARTHEST - 1e-3:
             return "unreliable", "The contact lies at the end of the range that is looked for."
         if deviation > VAGUE * abs(force):
             return "unreliable", (
@@ -395,9 +395,9 @@ def _in_plane(points: Array) -> Array:
     """Return points [n, k, 2] in the plane that holds them best; shapes in no plane are a :class:`DataError`."""
     if points.shape[-1] == 2:
         return points
-    known = points[np.isfinite(points).all(axis=-1)]
-    _, spread, axes = np.linalg.svd(known - known.mean(axis=0), full_matrices=False)
-    if spread[2] > 0.1 * spread[1] and spread[2] / math.sqrt(len(known)) > 0.02 * np.ptp(known @ axes[0]):
+    traced = points[np.isfinite(points).all(axis=-1)]
+    _, spread, axes = np.linalg.svd(traced - traced.mean(axis=0), full_matrices=False)
+    if spread[2] > 0.1 * spread[1] and spread[2] / math.sqrt(len(traced)) > 0.02 * np.ptp(traced @ axes[0]):
         raise DataError(
             "The traced shapes lie in no plane, and the contact force is found in the plane of bending alone; choose "
             "frames in which the whisker bends in one plane, or fit a scene with the object in it."

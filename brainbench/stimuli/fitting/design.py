@@ -228,13 +228,13 @@ def find_motions(
     if not np.isfinite(first[0]):
         raise DataError("Whiskers are unstable with the given motion; simulate the scenes more finely.")
     order = np.argsort(-np.nan_to_num(first, nan=-math.inf))[: options.searches]
-    found = [tried[index] for index in order]
+    best = [tried[index] for index in order]
     if slope is not None:
         how = {"maxiter": options.iterations, "maxls": 8}
         bounds = [(0, 1)] * len(at)
-        ends = [minimize(cost, x, jac=True, bounds=bounds, method="L-BFGS-B", options=how).x for x in found]
-        found = [*ends, found[0]]
-    return [begin, *(limits[:, 0] + x * width for x in found)]
+        ends = [minimize(cost, x, jac=True, bounds=bounds, method="L-BFGS-B", options=how).x for x in best]
+        best = [*ends, best[0]]
+    return [begin, *(limits[:, 0] + x * width for x in best)]
 
 
 def _result(

@@ -63,8 +63,8 @@ def _draw_shapes(axes: Any, trial: Trial, result: FitResult) -> None:
     axes[0, 0].set(xlabel="x (mm)", ylabel="y (mm)", title="traced (dots) and fitted shapes")
     axes[0, 0].legend(frameon=False, fontsize=8)
     scaled = result.residuals[0] / result.noise["shape"]
-    known = scaled[np.isfinite(scaled)]
-    axes[0, 1].hist(known, bins=40, density=True, color=COLORS[0], alpha=0.5)
+    finite = scaled[np.isfinite(scaled)]
+    axes[0, 1].hist(finite, bins=40, density=True, color=COLORS[0], alpha=0.5)
     x = np.linspace(-4, 4, 200)
     axes[0, 1].plot(x, np.exp(-(x**2) / 2) / np.sqrt(2 * np.pi), color=INK, lw=1)
     axes[0, 1].set(xlabel="residual / noise", title=f"noise {1e6 * result.noise['shape']:.1f} µm; line: normal law")

@@ -51,8 +51,8 @@ def _interval(free: FreeParameters, index: int, low: float, high: float, level: 
             return parameter.value(start, end, free.start.whisker)
         return (0.0 if end < 0 else math.inf) if parameter.kind == "log" else end
 
-    one, other = value(low), value(high)
-    return Interval(min(one, other), max(one, other), level, method)
+    first, second = value(low), value(high)
+    return Interval(min(first, second), max(first, second), level, method)
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,7 +124,7 @@ class Profile:
             return point
 
         if others:
-            found = least_squares(
+            minimum = least_squares(
                 lambda rest: self.residual(full(rest)),
                 u[others],
                 jac=lambda rest: self.jacobian(full(rest))[:, others],  # type: ignore[arg-type]
@@ -133,7 +133,7 @@ class Profile:
                 ftol=1e-6,
                 xtol=1e-5,
             )
-            squares = 2 * float(found.cost)
+            squares = 2 * float(minimum.cost)
         else:
             squares = float(np.sum(self.residual(u) ** 2))
         return math.sqrt(max(squares - self.least, 0.0) / self.scale)
@@ -236,13 +236,13 @@ class _Problem:
         """Return the minimum that is reached from coordinates [p]."""
         from scipy.optimize import least_squares
 
-        u, iterations, found = start, 0, None
-        known = bool(np.isfinite(self.model.readings.noise).all())
+        u, iterations, minimum = start, 0, None
+        stated = bool(np.isfinite(self.model.readings.noise).all())
         self.model.reset_noise()
-        for _ in range(1 if known else _ROUNDS):
+        for _ in range(1 if stated else _ROUNDS):
             low, high = self.model.limits
             # Counted from −1: SciPy's first step is as long as the start is far from 0, where the coordinates begin.
-            found = least_squares(
+            minimum = least_squares(
                 lambda moved: self.residual(moved - 1),
                 np.clip(u, low + 1e-6, high - 1e-6) + 1,
                 jac=lambda moved: self.jacobian(moved - 1),  # type: ignore[arg-type]
@@ -254,14 +254,14 @@ class _Problem:
                 gtol=1e-9,
                 max_nfev=self.model.options.most_iterations,
             )
-            step = float(np.abs(found.x - 1 - u).max())
-            u, iterations = found.x - 1, iterations + int(found.njev)
+            step = float(np.abs(minimum.x - 1 - u).max())
+            u, iterations = minimum.x - 1, iterations + int(minimum.njev)
             before = self.model.sigma.copy()
             self.model.update_noise(self.model.residual(u), before)
-            if found.status <= 0 or (step < 1e-3 and np.allclose(before, self.model.sigma, rtol=0.05)):
+            if minimum.status <= 0 or (step < 1e-3 and np.allclose(before, self.model.sigma, rtol=0.05)):
                 break
         deviance = self.model.deviance(self.residual(u))
-        return _Solution(u, self.model.sigma.copy(), deviance, found is not None and found.status > 0, iterations)
+        return _Solution(u, self.model.sigma.copy(), deviance, minimum is not None and minimum.status > 0, iterations)
 
 
 def _judge(problem: _Problem, solutions: Sequence[_Solution], began: float) -> FitResult:
@@ -271,18 +271,18 @@ def _judge(problem: _Problem, solutions: Sequence[_Solution], began: float) -> F
     u, model.sigma = best.u, best.sigma
     residual, jacobian = model.residual(u), model.jacobian(u)
     freedom = len(residual) - len(free)
-    known = bool(np.isfinite(model.readings.noise).all())
-    scale = 1.0 if known else float(residual @ residual) / freedom
-    found = directions(jacobian, free.names, math.sqrt(scale))
+    stated = bool(np.isfinite(model.readings.noise).all())
+    scale = 1.0 if stated else float(residual @ residual) / freedom
+    combinations = directions(jacobian, free.names, math.sqrt(scale))
     information = jacobian.T @ jacobian / scale + problem.prior_jacobian.T @ problem.prior_jacobian
     covariance = _inverse(information)
     errors = _simulation_errors(problem, u, jacobian, scale)
-    t = quantile(options.level, math.inf if known else freedom)
+    t = quantile(options.level, math.inf if stated else freedom)
     profile = None
     if options.intervals == "profile":
         least = float(np.sum(problem.residual(u) ** 2))
         profile = Profile(problem.residual, problem.jacobian, model.limits, u, covariance, least, scale)
-    unknown = {name: direction.words for name, direction in unknown_parameters(found).items()}
+    unknown = {name: direction.words for name, direction in unknown_parameters(combinations).items()}
     # Priors took part in the comparison of minima, so that none makes up for it.
     rivals = _rivals(problem, solutions, covariance)
     estimates = []
@@ -332,7 +332,7 @@ def _judge(problem: _Problem, solutions: Sequence[_Solution], began: float) -> F
         reasons=tuple(reasons),
         estimates=tuple(estimates),
         noise={name: float(level) for name, level in zip(model.readings.groups, model.sigma, strict=True)},
-        directions=found,
+        directions=combinations,
         tests=tests,
         whisker=whisker,
         residuals=tuple(trial.residuals(trace, whisker) for trial, trace in zip(model.trials, traces, strict=True)),
@@ -371,10 +371,10 @@ def _rivals(problem: _Problem, solutions: Sequence[_Solution], covariance: Array
         return {}
     # Two searches that end in one minimum differ by far less than its standard deviation.
     apart = math.sqrt(max(float(covariance[index, index]), 0.0))
-    for other in solutions[1:]:
-        if other.deviance < best.deviance + ALIKE and abs(other.u[index] - best.u[index]) > max(apart, 0.01):
+    for rival in solutions[1:]:
+        if rival.deviance < best.deviance + ALIKE and abs(rival.u[index] - best.u[index]) > max(apart, 0.01):
             name, unit = model.free.names[index], PARAMETERS[model.free.names[index]].unit
-            values = sorted(model.free.values(one.u)[index] for one in (best, other))
+            values = sorted(model.free.values(one.u)[index] for one in (best, rival))
             return {
                 name: f"{name} of {values[0]:.4g} and of {values[1]:.4g} {unit} fit alike: the readings are too rare "
                 "or too few to tell how often the whisker swings; read more often, or give narrower bounds."
@@ -416,10 +416,10 @@ def _unlikely(free: FreeParameters, index: int, value: float, interval: Interval
     low, high = (start / STATED, start * STATED) if name == "deflection" else parameter.real
     if not (low <= start <= high and (interval.high < low or interval.low > high)):
         return ""
-    known = f"about {start:.3g} was stated" if name == "deflection" else f"whiskers have {low:g} to {high:g}"
+    expected = f"about {start:.3g} was stated" if name == "deflection" else f"whiskers have {low:g} to {high:g}"
     return (
-        f"{name} is {value:.3g} {parameter.unit}, and {known}: a unit, the frame rate or a property that was taken as "
-        "known is wrong. If it is right, start near it."
+        f"{name} is {value:.3g} {parameter.unit}, and {expected}: a unit, the frame rate or a property that was "
+        "taken as known is wrong. If it is right, start near it."
     )
 
 

@@ -61,19 +61,19 @@ class Readings:
             values = trial.measured["shape" if trial.of_shapes else "wrench"].values
             if trial.of_shapes:
                 directions = values.shape[-1] - 1
-                known = np.repeat(np.isfinite(values).all(axis=-1, keepdims=True), directions, axis=-1)
-                group = np.full(known.shape, names.index("shape"))
-                sizes = np.full(known.shape, trial.job.whisker.arc_length / 100)
+                measured = np.repeat(np.isfinite(values).all(axis=-1, keepdims=True), directions, axis=-1)
+                group = np.full(measured.shape, names.index("shape"))
+                sizes = np.full(measured.shape, trial.job.whisker.arc_length / 100)
             else:
                 # A component that is zero throughout was not measured, or is zero by symmetry: it tells nothing.
-                known = (np.isfinite(values) & np.any(np.nan_to_num(values) != 0, axis=0))[:, None, :]
+                measured = (np.isfinite(values) & np.any(np.nan_to_num(values) != 0, axis=0))[:, None, :]
                 channel = np.array([names.index(name) for name in trial.channels])
-                group, sizes = np.broadcast_to(channel, known.shape), np.nan_to_num(values)[:, None, :]
-            rows.append(np.argwhere(known))
+                group, sizes = np.broadcast_to(channel, measured.shape), np.nan_to_num(values)[:, None, :]
+            rows.append(np.argwhere(measured))
             owners.append(np.full(len(rows[-1]), index))
-            groups.append(group[known])
-            np.add.at(squares, group[known], sizes[known] ** 2)
-            np.add.at(counts, group[known], 1)
+            groups.append(group[measured])
+            np.add.at(squares, group[measured], sizes[measured] ** 2)
+            np.add.at(counts, group[measured], 1)
             if "noise" in trial.measured:
                 stated = np.broadcast_to(trial.measured["noise"].values, len(trial.channels))
                 mine = [names.index(name) for name in trial.channels]
@@ -170,16 +170,16 @@ class FitModel:
         """Return by how much the residuals [m] at coordinates u [p] change in shorter steps, and with more links."""
         shorter = replace(self.fidelity, time_step=max(self.fidelity.time_step / SHORTER, 1e-7))
         finer = replace(shorter, links=min(2 * shorter.links, MOST_LINKS))
-        own, *others = (self.scan([u], fidelity)[0] for fidelity in (self.fidelity, shorter, finer))
-        return [other - own for other in others]
+        coarse, *others = (self.scan([u], fidelity)[0] for fidelity in (self.fidelity, shorter, finer))
+        return [other - coarse for other in others]
 
     def scan(self, points: Sequence[Array], fidelity: Fidelity | None = None) -> list[Array]:
         """Return the residuals [m] at each of many coordinates [p], simulated in one run of the engine."""
         jobs = [self._jobs(u) for u in points]
         shapes = any(trial.of_shapes for trial in self.trials)
-        found = iter(get_engine("rod").run(list(chain(*jobs)), fidelity or self.fidelity, record_shape=shapes))
+        traces = iter(get_engine("rod").run(list(chain(*jobs)), fidelity or self.fidelity, record_shape=shapes))
         self.simulated += len(points) * len(self.trials)
-        return [self._residual(u, list(islice(found, len(self.trials)))) for u in points]
+        return [self._residual(u, list(islice(traces, len(self.trials)))) for u in points]
 
     def _residual(self, u: Array, traces: Sequence[Trace]) -> Array:
         whisker = self.free.condition(u).whisker

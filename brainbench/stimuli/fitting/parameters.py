@@ -37,9 +37,9 @@ class Condition:
 
     def changed(self, values: Mapping[str, float]) -> Condition:
         """Return a condition with other values of some parameters."""
-        own = {name: value for name, value in values.items() if name in WHISKER}
+        material = {name: value for name, value in values.items() if name in WHISKER}
         return Condition(
-            with_values(self.whisker, own), {**self.others, **{k: values[k] for k in values if k not in own}}
+            with_values(self.whisker, material), {**self.others, **{k: values[k] for k in values if k not in material}}
         )
 
     def job(self, job: Job) -> Job:

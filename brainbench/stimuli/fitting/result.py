@@ -44,11 +44,11 @@ def directions(jacobian: Array, names: Sequence[str], noise: float = 1.0) -> tup
     """
     _, singular, rows = np.linalg.svd(np.nan_to_num(jacobian), full_matrices=False)
     least = singular.max(initial=0.0) * 1e-10
-    found = []
+    combinations = []
     for value, row in zip(singular[::-1], rows[::-1], strict=True):
         deviation = noise / value if value > max(least, 1e-300) else math.inf
-        found.append(_direction(deviation, row, names))
-    return tuple(found)
+        combinations.append(_direction(deviation, row, names))
+    return tuple(combinations)
 
 
 def _direction(deviation: float, row: Array, names: Sequence[str]) -> Direction:
@@ -56,14 +56,14 @@ def _direction(deviation: float, row: Array, names: Sequence[str]) -> Direction:
     order = order[np.abs(row[order]) > MEMBER * np.abs(row).max()]
     components = row[order] / row[order[0]]
     members = tuple(names[int(index)] for index in order)
-    known = deviation < UNKNOWN
-    return Direction(deviation, members, tuple(components.tolist()), known, _words(deviation, members, components))
+    identified = deviation < UNKNOWN
+    return Direction(deviation, members, tuple(components.tolist()), identified, _words(deviation, members, components))
 
 
 def _words(deviation: float, members: Sequence[str], components: Array) -> str:
-    known = deviation < UNKNOWN
+    identified = deviation < UNKNOWN
     if len(members) == 1:
-        if not known:
+        if not identified:
             return f"The data hardly depend on {members[0]}."
         return f"{members[0]} is known to {_size(members[0], deviation)}."
     # An example that one can check: the first parameter grows by a tenth, or by one unit of its scale.
@@ -75,7 +75,7 @@ def _words(deviation: float, members: Sequence[str], components: Array) -> str:
         for name, share in zip(members, components, strict=True)
     ]
     together = ", ".join(changes[:-1]) + f" together with {changes[-1]}"
-    if not known:
+    if not identified:
         return f"The data cannot tell {_listed(members)} apart: {together} leaves them as they are."
     return f"The combination {together} is known to {_size(members[0], deviation * abs(components[0]))}."
 
@@ -88,11 +88,11 @@ def _listed(names: Sequence[str]) -> str:
     return ", ".join(names[:-1]) + f" and {names[-1]}"
 
 
-def unknown_parameters(found: Sequence[Direction]) -> dict[str, Direction]:
+def unknown_parameters(combinations: Sequence[Direction]) -> dict[str, Direction]:
     """Return the parameters that take part in a direction that is not identified, each with the worst such "
     "direction."""
     worst: dict[str, Direction] = {}
-    for direction in found:
+    for direction in combinations:
         if not direction.identified:
             for name, share in zip(direction.members, direction.components, strict=True):
                 norm = math.sqrt(sum(one**2 for one in direction.components))
@@ -164,9 +164,9 @@ class FitResult:
         """Return the estimate of a parameter."""
         from brainbench.core.errors import check_name
 
-        known = {one.name: one for one in self.estimates}
-        check_name("fitted parameter", name, known)
-        return known[name]
+        by_name = {one.name: one for one in self.estimates}
+        check_name("fitted parameter", name, by_name)
+        return by_name[name]
 
     def summary(self) -> dict[str, Any]:
         """Return everything but the arrays, for JSON."""

@@ -52,9 +52,9 @@ class BulletEngine(SteppedEngine):
     def simulate(self, stepped: SteppedJob) -> tuple[Trace, float]:
         """See :meth:`SteppedEngine.simulate`."""
         gravity = np.asarray(stepped.job.gravity, float)
-        shown = stepped.frames(len(stepped.times)).nearest.tolist() if stepped.record_shape else []
+        shape = stepped.frames(len(stepped.times)).nearest.tolist() if stepped.record_shape else []
         with BulletWorld(stepped.chain, stepped.reach.obstacles, stepped.reach.nearest, gravity) as world:
-            run = _Run(stepped, world, frozenset(shown))
+            run = _Run(stepped, world, frozenset(shape))
             run.integrate()
         failed, reason = stepped.end(run.failed, run.reason)
         frames = stepped.frames(failed)
@@ -199,12 +199,12 @@ class _Run:
         margin = SEARCH + float(np.abs(moved) @ self._beyond)
         if not math.isfinite(margin):
             return None
-        found = list(world.closest(margin))
-        if not found:
+        rows = list(world.closest(margin))
+        if not rows:
             return None
         axes, jacobian, gaps, arcs, overlap = [], [], [], [], 0.0
-        bodies = {link: world.jacobian(link, q) for link in {item[0] for item in found}}
-        for link, number, point, normal, distance in found:
+        bodies = {link: world.jacobian(link, q) for link in {item[0] for item in rows}}
+        for link, number, point, normal, distance in rows:
             start, axis, linear, angular = bodies[link]
             frame = contact_axes(normal)
             arm = point - start
@@ -221,7 +221,7 @@ class _Run:
             np.array(axes),
             np.concatenate(jacobian),
             np.concatenate(gaps),
-            self.friction[[item[1] for item in found]],
+            self.friction[[item[1] for item in rows]],
             np.array(arcs),
             overlap,
         )

@@ -121,8 +121,8 @@ class BulletWorld:
         for number, bodies in enumerate(self.parts):
             for body, part in zip(bodies, self.obstacles[number].parts, strict=True):
                 extra = HULL_MARGIN if isinstance(part, ConvexPart) else 0.0
-                found = self.bullet.getClosestPoints(self.whisker, body, distance=margin)
-                for point in found:
+                points = self.bullet.getClosestPoints(self.whisker, body, distance=margin)
+                for point in points:
                     link, normal = (point[3] - FOLLICLE) // 2, np.array(point[7])
                     # Closest points of the cores, moved by the margin along the normal, are those of the thickened
                     # links.

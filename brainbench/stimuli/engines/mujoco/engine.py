@@ -263,9 +263,9 @@ def _penetration(slots: NDArray, hinges: NDArray, built: WhiskerModel, chain: Ch
     for steps in np.array_split(touching, len(touching) // CHUNK + 1):
         if not len(steps) or most[steps[0]] <= deepest:
             break
-        found = slots[steps]
-        arcs = _nearest_arcs(found[..., 5:8], _shape(built, chain, hinges[steps], steps), chain)
+        gaps = slots[steps]
+        arcs = _nearest_arcs(gaps[..., 5:8], _shape(built, chain, hinges[steps], steps), chain)
         link = np.clip(np.searchsorted(chain.nodes, arcs, side="right") - 1, 0, chain.links - 1)
-        overlap = np.where(found[..., 0] > 0, built.margins[link] - found[..., 4], 0.0)
+        overlap = np.where(gaps[..., 0] > 0, built.margins[link] - gaps[..., 4], 0.0)
         deepest = max(deepest, float(overlap.max(initial=0.0)))
     return deepest / MILLI

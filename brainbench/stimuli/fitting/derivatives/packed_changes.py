@@ -63,15 +63,15 @@ class PackedPlaces:
             cell = motions["cell"]
             return slice(int(cell[first]), int(cell[first + count - 1]) + 1)
 
-        found = []
+        places = []
         for j, task in enumerate(packed.tasks):
             some = slice(*(int(place) for place in shapes["first"][j : j + 2]))
             tracks = iter(dict.fromkeys(shapes["track"][some].tolist()))
-            known = {id(body.track): next(tracks) for body in {id(b.track): b for b in task.bodies}.values()}
-            bodies = tuple(knots(known[id(body.track)]) for body in task.bodies if body.obstacle.motion is not None)
+            by_track = {id(body.track): next(tracks) for body in {id(b.track): b for b in task.bodies}.values()}
+            bodies = tuple(knots(by_track[id(body.track)]) for body in task.bodies if body.obstacle.motion is not None)
             base = knots(int(packed.jobs.base[j]))
-            found.append(cls(task.chain.links, base, some, bodies, slice(int(loads[j]), int(loads[j + 1]))))
-        return found
+            places.append(cls(task.chain.links, base, some, bodies, slice(int(loads[j]), int(loads[j + 1]))))
+        return places
 
 
 def packed_change(task: JobTask, low: Job, high: Job, width: float, quasistatic: bool) -> Numbers:
@@ -210,9 +210,9 @@ def _rigid(nominal: Mesh | ConvexPart, moved: Mesh | ConvexPart) -> tuple[NDArra
     return turn, shift
 
 
-def _require(what: str, found: int, wanted: int) -> None:
-    if found != wanted:
-        raise UsageError(f"Jobs built from other values must have the same {what}: received {found} and {wanted}.")
+def _require(what: str, count: int, wanted: int) -> None:
+    if count != wanted:
+        raise UsageError(f"Jobs built from other values must have the same {what}: received {count} and {wanted}.")
 
 
 def packed_part(arrays: Mapping[str, NDArray[Any]], name: str, places: PackedPlaces, job: int) -> NDArray[Any]:

@@ -79,8 +79,8 @@ class RecordingSolver(WhiskerSolver):
         with turn(device):
             links = (self.capacity, count)
             self.paused = allocate(structs.PausedWhiskers, device, state=count, ended=count, link=links)
-            one = self._records(1, count)
-            affordable = self.room // sum(getattr(one, name).capacity for name in structs.StepRecords.vars)
+            single = self._records(1, count)
+            affordable = self.room // sum(getattr(single, name).capacity for name in structs.StepRecords.vars)
             self.paused.budget = budget = max(8, math.ceil(math.sqrt(steps)), min(steps, affordable))
             self.paused.records = self._records(budget, count)
             self.paused.keep = int(budget >= steps)

@@ -30,10 +30,10 @@ class MovedFollicle:
     @property
     def finest(self) -> float | None:
         """Shortest period (s) of the motion, as the follicle's own says; None when it says nothing."""
-        own = getattr(self.follicle, "finest", None)
-        if self.knots is None or own is None:
-            return own
-        return min(own, 2 * float(np.diff(self.knots).min()))
+        nominal = getattr(self.follicle, "finest", None)
+        if self.knots is None or nominal is None:
+            return nominal
+        return min(nominal, 2 * float(np.diff(self.knots).min()))
 
     def pose(self, times: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return positions [n, 3] (m) and angles [n, 3] (rad)."""
@@ -140,18 +140,18 @@ class JobParameters:
 
     def _nominal(self, name: str) -> float:
         if name in WHISKER:
-            found = {whisker_value(job.whisker, name) for job in self.jobs}
-            if len(found) > 1:
+            values = {whisker_value(job.whisker, name) for job in self.jobs}
+            if len(values) > 1:
                 raise UsageError(f"The whiskers of the jobs differ in {name!r}; fit them one by one.")
-            return found.pop()
+            return values.pop()
         kind, index, what = self._parse(name)
         if kind != "object" or what != "friction":
             return 0.0
         chosen = slice(None) if index < 0 else slice(index, index + 1)
-        found = {one.friction_beside(job.whisker.friction) for job in self.jobs for one in job.obstacles[chosen]}
-        if len(found) != 1:
+        values = {one.friction_beside(job.whisker.friction) for job in self.jobs for one in job.obstacles[chosen]}
+        if len(values) != 1:
             raise UsageError(f"{name!r} names no object, or several whose frictions differ; name one.")
-        return found.pop()
+        return values.pop()
 
     def _scale(self, name: str, value: float, length: float) -> float:
         if name in ("curvature", "friction") or name.endswith(".friction"):
@@ -181,8 +181,8 @@ class JobParameters:
                 if int(which or 0) >= count:
                     raise UsageError(f"{name!r} names object {which or 0}, and the jobs have {count}; count from 0.")
                 return "object", int(which or 0), what
-        known = (*WHISKER, *(f"base.{what}" for what in BASE), *(f"object.{what}" for what in OBJECT))
-        raise unknown_name("parameter", name, known)
+        names = (*WHISKER, *(f"base.{what}" for what in BASE), *(f"object.{what}" for what in OBJECT))
+        raise unknown_name("parameter", name, names)
 
     def _job(self, job: Job, given: dict[str, float]) -> Job:
         """Return a job at given values; what these do not change is the same object as at other values."""
@@ -195,8 +195,8 @@ class JobParameters:
                 continue
             kind, index, what = self._parse(name)
             if kind == "object":
-                for one in range(len(job.obstacles)) if index < 0 else (index,):
-                    moves.setdefault(one, {})[what] = value
+                for number in range(len(job.obstacles)) if index < 0 else (index,):
+                    moves.setdefault(number, {})[what] = value
             elif index < 0:
                 constant[what] = value
             else:
@@ -213,13 +213,13 @@ class JobParameters:
 
     def _keep(self, what: Any, given: Mapping[Any, float], make: Callable[[], Any]) -> Any:
         """Return what was made of these values at first."""
-        kept = self._kept.setdefault(what, {})
+        store = self._kept.setdefault(what, {})
         key = tuple(given.items())
-        if key not in kept:
-            if len(kept) > 4 * len(self.names):
-                kept.clear()
-            kept[key] = make()
-        return kept[key]
+        if key not in store:
+            if len(store) > 4 * len(self.names):
+                store.clear()
+            store[key] = make()
+        return store[key]
 
     def _moved_base(
         self, job: Job, constant: Mapping[str, float], at_knots: Mapping[tuple[int, str], float]

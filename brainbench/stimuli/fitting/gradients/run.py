@@ -192,8 +192,8 @@ class GradientRun:
     @cached_property
     def _rows(self) -> list[tuple[_Group, int]]:
         """Group of each job, and its row there."""
-        found = {index: (group, row) for group in self._groups for row, index in enumerate(group.indices)}
-        return [found[index] for index in range(len(self.jobs))]
+        places = {index: (group, row) for group in self._groups for row, index in enumerate(group.indices)}
+        return [places[index] for index in range(len(self.jobs))]
 
     def _simulate(self) -> tuple[list[Trace], list[_Group]]:
         tasks: list[JobTask] = []
@@ -244,8 +244,8 @@ class GradientRun:
             if steps is not None:
                 solver.steps[packed.jobs.whisker] = [steps[index] for index in indices]
             result = packed.launch(solver, record_shape=True)
-            found = [trace_of(result, row, task.job, self.fidelity, 0.0) for row, task in enumerate(some)]
-            return _Group(tuple(indices), packed, solver, PackedPlaces.of(packed)), found
+            traces = [trace_of(result, row, task.job, self.fidelity, 0.0) for row, task in enumerate(some)]
+            return _Group(tuple(indices), packed, solver, PackedPlaces.of(packed)), traces
 
         launches = _at_once(simulate, parts)
         traces = {index: trace for group, found in launches for index, trace in zip(group.indices, found, strict=True)}
@@ -254,14 +254,14 @@ class GradientRun:
     @cached_property
     def changes(self) -> list[list[Numbers]]:
         """Derivatives of the packed numbers of each job by each parameter: a row a parameter, a column a job."""
-        found = []
+        rows = []
         for (low, high), width in zip(self._changed, self._widths, strict=True):
             row = []
             for index, (group, place) in enumerate(self._rows):
                 task, ends = group.packed.tasks[place], (low[index], high[index])
                 row.append(packed_change(task, *ends, 2 * width, group.solver.quasistatic))
-            found.append(row)
-        return found
+            rows.append(row)
+        return rows
 
     def gradient(
         self,
@@ -332,10 +332,10 @@ def _at_once(function: Callable[[T], R], items: Sequence[T]) -> list[R]:
 
 def _leaves_plane(task: JobTask, job: Job) -> bool:
     """Return True when a job near that of a task, which stays in a plane, does not."""
-    own = task.job
-    parts = zip((job.follicle, *job.obstacles), (own.follicle, *own.obstacles), strict=True)
-    same = job.loads is own.loads and job.gravity == own.gravity and all(one is other for one, other in parts)
-    if same and (job.whisker.curvature == 0) == (own.whisker.curvature == 0):
+    nominal = task.job
+    parts = zip((job.follicle, *job.obstacles), (nominal.follicle, *nominal.obstacles), strict=True)
+    same = job.loads is nominal.loads and job.gravity == nominal.gravity and all(one is other for one, other in parts)
+    if same and (job.whisker.curvature == 0) == (nominal.whisker.curvature == 0):
         return False
     times = np.unique(np.concatenate([_span(job), task.base.times, *(body.track.times for body in task.bodies)]))
     position, euler = (np.asarray(values, dtype=float) for values in job.follicle.pose(times))

@@ -148,17 +148,17 @@ class TrackQuality:
     @property
     def words(self) -> tuple[str, ...]:
         """One sentence for each fault."""
-        told = []
+        sentences = []
         if self.missing_frames:
-            told.append(
+            sentences.append(
                 f"{self.missing_frames} of {self.frames} frames have no shape, the longest gap is {self.longest_gap} "
                 "frames; they are left out."
             )
         if self.missing_points > 0:
-            told.append(f"{100 * self.missing_points:.2g} % of the points in the other frames are missing.")
+            sentences.append(f"{100 * self.missing_points:.2g} % of the points in the other frames are missing.")
         if len(self.jumps):
-            told.append(_swap_words(self.jumps))
-        return tuple(told)
+            sentences.append(_swap_words(self.jumps))
+        return tuple(sentences)
 
 
 def every_frame(frames: NDArray[np.int_], path: str | os.PathLike[str]) -> NDArray[np.int_]:
@@ -176,8 +176,8 @@ def every_frame(frames: NDArray[np.int_], path: str | os.PathLike[str]) -> NDArr
 def inspect_track(shapes: xr.Dataset) -> TrackQuality:
     """Return what is wrong with traced shapes."""
     points = shapes["shape"].values
-    known: NDArray[np.bool_] = np.asarray(np.isfinite(points).all(axis=-1))
-    seen = known.sum(axis=1) >= min(2, points.shape[1])
+    present: NDArray[np.bool_] = np.asarray(np.isfinite(points).all(axis=-1))
+    seen = present.sum(axis=1) >= min(2, points.shape[1])
     edges = np.flatnonzero(np.diff(np.concatenate([[0], ~seen, [0]]).astype(int)))
     gaps = np.diff(edges.reshape(-1, 2), axis=1)
     lengths = traced_lengths(points)
@@ -186,7 +186,7 @@ def inspect_track(shapes: xr.Dataset) -> TrackQuality:
         frames=len(points),
         missing_frames=int((~seen).sum()),
         longest_gap=int(gaps.max()) if len(gaps) else 0,
-        missing_points=float(1 - known[seen].mean()) if seen.any() else 1.0,
+        missing_points=float(1 - present[seen].mean()) if seen.any() else 1.0,
         jumps=_jumps(points, seen, length) if math.isfinite(length) else np.zeros(0, dtype=int),
         length=length,
     )
@@ -194,15 +194,16 @@ def inspect_track(shapes: xr.Dataset) -> TrackQuality:
 
 def check_track(shapes: xr.Dataset) -> TrackQuality:
     """Return what is wrong with traced shapes that can be used."""
-    found = inspect_track(shapes)
-    if found.missing_frames > MOST_GAPS * found.frames:
+    quality = inspect_track(shapes)
+    if quality.missing_frames > MOST_GAPS * quality.frames:
         raise DataError(
-            f"{found.missing_frames} of {found.frames} frames have no shape (the longest gap is {found.longest_gap}); "
-            f"a track is used up to {100 * MOST_GAPS:g} %: trace it again, or cut it to frames in which it was seen."
+            f"{quality.missing_frames} of {quality.frames} frames have no shape (the longest gap is "
+            f"{quality.longest_gap}); a track is used up to {100 * MOST_GAPS:g} %: trace "
+            "it again, or cut it to frames in which it was seen."
         )
-    if len(found.jumps):
-        raise DataError(f"{_swap_words(found.jumps)} Correct the identities, or cut the track there.")
-    return found
+    if len(quality.jumps):
+        raise DataError(f"{_swap_words(quality.jumps)} Correct the identities, or cut the track there.")
+    return quality
 
 
 def check_length(shapes: xr.Dataset, arc_length: float) -> None:
@@ -230,10 +231,10 @@ def traced_lengths(points: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the length [n] (m) of the polyline through the known points of each frame; NaN below two."""
     lengths = np.full(len(points), np.nan)
     for index, frame in enumerate(points):
-        known = frame[np.isfinite(frame).all(axis=-1)]
-        if len(known) >= 2:
+        present = frame[np.isfinite(frame).all(axis=-1)]
+        if len(present) >= 2:
             # At most a dozen chords: noise lengthens a polyline of many points.
-            some = known[np.unique(np.linspace(0, len(known) - 1, min(len(known), 12)).round().astype(int))]
+            some = present[np.unique(np.linspace(0, len(present) - 1, min(len(present), 12)).round().astype(int))]
             lengths[index] = np.linalg.norm(np.diff(some, axis=0), axis=1).sum()
     return lengths
 
@@ -243,13 +244,13 @@ def _jumps(points: NDArray[np.float64], seen: NDArray[np.bool_], length: float) 
     frames = np.flatnonzero(seen)
     if len(frames) < 3:
         return np.zeros(0, dtype=int)
-    known = [points[index][np.isfinite(points[index]).all(axis=-1)] for index in frames]
-    base, chord = np.array([one[0] for one in known]), np.array([one[-1] - one[0] for one in known])
+    shapes = [points[index][np.isfinite(points[index]).all(axis=-1)] for index in frames]
+    base, chord = np.array([one[0] for one in shapes]), np.array([one[-1] - one[0] for one in shapes])
     steps = np.linalg.norm(np.diff(base, axis=0), axis=1)
-    usual = max(float(np.median(steps)), 1e-12)
-    jumped = (steps > JUMP * usual) & (steps > FAR * length)
+    typical = max(float(np.median(steps)), 1e-12)
+    jumped = (steps > JUMP * typical) & (steps > FAR * length)
     # Signed height of the middle above the chord in the x-y plane, over the length: its sign is the side it curves to.
-    middle = np.array([one[len(one) // 2] - one[0] for one in known])
+    middle = np.array([one[len(one) // 2] - one[0] for one in shapes])
     height = (chord[:, 0] * middle[:, 1] - chord[:, 1] * middle[:, 0]) / np.maximum(
         np.linalg.norm(chord, axis=1) * length, 1e-300
     )
@@ -265,8 +266,8 @@ def _jumps(points: NDArray[np.float64], seen: NDArray[np.bool_], length: float) 
 
 
 def _swap_words(jumps: NDArray[np.int_]) -> str:
-    shown = ", ".join(map(str, jumps[:5].tolist())) + (" …" if len(jumps) > 5 else "")
+    frames = ", ".join(map(str, jumps[:5].tolist())) + (" …" if len(jumps) > 5 else "")
     return (
-        f"The base jumps or the shape turns into its mirror image at {len(jumps)} frames ({shown}), as when the "
+        f"The base jumps or the shape turns into its mirror image at {len(jumps)} frames ({frames}), as when the "
         "whisker changes places with its neighbour or with that of the other side."
     )

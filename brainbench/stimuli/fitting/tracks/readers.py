@@ -109,9 +109,9 @@ def pickled_names(data: bytes, name: str) -> list[tuple[str, ...]]:  # noqa: PLR
 
     def above_mark() -> list[Any]:
         place = len(stack) - 1 - stack[::-1].index(mark)
-        taken = stack[place + 1 :]
+        entries = stack[place + 1 :]
         del stack[place:]
-        return taken
+        return entries
 
     try:
         for code, argument, _ in pickletools.genops(data):
@@ -132,19 +132,19 @@ def pickled_names(data: bytes, name: str) -> list[tuple[str, ...]]:  # noqa: PLR
                     count = int(code.name[-1])
                     stack[-count:] = [tuple(stack[-count:])]
                 case "APPEND":
-                    item = stack.pop()
-                    stack[-1].append(item)
+                    entry = stack.pop()
+                    stack[-1].append(entry)
                 case "APPENDS":
-                    items = above_mark()
-                    stack[-1].extend(items)
+                    entries = above_mark()
+                    stack[-1].extend(entries)
                 case "PUT" | "BINPUT" | "LONG_BINPUT":
                     memo[int(argument or 0)] = stack[-1]
                 case "MEMOIZE":
                     memo[len(memo)] = stack[-1]
                 case "GET" | "BINGET" | "LONG_BINGET":
                     stack.append(memo[int(argument or 0)])
-                case other:
-                    raise DataError(f"The names of the columns of {name} are not plain texts ({other}).")
+                case unexpected:
+                    raise DataError(f"The names of the columns of {name} are not plain texts ({unexpected}).")
     except (ValueError, IndexError, KeyError, AttributeError) as error:
         raise DataError(f"The names of the columns of {name} cannot be read ({error}).") from error
     if len(stack) != 1 or not all(
@@ -181,8 +181,8 @@ def read_whiskerman(path: str | os.PathLike[str], options: TrackOptions) -> tupl
     points[backward] = points[backward, ::-1]
     points[~tracked] = np.nan
     frames = np.flatnonzero(tracked)
-    kept = slice(frames[0], frames[-1] + 1)
-    return np.arange(len(control))[kept], points[kept]
+    span = slice(frames[0], frames[-1] + 1)
+    return np.arange(len(control))[span], points[span]
 
 
 def bezier(control: Array, count: int) -> Array:
@@ -194,15 +194,15 @@ def bezier(control: Array, count: int) -> Array:
 
 
 def _read_structs(path: str | os.PathLike[str]) -> list[dict[str, Any]]:
-    found = check_file(path, "track of WhiskerMan", most=4 * MOST_TABLE)
-    with found.open("rb") as stream:
+    file = check_file(path, "track of WhiskerMan", most=4 * MOST_TABLE)
+    with file.open("rb") as stream:
         head = stream.read(520)
     if b"\x89HDF\r\n" in head:  # MATLAB 7.3
         return _structs_of_hdf5(path)
     from scipy.io import loadmat
 
     with readable(path, "track of WhiskerMan (MATLAB file)"):
-        data = loadmat(found, variable_names=["whisker"], struct_as_record=True, appendmat=False)
+        data = loadmat(file, variable_names=["whisker"], struct_as_record=True, appendmat=False)
     if "whisker" not in data or data["whisker"].dtype.names is None:
         raise DataError(f"{shown(os.fspath(path))} is no track of WhiskerMan: the struct 'whisker' is missing.")
     _need(data["whisker"].dtype.names, path)

@@ -63,12 +63,12 @@ def read_whisk(path: str | os.PathLike[str], options: TrackOptions) -> tuple[NDA
 
 
 def _read_segments(path: str | os.PathLike[str]) -> Segments:
-    found = check_file(path, "file of whisk's traces", most=16 * MOST_TEXT)
-    with found.open("rb") as stream:
+    file = check_file(path, "file of whisk's traces", most=16 * MOST_TEXT)
+    with file.open("rb") as stream:
         head = stream.read(len(_HEADER))
     if head == _HEADER:
         with readable(path, "binary file of whisk's traces"):
-            return _parse_binary(found.read_bytes(), shown(os.fspath(path)))
+            return _parse_binary(file.read_bytes(), shown(os.fspath(path)))
     if head.startswith(b"whisker1"):
         return _parse_text(read_rows(path, "text file of whisk's traces"), shown(os.fspath(path)))
     raise DataError(
@@ -79,29 +79,29 @@ def _read_segments(path: str | os.PathLike[str]) -> Segments:
 def _parse_binary(data: bytes, name: str) -> Segments:
     """Return the traces of records of three int32 (number, frame, length) and four float32 lists: x, y, width, "
     "score."""
-    found: Segments = {}
+    segments: Segments = {}
     place, end = len(_HEADER), len(data) - 4
     while place < end:
         number, frame, count = (int(one) for one in np.frombuffer(data, "<i4", 3, place))
         place += 12
         if not 0 < count <= _MOST_POINTS or frame < 0 or place + 16 * count > end:
             raise DataError(f"{name} is cut off or damaged at byte {place}: a trace of {count} points does not fit.")
-        found[frame, number] = np.frombuffer(data, "<f4", 2 * count, place).reshape(2, count).T.astype(float)
+        segments[frame, number] = np.frombuffer(data, "<f4", 2 * count, place).reshape(2, count).T.astype(float)
         place += 16 * count
-    return found
+    return segments
 
 
 def _parse_text(rows: list[list[str]], name: str) -> Segments:
     """Return the traces of lines ``frame, id, time, n, x1, y1, width1, score1, …``."""
-    found: Segments = {}
+    segments: Segments = {}
     for index, row in enumerate(rows[1:], 2):
         try:
             frame, number, _, count = (int(cell) for cell in row[:4])
             values = np.array([float(cell) for cell in row[4 : 4 + 4 * count]]).reshape(count, 4)
         except ValueError as error:
             raise DataError(f"{name} is damaged: line {index} is no trace ({shown(','.join(row))}).") from error
-        found[frame, number] = values[:, :2]
-    return found
+        segments[frame, number] = values[:, :2]
+    return segments
 
 
 def _read_identities(path: str) -> tuple[dict[tuple[int, int], int], dict[tuple[int, int], Array]]:
@@ -136,8 +136,8 @@ def _read_whiskiwrap(
         arrays = {name: cast("Any", file[name])[()] for name in ("summary", "pixels_x", "pixels_y")}
         summary = arrays["summary"]
         # Older files call frame, number and follicle otherwise.
-        known = {"time": "fid", "id": "wid", "fol_x": "follicle_x", "fol_y": "follicle_y"}
-        columns = {str(known.get(name, name)): summary[name].astype(float) for name in summary.dtype.names or ()}
+        renamed = {"time": "fid", "id": "wid", "fol_x": "follicle_x", "fol_y": "follicle_y"}
+        columns = {str(renamed.get(name, name)): summary[name].astype(float) for name in summary.dtype.names or ()}
         if not {"fid", "wid"} <= set(columns):
             raise DataError(f"The summary of {shown(os.fspath(path))} has no frame and no number of each trace.")
         pairs = zip(arrays["pixels_x"], arrays["pixels_y"], strict=True)
@@ -165,7 +165,7 @@ def _orient(traces: Mapping[int, Array], follicles: Mapping[int, Array]) -> dict
 
     Else ends are followed from frame to frame, and the base is the one that moves less.
     """
-    found: dict[int, Array] = {}
+    oriented: dict[int, Array] = {}
     unknown: list[int] = []
     before: Array | None = None
     for frame, trace in traces.items():
@@ -178,10 +178,10 @@ def _orient(traces: Mapping[int, Array], follicles: Mapping[int, Array]) -> dict
                 same = np.linalg.norm(trace[0] - before[0]) + np.linalg.norm(trace[-1] - before[-1])
                 swapped = np.linalg.norm(trace[-1] - before[0]) + np.linalg.norm(trace[0] - before[-1])
                 trace = trace if same <= swapped else trace[::-1]
-        found[frame] = before = trace
-    if len(unknown) == len(found):
-        ends = np.array([[trace[0], trace[-1]] for trace in found.values()])
+        oriented[frame] = before = trace
+    if len(unknown) == len(oriented):
+        ends = np.array([[trace[0], trace[-1]] for trace in oriented.values()])
         moved = ends.std(axis=0).sum(axis=1)
         if moved[0] > moved[1]:
-            found = {frame: trace[::-1] for frame, trace in found.items()}
-    return found
+            oriented = {frame: trace[::-1] for frame, trace in oriented.items()}
+    return oriented

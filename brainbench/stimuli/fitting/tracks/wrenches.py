@@ -65,11 +65,11 @@ def _read_csv(path: str | os.PathLike[str]) -> xr.Dataset:
     times = table[:, names.index(clock)] * TIMES[clock.lower()]
     channels, columns = [], []
     for index, name in enumerate(names):
-        if found := _COLUMN.fullmatch(name):
-            unit = re.sub("[.·* ]", "", re.sub("[µμ]", "u", found[2] or ("N" if name[0] == "F" else "Nm")))
+        if match := _COLUMN.fullmatch(name):
+            unit = re.sub("[.·* ]", "", re.sub("[µμ]", "u", match[2] or ("N" if name[0] == "F" else "Nm")))
             if ("m" in unit.partition("N")[2]) != (name[0] == "M"):
                 raise DataError(f"The column {name!r} of {shown(os.fspath(path))} has the unit of the other kind.")
-            channels.append(found[1])
+            channels.append(match[1])
             columns.append(table[:, index] * _SCALES[unit])
     if not channels:
         raise DataError(
@@ -125,11 +125,11 @@ def _factors(unit: Any, channels: Sequence[str], path: str | os.PathLike[str]) -
     short = text
     for words, sign in _WORDS.items():
         short = re.sub(words, sign, short)
-    found = [re.sub("[.·* ]", "", one) for one in _UNIT.findall(short)]
-    kinds = {"FM"["m" in one.partition("N")[2]]: _SCALES[one] for one in found}
+    units = [re.sub("[.·* ]", "", one) for one in _UNIT.findall(short)]
+    kinds = {"FM"["m" in one.partition("N")[2]]: _SCALES[one] for one in units}
     if kinds == {"F": 1.0}:  # the unit of the forces alone, and moments in the same system
         kinds["M"] = 1.0
-    if len(kinds) < len(found) or not {name[0] for name in channels} <= set(kinds):
+    if len(kinds) < len(units) or not {name[0] for name in channels} <= set(kinds):
         raise DataError(
             f"The wrenches of {shown(os.fspath(path))} have the unit {shown(text)}, which does not tell forces and "
             f"moments; write the units of both, as in 'mN, mN·mm': {', '.join(_SCALES)}."
@@ -141,23 +141,23 @@ def _find_series(file: Any) -> tuple[Any, Any] | None:
     """Return the data set of wrenches and the group that holds its times."""
     if "wrench" in file:
         return file["wrench"], file
-    found: list[Any] = []
+    series: list[Any] = []
 
-    def look(name: str, item: Any) -> None:
-        six = getattr(item, "ndim", 0) == 2 and (item.shape[1] == len(CHANNELS) or "channels" in item.attrs)
+    def look(name: str, node: Any) -> None:
+        six = getattr(node, "ndim", 0) == 2 and (node.shape[1] == len(CHANNELS) or "channels" in node.attrs)
         if name.rpartition("/")[2] == "data" and six:
-            found.append(item)
+            series.append(node)
 
     file.visititems(look)
     # Six columns may be anything; those that name their channels are wrenches.
-    found = [item for item in found if "channels" in item.attrs] or found
-    if len(found) > 1:
+    series = [item for item in series if "channels" in item.attrs] or series
+    if len(series) > 1:
         raise DataError(
             f"{shown(file.filename)} has several time series that may be wrenches, "
-            f"{listing(item.parent.name for item in found)}; keep one, or name the channels of one in the attribute "
+            f"{listing(item.parent.name for item in series)}; keep one, or name the channels of one in the attribute "
             "'channels' of its data."
         )
-    return (found[0], found[0].parent) if found else None
+    return (series[0], series[0].parent) if series else None
 
 
 def _read_stimulus_set(path: str | os.PathLike[str], whisker: str | None, stimulus: str | None) -> xr.Dataset:
@@ -165,16 +165,16 @@ def _read_stimulus_set(path: str | os.PathLike[str], whisker: str | None, stimul
     from brainbench.stimuli.stimulus_set import read_stimulus_set
 
     dataset, chosen = to_axes(read_stimulus_set(path), "world"), {}
-    if (made := dataset.attrs.get("readout", "instantaneous")) != "instantaneous":
+    if (readout := dataset.attrs.get("readout", "instantaneous")) != "instantaneous":
         raise DataError(
-            f"A frame of {shown(os.fspath(path))} is no reading ({made}), and a fit compares readings; simulate the "
+            f"A frame of {shown(os.fspath(path))} is no reading ({readout}), and a fit compares readings; simulate the "
             "scenes with instantaneous frames (average = 1, no low-pass)."
         )
     for kind, name in (("whisker", whisker), ("stimulus", stimulus)):
         present = [str(one) for one in dataset[kind].values]
         chosen[kind] = present.index(choose_name(f"{kind} of {shown(os.fspath(path))}", name, present))
-    one = dataset["wrench"].isel(chosen)
-    return new_wrenches(dataset["time"].values, one.values, source=os.fspath(path))
+    wrench = dataset["wrench"].isel(chosen)
+    return new_wrenches(dataset["time"].values, wrench.values, source=os.fspath(path))
 
 
 def _no_times(path: str | os.PathLike[str], names: list[str]) -> DataError:
