@@ -1,12 +1,11 @@
 """Result records, the static site of a leaderboard, and reports.
 
-A record is one JSON file per score, named by its content (:mod:`leaderboards.store`), described by the JSON Schema in
-``record.schema.json``. :mod:`leaderboards.boards` decides what may be compared with what, :mod:`leaderboards.entries`
-folds seeds together, :mod:`leaderboards.ranking` tests which models differ, :mod:`leaderboards.standing` says what a
-score is worth and :mod:`leaderboards.conclusions` says it all in sentences. :mod:`leaderboards.figures` draws,
-:mod:`leaderboards.site` writes pages and :mod:`leaderboards.report` papers; :mod:`leaderboards.audit` finds stale and
-contradicting records, :mod:`leaderboards.changes` compares builds, :mod:`leaderboards.held_out` keeps recordings back.
-This package reads records, never models.
+A record is one JSON file per score, named by its content and described by the JSON Schema in ``record.schema.json``
+(:mod:`leaderboards.store`). :mod:`leaderboards.boards` decides what may be compared with what and says the result in
+sentences, :mod:`leaderboards.entries` folds seeds together, and :mod:`leaderboards.ranking` tests which models differ
+and says what a score is worth. :mod:`leaderboards.figures` draws, :mod:`leaderboards.site` writes pages and
+:mod:`leaderboards.report` papers; :mod:`leaderboards.audit` finds stale and contradicting records and compares builds,
+:mod:`leaderboards.held_out` keeps recordings back. This package reads records, never models.
 """
 
 from typing import TYPE_CHECKING

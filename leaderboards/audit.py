@@ -1,4 +1,4 @@
-"""Doubtful records of a set: stale ones, and those that contradict one another.
+"""Doubtful records of a set, and differences between two records or two builds of a board.
 
 A record is **stale** when something newer exists than what made it: the default estimator, or the definition behind a
 fidelity's name. A newer package alone makes none: what changes numbers raises the estimator's version. Two records
@@ -8,14 +8,19 @@ fidelity's name. A newer package alone makes none: what changes numbers raises t
 from __future__ import annotations
 
 import math
+import os
 from collections import defaultdict
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from itertools import islice
-from typing import Any
+from pathlib import Path
+from typing import Any, Literal
 
+from brainbench.core.files import to_plain
 from brainbench.core.identity import ScoreIdentity
-from brainbench.core.records import ESTIMATOR_VERSION, ResultRecord
-from leaderboards.store import StoredRecord
+from brainbench.core.records import ESTIMATOR_VERSION, ResultRecord, Score
+from leaderboards.boards import rank
+from leaderboards.store import StoredRecord, read_records
 
 TOLERANCE = 1e-3
 """Two runs of one computation agree within this on every machine: float32 sums differ in their last digits."""
@@ -95,3 +100,143 @@ def _agree(left: ResultRecord, right: ResultRecord) -> bool:
 
 def _value(record: ResultRecord) -> str:
     return "no number" if math.isnan(record.score.value) else f"{record.score.value:.4f}"
+
+
+_CAUSES = ("recordings", "stimuli", "brainbench version", "card.weights", "score.layer")
+
+
+@dataclass(frozen=True)
+class Difference:
+    """One statement of two records that is not the same."""
+
+    what: str
+    """Place in the record, such as ``score.value``."""
+    before: Any
+    after: Any
+
+    def __str__(self) -> str:
+        return f"{self.what}: {in_short(self.before)} → {in_short(self.after)}"
+
+
+@dataclass(frozen=True)
+class Change:
+    """A change of one model between two builds."""
+
+    kind: Literal["added", "removed", "changed", "moved", "restated"]
+    """``moved``: the record is the same, its rank or standing is not, because of others. ``restated``: another record
+    with the same inputs and numbers, which says more or less beside them."""
+    board: str
+    name: str
+    before: str
+    """Value, standing and rank before; empty for an added one."""
+    after: str
+    causes: tuple[str, ...] = ()
+    """Other differences between the records, such as the package's version or the stimuli."""
+
+
+def differences(record: ResultRecord, again: ResultRecord, *, tolerance: float = TOLERANCE) -> list[Difference]:
+    """Return what a repetition of a record's computation found otherwise, the inputs first.
+
+    Compared are the hashes of recordings, stimuli and weights, and every number, layer, animal, baseline and
+    status of the scores. Numbers count as equal within ``tolerance``. What only says when, where and with which
+    packages is not compared, nor the content hash of simulated stimuli whose configuration is the same.
+    """
+    one, other = record.score.provenance, again.score.provenance
+    inputs: list[tuple[str, Any, Any]] = [
+        ("recordings", one.recordings_hash, other.recordings_hash),
+        ("stimuli", one.stimuli_hash, other.stimuli_hash),
+        ("brainbench version", one.version, other.version),
+    ]
+    if record.card and again.card:
+        inputs.append(("card.weights", record.card.weights, again.card.weights))
+        inputs.append(("card.parameters", record.card.parameters, again.card.parameters))
+    before, after = dict(_statements(record)), dict(_statements(again))
+    numbers = [(name, before.get(name), after.get(name)) for name in dict.fromkeys([*before, *after])]
+    return [Difference(*item) for item in inputs if item[1] != item[2]] + [
+        Difference(*item) for item in numbers if not _equal(*item[1:], tolerance)
+    ]
+
+
+def open_build(*sources: str | os.PathLike[str]) -> list[StoredRecord]:
+    """Read the records of folders, files, or built sites (which hold those they were made from), each record once.
+
+    Raises:
+        DataFileNotFoundError: there is nothing there.
+    """
+    folders = [(source, Path(source) / "records") for source in sources]
+    return read_records([records if records.is_dir() else source for source, records in folders])
+
+
+def compare_builds(before: Iterable[StoredRecord], after: Iterable[StoredRecord]) -> list[Change]:
+    """Return what changed between two sets of records: added, removed, changed, and ranks or standings moved by others.
+
+    A model is the same when its name, weights seed, recordings' name, metric, estimator and time rule are.
+    """
+    old, new = _by_model(before), _by_model(after)
+    changes = []
+    for key in dict.fromkeys([*new, *old]):
+        ones, others = dict(old.get(key, {})), dict(new.get(key, {}))
+        pairs = [(ones.pop(identity), others.pop(identity)) for identity in sorted(ones.keys() & others.keys())]
+        changes += [Change("moved", *one[:2], one[2], other[2]) for one, other in pairs if one[2] != other[2]]
+        while ones and others:
+            (_, one), (_, other) = ones.popitem(), others.popitem()
+            found = differences(one[3], other[3], tolerance=0.0)
+            causes = tuple(str(item) for item in found if item.what in _CAUSES)
+            changes.append(Change("changed" if found else "restated", *other[:2], one[2], other[2], causes))
+        changes += [Change("removed", *one[:3], "") for one in ones.values()]
+        changes += [Change("added", *other[:2], "", other[2]) for other in others.values()]
+    order = ("added", "removed", "changed", "moved", "restated")
+    return sorted(changes, key=lambda change: (order.index(change.kind), change.board, change.name, change.before))
+
+
+_Placed = tuple[str, str, str, ResultRecord]
+"""Board, name, value and rank in print, and the record."""
+
+
+def _by_model(stored: Iterable[StoredRecord]) -> dict[tuple[Any, ...], dict[str, _Placed]]:
+    found: dict[tuple[Any, ...], dict[str, _Placed]] = defaultdict(dict)
+    for board in rank(item.record for item in stored if item.record is not None):
+        label = f"{board.recordings}, {board.metric or 'metric not stated'}, {board.estimator}"
+        for entry, record in ((one, record) for one in board.entries for record in one.records):
+            seed, value = record.card.seed if record.card else None, record.score.value
+            shown = f"{entry.name} (seed {seed})" if seed is not None else entry.name
+            # What a score is worth may change with the other records, though neither score nor rank does.
+            told = f"{'' if math.isnan(value) else f'{value:.3f}, '}{entry.standing}, rank {entry.rank}"
+            key = (entry.name, seed, board.recordings, board.metric, board.estimator, board.time)
+            found[key][record.identity] = (label, shown, told, record)
+    return found
+
+
+def _statements(record: ResultRecord) -> Iterator[tuple[str, Any]]:
+    scores: dict[str, Score | None] = {"score": record.score, "animal_to_animal": record.animal_to_animal}
+    scores |= {f"baselines.{name}": score for name, score in record.baselines.items()}
+    for where, score in scores.items():
+        for name, value in to_plain(score).items() if score is not None else ():
+            if name not in ("provenance", "reasons", "p_method", "name"):
+                yield from _leaves(f"{where}.{name}", value)
+
+
+def _leaves(where: str, value: Any) -> Iterator[tuple[str, Any]]:
+    if isinstance(value, Mapping):
+        named = value.get("layer") if where.endswith("]") and "layer" in value and "subject" not in value else None
+        for name, item in value.items():
+            if name == "method":
+                continue
+            yield from _leaves(f"{where}.{name}" if named is None else f"{where}({named}).{name}", item)
+    elif isinstance(value, list):
+        for index, item in enumerate(value):
+            yield from _leaves(f"{where}[{index}]", item)
+    else:
+        yield where, value
+
+
+def _equal(one: Any, other: Any, tolerance: float) -> bool:
+    numbers = all(isinstance(item, (int, float)) and not isinstance(item, bool) for item in (one, other))
+    return abs(one - other) <= tolerance if numbers else one == other
+
+
+def in_short(value: Any) -> str:
+    """Write a statement of a record in few characters."""
+    if value is None:
+        return "none"
+    return f"{value:.5g}" if isinstance(value, float) else str(value)

@@ -19,8 +19,7 @@ from brainbench.core.files import content_hash
 from brainbench.core.identity import unusual_settings
 from brainbench.core.records import Interval, ModelCard, ResultRecord, Score
 from brainbench.core.statistics import is_finite
-from leaderboards.ranking import CHANCE_LEVEL, Sample
-from leaderboards.standing import STANDINGS, Standing, not_repeatable, standing_of
+from leaderboards.ranking import CHANCE_LEVEL, STANDINGS, Sample, Standing, not_repeatable, standing_of
 
 UNTRAINED = "untrained"
 _SAME = 1e-6

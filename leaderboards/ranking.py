@@ -1,9 +1,9 @@
-"""Scores that are told apart when animals and stimuli are both samples, and the ranks that this leaves open.
+"""Scores that are told apart when animals and stimuli are both samples, the ranks that this leaves open, and standings.
 
 Scores are compared on the scale that all metrics share (:attr:`Score.scaled`). Two models were scored on the same
 animals and stimuli, so the test is paired: the difference of every animal, and the difference without each stimulus
 in turn, give the standard error (:func:`brainbench.core.statistics.two_factor_error`); seeds of weights add their
-own variance. Letters: N models, A animals, K stimuli.
+own variance. A standing says in words what a score is worth. Letters: N models, A animals, K stimuli.
 """
 
 from __future__ import annotations
@@ -11,12 +11,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.records import Interval, Score
+from brainbench.core.records import Interval, ResultRecord, Score
 from brainbench.core.statistics import FEWEST_ANIMALS, FEWEST_STIMULI, LEVEL, two_factor_error
 
 FALSE_DISCOVERY_RATE = 0.05
@@ -153,3 +153,53 @@ def _with_seeds(error: NDArray[np.float64], freedom: NDArray[np.float64], seeds:
         for variance, count in seeds:
             spent = spent + np.where(np.asarray(count) > 0, np.square(variance) / np.maximum(count, 1.0), 0.0)
         return np.sqrt(total), total**2 / spent
+
+
+Standing = Literal[
+    "above raw input", "above chance", "not told apart from chance", "not tested", "unreliable", "undefined"
+]
+MEANINGS: dict[Standing, str] = {
+    "above raw input": "Told apart from chance, and above the raw input of the models.",
+    "above chance": "Told apart from chance, but not above the raw input of the models.",
+    "not told apart from chance": "A model that knows nothing of these stimuli could score as high.",
+    "not tested": "The record states no test against chance.",
+    "unreliable": "Computed, but not to be trusted: the data are too noisy or too few.",
+    "undefined": "No number exists.",
+}
+"""Statements about a score, from the most to the least: every page uses these words and no others."""
+STANDINGS = tuple(MEANINGS)
+DOUBTFUL: tuple[Standing, ...] = ("unreliable", "undefined")
+"""Standings of scores that no conclusion is drawn from."""
+BUILT_IN_METRICS = (
+    "rsa", "rsa-correlation", "rsa-crossnobis", "rsa-partial", "cka", "decoding", "procrustes", "ridge"
+)  # fmt: skip
+"""Names of the metrics that come with the package (this package cannot import them)."""
+
+
+def standing_of(score: Score, *, above_raw: bool) -> Standing:
+    """Return what can be said of a score, given whether it is told apart above the raw input."""
+    if score.status != "ok":
+        return score.status
+    if math.isnan(score.p):
+        return "not tested"
+    if score.p > CHANCE_LEVEL:
+        return "not told apart from chance"
+    return "above raw input" if above_raw else "above chance"
+
+
+def not_repeatable(record: ResultRecord) -> str:
+    """Return why a record cannot be computed again from this package alone, empty when it can.
+
+    >>> from brainbench.core.records import ModelCard
+    >>> not_repeatable(ResultRecord(Score("features", 0.9, "ok"), card=ModelCard("features", family="user module")))
+    'its code is not in the registry'
+    """
+    card, name = record.card, record.score.name
+    if card is None or card.family in ("", "features computed elsewhere"):
+        return "its features were computed elsewhere"
+    if card.family == "user module":
+        return "its code is not in the registry"
+    metric = record.score.provenance.settings.get("metric")
+    if card.family != "policy" and metric is not None and metric not in BUILT_IN_METRICS:
+        return "its metric does not come with the package"
+    return "its weights do not come with the package" if name.startswith(("local-dir:", "hf-hub:")) else ""

@@ -11,7 +11,7 @@ from dataclasses import fields
 from typing import Any
 
 from brainbench.core.records import Interval, ModelCard, ResultRecord, Score
-from leaderboards.standing import not_repeatable
+from leaderboards.ranking import not_repeatable
 
 SYNTHETIC = "Synthetic demo recordings: ranks say nothing about brains."
 

@@ -21,7 +21,7 @@ from benchmarks.reproduction.comparisons import COMPARISONS, each
 from benchmarks.reproduction.contrasts import Effect, Verdict, contrast, judge
 from benchmarks.reproduction.measures import Measured
 from brainbench.core.statistics import wilson_interval
-from leaderboards.figures.scatter import regression
+from leaderboards.figures.charts import regression
 
 _UNTESTABLE: Verdict = "cannot be tested here"
 

@@ -1,9 +1,9 @@
 """Metrics: how alike a model's responses and animals' are, and what can be concluded from it.
 
 ``rdms`` makes and compares representational dissimilarity matrices (RDMs), ``reliability`` splits trials into halves
-and corrects for noise, ``measures`` holds the registered metrics, ``score`` and ``animal_to_animal`` are the engine of
-all of them, ``inference`` tests and gives intervals. Data pass in this order: :class:`Trials` → :meth:`Metric.animal`
-→ :meth:`Metric.score` and :meth:`Metric.score_animals` → a score.
+and corrects for noise, ``hooks`` says what a metric has to define and ``measures`` holds the registered ones,
+``evaluation`` and ``score`` are the engine of all of them, ``inference`` tests. Data pass in this order:
+:class:`Trials` → :meth:`Metric.animal` → :meth:`Metric.score` and :meth:`Metric.score_animals` → a score.
 """
 
 from __future__ import annotations

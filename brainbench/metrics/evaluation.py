@@ -1,4 +1,16 @@
-"""The layers of a model against the scored animals: comparisons, the choice of layer, and the permutation test."""
+"""The layers of a model against the scored animals: comparisons, the choice of layer, and the permutation test.
+
+The best of many layers looks good by luck alone: with six stimuli the largest of 40 unrelated comparisons is expected
+near .56. So the layer for an animal is the one that compares best with the *other* animals, unless one was committed to
+beforehand. Comparisons vote raw: dividing by reliability would give the noisiest animals the loudest vote. Ties go to
+the first layer.
+
+Other animals saw the same few stimuli, so what they share by luck is not held out: ten layers that know nothing score
+.41 on average against animals of one geometry and six stimuli. The permutation p-value does account for it, because the
+rules here broadcast over leading axes and a test repeats the whole choice inside every permutation; the mean score
+under permutation is a score's ``chance``. A layer that has no value for some stimuli is compared over the rest, in
+every order alike.
+"""
 
 from __future__ import annotations
 

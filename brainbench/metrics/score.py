@@ -2,7 +2,7 @@
 
 A metric compares all layers with all animals; what is done with the comparisons is the same for each: the choice of
 layer, the permutation test that repeats it, chance, what is attainable, the interval over animals and stimuli, and a
-verdict in words.
+verdict in words. :func:`score_agreement` scores the animals against one another in the same way.
 """
 
 from __future__ import annotations

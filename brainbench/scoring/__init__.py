@@ -2,7 +2,7 @@
 
 :mod:`~brainbench.scoring.options` says how, :mod:`~brainbench.scoring.model_responses` runs the model on the stimuli,
 :mod:`~brainbench.scoring.neural_responses` opens the recordings, and :mod:`~brainbench.scoring.scores` joins both into
-a score and a result record.
+a score and a result record. :mod:`~brainbench.scoring.jobs` finds the scores that a batch lacks.
 """
 
 from typing import TYPE_CHECKING

@@ -12,9 +12,8 @@ from html import escape
 import numpy as np
 
 from leaderboards.boards import RAW_INPUT, Board
-from leaderboards.figures.plots import WIDTH, Figure, cut, left_axis, legend
-from leaderboards.figures.svg import Drawing, Scale, scale_of
-from leaderboards.standing import DOUBTFUL
+from leaderboards.figures.svg import WIDTH, Drawing, Figure, Scale, cut, left_axis, legend, scale_of
+from leaderboards.ranking import DOUBTFUL
 from leaderboards.text import number
 
 # Nine equidistant colours of viridis (van der Walt & Smith 2015), perceptually uniform and safe for

@@ -1,4 +1,1 @@
-"""Reports of records for a paper.
-
-:mod:`paper` writes methods, tables and figures with the works that :mod:`citations` finds.
-"""
+"""Reports of records for a paper: :mod:`paper` writes methods, tables, figures and the works to cite."""

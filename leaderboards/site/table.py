@@ -9,11 +9,10 @@ from collections.abc import Iterable
 from typing import Any
 
 from brainbench.core.records import Score
-from leaderboards.boards import Baseline, Board
-from leaderboards.conclusions import conclusions
+from leaderboards.boards import Baseline, Board, conclusions
 from leaderboards.entries import Entry
-from leaderboards.figures.plots import interval_ends, score_scale
-from leaderboards.standing import standing_of
+from leaderboards.figures.svg import interval_ends, score_scale
+from leaderboards.ranking import standing_of
 from leaderboards.text import ways_to_get
 
 COLUMNS: tuple[dict[str, Any], ...] = (

@@ -46,7 +46,7 @@ from brainbench.stimuli.stimulus_set import hash_stimulus_set, write_stimulus_se
 from brainbench.stimuli.sweeps.generation import generate
 from leaderboards import build_leaderboard, read_records
 from leaderboards.held_out import Commitment
-from leaderboards.site.folder import MANIFEST, check_site
+from leaderboards.site.build import MANIFEST, check_site
 from tests.factories.published_surfaces import PUBLISHED
 from tests.factories.published_sweeps import write_run
 from tests.factories.reading_trials import Surface, bad_counts, not_finite, numbers, typed, written, written_json

@@ -13,7 +13,7 @@ from scipy.special import stdtrit
 
 from brainbench.core.records import Ceiling, Interval, LayerScore, ModelCard, ResultRecord, Score, SubjectScore
 from brainbench.core.statistics import two_factor_error
-from leaderboards.schema import record_schema
+from leaderboards.store import record_schema
 
 VALIDATOR = Draft202012Validator(record_schema())
 STIMULI = tuple(f"{shape}-{distance}" for shape in ("convex", "concave") for distance in ("close", "medium", "far"))

@@ -7,8 +7,7 @@ from dataclasses import replace
 
 import pytest
 
-from leaderboards.boards import NO_SCALE, rank
-from leaderboards.conclusions import conclusions
+from leaderboards.boards import NO_SCALE, conclusions, rank
 from tests.factories.records import draw_board, make_record
 
 TRUTHS = {"best": 0.95, "good": 0.6, "fair": 0.3, "nothing": 0.0}

@@ -22,7 +22,7 @@ from brainbench.scoring.model_responses import resolve_model
 from brainbench.scoring.options import ScoreOptions
 from brainbench.scoring.scores import score_record
 from brainbench.stimuli import Frames, Scene, WhiskerArray, simulate
-from leaderboards.changes import differences
+from leaderboards.audit import differences
 
 LABELS = ("a", "b", "c", "d", "e", "f")
 TRIALS = 30

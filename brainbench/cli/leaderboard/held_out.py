@@ -109,7 +109,7 @@ def score_held_out(record: ResultRecord, told: Commitment, secret: Path) -> dict
 
 
 def _rounded(score: Score) -> dict[str, Any]:
-    from leaderboards.standing import standing_of
+    from leaderboards.ranking import standing_of
 
     span = score.scaled_interval
     values = {"score": score.scaled, "low": span.low if span else math.nan, "high": span.high if span else math.nan}

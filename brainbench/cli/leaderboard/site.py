@@ -52,7 +52,7 @@ def report(
     title: Annotated[str, typer.Option(help="Heading of the report.")] = "Leaderboard report",
 ) -> Output:
     """Write a report of result records as Markdown, HTML or PDF, with the citations as BibTeX beside it."""
-    from leaderboards.changes import open_build
+    from leaderboards.audit import open_build
     from leaderboards.report.paper import write_paper
 
     stored = open_build(*(records or [RECORDS]))
@@ -68,7 +68,7 @@ def diff(
     after: Annotated[Path, typer.Argument(help="The same, later.")],
 ) -> Output:
     """Show which models were added, removed or changed, which ranks moved, and what caused it."""
-    from leaderboards.changes import compare_builds, open_build
+    from leaderboards.audit import compare_builds, open_build
 
     old, new = open_build(before), open_build(after)
     changes = compare_builds(old, new)

@@ -39,8 +39,7 @@ def verify(
     cannot be made; what differs is printed.
     """
     from brainbench.cli.leaderboard.held_out import score_held_out
-    from leaderboards.audit import remarks
-    from leaderboards.changes import differences
+    from leaderboards.audit import differences, remarks
     from leaderboards.held_out import Commitment
     from leaderboards.store import read_records
 
@@ -136,7 +135,7 @@ def refuse_foreign_code(record: ResultRecord, *, trusted: bool) -> None:
 
 
 def _verdict(result: dict[str, Any]) -> str:
-    from leaderboards.changes import in_short
+    from leaderboards.audit import in_short
 
     words = {
         "confirmed": "confirmed: scored again with the same result",

@@ -1,7 +1,7 @@
 """The registered metrics: RSA, CKA, Procrustes, ridge encoding, decoding and partial RSA.
 
-``metric`` says what a metric is and ``registry`` finds one by name; ``patterns`` is the base of those that compare a
-model's features with animals' mean responses. Ours are registered here, in the order in which they are listed.
+``metric`` says what a metric is and finds one by name; ``patterns`` has the base of those that compare a model's
+features with animals' mean responses. Ours are registered here, in the order in which they are listed.
 """
 
 from __future__ import annotations

@@ -1,10 +1,13 @@
 """Decoding of what stimuli have in common, for a model and for each animal (table 3.6 of the work this grew from).
 
 Labels such as ``convex-close`` name properties: the parts between hyphens. Each property that at least two stimuli per
-class share is decoded from the patterns of the other stimuli (:func:`~brainbench.metrics.measures.decoding.decode`),
-and the value is the mean accuracy over properties. It is a property of the model alone; the animals' own accuracy
-stands beside it as animal to animal. Accuracy without information lies below one over the number of classes, so the
-permutation's mean is the chance level to read.
+class share is decoded by logistic regression from the patterns of the other stimuli (:func:`decode`), and the value is
+the mean accuracy over properties. It is a property of the model alone; the animals' own accuracy stands beside it as
+animal to animal.
+
+With two stimuli per class left, chance is not the share of the largest class: leaving a stimulus out makes its class
+rarer in training, so accuracies well *below* chance are what a decoder without information gives. The permutation of
+classes over stimuli accounts for that, and its mean is the chance level to read.
 """
 
 from __future__ import annotations

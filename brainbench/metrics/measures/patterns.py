@@ -1,4 +1,7 @@
-"""Metrics of patterns: models' features [K, F] against animals' mean responses [K, U]."""
+"""Metrics of patterns: models' features [K, F] against animals' mean responses [K, U].
+
+Their base, linear CKA, the Procrustes distance, and ridge encoding.
+"""
 
 from __future__ import annotations
 
@@ -115,7 +118,23 @@ FOLDS = 10
 
 
 class RidgeEncoding(PatternMetric):
-    """Cross-validated ridge regression from features to units."""
+    """Ridge encoding: how much of the responses to a stimulus a model predicts from the other stimuli.
+
+    A tenth of the stimuli (at least one) is left out in turn; responses of all units are predicted by ridge
+    regression on the model's features, with the penalty chosen by leaving each training stimulus out. The corrected
+    value is the share of explainable variance
+
+        1 − (Σ (y − ŷ)² − N) / (Σ (y − ȳ)² − N)
+
+    over left-out stimuli and units, where ȳ is the training mean and N the noise of the left-out means estimated from
+    trials: 0 for a model that predicts no better than the training mean, negative for a worse one. Nothing is clamped.
+    The raw value is that times the explainable share of an animal's variance. No model of few stimuli reaches 1, since
+    what is special to a stimulus cannot be predicted from others: ``attainable`` is what an animal's own noiseless
+    responses reach.
+    """
+
+    # Residuals are combinations of the responses, so their squares are linear in the K × K products of the responses:
+    # units are never touched again, and all orders of the stimuli cost one matrix product.
 
     name = "ridge"
     title = "share of explainable variance that ridge regression predicts for stimuli left out"

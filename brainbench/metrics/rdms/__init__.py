@@ -1,2 +1,3 @@
-"""Representational dissimilarity matrices (RDMs): ``distances`` between patterns, with ``noise`` taken out, make one
-(``dissimilarity``); ``comparison`` compares them, ``pairs`` orders their entries, ``display`` draws one."""
+"""Representational dissimilarity matrices (RDMs): ``dissimilarity`` makes one of patterns, with ``noise`` taken out;
+``comparison`` compares them, ``pairs`` orders their entries and names their stimuli.
+"""

@@ -1,4 +1,4 @@
-"""Stimulus pairs: the order of an RDM's upper triangle and what permuting stimuli does to it.
+"""Stimulus pairs: the order of an RDM's upper triangle, what permuting stimuli does to it, and an RDM with names.
 
 Pair p of K stimuli is the p-th entry of the upper triangle read row by row:
 (0, 1), (0, 2) … (0, K−1), (1, 2) … so P = K(K−1)/2.

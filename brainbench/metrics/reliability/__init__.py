@@ -1,2 +1,2 @@
-"""Reliability of an animal's RDM: ``sessions`` sorts trials, ``whitening`` divides by their noise, ``halves``
-makes RDMs of parts of them, ``subject_rdm`` joins these; ``noise_correction`` and ``ceiling`` use it."""
+"""Reliability of an animal's RDM: ``sessions`` sorts trials and divides by their noise, ``halves`` makes RDMs of parts
+of them, ``subject_rdm`` joins these, ``noise_correction`` uses them; ``units`` leaves unreliable units out."""

@@ -1,12 +1,13 @@
 """One animal as metrics see it: its RDM with split-half reliability, its mean responses and their noise.
 
 An animal is a sequence of sessions (:class:`Trials`) with different units. Units of all sessions are joined after
-averaging trials, so an RDM spans them all. What cannot be split is left out by the rules of
-:mod:`brainbench.metrics.reliability.sessions`.
-
-``mahalanobis`` and ``crossnobis`` divide by the noise of each session, see
-:mod:`brainbench.metrics.reliability.sessions`; ``crossnobis`` takes every trial as its own fold, so unequal
+averaging trials, so an RDM spans them all. :mod:`brainbench.metrics.reliability.sessions` says what cannot be split
+and how ``mahalanobis`` and ``crossnobis`` divide by noise; ``crossnobis`` takes every trial as its own fold, so unequal
 numbers of trials leave it unbiased.
+
+How a perfect model would score is found from the animal without its noise: the products of the mean responses hold the
+noise of the means on their diagonal, which trials tell. What is left is the geometry of the noiseless responses, of
+which eigenvalues below zero are chance.
 """
 
 from __future__ import annotations

@@ -1,9 +1,10 @@
 """Recovery: animals are drawn from each candidate network, and all candidates are scored against them.
 
-``candidates`` runs the networks on the stimuli, ``boards`` draws animals from one of them and scores all (``design``
-says how many and how noisy), ``study`` does so for many boards, and ``confusion`` counts how often the true network
-wins, as numbers and as a picture. ``selection`` picks the stimuli of a larger pool that separate the candidates best,
-``cheapest`` looks for the smallest design that suffices, and ``motion`` for the whisking that tells two networks apart.
+``boards`` runs the networks on the stimuli, draws animals from one of them (a design says how many and how noisy) and
+scores all; ``study`` does so for many boards and looks for the smallest design that suffices; ``confusion`` counts how
+often the true network wins, as numbers and as a picture. ``selection`` picks the stimuli of a larger pool that separate
+the candidates best, ``motion`` looks for the whisking that tells two networks apart, and ``commands`` is
+``brainbench recovery``. An optional room, which nothing else imports.
 """
 
 from __future__ import annotations

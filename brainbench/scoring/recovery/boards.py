@@ -1,7 +1,7 @@
-"""One board of a recovery: animals drawn from a candidate, and the score of every candidate against them.
+"""One board of a recovery: animals drawn from a candidate network, and the score of every candidate against them.
 
 Scores are those of the engine, :func:`brainbench.metrics.score.score_layers`, with few orders of the stimuli: the
-value, chance and what is attainable need no p. Letters: A animal, C candidate, K stimulus.
+value, chance and what is attainable need no p. Letters: A animal, C candidate, F feature, K stimulus.
 """
 
 from __future__ import annotations

@@ -1,4 +1,7 @@
-"""Run the boards of a recovery, on this machine or a cluster, and go on where an earlier run stopped."""
+"""Run the boards of a recovery, on this machine or a cluster, and go on where an earlier run stopped.
+
+:func:`find_cheapest` repeats that with growing designs until the true candidate comes first often enough.
+"""
 
 from __future__ import annotations
 

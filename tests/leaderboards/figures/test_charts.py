@@ -16,11 +16,9 @@ from scipy import stats
 
 from brainbench.core.records import GraphEdge, GraphNode, Interval, ModelGraph
 from leaderboards.boards import rank
-from leaderboards.figures import plots, svg
-from leaderboards.figures.architecture import diagram
-from leaderboards.figures.charts import board_figures
-from leaderboards.figures.record import layers
-from leaderboards.figures.scatter import regression
+from leaderboards.figures import svg
+from leaderboards.figures.charts import board_figures, regression
+from leaderboards.figures.record import diagram, layers
 from leaderboards.figures.svg import STYLE, Drawing, Scale, scale_of, standalone
 
 
@@ -95,7 +93,7 @@ def test_the_accuracy_of_a_twin_comes_from_the_trained_record_or_else_from_its_o
 
 def test_untrained_networks_do_not_count_among_the_models_cut_from_the_accuracies(make_record):
     card = replace(make_record().card, objective="untrained", top1=0.1)
-    plain = [replace(make_record(f"net{i}"), card=replace(card, weights=str(i))) for i in range(plots.SHOWN + 1)]
+    plain = [replace(make_record(f"net{i}"), card=replace(card, weights=str(i))) for i in range(svg.SHOWN + 1)]
     figure = _figures(_trained(make_record("net.supervised")), *plain)["accuracy"]
     assert "Shown are the first" not in figure.caption
     assert "Shown are the first" in _figures(*plain)["accuracy"].caption
@@ -178,7 +176,7 @@ def test_an_interval_off_the_axis_is_held_at_its_end(make_record):
 
 
 def test_the_examples_hold():
-    for module in (svg, plots):
+    for module in (svg, svg):
         found = doctest.testmod(module)
         assert found.attempted
         assert found.failed == 0

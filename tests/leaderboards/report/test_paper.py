@@ -9,8 +9,7 @@ from dataclasses import replace
 import pytest
 
 from brainbench.core.errors import DataError, MissingDependencyError, UsageError
-from leaderboards.report.citations import references
-from leaderboards.report.paper import write_paper
+from leaderboards.report.paper import references, write_paper
 
 
 def _records(make_record):

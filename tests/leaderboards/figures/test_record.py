@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from leaderboards.figures.time_course import draw_time_course
+from leaderboards.figures.record import draw_time_course
 
 
 def _course(**changes):
