@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from brainbench.core.errors import BrainbenchError, DataError
 from brainbench.core.progress import Progress, track
 from brainbench.datasets import hdf5
-from brainbench.datasets.layouts.published_npz import LAYOUT, is_published, open_published
-from brainbench.datasets.layouts.registry import RecordingLayout
+from brainbench.datasets.layouts.registry import RecordingLayout, counted_layout
 from brainbench.datasets.reading import each_session, find_recordings, open_file, suitable_files
 from brainbench.datasets.sessions import SPIKES, Session, SessionTable, as_labels, natural_key
 from brainbench.datasets.trials.conditions import natural_vocabulary
@@ -177,8 +176,9 @@ def inspect(path: str | os.PathLike[str], *, strict: bool = False, progress: Pro
     layout_named, files = find_recordings(path)
     paths, skipped = suitable_files(files, strict=strict)
     for file_path in track(paths, "reading recordings", progress):
-        if is_published(file_path):
-            return _counted(open_published(file_path), file_path, f"published .npz, layout {LAYOUT.name}")
+        if (counted := counted_layout(file_path, layout_named)) is not None and counted.open_counted is not None:
+            kind = f"{file_path.suffix.lower()}, counted responses, layout {counted.name}"
+            return _counted(counted.open_counted(file_path), file_path, kind)
         with open_file(file_path) as file:
             if hdf5.holds_counts(file, file_path):
                 return _counted(hdf5.read_counts(file, file_path), file_path)

@@ -14,10 +14,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, nearest, shown, unknown_name
+from brainbench.core.plugins import load_optional
 from brainbench.core.reading.hdf5 import open_hdf5
 from brainbench.core.reading.regular import check_file
 from brainbench.datasets import hdf5, nwb
-from brainbench.datasets.layouts.registry import detect_layout, get_layout, is_name, list_layouts, load_layout
+from brainbench.datasets.layouts.registry import (
+    ENTRY_POINTS,
+    detect_layout,
+    get_layout,
+    is_name,
+    list_layouts,
+    load_layout,
+)
 from brainbench.datasets.trials.selection import DEFAULT, EVERYTHING, Selection
 
 if TYPE_CHECKING:
@@ -88,6 +96,7 @@ def resolve_selection(select: Selection | str) -> Selection:
 def open_file(path: Path) -> AbstractContextManager[h5py.File]:
     """Open an HDF5 file for reading; failures inside the block name the file too."""
     if path.suffix.lower() == ".npz":
+        load_optional(ENTRY_POINTS, "published-npz", "layout of .npz recordings")
         raise DataError(
             f"{path} is an .npz file: published recordings are opened one at a time and without a layout, to be "
             "inspected, checked and scored; they hold no spike times to join or copy."

@@ -16,8 +16,7 @@ from brainbench.core.errors import DataError, UsageError, check_each, listing, u
 from brainbench.core.progress import Progress, track
 from brainbench.datasets import hdf5
 from brainbench.datasets.inspection import propose
-from brainbench.datasets.layouts.published_npz import is_published, open_published
-from brainbench.datasets.layouts.registry import RecordingLayout, list_layouts
+from brainbench.datasets.layouts.registry import RecordingLayout, counted_layout, list_layouts
 from brainbench.datasets.reading import (
     Source,
     each_session,
@@ -227,8 +226,8 @@ def _no_conditions(session: Session) -> NoReturn:
 
 
 def _already_counted(path: Path, layout: RecordingLayout | None, given: Mapping[str, Any]) -> xr.Dataset | None:
-    if is_published(path, layout):
-        return open_published(path, **given)
+    if (counted := counted_layout(path, layout)) is not None and counted.open_counted is not None:
+        return counted.open_counted(path, **given)
     with open_file(path) as file:
         if not hdf5.holds_counts(file, path):
             return None

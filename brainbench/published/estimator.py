@@ -20,13 +20,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.provenance import Provenance
 from brainbench.core.records import LayerScore, Score, SubjectScore
-from brainbench.datasets.layouts.published_npz import read_arrays
 from brainbench.metrics.animals import recorded_rdm
 from brainbench.metrics.inference.permutation import EXACT_STIMULI, make_test, permuted_values
 from brainbench.metrics.rdms.comparison import compare
 from brainbench.metrics.rdms.dissimilarity import correlation_distances
 from brainbench.metrics.rdms.pairs import Floats
 from brainbench.metrics.reliability.noise_correction import THESIS_FILTER, noise_corrected
+from brainbench.published.recordings import read_arrays
 
 POOL = "concatenated"
 """Name of the target that holds the units of all animals."""

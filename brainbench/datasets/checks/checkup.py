@@ -16,11 +16,9 @@ from brainbench.core.errors import DataError, repeats
 from brainbench.core.progress import Progress, track
 from brainbench.datasets import hdf5
 from brainbench.datasets.checks.findings import SEVERITIES, Finding, some
-from brainbench.datasets.checks.published import check_published
 from brainbench.datasets.checks.tables import check_coverage, check_labels, check_tables
 from brainbench.datasets.checks.timing import check_clock, check_spikes
-from brainbench.datasets.layouts.published_npz import is_published
-from brainbench.datasets.layouts.registry import RecordingLayout
+from brainbench.datasets.layouts.registry import RecordingLayout, counted_layout
 from brainbench.datasets.reading import Source, each_session, find_recordings, open_file
 from brainbench.datasets.sessions import Session
 from brainbench.datasets.trials.conditions import Conditions
@@ -112,8 +110,8 @@ def check(source: Source, *, conditions: str | Conditions | None = None, progres
 def _check_file(
     path: Path, layout: RecordingLayout | None, conditions: Conditions | None, names: list[str]
 ) -> Iterator[Finding]:
-    if is_published(path, layout):
-        yield from check_published(path, names)
+    if (counted := counted_layout(path, layout)) is not None and counted.check_counted is not None:
+        yield from counted.check_counted(path, names)
         return
     with open_file(path) as file:
         if hdf5.holds_counts(file, path):

@@ -3,7 +3,7 @@
 A session is matched by the columns of its trials (``registry``) and then adapted by its layout, before it is counted.
 """
 
-from brainbench.datasets.layouts import area2_bump, pole, published_npz, registry, rodgers
+from brainbench.datasets.layouts import area2_bump, pole, registry, rodgers
 from brainbench.datasets.layouts.registry import register_layout
 
 for _layout in (
@@ -13,7 +13,6 @@ for _layout in (
     pole.YU,
     pole.HIRES,
     area2_bump.LAYOUT,
-    published_npz.LAYOUT,
     registry.SYNTHETIC,
 ):
     register_layout(_layout)

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import product
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from brainbench.core.errors import UsageError, check_name
 from brainbench.core.plugins import load_entry_points, load_module
@@ -17,6 +17,13 @@ from brainbench.datasets.sessions import Session
 from brainbench.datasets.trials.conditions import Conditions
 from brainbench.datasets.trials.selection import DEFAULT, Selection
 from brainbench.datasets.trials.windows import FIRST_CONTACT, Window
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    import xarray as xr
+
+    from brainbench.datasets.checks.findings import Finding
 
 ENTRY_POINTS = "brainbench.recordings"
 
@@ -51,6 +58,12 @@ class RecordingLayout:
     """Recipe of the stimuli that the animals felt, if there is one."""
     synthetic: bool = False
     """Layout of files that a program made; no others are recognised by it."""
+    endings: tuple[str, ...] = ()
+    """Endings of files whose responses are counted already, in lower case; ``open_counted`` reads them."""
+    open_counted: Callable[..., xr.Dataset] | None = None
+    """Returns the recordings of such a file; takes the options of ``open_recordings``, which it may refuse."""
+    check_counted: Callable[[Path, list[str]], Iterator[Finding]] | None = None
+    """Yields what is wrong with such a file, and adds the names of its sessions to the list."""
 
     def matches(self, session: Session) -> bool:
         """Return whether a session's condition table has the columns of this data set."""
@@ -118,6 +131,14 @@ def get_layout(name: str) -> RecordingLayout:
 def list_layouts() -> list[str]:
     """Return the names of the layouts."""
     return sorted(_known())
+
+
+def counted_layout(path: Path, layout: RecordingLayout | None = None) -> RecordingLayout | None:
+    """Return the layout that opens a file of counted responses: the one that was named, or the one of its ending."""
+    if layout is not None:
+        return layout if layout.open_counted else None
+    ending = path.suffix.lower()
+    return next((candidate for candidate in _known().values() if ending in candidate.endings), None)
 
 
 def detect_layout(session: Session) -> RecordingLayout | None:

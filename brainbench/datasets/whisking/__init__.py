@@ -1,5 +1,5 @@
 """Training data: whisker sweeps in shards of ours, or in the files of the published study.
 
-``files`` opens the shards; ``dataset`` makes batches of them, or of published sweeps, in reused memory, and
+``dataset`` opens the shards and makes batches of them, or of published sweeps, in reused memory, and
 ``separability`` measures how well their classes are told apart.
 """
