@@ -174,6 +174,12 @@ def _trusted(entry: Entry) -> bool:
 _Told = Callable[[Entry], str]
 
 
+_PANELS = 4
+"""Panels side by side in the figure of layers."""
+_PANEL_NAME = 23
+"""Characters of a name above a panel: bold letters of 10.5 pixels take about 6.7 each, the panel leaves 158."""
+
+
 def board_figures(board: Board) -> list[Figure]:
     """Return all figures of a board, drawn or with what they lack."""
     entries, title = board.entries, "Augmentation ablation (as figure 3.8 c)"
@@ -237,13 +243,13 @@ def layer_fit(entries: Sequence[Entry]) -> Figure:
     if not rows:
         return Figure(key, title, lacking="no record holds scores of layers")
     many, rows = len(rows), rows[:24]
-    columns, w, h = 4, WIDTH / 4, 112.0
+    columns, w, h = _PANELS, WIDTH / _PANELS, 112.0
     drawing = Drawing(WIDTH, math.ceil(len(rows) / columns) * h + 6, f"Score of every layer of {len(rows)} models")
     values = [layer.value for entry in rows for layer in entry.score.layers]
     for index, entry in enumerate(rows):
         x0, y0 = (index % columns) * w, (index // columns) * h
         scale = scale_of(values, y0 + h - 14, y0 + 24, top=1.0)
-        drawing.text(x0 + 24, y0 + 14, cut_name(entry.name, 27), "small title")
+        drawing.text(x0 + 24, y0 + 14, cut_name(entry.name, _PANEL_NAME), "small title")
         for tick in (0.0, 0.5, 1.0):
             drawing.line(x0 + 24, scale.at(tick), x0 + w - 8, scale.at(tick), "one" if tick == 1 else "grid")
             drawing.text(x0 + 20, scale.at(tick) + 3.5, tick_text(tick), "end quiet small")

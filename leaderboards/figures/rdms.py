@@ -47,16 +47,17 @@ def rdm_panel(board: Board) -> Figure:
     if not drawn:
         return Figure(key, title, lacking="no record holds RDMs")
     side = min(WIDTH / len(drawn) - 16, 170.0)
-    drawing = Drawing(WIDTH, side + 48, f"{len(drawn)} dissimilarity matrices of {size} stimuli")
+    drawing = Drawing(WIDTH, side + 72, f"{len(drawn)} dissimilarity matrices of {size} stimuli")
     for index, (name, detail, picture) in enumerate(drawn):
         x0 = index * (WIDTH / len(drawn))
         drawing.text(x0, 13, name, "title")
         drawing.text(x0, 28, cut(detail, max(12, int(side / 6.3))), "quiet small")
         draw_rdm(drawing, x0, 38, side, picture)
+        draw_range(drawing, x0, side + 46, side, picture)
     caption = (
         "Each cell is the dissimilarity of two stimuli in the order of the records "
         f"({', '.join(board.conditions[:8])}{', …' if size > 8 else ''}); dark is alike, bright is different, each "
-        "matrix over its own range, as comparisons by correlation ignore scale."
+        "matrix over its own range (the bar below it), as comparisons by correlation ignore scale."
     )
     return Figure(key, title, caption, drawing)
 
@@ -164,6 +165,15 @@ def draw_rdm(drawing: Drawing, x: float, y: float, side: float, picture: RdmPict
     )
 
 
+def draw_range(drawing: Drawing, x: float, y: float, width: float, picture: RdmPicture) -> None:
+    """Draw the bar of an RDM's colours with the dissimilarities at its ends."""
+    place = f'x="{x:.1f}" y="{y:.1f}" width="{width:.1f}" height="7"'
+    bar = _png(np.arange(_LEVELS)[None])
+    drawing.parts.append(f'<image {place} preserveAspectRatio="none" href="{bar}"/>')
+    drawing.text(x, y + 19, f"{picture.low:.3g}", "quiet small")
+    drawing.text(x + width, y + 19, f"{picture.high:.3g}", "quiet small end")
+
+
 def _png(cells: np.ndarray) -> str:
     """Encode colour levels (−1: transparent) as an indexed PNG (W3C recommendation, third edition).
 
@@ -177,9 +187,9 @@ def _png(cells: np.ndarray) -> str:
     rows = np.pad(index.reshape(cells.shape), ((0, 0), (1, 0)))
     data = b"\x89PNG\r\n\x1a\n"
     for kind, body in (
-        (b"IHDR", struct.pack(">IIBBBBB", len(cells), len(cells), 8, 3, 0, 0, 0)),
+        (b"IHDR", struct.pack(">IIBBBBB", cells.shape[1], len(cells), 8, 3, 0, 0, 0)),
         (b"PLTE", palette.astype(np.uint8).tobytes()),
-        (b"tRNS", b"\x00"),
+        (b"tRNS", b"\x00" if used[0] < 0 else b"\xff"),
         (b"IDAT", zlib.compress(rows.astype(np.uint8).tobytes(), 9)),
         (b"IEND", b""),
     ):

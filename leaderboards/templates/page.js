@@ -109,7 +109,7 @@ if (source) {
     if (kind.key === "interval") { td.className = "chart"; td.append(plot(row, board.axis)); return td; }
     if (kind.key === "rank") td.textContent = row.rank_first === null ? "–" : row.rank_first === row.rank_last ? row.rank_first : `${row.rank_first}–${row.rank_last}`;
     else if (kind.key === "score") { td.append(number(value)); if (row.score_low !== null) td.append(make("span", ` [${number(row.score_low)}, ${number(row.score_high)}]`, { class: "interval" })); }
-    else if (kind.key === "standing" && value) td.append(make("span", value, { class: `chip ${value.split(" ")[0]}` }));
+    else if (kind.key === "standing" && value) td.append(make("span", value, { class: `chip ${value.replaceAll(" ", "-")}` }));
     else if (value === null || value === undefined) td.textContent = "";
     else if (kind.key === "p") td.textContent = small(value);
     else if (kind.whole) td.textContent = count(value);
@@ -196,6 +196,8 @@ if (source) {
     $("recordings").value = board.recordings;
     $("metric").replaceChildren(...boards.map((item, i) => [item, i]).filter(([item]) => item.recordings === board.recordings).map(([item, i]) => option(String(i), item.label)));
     $("metric").value = String(state.board);
+    // The menu may be narrower than what it says.
+    $("metric").title = board.label;
     for (const name of FILTERS) {
       const values = [...new Set(rowsOf(board).filter((row) => row.kind === "model").map((row) => row[name] ?? "not stated"))].sort();
       $(name).replaceChildren(option("", "all"), ...values.map((value) => option(value, value)));

@@ -121,6 +121,16 @@ def test_a_variable_whose_variance_vanishes_has_no_regression():
     assert math.isnan(regression([0.0, 0.0, 0.0, 1.5e-299], [0.0, 0.0, 0.0, 1.0])[2])
 
 
+def test_names_above_panels_end_inside_the_drawing(make_record):
+    names = [f"zhuang-intersection-ln-small+mamba.masked{index}" for index in range(4)]
+    drawing = _figures(*map(make_record, names))["layers"].drawing
+    root = ElementTree.fromstring(drawing.render())
+    titles = [item for item in root.iter() if item.get("class") == "small title"]
+    assert len(titles) == 4
+    # Bold letters of 10.5 pixels are about 6.7 pixels wide.
+    assert max(float(item.get("x")) + 6.7 * len(item.text) for item in titles) < drawing.width
+
+
 def test_layers_stand_at_their_scores(make_record):
     drawing = layers([make_record("net")])
     assert drawing is not None

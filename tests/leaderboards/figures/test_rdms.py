@@ -6,10 +6,11 @@ import math
 import re
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from leaderboards.boards import rank
-from leaderboards.figures.rdms import MOST_GROUPS, rdm_lines, rdm_picture
+from leaderboards.figures.rdms import MOST_GROUPS, rdm_lines, rdm_panel, rdm_picture
 from tests.factories.records import BRAIN_RDM
 
 
@@ -58,3 +59,15 @@ def test_many_pairs_are_drawn_in_groups_and_undefined_ones_left_out(make_record)
     assert f"189 pairs of stimuli in {MOST_GROUPS} groups" in figure.caption
     empty = replace(score, model_rdm=())
     assert "no record holds" in _lines(replace(record, score=empty, baselines={}))[0].lacking
+
+
+def test_a_bar_shows_the_range_of_each_matrix(make_record):
+    record = make_record()
+    size = len(record.score.stimuli)
+    pairs = tuple(np.linspace(0.25, 4.0, size * (size - 1) // 2))
+    (board,) = rank([replace(record, score=replace(record.score, brain_rdm=pairs, model_rdm=()))])
+    drawing = rdm_panel(board).drawing
+    assert "0.25" in drawing.render()
+    assert ">4<" in drawing.render()
+    # The brain's, and that of the raw input, which the record brings.
+    assert drawing.render().count('preserveAspectRatio="none"') == 2

@@ -15,6 +15,8 @@ from brainbench.core.records import ResultRecord
 from brainbench.core.statistics import compare_scores
 from leaderboards import build_leaderboard, write_report
 from leaderboards import text as words
+from leaderboards.ranking import STANDINGS
+from leaderboards.site import score_page
 from tests.factories.html_page import HOSTILE, Page, poisoned
 from tests.factories.records import draw_board, make_record
 
@@ -236,3 +238,11 @@ def test_hostile_text_in_every_field_changes_no_element_of_the_pages(harmless, t
     for page in pages:
         assert len(page.all("script")) == 1
         assert not [name for _, attributes in page.elements for name in attributes if re.match("on", name)]
+
+
+def test_above_raw_input_and_above_chance_have_colours_of_their_own():
+    style = (Path(score_page.__file__).parents[1] / "templates" / "page.css").read_text(encoding="utf-8")
+    colours = dict(re.findall(r"\.chip\.([\w-]+) { color: var\(--(\w+)\)", style))
+    assert colours["above-raw-input"] != colours["above-chance"]
+    chips = set(re.findall(r"\.chip\.([\w-]+)", style))
+    assert chips == {standing.replace(" ", "-") for standing in STANDINGS}
