@@ -10,11 +10,12 @@ import math
 from dataclasses import dataclass, field, replace
 from functools import cache
 from importlib import resources
-from typing import Literal
+from typing import Annotated, Literal
 
 from brainbench.core.errors import UsageError, check_name, shown
+from brainbench.core.limits import Limit, Positive, limited
 from brainbench.core.overrides import read_pairs, read_value, with_changes
-from brainbench.core.reading.ranges import check_fields, check_number
+from brainbench.core.reading.ranges import check_number
 from brainbench.core.tradeoffs import TradeoffPoint, cheapest
 from brainbench.stimuli.whiskers.chain import Chain
 from brainbench.stimuli.whiskers.whisker import Whisker
@@ -24,19 +25,20 @@ DEFAULT_ENGINE = "rod"
 
 
 @dataclass(frozen=True)
+@limited
 class Fidelity:
     """Accuracy knobs of a whisker simulation; a value outside its range is a :class:`UsageError`."""
 
-    links: int = 10
+    links: Annotated[int, Limit(least=2, most=MOST_LINKS)] = 10
     """Links per whisker; the smallest number when ``links_per_mm`` is given."""
-    links_per_mm: float | None = None
+    links_per_mm: Positive | None = None
     """Links per millimetre of arc length, so that long whiskers get more; None for ``links`` on every whisker."""
-    time_step: float = 1e-4
+    time_step: Annotated[float, Limit(least=1e-7, most=5e-3, unit="s")] = 1e-4
     """Longest time step [s]."""
-    steps_per_period: float | None = None
+    steps_per_period: Annotated[float, Limit(least=4, most=1e4)] | None = None
     """Least number of time steps in one period of a whisker's first mode, so that short, stiff whiskers get shorter
-    steps; None for ``time_step`` on every whisker. Frequency and damping ratio of the first mode then come out low
-    by about π ζ / ``steps_per_period``."""
+    steps; None for ``time_step`` on every whisker. The frequency of the first mode then comes out low, and its
+    damping ratio high by about π / ``steps_per_period``."""
     precision: Literal["single", "double"] = "single"
     """Arithmetic of the ``rod`` backend; the others always use double precision."""
     solver: Literal["dynamic", "quasistatic"] = field(default="dynamic", metadata={"later": True})
@@ -45,21 +47,14 @@ class Fidelity:
     twist: bool | None = field(default=None, metadata={"later": True, "before": False})
     """True lets whiskers twist about their axis; one that stays in one plane is computed without in any case. None: as
     the scenes say (:attr:`brainbench.stimuli.scenes.scene.Scene.twist`), where the backend can."""
-    contact_tolerance: float | None = field(default=None, metadata={"later": True})
+    contact_tolerance: Annotated[float, Limit(least=1e-12, most=1e-3)] | None = field(
+        default=None, metadata={"later": True}
+    )
     """Relative error to which the contact forces of each step are solved, 1e-12 to 1e-3; below 1e-6 only in double
     precision. None: only few iterations, as always before there was this option; with friction this alone changes force
     and moment of some whiskers by several per cent. ``bullet`` solves them to 1e-9 in any case."""
 
     def __post_init__(self) -> None:
-        check_fields(self, "links", least=2, most=MOST_LINKS, whole=True)
-        check_fields(self, "links_per_mm", above=0)
-        check_fields(self, "time_step", least=1e-7, most=5e-3, of="{} (s)")
-        if self.twist not in (None, True, False):
-            raise UsageError(f"twist must be True, False or None; received {shown(self.twist)}.")
-        check_name("solver", self.solver, SOLVERS)
-        check_name("precision", self.precision, PRECISIONS)
-        check_fields(self, "steps_per_period", least=4, most=1e4)
-        check_fields(self, "contact_tolerance", least=1e-12, most=1e-3)
         if self.precision == "single" and (self.contact_tolerance or 1) < FINEST_SINGLE:
             raise UsageError(
                 f"contact_tolerance must be at least {FINEST_SINGLE:g} in single precision; received "
@@ -138,8 +133,6 @@ class Fidelity:
 
 FINEST_SINGLE = 1e-6
 """Least ``contact_tolerance`` in single precision, whose rounding is not far below it."""
-PRECISIONS = ("single", "double")
-SOLVERS = ("dynamic", "quasistatic")
 SHARES = {0.5: "error_50", 0.9: "error_90", 0.95: "error_95"}
 """Shares of whiskers, and the column of the table with the relative error that they stay below."""
 MARGIN = 0.85

@@ -12,13 +12,14 @@ import logging
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.errors import DataError, UsageError
-from brainbench.core.reading.ranges import check_fields, check_number
+from brainbench.core.limits import Count, Limit, limited
+from brainbench.core.reading.ranges import check_number
 from brainbench.stimuli.fitting.curves import STEPS, LoadedShapes, LoadedWhisker, offsets_of_samples
 from brainbench.stimuli.fitting.tracks.contract import check_length, check_track, traced_lengths
 from brainbench.stimuli.whiskers.whisker import Whisker
@@ -53,24 +54,23 @@ _UNITS = {"force": "N", "arc": "m", "moment": "N m", "base_angle": "rad", "force
 
 
 @dataclass(frozen=True)
+@limited
 class ContactOptions:
     """What is known of the traced shapes beside the whisker."""
 
-    noise: float | None = None
+    noise: Annotated[float, Limit(above=0, unit="m")] | None = None
     """Standard deviation of a traced coordinate [m]; estimated from each shape when None."""
     first_arc: float | Literal["base"] | None = "base"
     """Arc length of the first traced point [m]; None when the trace begins anywhere. Frames that lack it go without.
     ``base`` is 0 where nobody said so: then the trace must be about as long as the whisker."""
     tip_traced: bool = False
     """True when the last traced point is the tip of the whisker. Frames that lack it go without."""
-    contact_noise: float = 5e-5
+    contact_noise: Annotated[float, Limit(above=0, unit="m")] = 5e-5
     """Standard deviation of the contact points that are given [m]."""
-    frames: int = 1
+    frames: Count = 1
     """Neighbouring frames, an odd number, over which the contact's place and force are taken to change evenly."""
 
     def __post_init__(self) -> None:
-        check_fields(self, "noise", "contact_noise", above=0, of="{} (m)")
-        check_fields(self, "frames", least=1, whole=True, of="{} of one contact")
         if self.frames % 2 == 0:
             raise UsageError(
                 f"frames counts a frame and as many before as behind it, so it is odd; received {self.frames}."

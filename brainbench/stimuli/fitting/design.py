@@ -12,13 +12,13 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.errors import DataError, UsageError, check_each, check_once
-from brainbench.core.reading.ranges import check_fields
+from brainbench.core.limits import Count, Limit, Seed, limited
 from brainbench.core.records import Status
 from brainbench.stimuli.engines import get_engine
 from brainbench.stimuli.engines.fidelity import DEFAULT_ENGINE, Fidelity
@@ -111,34 +111,30 @@ SOFTNESS = 0.15
 
 
 @dataclass(frozen=True)
+@limited
 class DesignOptions:
     """Sensor, simulation and search of a design."""
 
-    force_noise: float = 2e-6
+    force_noise: Annotated[float, Limit(above=0, unit="N")] = 2e-6
     """Standard deviation of a force reading (N)."""
-    moment_noise: float = 1e-8
+    moment_noise: Annotated[float, Limit(above=0, unit="N·m")] = 1e-8
     """Standard deviation of a moment reading (N·m)."""
-    rate: float = 1000.0
+    rate: Annotated[float, Limit(above=0, unit="Hz")] = 1000.0
     """Readings per second."""
     fidelity: str = "balanced"
     """Setting of the search; the result is measured again with `check`."""
     check: str = "accurate"
     """Setting with which default and design are compared at the end."""
-    iterations: int = 12
+    iterations: Count = 12
     """Iterations of the search."""
-    starts: int = 16
+    starts: Annotated[int, Limit(least=0)] = 16
     """Other motions that are tried before, spread over the bounds."""
-    searches: int = 3
+    searches: Count = 3
     """Best of these from which the search goes on."""
-    seed: int = 0
+    seed: Seed = 0
     """Of these."""
 
     def __post_init__(self) -> None:
-        check_fields(self, "force_noise", above=0, of="{} (N)")
-        check_fields(self, "moment_noise", above=0, of="{} (N·m)")
-        check_fields(self, "rate", above=0, of="{} (Hz)")
-        check_fields(self, "starts", "seed", least=0, whole=True)
-        check_fields(self, "iterations", "searches", least=1, whole=True)
         Fidelity.parse(self.fidelity)
         Fidelity.parse(self.check)
 

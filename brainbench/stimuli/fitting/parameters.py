@@ -15,6 +15,7 @@ from typing import Any, Literal
 import numpy as np
 
 from brainbench.core.errors import UsageError, check_each
+from brainbench.core.limits import Positive, limited
 from brainbench.core.reading.ranges import check_number
 from brainbench.stimuli.fitting.gradients.parameters import WHISKER, JobParameters, whisker_value, with_values
 from brainbench.stimuli.motion.jobs import Job
@@ -182,18 +183,15 @@ class FreeParameters:
 
 
 @dataclass(frozen=True)
+@limited(of="The {} of a prior")
 class Prior:
     """What is known of a parameter before a fit."""
 
     mean: float
     """Mean, in the parameter's unit; of the logarithm for positive parameters (then the median)."""
-    spread: float
+    spread: Positive
     """Standard deviation; relative for positive parameters."""
     source: str
-
-    def __post_init__(self) -> None:
-        check_number("The mean of a prior", self.mean)
-        check_number("The spread of a prior", self.spread, above=0)
 
     def row(self, name: str, start: float, whisker: Whisker) -> tuple[float, float]:
         """Return the mean and the standard deviation of the coordinate u of a fit that began at ``start``."""

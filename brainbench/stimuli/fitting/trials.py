@@ -7,14 +7,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.contracts import CHANNELS
 from brainbench.core.errors import DataError, UsageError, check_name
-from brainbench.core.reading.ranges import check_fields, check_number
+from brainbench.core.limits import Limit, limited
+from brainbench.core.reading.ranges import check_number
 from brainbench.stimuli.fitting.curves import normal_offsets
 from brainbench.stimuli.fitting.parameters import Condition
 from brainbench.stimuli.fitting.tracks.contract import AXES, check_length
@@ -42,19 +43,18 @@ SPENT = 25.0
 
 
 @dataclass(frozen=True)
+@limited(of="The {} of a held whisker")
 class Pluck:
     """A whisker held aside and let go at t = 0."""
 
-    deflection: float
+    deflection: Annotated[float, Limit(above=0, unit="m")]
     """Deflection of the held point before the release [m]."""
-    arc: float
+    arc: Annotated[float, Limit(above=0, unit="m")]
     """Arc length of the held point [m]."""
     direction: Vector = (0.0, 1.0, 0.0)
     """Direction of the deflection, in the frame of the job; its length does not matter."""
 
     def __post_init__(self) -> None:
-        check_fields(self, "deflection", "arc", above=0, of="The {} (m) of a held whisker")
-        check_fields(self, "direction", items=3, of="The {} of a held whisker")
         check_number("The length of the direction of a held whisker", math.hypot(*self.direction), above=0)
 
     def loads(self, condition: Condition, start: float) -> tuple[Load, Load]:

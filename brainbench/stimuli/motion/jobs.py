@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.errors import UsageError
+from brainbench.core.limits import limited
 from brainbench.core.reading.ranges import check_fields, check_number
 from brainbench.stimuli.objects.obstacle import Obstacle
 from brainbench.stimuli.whiskers.whisker import Whisker
@@ -33,6 +34,7 @@ class Follicle(Protocol):
 
 
 @dataclass(frozen=True)
+@limited(of="The {} of a base that stands still")
 class StillFollicle:
     """A base that stands still."""
 
@@ -41,10 +43,6 @@ class StillFollicle:
     """Base point [m, world]."""
     euler: tuple[float, float, float] = (math.pi / 2, 0.0, -math.pi / 2)
     """(θ, φ, ζ) [rad]; the default lays the base frame on the world frame."""
-
-    def __post_init__(self) -> None:
-        check_fields(self, "position", items=3, of="The {} (m) of a base that stands still")
-        check_fields(self, "euler", items=3, of="The angles {} (rad) of a base that stands still")
 
     def pose(self, times: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the same pose at every time."""

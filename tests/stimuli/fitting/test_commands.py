@@ -61,7 +61,7 @@ def test_contacts_of_a_track_are_printed(run, tmp_path):
         (["--whisker", "C2"], "mouse:C2"),
         (["--whisker", "mouse:C9"], "C"),
         (["--parameters", "young_moduls"], "young_modulus"),
-        (["--known", "arc_length"], "NAME=VALUE"),
+        (["--known", "arc_length"], "name=value"),
         (["--known", "arc_lenth=0.02"], "arc_length"),
         (["--bounds", "young_modulus=5"], "LOW:HIGH"),
         (["--known", "density=1200,density=1300"], "'density' more than once"),
