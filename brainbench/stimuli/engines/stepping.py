@@ -13,20 +13,22 @@ from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import ConvexHull
 
 from brainbench.core.devices import usable_processors
-from brainbench.core.rotations import base_rotation
+from brainbench.core.rotations import base_rotation, to_matrices
 from brainbench.stimuli.engines.fidelity import Fidelity
-from brainbench.stimuli.engines.job_pool import run_groups
 from brainbench.stimuli.engines.motion_pieces import Cutting
-from brainbench.stimuli.engines.overlap import overlap_fault
-from brainbench.stimuli.engines.protocol import Progress, WhiskerEngine
-from brainbench.stimuli.engines.reach import Reach, reachable
+from brainbench.stimuli.engines.protocol import Progress, WhiskerEngine, run_groups
+from brainbench.stimuli.engines.reach import Reach, reachable, to_obstacle_frame
 from brainbench.stimuli.engines.trust import (
+    AT_BASE,
     GOT_INSIDE,
     LARGEST_CHANGE,
     LARGEST_CREEP_CHANGE,
     LARGEST_OVERLAP,
+    LARGEST_START_OVERLAP,
+    STARTED_INSIDE,
     SUSPICIOUS_FORCE,
     SUSPICIOUS_ROUGHNESS,
     SUSPICIOUS_SHARE,
@@ -40,7 +42,79 @@ from brainbench.stimuli.engines.trust import (
     without_escape,
 )
 from brainbench.stimuli.motion.jobs import Job, Trace
+from brainbench.stimuli.objects.obstacle import Box, Capsule, Cylinder, Obstacle, Part, Sphere
 from brainbench.stimuli.whiskers.chain import Chain
+
+LEAST_TAPER = 1e-6
+"""Difference of the radii of a link's ends (mm) below which it is a capsule."""
+_SIDES = 8
+
+
+def cone_vertices(core: float, length: float, *, narrows: bool) -> NDArray[np.float64]:
+    """Return the vertices [9, 3] (mm) of the cone inside a link along x, ``core`` (mm) being the radius of its base.
+
+    It ``narrows`` when the link is thinner at its end than at its start.
+    """
+    # Eight sides: a facet lies at most 8 % of ``core``, a difference of radii, inside the cone.
+    angle = 2 * np.pi * np.arange(_SIDES) / _SIDES
+    wide, apex = (0.0, length) if narrows else (length, 0.0)
+    ring = np.stack([np.full(_SIDES, wide), core * np.cos(angle), core * np.sin(angle)], axis=1)
+    return np.append(ring, [(apex, 0.0, 0.0)], axis=0)
+
+
+PARTS = 8
+"""Parts of a link at whose ends its overlap is measured."""
+
+
+def part_depth(part: Part, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return how deep [n] points [n, 3] lie in a body; below zero outside, where it is no farther than that."""
+    match part:
+        case Sphere():
+            return part.radius - np.linalg.norm(points - part.centre, axis=1)
+        case Box():
+            local = (points - part.centre) @ to_matrices(part.quaternion)
+            return (np.asarray(part.half_sizes) - np.abs(local)).min(axis=1)
+        case Capsule() | Cylinder():
+            start, along = np.asarray(part.start), np.subtract(part.end, part.start)
+            length = np.linalg.norm(along)
+            arc = (points - start) @ (along / length)
+            capsule = isinstance(part, Capsule)
+            foot = start + np.outer(arc.clip(0, length) if capsule else arc, along / length)
+            depth = part.radius - np.linalg.norm(points - foot, axis=1)
+            return depth if capsule else np.minimum(depth, np.minimum(arc, length - arc))
+        case _:
+            planes = ConvexHull(part.vertices).equations
+            return -(points @ planes[:, :3].T + planes[:, 3]).max(axis=1)
+
+
+def obstacle_depth(obstacle: Obstacle, points: NDArray, times: NDArray) -> NDArray[np.float64]:
+    """Return how deep [n] points [n, 3] (world), at ``times`` [n] (s), lie in the deepest part of an obstacle."""
+    local = to_obstacle_frame(obstacle, points, times)
+    return np.max([part_depth(part, local) for part in obstacle.parts], axis=0)
+
+
+def overlap_fault(
+    obstacles: Sequence[Obstacle], chain: Chain, position: NDArray, euler: NDArray, times: NDArray
+) -> tuple[int, str, float]:
+    """Return the first step at which the whisker starts in an object, or one reaches its base point.
+
+    Also returned are what is wrong in words, and the overlap at the start (m). Without a fault the step is the number
+    of steps and the words are empty. ``position`` and ``euler`` [n + 1, 3] are the base's at ``times`` [n + 1] (s).
+    """
+    share = np.linspace(0, 1, PARTS * chain.links + 1)
+    arcs = np.interp(share, np.linspace(0, 1, chain.links + 1), chain.nodes)
+    rest = np.stack([np.interp(arcs, chain.nodes, axis) for axis in (*chain.points.T, np.zeros(chain.links + 1))], 1)
+    line = rest @ base_rotation(euler[0]).T + position[0]
+    first, reason, depth = len(times) - 1, "", 0.0
+    for obstacle in obstacles:
+        here = obstacle_depth(obstacle, line, np.full(len(line), times[0])) + chain.whisker.radius(arcs)
+        depth = max(depth, float(here.max()))
+        reached = np.flatnonzero(obstacle_depth(obstacle, position, times)[:-1] > -chain.whisker.base_radius)
+        if len(reached) and reached[0] < first:
+            first, reason = int(reached[0]), fault(AT_BASE, float(times[reached[0]]), 0.0)
+    if depth > LARGEST_START_OVERLAP:
+        first, reason = 0, fault(STARTED_INSIDE, float(times[0]), depth)
+    return first, reason, depth
 
 
 def is_silent(job: Job, reach: Reach, position: NDArray[np.float64], euler: NDArray[np.float64]) -> bool:

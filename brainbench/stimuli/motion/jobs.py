@@ -7,16 +7,19 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import ClassVar, Literal, Protocol
+from typing import Annotated, ClassVar, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.errors import UsageError
-from brainbench.core.limits import limited
+from brainbench.core.limits import Limit, limited
 from brainbench.core.reading.ranges import check_fields, check_number
 from brainbench.stimuli.objects.obstacle import Obstacle
 from brainbench.stimuli.whiskers.whisker import Whisker
+
+_Metres = Annotated[float, Limit(unit="m")]
+_Radians = Annotated[float, Limit(unit="rad")]
 
 
 class Follicle(Protocol):
@@ -39,9 +42,9 @@ class StillFollicle:
     """A base that stands still."""
 
     finest: ClassVar[float] = math.inf
-    position: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    position: tuple[_Metres, _Metres, _Metres] = (0.0, 0.0, 0.0)
     """Base point [m, world]."""
-    euler: tuple[float, float, float] = (math.pi / 2, 0.0, -math.pi / 2)
+    euler: tuple[_Radians, _Radians, _Radians] = (math.pi / 2, 0.0, -math.pi / 2)
     """(θ, φ, ζ) [rad]; the default lays the base frame on the world frame."""
 
     def pose(self, times: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

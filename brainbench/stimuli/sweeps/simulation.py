@@ -9,8 +9,7 @@ import numpy as np
 
 from brainbench.stimuli.engines import get_engine
 from brainbench.stimuli.engines.fidelity import DEFAULT_ENGINE, Fidelity
-from brainbench.stimuli.engines.protocol import WhiskerEngine
-from brainbench.stimuli.engines.sweep_batch import SweepBatch, describe_unstable, join_batches
+from brainbench.stimuli.engines.protocol import SweepBatch, WhiskerEngine, describe_unstable, join_batches
 from brainbench.stimuli.explain import Explanation
 from brainbench.stimuli.simulation import simulate_uncached
 from brainbench.stimuli.sweeps.grid import SweepGrid

@@ -49,22 +49,6 @@ def test_a_wrong_sign_is_refused(measured):
         _fit(_changed(measured, -1.0))
 
 
-@pytest.mark.parametrize(
-    ("times", "told"),
-    [(lambda t: 1e3 * t, "time_ms"), (lambda t: 1e-3 * t, "swings with"), (lambda t: t + 3.0, "nothing is left")],
-    ids=["milliseconds", "kiloseconds", "another origin"],
-)
-def test_a_wrong_clock_is_refused(measured, times, told: str):
-    changed = new_wrenches(times(measured["time"].values), measured["wrench"].values, measured["channel"].values)
-    with pytest.raises(DataError, match=told):
-        Trial.ringdown(WHISKER, changed, 1e-3)
-
-
-def test_a_whisker_in_millimetres_is_refused(measured):
-    with pytest.raises(DataError, match="SI units"):
-        Trial.ringdown(replace(WHISKER, arc_length=1e3 * WHISKER.arc_length), measured, 1e-3)
-
-
 def test_a_component_that_reads_zero_though_the_whisker_acts_there_is_said(measured):
     good, bad = _fit(measured), _fit(_changed(measured, zero="Fy"))
     assert (good.status, bad.status) == ("ok", "unreliable")

@@ -6,7 +6,7 @@ import pytest
 from brainbench.core.errors import UsageError
 from brainbench.stimuli import Fidelity, simulate
 from brainbench.stimuli.engines.fidelity import DEFAULT_ENGINE
-from brainbench.stimuli.engines.sweep_batch import SweepBatch, join_batches
+from brainbench.stimuli.engines.protocol import SweepBatch, join_batches
 from brainbench.stimuli.explain import Explanation
 from brainbench.stimuli.sweeps.simulation import simulate_sweeps
 from tests.factories.engines import FakeEngine

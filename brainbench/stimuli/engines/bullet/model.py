@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.errors import MissingDependencyError, UsageError, install_command, missing_dependency
 from brainbench.core.rotations import from_z_axis
-from brainbench.stimuli.engines.tapered_links import LEAST_TAPER, cone_vertices
+from brainbench.stimuli.engines.stepping import LEAST_TAPER, cone_vertices
 from brainbench.stimuli.engines.units import MICRO, MILLI
 from brainbench.stimuli.objects.obstacle import Box, Capsule, ConvexPart, Cylinder, Obstacle, Part, Sphere
 from brainbench.stimuli.whiskers.chain import Chain

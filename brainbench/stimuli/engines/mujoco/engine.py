@@ -17,10 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.rotations import euler_matrix
-from brainbench.stimuli.engines.mujoco.drive import ARMATURE
-from brainbench.stimuli.engines.mujoco.model import SLOT_WIDTH, WhiskerModel, build_model, engine
-from brainbench.stimuli.engines.planarity import stays_in_plane
-from brainbench.stimuli.engines.reach import Reach
+from brainbench.stimuli.engines.mujoco.model import ARMATURE, SLOT_WIDTH, WhiskerModel, build_model, engine
+from brainbench.stimuli.engines.reach import Reach, stays_in_plane
 from brainbench.stimuli.engines.stepping import SteppedEngine, SteppedJob
 from brainbench.stimuli.engines.trust import LARGEST_BEND, LARGEST_CHANGE, state_fault, strongest_force
 from brainbench.stimuli.engines.units import MICRO, MILLI

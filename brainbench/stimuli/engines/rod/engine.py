@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from brainbench.core.devices import pick_device, usable_processors, warp
 from brainbench.core.progress import Progress as NamedProgress
 from brainbench.stimuli.engines.fidelity import Fidelity
-from brainbench.stimuli.engines.job_pool import run_groups
-from brainbench.stimuli.engines.protocol import Progress, WhiskerEngine
+from brainbench.stimuli.engines.protocol import Progress, SweepBatch, WhiskerEngine, run_groups
 from brainbench.stimuli.engines.rod.compilation import load_kernels
 from brainbench.stimuli.engines.rod.launch import LaunchResult, WhiskerSolver, real_type
 from brainbench.stimuli.engines.rod.packing import Track, capacity_for
@@ -23,7 +22,6 @@ from brainbench.stimuli.engines.rod.shapes import PackedSurface
 from brainbench.stimuli.engines.rod.tasks import JobTask, PackedTasks, make_task
 from brainbench.stimuli.engines.rod.tries import Try, run_with_retries, tries_ahead
 from brainbench.stimuli.engines.stepping import silent_trace
-from brainbench.stimuli.engines.sweep_batch import SweepBatch
 from brainbench.stimuli.engines.trust import check_jobs, without_escape
 from brainbench.stimuli.motion.jobs import Job, Trace
 from brainbench.stimuli.objects.solid import Solid

@@ -20,13 +20,13 @@ from brainbench.core.devices import pick_device
 from brainbench.core.errors import UsageError
 from brainbench.core.rotations import base_rotation, euler_matrix, from_matrices
 from brainbench.stimuli.engines.fidelity import Fidelity
+from brainbench.stimuli.engines.protocol import SweepBatch, describe_unstable, join_batches
 from brainbench.stimuli.engines.rod.launch import LaunchResult, WhiskerSolver
 from brainbench.stimuli.engines.rod.limits import MESHES
 from brainbench.stimuli.engines.rod.packing import PackedJobs, PackedMotions, still_knots
 from brainbench.stimuli.engines.rod.shapes import PackedShapes, PackedSurface
 from brainbench.stimuli.engines.rod.tasks import followed
 from brainbench.stimuli.engines.rod.tries import Ahead, Try, first_simulation, run_with_retries, tries_ahead
-from brainbench.stimuli.engines.sweep_batch import SweepBatch, describe_unstable, join_batches
 from brainbench.stimuli.engines.trust import BLOW
 from brainbench.stimuli.engines.units import MILLI
 from brainbench.stimuli.objects.solid import Solid

@@ -12,8 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.motion_pieces import KNOT, Cutting
-from brainbench.stimuli.engines.planarity import stays_in_plane
-from brainbench.stimuli.engines.reach import Reach, reachable
+from brainbench.stimuli.engines.reach import Reach, reachable, stays_in_plane
 from brainbench.stimuli.engines.rod.launch import LaunchResult, WhiskerSolver
 from brainbench.stimuli.engines.rod.limits import FINEST, WIDEST
 from brainbench.stimuli.engines.rod.packing import (

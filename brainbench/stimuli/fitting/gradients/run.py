@@ -15,8 +15,7 @@ from brainbench.core.devices import pick_device, usable_processors
 from brainbench.core.errors import UsageError
 from brainbench.core.rotations import base_rotation
 from brainbench.stimuli.engines.fidelity import Fidelity
-from brainbench.stimuli.engines.planarity import stays_in_plane
-from brainbench.stimuli.engines.reach import reachable
+from brainbench.stimuli.engines.reach import reachable, stays_in_plane
 from brainbench.stimuli.engines.rod.engine import RodEngine, trace_of
 from brainbench.stimuli.engines.rod.packing import capacity_for, knots_alike
 from brainbench.stimuli.engines.rod.tasks import JobTask, PackedTasks, make_task

@@ -1,7 +1,6 @@
 """The PyBullet backend against Newton's laws, the elastica, the MuJoCo backend and Bullet's own time step."""
 
 import math
-import sys
 from dataclasses import replace
 from importlib.util import find_spec
 
@@ -10,20 +9,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from brainbench.core.errors import MissingDependencyError, UsageError
 from brainbench.core.rotations import base_rotation
 from brainbench.stimuli import get_recipe
 from brainbench.stimuli.engines import get_engine
-from brainbench.stimuli.engines.bullet import model
-from brainbench.stimuli.engines.bullet.contact import contact_axes, cross_matrix, solve_contacts
-from brainbench.stimuli.engines.bullet.model import FOLLICLE, MOST_LINKS, BulletWorld
+from brainbench.stimuli.engines.bullet.engine import contact_axes, cross_matrix, solve_contacts
+from brainbench.stimuli.engines.bullet.model import FOLLICLE, BulletWorld
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.motion.jobs import Job, Load, StillFollicle
-from brainbench.stimuli.objects.obstacle import Box, Capsule, ConvexPart, Cylinder, Obstacle, Sphere
 from brainbench.stimuli.scenes.frames import Frames
 from brainbench.stimuli.validation import bench_tests
 from brainbench.stimuli.whiskers.chain import build_chain
-from brainbench.stimuli.whiskers.whisker import Whisker
 from tests.factories.obstacles import post
 from tests.factories.swing import Swing
 from tests.factories.whiskers import C2
@@ -41,15 +36,6 @@ def _run(*jobs, fidelity=COARSE, backend="bullet", **options):
 def _scale(wrench):
     """Largest force and largest moment, as a divisor of [n, 6] differences."""
     return np.repeat([np.abs(wrench[:, :3]).max(), np.abs(wrench[:, 3:]).max()], 3)
-
-
-def test_without_pybullet_the_error_names_the_extra_or_the_python(monkeypatch):
-    monkeypatch.setitem(sys.modules, "pybullet", None)
-    with pytest.raises(MissingDependencyError, match=r"\[bullet\]"):
-        model.engine()
-    monkeypatch.setattr(sys, "version_info", (3, 12, 0, "final", 0))
-    with pytest.raises(MissingDependencyError, match=r"'bullet' .*3\.12.*'mujoco'"):
-        _run(Job(C2, StillFollicle(), (), np.array([0.01])))
 
 
 @needs_bullet
@@ -118,41 +104,6 @@ def test_with_friction_a_resting_whisker_keeps_the_drag_and_the_step_does_not_ma
 
 
 @needs_bullet
-@pytest.mark.parametrize(
-    "part",
-    [
-        Capsule((0.0, 0.0, -0.002), (0.0, 0.0, 0.002), 1e-3),
-        Cylinder((0.0, 0.0, 0.002), (0.0, 0.0, -0.002), 1e-3),
-        Cylinder((-0.002, 0.0, 0.0), (0.002, 0.0, 0.0), 1e-3),
-        Sphere((0.0, 0.0, 0.0), 1e-3),
-        Box((0.0, 0.0, 0.0), (2e-3, 3e-3, 1e-3), (math.sqrt(0.5), math.sqrt(0.5), 0.0, 0.0)),
-        ConvexPart(np.array([[x, y, z] for x in (-2e-3, 2e-3) for y in (-1e-3, 1e-3) for z in (-1e-3, 1e-3)])),
-    ],
-)
-@pytest.mark.parametrize("gap", [0.01, -0.003])
-def test_distances_to_every_shape_are_those_of_geometry(part, gap):
-    cylinder = Whisker(0.01, 50e-6, 50e-6, young_modulus=5e9, density=1300.0, damping_ratio=0.3)
-    with BulletWorld(build_chain(cylinder, 2), [Obstacle((part,))], 0.0, np.zeros(3)) as world:
-        # The second link runs from 5 to 10 mm along x; all parts reach 1 mm from their centre along y.
-        world.place([0.0] * (FOLLICLE + 4))
-        world.place_obstacle(0, np.array([7.5, -1.05 - gap, 0.0]), np.array([1.0, 0, 0, 0]))
-        (link, obstacle, point, normal, distance), *_ = world.closest(0.1)
-    assert (link, obstacle) == (1, 0)
-    assert distance == pytest.approx(gap, abs=1e-6)
-    np.testing.assert_allclose(normal, [0, 1, 0], atol=1e-5)
-    assert point[1] == pytest.approx(-0.05, abs=1e-6)
-
-
-@needs_bullet
-def test_the_joint_space_inertia_is_that_of_the_chain():
-    chain = build_chain(C2, 7)
-    with BulletWorld(chain, [], math.inf, np.zeros(3)) as world:
-        hinges = world.mass_matrix([0.0] * (FOLLICLE + 14))[FOLLICLE:, FOLLICLE:]
-    # Bullet's unit is mg·mm² = 1e-12 kg·m²; about z the chain states its own.
-    np.testing.assert_allclose(hinges[1::2, 1::2] * 1e-12, chain._planar_mass(), rtol=1e-5)
-
-
-@needs_bullet
 def test_steps_converge_on_what_bullet_itself_computes_at_a_fraction_of_a_microsecond():
     soft = replace(C2, young_modulus=5e6)
     chain, step, count = build_chain(soft, 3), 2e-6, 4000
@@ -194,16 +145,6 @@ def _steps_of_bullet(bullet, body, chain, step, count, load):
             axis = np.array(bullet.getMatrixFromQuaternion(frame[5])).reshape(3, 3)[:, 0]
             tips.append((np.array(frame[4]) + length * axis) / 1e3)
     return np.array(tips)
-
-
-@needs_bullet
-def test_more_links_than_pybullet_moves_are_refused():
-    job = Job(C2, StillFollicle(), (), np.array([0.01]), gravity=(0.0, 0.0, -9.81))
-    assert _run(job, fidelity=Fidelity(links=MOST_LINKS, time_step=1e-3))[0].status == "ok"
-    with pytest.raises(UsageError, match=r"60 links .*received 61"):
-        _run(job, fidelity=Fidelity(links=MOST_LINKS + 1, time_step=1e-3))
-    with pytest.raises(UsageError, match=r"workers .*received 0"):
-        _run(job, workers=0)
 
 
 @given(seed=st.integers(0, 10**6), contacts=st.integers(1, 4))

@@ -12,10 +12,10 @@ import pytest
 from brainbench.core.devices import warp
 from brainbench.core.files import content_hash, portable
 from brainbench.stimuli.engines.fidelity import Fidelity
+from brainbench.stimuli.engines.protocol import SweepBatch
 from brainbench.stimuli.engines.rod import launch, scheduling, streams, sweeps
 from brainbench.stimuli.engines.rod.sweeps import SweepLauncher
 from brainbench.stimuli.engines.rod.tries import ON_AN_IDLE_GPU, ONE_BY_ONE, first_simulation, tries_ahead
-from brainbench.stimuli.engines.sweep_batch import SweepBatch
 from brainbench.stimuli.objects.collections import resolve_objects
 from brainbench.stimuli.sweeps.grid import SweepGrid
 from brainbench.stimuli.sweeps.sweep_scenes import GRIDS, SweepScenes

@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from brainbench.core.errors import UsageError
 from brainbench.core.rotations import euler_matrix
 from brainbench.geometry import Mesh
 from brainbench.stimuli.engines.fidelity import Fidelity
@@ -228,19 +227,3 @@ def test_an_unstable_whisker_has_no_gradient():
     assert np.isnan(run.tangents()[0].wrench).all()
     assert gradient.events[0].status == "unstable"
     assert not gradient.smooth
-
-
-def test_what_cannot_be_differentiated_is_refused():
-    job = touching_job(_prism())
-
-    def scaled(values):
-        return [replace(job, obstacles=(Obstacle((), surface=_prism().scaled(values[0])),))]
-
-    with pytest.raises(UsageError, match="deforms or scales a mesh"):
-        GradientRun(scaled, [1.0], fidelity=COARSE).gradient([np.ones((30, 6))])
-    with pytest.raises(UsageError, match="same number of jobs"):
-        GradientRun(lambda values: [job] * (1 + (values[0] > 1)), [1.0], fidelity=COARSE)
-    with pytest.raises(UsageError, match="positive scale"):
-        GradientRun(lambda values: [job], [0.0], fidelity=COARSE)
-    with pytest.raises(UsageError, match="finite"):
-        GradientRun(lambda values: [job], [np.nan], fidelity=COARSE)

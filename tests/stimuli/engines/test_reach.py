@@ -1,13 +1,14 @@
 """Which whiskers stay in one plane, and that these are computed without twist."""
 
+from __future__ import annotations
+
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from brainbench.stimuli.engines.fidelity import Fidelity
-from brainbench.stimuli.engines.planarity import stays_in_plane
-from brainbench.stimuli.engines.reach import reachable
+from brainbench.stimuli.engines.reach import reachable, stays_in_plane
 from brainbench.stimuli.engines.rod.engine import RodEngine
 from brainbench.stimuli.motion.jobs import Job, Load, StillFollicle
 from brainbench.stimuli.objects.obstacle import Box, Capsule, Cylinder, Obstacle, Sphere

@@ -1,0 +1,30 @@
+"""What engines share: names, devices, jobs that cannot be."""
+
+import numpy as np
+import pytest
+
+from brainbench.core.errors import UsageError
+from brainbench.stimuli.engines import get_engine, list_engines
+from brainbench.stimuli.engines.fidelity import Fidelity
+from brainbench.stimuli.motion.jobs import Job, Load, StillFollicle
+from tests.factories.whiskers import C2
+
+COARSE = Fidelity(links=8, time_step=1e-4)
+
+
+def _run(*jobs, fidelity=COARSE, **options):
+    return get_engine("mujoco").run(jobs, fidelity, **options)
+
+
+def test_unknown_backends_and_bad_jobs_are_refused():
+    assert "mujoco" in list_engines()
+    with pytest.raises(UsageError, match="did you mean 'mujoco'"):
+        get_engine("mojoco")
+    with pytest.raises(UsageError, match=r"frame times .*increasing"):
+        Job(C2, StillFollicle(), (), np.array([0.2, 0.1]))
+    with pytest.raises(UsageError, match=r"\(0 s\) .*\(0\.1 s\)"):
+        Job(C2, StillFollicle(), (), np.array([0.0]), start=0.1)
+    with pytest.raises(UsageError, match=r"arc of a load .*\(m\).*0\.015265.*received 0\.02"):
+        Job(C2, StillFollicle(), (), np.array([0.1]), loads=(Load(0.02, (0, 0, 1e-6)),))
+    with pytest.raises(UsageError, match=r"workers .*received 0"):
+        _run(Job(C2, StillFollicle(), (), np.array([0.1])), workers=0)
