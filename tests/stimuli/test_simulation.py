@@ -205,7 +205,7 @@ def test_an_edited_drawing_module_leaves_simulations_in_their_place_in_the_cache
     names = []
     for copy in ("before", "after"):
         shutil.copytree(Path(brainbench.__file__).parent, tmp_path / copy / "brainbench", ignore=_WEIGHTS)
-        with (tmp_path / copy / "brainbench/stimuli/figures/raster.py").open("a") as module:
+        with (tmp_path / copy / "brainbench/stimuli/figures/rays.py").open("a") as module:
             module.write(f"# {copy}\n")
         ended = subprocess.run(
             [sys.executable, "-c", code], env={**os.environ, "PYTHONPATH": str(tmp_path / copy)}, cwd=tmp_path,

@@ -13,8 +13,8 @@ from brainbench.cli.tactile import figures
 from brainbench.core.figures.style import panels, save_figure
 from brainbench.stimuli.figures.camera import Camera
 from brainbench.stimuli.figures.canvas import Style
-from brainbench.stimuli.figures.films import write_film
-from brainbench.stimuli.figures.raster import Triangles
+from brainbench.stimuli.figures.rays import Triangles
+from brainbench.stimuli.figures.scenes import write_film
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -14,8 +14,7 @@ from scipy.signal import spectrogram
 from brainbench.core.figures.style import COLORS, new_figure, panels, save_figure
 from brainbench.core.rotations import to_matrices
 from brainbench.stimuli.figures.camera import Camera, Lens
-from brainbench.stimuli.figures.raster import Triangles, draw
-from brainbench.stimuli.figures.shading import lamp, paint, shade
+from brainbench.stimuli.figures.rays import Triangles, draw, lamp, paint, shade
 from brainbench.stimuli.figures.surfaces import ball, corner_normals, tube
 from robotics_bridge.sensors.queries.solids import tessellate
 

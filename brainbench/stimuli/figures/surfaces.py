@@ -13,19 +13,18 @@ from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.rotations import euler_matrix, to_matrices
 from brainbench.geometry import Mesh, convex_hull
-from brainbench.stimuli.figures.raster import Triangles
+from brainbench.stimuli.figures.rays import Triangles
 from brainbench.stimuli.motion.trajectories import Path, Spin
 from brainbench.stimuli.objects.obstacle import Box, Capsule, ConvexPart, Cylinder, Part, RigidMotion, Sphere
 from brainbench.stimuli.objects.placed_object import PlacedObject
 from brainbench.stimuli.objects.procedural.bodies import transported_normals
 
-CREASE = math.cos(math.radians(35))
-"""Neighbouring triangles at a smaller angle are shaded as one smooth surface."""
+CREASE = math.radians(35)
+"""Neighbouring triangles at a smaller angle [rad] are shaded as one smooth surface."""
 SIDES = 7
 """Corners of a whisker's cross-section."""
 ROUND = 64
 """Corners of a circle of an object."""
-_DETAILED = 200_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,28 +92,21 @@ def part_mesh(part: Part) -> Mesh:
 
 
 def corner_normals(mesh: Mesh) -> NDArray[np.float64]:
-    """Return unit normals [F, 3, 3] at the corners: area-weighted means over the smooth neighbours of each triangle.
+    """Return unit normals [F, 3, 3] at the corners: area-weighted means over each smooth patch of the mesh."""
+    from trimesh import Trimesh
+    from trimesh.graph import connected_component_labels
 
-    Meshes of more than 200,000 triangles are shaded flat: their triangles are smaller than pixels.
-    """
+    solid = Trimesh(mesh.vertices, mesh.faces, process=False)
+    smooth = solid.face_adjacency[solid.face_adjacency_angles < CREASE]
+    patch = connected_component_labels(smooth, node_count=len(mesh.faces))
+    # A vertex has one normal in each patch that meets there.
+    _, place = np.unique(patch[:, None] * len(mesh.vertices) + mesh.faces, return_inverse=True)
+    place = place.reshape(-1)
     corners = mesh.vertices[mesh.faces]
-    area = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    unit = area / np.maximum(np.linalg.norm(area, axis=1, keepdims=True), 1e-300)
-    if len(mesh.faces) > _DETAILED:
-        return np.repeat(unit[:, None], 3, axis=1)
-    vertex = mesh.faces.reshape(-1)
-    order = np.argsort(vertex, kind="stable")
-    counts = np.bincount(vertex, minlength=len(mesh.vertices))
-    begins = np.cumsum(counts) - counts
-    # Every corner paired with every triangle that shares its vertex.
-    corner = np.repeat(np.arange(len(vertex)), counts[vertex])
-    within = np.arange(len(corner)) - np.repeat(np.cumsum(counts[vertex]) - counts[vertex], counts[vertex])
-    neighbour = order[begins[vertex[corner]] + within] // 3
-    smooth = np.sum(unit[corner // 3] * unit[neighbour], axis=1) > CREASE
-    total = np.stack([np.bincount(corner[smooth], area[neighbour[smooth], i], len(vertex)) for i in range(3)], axis=-1)
-    length = np.linalg.norm(total, axis=1, keepdims=True)
-    own = np.repeat(unit, 3, axis=0)
-    return np.where(length > 0, total / np.maximum(length, 1e-300), own).reshape(-1, 3, 3)
+    area = np.repeat(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), 3, axis=0)
+    total = np.stack([np.bincount(place, area[:, axis]) for axis in range(3)], axis=-1)
+    unit = total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-300)
+    return unit[place].reshape(-1, 3, 3)
 
 
 def tube(line: NDArray[np.float64], radii: NDArray[np.float64], colors: NDArray[np.float64]) -> Triangles:

@@ -11,7 +11,7 @@ from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.figures import scenes as module
 from brainbench.stimuli.figures.camera import Camera
 from brainbench.stimuli.figures.canvas import Style
-from brainbench.stimuli.figures.picture import Picture
+from brainbench.stimuli.figures.pictures import Picture
 from brainbench.stimuli.figures.scenes import film_times, render, still_time
 from brainbench.stimuli.motion.trajectories import Still, Translation, Whisking
 from brainbench.stimuli.objects.placed_object import PlacedObject

@@ -6,7 +6,7 @@ from trimesh import creation
 
 from brainbench.geometry import Mesh
 from brainbench.stimuli.figures.camera import Camera
-from brainbench.stimuli.figures.raster import Triangles, draw
+from brainbench.stimuli.figures.rays import Triangles, draw
 from brainbench.stimuli.figures.surfaces import corner_normals
 
 SIZE = (400, 300)
