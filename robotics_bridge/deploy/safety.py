@@ -7,27 +7,28 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.errors import UsageError, check_each
-from brainbench.core.reading.ranges import check_fields
+from brainbench.core.limits import Limit, limited, limits_of
 from robotics_bridge.deploy.driver import Clock, Driver, HandReading
 from robotics_bridge.hands import Hand
 
-LIMITS = {
-    "pressure": 1000.0, "margin": 1.0, "timeout": 2.0, "start_timeout": 60.0, "rate_share": 1.0, "rate_window": 60.0,
-}  # fmt: skip
-"""Largest value of each limit: a hand must not run on for longer, or press harder, because of a slip of the keys."""
 DRIFT = 2e-4
 """Largest difference of the rates of two clocks (s/s): quartz is right to 50 ppm, and the system's time service adds
 its own. A delay that grows more slowly than this is not seen."""
 
 
 @dataclass(frozen=True, eq=False)
+@limited(of="The safety limit '{}'")
 class SafetyLimits:
-    """Limits of joints, readings and timing."""
+    """Limits of joints, readings and timing.
+
+    Each has a largest value: a hand must not run on for longer, or press harder, because of a slip of the keys.
+    """
 
     low: NDArray[np.float64]
     """[J] (rad)."""
@@ -35,17 +36,17 @@ class SafetyLimits:
     """[J] (rad)."""
     speed: NDArray[np.float64]
     """[J] (rad/s): fastest change of a target; twice that measured is absurd."""
-    pressure: float = 30.0
+    pressure: Annotated[float, Limit(above=0, most=1000)] = 30.0
     """Largest reading of a finger tip, in the maker's unit."""
-    margin: float = 0.15
+    margin: Annotated[float, Limit(above=0, most=1)] = 0.15
     """Distance beyond its limits at which a joint may be measured (rad; of a slide by its lever)."""
-    timeout: float = 0.1
+    timeout: Annotated[float, Limit(above=0, most=2)] = 0.1
     """Oldest report to act upon (s)."""
-    start_timeout: float = 3.0
+    start_timeout: Annotated[float, Limit(above=0, most=60)] = 3.0
     """Longest wait for the first report (s)."""
-    rate_share: float = 0.8
+    rate_share: Annotated[float, Limit(above=0, most=1)] = 0.8
     """Smallest share of the nominal control rate over the window."""
-    rate_window: float = 1.0
+    rate_window: Annotated[float, Limit(above=0, most=60)] = 1.0
     """Seconds over which the rate is judged."""
     lever: NDArray[np.float64] | float = 1.0
     """[J] factor on the margin (:meth:`~robotics_bridge.hands.hand.Hand.lever`)."""
@@ -56,8 +57,6 @@ class SafetyLimits:
         ends = np.array([self.low, self.high, self.speed], float)
         if not (np.isfinite(ends).all() and (ends[0] < ends[1]).all() and (ends[2] > 0).all()):
             raise UsageError("Every joint needs a finite lower limit below its upper one and a finite positive speed.")
-        for name, most in LIMITS.items():
-            check_fields(self, name, of="The safety limit '{}'", above=0, most=most)
 
     @classmethod
     def of_hand(cls, hand: Hand, joints: tuple[str, ...], **changes: float) -> SafetyLimits:
@@ -67,7 +66,7 @@ class SafetyLimits:
         if missing := [name for name in joints if name not in names]:
             raise UsageError(f"The hand {hand.name!r} has no joint {missing[0]!r}.")
         ranges = np.array([model.jnt_range[names[name]] for name in joints])
-        check_each("safety limit", changes, LIMITS)
+        check_each("safety limit", changes, [name for name in limits_of(cls) if name != "lever"])
         return cls(ranges[:, 0], ranges[:, 1], hand.rated_speeds(joints), lever=hand.lever(joints), **changes)
 
     def fault(self, reading: HandReading, age: float) -> str | None:

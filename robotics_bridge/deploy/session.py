@@ -6,14 +6,14 @@ import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, check_each, listing
 from brainbench.core.files import file_hash
-from brainbench.core.reading.ranges import check_fields, check_number
+from brainbench.core.limits import Limit, check_value, limited
 from robotics_bridge import hands
 from robotics_bridge.deploy.controller import Controller
 from robotics_bridge.deploy.driver import Driver, HandReading, Source
@@ -26,31 +26,29 @@ REAL_TYPES = ("agg_bool", "agg_force")
 """Observation types that a real hand can measure."""
 LARGEST_SCALE = 1e6
 """Largest scale or threshold of a pressure calibration."""
+_Scale = Annotated[float, Limit(least=-LARGEST_SCALE, most=LARGEST_SCALE)]
 
 
 @dataclass(frozen=True)
+@limited(of="'{}' of a pressure calibration")
 class PressureCalibration:
     """From the maker's contact pressure to the simulator's ``agg_force``; the published values."""
 
-    scale: float = 1000.0
+    scale: _Scale = 1000.0
     """``agg_force`` of one unit of the maker's contact pressure."""
-    per_finger: Mapping[str, float] = field(default_factory=dict)
+    per_finger: Mapping[str, _Scale] = field(default_factory=dict)
     """Finger → scale of its own."""
-    axes: tuple[float, float, float] = (-1.0, -1.0, 1.0)
+    axes: tuple[_Scale, _Scale, _Scale] = (-1.0, -1.0, 1.0)
     """Factor per axis: the hand reports x and y with the opposite sign."""
-    threshold: float = 0.05
+    threshold: Annotated[float, Limit(above=0, most=LARGEST_SCALE)] = 0.05
     """Contact pressure, in the maker's unit, above which a finger touches (η_real of 4.31)."""
 
     def __post_init__(self) -> None:
-        of = "'{}' of a pressure calibration"
-        check_fields(self, "threshold", of=of, above=0, most=LARGEST_SCALE)
-        check_fields(self, "axes", of=of, items=3)
+        for name, factor in self.per_finger.items():
+            check_value(f"'{name}' of a pressure calibration", factor, _Scale)
         factors = [("scale", self.scale), *self.per_finger.items(), *(("axes", factor) for factor in self.axes)]
-        for name, factor in factors:
-            told = of.replace("{}", name)
-            check_number(told, factor, least=-LARGEST_SCALE, most=LARGEST_SCALE)
-            if factor == 0:
-                raise UsageError(f"{told} must not be 0; received {factor}.")
+        if zero := [name for name, factor in factors if factor == 0]:
+            raise UsageError(f"{zero[0]!r} of a pressure calibration must not be 0; received 0.")
 
     def force(self, fingers: tuple[str, ...], pressure: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the simulator's ``agg_force`` [F, 3] of pressures [F, 3]."""

@@ -8,14 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import torch
 
 from brainbench.core.devices import mujoco_module, pick_device, warp
-from brainbench.core.errors import UsageError, check_kind, check_name
-from brainbench.core.reading.ranges import check_fields
+from brainbench.core.errors import UsageError, check_kind
+from brainbench.core.limits import Count, Limit, limited
 from robotics_bridge.envs.kernels.actuation import ActuatorArrays, actuate, count_launch
 from robotics_bridge.hands.layouts import check_names
 from robotics_bridge.hands.observations import observation_type
@@ -28,14 +28,15 @@ ENGINES = ("mujoco", "warp")
 
 
 @dataclass(frozen=True, kw_only=True)
+@limited
 class EnvOptions:
     """Options of the simulation of a task, and of what is observed; a value that is not valid is a UsageError."""
 
-    num_envs: int = 1
+    num_envs: Annotated[int, Limit(least=1, most=MOST_ENVS)] = 1
     """Environments B."""
     device: str = "cpu"
     """``cpu``, ``cuda`` or ``cuda:1``."""
-    engine: str | None = None
+    engine: Literal["mujoco", "warp"] | None = None
     """``mujoco`` (C MuJoCo) or ``warp`` (MuJoCo Warp); by default the one for the device."""
     observe: str = "none"
     """Tactile observation type (table 4.3); ``none`` builds no tactile sensor."""
@@ -45,13 +46,13 @@ class EnvOptions:
     """Number of taxels: ``low``, ``med`` or ``high``; or a probe file (``.json``)."""
     noisy: bool = False
     """Tactile readings with the published imperfections."""
-    seed: int = 0
+    seed: Annotated[int, Limit(least=0, most=2**63 - 1)] = 0
     """Seed of all random numbers."""
     link_pose: bool = False
     """Also observe the poses of the tactile links in the palm's frame."""
     keep_final: bool = False
     """Return the last observations of episodes that ended as ``info["final_observations"]``."""
-    threads: int | None = None
+    threads: Count | None = None
     """Threads of C MuJoCo; None takes all processors."""
     knobs: Mapping[str, Any] = field(default_factory=dict)
     """Further settings of the tactile sensors, e.g. ``{"points": 500}``."""
@@ -62,12 +63,8 @@ class EnvOptions:
     """
 
     def __post_init__(self) -> None:
-        check_fields(self, "num_envs", least=1, most=MOST_ENVS, whole=True)
-        check_fields(self, "seed", least=0, below=2**63, whole=True)
-        check_fields(self, "threads", least=1, whole=True)
         check_kind("device", self.device, str, "'cpu', 'cuda' or 'cuda:N'")
         object.__setattr__(self, "engine", self.engine or ("mujoco" if self.device == "cpu" else "warp"))
-        check_name("engine", self.engine, ENGINES)
         observation_type(self.observe)
         check_names("low" if self.resolution == "custom" else self.resolution, self.placement)
         if self.observe == "none" and (self.noisy or self.knobs):

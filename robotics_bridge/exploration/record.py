@@ -10,7 +10,7 @@ import json
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
@@ -20,8 +20,9 @@ from numpy.typing import NDArray
 from brainbench.core.contracts import CHANNELS, GRID_SHAPE, SUB_STEP_SECONDS, SUB_STEPS, check_stimulus_set
 from brainbench.core.errors import DataError, UsageError, check_each, check_once, listing
 from brainbench.core.files import content_hash, to_json
+from brainbench.core.limits import Limit, limited
 from brainbench.core.progress import Progress, track
-from brainbench.core.reading.ranges import check_fields, check_number
+from brainbench.core.reading.ranges import check_number
 from brainbench.core.rotations import from_matrices, from_rpy, to_matrices
 from brainbench.core.version import __version__
 from robotics_bridge import hands
@@ -104,6 +105,7 @@ _DENSE = 2e5
 
 
 @dataclass(frozen=True, eq=False)
+@limited(of="{} of an explored object", unresolved=("geometry",))
 class Explored:
     """An object to explore."""
 
@@ -112,16 +114,15 @@ class Explored:
     """Its shape; link and pose do not matter. A mesh collides as its convex hull; taxels feel the surface itself."""
     quaternion: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
     """Orientation in which it is held (w, x, y, z)."""
-    retreat: float = 0.0
+    retreat: Annotated[float, Limit(least=-1, most=1, unit="m")] = 0.0
     """Held so much further away than the procedure says (m)."""
 
     def __post_init__(self) -> None:
-        if np.shape(self.quaternion) != (4,) or not 1e-6 < float(np.linalg.norm(self.quaternion)) < np.inf:
+        if not float(np.linalg.norm(self.quaternion)) > 1e-6:
             raise UsageError(
-                f"The orientation of {self.label!r} is a quaternion (w, x, y, z) that is finite and not zero; received "
+                f"The orientation of {self.label!r} is a quaternion (w, x, y, z) that is not zero; received "
                 f"{self.quaternion!r}."
             )
-        check_fields(self, "retreat", least=-1, most=1, of="{} of an explored object (m)")
         extent = float(np.max(self.geometry.reach(np.concatenate([np.eye(3), -np.eye(3)]))))
         check_number(f"extent of {self.label!r} from its origin (m)", extent, most=1)
 

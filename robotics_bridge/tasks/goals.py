@@ -8,60 +8,58 @@ from __future__ import annotations
 import abc
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 from brainbench.core.errors import UsageError
-from brainbench.core.reading.ranges import check_fields, check_number
+from brainbench.core.limits import Count, Limit, limited
 from brainbench.core.rotations import TURN, about, constant, multiply, tilted, twist_of
-from robotics_bridge.tasks.settings import check_range, unit_vector
+from robotics_bridge.tasks.settings import Factors, check_order, unit_vector
 
 if TYPE_CHECKING:
     import torch
 
+_Part = Annotated[float, Limit(above=0, below=1)]
+_Turn = Annotated[float, Limit(least=-TURN, most=TURN, unit="rad")]
+_Half = Annotated[float, Limit(least=-math.pi, most=math.pi, unit="rad")]
+
 
 @dataclass(frozen=True, kw_only=True)
+@limited(of="{} of a goal")
 class Goal(abc.ABC):
     """An orientation to reach; a new one is proposed as soon as it is."""
 
-    threshold: float = 0.1
-    """Angle below which the goal counts as reached [rad]."""
-    limit: int | None = None
+    threshold: Annotated[float, Limit(above=0, below=math.pi, unit="rad")] = 0.1
+    """Angle below which the goal counts as reached [rad]. No two orientations are further apart than π."""
+    limit: Count | None = None
     """Goals of a complete episode, for who reads the task; what ends it is an ending (``terms.enough_goals``)."""
-    deadline: tuple[float, float] | None = None
+    deadline: Factors | None = None
     """Range of the time after which another goal is proposed [s]; None waits for ever."""
     axis: tuple[float, float, float] | None = None
     """World axis of the commanded rotation, made unit length; None for goals about any axis."""
     by_looks: bool = False
     """Orientations in which the object looks the same are the same: of a cylinder, all turns about its own axis. False
     (published) tells them apart."""
-    start_threshold: float | None = None
+    start_threshold: Annotated[float, Limit(below=math.pi, unit="rad")] | None = None
     """Wider threshold with which a teacher begins to learn [rad]; None learns with ``threshold`` from the start.
 
     While it learns, the threshold is multiplied by ``narrowing`` whenever the share of successful episodes, over as
     many as there are environments, exceeds ``mastered``, down to ``threshold``. Whoever does not learn (evaluations,
     students, ``play``) has ``threshold``.
     """
-    mastered: float = 0.3
+    mastered: _Part = 0.3
     """Share of successful episodes above which the threshold narrows."""
-    narrowing: float = 0.9
+    narrowing: _Part = 0.9
     """Factor by which it narrows."""
 
     def __post_init__(self) -> None:
-        # No two orientations are further apart than π: every one would count as reached.
-        check_number("The threshold of a goal (rad)", self.threshold, above=0, below=math.pi)
-        check_fields(self, "limit", least=1, whole=True, of="{} of a goal")
-        if self.deadline is not None:
-            check_range("deadline of a goal (s)", self.deadline, least=0)
+        check_order(self, "deadline", of="{} of a goal (s)")
         if self.axis is not None:
             object.__setattr__(self, "axis", unit_vector("axis of a goal", self.axis, 3))
-        check_fields(self, "start_threshold", below=math.pi, of="{} of a goal (rad)")
         if self.start_threshold is not None and not self.threshold <= self.start_threshold:
             raise UsageError(
                 f"Learning begins with a wider threshold than {self.threshold:g} rad; received start_threshold = "
                 f"{self.start_threshold!r}."
             )
-        check_number("The share 'mastered' of a goal", self.mastered, above=0, below=1)
-        check_number("The factor 'narrowing' of a goal", self.narrowing, above=0, below=1)
 
     def first(self, quat: torch.Tensor, draw: torch.Tensor) -> torch.Tensor:
         """Return the goals [B, 4] (w, x, y, z) of new episodes: what follows the object's orientations ``quat``."""
@@ -73,23 +71,19 @@ class Goal(abc.ABC):
 
 
 @dataclass(frozen=True, kw_only=True)
+@limited(of="{} of a goal")
 class SteppingRotation(Goal):
     """Each goal lies one step further about a fixed world axis than the last."""
 
     axis: tuple[float, float, float] | None = (-1.0, 0.0, 0.0)
-    step: float = 1.570795
+    step: _Turn = 1.570795
     """Angle from goal to goal [rad]."""
-    allowed_off_axis: float = math.pi / 6
+    allowed_off_axis: Annotated[float, Limit(least=0, unit="rad")] = math.pi / 6
     """Tilt against the axis up to which rotation counts [rad]."""
     lying_flat: bool = False
     """Goals are those of an object that begins straight, in which it lies flat on the palm. False (published) keeps the
     random yaw of the start in all of them: from the first goal on it is a tilt at which the object cannot lie."""
-    limit: int | None = 15
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_fields(self, "step", least=-TURN, most=TURN, of="{} of a goal (rad)")
-        check_fields(self, "allowed_off_axis", least=0, of="{} of a goal (rad)")
+    limit: Count | None = 15
 
     def first(self, quat: torch.Tensor, draw: torch.Tensor) -> torch.Tensor:
         """Return the goals one step from the start."""
@@ -107,16 +101,17 @@ class SteppingRotation(Goal):
 
 
 @dataclass(frozen=True, kw_only=True)
+@limited(of="{} of a goal")
 class TimedRotation(Goal):
     """Each goal is the object's orientation at the time, tilted at random about x and y, to be reached in time."""
 
-    tilt: tuple[float, float] = (-0.7853975, 0.7853975)
+    tilt: tuple[_Half, _Half] = (-0.7853975, 0.7853975)
     """Range of both angles [rad]."""
-    deadline: tuple[float, float] | None = (4.0, 6.0)
+    deadline: Factors | None = (4.0, 6.0)
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_range("tilt of a goal (rad)", self.tilt, least=-math.pi, most=math.pi)
+        check_order(self, "tilt", of="{} of a goal (rad)")
 
     def following(self, quat: torch.Tensor, goal: torch.Tensor, draw: torch.Tensor) -> torch.Tensor:
         """Return tilted orientations of the object."""

@@ -11,13 +11,13 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 
 from brainbench.core.devices import mujoco_module, warp
-from brainbench.core.errors import UsageError, check_name
-from brainbench.core.reading.ranges import check_fields, check_number
+from brainbench.core.errors import UsageError
+from brainbench.core.limits import Count, Limit, NotNegative, Positive, limited
 from robotics_bridge.sensors.taxels.sensors import PUBLISHED_TWIST
 from robotics_bridge.sensors.temperature.grid import TemperatureGrid
 from robotics_bridge.sensors.temperature.materials import ABSOLUTE_ZERO, ThermalBody, ThermalMaterial, material
@@ -34,22 +34,26 @@ if TYPE_CHECKING:
     from robotics_bridge.tasks.terms import StepContext, TaskScene
 
 
+_Celsius = Annotated[float, Limit(least=ABSOLUTE_ZERO, unit="°C")]
+
+
 @dataclass(frozen=True, kw_only=True)
+@limited(of="{} of the hot ball")
 class ThermalSettings:
     """Materials of fingers and balls. The first four numbers are the axes of figure 4.8 and section 4.6.3."""
 
     conductivity: float = 150.0
     """Conductivity of the fingers [W/(m·K)]."""
     emissivity: float = 0.5
-    heat: float = 500.0
+    heat: NotNegative = 500.0
     """Made inside the fingers, per area of a layer of cells [W/m²] (4.36)."""
-    ambient: float = 22.0
+    ambient: _Celsius = 22.0
     """Temperature of the room, the hand and all balls but one at the start [°C]."""
-    hot: float = 45.0
+    hot: _Celsius = 45.0
     """Temperature of the target ball [°C]."""
-    margin: float = 0.12
+    margin: Annotated[float, Limit(above=0, below=1)] = 0.12
     """The latch fires at a progress of 1 − margin (42.2 °C)."""
-    cells: tuple[int, int, int] = (4, 4, 4)
+    cells: tuple[Count, Count, Count] = (4, 4, 4)
     """Cells of the grid on each finger link; not published."""
     density: float = 2700.0
     """Density of the fingers [kg/m³]; not published (aluminium)."""
@@ -59,21 +63,15 @@ class ThermalSettings:
     """Material of the balls; not published."""
     conduction: Literal["physical", "thesis"] = "thesis"
     """Contact law: the published heuristic (4.38, 4.39), or with the resistance of ball and cells."""
-    convection: float = 10.0
+    convection: NotNegative = 10.0
     """[W/(m²·K)]; not published."""
-    contact_radius: float = 0.005
+    contact_radius: Positive = 0.005
     """Radius of the finger where it is touched, which with the overlap gives the area of a contact [m]; not
     published."""
 
     def __post_init__(self) -> None:
         if not self.hot > self.ambient:
             raise UsageError(f"The target is hotter than the room; received {self.hot} and {self.ambient} °C.")
-        check_number("The latch's margin", self.margin, above=0, below=1)
-        check_fields(self, "ambient", "hot", least=ABSOLUTE_ZERO)
-        check_fields(self, "heat", "convection", least=0)
-        check_fields(self, "contact_radius", above=0)
-        check_fields(self, "cells", items=3, least=1, whole=True)
-        check_name("conduction", self.conduction, ("physical", "thesis"))
         # What is wrong in the materials is told by them.
         _ = self.material, material(self.ball)
 

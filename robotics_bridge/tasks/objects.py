@@ -14,7 +14,8 @@ from typing import Any
 
 from brainbench.core.devices import mujoco_module
 from brainbench.core.errors import UsageError, shown
-from brainbench.core.reading.ranges import check_fields, check_numbers
+from brainbench.core.limits import Positive, limited
+from brainbench.core.reading.ranges import check_numbers
 from robotics_bridge.tasks.settings import unit_vector
 
 GRAIN = 1e-4
@@ -50,12 +51,13 @@ class ObjectPrimitive:
 
 
 @dataclass(frozen=True)
+@limited(of="{} of an object")
 class ObjectShape:
     """One object: its solids and its outer measures."""
 
     name: str
     solids: tuple[ObjectPrimitive, ...]
-    extent: tuple[float, float, float]
+    extent: tuple[Positive, Positive, Positive]
     """Edges of the box around it, along the body's axes [m]."""
     bottom: float
     """Depth below the body's origin to which it reaches when upright [m]."""
@@ -65,8 +67,6 @@ class ObjectShape:
     def __post_init__(self) -> None:
         if not self.solids:
             raise UsageError(f"The object {self.name!r} needs at least one solid.")
-        check_fields(self, "extent", items=3, above=0, of=f"{{}} of the object {self.name!r} (m)")
-        check_fields(self, "bottom", of=f"{{}} of the object {self.name!r} (m)")
         if self.round_about is not None:
             axis = unit_vector(f"round_about of the object {self.name!r}", self.round_about, 3)
             object.__setattr__(self, "round_about", axis)

@@ -7,22 +7,26 @@ from __future__ import annotations
 
 import inspect
 import math
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
-from typing import Any
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal
 
-from brainbench.core.errors import UsageError, check_each, check_name, shown
-from brainbench.core.reading.ranges import check_fields, check_number, check_numbers
+from brainbench.core.errors import UsageError, check_each, shown
+from brainbench.core.limits import Count, Limit, NotNegative, Positive, Share, limited
+from brainbench.core.reading.ranges import check_numbers
+
+Range = tuple[float, float]
+"""Lower and upper bound of a uniform distribution."""
+Factors = tuple[NotNegative, NotNegative]
+"""The same of numbers that are not negative."""
 
 
-def check_range(name: str, value: Any, **bounds: Any) -> None:
-    """Raise UsageError unless a value is a range (low, high) of numbers in order that :func:`check_number` takes."""
-    fits = isinstance(value, Sequence) and not isinstance(value, str) and len(value) == 2
-    if fits:
-        for end in value:
-            check_number(f"An end of {name}", end, **bounds)
-    if not fits or value[0] > value[1]:
-        raise UsageError(f"{name} is a range (low, high); received {shown(value)}.")
+def check_order(options: Any, *names: str, of: str = "{}") -> None:
+    """Raise UsageError unless fields of a dataclass that are ranges (low, high) are in order; None is."""
+    for name in names:
+        value = getattr(options, name)
+        if value is not None and value[0] > value[1]:
+            raise UsageError(f"{of.replace('{}', name)} is a range (low, high); received {shown(value)}.")
 
 
 def unit_vector(name: str, value: Any, count: int) -> tuple[float, ...]:
@@ -56,24 +60,23 @@ def check_parameters(of: str, function: Callable[..., Any], given: Iterable[str]
 
 
 @dataclass(frozen=True, kw_only=True)
+@limited(of="contacts.{}")
 class ContactModel:
     """Compliance of all contacts (MuJoCo's ``solref`` and ``solimp``), physics steps, and the scale of the drives."""
 
-    time_constant: float = 0.02
+    time_constant: Positive = 0.02
     """Time in which the solver takes overlap away [s]; the published engine's default."""
-    damping_ratio: float = 1.0
+    damping_ratio: Positive = 1.0
     """Damping of that approach; 1 is critical."""
     impedance: tuple[float, float, float] = (0.9, 0.95, 0.001)
     """Share of the constraint that is enforced at no overlap and at a full one, and the depth of a full one [m]."""
-    substeps: int = 1
+    substeps: Annotated[int, Limit(least=1, most=100)] = 1
     """Physics steps within the solver's ``timestep``; drives and sensors keep the rate of that."""
-    drive_scale: float = 1.0
+    drive_scale: Positive = 1.0
     """Factor on stiffness, damping, effort and armature of the hand's drives. Free motion depends on their ratios
     alone, so it stays the same; the force of a blocked finger and the blow of a fast one become smaller."""
 
     def __post_init__(self) -> None:
-        check_fields(self, "time_constant", "damping_ratio", "drive_scale", above=0, of="contacts.{}")
-        check_fields(self, "substeps", least=1, most=100, whole=True, of="contacts.{}")
         low, high, width = self.impedance
         if not (0 < low <= high < 1 and width > 0):
             raise UsageError(
@@ -102,88 +105,74 @@ def set_contacts(model: Any, contacts: ContactModel) -> None:
     model.geom_solimp[:, :3] = contacts.impedance
 
 
-SCHEDULES = ("adaptive", "fixed")
 BOUNDED = "robotics_bridge.policies.training.bounded_ppo:BoundedPPO"
 """The algorithm of runs whose learning rate has other bounds than rsl_rl's."""
 _WIDEST = (1e-5, 1e-2)
 
 
-def check_widths(hidden: Sequence[int]) -> None:
-    """Raise UsageError unless these are widths of one hidden layer or more."""
-    if not hidden:
-        raise UsageError("A network has at least one hidden layer; received no width.")
-    for width in hidden:
-        check_number("A width of the hidden layers", width, least=1, most=65_536, whole=True)
-
-
-LOSSES = ("mse", "inv_var_mse")
-"""``inv_var_mse``: each action's squared error over the variance of the teacher's action in the rollout."""
+Widths = Annotated[tuple[Annotated[int, Limit(least=1, most=65_536)], ...], Limit(shortest=1)]
+"""Widths of the hidden layers of a network."""
+LearningRate = Annotated[float, Limit(above=0, most=1)]
+Loss = Literal["mse", "inv_var_mse"]
 
 
 @dataclass(frozen=True, kw_only=True)
+@limited(of="{} of a teacher")
 class TeacherSettings:
     """PPO of the privileged teacher, upper half of table 4.4."""
 
-    num_envs: int = 8192
+    num_envs: Count = 8192
     """Environments at once."""
-    steps_per_env: int = 24
+    steps_per_env: Count = 24
     """Control steps of every environment in an iteration."""
-    iterations: int = 6000
+    iterations: Annotated[int, Limit(least=0)] = 6000
     learning_rate: float = 1e-3
     """Learning rate of the first iteration."""
-    epochs: int = 5
+    epochs: Count = 5
     """Passes over the steps of an iteration."""
-    minibatches: int = 4
+    minibatches: Count = 4
     """Parts of a pass, a gradient step each."""
-    discount: float = 0.998
+    discount: Share = 0.998
     """γ, per control step."""
-    gae_lambda: float = 0.95
+    gae_lambda: Share = 0.95
     """λ of the advantages (Schulman et al. 2016)."""
-    clip: float = 0.2
+    clip: Positive = 0.2
     """Largest change of an action's likelihood ratio that still pays (ε of PPO)."""
-    desired_kl: float = 0.01
+    desired_kl: Positive = 0.01
     """Aim of the adaptive learning rate."""
-    schedule: str = "adaptive"
+    schedule: Literal["adaptive", "fixed"] = "adaptive"
     """``adaptive``: the rate follows the KL divergence of updates; ``fixed``: it stays."""
-    learning_rate_range: tuple[float, float] = (1e-5, 1e-2)
+    learning_rate_range: tuple[Positive, Positive] = (1e-5, 1e-2)
     """Bounds of the adaptive rate; the widest are those of rsl_rl."""
-    entropy: float = 2e-3
+    entropy: NotNegative = 2e-3
     """Weight of the bonus for spread actions."""
-    value_loss: float = 1.0
+    value_loss: NotNegative = 1.0
     """Weight of the critic's loss."""
-    max_grad_norm: float = 1.0
+    max_grad_norm: Positive = 1.0
     """Norm to which longer gradients are cut."""
-    hidden: tuple[int, ...] = (512, 256, 128)
+    hidden: Widths = (512, 256, 128)
     """Widths of the layers of actor and critic."""
-    initial_std: float = 1.0
+    initial_std: Positive = 1.0
     """Standard deviation of the first actions."""
     std_type: str = "log"
     """Form of the policy's standard deviation (text above table 4.4; the released settings say ``log``)."""
-    std_range: tuple[float, float] = (1e-6, 1e6)
+    std_range: tuple[Positive, Positive] = (1e-6, 1e6)
     """Bounds of the standard deviation of actions."""
-    rnd_weight: float = 100.0
+    rnd_weight: NotNegative = 100.0
     """Weight of the curiosity reward, per second; 0 trains without it."""
-    rnd_outputs: int = 8
+    rnd_outputs: Count = 8
     """Numbers of the random network that the curious one predicts (Burda et al. 2018)."""
-    rnd_learning_rate: float = 1e-3
+    rnd_learning_rate: NotNegative = 1e-3
     """Learning rate of the predicting network."""
 
     def __post_init__(self) -> None:
-        check_name("schedule of the learning rate", self.schedule, SCHEDULES)
-        for name in ("learning_rate_range", "std_range"):
-            check_range(name, getattr(self, name), above=0)
+        check_order(self, "learning_rate_range", "std_range")
         low, high = self.learning_rate_range
         if not _WIDEST[0] <= low <= self.learning_rate <= high <= _WIDEST[1]:
             raise UsageError(
                 f"A learning rate lies within its range, and that within {_WIDEST}; received {self.learning_rate!r} "
                 f"and {(low, high)}."
             )
-        check_fields(self, "num_envs", "steps_per_env", "epochs", "minibatches", "rnd_outputs", least=1, whole=True)
-        check_fields(self, "iterations", least=0, whole=True)
-        check_widths(self.hidden)
-        check_fields(self, "discount", "gae_lambda", least=0, most=1)
-        check_fields(self, "clip", "desired_kl", "max_grad_norm", "initial_std", above=0)
-        check_fields(self, "entropy", "value_loss", "rnd_weight", "rnd_learning_rate", least=0)
 
     def config(self, groups: dict[str, tuple[str, ...]], actor: dict[str, Any] | None = None) -> dict[str, Any]:
         """Return the configuration of rsl_rl 5 (``PPO.construct_algorithm``), given observation set → groups.
@@ -224,43 +213,34 @@ class TeacherSettings:
 
 
 @dataclass(frozen=True, kw_only=True)
+@limited(of="{} of a student")
 class StudentSettings:
-    """DAgger distillation of the tactile student, lower half of table 4.4; UsageError for a number out of range."""
+    """DAgger distillation of the tactile student, lower half of table 4.4."""
 
-    iterations: int = 6000
-    learning_rate: float = 1e-4
-    epochs: int = 5
+    iterations: Annotated[int, Limit(least=0)] = 6000
+    learning_rate: LearningRate = 1e-4
+    epochs: Count = 5
     """Passes over the steps of an iteration."""
-    gradient_length: int = 2
+    gradient_length: Count = 2
     """Steps through which gradients flow back in time."""
-    clip: float | None = None
+    clip: Annotated[float, Limit(above=0, most=100)] | None = None
     """Largest change of an action within an iteration that still lowers the loss; None for any."""
-    max_grad_norm: float | None = None
+    max_grad_norm: Annotated[float, Limit(above=0, most=1e6)] | None = None
     """Norm to which longer gradients are cut; None leaves them."""
-    loss: str = "mse"
-    """One of :data:`LOSSES`."""
-
-    def __post_init__(self) -> None:
-        check_fields(self, "iterations", least=0, whole=True)
-        check_fields(self, "epochs", "gradient_length", least=1, whole=True)
-        check_fields(self, "learning_rate", "clip", "max_grad_norm", above=0)
-        check_name("loss of a student", self.loss, LOSSES)
+    loss: Loss = "mse"
+    """``inv_var_mse``: each action's squared error over the variance of the teacher's action in the rollout."""
 
 
 @dataclass(frozen=True)
+@limited(of="{} of a decoder")
 class AuxiliaryDecoder:
-    """A head that predicts an observation group from the student's latent (table 4.5); UsageError for a bad number."""
+    """A head that predicts an observation group from the student's latent (table 4.5)."""
 
     target: str
     """Name of the group."""
-    weight: float = 1.0
+    weight: NotNegative = 1.0
     """Weight of its mean squared error in the loss."""
     scale: float = 1.0
     """Factor on the target."""
-    hidden: tuple[int, ...] = field(default=(128, 64))
+    hidden: Widths = (128, 64)
     """Widths of its layers."""
-
-    def __post_init__(self) -> None:
-        check_fields(self, "weight", least=0)
-        check_fields(self, "scale")
-        check_widths(self.hidden)

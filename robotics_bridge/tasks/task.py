@@ -6,10 +6,11 @@ import itertools
 import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Annotated, Any, Literal
 
-from brainbench.core.errors import UsageError, check_each, check_name
-from brainbench.core.reading.ranges import check_fields, check_number, check_numbers
+from brainbench.core.errors import UsageError, check_each, check_name, shown
+from brainbench.core.limits import Count, Limit, NotNegative, Positive, limited
+from brainbench.core.reading.ranges import check_number, check_numbers
 from brainbench.core.rotations import TURN
 from robotics_bridge.tasks import terms
 from robotics_bridge.tasks.goals import Goal
@@ -18,16 +19,18 @@ from robotics_bridge.tasks.settings import (
     CONTACTS,
     AuxiliaryDecoder,
     ContactModel,
+    Factors,
+    Range,
     StudentSettings,
     TeacherSettings,
+    check_order,
     check_parameters,
-    check_range,
     unit_vector,
 )
 from robotics_bridge.tasks.terms import TaskScene, TaskState
 
-Range = tuple[float, float]
-"""Lower and upper bound of a uniform distribution."""
+_Angle = Annotated[float, Limit(least=-math.pi / 2, most=math.pi / 2, unit="rad")]
+_Turn = Annotated[float, Limit(least=-TURN, most=TURN, unit="rad")]
 Pose = tuple[tuple[float, float, float], tuple[float, float, float, float]]
 """Position (m) and quaternion (w, x, y, z)."""
 
@@ -52,57 +55,54 @@ class Ending:
 
 
 @dataclass(frozen=True, kw_only=True)
+@limited(of="actuators.{}")
 class ActuatorRandomisation:
     """Imperfections of the drives, drawn anew at every reset (thesis, text above table 4.9)."""
 
-    stiffness: Range = (0.95, 1.05)
+    stiffness: Factors = (0.95, 1.05)
     """Factor on the gain of the position error."""
-    damping: Range = (0.95, 1.05)
+    damping: Factors = (0.95, 1.05)
     """Factor on the gain of the velocity."""
-    strength: Range = (0.95, 1.05)
+    strength: Factors = (0.95, 1.05)
     """Factor on the torque."""
-    position_bias: Range = (-0.01, 0.01)
+    position_bias: tuple[_Angle, _Angle] = (-0.01, 0.01)
     """Error of the measured joint position [rad]."""
-    deadband: Range = (0.0, 0.005)
+    deadband: Factors = (0.0, 0.005)
     """Error below which the drive does nothing [rad]."""
-    backlash: Range = (0.0, 0.01)
+    backlash: Factors = (0.0, 0.01)
     """Play of the gears [rad]."""
-    kick_ratio: Range = (0.9, 1.1)
+    kick_ratio: Factors = (0.9, 1.1)
     """Factor on ``kick``."""
     kick: float = 0.0
     """Constant torque in the direction of the error [N·m]; the released settings have 0."""
-    torque_noise: float = 0.1
+    torque_noise: NotNegative = 0.1
     """Half width of white noise in every physics step, in units of the joint's effort."""
 
     def __post_init__(self) -> None:
-        for name in ("stiffness", "damping", "strength", "deadband", "backlash", "kick_ratio"):
-            check_range(f"actuators.{name}", getattr(self, name), least=0)
-        check_range("actuators.position_bias (rad)", self.position_bias, least=-math.pi / 2, most=math.pi / 2)
-        check_fields(self, "kick", of="actuators.{}")
-        check_fields(self, "torque_noise", least=0, of="actuators.{}")
+        names = ("stiffness", "damping", "strength", "position_bias", "deadband", "backlash", "kick_ratio")
+        check_order(self, *names, of="actuators.{}")
 
 
 @dataclass(frozen=True, kw_only=True)
+@limited(of="object_changes.{}")
 class ObjectRandomisation:
     """Differences between objects (thesis, table 4.9)."""
 
-    friction: Range = (1.0, 1.0)
+    friction: Factors = (1.0, 1.0)
     """Factor on the object's friction, which decides in all its contacts."""
     mass_offset: Range = (0.0, 0.0)
     """Added to the object's mass [kg]."""
-    size: Range = (1.0, 1.0)
+    size: tuple[Positive, Positive] = (1.0, 1.0)
     """Factor on all lengths, spread evenly over environments; drawn once."""
     each_reset: bool = True
     """Draw friction and mass anew at every reset, or once."""
 
     def __post_init__(self) -> None:
-        check_range("object_changes.friction", self.friction, least=0)
-        check_range("object_changes.mass_offset", self.mass_offset)
-        check_range("object_changes.size", self.size)
-        check_number("object_changes.size", self.size[0], above=0)
+        check_order(self, "friction", "mass_offset", "size", of="object_changes.{}")
 
 
 @dataclass(frozen=True, kw_only=True)
+@limited(of="push.{}")
 class Push:
     """A random force on the object, for one physics step each time (thesis, table 4.9)."""
 
@@ -112,16 +112,15 @@ class Push:
     """[N]."""
     z: Range = (0.0, 0.0)
     """[N]."""
-    interval: Range = (2.0, 4.0)
+    interval: Factors = (2.0, 4.0)
     """Time from one push to the next [s]; a control step at least."""
 
     def __post_init__(self) -> None:
-        for name in ("x", "y", "z"):
-            check_range(f"push.{name}", getattr(self, name))
-        check_range("push.interval", self.interval, least=0)
+        check_order(self, "x", "y", "z", "interval", of="push.{}")
 
 
 @dataclass(frozen=True, kw_only=True)
+@limited(of="placement.{}")
 class Placement:
     """Start of the object: its lowest point at a height, with random position and yaw."""
 
@@ -130,7 +129,7 @@ class Placement:
     x: Range = (0.0, 0.0)
     y: Range = (0.0, 0.0)
     """Coordinates of its origin [m]."""
-    yaw: Range = (0.0, 0.0)
+    yaw: tuple[_Turn, _Turn] = (0.0, 0.0)
     """About the vertical [rad]."""
     quaternion: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
     """Orientation at yaw 0 (w, x, y, z); made unit length."""
@@ -138,42 +137,40 @@ class Placement:
     """Places of several objects, taken in random order [m]; x, y and height are added."""
 
     def __post_init__(self) -> None:
-        check_fields(self, "height", of="placement.{}")
-        for name in ("x", "y"):
-            check_range(f"placement.{name}", getattr(self, name))
-        check_range("placement.yaw (rad)", self.yaw, least=-TURN, most=TURN)
-        for site in self.sites:
-            check_numbers("A site of placement.sites", site, 3)
+        check_order(self, "x", "y", "yaw", of="placement.{}")
         object.__setattr__(self, "quaternion", unit_vector("placement.quaternion", self.quaternion, 4))
 
 
 @dataclass(frozen=True, kw_only=True)
+@limited(of="solver.{}")
 class Solver:
     """Exactness of the physics (as in the released settings)."""
 
-    timestep: float = 0.005
+    timestep: Positive = 0.005
     """Time step of physics [s]."""
-    decimation: int = 5
+    decimation: Count = 5
     """Physics steps in a control step."""
-    iterations: int = 50
+    iterations: Count = 50
     """Iterations of the constraint solver, at most."""
-    line_search: int = 50
+    line_search: Count = 50
     """Iterations of its line search, at most."""
-    tolerance: float = 1e-5
+    tolerance: Positive = 1e-5
     """Improvement below which it stops (as MuJoCo's ``opt.tolerance``)."""
 
 
 @dataclass(frozen=True, kw_only=True)
+@limited(of="noise.{}")
 class ObservationNoise:
     """Gaussian noise of the measured proprioception (released settings)."""
 
-    position: float = 0.005
+    position: NotNegative = 0.005
     """[rad]."""
-    velocity: float = 0.005
+    velocity: NotNegative = 0.005
     """On the velocity as observed, after its factor of 0.2."""
 
 
 @dataclass(frozen=True, kw_only=True)
+@limited(of="success.{}")
 class Success:
     """Success of an episode."""
 
@@ -183,11 +180,9 @@ class Success:
     threshold: float = 1.0
     """Smallest value of the metric that is a success."""
 
-    def __post_init__(self) -> None:
-        check_fields(self, "threshold", of="success.{}")
-
 
 @dataclass(frozen=True, kw_only=True)
+@limited(of="{} of a task")
 class Task:
     """Everything that makes a task. Change one with ``dataclasses.replace``."""
 
@@ -197,16 +192,16 @@ class Task:
     rewards: Mapping[str, Reward]
     endings: Mapping[str, Ending] = field(default_factory=dict)
     success: Success = Success(metric="goals")
-    episode: float = 10.0
+    episode: Positive = 10.0
     """Longest duration [s]."""
     # --- scene ---
     objects: tuple[ObjectShape, ...] = PRIMITIVES
     """Shapes of the object, spread over environments in turn."""
-    copies: int = 1
+    copies: Count = 1
     """Objects in the scene; more than one are equal but for what ``task_state`` makes of them."""
-    density: float = 200.0
+    density: Annotated[float, Limit(least=1, unit="kg/m³")] = 200.0
     """Density of objects [kg/m³]; the value that the published engine takes by default."""
-    friction: float = 1.0
+    friction: NotNegative = 1.0
     """Friction of objects, before randomisation."""
     placement: Placement = Placement()
     hand_poses: Mapping[str, Pose] = field(default_factory=dict)
@@ -219,20 +214,20 @@ class Task:
     """Adds fixed things to the ``mujoco.MjSpec`` of the scene."""
     carriage: Mapping[str, tuple[Range, float, float, float]] = field(default_factory=dict)
     """Slides that carry the palm: world axis (x, y, z) → range [m], stiffness [N/m], damping [N·s/m], effort [N]."""
-    carriage_speed: float = 0.5
+    carriage_speed: Positive = 0.5
     """How fast targets of the slides move at most, where ``rated_speed`` holds [m/s]."""
-    starts: str | None = None
+    starts: Literal["grasps"] | None = None
     """``grasps``: start from sampled grasps instead of the placement."""
     solver: Solver = Solver()
     contacts: ContactModel = CONTACTS["published"]
     """Firmness of contacts; names of :data:`~robotics_bridge.tasks.settings.CONTACTS` on the command line."""
-    taxel_twist: float | None = None
+    taxel_twist: NotNegative | None = None
     """Torsional friction of the force taxels [N·m·s], by the published law, where it is 2; None: taxels that hold what
     they touch and add up to the engine's contact forces."""
     # --- control ---
-    action_ratio: float = 0.5
+    action_ratio: NotNegative = 0.5
     """Part of a joint's range by which an action of 1 moves its target away from rest."""
-    action_limit: float | None = None
+    action_limit: Positive | None = None
     """Largest action, either way, that counts and is observed as the last one; None (published) for none.
 
     What moves no joint further changes no motion, but policies that read their own last action can otherwise run away
@@ -250,14 +245,14 @@ class Task:
     goal: Goal | None = None
     turn_axis: tuple[float, float, float] | None = None
     """Axis of the object whose rotation is counted (its own frame); made unit length."""
-    turn_window: int = 60
+    turn_window: Count = 60
     """Steps over which stagnation is judged."""
     task_state: Callable[[TaskScene], TaskState] | None = None
     """Makes the part of the task that keeps a state of its own (hot_ball's thermometers)."""
     # --- learning ---
-    command: tuple[str, ...] = ("on",)
+    command: tuple[Literal["on", "orientation"], ...] = ("on",)
     """Contents of the group ``command``, which a hand is told: ``on`` (1: do it), ``orientation`` of the goal."""
-    goal_terms: tuple[str, ...] = ()
+    goal_terms: tuple[Literal["orientation", "difference", "angle"], ...] = ()
     """Contents of the group ``goal``: ``orientation``, ``difference``, ``angle``."""
     distances_in: str = "priv_obj_props"
     """Group that holds the distances from finger tips to the object."""
@@ -271,14 +266,6 @@ class Task:
 
     def __post_init__(self) -> None:
         of = f"of task {self.name!r}"
-        own = f"{{}} {of}"
-        check_fields(self, "episode", "action_limit", "carriage_speed", above=0, of=own)
-        check_fields(self, "density", least=1, of=f"{own} (kg/m³)")
-        check_fields(self, "copies", "turn_window", least=1, whole=True, of=own)
-        check_fields(self, "friction", "action_ratio", least=0, of=own)
-        check_fields(self.noise, "position", "velocity", least=0, of=f"noise.{own}")
-        check_fields(self.solver, "timestep", "tolerance", above=0, of=f"solver.{own}")
-        check_fields(self.solver, "decimation", "iterations", "line_search", least=1, whole=True, of=f"solver.{own}")
         least = 2 * self.solver.timestep / self.contacts.substeps
         if self.contacts.time_constant < least:
             raise UsageError(
@@ -290,7 +277,6 @@ class Task:
             raise UsageError(f"Task {self.name!r} needs at least one object.")
         self._check_names(of)
         self._check_places(of)
-        check_fields(self, "taxel_twist", least=0, of=own)
 
     def _check_terms(self, of: str) -> None:
         for name, reward in self.rewards.items():
@@ -306,14 +292,10 @@ class Task:
             check_name(f"success.metric {of} without task_state", self.success.metric, ("goals", "turned"))
         if self.success.metric == "turned" and self.turn_axis is None:
             raise UsageError(f"success.metric {of} is 'turned', which counts turns about turn_axis; name that axis.")
-        if self.starts is not None:
-            check_name(f"starts {of}", self.starts, ("grasps",))
         if self.copies > len(self.placement.sites) > 0:
             raise UsageError(f"placement.sites {of} has {len(self.placement.sites)} places for {self.copies} objects.")
         check_name(f"distances_in {of}", self.distances_in, GROUPS)
         check_each("observation group", (*self.auxiliary, *itertools.chain(*self.groups.values())), GROUPS)
-        check_each(f"content of command {of}", self.command, COMMANDS)
-        check_each(f"content of goal_terms {of}", self.goal_terms, GOAL_TERMS)
 
     def _check_places(self, of: str) -> None:
         poses = {}
@@ -328,7 +310,9 @@ class Task:
                 check_number(f"joint {joint!r} of {hand!r} {of} (rad)", position)
         for axis, (span, *numbers) in self.carriage.items():
             check_name(f"axis of the carriage {of}", axis, ("x", "y", "z"))
-            check_range(f"carriage.{axis} {of}", span)
+            check_numbers(f"carriage.{axis} {of}", span, 2)
+            if span[0] > span[1]:
+                raise UsageError(f"carriage.{axis} {of} is a range (low, high); received {shown(span)}.")
             for name, number in zip(("stiffness", "damping", "effort"), numbers, strict=True):
                 check_number(f"{name} of carriage.{axis} {of}", number, least=0)
 
@@ -358,10 +342,6 @@ GROUPS = (
     "priv_thermal", "thermal", "aux_obj_size", "aux_goal_dist", "aux_obj_tilt", "aux_rotation_progress",
 )  # fmt: skip
 """Observation groups (table 4.7 and the decoders' targets)."""
-COMMANDS = ("on", "orientation")
-"""Contents of the group ``command``."""
-GOAL_TERMS = ("orientation", "difference", "angle")
-"""Contents of the group ``goal``."""
 MEASURED = ("proprio", "tactile", "link_pose", "command", "thermal")
 """Groups that a hand measures or is told; the others are known to the simulation alone."""
 

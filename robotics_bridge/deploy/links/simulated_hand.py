@@ -11,14 +11,15 @@ import socket
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.errors import DataError, UsageError
+from brainbench.core.limits import Limit, Seed, Share, limited
 from brainbench.core.overrides import read_pairs, with_changes
-from brainbench.core.reading.ranges import check_fields, check_number
+from brainbench.core.reading.ranges import check_number
 from robotics_bridge import hands
 from robotics_bridge.deploy.driver import DriverRequest, HandReading
 from robotics_bridge.deploy.links.frames import new_key
@@ -35,36 +36,33 @@ from robotics_bridge.tasks.settings import CONTACTS, ContactModel, set_contacts
 
 HOLD_AFTER = 0.25
 """Seconds without a command after which the hand holds by itself."""
+_Delay = Annotated[float, Limit(least=0, below=3600, unit="s")]
 
 
 @dataclass(frozen=True)
+@limited(of="fault '{}'")
 class Faults:
     """Faults between hand and controller. Probabilities are per report."""
 
-    drop: float = 0.0
+    drop: Share = 0.0
     """Probability that a report is lost."""
-    delay: float = 0.0
+    delay: _Delay = 0.0
     """Seconds that reports are under way."""
-    delay_after: float = 0.0
+    delay_after: _Delay = 0.0
     """Seconds from the start until that delay sets in."""
-    jitter: float = 0.0
+    jitter: _Delay = 0.0
     """Up to so many seconds more, drawn for each: reports overtake one another."""
-    damage: float = 0.0
+    damage: Share = 0.0
     """Probability that a byte of a report is changed."""
-    absurd: float = 0.0
+    absurd: Share = 0.0
     """Probability that a joint is reported at 1000 rad."""
-    nan: float = 0.0
+    nan: Share = 0.0
     """Probability that a joint's position is no number."""
-    silent_after: float = 0.0
+    silent_after: _Delay = 0.0
     """Seconds after which the hand says nothing more; 0: never."""
-    frozen_after: float = 0.0
+    frozen_after: _Delay = 0.0
     """Seconds after which it repeats one report (its time too) under new numbers; 0: never."""
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        check_fields(self, "drop", "damage", "absurd", "nan", least=0, most=1)
-        check_fields(self, "delay", "delay_after", "jitter", "silent_after", "frozen_after", least=0, below=3600)
-        check_fields(self, "seed", least=0, whole=True)
+    seed: Seed = 0
 
     @classmethod
     def parse(cls, texts: list[str]) -> Faults:

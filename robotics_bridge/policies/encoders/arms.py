@@ -10,20 +10,20 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields
 from functools import partial
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 from torch import nn
 
 from brainbench.core.contracts import GRID_SHAPE
-from brainbench.core.errors import UsageError, check_each, check_kind, check_name, shown, unknown_name
-from brainbench.core.reading.ranges import check_fields
+from brainbench.core.errors import UsageError, check_each, check_kind, shown, unknown_name
+from brainbench.core.limits import Limit, Seed, limited
 from brainbench.models.architecture import Architecture
 from brainbench.models.cells import GRU
 from brainbench.models.registry import list_models
 from robotics_bridge import hands
 from robotics_bridge.hands.observations import observation_type
-from robotics_bridge.policies.encoders.front_end import LEARNING, TIMES, FrontEnd, HandCalibration, Learning, Time
+from robotics_bridge.policies.encoders.front_end import FrontEnd, HandCalibration, Learning, Time
 from robotics_bridge.policies.encoders.recurrent import MOST_CELLS, UNITS, ConvGRUProducts, EchoState, FeatureNorm
 from robotics_bridge.policies.encoders.taxel_grid import TaxelGraph, TaxelGrid
 
@@ -34,11 +34,13 @@ _OF_NETWORKS = ("time", "learning", "pretrained", "options", "calibration")
 """Settings that encoders which are learned with the policy, and the reservoir, do not have."""
 _COUNTED = 1 << 24
 """Values per channel whose squares are added up at a time."""
+_Width = Annotated[int, Limit(least=1, most=8192)]
 Stepped = tuple[torch.Tensor, torch.Tensor]
 """What a step gives, and the memory after it."""
 
 
 @dataclass(frozen=True, kw_only=True)
+@limited(of="'{}' of a tactile encoder")
 class EncoderConfig:
     """A tactile encoder and what it reads; plain values only, so that it can stand in a file."""
 
@@ -49,17 +51,17 @@ class EncoderConfig:
     observe: str = "force_torque"
     placement: str = "hand"
     resolution: str = "med"
-    slots: int = 5
+    slots: Annotated[int, Limit(least=1, most=1000)] = 5
     """S, physics steps in a control step."""
-    features: int = 32
+    features: _Width = 32
     """F: size of the embedding that the head gets."""
-    units: int = _HIDDEN
+    units: _Width = _HIDDEN
     """Units of the LSTM of the arm ``rnn``."""
     time: Time = "native"
     """Clock of a network (:mod:`~robotics_bridge.policies.encoders.front_end`)."""
     learning: Learning = "frozen"
     """Learning of a network: ``frozen`` or ``finetuned``."""
-    seed: int = 0
+    seed: Seed = 0
     """Seed of an untrained network or of a reservoir."""
     pretrained: str | None = None
     """Weights of a network with a tag."""
@@ -69,12 +71,6 @@ class EncoderConfig:
     """Force and moment that are one unit to a network."""
 
     def __post_init__(self) -> None:
-        of = "'{}' of a tactile encoder"
-        check_fields(self, "slots", least=1, most=1000, whole=True, of=of)
-        check_fields(self, "features", "units", least=1, most=8192, whole=True, of=of)
-        check_fields(self, "seed", least=0, whole=True, of=of)
-        check_name("time of an encoder", self.time, TIMES)
-        check_name("way of learning of an encoder", self.learning, LEARNING)
         if not isinstance(self.name, str):
             raise unknown_name("tactile encoder", self.name, ARMS)
         # Equal to its default a setting may stand anywhere: a configuration in a file holds them all.

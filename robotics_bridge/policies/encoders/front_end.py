@@ -21,7 +21,7 @@ from torch import nn
 
 from brainbench.core.contracts import CHANNELS, GRID_SHAPE, SUB_STEP_SECONDS
 from brainbench.core.errors import DataError, UsageError, check_name
-from brainbench.core.reading.ranges import check_fields
+from brainbench.core.limits import Positive, limited
 from brainbench.models.network import EncoderAttenderDecoder
 from brainbench.models.normaliser import FORCE_SCALE, MOMENT_SCALE
 from brainbench.models.registry import load_model
@@ -33,6 +33,7 @@ _TOUCHING = 1e-3
 
 
 @dataclass(frozen=True)
+@limited(of="{} of a hand calibration")
 class HandCalibration:
     """Force and moment of one site of a hand that look to the encoder as its own unit.
 
@@ -40,13 +41,10 @@ class HandCalibration:
     follows; one that was fitted to whiskers therefore sees values of the size that it was fitted to.
     """
 
-    force: float = 0.5
+    force: Positive = 0.5
     """N that count as :data:`~brainbench.models.normaliser.FORCE_SCALE`."""
-    moment: float = 5e-3
+    moment: Positive = 5e-3
     """N·m that count as :data:`~brainbench.models.normaliser.MOMENT_SCALE`."""
-
-    def __post_init__(self) -> None:
-        check_fields(self, "force", "moment", above=0, of="The {} of a hand calibration")
 
     @classmethod
     def fit(cls, grid: torch.Tensor) -> HandCalibration:

@@ -7,13 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from brainbench.core.errors import UsageError, check_each, check_once
+from brainbench.core.limits import Count, Limit, limited
 from brainbench.core.progress import Progress
 from robotics_bridge.envs.env import Env
 from robotics_bridge.hands.layouts import PLACEMENTS, Layout, active_count
@@ -235,14 +236,15 @@ def read_placements(
 
 
 @dataclass(frozen=True, kw_only=True)
+@limited(of="{} of a probe")
 class ProbeOptions:
-    """Extent of a probe; UsageError for a number out of range."""
+    """Extent of a probe."""
 
-    seconds: float = 5.0
+    seconds: Annotated[float, Limit(least=0.5, most=600, unit="s")] = 5.0
     """Simulated time per environment."""
-    reservoirs: int = 3
+    reservoirs: Count = 3
     """Random reservoirs that are drawn."""
-    untrained: int = 5
+    untrained: Count = 5
     """Initial states of the untrained network."""
     seed: int = 0
     """Seed of the episodes, of the reservoirs and of random placements."""
@@ -252,7 +254,7 @@ class ProbeOptions:
     """More networks, each an arm of its name: models of the registry, ``local-dir:FOLDER``."""
     place: int | None = None
     """Choose so many taxels, and compare them with all and with others, in place of the arms."""
-    draws: int = 10
+    draws: Count = 10
     """Random placements of so many taxels."""
 
     def __post_init__(self) -> None:
@@ -260,12 +262,6 @@ class ProbeOptions:
         check_once("networks of a probe", self.networks)
         if self.place is not None and (self.arms or self.networks):
             raise UsageError("A probe either compares arms or places taxels; received both.")
-        if not (0.5 <= self.seconds <= 600 and min(self.reservoirs, self.untrained, self.draws) >= 1):
-            raise UsageError(
-                "A probe takes 0.5 to 600 seconds and at least one draw of what is random; received "
-                f"{self.seconds:g} s, {self.reservoirs} reservoirs, {self.untrained} untrained networks and "
-                f"{self.draws} placements."
-            )
 
 
 def check_environments(env: Env, parts: int = 1) -> int:

@@ -6,27 +6,26 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
-from brainbench.core.errors import UsageError, check_each, check_name, listing, shown
-from brainbench.core.reading.ranges import check_fields
+from brainbench.core.errors import UsageError, check_each, listing, shown
+from brainbench.core.limits import Count, Limit, Seed, Share, limited
 from brainbench.models.architecture import Architecture
 from robotics_bridge.hands.layouts import check_names
 from robotics_bridge.hands.observations import observation_type
 from robotics_bridge.policies.encoders.arms import ARMS, AUTO, EncoderConfig
-from robotics_bridge.policies.student import EMBEDDERS
-from robotics_bridge.tasks.settings import CONTACTS, LOSSES, StudentSettings, check_widths
+from robotics_bridge.tasks.settings import LearningRate, Loss, StudentSettings, Widths
 
 _HIDDEN = (512, 256, 128)
 _SHARED = ("hand", "observe", "placement", "resolution")
 """Fields of an encoder that are those of its student."""
 FELT = ("placement", "resolution", "noisy", "encoder", "encoder_settings")
 """Fields of a student's touch, which one without touch does not have."""
-MOST = {"learning_rate": 1.0, "clip": 100.0, "max_grad_norm": 1e6}
-"""Largest value of settings that are numbers above 0."""
+_Times = Annotated[int, Limit(least=0)]
 
 
 @dataclass(frozen=True, kw_only=True)
+@limited(of="'{}' of a student")
 class DistillConfig:
     """A student, with the task's own settings for those of None (thesis, table 4.4); UsageError for a bad value."""
 
@@ -48,54 +47,51 @@ class DistillConfig:
     """Number of taxels: ``low``, ``med`` or ``high``; or a probe file (``.json``)."""
     noisy: bool = False
     """Taxels with the published noise (table 4.12)."""
-    contacts: str | None = None
+    contacts: Literal["firm", "published"] | None = None
     """Contact model, ``firm`` or ``published``; by default that in which the teacher was trained."""
     encoder: str = AUTO
     """Tactile encoder: an arm of :data:`~robotics_bridge.policies.encoders.arms.ARMS`, or a network's name."""
     encoder_settings: Mapping[str, Any] = field(default_factory=dict)
     """Further fields of :class:`~robotics_bridge.policies.encoders.arms.EncoderConfig`: time, learning, seed, …"""
-    embedder: str = "mlp"
+    embedder: Literal["none", "mlp", "lstm"] = "mlp"
     """Embedder of joints and goal: ``none``, ``mlp`` or ``lstm``."""
-    hidden: tuple[int, ...] = _HIDDEN
+    hidden: Widths = _HIDDEN
     """Widths of the head's layers."""
-    num_envs: int = 4096
+    num_envs: Count = 4096
     """Environments at once."""
-    steps_per_env: int = 24
+    steps_per_env: Count = 24
     """Control steps of every environment in an iteration."""
-    iterations: int | None = None
+    iterations: Count | None = None
     """Iterations in all; by default the task's own (table 4.4)."""
-    learning_rate: float | None = None
+    learning_rate: LearningRate | None = None
     """Learning rate; by default the task's own (table 4.4)."""
-    epochs: int | None = None
+    epochs: Count | None = None
     """Passes over the steps of an iteration; by default the task's own."""
-    gradient_length: int | None = None
+    gradient_length: Count | None = None
     """Steps through which gradients flow back in time."""
-    clip: float | None = None
+    clip: Annotated[float, Limit(above=0, most=100)] | None = None
     """Largest change of an action within an iteration that still lowers the loss."""
-    max_grad_norm: float | None = None
+    max_grad_norm: Annotated[float, Limit(above=0, most=1e6)] | None = None
     """Norm to which longer gradients are cut."""
-    loss: str | None = None
-    """One of :data:`LOSSES`."""
-    teacher_share: float = 0.0
+    loss: Loss | None = None
+    """Loss of the actions; by default the task's own."""
+    teacher_share: Share = 0.0
     """Share of actions that the teacher takes at the start (β of DAgger); 0 is the published, on-policy way."""
-    teacher_iterations: int = 0
+    teacher_iterations: _Times = 0
     """Iterations over which that share falls linearly to 0; 0 keeps it."""
-    aggregate: int = 0
+    aggregate: _Times = 0
     """Earlier rollouts that are kept and learned from again."""
-    save_interval: int = 100
+    save_interval: Count = 100
     """Iterations from one saved state to the next."""
-    seed: int = 0
+    seed: Seed = 0
     """Seed of weights, episodes and the teacher's share."""
-    precision: str = "float32"
+    precision: Literal["float32", "bf16"] = "float32"
     """Precision of the tactile encoder in learning and acting: ``float32`` or ``bf16`` (mixed). The rest is single."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "hidden", tuple(self.hidden))
-        check_widths(self.hidden)
         kind = observation_type(self.observe)
         check_names(self.resolution, self.placement)
-        if not isinstance(self.noisy, bool):
-            raise UsageError(f"'noisy' must be true or false; received {shown(self.noisy)}.")
         if not isinstance(self.encoder_settings, Mapping):
             raise UsageError(f"'encoder_settings' must be names and values; received {shown(self.encoder_settings)}.")
         usual = {item.name: item.default for item in fields(self)} | {"encoder_settings": {}}
@@ -103,17 +99,6 @@ class DistillConfig:
             raise UsageError(f"A student that observes {self.observe!r} has no touch; leave out {listing(idle)}.")
         if self.teacher_iterations and not self.teacher_share:
             raise UsageError("'teacher_iterations' is the time in which 'teacher_share' falls, and that is 0.")
-        if self.contacts is not None:
-            check_name("contacts of a task", self.contacts, CONTACTS)
-        check_name("encoder of flat groups", self.embedder, EMBEDDERS)
-        check_name("loss", self.loss or "mse", LOSSES)
-        check_name("precision", self.precision, ("float32", "bf16"))
-        check_fields(self, "teacher_share", least=0, most=1)
-        for name, most in MOST.items():
-            check_fields(self, name, above=0, most=most)
-        positive = ("num_envs", "steps_per_env", "save_interval", "iterations", "epochs", "gradient_length")
-        check_fields(self, *positive, least=1, whole=True)
-        check_fields(self, "teacher_iterations", "aggregate", "seed", least=0, whole=True)
         if own := {"name", *_SHARED} & set(self.encoder_settings):
             raise UsageError(f"{listing(own)} of an encoder: set it for the student (its 'encoder' is the name).")
         _ = self.tactile  # whose settings are checked by its own class

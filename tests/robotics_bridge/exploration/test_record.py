@@ -113,11 +113,10 @@ def test_objects_are_held_in_some_way(value) -> None:
     for place in range(4):
         turned = [0.0] * 4
         turned[place] = value
-        with pytest.raises(UsageError, match="'box' is a quaternion"):
+        with pytest.raises(UsageError, match="quaternion of an explored object"):
             _box(quaternion=tuple(turned))
-    for wrong in ((0, 0, 0, 0), (1, 0, 0)):
-        with pytest.raises(UsageError, match="'box' is a quaternion"):
-            _box(quaternion=wrong)
+    with pytest.raises(UsageError, match="'box' is a quaternion"):
+        _box(quaternion=(0, 0, 0, 0))
     with pytest.raises(UsageError, match=rf"retreat .*received {value}"):
         _box(retreat=value)
     assert _box(quaternion=(2.0, 0, 0, 0), retreat=-1e-3).retreat < 0

@@ -56,8 +56,6 @@ def test_a_rollout_in_a_task_is_read_from_every_arm_of_a_probe() -> None:
 def test_options_of_a_probe_name_the_culprit() -> None:
     with pytest.raises(UsageError, match="did you mean 'reservoir'"):
         ProbeOptions(arms=("resevoir",))
-    with pytest.raises(UsageError, match=r"received 0\.1 s"):
-        ProbeOptions(seconds=0.1)
 
 
 def _telling(taxels: int = 12, telling: tuple[int, ...] = (3, 7, 8), noise: float = 0.3, envs: int = 20):
@@ -129,7 +127,7 @@ def test_chosen_taxels_are_read_on_environments_that_did_not_choose_them(monkeyp
         seen.append(float(wanted.mean()))
         return choose(proprio, features, wanted, valid, count)
 
-    monkeypatch.setattr(probe, "choose_taxels", watched)
+    monkeypatch.setattr("robotics_bridge.policies.readouts.probe.choose_taxels", watched)
     begun = torch.zeros(30, 20, dtype=torch.bool)
     half = (torch.arange(20) >= 10).float()[None, :, None].expand(30, 20, 3)
     targets = {name: half + 0.01 * torch.randn(30, 20, 3) for name in ("position", "velocity", "spin", "contact")}
@@ -196,5 +194,5 @@ def test_a_hand_is_placed_from_one_rollout(tmp_path) -> None:
 def test_a_probe_places_taxels_or_compares_arms() -> None:
     with pytest.raises(UsageError, match="received both"):
         ProbeOptions(place=50, arms=("reservoir",))
-    with pytest.raises(UsageError, match="0 placements"):
+    with pytest.raises(UsageError, match="draws of a probe .*received 0"):
         ProbeOptions(draws=0)

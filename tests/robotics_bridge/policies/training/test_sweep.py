@@ -95,7 +95,7 @@ def test_students_of_every_subset_are_looked_at_when_a_sweep_is_read(tmp_path) -
     with pytest.raises(UsageError, match=r"'time' = 'resampled' is for .*'mlp'"):
         read_sweep(path)
     path.write_text(f'types = ["bool"]\n[pinned]\nnoisy = "no"\n{ENTRY}')
-    with pytest.raises(UsageError, match="'noisy' must be true or false"):
+    with pytest.raises(UsageError, match="'noisy' of a student must be True or False"):
         read_sweep(path)
     path.write_text(f'types = ["bool"]\n[settings]\nencoder = "rnn"\n{ENTRY}')
     assert [student.encoder for student in read_sweep(path).students()] == ["auto", "rnn"]
