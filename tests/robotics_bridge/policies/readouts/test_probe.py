@@ -194,5 +194,5 @@ def test_a_hand_is_placed_from_one_rollout(tmp_path) -> None:
 def test_a_probe_places_taxels_or_compares_arms() -> None:
     with pytest.raises(UsageError, match="received both"):
         ProbeOptions(place=50, arms=("reservoir",))
-    with pytest.raises(UsageError, match="draws of a probe .*received 0"):
+    with pytest.raises(UsageError, match=r"draws of a probe .*received 0"):
         ProbeOptions(draws=0)
