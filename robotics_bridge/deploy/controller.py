@@ -259,8 +259,8 @@ class Controller:
     def _observe(self, reading: HandReading) -> dict[str, NDArray[np.float32]]:
         position, velocity = reading.position[self._order], reading.velocity[self._order]
         proprio = np.concatenate([position, VELOCITY * velocity, self._action]).astype(np.float32)
-        found = {name: np.asarray(source(reading), np.float32) for name, source in self.sources.items()}
-        return {name: found.get(name, proprio) for name in self.contract.inputs}
+        groups = {name: np.asarray(source(reading), np.float32) for name, source in self.sources.items()}
+        return {name: groups.get(name, proprio) for name in self.contract.inputs}
 
     def _limit(self, targets: Mapping[str, float], reading: HandReading) -> NDArray[np.float64]:
         wanted = np.array([targets.get(name, reading.position[i]) for i, name in enumerate(self.driver.joints)])

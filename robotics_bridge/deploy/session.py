@@ -131,22 +131,22 @@ class DeployedPolicy:
         contract = self.contract
         check_measured(contract.inputs, "A policy on a hand")
         # What is told to the hand is no measurement; a contract that states it needs no word of the user.
-        told = ("proprio", "tactile", *(("command",) if "command" in contract.more else ()))
-        found = {
+        answered = ("proprio", "tactile", *(("command",) if "command" in contract.more else ()))
+        unmeasured = {
             name: f"{list(shape)}, {_MEANINGS.get(name, 'known to the simulation alone')}"
             for name, shape in contract.inputs.items()
-            if name not in told
+            if name not in answered
         }
         chains = hands.load(contract.hand).fingers
         tips = {chain[-1] for finger, chain in chains.items() if fingers is None or finger in fingers}
         if blind := [link for link in contract.links if contract.observe not in REAL_TYPES or link not in tips]:
-            found["tactile"] = f"{contract.observe!r} of {listing(blind, limit=3)}"
-        if missing := [f"{name} ({what})" for name, what in found.items() if name not in given]:
+            unmeasured["tactile"] = f"{contract.observe!r} of {listing(blind, limit=3)}"
+        if missing := [f"{name} ({what})" for name, what in unmeasured.items() if name not in given]:
             raise UsageError(
                 f"The policy was trained with what the hand cannot measure: {'; '.join(missing)}. Give each a constant "
                 "with --input NAME=NUMBER,NUMBER… (touch also with --shadow)."
             )
-        return found
+        return unmeasured
 
     def controller(
         self,
@@ -199,10 +199,10 @@ def read_deployed(path: str | Path) -> DeployedPolicy:
             raise DataFileNotFoundError(
                 f"There is no file {str(file)!r}; brainbench policy export writes a policy and its contract."
             )
-    found = PolicyContract.read(contract)
-    if found.sha256 and found.sha256 != file_hash(path, length=64):
+    stated = PolicyContract.read(contract)
+    if stated.sha256 and stated.sha256 != file_hash(path, length=64):
         raise DataError(f"{str(path)!r} is not the file that its contract describes; export the policy again.")
-    return DeployedPolicy(path, found)
+    return DeployedPolicy(path, stated)
 
 
 def constant(name: str, values: Sequence[float], shape: tuple[int, ...]) -> Source:

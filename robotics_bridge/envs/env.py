@@ -206,10 +206,10 @@ class Env:
     def _memory(self) -> dict[str, torch.Tensor]:
         """Return by name what :meth:`state_dict` copies."""
         state = self.state
-        own = {**state.memory(), "generator": state.generator.get_state()}
+        tensors = {**state.memory(), "generator": state.generator.get_state()}
         if self.touch is not None:
-            own[_NOISE_SEED] = torch.tensor(self.touch.suite.context.seed)
-        return own | {f"observations.{name}": value for name, value in state.observations.items()}
+            tensors[_NOISE_SEED] = torch.tensor(self.touch.suite.context.seed)
+        return tensors | {f"observations.{name}": value for name, value in state.observations.items()}
 
     def state_dict(self) -> dict[str, torch.Tensor]:
         """Return copies of all that the future depends on, but for the memory of noisy or slow tactile sensors."""
@@ -218,15 +218,15 @@ class Env:
     def load_state_dict(self, values: Mapping[str, torch.Tensor]) -> None:
         """Take up what :meth:`state_dict` returned."""
         state = self.state
-        for name, own in self._memory().items():
+        for name, present in self._memory().items():
             # States that were kept before the noise could be seeded anew have the seed of the options.
             if name == _NOISE_SEED and name not in values:
                 continue
-            if name not in values or (name != "generator" and values[name].shape != own.shape):
-                other = tuple(values[name].shape) if name in values else "none"
+            if name not in values or (name != "generator" and values[name].shape != present.shape):
+                shape = tuple(values[name].shape) if name in values else "none"
                 raise UsageError(
-                    f"This is the state of other environments: {name!r} has the shape {tuple(own.shape)} here; "
-                    f"received {other}. Make the environments as those were."
+                    f"This is the state of other environments: {name!r} has the shape {tuple(present.shape)} here; "
+                    f"received {shape}. Make the environments as those were."
                 )
 
         def under(part: str) -> dict[str, torch.Tensor]:

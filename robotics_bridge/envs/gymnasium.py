@@ -46,8 +46,8 @@ class GymVectorEnv(VectorEnv):
         """The native environment."""
         self.num_envs = env.num_envs
         self.metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}
-        own = (name for name in env.observation_shapes if privileged or name in MEASURED)
-        self._groups = groups or tuple(own)
+        measured = (name for name in env.observation_shapes if privileged or name in MEASURED)
+        self._groups = groups or tuple(measured)
         shapes, box = env.observation_shapes, gymnasium.spaces.Box
         spaces: Any = {name: box(-np.inf, np.inf, shapes[name], np.float32) for name in self._groups}
         self.single_observation_space = gymnasium.spaces.Dict(spaces)
@@ -116,9 +116,9 @@ class GymEnv(gymnasium.Env):
 
         The last observation of an episode is its own; ``info`` has ``diverged``, at the end ``metric`` and ``return``.
         """
-        found, reward, terminated, truncated, facts = self.vector.step(np.asarray(action)[None])
+        batch, reward, terminated, truncated, facts = self.vector.step(np.asarray(action)[None])
         info: dict[str, Any] = {"diverged": bool(facts["diverged"][0])}
-        observations = {name: value[0] for name, value in found.items()}
+        observations = {name: value[0] for name, value in batch.items()}
         if "final_obs" in facts:
             observations = facts["final_obs"][0]
             info |= {name: float(value[0]) for name, value in facts["final_info"].items()}

@@ -71,12 +71,12 @@ def grasps_for(task: Task, hand: Hand, model: TaskModel, *, seed: int = 0) -> di
     fields = ("geom_size", "geom_pos", "body_pos", "body_quat", "body_mass")
     numbers = [np.round(getattr(m, name), 6).tolist() for m in model.models for name in fields]
     # By these a grasp holds too. Usual values are left out, since keys of earlier versions do not have them.
-    usual = ((task.friction, 1.0), (asdict(task.solver), asdict(Solver())), (hand.physics, None))
-    numbers += [model.rest.tolist(), *(own for own, other in usual if own != other)]
+    defaults = ((task.friction, 1.0), (asdict(task.solver), asdict(Solver())), (hand.physics, None))
+    numbers += [model.rest.tolist(), *(own for own, other in defaults if own != other)]
     key = content_hash(asdict(settings), asdict(task.contacts), task.name, seed, *numbers)
     path = cache_dir("grasps") / f"{hand.name}-{key}.npz"
-    if (found := read_sealed(path, "grasps")) is not None:
-        return found
+    if (cached := read_sealed(path, "grasps")) is not None:
+        return cached
     each = max(settings.count // len(model.models), 1)
     parts = [sample(task, hand, model, index, each, settings, seed) for index in range(len(model.models))]
     grasps = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
@@ -91,9 +91,9 @@ def sample(
     """Return grasps ``joints``, ``target`` [n, J] and ``object`` [n, 7] of one shape."""
     trial = _Trial(task, model, shape, settings)
     rng = np.random.default_rng((seed, shape))
-    found: dict[str, list[NDArray[np.float64]]] = {"joints": [], "target": [], "object": []}
+    grasps: dict[str, list[NDArray[np.float64]]] = {"joints": [], "target": [], "object": []}
     for _ in range(settings.tries):
-        if len(found["joints"]) == count:
+        if len(grasps["joints"]) == count:
             break
         # Candidates by rejection: random joints, places and turns, of which only those that hold are kept.
         change = rng.uniform(-settings.perturb, settings.perturb, len(model.rest))
@@ -102,13 +102,13 @@ def sample(
         held = trial.run(joints, place, rng.uniform(-np.pi, np.pi))
         if held is not None:
             for name, value in held.items():
-                found[name].append(value)
-    if len(found["joints"]) < count:
+                grasps[name].append(value)
+    if len(grasps["joints"]) < count:
         raise DataError(
-            f"Only {len(found['joints'])} of {count} grasps of {model.shapes[shape].name!r} by hand {hand.name!r} "
+            f"Only {len(grasps['joints'])} of {count} grasps of {model.shapes[shape].name!r} by hand {hand.name!r} "
             f"held in {settings.tries} tries; set joints near a grasp (Task.joints) or another pose (Task.hand_poses)."
         )
-    return {name: np.array(values) for name, values in found.items()}
+    return {name: np.array(values) for name, values in grasps.items()}
 
 
 class _Trial:
@@ -183,14 +183,14 @@ class _Trial:
 
     def _above(self, body: int) -> NDArray[np.int64]:
         """Return the numbers of the flexing joints that move a body; those that spread a finger are left alone."""
-        model, found = self._model, []
+        model, columns = self._model, []
         # A joint whose range lies about its zero spreads the finger; flexion has a one-sided range.
         flexes = np.abs(model.low + model.high) >= 0.5 * (model.high - model.low)
         owners = np.array([self._m.jnt_bodyid[self._m.joint(name).id] for name in model.joints])
         while body > 0:
-            found.append(np.flatnonzero((owners == body) & flexes))
+            columns.append(np.flatnonzero((owners == body) & flexes))
             body = int(self._m.body_parentid[body])
-        return np.concatenate(found)
+        return np.concatenate(columns)
 
     def _contacts(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """Return the other body and the depth (m) of every contact of the tool."""

@@ -171,11 +171,11 @@ class Simulation:
 
     def memory(self) -> dict[str, torch.Tensor]:
         """Return what the next step depends on, by name: the tensors themselves, but for C MuJoCo's own state."""
-        own = {"ctrl": self.ctrl, "push": self.push, "qpos": self.qpos, "qvel": self.qvel}
-        own |= {f"field.{name}": value for name, value in self.fields.items()}
+        tensors = {"ctrl": self.ctrl, "push": self.push, "qpos": self.qpos, "qvel": self.qvel}
+        tensors |= {f"field.{name}": value for name, value in self.fields.items()}
         if self.uses_warp:
-            return {**own, "warmstart": self._warmstart, "time": self._time}
-        return {**own, "integration": torch.from_numpy(self.engine.integration_state())}
+            return {**tensors, "warmstart": self._warmstart, "time": self._time}
+        return {**tensors, "integration": torch.from_numpy(self.engine.integration_state())}
 
     def restored(self, values: Mapping[str, torch.Tensor]) -> None:
         """Take note that values were written to :meth:`memory`; C MuJoCo takes its own state from there."""
@@ -267,8 +267,8 @@ class Actuators:
                 "kick": c.kick * draw(joints, *c.kick_ratio) / lever,
             }  # fmt: skip
         for name, value in values.items():
-            own = self.values[name]
-            own.copy_(torch.where(column, value, own))
+            present = self.values[name]
+            present.copy_(torch.where(column, value, present))
         self.target.copy_(torch.where(column, position, self.target))
 
     def seed(self, seed: int) -> None:
@@ -288,5 +288,5 @@ class Actuators:
 
     def memory(self) -> dict[str, torch.Tensor]:
         """Return the tensors themselves that the next launch depends on, by name."""
-        own = {"target": self.target, "power": self.power}
-        return {**self.values, **own, "tick": self._noise_state[:1], "seed": self._noise_state[1]}
+        tensors = {"target": self.target, "power": self.power}
+        return {**self.values, **tensors, "tick": self._noise_state[:1], "seed": self._noise_state[1]}

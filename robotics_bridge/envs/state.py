@@ -151,8 +151,8 @@ class GoalState:
     def memory(self) -> dict[str, torch.Tensor]:
         """Return the tensors themselves that later steps depend on, by name."""
         names = ("quat", "previous", "angle", "angle_before", "left", "reached", "missed", "count", "rate", "off_axis")
-        own = {name: getattr(self, name) for name in (*names, "turned", "turned_held")}
-        return {**own, "ring": self._ring, "step": self._step[0], **self.curriculum()}
+        tensors = {name: getattr(self, name) for name in (*names, "turned", "turned_held")}
+        return {**tensors, "ring": self._ring, "step": self._step[0], **self.curriculum()}
 
 
 @dataclass(eq=False)
@@ -263,10 +263,10 @@ class EnvState:
         for follower, leader, law in coupled(first):
             # Joints that follow others start where their law has them; of joints at 0 that is mostly 0.
             columns = [int(first.jnt_qposadr[joint]) for joint in (follower, leader)]
-            own, other = (float(first.qpos0[column]) for column in columns)
+            start, offset = (float(first.qpos0[column]) for column in columns)
             if (name := first.joint(leader).name) in model.joints:
-                other = float(model.rest[model.joints.index(name)]) - other
-                self.simulation.start[:, columns[0]] = own + float(np.polynomial.Polynomial(law)(other))
+                offset = float(model.rest[model.joints.index(name)]) - offset
+                self.simulation.start[:, columns[0]] = start + float(np.polynomial.Polynomial(law)(offset))
         # An action of 1 is the same share of every joint's range.
         self.action_scale = self.task.action_ratio * (self.high - self.low)[self.moved]
         """[A] change of a target per unit of action (rad)."""
@@ -300,13 +300,13 @@ class EnvState:
         parts["simulation"] = self.simulation
         if self.task_state is not None:
             parts["task_state"] = self.task_state
-        found: dict[str, torch.Tensor] = dict(vars(self.episode))
-        found |= {f"{part}.{name}": value for part, owner in parts.items() for name, value in owner.memory().items()}
+        tensors: dict[str, torch.Tensor] = dict(vars(self.episode))
+        tensors |= {f"{part}.{name}": value for part, owner in parts.items() for name, value in owner.memory().items()}
         if self.touch is not None:
             clock, wp = self.touch.suite.context, warp()
-            found |= {"touch.age": wp.to_torch(clock.age), "touch.episode": wp.to_torch(clock.episode)}
-            found["touch.reading"] = self.touch.reading
-        return found
+            tensors |= {"touch.age": wp.to_torch(clock.age), "touch.episode": wp.to_torch(clock.episode)}
+            tensors["touch.reading"] = self.touch.reading
+        return tensors
 
     def draw(self, count: int, low: float, high: float) -> torch.Tensor:
         """Return uniform random numbers [B, count]."""

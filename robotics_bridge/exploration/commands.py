@@ -56,16 +56,16 @@ def hand(
         raise UsageError(f"--frames is a multiple of 5, the sub-steps of a time step; received {frames}.")
     explored = [item for text in objects or ["primitives"] for item in objects_of(text, diagonal * 1e-3, unit)]
     with progress_bar() as progress:
-        found = record_exploration(
+        recording = record_exploration(
             explored, tuple(procedure or PROCEDURES), hand=robot, resolution=resolution, placement=placement,
             noisy=noisy, frames=frames, seed=seed, progress=progress,
         )  # fmt: skip
-    calibration = found.calibration()
-    dataset = found.dataset(calibration)
+    calibration = recording.calibration()
+    dataset = recording.dataset(calibration)
     dataset.attrs["content_hash"] = hash_stimulus_set(dataset)
     if out is not None:
         write_stimulus_set(dataset, out)
-    force = np.linalg.norm(found.wrench[..., :3], axis=-1)
+    force = np.linalg.norm(recording.wrench[..., :3], axis=-1)
     sites = force.shape[-1]
     data = [
         {
@@ -73,11 +73,11 @@ def hand(
             "sites_touched": int((felt.max(axis=0) > 1e-3).sum()),
             "peak_force_N": float(felt.sum(axis=1).max()),
         }
-        for label, felt in zip(found.labels, force, strict=True)
+        for label, felt in zip(recording.labels, force, strict=True)
     ]
     silent = [item["stimulus"] for item in data if not item["sites_touched"]]
     unit_of = f"one unit = {calibration.force:.3g} N, {calibration.moment:.3g} N·m"
-    title = f"{found.hand}, {placement}, {resolution}; {unit_of}"
+    title = f"{recording.hand}, {placement}, {resolution}; {unit_of}"
     columns = {
         "stimulus": "{0[stimulus]}",
         ">sites touched": lambda item: f"{item['sites_touched']} of {sites}",
@@ -113,22 +113,22 @@ def objects_of(text: str, diagonal: float, unit: str | None = None) -> list[Expl
         shapes = {kind: Geometry(name=kind, link=kind, kind=kind, size=size) for kind, size in sizes.items()}
         return [Explored(kind, one, quaternion=lying.get(kind, (1, 0, 0, 0))) for kind, one in shapes.items()]
     if text == RODGERS:
-        shape, found = _geometry(_surface(rodgers_solid(diagonal))), []
+        shape, explored = _geometry(_surface(rodgers_solid(diagonal))), []
         for scene in get_recipe(RODGERS).scenes:
             side, _, distance = scene.label.partition("-")
             # The concave face looks towards -y, askew by 25 degrees; the side that is named faces the palm.
             half, skew = math.radians(-90.0 if side == "convex" else 90.0) / 2, math.radians(25.0) / 2
             c, s, cz, sz = math.cos(half), math.sin(half), math.cos(skew), math.sin(skew)
             turn = (c * cz, s * cz, -s * sz, c * sz)
-            found.append(Explored(scene.label, shape, quaternion=turn, retreat=_DISTANCES[distance]))
-        return found
-    found = []
-    for name, item in resolve_objects([text], unit=unit, surfaces=True).items():
-        mesh = _surface(item.load())
+            explored.append(Explored(scene.label, shape, quaternion=turn, retreat=_DISTANCES[distance]))
+        return explored
+    explored = []
+    for name, solid in resolve_objects([text], unit=unit, surfaces=True).items():
+        mesh = _surface(solid.load())
         # Centred, and scaled to the diagonal of its box.
         centred = Mesh(mesh.vertices - mesh.bounds.mean(axis=0), mesh.faces)
-        found.append(Explored(name, _geometry(centred.scaled(diagonal / mesh.diagonal))))
-    return found
+        explored.append(Explored(name, _geometry(centred.scaled(diagonal / mesh.diagonal))))
+    return explored
 
 
 def _geometry(mesh: Any) -> Any:

@@ -288,9 +288,9 @@ class _World:
 
     def move(self, conditions: Sequence[tuple[Explored, str]], time: float) -> None:
         """Put every object where it is at a time (0 to 1 of its procedure), and step the hand once."""
-        for data, (item, procedure) in zip(self.engine.data, conditions, strict=True):
+        for data, (explored, procedure) in zip(self.engine.data, conditions, strict=True):
             pose, after = PROCEDURES[procedure](time), PROCEDURES[procedure](time + STEP)
-            data.qpos[self._at : self._at + 7] = self._held(pose, item)
+            data.qpos[self._at : self._at + 7] = self._held(pose, explored)
             # Velocity by a forward difference over 1 ‰ of the procedure: friction needs the speed of an object that is
             # put in place.
             names, span = ("x", "y", "z", "yaw"), STEP * self.span
@@ -302,8 +302,8 @@ class _World:
             data.ctrl[self._drives] = self._open + pose.closing * (self._closed - self._open)
         self.engine.step()
 
-    def _held(self, pose: Pose, item: Explored) -> NDArray[np.float64]:
-        height = pose.z + item.retreat + self._bottoms[id(item)]
+    def _held(self, pose: Pose, explored: Explored) -> NDArray[np.float64]:
+        height = pose.z + explored.retreat + self._bottoms[id(explored)]
         # Yaw about the world's vertical, applied after the orientation in which the object is held.
-        turned = from_matrices(to_matrices(from_rpy((0.0, 0.0, pose.yaw))) @ to_matrices(item.quaternion))
+        turned = from_matrices(to_matrices(from_rpy((0.0, 0.0, pose.yaw))) @ to_matrices(explored.quaternion))
         return np.concatenate([[self._place[0] + pose.x, self._place[1] + pose.y, height], turned])

@@ -42,12 +42,12 @@ def from_json(kind: type[T], values: Any, where: str) -> T:
         return msgspec.convert(values, kind)
     except msgspec.ValidationError as error:
         fault, _, place = str(error).partition(" - at `$")
-        found = values
+        value = values
         for step in re.findall(r"\w+|\[\.\.\.\]", place):
             if step == "[...]":  # an entry of a mapping, whose name is not told
                 break
-            found = found[int(step)] if isinstance(found, list) else found[step]
-        raise wrong(where, place.strip(".`"), found, fault) from error
+            value = value[int(step)] if isinstance(value, list) else value[step]
+        raise wrong(where, place.strip(".`"), value, fault) from error
 
 
 def wrong(where: str, place: str, received: Any, allowed: str) -> DataError:
@@ -183,8 +183,8 @@ class PolicyContract:
                 f"The contract {where!r} does not say {missing[0]!r}, so no hand can run the policy; "
                 "export it from a trained run."
             )
-        found = from_json(_Written, document, where)
-        given, inputs = found.deployment, shapes_of(found.inputs, where, "inputs")
+        written = from_json(_Written, document, where)
+        given, inputs = written.deployment, shapes_of(written.inputs, where, "inputs")
         joints, moved = given.joints, given.action_map.names
         if sorted((*moved, *given.frozen)) != sorted(joints) or repeats(joints):
             allowed = "every joint stands there once, and either in 'action_map' or in 'frozen'"
@@ -205,7 +205,7 @@ class PolicyContract:
         more |= {"twist": given.twist, "contacts": trained_contacts(deployment, where)}
         return cls(
             inputs, given.rate, given.hand, joints, moved, given.action_map.rows(), given.frozen, links, observe,
-            found.sha256, more,
+            written.sha256, more,
         )  # fmt: skip
 
 

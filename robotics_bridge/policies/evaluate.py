@@ -62,8 +62,8 @@ class PolicyEvaluation:
 
     def interval(self) -> tuple[float, float]:
         """Return the 95 % interval of the success rate."""
-        found = wilson_interval(sum(self.success), len(self.success), over="episodes")
-        return found.low, found.high
+        interval = wilson_interval(sum(self.success), len(self.success), over="episodes")
+        return interval.low, interval.high
 
     def mean(self, name: str) -> tuple[float, float]:
         """Return mean and half width of its 95 % interval over episodes of one of :data:`QUANTITIES`."""
@@ -85,8 +85,8 @@ class PolicyEvaluation:
     def _of(self, name: str) -> dict[str, float]:
         """Return what :meth:`summary` says of the episodes with one object."""
         rows = [index for index, other in enumerate(self.objects) if other == name]
-        told = {"success_rate": self.success, "goals": self.goals, "dropped": self.dropped}
-        means = {key: sum(values[row] for row in rows) / len(rows) for key, values in told.items()}
+        quantities = {"success_rate": self.success, "goals": self.goals, "dropped": self.dropped}
+        means = {key: sum(values[row] for row in rows) / len(rows) for key, values in quantities.items()}
         return {"episodes": len(rows), **means}
 
 
@@ -158,7 +158,7 @@ def evaluate(
         observations = env.reset()
         forget(policy, torch.ones(env.num_envs, dtype=torch.bool, device=env.device))
         left = torch.full((env.num_envs,), each, device=env.device)
-        found: list[list[Any]] = []
+        ended: list[list[Any]] = []
         # Whoever is done waits for the slowest, so the device is asked once a step.
         while bool((left > 0).any()):
             observations, _, terminated, truncated, info = env.step(policy(observations))
@@ -167,12 +167,12 @@ def evaluate(
             names = ("success", "metric", "return", "steps", "diverged", "goals", "turned", "dropped")
             columns = [info[name].float() for name in names]
             table = torch.stack((*columns, env.state.shape_of.float()), dim=1)
-            found += table[done & (left > 0)].tolist()
+            ended += table[done & (left > 0)].tolist()
             # Episodes beyond an environment's share are not counted: fast failures would otherwise be counted more
             # often.
             left -= done.long()
-        rates.append(sum(row[0] for row in found) / len(found))
-        rows += found
+        rates.append(sum(row[0] for row in ended) / len(ended))
+        rows += ended
     success, metric, returns, lengths, diverged, goals, turned, dropped, shapes = zip(*rows, strict=True)
     seconds = tuple(n * env.step_dt for n in lengths)
     return PolicyEvaluation(

@@ -97,8 +97,8 @@ def _tensors(message: Any) -> Iterator[Any]:
         return
     for field, value in message.ListFields():
         if field.message_type is not None:
-            for item in (value,) if hasattr(value, "DESCRIPTOR") else value:
-                yield from _tensors(item)
+            for part in (value,) if hasattr(value, "DESCRIPTOR") else value:
+                yield from _tensors(part)
 
 
 TOLERANCE = 1e-4
@@ -195,10 +195,10 @@ def compare(policy: TactilePolicy, run: Runner) -> float:
         with torch.no_grad(), evaluating(policy):
             latent, h = policy.advance({name: value.to(h.device) for name, value in obs.items()}, h)
             expected = policy.action_of(latent).cpu()
-        found = run({name: value[0].numpy() for name, value in obs.items()}, forget)
-        if found.shape != tuple(expected.shape[1:]):
+        actions = run({name: value[0].numpy() for name, value in obs.items()}, forget)
+        if actions.shape != tuple(expected.shape[1:]):
             return math.inf
-        error = float(np.abs(found - expected[0].numpy()).max())
+        error = float(np.abs(actions - expected[0].numpy()).max())
         worst = max(worst, error if math.isfinite(error) else math.inf)
         largest = max(largest, float(expected.abs().max()))
     return worst / largest

@@ -30,12 +30,12 @@ def with_contacts_of(task: Task, policies: Iterable[str]) -> Task:
 
     A policy is a shipped one or the folder of a run; ``zero`` and ``random`` were trained in none.
     """
-    found = {name: trained_contacts(described) for name in policies if (described := stored(name))}
-    models = {*found.values()} or {task.contacts}
+    contacts = {name: trained_contacts(described) for name in policies if (described := stored(name))}
+    models = {*contacts.values()} or {task.contacts}
     if len(models) > 1:
-        told = ", ".join(f"{name} ({contacts_name(model)})" for name, model in found.items())
+        names = ", ".join(f"{name} ({contacts_name(model)})" for name, model in contacts.items())
         raise UsageError(
-            f"The policies were trained with different contacts: {told}. Say which they all get (--change "
+            f"The policies were trained with different contacts: {names}. Say which they all get (--change "
             "contacts=firm), or take one at a time."
         )
     return replace(task, contacts=models.pop())
@@ -45,11 +45,11 @@ def check_version(described: Mapping[str, Any], name: str) -> None:
     """Check that a policy is of this version of the tasks, by its ``config.json``; raise DataError for another."""
     version = described.get("task_version", 1)
     if version != TASK_VERSION:
-        made = described.get("provenance")
-        made = f" (brainbench {made.get('version')} made it)" if isinstance(made, dict) else ""
+        maker = described.get("provenance")
+        maker = f" (brainbench {maker.get('version')} made it)" if isinstance(maker, dict) else ""
         raise DataError(
             f"The policy {name!r} is of version {str(version)[:20]} of the tasks, and this package has version "
-            f"{TASK_VERSION}: train it again, or use the package of that version{made}."
+            f"{TASK_VERSION}: train it again, or use the package of that version{maker}."
         )
 
 
@@ -62,14 +62,15 @@ def check_actions(described: Mapping[str, Any], env: Env, name: str) -> None:
     given = from_json(dict, described.get("deployment", described), f"deployment of {name}")
     if "action_map" not in given:
         return
-    own, here = from_json(TrainedMap, given["action_map"], f"action_map of {name}"), env.action_map
-    if own.names != here.names:
+    action_map, here = from_json(TrainedMap, given["action_map"], f"action_map of {name}"), env.action_map
+    if action_map.names != here.names:
         raise UsageError(
-            f"The policy {name!r} moves {', '.join(own.names)} (task {str(given.get('task'))[:80]!r}), and the task "
-            f"{env.task.name!r} moves {', '.join(here.names)}: take the task in which it was trained."
+            f"The policy {name!r} moves {', '.join(action_map.names)} (task {str(given.get('task'))[:80]!r}), and the "
+            f"task {env.task.name!r} moves {', '.join(here.names)}: take the task in which it was trained."
         )
-    for what, theirs, ours in (("are counted from", own.default, here.default), ("move by", own.scale, here.scale)):
-        for joint, trained, now in zip(own.names, theirs, ours.tolist(), strict=True):
+    sides = (("are counted from", action_map.default, here.default), ("move by", action_map.scale, here.scale))
+    for what, theirs, ours in sides:
+        for joint, trained, now in zip(action_map.names, theirs, ours.tolist(), strict=True):
             if abs(trained - now) > _SAME_ANGLE:
                 raise UsageError(
                     f"Actions of the policy {name!r} {what} {joint} = {trained:g} rad, and here {now:g} rad: take the "
@@ -118,8 +119,8 @@ def check_fit(described: Mapping[str, Any], env: Env, name: str) -> None:
             )
     if unmeasured := [group for group, _ in groups if group not in MEASURED]:
         _LOG.warning("The student %r reads %s, which only the simulation knows.", name, ", ".join(unmeasured))
-    if (own := trained_contacts(described)) != env.task.contacts:
+    if (contacts := trained_contacts(described)) != env.task.contacts:
         _LOG.warning(
-            "The policy %r was trained with contacts %s; these are %s.", name, contacts_name(own),
+            "The policy %r was trained with contacts %s; these are %s.", name, contacts_name(contacts),
             contacts_name(env.task.contacts),
         )  # fmt: skip

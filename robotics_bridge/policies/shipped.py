@@ -33,8 +33,8 @@ def hint(name: str) -> str:
 def list_policies(kind: str, task: str | None = None) -> list[str]:
     """Return the names ``<task>.<what sets it apart>`` of a kind (``teacher``, ``student``), of one task or all."""
     files = sorted(FOLDER.glob("*/config.json"))
-    found = [file.parent.name for file in files if ("brainbench_student" in read_json(file)) == (kind == "student")]
-    return [name for name in found if task in (None, name.partition(".")[0])]
+    names = [file.parent.name for file in files if ("brainbench_student" in read_json(file)) == (kind == "student")]
+    return [name for name in names if task in (None, name.partition(".")[0])]
 
 
 def stored(name: str | os.PathLike[str]) -> dict[str, Any]:

@@ -56,15 +56,15 @@ class GroupEncoder(nn.Module):
         if self.cell is None:
             return self.net(x), h_in
         hidden, memory = h_in.chunk(2, 1)
-        found = []
+        states = []
         for step, each in enumerate(x):
             # Memory may be forgotten between any two steps; what has none follows as one batch.
             hidden, memory = self.cell(each, (hidden, memory))
-            found.append(hidden)
+            states.append(hidden)
             if ended is not None:
                 gone = ended[step][:, None]
                 hidden, memory = torch.where(gone, 0.0, hidden), torch.where(gone, 0.0, memory)
-        return self.net(torch.stack(found)), torch.cat((hidden, memory), 1)
+        return self.net(torch.stack(states)), torch.cat((hidden, memory), 1)
 
 
 class PolicyCore(nn.Module):
@@ -87,20 +87,20 @@ class PolicyCore(nn.Module):
         """Precision of the tactile encoder while :meth:`unroll` runs (mixed); None for that of its weights."""
 
     @property
-    def kept_size(self) -> int:
-        """Numbers of memory per row where a frozen encoder's features are kept, so that it needs none here."""
+    def stored_size(self) -> int:
+        """Numbers of memory per row where a frozen encoder's features are stored, so that it needs none here."""
         return sum(self.splits[:-2]) or 1
 
     def unroll(
         self, flat: Sequence[torch.Tensor], taxels: torch.Tensor | None, h_in: torch.Tensor,
-        ended: torch.Tensor | None = None, *, kept: bool = False,
+        ended: torch.Tensor | None = None, *, stored: bool = False,
     ) -> Stepped:  # fmt: skip
         """Return (latents [L, B, D], h_out) of normalised flat groups [L, B, n] and readings [L, B, S, N, C].
 
-        With ``kept``, ``taxels`` are features [L, B, F] and the memory has ``kept_size``. It is forgotten after a step
-        where ``ended`` [L, B]; None for nowhere.
+        With ``stored``, ``taxels`` are features [L, B, F] and the memory has ``stored_size``. It is forgotten after a
+        step where ``ended`` [L, B]; None for nowhere.
         """
-        sizes = [*self.splits[:-2], h_in.shape[1] - sum(self.splits[:-2])] if kept else self.splits
+        sizes = [*self.splits[:-2], h_in.shape[1] - sum(self.splits[:-2])] if stored else self.splits
         states = list(h_in.split(sizes, 1))
         parts = []
         for index, (embed, x) in enumerate(zip(self.embedders, flat, strict=True)):
@@ -109,7 +109,7 @@ class PolicyCore(nn.Module):
         if self.tactile is not None and taxels is not None:
             mixed = self.precision is not None
             with torch.autocast(taxels.device.type, self.precision, cache_enabled=False) if mixed else nullcontext():
-                if kept:
+                if stored:
                     y = self.tactile.embed(taxels)
                 else:
                     y, states[-2] = self.tactile.unroll(taxels, states[-2], ended)
@@ -179,16 +179,16 @@ class TactilePolicy(MLPModel):
     @property
     def shapes(self) -> dict[str, tuple[int, ...]]:
         """Shape of every group that it reads, per environment."""
-        found: dict[str, tuple[int, ...]] = {k: (size,) for k, size in zip(self.obs_groups, self._sizes, strict=True)}
+        shapes: dict[str, tuple[int, ...]] = {k: (size,) for k, size in zip(self.obs_groups, self._sizes, strict=True)}
         if self.core.tactile is not None:
-            found[TACTILE] = self.core.tactile.shape
-        return found
+            shapes[TACTILE] = self.core.tactile.shape
+        return shapes
 
     def advance(self, obs: Any, h_in: torch.Tensor, features: torch.Tensor | None = None) -> Stepped:
         """Return (latent [B, D], h_out [B, H]) of one step; :meth:`unroll` without L, not remembered in the model."""
         read = self.shapes if features is None else self.obs_groups
-        kept = None if features is None else features[None]
-        latents, h_out = self.unroll({name: obs[name][None] for name in read}, h_in, None, kept)
+        stored = None if features is None else features[None]
+        latents, h_out = self.unroll({name: obs[name][None] for name in read}, h_in, None, stored)
         return latents[0], h_out
 
     def unroll(
@@ -197,14 +197,14 @@ class TactilePolicy(MLPModel):
         """Return (latents [L, B, D], h_out [B, H]) of groups [L, B, …] from a memory of zeros before the first step.
 
         It starts anew after a step where ``ended`` [L, B]. With ``features`` [L, B, F] of the frozen encoder instead of
-        its readings, the memory is [B, ``core.kept_size``].
+        its readings, the memory is [B, ``core.stored_size``].
         """
         flat: list[torch.Tensor] = []
         if self.obs_groups:
             joined = torch.cat([obs[name] for name in self.obs_groups], -1)
             flat = list(self.obs_normalizer(joined).split(self._sizes, -1))
         if features is not None:
-            return self.core.unroll(flat, features, h_in, ended, kept=True)
+            return self.core.unroll(flat, features, h_in, ended, stored=True)
         return self.core.unroll(flat, obs[TACTILE] if self.core.tactile is not None else None, h_in, ended)
 
     def action_of(self, latent: torch.Tensor) -> torch.Tensor:
@@ -212,10 +212,10 @@ class TactilePolicy(MLPModel):
         output = self.mlp(latent)
         return output if self.distribution is None else self.distribution.deterministic_output(output)
 
-    def zeros(self, batch: int, *, kept: bool = False) -> torch.Tensor:
-        """Return the memory [B, H] before the first step; that of ``unroll`` with features, if those are kept."""
+    def zeros(self, batch: int, *, stored: bool = False) -> torch.Tensor:
+        """Return the memory [B, H] before the first step; that of ``unroll`` with features, if those are stored."""
         like = next(self.parameters())
-        size = self.core.kept_size if kept else self.core.state_size
+        size = self.core.stored_size if stored else self.core.state_size
         return torch.zeros(batch, size, device=like.device, dtype=like.dtype)
 
     def get_latent(self, obs: Any, masks: torch.Tensor | None = None, hidden_state: Any = None) -> torch.Tensor:

@@ -219,8 +219,8 @@ class Thermometers:
 
     def memory(self) -> dict[str, torch.Tensor]:
         """Return the tensors themselves of latch and metric; the temperatures begin anew."""
-        own = {"latched": self.latched, "latch_time": self.latch_time, "contact": self.contact}
-        return {**own, "touching": self.touching, "age": self.age}
+        tensors = {"latched": self.latched, "latch_time": self.latch_time, "contact": self.contact}
+        return {**tensors, "touching": self.touching, "age": self.age}
 
     def restored(self) -> None:
         """Make the target ball hot that a loaded state has, and the fingers cold: their temperatures are not kept."""
@@ -240,8 +240,8 @@ class Thermometers:
 
         hot = self._env.episode.target.unsqueeze(1) == self._numbers
         value = self.thermal.ambient + (self.thermal.hot - self.thermal.ambient) * hot
-        known = self._heat[:, self._balls]
-        self._heat[:, self._balls] = torch.where(mask.unsqueeze(1), value.to(known.dtype), known)
+        present = self._heat[:, self._balls]
+        self._heat[:, self._balls] = torch.where(mask.unsqueeze(1), value.to(present.dtype), present)
 
 
 SIDE, WALL, HEIGHT, TILT = 0.5, 0.0125, 0.25, math.radians(10)

@@ -85,8 +85,8 @@ def register(name: str, config: str = "default") -> Callable[[Maker], Maker]:
     """
 
     def keep(maker: Maker) -> Maker:
-        own = name in _OWN and not maker.__module__.startswith("robotics_bridge.tasks.")
-        if own or config in _MADE.get(name, {}):
+        shipped = name in _OWN and not maker.__module__.startswith("robotics_bridge.tasks.")
+        if shipped or config in _MADE.get(name, {}):
             raise UsageError(f"There is a task {name!r} with a configuration {config!r} already; take another name.")
         _MADE.setdefault(name, {})[config] = maker
         return maker

@@ -91,7 +91,7 @@ def build(task: Task, hand: Hand) -> TaskModel:
             set_contacts(models[-1], task.contacts)
     first = models[0]
     joints = tuple(drives)
-    ids, own = [first.joint(name).id for name in joints], [n for n in joints if not n.startswith("carriage_")]
+    ids, fingers = [first.joint(name).id for name in joints], [n for n in joints if not n.startswith("carriage_")]
     # Joints without limits get a full turn: actions are scaled by ranges.
     limited = first.jnt_limited[ids].astype(bool)
     low = np.where(limited, first.jnt_range[ids, 0], -np.pi)
@@ -110,29 +110,29 @@ def build(task: Task, hand: Hand) -> TaskModel:
     opened = dict(zip(hand.joints, (flexed(hand, 0.0)[hand.joint_numbers] + 0.0).tolist(), strict=True))
     rest = np.array([given.get(name, opened.get(name, 0.0)) for name in joints])
     stiffness, damping, effort = (np.array([drives[name][column] for name in joints]) for column in range(3))
-    made = TaskModel(
+    model = TaskModel(
         models=models, shapes=shapes, objects=names, joints=joints, moved=_moved(task, hand, joints),
         stiffness=stiffness, damping=damping, effort=effort, rest=np.clip(rest, low, high), low=low, high=high,
         tips=_tips(hand),
-        lever=np.array([*hand.lever(own), *np.ones(len(joints) - len(own))]),
+        lever=np.array([*hand.lever(fingers), *np.ones(len(joints) - len(fingers))]),
     )  # fmt: skip
     if task.starts is None:
-        _warn_inside(task, hand, made)
-    return made
+        _warn_inside(task, hand, model)
+    return model
 
 
-def _warn_inside(task: Task, hand: Hand, made: TaskModel) -> None:
+def _warn_inside(task: Task, hand: Hand, built: TaskModel) -> None:
     """Say where the first object begins inside the hand, which would throw it out."""
-    model, place = made.models[0], task.placement
-    data, name = mujoco.MjData(model), made.objects[0]
-    data.qpos[[model.joint(joint).qposadr[0] for joint in made.joints]] = made.rest
+    model, place = built.models[0], task.placement
+    data, name = mujoco.MjData(model), built.objects[0]
+    data.qpos[[model.joint(joint).qposadr[0] for joint in built.joints]] = built.rest
     column, site = int(model.joint(name).qposadr[0]), place.sites[0] if place.sites else (0.0, 0.0, 0.0)
-    data.qpos[column : column + 3] = np.add(site, (0.0, 0.0, place.height + made.shapes[0].bottom))
+    data.qpos[column : column + 3] = np.add(site, (0.0, 0.0, place.height + built.shapes[0].bottom))
     data.qpos[column + 3 : column + 7] = place.quaternion
     mujoco.mj_forward(model, data)
     for pair, distance in zip(model.geom_bodyid[data.contact.geom], data.contact.dist.tolist(), strict=True):
         links = [model.body(body).name for body in pair]
-        if name in links and distance < -_INSIDE and (link := links[links[0] == name]) not in made.objects:
+        if name in links and distance < -_INSIDE and (link := links[links[0] == name]) not in built.objects:
             _log.warning(
                 "The object begins %.0f mm inside %s of hand %s: place the hand (Task.hand_poses) or its joints "
                 "(Task.joints) elsewhere in a task of your own.", -1e3 * distance, shown(link), shown(hand.name),
@@ -198,10 +198,10 @@ def drives_of(hand: Hand) -> dict[str, tuple[float, float, float]]:
     pairs = [(follower, leader) for follower, leader, _ in coupled(model) if not {follower, leader} <= set(servos)]
     follow = {leader if follower in servos else follower for follower, leader in pairs}
     if left := [model.actuator(index).name for index in range(model.nu) if index not in servos.values()]:
-        told = "are no position servo of one joint and are left out; joints without a servo get a weak one"
-        _log.warning("Of hand %s the drives %s %s.", shown(hand.name), listing(left), told)
+        message = "are no position servo of one joint and are left out; joints without a servo get a weak one"
+        _log.warning("Of hand %s the drives %s %s.", shown(hand.name), listing(left), message)
     order = [*servos, *(joint for joint in hand.joint_numbers.tolist() if joint not in {*servos, *follow})]
-    found = {}
+    drives = {}
     for joint in order:
         slides = model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE
         (stiffness, damping), effort = (WEAK_PUSH, _EFFORT / LEVER) if slides else (WEAK_SERVO, _EFFORT)
@@ -218,8 +218,8 @@ def drives_of(hand: Hand) -> dict[str, tuple[float, float, float]]:
         if model.jnt_actfrclimited[joint]:
             stated = float(model.jnt_actfrcrange[joint, 1])
             effort = min(effort, stated) if joint in servos else stated
-        found[model.joint(joint).name] = (stiffness, damping, effort)
-    return found
+        drives[model.joint(joint).name] = (stiffness, damping, effort)
+    return drives
 
 
 def coupled(model: Any) -> list[tuple[int, int, NDArray[np.float64]]]:
@@ -238,20 +238,20 @@ def _moved(task: Task, hand: Hand, joints: Sequence[str]) -> tuple[str, ...]:
         return tuple(joints)
     chosen: set[str] = set()
     for part in task.moves:
-        found = [name for name in hand.fingers if name.lower().startswith(part)]
+        names = [name for name in hand.fingers if name.lower().startswith(part)]
         # Fingers of a hand from a file are named by their tips, with the word in any place, or in another link.
-        found = found or [name for name in hand.fingers if part in name.lower()]
-        if not found:
-            found = [n for n, chain in hand.fingers.items() if any(part in link.lower() for link in chain)]
+        names = names or [name for name in hand.fingers if part in name.lower()]
+        if not names:
+            names = [n for n, chain in hand.fingers.items() if any(part in link.lower() for link in chain)]
             # A word that all fingers have, such as that of a middle phalanx, names none.
-            found = found if len(found) < len(hand.fingers) else []
-        if not found:
+            names = names if len(names) < len(hand.fingers) else []
+        if not names:
             raise UsageError(
                 f"Task {task.name!r} moves {', '.join(task.moves)}; the fingers of hand {hand.name!r} are "
                 f"{', '.join(hand.fingers)}. Register a task with moves={tuple(hand.fingers)} in a file of your own; "
                 "on the command line --task-file names it (docs/tasks.md, 'Another hand, a task of your own')."
             )
-        chosen |= set(found)
+        chosen |= set(names)
     links = {link for name in chosen for link in hand.fingers[name]}
     others = {link for name in hand.fingers if name not in chosen for link in hand.fingers[name]}
     model = hand.model
@@ -269,14 +269,14 @@ def _moved(task: Task, hand: Hand, joints: Sequence[str]) -> tuple[str, ...]:
 
 def _tips(hand: Hand) -> dict[str, Any]:
     layout = hand.layout("low", "tips")
-    found = {}
+    points = {}
     for tip in hand.tips:
-        found[tip] = (0.0, 0.0, 0.0)
+        points[tip] = (0.0, 0.0, 0.0)
         if tip in _TIPS and hand.spec is not None:
-            found[tip] = _TIPS[tip]
+            points[tip] = _TIPS[tip]
         elif tip in layout and layout[tip].active.any():
-            found[tip] = tuple(layout[tip].position[layout[tip].active].mean(axis=0).tolist())
-    return found
+            points[tip] = tuple(layout[tip].position[layout[tip].active].mean(axis=0).tolist())
+    return points
 
 
 def palm_up(hand: Hand) -> Pose:
@@ -286,10 +286,10 @@ def palm_up(hand: Hand) -> Pose:
     # Fingers around the middle of the palm, as of a gripper, point nowhere along it: then an axis of the palm.
     forward = step / length if length > 1e-6 else -np.eye(3)[np.argmin(np.abs(up))]
     # Columns: where the palm's own directions (forward, up × forward, up) go in the world.
-    own = np.stack([forward, np.cross(up, forward), up], axis=1)
+    palm = np.stack([forward, np.cross(up, forward), up], axis=1)
     world = np.stack([[-1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 1.0]], axis=1)
     # Rotation that takes the palm's orthonormal directions to their place in the world.
-    matrix = world @ own.T
+    matrix = world @ palm.T
     quaternion = np.zeros(4)
     mujoco.mju_mat2Quat(quaternion, matrix.ravel())
     x, y, z = (np.array([0.0, 0.0, _PALM_TOP]) - matrix @ (surface + 0.4 * step)).tolist()

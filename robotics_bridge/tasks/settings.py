@@ -50,9 +50,9 @@ def check_parameters(of: str, function: Callable[..., Any], given: Iterable[str]
         signature = inspect.signature(function)
     except ValueError:  # Written in C, which tells no parameters.
         return
-    own = list(signature.parameters.values())[1:]
-    if not any(one.kind is one.VAR_KEYWORD for one in own):
-        check_each(f"parameter of {of}", given, [one.name for one in own if one.kind is not one.VAR_POSITIONAL])
+    parameters = list(signature.parameters.values())[1:]
+    if not any(one.kind is one.VAR_KEYWORD for one in parameters):
+        check_each(f"parameter of {of}", given, [one.name for one in parameters if one.kind is not one.VAR_POSITIONAL])
     try:
         signature.bind(None, **dict.fromkeys(given))
     except TypeError as error:

@@ -35,12 +35,12 @@ def export(
     student, described = load_student(run)
     target = out or (run / "policy.onnx" if run.exists() else Path(f"{run.name}.onnx"))
     with progress_bar("exporting the policy"):
-        found = export_policy(student, target, deployment=described["deployment"], name=run.name)
+        written = export_policy(student, target, deployment=described["deployment"], name=run.name)
     text = (
-        f"{found.path}: {found.state_size:,} numbers of memory; {STEPS} steps with resets differ by at most "
-        f"{found.difference:.1e} of the largest action\n{found.contract}"
+        f"{written.path}: {written.state_size:,} numbers of memory; {STEPS} steps with resets differ by at most "
+        f"{written.difference:.1e} of the largest action\n{written.contract}"
     )
-    return Output(found, text)
+    return Output(written, text)
 
 
 def deploy(

@@ -46,10 +46,10 @@ class World:
 
         if self.task_file is None:  # else the file may register the task
             check_name("task", self.task, tasks.list_tasks())
-        known = (*shipped.AGENTS, *shipped.list_policies("teacher"), *shipped.list_policies("student"))
+        choices = (*shipped.AGENTS, *shipped.list_policies("teacher"), *shipped.list_policies("student"))
         for name in agents:
-            if name not in known and not Path(name).exists():
-                raise unknown_name("agent", name, known, hint=shipped.hint(name))
+            if name not in choices and not Path(name).exists():
+                raise unknown_name("agent", name, choices, hint=shipped.hint(name))
 
     def make(self, agents: Iterable[str] = (), **options: Any) -> Env:
         """Return its environment; a task of the user's own is read first, then changed.
@@ -78,8 +78,8 @@ def read_task_file(file: Path | None) -> None:
 
 def in_world(command: Callable[..., Output]) -> Callable[..., Output]:
     """Decorate a command so that its parameter ``world`` is filled from an argument and options."""
-    own = list(inspect.signature(World, eval_str=True).parameters.values())
-    return filled_from(command, "world", own, lambda values: World(**values))
+    parameters = list(inspect.signature(World, eval_str=True).parameters.values())
+    return filled_from(command, "world", parameters, lambda values: World(**values))
 
 
 def agent_of(name: str, env: Env, *, seed: int = 0) -> Any:
@@ -107,15 +107,15 @@ def touch_of(names: list[str]) -> dict[str, Any]:
     from robotics_bridge.policies.contract import from_json
     from robotics_bridge.policies.shipped import stored
 
-    found: dict[str, dict[str, Any]] = {}
+    touch: dict[str, dict[str, Any]] = {}
     for name in names:
         if (facts := stored(name)).get("brainbench_student"):
             # Loads the students' networks, which other agents do not need.
             from robotics_bridge.policies.training.distill_config import DistillConfig
 
-            kept = from_json(dict, facts.get("distill"), "distill of config.json")
-            from_json(DistillConfig, kept, "config.json")
-            found[name] = {key: kept[key] for key in TOUCH if key in kept}
-    if any(senses != next(iter(found.values())) for senses in found.values()):
-        raise UsageError(f"The students {', '.join(found)} feel differently; evaluate them one at a time.")
-    return next(iter(found.values()), {})
+            config = from_json(dict, facts.get("distill"), "distill of config.json")
+            from_json(DistillConfig, config, "config.json")
+            touch[name] = {key: config[key] for key in TOUCH if key in config}
+    if any(senses != next(iter(touch.values())) for senses in touch.values()):
+        raise UsageError(f"The students {', '.join(touch)} feel differently; evaluate them one at a time.")
+    return next(iter(touch.values()), {})

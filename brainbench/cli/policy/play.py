@@ -21,12 +21,12 @@ def list_tasks() -> Output:
     from robotics_bridge.policies.shipped import list_policies, stored
     from robotics_bridge.tasks.settings import contacts_name
 
-    found = []
+    rows = []
     for name in tasks.list_tasks():
         task = tasks.load(name)
         student = [*task.groups["student"], "tactile"]
         shipped = [*list_policies("teacher", name), *list_policies("student", name)]
-        found.append(
+        rows.append(
             {
                 "task": name,
                 "text": task.text,
@@ -46,10 +46,10 @@ def list_tasks() -> Output:
         "success": "{0[metric]} ≥ {0[success_from]:.3g}",
         "student sees": lambda item: ", ".join(item["student"]),
     }
-    policies = [(name, row["task"], row["contacts"][name]) for row in found for name in row["shipped"]]
+    policies = [(name, row["task"], row["contacts"][name]) for row in rows for name in row["shipped"]]
     heads = ("trained policy", "task", "contacts")
     trained = table_of("", policies, {head: f"{{0[{index}]}}" for index, head in enumerate(heads)})
-    return Output(found, f"{table_of('', found, columns)}\n\n{trained}")
+    return Output(rows, f"{table_of('', rows, columns)}\n\n{trained}")
 
 
 @with_options(ENV, (*TOUCH, "device", "seed"), build=False)
@@ -117,21 +117,21 @@ def play(
             drawing.write_video(video, film, size, 1 / (every * env.step_dt))
         if strip is not None:
             drawing.write_strip(strip, stills, times)
-    told = {
+    result = {
         "task": env.task.name, "hand": env.hand.name, "contacts": contacts_name(env.task.contacts), "agent": agent,
         "seconds": steps * env.step_dt, "reward": sum(rewards), "episodes_ended": ended,
         "metric": env.task.success.metric, "files": pictures, "goals": goals, "turned": turned, "dropped": dropped,
     }  # fmt: skip
-    shown: dict[str, object] = {
-        "task": told["task"], "hand": told["hand"], "contacts": told["contacts"], "agent": agent,
-        "simulated": f"{told['seconds']:g} s",
+    lines: dict[str, object] = {
+        "task": result["task"], "hand": result["hand"], "contacts": result["contacts"], "agent": agent,
+        "simulated": f"{result['seconds']:g} s",
         # What a task does not count stays unsaid.
         **({"goals reached": goals} if env.task.goal is not None else {}),
         **({"turned": f"{round(turned, 2) + 0:.2f} rad about the commanded axis"} if env.task.turns else {}),
         "dropped": f"{dropped} times", "episodes ended": ended, "reward": f"{sum(rewards):.3g}",
     }  # fmt: skip
-    shown |= {"files": ", ".join(map(str, pictures))} if pictures else {}
-    return Output(told, f"{env.task.text}\n\n{facts(shown)}")
+    lines |= {"files": ", ".join(map(str, pictures))} if pictures else {}
+    return Output(result, f"{env.task.text}\n\n{facts(lines)}")
 
 
 @in_world
@@ -166,11 +166,11 @@ def evaluate(
     names = ["zero", "random", *(name for name in agents or [] if name not in ("zero", "random"))]
     # All are read before the first one runs: an unfit last one would else be told after minutes.
     acting = {name: agent_of(name, env) for name in names}
-    found: list[dict[str, Any]] = []
+    rows: list[dict[str, Any]] = []
     with progress_bar() as progress:
         for name, act in acting.items():
             result = run(env, act, episodes=episodes, seed=tuple(range(seeds)), name=name, progress=progress)
-            found.append({**result.summary(), "contacts": contacts})
+            rows.append({**result.summary(), "contacts": contacts})
     columns = {
         "agent": "{0[agent]}",
         ">episodes": "{0[episodes]}",
@@ -184,13 +184,13 @@ def evaluate(
         ">diverged": "{0[diverged]}",
         ">by object": lambda item: _by_kind(item["objects"]),
     }
-    return Output(found, table_of(f"{env.task.text}; contacts: {contacts}", found, columns), out=out)
+    return Output(rows, table_of(f"{env.task.text}; contacts: {contacts}", rows, columns), out=out)
 
 
 def _by_kind(objects: Mapping[str, Mapping[str, float]]) -> str:
     """Return the success with each kind of object, the first word of its name."""
-    found: dict[str, list[float]] = {}
-    for name, item in objects.items():
-        won, of = found.setdefault(name.partition(" ")[0], [0.0, 0.0])
-        found[name.partition(" ")[0]] = [won + item["success_rate"] * item["episodes"], of + item["episodes"]]
-    return ", ".join(f"{kind} {won / of:.2f}" for kind, (won, of) in found.items())
+    counts: dict[str, list[float]] = {}
+    for name, share in objects.items():
+        won, of = counts.setdefault(name.partition(" ")[0], [0.0, 0.0])
+        counts[name.partition(" ")[0]] = [won + share["success_rate"] * share["episodes"], of + share["episodes"]]
+    return ", ".join(f"{kind} {won / of:.2f}" for kind, (won, of) in counts.items())

@@ -50,12 +50,12 @@ def train(
     with progress_bar() as progress:
         result = teacher.train(env, run, options, settings=settings, progress=progress)
     last = dict(result.history[-1]) if result.history else {}
-    told = {
+    summary = {
         "run": result.folder, "iterations": result.iterations, "control_steps": result.steps, "seconds": result.seconds,
         "reward": last.get("reward"), "success": last.get("episode/success"),
     }  # fmt: skip
-    shown = {key: f"{value:.4g}" if isinstance(value, float) else value for key, value in told.items()}
-    return Output(told | {"last": last}, facts(shown))
+    lines = {key: f"{value:.4g}" if isinstance(value, float) else value for key, value in summary.items()}
+    return Output(summary | {"last": last}, facts(lines))
 
 
 DISTILL = "robotics_bridge.policies.training.distill_config:DistillConfig"
@@ -147,18 +147,18 @@ def sweep(
     from robotics_bridge.policies.training.sweep import PUBLISHED, read_sweep
 
     read_task_file(task_file)
-    found = read_sweep(file or PUBLISHED)
+    plan = read_sweep(file or PUBLISHED)
     if count:
-        numbers = found.count(subset)
+        numbers = plan.count(subset)
         rows = [[name, str(value)] for name, value in {**numbers["entries"], **numbers["types"]}.items()]
         more = numbers["students"] - numbers["published"]
-        extra = f" ({numbers['published']} without {', '.join(found.extra_types)})" if more else ""
+        extra = f" ({numbers['published']} without {', '.join(plan.extra_types)})" if more else ""
         text = table("", ["entry or type", "students"], rows, right=(1,))
-        return Output(numbers, f"{text}\n\n{numbers['students']} students in {found.name}, {subset}{extra}")
+        return Output(numbers, f"{text}\n\n{numbers['students']} students in {plan.name}, {subset}{extra}")
     part, parts = part_of(shard, "--shard takes")
     changes: dict[str, Any] = {"num_envs": envs, "iterations": iterations}
     changes = {name: value for name, value in changes.items() if value is not None}
-    students = [replace(student, **changes) for student in found.students(subset)][part::parts]
+    students = [replace(student, **changes) for student in plan.students(subset)][part::parts]
     if names:
         return Output([student.name for student in students], "\n".join(student.name for student in students))
     results = []

@@ -235,8 +235,8 @@ class HandLink:
                 break
             if self._start(data, sender, now):
                 targets = None
-            elif (found := self._command(data, sender, now)) is not None:
-                targets = found
+            elif (command := self._command(data, sender, now)) is not None:
+                targets = command
             else:
                 self._offer(data, sender, now)
         return None if self.stopped else targets

@@ -76,14 +76,14 @@ class EncoderConfig:
         # Equal to its default a setting may stand anywhere: a configuration in a file holds them all.
         owner = {"units": "'rnn'"} if self.arm != "rnn" else {}
         owner |= dict.fromkeys(_OF_NETWORKS, "a network (brainbench models list)") if self.arm in ARMS else {}
-        for item in fields(self):
-            value, usual = getattr(self, item.name), item.default
-            if item.default_factory is not MISSING:
-                usual = item.default_factory()
-            if item.name in owner and value != usual:
+        for setting in fields(self):
+            value, default = getattr(self, setting.name), setting.default
+            if setting.default_factory is not MISSING:
+                default = setting.default_factory()
+            if setting.name in owner and value != default:
                 raise UsageError(
-                    f"{item.name!r} = {shown(value)} is for the tactile encoder {owner[item.name]}; {self.arm!r} has "
-                    "no such setting. Leave it out."
+                    f"{setting.name!r} = {shown(value)} is for the tactile encoder {owner[setting.name]}; {self.arm!r} "
+                    "has no such setting. Leave it out."
                 )
 
     @classmethod
@@ -157,13 +157,13 @@ class TactileEncoder(nn.Module):
 
         The memory is forgotten after a step where ``ended`` [L, B]; None for nowhere.
         """
-        found = []
+        embeddings = []
         for step, reading in enumerate(taxels):
             y, h_in = self(reading, h_in)
-            found.append(y)
+            embeddings.append(y)
             if ended is not None:
                 h_in = torch.where(ended[step][:, None], 0.0, h_in)
-        return torch.stack(found), h_in
+        return torch.stack(embeddings), h_in
 
     @property
     def frozen_part(self) -> FrontEnd | None:

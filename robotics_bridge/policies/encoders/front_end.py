@@ -93,17 +93,17 @@ class Resampler(nn.Module):
         self.advance, self.cycle = ratio.numerator, ratio.denominator
         # How far before the last reading sample i of a step lies, counted in readings.
         oldest = (self.advance - 1) * sub_steps / self.advance + (sub_steps - 1) * self.cycle / self.advance
-        kept = max(int(oldest) + 2, sub_steps)
-        self.past = kept - sub_steps
-        weights = torch.zeros(self.cycle, sub_steps, kept)
+        remembered = max(int(oldest) + 2, sub_steps)
+        self.past = remembered - sub_steps
+        weights = torch.zeros(self.cycle, sub_steps, remembered)
         for phase in range(self.advance):
             for sample in range(sub_steps):
                 parts = phase * sub_steps + (sub_steps - 1 - sample) * self.cycle
                 # Times as whole numbers of 1/p readings: no rounding decides which readings a sample lies between.
                 whole, rest = divmod(parts, self.advance)
-                weights[phase, sample, kept - 1 - whole] += 1 - rest / self.advance
+                weights[phase, sample, remembered - 1 - whole] += 1 - rest / self.advance
                 if rest:
-                    weights[phase, sample, kept - 2 - whole] += rest / self.advance
+                    weights[phase, sample, remembered - 2 - whole] += rest / self.advance
         self.register_buffer("weights", weights, persistent=False)
         self.state_size: int = 1 + self.past * values
         """Numbers of state per row: the phase and the readings before."""

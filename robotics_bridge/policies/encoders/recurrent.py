@@ -49,7 +49,7 @@ class ConvGRUProducts(nn.Module):
         with torch.autocast(x.device.type, enabled=False):
             inputs = cell.in_channels * len(self.places[0])
             split = [matrix.to(kind).split([inputs, len(matrix) - inputs]) for matrix, _ in (gates, candidate)]
-            flat, found = x.flatten(0, 1).to(kind), []
+            flat, states = x.flatten(0, 1).to(kind), []
             shares = [
                 torch.addmm(bias.to(kind), flat, parts[0]).unflatten(0, x.shape[:2])
                 for parts, (_, bias) in zip(split, (gates, candidate), strict=True)
@@ -62,10 +62,10 @@ class ConvGRUProducts(nn.Module):
                 # h = u h + (1 − u) c. The state stays in single precision, since small updates vanish in half
                 # precision.
                 state = torch.lerp(torch.tanh(new).float(), state.float(), torch.sigmoid(keep).float())
-                found.append(state)
+                states.append(state)
                 if ended is not None:
                     state = torch.where(ended[step][:, None], 0.0, state)
-        return torch.stack(found), state
+        return torch.stack(states), state
 
     def _gates(self, cell: GRU, names: tuple[str, ...]) -> tuple[torch.Tensor, torch.Tensor]:
         """Return the matrix [(inputs + C)·P, gates·C·P] and bias of some gates, without their mean over channels."""

@@ -70,10 +70,10 @@ def finger_rows(fingers: Mapping[str, Sequence[str]]) -> dict[str, int]:
     for finger in fingers:
         # Fingers of files are named by their tips: rh_ffdistal, thumbtip.
         parts = [part.removesuffix("distal").removesuffix("tip") for part in re.findall("[a-z]+", finger.lower())]
-        found = [row for row, name in enumerate(FINGERS) if any(word in parts for word in _WORDS[name])]
-        if len(found) != 1 or found[0] in rows.values():
+        matches = [row for row, name in enumerate(FINGERS) if any(word in parts for word in _WORDS[name])]
+        if len(matches) != 1 or matches[0] in rows.values():
             return {name: row for row, name in enumerate(fingers)}
-        rows[finger] = found[0]
+        rows[finger] = matches[0]
     return rows
 
 
@@ -114,9 +114,9 @@ class FingerAxes:
             raise UsageError(f"The link {link!r} is neither the palm {self.palm!r} nor part of a finger.")
         # A taxel of the palm belongs to the finger axis nearest to it, whose first segment leads over the palm.
         order = sorted(self.chains)
-        found = [_along(self.joints[row], 0, points) for row in order]
-        nearest = np.argmin([distance for _, distance in found], axis=0)
-        lengths = np.stack([length for length, _ in found])[nearest, np.arange(len(points))]
+        along = [_along(self.joints[row], 0, points) for row in order]
+        nearest = np.argmin([distance for _, distance in along], axis=0)
+        lengths = np.stack([length for length, _ in along])[nearest, np.arange(len(points))]
         return np.array(order)[nearest], lengths
 
 
@@ -233,8 +233,8 @@ class TaxelGrid(nn.Module):
         self.observe = observe
         self.channels: int = kind.channels
         """C."""
-        own = resolution not in layouts.RESOLUTIONS
-        self.axes: FingerAxes = finger_axes_of(body, body.layout(resolution if own else "med", "hand"))
+        custom = resolution not in layouts.RESOLUTIONS
+        self.axes: FingerAxes = finger_axes_of(body, body.layout(resolution if custom else "med", "hand"))
         parts = [_scatter(self.axes, link, probes, observe) for link, probes in self.layout.items()]
         if not parts:
             raise UsageError(f"The hand {body.name!r} has no taxels at the placement {placement!r}.")
@@ -335,19 +335,20 @@ class TaxelGraph(nn.Module):
             raise UsageError(f"The graph of taxels reads 'force_torque'; received {observe!r}.")
         points = [probes.position[probes.active] for probes in layout.values()]
         sizes = [len(one) for one in points]
-        found: list[tuple[float, NDArray[Any]]] = []
-        for number, one in enumerate(points):
-            for value, pattern in zip(*_patterns(one), strict=True):
+        patterns: list[tuple[float, NDArray[Any]]] = []
+        for number, places in enumerate(points):
+            for value, pattern in zip(*_patterns(places), strict=True):
                 whole = [np.zeros(size) for size in sizes]
-                whole[number] = np.sqrt(len(one)) * pattern
-                found.append((value, np.concatenate(whole)))
+                whole[number] = np.sqrt(len(places)) * pattern
+                patterns.append((value, np.concatenate(whole)))
         # Stable: patterns that are equally smooth keep the order of the links.
-        kept = sorted(found, key=lambda item: item[0])[:SITES]
+        smoothest = sorted(patterns, key=lambda item: item[0])[:SITES]
         middle = np.concatenate([np.tile(one.mean(0), (len(one), 1)) for one in points if len(one)])
         # Not weights: they follow from the layout, so files of weights need not hold them.
-        self.cells: int = len(kept)
+        rows = [pattern for _, pattern in smoothest]
+        self.cells: int = len(rows)
         """K."""
-        self.register_buffer("patterns", torch.tensor(np.array([one for _, one in kept])).float(), persistent=False)
+        self.register_buffer("patterns", torch.tensor(np.array(rows)).float(), persistent=False)
         self.register_buffer("middle", torch.from_numpy(middle).float(), persistent=False)
 
     def wrenches(self, taxels: torch.Tensor) -> torch.Tensor:

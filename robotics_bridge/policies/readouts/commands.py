@@ -54,24 +54,25 @@ def probe(
     touch = touch_of([agent])  # A student acts on what it feels; one that feels nothing is asked what it could feel.
     touch = touch if touch.get("observe", "none") != "none" else {"observe": "force_torque"}
     env = world.make([agent], num_envs=envs, device=device, seed=options.seed, **touch)
-    told: dict[str, Any] = {"task": world.task, "config": world.config, "change": world.change or [], "agent": agent}
-    told |= {"contacts": contacts_name(env.task.contacts), "environments": envs, "seconds": options.seconds}
-    told["noisy"] = env.options.noisy
+    result: dict[str, Any] = {"task": world.task, "config": world.config, "change": world.change or [], "agent": agent}
+    result |= {"contacts": contacts_name(env.task.contacts), "environments": envs, "seconds": options.seconds}
+    result["noisy"] = env.options.noisy
     with progress_bar() as progress:
         policy = agent_of(agent, env)
         if options.place is None:
-            found = readouts.probe(env, policy, options, progress)
-            told |= {"arms": [readouts.plain(item) for item in found], "differences": readouts.differences(found)}
+            readings = readouts.probe(env, policy, options, progress)
+            result["arms"] = [readouts.plain(item) for item in readings]
+            result["differences"] = readouts.differences(readings)
         else:
             placed, chosen = readouts.place(env, policy, options, progress)
-            told |= {"place": options.place, **readouts.placements(placed)}
+            result |= {"place": options.place, **readouts.placements(placed)}
             if layout is not None:
                 write_probes(layout, chosen)
     size = "features" if options.place is None else "taxels"
-    text = _table("R² on environments left out, by object quantity", told["arms"], size, "draws")
-    if told["differences"]:
-        text += "\n" + _table("Differences of R²", told["differences"], "less", sign="+")
-    return Output(told, text, out=out)
+    text = _table("R² on environments left out, by object quantity", result["arms"], size, "draws")
+    if result["differences"]:
+        text += "\n" + _table("Differences of R²", result["differences"], "less", sign="+")
+    return Output(result, text, out=out)
 
 
 def _table(title: str, rows: list[dict[str, Any]], *more: str, sign: str = "") -> str:

@@ -67,7 +67,7 @@ def collect(env: Env, policy: Acting, seconds: float) -> TouchRollout:
     age = torch.zeros(env.num_envs, dtype=torch.long, device=env.device)
     # A policy may remember what it did before this rollout.
     forget(policy, age == 0)
-    kept: dict[str, list[torch.Tensor]] = {}
+    columns: dict[str, list[torch.Tensor]] = {}
     for _ in range(round(seconds / env.step_dt)):
         velocity, spin = env.state.target_velocity
         row = {"proprio": observations["proprio"], "taxels": observations["tactile"], "begun": age == 0}
@@ -75,12 +75,12 @@ def collect(env: Env, policy: Acting, seconds: float) -> TouchRollout:
         row |= {"position": env.state.target_pose[:, :3], "velocity": velocity, "spin": spin}
         row |= {"contact": _centre(env, age), "valid": age >= _SETTLING}
         for name, value in row.items():
-            kept.setdefault(name, []).append(value.clone())
+            columns.setdefault(name, []).append(value.clone())
         observations, _, terminated, truncated, _ = env.step(policy(observations))
         done = terminated | truncated
         forget(policy, done)
         age = torch.where(done, 0, age + 1)
-    stacked = {name: torch.stack(rows) for name, rows in kept.items()}
+    stacked = {name: torch.stack(rows) for name, rows in columns.items()}
     targets = {name: stacked.pop(name) for name in TARGETS}
     # Six standard deviations of white noise, which is 0 where taxels have none.
     floor = 6 * PRESETS["published-force_torque"].white * env.options.noisy
@@ -169,11 +169,11 @@ Features = torch.Tensor
 def traces(x: torch.Tensor, begun: torch.Tensor) -> Features:
     """Return values [T, B, F] and leaky averages of their past, which episodes begin without."""
     state = x.new_zeros(len(_TRACES), *x.shape[1:])
-    keep, found = x.new_tensor(_TRACES)[:, None, None], []
+    keep, values = x.new_tensor(_TRACES)[:, None, None], []
     for now, first in zip(x, begun, strict=True):
         state = keep * torch.where(first[:, None], 0.0, state) + (1 - keep) * now
-        found.append(torch.cat((now, *state), -1))
-    return torch.stack(found)
+        values.append(torch.cat((now, *state), -1))
+    return torch.stack(values)
 
 
 def raw(rollout: TouchRollout) -> Features:
@@ -205,11 +205,11 @@ def network(
     """Return the features of a network that steps through the rollout, its memory forgotten where episodes begin."""
     front = FrontEnd(model, grid, time=time, calibration=calibration, seed=seed, options=without_latency(model))
     front = front.to(rollout.taxels.device)
-    state, found = front.init_state(rollout.taxels.shape[1]), []
+    state, answers = front.init_state(rollout.taxels.shape[1]), []
     for reading, first in zip(rollout.taxels, rollout.begun, strict=True):
         features, state = front(reading, torch.where(first[:, None], 0.0, state))
-        found.append(features)
-    return torch.stack(found)
+        answers.append(features)
+    return torch.stack(answers)
 
 
 def reservoir(
@@ -221,11 +221,11 @@ def reservoir(
     felt = (grid.wrenches(rollout.taxels.flatten(0, 1)).cpu() / torch.tensor(unit)).flatten(2, -2).mT.flatten(1)
     echo = EchoState(felt.shape[1], seed=seed)
     drive = echo.drive(felt).unflatten(0, rollout.taxels.shape[:2])
-    state, found = drive.new_zeros(drive.shape[1:]), []
+    state, states = drive.new_zeros(drive.shape[1:]), []
     for now, first in zip(drive, rollout.begun.cpu(), strict=True):
         state = echo(now, torch.where(first[:, None], 0.0, state))
-        found.append(state)
-    return torch.stack(found)
+        states.append(state)
+    return torch.stack(states)
 
 
 @dataclass(frozen=True)
@@ -247,9 +247,10 @@ class Subject:
     """Of the first reservoir."""
 
 
-def networks(time: Time, name: str, one: Subject, seeds: Sequence[int] = (0,)) -> list[Features]:
+def networks(time: Time, name: str, subject: Subject, seeds: Sequence[int] = (0,)) -> list[Features]:
     """Return the features of a network, once for each seed of weights that are drawn."""
-    return [network(one.rollout, one.grid, one.calibration, model=name, time=time, seed=seed) for seed in seeds]
+    parts = (subject.rollout, subject.grid, subject.calibration)
+    return [network(*parts, model=name, time=time, seed=seed) for seed in seeds]
 
 
 def mapped(rollout: TouchRollout, grid: TaxelGrid | TaxelGraph) -> Features:
@@ -258,16 +259,16 @@ def mapped(rollout: TouchRollout, grid: TaxelGrid | TaxelGraph) -> Features:
     return felt.flatten(1).unflatten(0, rollout.taxels.shape[:2])
 
 
-def bent(one: Subject) -> Subject:
+def bent(subject: Subject) -> Subject:
     """Return a subject whose map follows the posture of the fingers."""
-    turn, rollout = PostureTurn(one.grid).to(one.rollout.taxels.device), one.rollout
+    turn, rollout = PostureTurn(subject.grid).to(subject.rollout.taxels.device), subject.rollout
     steps = zip(rollout.taxels, rollout.link_pose, strict=True)
-    return replace(one, rollout=replace(rollout, taxels=torch.stack([turn(*step) for step in steps])))
+    return replace(subject, rollout=replace(rollout, taxels=torch.stack([turn(*step) for step in steps])))
 
 
-def _reservoirs(one: Subject, grid: TaxelGrid | TaxelGraph) -> list[Features]:
-    seeds = range(one.seed, one.seed + one.reservoirs)
-    return [reservoir(one.rollout, grid, one.calibration, seed=seed) for seed in seeds]
+def _reservoirs(subject: Subject, grid: TaxelGrid | TaxelGraph) -> list[Features]:
+    seeds = range(subject.seed, subject.seed + subject.reservoirs)
+    return [reservoir(subject.rollout, grid, subject.calibration, seed=seed) for seed in seeds]
 
 
 def _with_traces(features: Callable[[Subject], Features]) -> Callable[[Subject], list[Features]]:

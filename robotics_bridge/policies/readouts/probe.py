@@ -101,9 +101,9 @@ class _Elimination:
         used = scale > 1e-7 * scale.max().clamp(min=1e-30)
         moments = []
         for mine in (learning, ~learning):
-            kept = valid[:, mine]
-            z = ((x[:, mine][kept] - mean) / torch.where(used, scale, 1.0)).clamp(-FARTHEST, FARTHEST) * used
-            y = (wanted[:, mine][kept] - centre) / size
+            counted = valid[:, mine]
+            z = ((x[:, mine][counted] - mean) / torch.where(used, scale, 1.0)).clamp(-FARTHEST, FARTHEST) * used
+            y = (wanted[:, mine][counted] - centre) / size
             moments.append([part.double() / len(z) for part in (z.T @ z, z.T @ y, y.square().sum(0))])
         (self._gram, self._product, _), (self._test_gram, self._test_product, self._error) = moments
         self._gram.diagonal().add_(_PENALTY)
@@ -112,23 +112,23 @@ class _Elimination:
     def take(self, block: slice) -> None:
         """Put a block of features into the regression."""
         factor = torch.linalg.cholesky(self._gram[block, block])
-        told = torch.cholesky_solve(self._gram[block], factor)  # B: features of the block → all features
+        explained = torch.cholesky_solve(self._gram[block], factor)  # B: features of the block → all features
         weights = torch.cholesky_solve(self._product[block], factor)
         # Schur complement on the learning side; x − x_S B and y − x_S w on the test side.
         column = self._gram[:, block].clone()
         self._product -= column @ weights
-        self._gram.addmm_(column, told, alpha=-1)
+        self._gram.addmm_(column, explained, alpha=-1)
         inner, across = self._test_gram[block, block].clone(), self._test_gram[:, block].clone()
         self._error += (weights * (inner @ weights)).sum(0) - 2 * (weights * self._test_product[block]).sum(0)
-        self._test_product -= across @ weights + told.T @ (self._test_product[block] - inner @ weights)
-        self._test_gram.addmm_(across, told, alpha=-1).addmm_(told.T, across.T - inner @ told, alpha=-1)
+        self._test_product -= across @ weights + explained.T @ (self._test_product[block] - inner @ weights)
+        self._test_gram.addmm_(across, explained, alpha=-1).addmm_(explained.T, across.T - inner @ explained, alpha=-1)
 
     def gains(self, first: int, taxels: int, width: int) -> torch.Tensor:
         """Return by how much each taxel [N] would raise R² on the test environments."""
-        own, own_test = (_blocks(gram[first:, first:], taxels, width) for gram in (self._gram, self._test_gram))
+        blocks, own_test = (_blocks(gram[first:, first:], taxels, width) for gram in (self._gram, self._test_gram))
         product, test = (m[first:].unflatten(0, (taxels, width)) for m in (self._product, self._test_product))
         # Of taken taxels nothing but the penalty's rest is left; it keeps the blocks regular.
-        weights = torch.linalg.solve(own + 1e-9 * torch.eye(width, dtype=own.dtype), product)
+        weights = torch.linalg.solve(blocks + 1e-9 * torch.eye(width, dtype=blocks.dtype), product)
         lost = (weights * (own_test @ weights)).sum(1) - 2 * (weights * test).sum(1)
         return -(lost / self._spread).mean(1)
 
@@ -151,7 +151,7 @@ def even_taxels(layout: Mapping[str, Probes], count: int) -> list[int]:
     share = count * sizes / sizes.sum()
     whole = np.floor(share).astype(int)
     whole[np.argsort(whole - share, kind="stable")[: count - whole.sum()]] += 1
-    found: list[int] = []
+    taxels: list[int] = []
     for first, number, probes in zip(np.cumsum(sizes) - sizes, whole, layout.values(), strict=True):
         points, mine = probes.position[probes.active], []
         away = -np.linalg.norm(points - points.mean(0), axis=1)
@@ -159,22 +159,22 @@ def even_taxels(layout: Mapping[str, Probes], count: int) -> list[int]:
             mine.append(int(away.argmax()))
             gap = np.linalg.norm(points - points[mine[-1]], axis=1)
             away = gap if len(mine) == 1 else np.minimum(away, gap)
-        found += [int(first) + one for one in mine]
-    return found
+        taxels += [int(first) + one for one in mine]
+    return taxels
 
 
 def part_of_layout(layout: Mapping[str, Probes], taxels: Iterable[int]) -> dict[str, Probes]:
     """Return a layout with these taxels alone, for :func:`robotics_bridge.hands.layouts.write_probes`."""
-    wanted, first, found = set(taxels), 0, {}
+    wanted, first, part = set(taxels), 0, {}
     for link, probes in layout.items():
         active = np.flatnonzero(probes.active)
-        kept = [cell for index, cell in enumerate(active) if first + index in wanted]
-        if kept:
+        cells = [cell for index, cell in enumerate(active) if first + index in wanted]
+        if cells:
             radius = np.zeros_like(probes.radius)
-            radius[kept] = probes.radius[kept]
-            found[link] = Probes(probes.position, probes.normal, radius, probes.shape)
+            radius[cells] = probes.radius[cells]
+            part[link] = Probes(probes.position, probes.normal, radius, probes.shape)
         first += len(active)
-    return found
+    return part
 
 
 def read_placements(
@@ -226,13 +226,13 @@ def read_placements(
                 read.append(read_targets(rollout.proprio[:, mine], part, wanted[:, mine], valid[:, mine]))
                 done += 1
             parts.setdefault(name, []).append(read)
-    found = []
+    placed = []
     for name, read in parts.items():
         errors = np.stack([np.concatenate([one[0] for one in draw]) for draw in zip(*read, strict=True)])
         spread = np.concatenate([part[0][1] for part in read])
         sets = tuple(map(tuple, fixed[name])) if name in fixed else tuple(chosen)
-        found.append(Placed(name, Readout(name, len(sets[0]) * features.shape[-1], errors, spread), sets))
-    return found
+        placed.append(Placed(name, Readout(name, len(sets[0]) * features.shape[-1], errors, spread), sets))
+    return placed
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -275,11 +275,11 @@ def check_environments(env: Env, parts: int = 1) -> int:
 def roll_out(env: Env, policy: Acting, options: ProbeOptions, parts: int = 1) -> TouchRollout:
     """Roll a policy out once; what is read is known wherever ``valid`` is."""
     least = check_environments(env, parts)
-    found = collect(env, policy, options.seconds)
-    valid = found.valid & ~found.wanted.isnan().any(-1)
+    rollout = collect(env, policy, options.seconds)
+    valid = rollout.valid & ~rollout.wanted.isnan().any(-1)
     if int((valid.sum(0) > 0).sum()) < least:
         raise UsageError("The object is touched in too few environments; take a policy that holds it, or more of them.")
-    return replace(found, valid=valid)
+    return replace(rollout, valid=valid)
 
 
 @torch.no_grad()
@@ -298,12 +298,12 @@ def probe(env: Env, policy: Acting, options: ProbeOptions, progress: Progress | 
     links = tuple(int(probes.active.sum()) for probes in layout.values())
     draws = (options.reservoirs, options.untrained, options.seed)
     subject = Subject(rollout, grid, TaxelGraph(layout), calibration, links, *draws)
-    found = []
+    readouts = []
     for index, name in enumerate(names):
         say(index + 1, len(names) + 1, f"reading {name}")
         features = ARMS[name](subject) if name in ARMS else networks("native", name, subject)
-        found.append(read_arm(name, rollout, features))
-    return found
+        readouts.append(read_arm(name, rollout, features))
+    return readouts
 
 
 def read_arm(name: str, rollout: TouchRollout, draws: Sequence[Features]) -> Readout:
@@ -328,15 +328,15 @@ def place(
     say(0, 1, "rolling out")
     rollout = roll_out(env, policy, options, HALVES)
     owner = np.repeat(list(layout), [int(probes.active.sum()) for probes in layout.values()])
-    own = {name: np.flatnonzero(np.isin(owner, env.hand.links(name))).tolist() for name in PLACEMENTS}
-    others = {name: taxels for name, taxels in own.items() if 0 < len(taxels) < len(owner)}
-    found = read_placements(
+    placements = {name: np.flatnonzero(np.isin(owner, env.hand.links(name))).tolist() for name in PLACEMENTS}
+    others = {name: taxels for name, taxels in placements.items() if 0 < len(taxels) < len(owner)}
+    placed = read_placements(
         rollout, layout, count, others=others, draws=options.draws, seed=options.seed, progress=progress
     )
     say(1, 1, "choosing taxels on all environments")
     features = taxel_features(rollout)
     best = choose_taxels(rollout.proprio, features, rollout.wanted, rollout.valid, count)
-    return found, part_of_layout(layout, best)
+    return placed, part_of_layout(layout, best)
 
 
 CONTRASTS = (
@@ -349,16 +349,16 @@ CONTRASTS = (
 """Arms that are compared."""
 
 
-def plain(one: Readout, less: Readout | None = None) -> dict[str, Any]:
+def plain(readout: Readout, less: Readout | None = None) -> dict[str, Any]:
     """Return R² of an arm with its interval by target as plain numbers, or its difference from another arm."""
-    facts: dict[str, Any] = {"arm": one.arm}
-    facts |= {"features": one.features, "draws": len(one.errors)} if less is None else {"less": less.arm}
+    facts: dict[str, Any] = {"arm": readout.arm}
+    facts |= {"features": readout.features, "draws": len(readout.errors)} if less is None else {"less": less.arm}
     for name in TARGETS:
-        low, high = one.interval(name, less=less)
-        value = one.r2(name) - (0.0 if less is None else less.r2(name))
+        low, high = readout.interval(name, less=less)
+        value = readout.r2(name) - (0.0 if less is None else less.r2(name))
         facts[name] = {"r2": value, "low": low, "high": high}
         if less is None:
-            facts[name]["per_draw"] = one.per_draw(name)
+            facts[name]["per_draw"] = readout.per_draw(name)
     return facts
 
 
@@ -369,8 +369,8 @@ def differences(readouts: Sequence[Readout]) -> list[dict[str, Any]]:
     return [plain(by_name[a], by_name[b]) for a, b in pairs if a in by_name and b in by_name]
 
 
-def placements(found: Sequence[Placed]) -> dict[str, Any]:
+def placements(placed: Sequence[Placed]) -> dict[str, Any]:
     """Return placements and their differences from all taxels as plain numbers."""
-    every = next(one for one in found if one.name == "all")
-    rows = [plain(one.readout) | {"taxels": len(one.taxels[0]), "indices": one.taxels} for one in found]
-    return {"arms": rows, "differences": [plain(one.readout, every.readout) for one in found if one is not every]}
+    every = next(one for one in placed if one.name == "all")
+    rows = [plain(one.readout) | {"taxels": len(one.taxels[0]), "indices": one.taxels} for one in placed]
+    return {"arms": rows, "differences": [plain(one.readout, every.readout) for one in placed if one is not every]}

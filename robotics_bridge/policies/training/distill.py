@@ -144,7 +144,7 @@ class _Run:
         self.observations: dict[str, torch.Tensor] = env.reset()
         # First episodes end at different times, so that no rollout holds only beginnings.
         env.episode_length_buf.copy_(torch.randint_like(env.episode_length_buf, int(env.max_episode_length)))
-        self.memory = self.student.zeros(env.num_envs, kept=self.front is not None)
+        self.memory = self.student.zeros(env.num_envs, stored=self.front is not None)
         self.touched = self.front.init_state(env.num_envs) if self.front is not None else self.memory[:, :0]
         self.kept: list[tuple[int, Rollout]] = []
         self.iteration, self.loss = 0, math.nan

@@ -94,13 +94,13 @@ class DistillConfig:
         check_names(self.resolution, self.placement)
         if not isinstance(self.encoder_settings, Mapping):
             raise UsageError(f"'encoder_settings' must be names and values; received {shown(self.encoder_settings)}.")
-        usual = {item.name: item.default for item in fields(self)} | {"encoder_settings": {}}
-        if idle := [name for name in FELT if kind.sensor is None and getattr(self, name) != usual[name]]:
+        defaults = {item.name: item.default for item in fields(self)} | {"encoder_settings": {}}
+        if idle := [name for name in FELT if kind.sensor is None and getattr(self, name) != defaults[name]]:
             raise UsageError(f"A student that observes {self.observe!r} has no touch; leave out {listing(idle)}.")
         if self.teacher_iterations and not self.teacher_share:
             raise UsageError("'teacher_iterations' is the time in which 'teacher_share' falls, and that is 0.")
-        if own := {"name", *_SHARED} & set(self.encoder_settings):
-            raise UsageError(f"{listing(own)} of an encoder: set it for the student (its 'encoder' is the name).")
+        if shared := {"name", *_SHARED} & set(self.encoder_settings):
+            raise UsageError(f"{listing(shared)} of an encoder: set it for the student (its 'encoder' is the name).")
         _ = self.tactile  # whose settings are checked by its own class
 
     @classmethod
@@ -112,8 +112,8 @@ class DistillConfig:
     def resolved(self, settings: StudentSettings) -> DistillConfig:
         """Return the configuration with the task's own settings where it has none."""
         open_fields = ("iterations", "learning_rate", "epochs", "gradient_length", "clip", "max_grad_norm", "loss")
-        own = {name: getattr(settings, name) for name in open_fields if getattr(self, name) is None}
-        return replace(self, **own)
+        settled = {name: getattr(settings, name) for name in open_fields if getattr(self, name) is None}
+        return replace(self, **settled)
 
     @property
     def tactile(self) -> EncoderConfig | None:
@@ -140,8 +140,8 @@ class DistillConfig:
 
     @property
     def _unusual(self) -> list[str]:
-        found = [] if self.embedder == "mlp" else [self.embedder]
-        return found if self.hidden == _HIDDEN else [*found, f"head-{'-'.join(map(str, self.hidden))}"]
+        words = [] if self.embedder == "mlp" else [self.embedder]
+        return words if self.hidden == _HIDDEN else [*words, f"head-{'-'.join(map(str, self.hidden))}"]
 
     @property
     def name(self) -> str:

@@ -22,13 +22,13 @@ SENSES = {
 
 def sensed_groups(observe: Iterable[str]) -> tuple[str, ...]:
     """Return the groups of observations of :data:`SENSES`; UsageError for another, or one that is privileged."""
-    found = []
+    groups = []
     for name in observe:
         if name in GROUPS and name != TACTILE:
             check_measured((name,), "A policy without a teacher")
         check_name("observation", name, SENSES)
-        found.append(SENSES[name])
-    return tuple(found)
+        groups.append(SENSES[name])
+    return tuple(groups)
 
 
 def sensing_policy(
@@ -39,7 +39,7 @@ def sensing_policy(
         if name not in env.observation_shapes:
             given = "make the environment with an observation type" if name == TACTILE else "leave it out"
             raise UsageError(f"Task {env.task.name!r} gives no {name!r} here: {given}.")
-    o, named = env.options, contacts_name(env.task.contacts)
+    o, contacts = env.options, contacts_name(env.task.contacts)
     senses: dict[str, Any] = {"observe": "none"}
     if "touch" in observe:
         senses = {name: getattr(o, name) for name in ("observe", "placement", "resolution", "noisy")} | {
@@ -47,5 +47,5 @@ def sensing_policy(
         }
     return DistillConfig(
         task=env.task.name, hand=str(env.hand.path or env.hand.name), embedder="lstm", hidden=settings.hidden,
-        num_envs=env.num_envs, seed=seed, contacts=named if named in CONTACTS else None, **senses,
+        num_envs=env.num_envs, seed=seed, contacts=contacts if contacts in CONTACTS else None, **senses,
     )  # fmt: skip

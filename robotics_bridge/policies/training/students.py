@@ -102,8 +102,8 @@ def train_student(
         placement=config.placement, resolution=config.resolution, noisy=config.noisy,
         seed=config.seed,
     )  # fmt: skip
-    named = contacts_name(task.contacts)
-    config = replace(config, contacts=named if named in CONTACTS else None)
+    contacts = contacts_name(task.contacts)
+    config = replace(config, contacts=contacts if contacts in CONTACTS else None)
     teacher = load_teacher(config.teacher, env)
     config = calibrated(config, env, teacher, out)
     result = distill(config, out, env=env, teacher=teacher, stop_after=stop_after, stop_at=stop_at, progress=progress)
@@ -117,12 +117,12 @@ def is_done(config: DistillConfig, out: Path) -> bool:
     if not (out / EVALUATION).is_file():
         return False
     mine = config.resolved(tasks.load(config.task, config.variant).student)
-    known = DistillConfig.of(read_mapping(out / CONFIG).get("distill", {}))
+    stored = DistillConfig.of(read_mapping(out / CONFIG).get("distill", {}))
     # Contacts and calibration that a student does not state are chosen when it begins.
-    settings = {**known.encoder_settings, **mine.encoder_settings}
-    mine = replace(mine, encoder_settings=settings, contacts=mine.contacts or known.contacts)
-    total = known.iterations or 0
-    return mine == known and all(item.get("iterations", total) >= total for item in read_json(out / EVALUATION))
+    settings = {**stored.encoder_settings, **mine.encoder_settings}
+    mine = replace(mine, encoder_settings=settings, contacts=mine.contacts or stored.contacts)
+    total = stored.iterations or 0
+    return mine == stored and all(item.get("iterations", total) >= total for item in read_json(out / EVALUATION))
 
 
 def calibrated(config: DistillConfig, env: Any, teacher: Any, out: Path) -> DistillConfig:
@@ -135,11 +135,11 @@ def calibrated(config: DistillConfig, env: Any, teacher: Any, out: Path) -> Dist
     if tactile is None or tactile.arm in ARMS or "calibration" in config.encoder_settings:
         return config
     if (out / CONFIG).is_file():
-        found = read_mapping(out / CONFIG).get("distill", {}).get("encoder_settings", {}).get("calibration")
+        measured = read_mapping(out / CONFIG).get("distill", {}).get("encoder_settings", {}).get("calibration")
     else:
-        found = asdict(_measure(tactile, env, teacher))
-    settings = dict(config.encoder_settings) if found is None else {**config.encoder_settings, "calibration": found}
-    return replace(config, encoder_settings=settings)
+        measured = asdict(_measure(tactile, env, teacher))
+    settings = {} if measured is None else {"calibration": measured}
+    return replace(config, encoder_settings={**config.encoder_settings, **settings})
 
 
 def _measure(tactile: EncoderConfig, env: Any, teacher: Any) -> HandCalibration:
@@ -165,15 +165,15 @@ def evaluate_student(
     so far.
     """
     student, _ = load_student(folder, device=str(env.device))
-    policy, found = Policy(student), []
+    policy, rows = Policy(student), []
     for seed in track(SEEDS[:evaluations], "evaluating", progress):
         result = evaluate(env, policy, episodes=episodes, seed=seed, name=Path(folder).name)
-        found.append(
+        rows.append(
             {
                 "seed": seed, "success": [float(item) for item in result.success], "diverged": result.diverged,
                 "iterations": iterations,
                 **{name: [float(item) for item in getattr(result, name)] for name in GRADED},
             }
         )  # fmt: skip
-    write_json(Path(folder) / EVALUATION, found)
-    return tuple(found)
+    write_json(Path(folder) / EVALUATION, rows)
+    return tuple(rows)

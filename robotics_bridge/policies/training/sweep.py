@@ -76,10 +76,10 @@ class StudentSweep:
         every = (*self.types, *self.extra_types)
         check_name("subset of the sweep", subset, (*SUBSETS, *every))
         each = product(self.entries, self.seeds)
-        found = [student for entry, seed in each for student in self._of_entry(entry, seed, subset, every)]
-        if twice := repeats(student.name for student in found):
+        students = [student for entry, seed in each for student in self._of_entry(entry, seed, subset, every)]
+        if twice := repeats(student.name for student in students):
             raise UsageError(f"The sweep {self.name!r} names the student {twice[0]!r} twice.")
-        return found
+        return students
 
     def _of_entry(self, entry: SweepEntry, seed: int, subset: str, every: Sequence[str]) -> list[DistillConfig]:
         common = {
@@ -157,12 +157,12 @@ def _sweep(path: Path, document: Mapping[str, Any]) -> StudentSweep:
     return sweep
 
 
-def _entry(item: Mapping[str, Any], settings: Mapping[str, Any]) -> SweepEntry:
-    check_each("key of a sweep's entry", item, _ENTRY)
+def _entry(table: Mapping[str, Any], settings: Mapping[str, Any]) -> SweepEntry:
+    check_each("key of a sweep's entry", table, _ENTRY)
     for key in ("task", "hand", "placements"):
-        if not item.get(key):
-            raise UsageError(f"An entry of a sweep needs {key!r}; received {shown(dict(item))}.")
-    own = {**settings, **item.get("settings", {})}
-    if "iterations" in item:
-        own["iterations"] = item["iterations"]
-    return SweepEntry(item["task"], item["hand"], tuple(item["placements"]), own)
+        if not table.get(key):
+            raise UsageError(f"An entry of a sweep needs {key!r}; received {shown(dict(table))}.")
+    combined = {**settings, **table.get("settings", {})}
+    if "iterations" in table:
+        combined["iterations"] = table["iterations"]
+    return SweepEntry(table["task"], table["hand"], tuple(table["placements"]), combined)

@@ -278,8 +278,8 @@ def test_what_a_frozen_network_gave_needs_no_memory_of_touch() -> None:
             given, own = front(obs[step]["tactile"], own)
             features.append(given)
         whole, _ = policy.unroll(obs, policy.zeros(2))
-        kept, after = policy.unroll(obs, policy.zeros(2, kept=True), None, torch.stack(features))
-    assert after.shape == (2, policy.core.kept_size)
+        kept, after = policy.unroll(obs, policy.zeros(2, stored=True), None, torch.stack(features))
+    assert after.shape == (2, policy.core.stored_size)
     torch.testing.assert_close(kept, whole, atol=1e-5, rtol=1e-4)
 
 
