@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from brainbench.cli.destinations import out_file_option, out_folder_option
+from brainbench.cli.destinations import out_file_option
 from brainbench.cli.model_card import model_card
 from brainbench.cli.output import Output, facts, list_without_command, progress_bar, table, table_of, tracked
 from brainbench.core.files import to_plain
@@ -124,30 +124,6 @@ def remove(
 
     made = remove_user_model(name)
     return Output(made, f"{made.name} is no longer a name of {made.target}; the code was not touched.")
-
-
-@app.command("import")
-def import_(
-    file: Annotated[Path, typer.Argument(help="Lightning .ckpt, state dict of PyTorch, or .safetensors.")],
-    architecture: Annotated[str | None, typer.Option(help="Registry name, where the file leaves a choice.")] = None,
-    config: Annotated[Path | None, typer.Option(help="The run's settings: config.yaml, or its graph in JSON.")] = None,
-    out: Annotated[Path | None, out_folder_option("Folder to write.")] = None,
-) -> Output:
-    """Turn weights of the published study into a model that can be scored; nothing in the file is executed."""
-    from brainbench.models.published.importing import import_checkpoint
-
-    with progress_bar("importing the weights"):
-        made = import_checkpoint(file, architecture=architecture, config=config, out=out)
-    left = ", ".join(f"{part} ({count} entries)" for part, count in made.not_imported.items())
-    shown = {
-        "architecture": made.architecture,
-        "decoder": made.decoder or "not in the file: drawn from seed 0",
-        "objective": made.objective or "not told by the file",
-        "parameters in the file": f"{made.parameters:,}",
-        "not part of the network": left or "nothing",
-        "score it with": f"brainbench score {made.name}",
-    }
-    return Output(made, facts(shown))
 
 
 def export(

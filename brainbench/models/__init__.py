@@ -11,11 +11,8 @@ from typing import TYPE_CHECKING
 
 from brainbench.core.lazy import lazy_exports
 from brainbench.models import zoo
-from brainbench.models.training.checkpoints import foreign_importers
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from brainbench.models.activations import extract
     from brainbench.models.registry import describe_model, list_models, load_model, register_model
     from brainbench.models.user_models import load_user_model
@@ -23,14 +20,5 @@ if TYPE_CHECKING:
 __all__ = ["describe_model", "extract", "list_models", "load_model", "load_user_model", "register_model"]
 
 zoo.register()
-
-
-def _import_foreign(path: Path, settings: Path | None) -> Path:
-    from brainbench.models.published.importing import import_to_cache
-
-    return import_to_cache(path, settings)
-
-
-foreign_importers.append(_import_foreign)
 
 __getattr__, __dir__ = lazy_exports(__name__)

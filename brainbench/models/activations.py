@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from brainbench.core.errors import BrainbenchError, UsageError, check_each, check_name
+from brainbench.core.errors import BrainbenchError, UsageError, check_each, unknown_name
+from brainbench.core.plugins import load_optional, optional_parts
 from brainbench.core.reading.ranges import check_number
 
 if TYPE_CHECKING:
@@ -24,6 +25,8 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 
+READOUTS = "brainbench.readouts"
+"""Entry points of ways to read layers other than the default."""
 OUTPUT = "output"
 """Layer name of a user model's own output."""
 _REPEATED = 0.05
@@ -69,7 +72,7 @@ def extract(
         folder: Keep every layer as ``<folder>/<layer>.npy``, which replaces an earlier one, and return them mapped
             into memory.
         readout: ``published`` reads a network of the study by its layer names and steps there; the mean of axis 1 is
-            then what was scored (:mod:`brainbench.models.published.readout`).
+            then what was scored (``brainbench/published``).
     """
     import torch
 
@@ -81,11 +84,8 @@ def extract(
     if not isinstance(values, torch.Tensor) and values.dtype.kind not in "fiub":
         raise UsageError(f"Stimuli are real numbers; received {values.dtype}.")
     like = next((p for p in model.parameters() if p.is_floating_point()), torch.zeros(()))
-    check_name("readout", readout, ("default", "published"))
-    if readout == "published":
-        from brainbench.models.published.readout import published_activations
-
-        named = reader = partial(published_activations, model, layers=layers)
+    if readout != "default":
+        named = reader = partial(find_readout(readout).activations, model, layers=layers)
     else:
         named = named_reader(model, layers)
         reader = named or partial(_hooked_run, model, _hooked(model, layers), layers is not None, {})
@@ -124,6 +124,13 @@ def extract(
             result.nonfinite[name] = count
             _log.warning("%d of %d activations of layer %r are not finite.", count, activity.size, name)
     return result
+
+
+def find_readout(name: str) -> Any:
+    """Return a readout: how layers are named (``layers(model)``) and read (``activations(model, x, layers)``)."""
+    if (readout := load_optional(READOUTS, name, "readout")) is None:
+        raise unknown_name("readout", name, ("default", *optional_parts(READOUTS)))
+    return readout
 
 
 def _check_repeated(result: Activations, again: Iterator[tuple[str, np.ndarray]], model: nn.Module) -> None:

@@ -1,4 +1,4 @@
-"""``brainbench stimuli convert``: the published study's sweeps and WHISKiT's runs into files of ours, and back."""
+"""``brainbench stimuli convert`` and ``models import``: published sweeps, runs and weights into files of ours."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from brainbench.cli.destinations import beside
+from brainbench.cli.destinations import beside, out_folder_option
 from brainbench.cli.options import refuse
 from brainbench.cli.output import Output, facts, progress_bar
 from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, listing
@@ -201,3 +201,26 @@ def _in_words(value: Any) -> str:
     if isinstance(value, Mapping):
         return "; ".join(f"{name}: {_in_words(item)}" for name, item in value.items() if item) or "none"
     return ", ".join(value) if isinstance(value, list) else f"{value:,}" if isinstance(value, int) else str(value)
+
+
+def import_model(
+    file: Annotated[Path, typer.Argument(help="Lightning .ckpt, state dict of PyTorch, or .safetensors.")],
+    architecture: Annotated[str | None, typer.Option(help="Registry name, where the file leaves a choice.")] = None,
+    config: Annotated[Path | None, typer.Option(help="The run's settings: config.yaml, or its graph in JSON.")] = None,
+    out: Annotated[Path | None, out_folder_option("Folder to write.")] = None,
+) -> Output:
+    """Turn weights of the published study into a model that can be scored; nothing in the file is executed."""
+    from brainbench.published.checkpoint_import import import_checkpoint
+
+    with progress_bar("importing the weights"):
+        made = import_checkpoint(file, architecture=architecture, config=config, out=out)
+    left = ", ".join(f"{part} ({count} entries)" for part, count in made.not_imported.items())
+    shown = {
+        "architecture": made.architecture,
+        "decoder": made.decoder or "not in the file: drawn from seed 0",
+        "objective": made.objective or "not told by the file",
+        "parameters in the file": f"{made.parameters:,}",
+        "not part of the network": left or "nothing",
+        "score it with": f"brainbench score {made.name}",
+    }
+    return Output(made, facts(shown))

@@ -86,12 +86,12 @@ class ResolvedModel:
         card, shown = replace(card, layer=options.layer or card.layer), None
         names = getattr(self.module, "layers", None) if self.module is not None else self.activations
         if options.readout == "published":
-            from brainbench.models.published.readout import published_layers
+            from brainbench.models.activations import find_readout
 
             if self.module is None:
                 raise UsageError("The published readout needs a network; these are features computed elsewhere.")
             # A committed layer goes by our names; theirs are other arrays, so only the caller can commit to one.
-            card, names = replace(card, layer=options.layer), published_layers(self.module)
+            card, names = replace(card, layer=options.layer), find_readout(options.readout).layers(self.module)
         if card.layer is not None and names is not None and card.layer not in (options.layers or names):
             raise unknown_name("layer", card.layer, options.layers or names)
         if labels is None:

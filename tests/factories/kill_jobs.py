@@ -325,7 +325,7 @@ JOBS = (
     KillJob("models export", 8, _export, modules=(*_CLI, "torch.export", "brainbench.models.export")),
     KillJob("stimuli convert, sweeps", 12, _convert, _write_tree, (*_CLI, "h5py", "brainbench.stimuli"), resumes=True),
     KillJob("stimuli convert, a run", 8, _convert_set, _write_set, (*_CLI, "h5netcdf", "brainbench.stimuli")),
-    KillJob("models import", 12, _import, _write_checkpoint, (*_CLI, "brainbench.models.published.importing")),
+    KillJob("models import", 12, _import, _write_checkpoint, (*_CLI, "brainbench.published.checkpoint_import")),
 )  # fmt: skip
 
 

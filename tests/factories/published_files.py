@@ -7,7 +7,7 @@ from functools import cached_property
 import numpy as np
 import torch
 
-from brainbench.models.published.names import published_names, stored_readout
+from brainbench.published.checkpoint_import import published_names, stored_readout
 
 STEPS = 22
 

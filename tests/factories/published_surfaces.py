@@ -11,11 +11,10 @@ import torch
 
 from brainbench.core.reading.tensors import read_tensors
 from brainbench.datasets import open_recordings
-from brainbench.models.published.files import read_settings, read_weights
-from brainbench.models.published.importing import build_published, import_checkpoint
-from brainbench.models.published.recognition import recognise
 from brainbench.models.registry import load_model
 from brainbench.models.training.checkpoints import WEIGHTS
+from brainbench.published.checkpoint_files import read_settings, read_weights, recognise
+from brainbench.published.checkpoint_import import build_published, import_checkpoint
 from brainbench.published.sweep_files import SweepFile, open_sweep_tree, read_sweep
 from brainbench.published.walk import explain_file
 from tests.factories.published_files import lightning_state

@@ -7,11 +7,12 @@ options it was built with; weights may be stored in half precision and are alway
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, check_name, listing, needing
+from brainbench.core.plugins import load_optional
 from brainbench.models.architecture import Architecture
 
 if TYPE_CHECKING:
@@ -24,8 +25,8 @@ PREFIXES = (LOCAL, HUB)
 """Beginnings of a model's name that is a folder or a repository instead of a registry name."""
 DTYPES = ("float32", "float16", "bfloat16")
 FOREIGN, SCORED, SETTINGS = "*.ckpt", "val_best.ckpt", "config.yaml"
-foreign_importers: list[Callable[[Path, Path | None], Path]] = []
-"""Functions that make a model's folder of a foreign file and its settings, if there are any; entered by the package."""
+IMPORTERS = "brainbench.checkpoints"
+"""Entry points of functions that make a model's folder of a foreign file and its settings (None without any)."""
 
 
 def save_checkpoint(
@@ -159,10 +160,11 @@ def _imported(folder: Path, source: str) -> Path:
             f"{source!r} holds {listing([os.fspath(path.relative_to(folder)) for path in found])}; name the folder of "
             "one of them, or import it with: brainbench models import FILE"
         )
-    if not found or not foreign_importers:
+    if not found:
         return folder
+    importer = load_optional(IMPORTERS, "published", "importer of published weights")
     settings = found[0].with_name(SETTINGS)
-    return foreign_importers[0](found[0], settings if settings.is_file() else None)
+    return importer(found[0], settings if settings.is_file() else None) if importer is not None else folder
 
 
 def shipped() -> dict[str, Path]:

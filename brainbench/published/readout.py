@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Collection, Iterable
+from dataclasses import dataclass
 
 import torch
 from torch import nn
@@ -124,3 +125,15 @@ def _through(x: torch.Tensor, layers: Layers) -> tuple[Named, torch.Tensor]:
     for name, layer in layers:
         x = found[name] = layer(x)
     return found, x
+
+
+@dataclass(frozen=True)
+class Readout:
+    """How layers are named and read."""
+
+    layers: Callable[[nn.Module], tuple[str, ...]]
+    activations: Callable[..., Named]
+
+
+READOUT = Readout(published_layers, published_activations)
+"""The published readout, as :func:`brainbench.models.activations.find_readout` gives it."""

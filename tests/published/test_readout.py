@@ -4,8 +4,8 @@ from torch import nn
 
 from brainbench.core.errors import UsageError
 from brainbench.models.activations import extract
-from brainbench.models.published.readout import published_activations, published_layers
 from brainbench.models.registry import load_model
+from brainbench.published.readout import published_activations, published_layers
 from tests.factories.training_sweeps import random_sweeps
 
 
