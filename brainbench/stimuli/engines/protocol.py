@@ -1,4 +1,7 @@
-"""What every physics engine does: whisker jobs (:mod:`brainbench.stimuli.motion.jobs`) go in, traces come out."""
+"""What every physics engine does: whisker jobs (:mod:`brainbench.stimuli.motion.jobs`) go in, traces come out.
+
+Here too: the results of many sweeps at once, and threads that share jobs.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Parts and surfaces of the obstacles that a whisker could ever touch. A scene costs only what it uses."""
+"""What a whisker could ever touch of its obstacles, so that a scene costs only what it uses, and planes it stays in."""
 
 from __future__ import annotations
 
@@ -143,6 +143,9 @@ _TINY = 1e-9
 """Share of a length, length (m) of a way, or sine of an angle, that counts as none."""
 
 
+# A whisker stays in a plane when base, forces and objects are mirror images of themselves in a plane through it, and
+# nothing moves across that. It then bends only, and its joints need no hinge for twist. A curved whisker has one such
+# plane, a straight one has many: those of its loads and of round pegs are tried. Letters: n time, p part.
 def stays_in_plane(
     job: Job, reach: Reach, position: NDArray[np.float64], euler: NDArray[np.float64], times: NDArray[np.float64]
 ) -> bool:

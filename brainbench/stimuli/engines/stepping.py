@@ -50,6 +50,9 @@ LEAST_TAPER = 1e-6
 _SIDES = 8
 
 
+# The collision shape of a tapered link is a slim cone with a margin. A staircase of capsules turns the force of a peg
+# that sits on a step dr by up to √(2 dr/R). The cone has the taper as its surface and the margin rounds it, so its
+# facets are smaller than dr and do not matter.
 def cone_vertices(core: float, length: float, *, narrows: bool) -> NDArray[np.float64]:
     """Return the vertices [9, 3] (mm) of the cone inside a link along x, ``core`` (mm) being the radius of its base.
 
@@ -66,6 +69,7 @@ PARTS = 8
 """Parts of a link at whose ends its overlap is measured."""
 
 
+# Inside a convex body the distance from its surface is the least over its faces: no search, no limit. All in metres.
 def part_depth(part: Part, points: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return how deep [n] points [n, 3] lie in a body; below zero outside, where it is no farther than that."""
     match part:

@@ -1,6 +1,7 @@
-"""Whether measured wrenches can be those of a trial at all: their clock, unit and sign, before anything is fitted.
+"""Whether measured wrenches can be those of a trial at all, and whether residuals look like noise.
 
-A wrong unit or sign leads least squares to a bound and not to a sentence; a wrong clock makes it simulate for minutes.
+A wrong unit or sign leads least squares to a bound and not to a sentence, so wrenches are looked at before anything is
+fitted. Letters: m reading, p parameter.
 """
 
 from __future__ import annotations
@@ -133,6 +134,16 @@ class ResidualTest:
     passed: bool
 
 
+# A model that is wrong leaves residuals whose neighbours agree. The statistic of an ordering is S = Σ rᵢ rⱼ over pairs
+# of readings at most three places apart. After a fit the residuals are (1 − Q Qᵀ) ε, with an orthonormal basis Q [m, p]
+# of the Jacobian's columns, so mean and variance of S = rᵀ W r under white noise are known exactly (Durbin & Watson
+# 1950, Biometrika 37, 409-428, for the lag of one):
+#
+#     E S = −σ² tr(QᵀWQ),   var S = 2 σ⁴ (tr W² − 2 tr(QᵀW²Q) + tr((QᵀWQ)²))
+#
+# The test is one-sided: agreement counts, and a normal law is taken for S. Residuals that swing have no sum S where
+# eight readings make a swing, and a negative one below. So the squares of the deviates of single lags over time are
+# also added up, as by Ljung & Box (1978, Biometrika 65, 297-303), and compared with the chi-square law.
 def check_residuals(residual: Array, jacobian: Array, readings: Readings) -> tuple[ResidualTest, ...]:
     """Return the tests of whitened residuals [m] with their Jacobian [m, p]; each at its share of :data:`ALPHA`."""
     from scipy.special import chdtrc, ndtr

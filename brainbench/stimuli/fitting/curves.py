@@ -1,7 +1,7 @@
-"""Distances of traced points from the smooth curve through the nodes of a simulated whisker.
+"""Curves of whiskers: distances of traced points from them, and their shapes under one contact.
 
 Letters: n instant, N link, k traced point, m sample along the curve, d = 1 direction across a curve in a plane, 2 in
-space.
+space, b shape of a batch.
 """
 
 from __future__ import annotations
@@ -85,6 +85,13 @@ BEYOND = 12
 """Samples from the contact to the tip."""
 
 
+# With the angle ψ of the rod against its direction at the contact, the equations of the elastica (Antman 2005,
+# Nonlinear Problems of Elasticity, chapter 4) from the contact at arc a back to the base are
+#
+#     dψ/ds = κ₀(s) + M/(E I(s)),   dM/ds = −f cos ψ,   ψ(a) = 0,   M(a) = 0
+#
+# for a force f normal to the rod. They need no angle and no position: those of the base turn and move the finished
+# shape, so no boundary-value problem is solved. Beyond the contact the rod has its rest curvature.
 @dataclass(frozen=True, eq=False)
 class LoadedShapes:
     """Shapes of a whisker under one contact each; sampled from the base to the tip."""
@@ -121,7 +128,7 @@ class LoadedShapes:
 
 
 class LoadedWhisker:
-    """A whisker whose shapes under a contact are asked for."""
+    """A clamped whisker that one frictionless contact bends by any amount, in its plane."""
 
     def __init__(self, whisker: Whisker) -> None:
         self.whisker = whisker

@@ -2,8 +2,8 @@
 
 Two objects a, b that are felt with white noise of standard deviation σ in each reading are apart by Mahalanobis'
 distance D, D² = Σ ((wₐ − w_b)/σ)² over the readings, whiskers and components of a whisk. D² of n whisks is n times that
-of one, so a motion with twice the D² needs half the whisks. The smallest D² of all pairs is raised by its gradient, for
-which one pass goes back over the simulation (:mod:`brainbench.stimuli.fitting.gradients`).
+of one, so a motion with twice the D² needs half the whisks. The smallest D² of all pairs is raised by its gradient
+(:mod:`brainbench.stimuli.fitting.gradients`).
 """
 
 from __future__ import annotations

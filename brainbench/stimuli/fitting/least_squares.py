@@ -1,4 +1,7 @@
-"""Fit parameters of whiskers to measurements by nonlinear least squares."""
+"""Fit parameters of whiskers to measurements by nonlinear least squares, with confidence intervals.
+
+Letters: m residual, p parameter. Sums of squares S are of whitened residuals, priors included as residuals.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The model of a fit: coordinates of the parameters → residuals over all trials, whitened by the noise.
+"""The model of a fit: coordinates of the parameters → whitened residuals over all trials, and where a fit begins.
 
 Letters: m reading, p parameter, g noise group (a channel of a wrench, or shapes).
 """
@@ -261,6 +261,9 @@ PER_SWING = 6
 _FEWEST, _MOST_POINTS = 9, 129
 
 
+# A swing that begins out of step leads least squares to a wrong number of swings, and readings rarer than two in a
+# period fit several frequencies equally well. Both are local minima of the likelihood over the one parameter that sets
+# the frequency, so that parameter is scanned before the fit, finely enough that no minimum lies between two points.
 def scanned(model: FitModel) -> int | None:
     """Return the index of the parameter whose range is scanned; None when no trial is a ring-down, or it is known."""
     if not any(trial.pluck for trial in model.trials):

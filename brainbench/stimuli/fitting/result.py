@@ -1,4 +1,4 @@
-"""Result of a fit: estimates with intervals, noise, tests of the residuals, and whether any of it can be trusted."""
+"""Result of a fit: estimates with intervals, combinations that the data tell, and whether any of it can be trusted."""
 
 from __future__ import annotations
 
@@ -22,6 +22,9 @@ MEMBER = 0.1
 """Share of the largest component of a direction from which a parameter belongs to it."""
 
 
+# With whitened residuals of Jacobian J [m, p] the Fisher information is JᵀJ (Seber & Wild 2003, Nonlinear Regression,
+# chapter 2). A direction v with singular value s is known with a standard deviation of 1/s: along it, coordinates may
+# change by that much without the data noticing.
 @dataclass(frozen=True, eq=False)
 class Direction:
     """A combination of parameters that the data tell to a known precision."""
@@ -89,8 +92,7 @@ def _listed(names: Sequence[str]) -> str:
 
 
 def unknown_parameters(combinations: Sequence[Direction]) -> dict[str, Direction]:
-    """Return the parameters that take part in a direction that is not identified, each with the worst such "
-    "direction."""
+    """Return the parameters that take part in a direction that is not identified, each with the worst such one."""
     worst: dict[str, Direction] = {}
     for direction in combinations:
         if not direction.identified:

@@ -42,6 +42,8 @@ TOLERANCE = 1e-9
 """Relative change of the forces in one sweep at which they count as solved."""
 
 
+# Contacts of one step with Coulomb friction are solved together with the implicit springs. Rows of a contact are its
+# normal and two tangents; m contact.
 def contact_axes(normal: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return rows [3, 3]: the unit ``normal`` and two tangents that complete a right-handed frame.
 

@@ -32,6 +32,9 @@ ARMATURE = 1e9
 reaction (µN·m) deflect the follicle."""
 
 
+# A MuJoCo mocap body teleports and has no velocity. Instead every moving coordinate is a joint of huge armature B,
+# pushed by B times the second difference of its trajectory: the discrete integrator then reproduces the trajectory,
+# with the right velocity, to rounding.
 @dataclass(frozen=True, eq=False)
 class PrescribedMotion:
     """Prescribed positions and velocities of some joints and the accelerations that produce them."""

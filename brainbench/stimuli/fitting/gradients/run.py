@@ -179,15 +179,6 @@ class GradientRun:
     def _widths(self) -> NDArray[np.float64]:
         return 1e-4 * self.scales
 
-    def describe(self) -> str:
-        """Say in words how the jobs were launched: each launch has a thread a whisker and kernels of its kind."""
-        launches = [
-            f"{len(group.indices)} whiskers of {hinges} hinges a joint in {len(group.solver.checkpoints)} parts"
-            for group in self._groups
-            for hinges in (3 if group.packed.tasks[0].twists else 2,)
-        ]
-        return f"{len(launches)} launches: {'; '.join(launches)}"
-
     @cached_property
     def _rows(self) -> list[tuple[_Group, int]]:
         """Group of each job, and its row there."""

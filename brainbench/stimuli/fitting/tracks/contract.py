@@ -4,6 +4,9 @@
 (N, N·m): action of the whisker on its base about the base point, some of the channels Fx … Mz. ``time`` [s] increases.
 A variable ``noise`` may hold the standard deviation of one reading, one number for shapes or [channel] for wrenches,
 from repeats.
+
+Faults of shapes are gaps, whiskers that change places, wrong units, shapes longer than the whisker. What can be used
+stays and is counted; what cannot be true is refused in one sentence. Letters: n frame, k point.
 """
 
 from __future__ import annotations
@@ -124,8 +127,8 @@ LONGER = 1.1
 UNITS = 5.0
 """The same ratio, or its inverse, from which the unit is wrong and not the whisker."""
 JUMP = 8.0
-"""Step of the base over the usual step from which it is a jump; a jump must also be a share :data:`FAR` of the "
-"length."""
+"""Step of the base over the usual step from which it is a jump; a jump must also be a share :data:`FAR` of the
+length."""
 FAR = 0.1
 
 

@@ -25,6 +25,9 @@ Columns = dict[tuple[str, str, str], Array]
 """[n] of each individual ("" without), body part and coordinate."""
 
 
+# Points of DeepLabCut (Mathis et al. 2018, Nat. Neurosci. 21, 1281): the CSV and HDF5 tables of analysed videos. Three
+# lines of names (scorer, bodyparts, coords; four with individuals) stand above x, y and likelihood of each body part.
+# HDF5 tables of pandas keep their names as a pickle; it is taken apart word by word and never loaded.
 def read_deeplabcut(path: str | os.PathLike[str], options: TrackOptions) -> tuple[NDArray[np.int_], Array]:
     """Return frame numbers [n] and points [n, k, 2 or 3] (pixels) of one whisker."""
     name = shown(os.fspath(path))
@@ -101,59 +104,36 @@ def frame_numbers(values: Array, path: str | os.PathLike[str]) -> NDArray[np.int
     return values.astype(int)
 
 
-def pickled_names(data: bytes, name: str) -> list[tuple[str, ...]]:  # noqa: PLR0912 — a branch for each word
+def pickled_names(data: bytes, name: str) -> list[tuple[str, ...]]:
     """Return the list of tuples of texts that a pickle spells out, without loading it."""
-    stack: list[Any] = []
-    memo: dict[int, Any] = {}
-    mark = object()
-
-    def above_mark() -> list[Any]:
-        place = len(stack) - 1 - stack[::-1].index(mark)
-        entries = stack[place + 1 :]
-        del stack[place:]
-        return entries
-
+    rows: list[tuple[str, ...]] = []
+    texts: list[str] = []
+    memo: dict[int, str | None] = {}
     try:
-        for code, argument, _ in pickletools.genops(data):
-            match code.name:
-                case "PROTO" | "FRAME" | "STOP":
-                    pass
-                case "UNICODE" | "BINUNICODE" | "SHORT_BINUNICODE":
-                    stack.append(argument)
-                case "MARK":
-                    stack.append(mark)
-                case "LIST":
-                    stack.append(above_mark())
-                case "TUPLE":
-                    stack.append(tuple(above_mark()))
-                case "EMPTY_LIST":
-                    stack.append([])
-                case "TUPLE1" | "TUPLE2" | "TUPLE3":
-                    count = int(code.name[-1])
-                    stack[-count:] = [tuple(stack[-count:])]
-                case "APPEND":
-                    entry = stack.pop()
-                    stack[-1].append(entry)
-                case "APPENDS":
-                    entries = above_mark()
-                    stack[-1].extend(entries)
-                case "PUT" | "BINPUT" | "LONG_BINPUT":
-                    memo[int(argument or 0)] = stack[-1]
-                case "MEMOIZE":
-                    memo[len(memo)] = stack[-1]
-                case "GET" | "BINGET" | "LONG_BINGET":
-                    stack.append(memo[int(argument or 0)])
-                case unexpected:
-                    raise DataError(f"The names of the columns of {name} are not plain texts ({unexpected}).")
-    except (ValueError, IndexError, KeyError, AttributeError) as error:
+        for opcode, argument, _ in pickletools.genops(data):
+            if opcode.name in ("UNICODE", "BINUNICODE", "SHORT_BINUNICODE"):
+                texts.append(argument)
+            elif opcode.name in ("GET", "BINGET", "LONG_BINGET"):
+                texts.append(memo[int(argument or 0)] or "")
+            elif opcode.name in ("PUT", "BINPUT", "LONG_BINPUT", "MEMOIZE"):
+                # What is put away is the last text, or else a list or a tuple, which no name asks for again.
+                memo[len(memo) if opcode.name == "MEMOIZE" else int(argument or 0)] = texts[-1] if texts else None
+            elif opcode.name in ("TUPLE", "TUPLE1", "TUPLE2", "TUPLE3"):
+                rows.append(tuple(texts))
+                texts = []
+            elif opcode.name not in ("PROTO", "FRAME", "STOP", "MARK", "LIST", "EMPTY_LIST", "APPEND", "APPENDS"):
+                raise DataError(f"The names of the columns of {name} are not plain texts ({opcode.name}).")
+    except (ValueError, KeyError) as error:
         raise DataError(f"The names of the columns of {name} cannot be read ({error}).") from error
-    if len(stack) != 1 or not all(
-        isinstance(row, tuple) and len(row) in (3, 4) and all(isinstance(word, str) for word in row) for row in stack[0]
-    ):
+    if texts or not rows or not all(len(row) in (3, 4) and all(row) for row in rows):
         raise DataError(f"The columns of {name} are not named by scorer, body part and coordinate.")
-    return stack[0]
+    return rows
 
 
+# Tracks of WhiskerMan (Petersen et al. 2020, PLoS Comput. Biol. 16, e1007402): .tr4, .tr4_2D and .mat. The struct array
+# "whisker" holds, for each whisker, the control points of a Bézier curve in every frame, whether it was tracked, and
+# its follicle (pixels). Read are MATLAB's formats up to 7, and 7.3, which is HDF5. As many points are taken of a curve
+# as it has control points: more would repeat the same numbers.
 _STRUCT_FIELDS = ("r3all", "tracked", "fp3_all")
 
 

@@ -77,8 +77,8 @@ def _read_segments(path: str | os.PathLike[str]) -> Segments:
 
 
 def _parse_binary(data: bytes, name: str) -> Segments:
-    """Return the traces of records of three int32 (number, frame, length) and four float32 lists: x, y, width, "
-    "score."""
+    """Return the traces of records of three int32 (number, frame, length) and four float32 lists: x, y, width,
+    score."""
     segments: Segments = {}
     place, end = len(_HEADER), len(data) - 4
     while place < end:

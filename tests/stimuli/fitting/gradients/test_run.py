@@ -195,7 +195,7 @@ def test_whiskers_of_different_frames_and_lengths_share_parameters():
     parameters = JobParameters([first, second], ("young_modulus", "density"))
     run = GradientRun(parameters.build, parameters.values, fidelity=COARSE)
     # Frames differ, so that each has a launch of its own; the second bends in space and is short.
-    assert run.describe().startswith("2 launches: 1 whiskers of 3 hinges a joint in ")
+    assert len(run._groups) == 2
     weights = [np.ones((30, 6)), np.ones((2, 6))]
     gradient = run.gradient(weights)
     for index, job in enumerate((first, second)):
