@@ -20,10 +20,10 @@ from robotics_bridge.physics.selection import EnvIds, select_envs
 from robotics_bridge.physics.state import MOST_ENVS, HandState
 from robotics_bridge.sensors.context import memory_of
 from robotics_bridge.sensors.fidelity import SensorFidelity
+from robotics_bridge.sensors.kernels.pairs import clear_readings, count_update, reset_clock
 from robotics_bridge.sensors.plausibility import warn_of
 from robotics_bridge.sensors.probes.runtime import DistanceRuntime
 from robotics_bridge.sensors.probes.sensors import SurfaceDistanceProbe
-from robotics_bridge.sensors.queries.kernels.pairs import clear_readings, count_update, reset_clock
 from robotics_bridge.sensors.queries.pairs import DIVERGED, OVERFULL, UNFELT, PairTable
 from robotics_bridge.sensors.queries.solids import Solids
 from robotics_bridge.sensors.runtime import History, Runtime, SuiteContext

@@ -12,8 +12,8 @@ from brainbench.core.devices import warp
 from brainbench.core.errors import UsageError, check_kind
 from brainbench.core.reading.ranges import check_fields, check_number
 from robotics_bridge.physics.state import HandState
-from robotics_bridge.sensors.audio.kernels import sound as k
 from robotics_bridge.sensors.audio.sensors import AudioSensor
+from robotics_bridge.sensors.kernels import sound as k
 from robotics_bridge.sensors.suite import SensorSuite
 
 

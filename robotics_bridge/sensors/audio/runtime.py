@@ -13,7 +13,9 @@ import torch
 from brainbench.core.devices import warp
 from brainbench.core.reading.ranges import check_number
 from robotics_bridge.physics.state import HandState
-from robotics_bridge.sensors.audio.kernels.sound import (
+from robotics_bridge.sensors.audio.sensors import ActuationAudio, ContactAudio
+from robotics_bridge.sensors.context import fill
+from robotics_bridge.sensors.kernels.sound import (
     ContactSoundArrays,
     DriveSoundArrays,
     DriveSoundParams,
@@ -23,8 +25,6 @@ from robotics_bridge.sensors.audio.kernels.sound import (
     ring_modes,
     sound_drives,
 )
-from robotics_bridge.sensors.audio.sensors import ActuationAudio, ContactAudio
-from robotics_bridge.sensors.context import fill
 from robotics_bridge.sensors.noise.model import stream_key
 from robotics_bridge.sensors.runtime import Runtime, SuiteContext
 from robotics_bridge.sensors.suite import SensorSuite

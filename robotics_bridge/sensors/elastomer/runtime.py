@@ -12,19 +12,18 @@ import torch
 from brainbench.core.devices import warp
 from robotics_bridge.physics.state import HandState
 from robotics_bridge.sensors.context import ReadoutSlice, fill
-from robotics_bridge.sensors.elastomer.kernels.anchors import anchor_kernel
-from robotics_bridge.sensors.elastomer.kernels.dilation import (
+from robotics_bridge.sensors.elastomer.taxel import ElastomerTaxel, Layer
+from robotics_bridge.sensors.kernels.dilation import (
     ElastomerArrays,
     GelParams,
     indent_kernel,
     marker_kernel,
     spread_kernel,
 )
-from robotics_bridge.sensors.elastomer.kernels.shear import CHUNK, sum_shear
-from robotics_bridge.sensors.elastomer.taxel import ElastomerTaxel, Layer
+from robotics_bridge.sensors.kernels.proximity import BLOCK, CloudArrays
+from robotics_bridge.sensors.kernels.shear import CHUNK, anchor_kernel, sum_shear
 from robotics_bridge.sensors.queries.surface_points import sample_cloud
 from robotics_bridge.sensors.runtime import ProbeRuntime, SuiteContext
-from robotics_bridge.sensors.taxels.kernels.proximity import BLOCK, CloudArrays
 
 wp = warp()
 

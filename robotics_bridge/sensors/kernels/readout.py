@@ -7,14 +7,14 @@ from functools import cache
 from types import SimpleNamespace
 
 from brainbench.core.devices import warp
-from robotics_bridge.sensors.kernels.wide import load_planes, store_planes
-from robotics_bridge.sensors.noise.kernels.noise import (
+from robotics_bridge.sensors.kernels.noise import (
     NoiseParams,
     apply_drawn,
     decay,
     episode_draw,
     pair_normals,
 )
+from robotics_bridge.sensors.kernels.wide import load_planes, store_planes
 
 wp = warp()
 

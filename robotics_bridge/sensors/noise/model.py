@@ -2,7 +2,7 @@
 
 Order of the measured branch: radius noise and gain → crosstalk → hysteresis → random walk → white noise → bias →
 quantisation → dead probes → threshold → delay. The ground truth is never touched. Values are drawn by counter
-(:mod:`robotics_bridge.sensors.noise.kernels.noise`): they depend on seed, sensor name, environment, episode, update,
+(:mod:`robotics_bridge.sensors.kernels.noise`): they depend on seed, sensor name, environment, episode, update,
 probe and channel, and on nothing else. Letters: B environment, N probe, C channel; arrays are planar [C, B, N].
 """
 

@@ -17,7 +17,7 @@ from brainbench.core.devices import pick_device, warp
 from brainbench.core.errors import UsageError
 from brainbench.core.reading.ranges import check_number
 from robotics_bridge.sensors.context import LaunchContext, ReadoutSlice, fill
-from robotics_bridge.sensors.noise.kernels.noise import NoiseParams, crosstalk, delay_line, measure
+from robotics_bridge.sensors.kernels.noise import NoiseParams, crosstalk, delay_line, measure
 from robotics_bridge.sensors.noise.model import Noise, stream_key
 
 wp = warp()

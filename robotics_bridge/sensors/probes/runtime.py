@@ -9,7 +9,7 @@ import numpy as np
 
 from brainbench.core.devices import warp
 from robotics_bridge.physics.state import HandState
-from robotics_bridge.sensors.probes.kernels.probe import depth_kernel, distance_kernel
+from robotics_bridge.sensors.kernels.probe import depth_kernel, distance_kernel
 from robotics_bridge.sensors.probes.sensors import ContactDepthProbe, ContactProbe, SurfaceDistanceProbe
 from robotics_bridge.sensors.runtime import ProbeRuntime, SuiteContext
 

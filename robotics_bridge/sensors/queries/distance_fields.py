@@ -13,7 +13,7 @@ from brainbench.core.files import cache_dir
 from brainbench.core.reading.ranges import check_number
 from brainbench.core.reading.sealed import read_sealed, write_sealed
 from brainbench.geometry import Mesh
-from robotics_bridge.sensors.queries.kernels import distance
+from robotics_bridge.sensors.kernels import distance
 
 _FORMAT = 3
 

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from brainbench.core.devices import to_struct, warp
 from robotics_bridge.physics.state import HandState
 from robotics_bridge.sensors.context import LaunchContext
-from robotics_bridge.sensors.queries.kernels.pairs import CONTACTS, PairArrays, SlotArrays, pair_kernel, start_kernel
+from robotics_bridge.sensors.kernels.pairs import CONTACTS, PairArrays, SlotArrays, pair_kernel, start_kernel
 from robotics_bridge.sensors.queries.solids import Solids
 
 DIVERGED = 1

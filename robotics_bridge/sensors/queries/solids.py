@@ -12,8 +12,8 @@ from brainbench.core.devices import to_struct
 from brainbench.core.errors import UsageError
 from brainbench.geometry import Mesh
 from robotics_bridge.physics.scene import KINDS, Geometry, TouchScene
+from robotics_bridge.sensors.kernels.distance import OTHER, WALL, SolidArrays
 from robotics_bridge.sensors.queries.distance_fields import Field, mesh_tree, sample_field
-from robotics_bridge.sensors.queries.kernels.distance import OTHER, WALL, SolidArrays
 from robotics_bridge.sensors.queries.walls import as_solid, wall_thickness
 
 _UNBOUNDED = 1.0e6

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from brainbench.core.devices import to_struct
 from robotics_bridge.physics.scene import Geometry
+from robotics_bridge.sensors.kernels.proximity import BLOCK, CellArrays, CloudArrays
 from robotics_bridge.sensors.probes.placement import cover_evenly, face_areas
 from robotics_bridge.sensors.queries.solids import Solids, tessellate
-from robotics_bridge.sensors.taxels.kernels.proximity import BLOCK, CellArrays, CloudArrays
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,9 +12,9 @@ from brainbench.core.errors import UsageError
 from brainbench.geometry import Mesh
 from brainbench.geometry.distance import sample_surface
 from brainbench.geometry.mesh_repair import repair
+from robotics_bridge.sensors.kernels.distance import measure_walls
 from robotics_bridge.sensors.probes.placement import face_areas
 from robotics_bridge.sensors.queries.distance_fields import mesh_tree
-from robotics_bridge.sensors.queries.kernels.distance import measure_walls
 
 RESOLVED = 4.0
 """Cells across a wall from which a distance field tells its two sides apart."""

@@ -10,9 +10,9 @@ from scipy.spatial import KDTree
 
 from brainbench.core.devices import warp
 from robotics_bridge.physics.state import HandState
+from robotics_bridge.sensors.kernels import contact_load as kernels
 from robotics_bridge.sensors.probes.placement import Probes
 from robotics_bridge.sensors.runtime import SuiteContext
-from robotics_bridge.sensors.taxels.kernels import contact_load as kernels
 from robotics_bridge.sensors.taxels.runtime import KinematicRuntime
 from robotics_bridge.sensors.taxels.sensors import KinematicTaxel
 

@@ -10,13 +10,12 @@ import numpy as np
 from brainbench.core.devices import warp
 from robotics_bridge.physics.state import HandState
 from robotics_bridge.sensors.context import fill
+from robotics_bridge.sensors.kernels.contact_load import ContactNodes, PressArrays, SpreadPlan
+from robotics_bridge.sensors.kernels.kinematic import KinematicParams, StickArrays, kinematic_kernel
+from robotics_bridge.sensors.kernels.proximity import ProximityArrays, ProximityParams, proximity_kernel
 from robotics_bridge.sensors.kernels.readout import FUSED
 from robotics_bridge.sensors.queries.surface_points import list_by_cells, sample_cloud
 from robotics_bridge.sensors.runtime import ProbeRuntime, SuiteContext, probe_rows
-from robotics_bridge.sensors.taxels.kernels.contact_load import ContactNodes, PressArrays, SpreadPlan
-from robotics_bridge.sensors.taxels.kernels.kinematic import KinematicParams, kinematic_kernel
-from robotics_bridge.sensors.taxels.kernels.proximity import ProximityArrays, ProximityParams, proximity_kernel
-from robotics_bridge.sensors.taxels.kernels.stick import StickArrays
 from robotics_bridge.sensors.taxels.sensors import KinematicTaxel, ProximityTaxel
 
 wp = warp()

@@ -14,10 +14,7 @@ from numpy.typing import NDArray
 from brainbench.core.devices import warp
 from robotics_bridge.physics.state import HandState
 from robotics_bridge.sensors.context import fill
-from robotics_bridge.sensors.runtime import Runtime, SuiteContext
-from robotics_bridge.sensors.suite import SensorSuite
-from robotics_bridge.sensors.temperature.grid import TemperatureGrid
-from robotics_bridge.sensors.temperature.kernels.heat import (
+from robotics_bridge.sensors.kernels.heat import (
     CAPACITY,
     HeatArrays,
     ThermalParams,
@@ -27,6 +24,9 @@ from robotics_bridge.sensors.temperature.kernels.heat import (
     exchange_heat,
     sense_temperature,
 )
+from robotics_bridge.sensors.runtime import Runtime, SuiteContext
+from robotics_bridge.sensors.suite import SensorSuite
+from robotics_bridge.sensors.temperature.grid import TemperatureGrid
 from robotics_bridge.sensors.temperature.materials import ThermalBody, material
 
 wp = warp()

@@ -25,9 +25,8 @@ from robotics_bridge.sensors import (
     TemperatureGrid,
 )
 from robotics_bridge.sensors.audio.materials import Modes
-from robotics_bridge.sensors.elastomer.kernels import dilation
-from robotics_bridge.sensors.probes.kernels import probe as _probe_kernels
-from robotics_bridge.sensors.taxels.kernels import kinematic, proximity
+from robotics_bridge.sensors.kernels import dilation, kinematic, proximity
+from robotics_bridge.sensors.kernels import probe as _probe_kernels
 from tests.factories.touch_scenes import PAD, move_all, pad_scene, poses_at, random_pose, state_of
 
 BALL = Geometry(name="ball", link="object", kind="sphere", size=(0.01,))

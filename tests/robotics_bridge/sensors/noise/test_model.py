@@ -23,7 +23,7 @@ def _constant(value: float = 0.0, steps: int = 50, envs: int = 40, probes: int =
 @cache
 def _words_kernel():
     from brainbench.core.devices import warp
-    from robotics_bridge.sensors.noise.kernels.noise import philox
+    from robotics_bridge.sensors.kernels.noise import philox
 
     wp = warp()
 
@@ -122,7 +122,7 @@ def test_dead_probes_are_as_many_as_asked_for_and_stuck_at_one_value_in_all_chan
 @cache
 def _radius_kernel():
     from brainbench.core.devices import warp
-    from robotics_bridge.sensors.noise.kernels.noise import NoiseParams, radius_noise
+    from robotics_bridge.sensors.kernels.noise import NoiseParams, radius_noise
 
     wp = warp()
 

@@ -12,10 +12,12 @@ the second. Vectors are in the frame of the sensor link (m, N).
 Letters: B environment, L link, S sensor, C contact, N taxel, K sensor of one link.
 """
 
+from __future__ import annotations
+
 from brainbench.core.devices import warp
 from robotics_bridge.physics.kernels.state import StateArrays, in_scene
+from robotics_bridge.sensors.kernels.pairs import SlotArrays
 from robotics_bridge.sensors.kernels.readout import ProbeArrays, ReadoutArrays
-from robotics_bridge.sensors.queries.kernels.pairs import SlotArrays
 
 wp = warp()
 

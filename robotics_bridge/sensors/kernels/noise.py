@@ -9,6 +9,8 @@ Order of the measured branch: radius noise and gain → crosstalk → hysteresis
 quantisation → dead taxels → (threshold, by the sensor) → delay. Letters: B environment, N probe, C channel.
 """
 
+from __future__ import annotations
+
 from typing import Any
 
 from brainbench.core.devices import warp

@@ -3,10 +3,12 @@
 Letters: B environment, S source or sensor, K sample of a block, M mode, J joint. Planes are [K, B, S].
 """
 
+from __future__ import annotations
+
 from brainbench.core.devices import warp
 from robotics_bridge.physics.kernels.state import StateArrays, in_scene
+from robotics_bridge.sensors.kernels.noise import draw, normals
 from robotics_bridge.sensors.kernels.readout import ReadoutArrays
-from robotics_bridge.sensors.noise.kernels.noise import draw, normals
 
 wp = warp()
 

@@ -4,14 +4,16 @@ Equation numbers are those of the thesis. Vectors are in the frame of the sensor
 Letters: B environment, N probe, R row of probes that one thread takes in turn.
 """
 
+from __future__ import annotations
+
 from functools import cache
 from typing import Any
 
 from brainbench.core.devices import warp
+from robotics_bridge.sensors.kernels.distance import FAR, WALL, SolidArrays, shape_functions
+from robotics_bridge.sensors.kernels.noise import episode_draw, radius_noise
+from robotics_bridge.sensors.kernels.pairs import PairArrays
 from robotics_bridge.sensors.kernels.readout import CLEAN, ProbeArrays, ReadoutArrays, readout_functions, silenced
-from robotics_bridge.sensors.noise.kernels.noise import episode_draw, radius_noise
-from robotics_bridge.sensors.queries.kernels.distance import FAR, WALL, SolidArrays, shape_functions
-from robotics_bridge.sensors.queries.kernels.pairs import PairArrays
 
 wp = warp()
 

@@ -4,16 +4,18 @@ Thesis 4.17–4.21, and the layer terms derived in docs/elastomers.md. Vectors a
 Letters: B environment, N marker, P surface point, S sensor of the group.
 """
 
+from __future__ import annotations
+
 from functools import cache
 from typing import Any
 
 from brainbench.core.devices import warp
+from robotics_bridge.sensors.kernels.distance import SolidArrays
+from robotics_bridge.sensors.kernels.noise import episode_draw, radius_noise
+from robotics_bridge.sensors.kernels.pairs import PairArrays
+from robotics_bridge.sensors.kernels.probe import deepest_function
+from robotics_bridge.sensors.kernels.proximity import BLOCK, CloudArrays
 from robotics_bridge.sensors.kernels.readout import ProbeArrays, ReadoutArrays, readout_functions, silenced
-from robotics_bridge.sensors.noise.kernels.noise import episode_draw, radius_noise
-from robotics_bridge.sensors.probes.kernels.probe import deepest_function
-from robotics_bridge.sensors.queries.kernels.distance import SolidArrays
-from robotics_bridge.sensors.queries.kernels.pairs import PairArrays
-from robotics_bridge.sensors.taxels.kernels.proximity import BLOCK, CloudArrays
 
 wp = warp()
 

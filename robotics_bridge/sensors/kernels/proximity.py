@@ -3,11 +3,15 @@
 Letters: B environment, N taxel, P surface point, K block of points, R variant row, G geometry, S sensor.
 """
 
+from __future__ import annotations
+
 from functools import cache
 from typing import Any
 
 from brainbench.core.devices import warp
 from robotics_bridge.physics.kernels.state import StateArrays
+from robotics_bridge.sensors.kernels.noise import episode_draw, radius_noise
+from robotics_bridge.sensors.kernels.pairs import PairArrays
 from robotics_bridge.sensors.kernels.readout import (
     CLEAN,
     FUSED,
@@ -16,8 +20,6 @@ from robotics_bridge.sensors.kernels.readout import (
     readout_functions,
     silenced,
 )
-from robotics_bridge.sensors.noise.kernels.noise import episode_draw, radius_noise
-from robotics_bridge.sensors.queries.kernels.pairs import PairArrays
 
 wp = warp()
 

@@ -5,13 +5,15 @@ that are near), each with the transform from link to geometry frame and the rela
 pose arithmetic of their own. Letters: B environment, S slot, P place in the lists of all slots, W word of touch bits.
 """
 
+from __future__ import annotations
+
 from functools import cache
 from typing import Any
 
 from brainbench.core.devices import warp
 from robotics_bridge.physics.kernels.state import StateArrays, in_scene, link_fails, status_of
+from robotics_bridge.sensors.kernels.distance import PLANE, SolidArrays
 from robotics_bridge.sensors.kernels.wide import entry, load_contacts, load_owners
-from robotics_bridge.sensors.queries.kernels.distance import PLANE, SolidArrays
 
 wp = warp()
 

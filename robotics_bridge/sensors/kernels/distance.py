@@ -4,6 +4,8 @@ Every function ``name(…, x) -> (normal, distance)`` gives a vec4 in the frame 
 and the distance (m), negative inside. Letters: R variant row (1 or B environments), G geometry, F distance field.
 """
 
+from __future__ import annotations
+
 from functools import cache
 from types import SimpleNamespace
 

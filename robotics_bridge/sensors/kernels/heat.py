@@ -3,6 +3,8 @@
 Letters: B environment, S sensor, N cell of all sensors, L link, M contacts kept per sensor.
 """
 
+from __future__ import annotations
+
 from brainbench.core.devices import warp
 from robotics_bridge.physics.kernels.state import StateArrays, in_scene
 from robotics_bridge.sensors.kernels.readout import ReadoutArrays

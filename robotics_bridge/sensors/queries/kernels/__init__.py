@@ -1,1 +1,0 @@
-"""Warp functions of distances and contact pairs."""
