@@ -34,7 +34,7 @@ from robotics_bridge.sensors import (
     SurfaceDistanceProbe,
     TemperatureGrid,
 )
-from robotics_bridge.sensors.audio.materials import Modes
+from robotics_bridge.sensors.audio.sensors import Modes
 
 FULL = Noise.preset("published-force")
 CLASSES = ("kinematic", "depth", "contact", "distance", "proximity", "elastomer", "temperature", "audio")

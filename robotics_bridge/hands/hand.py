@@ -19,10 +19,10 @@ from brainbench.core.devices import mujoco_module
 from brainbench.core.errors import DataError, UsageError, check_each, check_kind, listing, shown
 from brainbench.core.files import content_hash
 from brainbench.core.reading.regular import readable
-from robotics_bridge.hands.facing import palmar_directions
 from robotics_bridge.hands.files import read_mjspec, stated_speeds
 from robotics_bridge.hands.layouts import Layout, check_names, is_probe_file, pad_probes, read_probes, select
 from robotics_bridge.hands.spec import HandSpec, build
+from robotics_bridge.hands.surface import palmar_directions
 from robotics_bridge.sensors.probes.placement import Probes
 
 _log = logging.getLogger(__name__)

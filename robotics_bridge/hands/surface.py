@@ -1,7 +1,11 @@
-"""Probes on the surface of any link of a MuJoCo model, by casting a bundle of parallel rays onto it."""
+"""The side of a link that touches, and probes on it, cast as a bundle of parallel rays.
+
+A link touches on the side to which it goes when fingers flex; a jaw on the side of the opposite jaw.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -107,4 +111,148 @@ def _nearest(model: Any, geoms: list[int], origin: NDArray, direction: NDArray) 
         # A ray that misses has the distance −1.
         if distance >= 0 and (best is None or distance < best[0]):
             best = (distance, normal)
+    return best
+
+
+_CROSSED = 0.012
+"""Joints nearer to each other (m) act on a link together."""
+_SNAP = 0.9
+"""Cosine from which a direction counts as that of an axis of its link: jaws have flat faces."""
+_JAWS = 0.4
+"""Length of the mean direction of finger tips up to which they go towards each other: .8 and more of hands."""
+_APART = -0.5
+"""Cosine to the other tips below which a tip goes away from them."""
+
+
+def palmar_directions(model: Any, palm: str, fingers: Mapping[str, tuple[str, ...]]) -> dict[str, np.ndarray]:
+    """Return link → the direction [3] of its palmar side, in the link's frame.
+
+    A link's palmar side is where it moves when its joint flexes (of two crossed joints, the one with more range
+    counts), or where it comes from if that opens a gripper (:func:`opens`). A joint that swings as far to both sides
+    spreads or twists the finger and tells nothing: such links face as the next one towards the tip does. What slides,
+    and tips of which no joint tells, face the other fingers. The palm faces where the finger tips go, along the nearest
+    axis of its frame, or the tips of jaws.
+    """
+    data = half_open(model)
+    sign = -1.0 if opens(model, fingers) else 1.0
+    towards: dict[str, np.ndarray] = {}
+    tips = []
+    for name, chain in fingers.items():
+        known: np.ndarray | None = None
+        for place in reversed(range(len(chain))):
+            body = model.body(chain[place]).id
+            following = data.xpos[model.body(chain[place + 1]).id] if place + 1 < len(chain) else None
+            world = _flexed(model, data, body, following)
+            if world is None and known is None and place + 1 == len(chain):
+                others = [other[-1] for key, other in fingers.items() if key != name] or [palm]
+                world = _opposite(model, data, body, [model.body(other).id for other in others])
+                if world is None:
+                    world = _flexed(model, data, body, following, symmetric=True)
+            known = known if world is None else sign * world
+            if known is not None:
+                towards[chain[place]] = data.xmat[body].reshape(3, 3).T @ known
+                tips += [known] if place + 1 == len(chain) else []
+    if tips:
+        mean, body = np.mean(tips, axis=0), model.body(palm).id
+        if np.linalg.norm(mean) <= _JAWS:
+            # Jaws go towards each other: the palm faces what lies between them.
+            ends = [link_middle(model, data, model.body(chain[-1]).id) for chain in fingers.values()]
+            mean = np.mean(ends, axis=0) - link_middle(model, data, body)
+        elif list(map(len, fingers.values())) == [1]:
+            # A single jaw closes on the palm itself.
+            mean = -mean
+        if np.linalg.norm(mean) > 1e-6:
+            # In the palm's frame, snapped to the nearest of its axes.
+            turned = data.xmat[body].reshape(3, 3).T @ mean
+            face = np.argmax(np.abs(turned))
+            towards[palm] = np.sign(turned[face]) * np.eye(3)[face]
+    return towards
+
+
+def opens(model: Any, fingers: Mapping[str, tuple[str, ...]]) -> bool:
+    """Return whether flexion, the longer side of the ranges, parts the finger tips: a gripper that is closed at 0."""
+    data, tips = half_open(model), [model.body(chain[-1]).id for chain in fingers.values()]
+    middles = np.array([link_middle(model, data, tip) for tip in tips])
+    for place, tip in enumerate(tips):
+        way = _flexed(model, data, tip, None)
+        if way is None or len(tips) < 2:
+            return False
+        away = np.delete(middles, place, axis=0).mean(axis=0) - middles[place]
+        if not way @ away < _APART * np.linalg.norm(away):
+            return False
+    return True
+
+
+def half_open(model: Any) -> Any:
+    """Return the ``mujoco.MjData`` of a hand at rest, with jaws that slide half open: one lies on each side."""
+    data = mujoco.MjData(model)
+    for joint in np.flatnonzero((model.jnt_type == mujoco.mjtJoint.mjJNT_SLIDE) & (model.jnt_limited != 0)):
+        data.qpos[model.jnt_qposadr[joint]] = model.jnt_range[joint].mean()
+    mujoco.mj_kinematics(model, data)
+    return data
+
+
+def link_middle(model: Any, data: Any, body: int) -> NDArray[np.float64]:
+    """Return the middle of a body's solids [3] (world, m), its origin where it has none."""
+    own = link_points(model, body)
+    local = (own.min(axis=0) + own.max(axis=0)) / 2 if len(own) else np.zeros(3)
+    return data.xpos[body] + data.xmat[body].reshape(3, 3) @ local
+
+
+def _opposite(model: Any, data: Any, body: int, others: list[int]) -> NDArray[np.float64] | None:
+    """Return the direction [3] (world) from a tip to the others: along its slide, else along an axis of its frame."""
+    away = np.mean([link_middle(model, data, other) for other in others], axis=0) - link_middle(model, data, body)
+    length = float(np.linalg.norm(away))
+    if length < 1e-6:
+        return None
+    slide = slide_of(model, body)
+    if slide >= 0:
+        axis = data.xmat[model.jnt_bodyid[slide]].reshape(3, 3) @ model.jnt_axis[slide]
+        along = float(axis @ away)
+        return np.sign(along) * axis if abs(along) > 0.1 * length else None
+    axes = data.xmat[body].reshape(3, 3).T
+    cosine = axes @ away / length
+    face = int(np.argmax(np.abs(cosine)))
+    return np.sign(cosine[face]) * axes[face] if abs(cosine[face]) > _SNAP else away / length
+
+
+def slide_of(model: Any, body: int) -> int:
+    """Return the joint that moves a body, of its own or of what it is fixed to, if it slides; −1 otherwise."""
+    joint = int(model.body_jntadr[model.body_weldid[body]])
+    return joint if joint >= 0 and model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE else -1
+
+
+def _flexed(
+    model: Any, data: Any, body: int, following: np.ndarray | None, *, symmetric: bool = False
+) -> np.ndarray | None:
+    """Return where a body goes [3] (world) when its joint flexes; None if that is not known."""
+    own = link_points(model, body)
+    joint = _flexion(model, body)
+    if joint < 0 or slide_of(model, body) >= 0 or not len(own):
+        return None
+    low, high = (float(value) for value in model.jnt_range[joint])
+    if not symmetric and abs(high + low) < 0.2 * (high - low):
+        return None
+    end, start = following, int(model.body_weldid[body])
+    if end is None or start != body or np.linalg.norm(end - data.xpos[body]) < 1e-6:
+        end = data.xpos[body] + data.xmat[body].reshape(3, 3) @ own.mean(axis=0)
+    axis = data.xmat[model.jnt_bodyid[joint]].reshape(3, 3) @ model.jnt_axis[joint]
+    reach = end - data.xpos[start]
+    # Velocity of the far end under a turn about the joint, ω × r; the longer side of its range is flexion.
+    way = (1.0 if abs(high) >= abs(low) else -1.0) * np.cross(axis, reach)
+    length = float(np.linalg.norm(way))
+    return way / length if length > 1e-9 * max(float(np.linalg.norm(reach)), 1e-9) else None
+
+
+def _flexion(model: Any, body: int) -> int:
+    """Return the joint that flexes a body: of its own and those that cross them, the one with the largest range."""
+    best, most = -1, 0.0
+    while body > 0:
+        for joint in np.flatnonzero(model.jnt_bodyid == body).tolist():
+            span = float(np.ptp(model.jnt_range[joint])) if model.jnt_limited[joint] else 2 * np.pi
+            if int(model.jnt_type[joint]) == 3 and span > most:
+                best, most = joint, span
+        if best >= 0 and np.linalg.norm(model.body_pos[body]) > _CROSSED:
+            break
+        body = int(model.body_parentid[body])
     return best

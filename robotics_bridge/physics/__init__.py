@@ -1,16 +1,15 @@
 """One state interface for tactile sensors, filled by C MuJoCo on the processor or MuJoCo Warp on the GPU.
 
-``scene`` says what there is to touch, ``cpu`` and ``gpu`` step it and fill a ``state``; ``variants`` make
-environments differ.
+``scene`` says what there is to touch, and what differs between environments; ``cpu`` and ``gpu`` step it and fill a
+``state``.
 """
 
 from __future__ import annotations
 
 from robotics_bridge.physics.cpu import MujocoEngine
 from robotics_bridge.physics.gpu import MujocoWarpEngine
-from robotics_bridge.physics.scene import KINDS, Geometry, TouchScene
+from robotics_bridge.physics.scene import KINDS, Geometry, TouchScene, compile_variants
 from robotics_bridge.physics.state import HandState
-from robotics_bridge.physics.variants import compile_variants
 
 __all__ = [
     "KINDS",

@@ -15,10 +15,8 @@ from numpy.typing import ArrayLike, NDArray
 from brainbench.core.devices import mujoco_module
 from brainbench.core.errors import UsageError, unknown_name
 from brainbench.core.reading.ranges import check_number
-from robotics_bridge.physics.scene import TouchScene
-from robotics_bridge.physics.selection import EnvIds, select_envs
-from robotics_bridge.physics.state import MOST_ENVS, HandState
-from robotics_bridge.physics.variants import check_fields, model_fields
+from robotics_bridge.physics.scene import TouchScene, check_model_fields, model_fields
+from robotics_bridge.physics.state import MOST_ENVS, EnvIds, HandState, select_envs
 
 mujoco = mujoco_module()
 
@@ -31,7 +29,7 @@ class MujocoEngine:
 
     Args:
         model: a compiled ``mujoco.MjModel``, or variants of one that differ in numbers only (see
-            :func:`~robotics_bridge.physics.variants.compile_variants`); copies are simulated, without the flag
+            :func:`~robotics_bridge.physics.scene.compile_variants`); copies are simulated, without the flag
             ``autoreset``.
         num_envs: B.
         threads: how many work at once, at least 1; every processor by default.
@@ -62,7 +60,7 @@ class MujocoEngine:
         order = list(assignment) or range(len(models))
         self.scene: TouchScene = TouchScene.from_mujoco(models[0], models[1:], assignment)
         self.num_envs = num_envs
-        varied = check_fields(models[0], fields or {}, num_envs)
+        varied = check_model_fields(models[0], fields or {}, num_envs)
         self.models: list[Any] = [models[order[env % len(order)]] for env in range(num_envs)]
         """The ``mujoco.MjModel`` of every environment."""
         self._own_models = bool(varied)

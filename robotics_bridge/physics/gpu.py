@@ -16,10 +16,8 @@ from brainbench.core.devices import mujoco_module, pick_device, warp
 from brainbench.core.errors import UsageError, needing, unknown_name
 from brainbench.core.reading.ranges import check_number
 from robotics_bridge.physics.kernels.state import fill_contacts, fill_links
-from robotics_bridge.physics.scene import TouchScene
-from robotics_bridge.physics.selection import EnvIds, select_envs
-from robotics_bridge.physics.state import MOST_ENVS, HandState
-from robotics_bridge.physics.variants import check_fields, differing_fields
+from robotics_bridge.physics.scene import TouchScene, check_model_fields, differing_fields
+from robotics_bridge.physics.state import MOST_ENVS, EnvIds, HandState, select_envs
 
 mujoco = mujoco_module()
 
@@ -59,7 +57,7 @@ class MujocoWarpEngine:
         self.scene: TouchScene = TouchScene.from_mujoco(models[0], models[1:], assignment)
         order = list(assignment) or list(range(len(models)))
         varied = differing_fields(models, order, num_envs) if len(models) > 1 else {}
-        varied |= check_fields(self.model, fields or {}, num_envs)
+        varied |= check_model_fields(self.model, fields or {}, num_envs)
         self._varied = tuple(varied)
         with wp.ScopedDevice(self._device):
             self._m = _put_model(self._engine, self.model, varied, num_envs)

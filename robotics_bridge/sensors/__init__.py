@@ -1,8 +1,8 @@
 """Tactile sensors: frozen configurations, one :class:`SensorSuite` that reads them all, and a noise model.
 
 An update lists what each link meets (``queries``), then every kind of sensor reads it (``probes``, ``taxels``,
-``elastomer``, ``temperature``, ``audio``), and ``noise`` turns the truth into a measurement. ``calibration`` fits the
-noise to a real device, ``afferents`` splits signals into the bands of the hand's nerves.
+``temperature``, ``audio``) by its ``kernels``, and ``noise`` turns the truth into a measurement. ``calibration`` fits
+the noise to a real device, ``afferents`` splits signals into the bands of the hand's nerves.
 """
 
 from __future__ import annotations
@@ -15,13 +15,12 @@ if TYPE_CHECKING:
     from robotics_bridge.sensors.afferents import AfferentFilter
     from robotics_bridge.sensors.audio.microphone import Microphone
     from robotics_bridge.sensors.audio.sensors import ActuationAudio, ContactAudio
-    from robotics_bridge.sensors.elastomer.taxel import ElastomerTaxel
-    from robotics_bridge.sensors.fidelity import Fidelity
     from robotics_bridge.sensors.noise.model import Noise
     from robotics_bridge.sensors.probes.placement import Probes
     from robotics_bridge.sensors.probes.sensors import ContactDepthProbe, ContactProbe, SurfaceDistanceProbe
+    from robotics_bridge.sensors.sensor import Fidelity
     from robotics_bridge.sensors.suite import SensorSuite
-    from robotics_bridge.sensors.taxels.sensors import KinematicTaxel, ProximityTaxel
+    from robotics_bridge.sensors.taxels.sensors import ElastomerTaxel, KinematicTaxel, ProximityTaxel
     from robotics_bridge.sensors.temperature.grid import TemperatureGrid
 
 __all__ = [

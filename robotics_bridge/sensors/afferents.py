@@ -19,7 +19,7 @@ from brainbench.core.reading.ranges import check_number
 if TYPE_CHECKING:
     import torch
 
-    from robotics_bridge.physics.selection import EnvIds
+    from robotics_bridge.physics.state import EnvIds
 
 
 AFFERENTS = {"SA-I": (0.0, 5.0), "FA-I": (5.0, 50.0), "FA-II": (40.0, 400.0)}
@@ -88,7 +88,7 @@ class AfferentFilter:
 
     def reset(self, env_ids: EnvIds | None = None, x: torch.Tensor | None = None) -> None:
         """Forget the past of some environments (all by default); the signal ``x`` [B, …], or 0, was always there."""
-        from robotics_bridge.physics.selection import select_envs
+        from robotics_bridge.physics.state import select_envs
 
         if env_ids is None and x is None:
             self._state = {}

@@ -24,11 +24,11 @@ from robotics_bridge.sensors import (
     SurfaceDistanceProbe,
     TemperatureGrid,
 )
-from robotics_bridge.sensors.audio.materials import ElasticMaterial, Modes
 from robotics_bridge.sensors.audio.modes import find_modes
+from robotics_bridge.sensors.audio.sensors import ElasticMaterial, Modes
 from robotics_bridge.sensors.noise.stages import simulate
 from robotics_bridge.sensors.sensor import Sensor
-from robotics_bridge.sensors.temperature.materials import ThermalMaterial
+from robotics_bridge.sensors.temperature.grid import ThermalMaterial
 
 Result = tuple[float, float, float]
 _GAP = math.hypot(0.003, 0.03) - 0.02

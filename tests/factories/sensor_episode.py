@@ -26,7 +26,7 @@ from robotics_bridge.sensors import (
     SurfaceDistanceProbe,
     TemperatureGrid,
 )
-from robotics_bridge.sensors.audio.materials import Modes
+from robotics_bridge.sensors.audio.sensors import Modes
 from robotics_bridge.sensors.noise.stages import simulate
 from tests.factories.touch_scenes import falling, pyramid
 

@@ -20,9 +20,9 @@ from robotics_bridge import hands, sensors
 from robotics_bridge.hands.scenes import closing, holding
 from robotics_bridge.physics import Geometry, HandState, MujocoEngine, MujocoWarpEngine, TouchScene
 from robotics_bridge.sensors import ContactAudio, ElastomerTaxel, Noise, Probes, SensorSuite, TemperatureGrid
-from robotics_bridge.sensors.audio.materials import Modes
 from robotics_bridge.sensors.audio.modes import find_modes
-from robotics_bridge.sensors.temperature.materials import ThermalBody
+from robotics_bridge.sensors.audio.sensors import Modes
+from robotics_bridge.sensors.temperature.grid import ThermalBody
 
 CLASSES = {
     "ContactProbe": "published-bool",

@@ -2,19 +2,123 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Collection, Iterable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.devices import to_struct
+from brainbench.core.devices import to_struct, warp
 from brainbench.core.errors import UsageError
+from brainbench.core.files import cache_dir
+from brainbench.core.reading.ranges import check_number
+from brainbench.core.reading.sealed import read_sealed, write_sealed
 from brainbench.geometry import Mesh
+from brainbench.geometry.distance import sample_surface
+from brainbench.geometry.mesh_repair import repair
 from robotics_bridge.physics.scene import KINDS, Geometry, TouchScene
-from robotics_bridge.sensors.kernels.distance import OTHER, WALL, SolidArrays
-from robotics_bridge.sensors.queries.distance_fields import Field, mesh_tree, sample_field
-from robotics_bridge.sensors.queries.walls import as_solid, wall_thickness
+from robotics_bridge.sensors.kernels import distance
+from robotics_bridge.sensors.kernels.distance import OTHER, WALL, SolidArrays, measure_walls
+from robotics_bridge.sensors.probes.placement import face_areas
+
+_FORMAT = 3
+
+
+@dataclass(frozen=True, eq=False)
+class Field:
+    """Signed distances on a regular grid around a mesh."""
+
+    values: NDArray[np.float32]
+    """[nx, ny, nz] (m), negative inside."""
+    origin: NDArray[np.float32]
+    """Position [3] of the first sample (m)."""
+    spacing: float
+    """Distance of neighbouring samples (m)."""
+
+
+def sample_field(mesh: Mesh, resolution: int = 64, device: Any = "cpu") -> Field:
+    """Return the distance field of a closed mesh, from the cache if it was sampled before.
+
+    Args:
+        mesh: its surface; where it has holes, inside is where its winding number exceeds one half.
+        resolution: cells along the longest edge of the bounding box; the grid extends a quarter of that edge beyond the
+            box on every side, further out distances are extrapolated.
+    """
+    check_number("The resolution of a distance field (cells)", resolution, least=4, most=512, whole=True)
+    low, high = mesh.bounds
+    # A margin of a quarter of the box on each side, so that most probes in reach fall within the samples.
+    spacing = float((high - low).max()) / resolution
+    counts = np.ceil((high - low) / spacing).astype(int) + 1 + 2 * max(4, -(-resolution // 4))
+    # Samples lie symmetrically about the middle of the box, so that a symmetric mesh has a symmetric field.
+    origin = (0.5 * (low + high) - 0.5 * spacing * (counts - 1)).astype(np.float32)
+    path = cache_dir("fields") / f"{mesh.content_hash}-{resolution}-{_FORMAT}.npz"
+    kept = read_sealed(path, "distance field")
+    if kept is not None and kept["values"].shape == tuple(counts):
+        return Field(kept["values"], origin, spacing)
+    wp, tree = warp(), mesh_tree(mesh, device, winding=True)
+    samples = wp.zeros(tuple(int(n) for n in counts), dtype=wp.float32, device=device)
+    reach = 4 * float(spacing * counts.max())
+    inputs = [tree.id, wp.vec3f(*origin.tolist()), spacing, reach, samples]
+    wp.launch(distance.sample_field, dim=samples.shape, inputs=inputs, device=device)
+    values = samples.numpy()
+    write_sealed(path, "distance field", {"values": values})
+    return Field(values, origin, spacing)
+
+
+def mesh_tree(mesh: Mesh, device: Any, *, winding: bool = False) -> Any:
+    """Return a ``warp.Mesh``: the triangles with their search tree."""
+    wp = warp()
+    return wp.Mesh(
+        points=wp.array(mesh.vertices.astype(np.float32), dtype=wp.vec3f, device=device),
+        indices=wp.array(mesh.faces.astype(np.int32).ravel(), dtype=wp.int32, device=device),
+        support_winding_number=winding,
+    )
+
+
+RESOLVED = 4.0
+"""Cells across a wall from which a distance field tells its two sides apart."""
+_FLAT = 1e-6
+"""Mean thickness, as a part of the diagonal, below which a mesh encloses nothing."""
+_SAMPLES = 2000
+_SHARE = 0.02
+"""Part of the surface that must lie over thin walls for the mesh to be thin: an edge alone is none."""
+
+
+def as_solid(mesh: Mesh) -> Mesh:
+    """Return a mesh with its faults mended, as far as that can be; what was done and what is left is warned of."""
+    spread = np.linalg.svd(mesh.vertices - mesh.vertices.mean(axis=0), compute_uv=False)
+    # A closed surface of area A and thickness t has the volume A t / 2; an open one must at least not be flat.
+    empty = 2 * abs(mesh.volume) <= _FLAT * mesh.diagonal * float(mesh.to_trimesh().area)
+    if spread[2] <= _FLAT * spread[0] or (mesh.diagnosis.watertight and empty):
+        raise UsageError(
+            f"The mesh {mesh.name!r} has no thickness, so that no point lies inside it. Give its walls at least 0.1 mm."
+        )
+    mended = repair(mesh)
+    words = [*mended.done, *(text for text in mended.remaining if "closed solid" in text)]
+    if words:
+        warnings.warn(
+            f"The mesh {mesh.name!r} is not a sound solid: {'; '.join(words)}. Near a hole, what is inside is guessed.",
+            RuntimeWarning,
+            stacklevel=2,
+        )
+    return mended.mesh
+
+
+def wall_thickness(mesh: Mesh, cell: float, device: Any) -> float:
+    """Return the thickness (m) of walls of a closed mesh that cells of a distance field (m) cannot resolve, or 0."""
+    wp, tree = warp(), mesh_tree(mesh, device)
+    points, faces = sample_surface(mesh, _SAMPLES, np.random.default_rng(0))
+    normal = face_areas(mesh.vertices[mesh.faces[faces]])[1]
+    arrays = [wp.array(a.astype(np.float32), dtype=wp.vec3f, device=device) for a in (points, normal)]
+    out = wp.zeros(len(points), dtype=float, device=device)
+    inputs = [tree.id, *arrays, 1e-6 * mesh.diagonal, out]
+    wp.launch(measure_walls, dim=len(points), inputs=inputs, device=device)
+    thickness = out.numpy()
+    thin = thickness[(thickness > 0) & (thickness < RESOLVED * cell)]
+    return float(np.quantile(thin, 0.1)) if len(thin) > _SHARE * len(points) else 0.0
+
 
 _UNBOUNDED = 1.0e6
 _LARGER = 1024.0

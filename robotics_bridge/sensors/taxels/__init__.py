@@ -1,4 +1,4 @@
-"""Taxels of force and torque: ``sensors`` holds the configurations, ``runtime`` serves them.
+"""Taxels of force and torque: ``sensors`` holds the configurations of all of them.
 
-``contact_load`` serves kinematic taxels that add up to the forces of the physics engine.
+``runtime`` serves those that act by themselves, ``elastomer`` those that share a soft layer.
 """

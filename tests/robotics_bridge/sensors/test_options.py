@@ -16,7 +16,7 @@ from robotics_bridge.sensors import (
     ProximityTaxel,
     SurfaceDistanceProbe,
 )
-from robotics_bridge.sensors.elastomer.taxel import Layer
+from robotics_bridge.sensors.taxels.sensors import Layer
 
 PROBE = Probes([[0, 0, 0]], [[0, 0, 1.0]], 0.002)
 POSITIVE = {

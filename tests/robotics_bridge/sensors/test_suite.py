@@ -24,7 +24,7 @@ from robotics_bridge.sensors import (
     SurfaceDistanceProbe,
     TemperatureGrid,
 )
-from robotics_bridge.sensors.audio.materials import Modes
+from robotics_bridge.sensors.audio.sensors import Modes
 from robotics_bridge.sensors.kernels import dilation, kinematic, proximity
 from robotics_bridge.sensors.kernels import probe as _probe_kernels
 from tests.factories.touch_scenes import PAD, move_all, pad_scene, poses_at, random_pose, state_of

@@ -10,15 +10,14 @@ import pytest
 from brainbench.core.errors import UsageError
 from brainbench.geometry import Mesh
 from robotics_bridge.physics import Geometry
-from robotics_bridge.sensors.audio.materials import (
+from robotics_bridge.sensors.audio.modes import fill, find_modes, solve
+from robotics_bridge.sensors.audio.sensors import (
     ELASTIC_MATERIALS,
     ElasticMaterial,
     Modes,
     elastic_material,
     preset_modes,
 )
-from robotics_bridge.sensors.audio.modes import find_modes, solve
-from robotics_bridge.sensors.audio.tetrahedra import fill
 
 STEEL = ElasticMaterial(2e11, 0.3, 7850.0, 5.0, 3e-8)
 

@@ -9,7 +9,7 @@ import pytest
 from brainbench.core.errors import UsageError
 from robotics_bridge.physics import Geometry, MujocoEngine
 from robotics_bridge.sensors import ContactProbe, ElastomerTaxel, Probes, SensorSuite
-from robotics_bridge.sensors.elastomer.pressure import contact_pressure
+from robotics_bridge.sensors.taxels.elastomer import contact_pressure
 from tests.factories.touch_scenes import pad_scene, poses_at, state_of
 
 RADIUS, PITCH, MODULUS, POISSON = 0.01, 1e-4, 2e5, 0.45

@@ -9,7 +9,7 @@ from brainbench.core.errors import UsageError
 from brainbench.core.files import read_json
 from brainbench.geometry import Mesh, winding_number
 from robotics_bridge.sensors import ContactProbe, ElastomerTaxel, Probes, ProximityTaxel
-from robotics_bridge.sensors.fidelity import PRESETS, TABLE, SensorFidelity
+from robotics_bridge.sensors.sensor import PRESETS, TABLE, SensorFidelity
 from robotics_bridge.sensors.tradeoff import triangle_distance
 
 PROBES = Probes([[0, 0, 0]], [[0, 0, 1.0]], 0.01)
