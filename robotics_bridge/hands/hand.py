@@ -104,13 +104,13 @@ class Hand:
         :data:`LEVER` times that.
         """
         names = list(joints)
-        known = stated_speeds(self.path) if self.spec is None else {one.name: one.velocity for one in self.spec.joints}
-        if assumed := [name for name in names if name not in known]:
+        speeds = stated_speeds(self.path) if self.spec is None else {one.name: one.velocity for one in self.spec.joints}
+        if assumed := [name for name in names if name not in speeds]:
             slow = f"slides: {UNKNOWN_SPEED * LEVER:g} m/s"
-            told = f"{UNKNOWN_SPEED:g} rad/s ({slow}) counts as the largest of {listing(assumed)}"
-            _log.warning("Hand %s states no speed for %d joints: %s.", shown(self.name), len(assumed), told)
-            known |= dict(zip(assumed, UNKNOWN_SPEED * self.lever(assumed), strict=True))
-        return np.array([known[name] for name in names])
+            assumption = f"{UNKNOWN_SPEED:g} rad/s ({slow}) counts as the largest of {listing(assumed)}"
+            _log.warning("Hand %s states no speed for %d joints: %s.", shown(self.name), len(assumed), assumption)
+            speeds |= dict(zip(assumed, UNKNOWN_SPEED * self.lever(assumed), strict=True))
+        return np.array([speeds[name] for name in names])
 
     @property
     def tips(self) -> tuple[str, ...]:
@@ -150,8 +150,8 @@ class Hand:
         layout = dict(source) if isinstance(source, Mapping) else read_probes(source)
         if not layout:
             raise UsageError(f"A layout of hand {self.name!r} needs at least one link with probes; received none.")
-        known = [self.model.body(index).name for index in range(1, self.model.nbody)]
-        check_each("link", layout, known)
+        links = [self.model.body(index).name for index in range(1, self.model.nbody)]
+        check_each("link", layout, links)
         for link, probes in layout.items():
             check_kind(f"layout of link {link!r}", probes, Probes, "Probes(...)")
         return replace(self, custom=layout)
@@ -159,7 +159,7 @@ class Hand:
     def _cast(self, resolution: str, links: tuple[str, ...]) -> Layout:
         from robotics_bridge.hands.surface import cast_grid, geoms_of
 
-        found: Layout = {}
+        layout: Layout = {}
         reasons: list[str] = []
         facing = palmar_directions(self.model, self.palm, self.fingers)
         for link in links:
@@ -173,16 +173,16 @@ class Hand:
                 settings = {"facing": facing[link], "radius": radius}
                 for extent in (0.8, 0.4):
                     with contextlib.suppress(UsageError):
-                        found[link] = cast_grid(self.model, link, rows, columns, **settings, extent=extent)
+                        layout[link] = cast_grid(self.model, link, rows, columns, **settings, extent=extent)
                         break
                 else:
                     reasons.append(f"{link!r} has no surface on its inner side")
-        if not found:
+        if not layout:
             raise UsageError(
                 f"Hand {self.name!r} gets no taxels on {', '.join(links)}: {'; '.join(reasons)}. Place them with "
                 "Hand.with_probes (a probe file, or link → Probes)."
             )
-        return found
+        return layout
 
 
 def from_file(path: Path) -> Hand:
@@ -231,5 +231,5 @@ def from_file(path: Path) -> Hand:
 
 
 def _joints_below(model: Any, body: int, children: dict[int, list[int]]) -> int:
-    own = sum(int(model.jnt_type[index]) in (2, 3) for index in range(model.njnt) if model.jnt_bodyid[index] == body)
-    return own + sum(_joints_below(model, child, children) for child in children[body])
+    count = sum(int(model.jnt_type[index]) in (2, 3) for index in range(model.njnt) if model.jnt_bodyid[index] == body)
+    return count + sum(_joints_below(model, child, children) for child in children[body])

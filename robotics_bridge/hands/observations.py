@@ -96,13 +96,13 @@ def sensors_for(
     if kind.sensor == "ElastomerTaxel" and any(not probes.active.all() for probes in layout.values()):
         # A grid with fillers is no regular one; its sources are summed directly.
         settings.setdefault("dilation", "direct")
-    make, found = getattr(sensors, kind.sensor), {}
-    own = [field.name for field in fields(make) if field.name not in ("link", "probes")]
-    check_each(f"setting of {kind.sensor}", settings, own)
+    make, sensors_of = getattr(sensors, kind.sensor), {}
+    names = [field.name for field in fields(make) if field.name not in ("link", "probes")]
+    check_each(f"setting of {kind.sensor}", settings, names)
     for link, probes in layout.items():
         placed = probes.with_radius(PROXIMITY_RADIUS) if kind.sensor == "ProximityTaxel" else probes
-        found[link] = make(link=link, probes=placed, **settings)
-    return found
+        sensors_of[link] = make(link=link, probes=placed, **settings)
+    return sensors_of
 
 
 def observe(name: str, readings: Mapping[str, torch.Tensor], layout: Layout) -> torch.Tensor:

@@ -76,8 +76,8 @@ def place_palm(hand: Hand, spec: Any, place: ArrayLike, turn: ArrayLike) -> Any:
     if body.name != hand.palm:
         data = mujoco.MjData(model)
         mujoco.mj_kinematics(model, data)
-        own, root = (data.xmat[number].reshape(3, 3) for number in (palm, model.body_rootid[palm]))
-        moved = to_matrices(turn) @ own.T
+        palm_axes, root = (data.xmat[number].reshape(3, 3) for number in (palm, model.body_rootid[palm]))
+        moved = to_matrices(turn) @ palm_axes.T
         place = np.asarray(place) + moved @ (data.xpos[model.body_rootid[palm]] - data.xpos[palm])
         turn = from_matrices(moved @ root)
     # An orientation that the file gives as angles would come before the quaternion.
@@ -123,7 +123,7 @@ def _between(hand: Hand, spec: Any, jaws: dict[int, tuple[float, float]]) -> Any
     ball = spec.body(OBJECT)
     ball.pos = body.pos + to_matrices(body.quat) @ root.xmat.reshape(3, 3).T @ (middle - root.xpos)
     starts = {joint: np.array(model.body_pos[model.jnt_bodyid[joint]]) for joint in jaws}
-    made = None
+    model_of = None
     for smaller in range(6):
         ball.geoms[0].size[0] *= 0.7 if smaller else 1.0
         for share in np.linspace(0.95, 0.0, 39):
@@ -134,12 +134,12 @@ def _between(hand: Hand, spec: Any, jaws: dict[int, tuple[float, float]]) -> Any
                 way = to_matrices(model.body_quat[jaw]) @ model.jnt_axis[joint]
                 moved = slide.ref - model.qpos0[model.jnt_qposadr[joint]]
                 spec.body(model.body(jaw).name).pos = starts[joint] + moved * way
-            made = spec.compile()
-            start = mujoco.MjData(made)
-            mujoco.mj_forward(made, start)
-            if not any(made.geom(OBJECT).id in contact.geom for contact in start.contact):
-                return made
-    return made
+            model_of = spec.compile()
+            start = mujoco.MjData(model_of)
+            mujoco.mj_forward(model_of, start)
+            if not any(model_of.geom(OBJECT).id in contact.geom for contact in start.contact):
+                return model_of
+    return model_of
 
 
 def closing(hand: Hand, share: float) -> NDArray[np.float64]:

@@ -138,20 +138,20 @@ def palmar_directions(model: Any, palm: str, fingers: Mapping[str, tuple[str, ..
     towards: dict[str, np.ndarray] = {}
     tips = []
     for name, chain in fingers.items():
-        known: np.ndarray | None = None
+        facing: np.ndarray | None = None
         for place in reversed(range(len(chain))):
             body = model.body(chain[place]).id
             following = data.xpos[model.body(chain[place + 1]).id] if place + 1 < len(chain) else None
             world = _flexed(model, data, body, following)
-            if world is None and known is None and place + 1 == len(chain):
+            if world is None and facing is None and place + 1 == len(chain):
                 others = [other[-1] for key, other in fingers.items() if key != name] or [palm]
                 world = _opposite(model, data, body, [model.body(other).id for other in others])
                 if world is None:
                     world = _flexed(model, data, body, following, symmetric=True)
-            known = known if world is None else sign * world
-            if known is not None:
-                towards[chain[place]] = data.xmat[body].reshape(3, 3).T @ known
-                tips += [known] if place + 1 == len(chain) else []
+            facing = facing if world is None else sign * world
+            if facing is not None:
+                towards[chain[place]] = data.xmat[body].reshape(3, 3).T @ facing
+                tips += [facing] if place + 1 == len(chain) else []
     if tips:
         mean, body = np.mean(tips, axis=0), model.body(palm).id
         if np.linalg.norm(mean) <= _JAWS:
@@ -194,8 +194,8 @@ def half_open(model: Any) -> Any:
 
 def link_middle(model: Any, data: Any, body: int) -> NDArray[np.float64]:
     """Return the middle of a body's solids [3] (world, m), its origin where it has none."""
-    own = link_points(model, body)
-    local = (own.min(axis=0) + own.max(axis=0)) / 2 if len(own) else np.zeros(3)
+    points = link_points(model, body)
+    local = (points.min(axis=0) + points.max(axis=0)) / 2 if len(points) else np.zeros(3)
     return data.xpos[body] + data.xmat[body].reshape(3, 3) @ local
 
 
@@ -226,16 +226,16 @@ def _flexed(
     model: Any, data: Any, body: int, following: np.ndarray | None, *, symmetric: bool = False
 ) -> np.ndarray | None:
     """Return where a body goes [3] (world) when its joint flexes; None if that is not known."""
-    own = link_points(model, body)
+    points = link_points(model, body)
     joint = _flexion(model, body)
-    if joint < 0 or slide_of(model, body) >= 0 or not len(own):
+    if joint < 0 or slide_of(model, body) >= 0 or not len(points):
         return None
     low, high = (float(value) for value in model.jnt_range[joint])
     if not symmetric and abs(high + low) < 0.2 * (high - low):
         return None
     end, start = following, int(model.body_weldid[body])
     if end is None or start != body or np.linalg.norm(end - data.xpos[body]) < 1e-6:
-        end = data.xpos[body] + data.xmat[body].reshape(3, 3) @ own.mean(axis=0)
+        end = data.xpos[body] + data.xmat[body].reshape(3, 3) @ points.mean(axis=0)
     axis = data.xmat[model.jnt_bodyid[joint]].reshape(3, 3) @ model.jnt_axis[joint]
     reach = end - data.xpos[start]
     # Velocity of the far end under a turn about the joint, ω × r; the longer side of its range is flexion.

@@ -66,11 +66,11 @@ class MujocoEngine:
         self._own_models = bool(varied)
         if varied:
             self.models = list(map(copy.copy, self.models))
-            for env, own in enumerate(self.models):
+            for env, model_of in enumerate(self.models):
                 for name, rows in varied.items():
-                    getattr(own, name)[...] = rows[env]
+                    getattr(model_of, name)[...] = rows[env]
                 # Masses, inertias and the like enter constants that the compiler derived.
-                mujoco.mj_setConst(own, mujoco.MjData(own))
+                mujoco.mj_setConst(model_of, mujoco.MjData(model_of))
         self.data: list[Any] = [mujoco.MjData(m) for m in self.models]
         """The ``mujoco.MjData`` of every environment."""
         self.state: HandState = HandState.empty(num_envs, self.model.nbody, contacts * num_envs, "cpu")
@@ -99,9 +99,9 @@ class MujocoEngine:
     def set(self, **values: ArrayLike) -> None:
         """Write ``qpos``, ``qvel``, ``ctrl``, … of every environment [B, n] (or one row [n] for all)."""
         for name, value in values.items():
-            if not isinstance(own := getattr(self.data[0], name, None), np.ndarray):
+            if not isinstance(field := getattr(self.data[0], name, None), np.ndarray):
                 raise unknown_name("array of the simulation", name, model_fields(self.data[0]))
-            shape = (self.num_envs, *own.shape)
+            shape = (self.num_envs, *field.shape)
             try:
                 rows = np.broadcast_to(np.asarray(value, dtype=float), shape)
             except ValueError:
@@ -206,12 +206,12 @@ class _Gatherer:
             parts = (c.geom, c.dist, c.pos, c.frame[:, :3], c.efc_address, c.dim, data.efc_force, tangents)
             self._contacts[env] = tuple(part.copy() for part in (*parts, c.friction[:, :2]))
 
-    def _forces(self, found: Sequence[tuple[NDArray[Any], ...]]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _forces(self, contacts: Sequence[tuple[NDArray[Any], ...]]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return normal force [C] and friction [C, 3] of every contact, by its rows among the constraint forces."""
-        address, dim, tangent, cone = (np.concatenate([parts[i] for parts in found]) for i in (4, 5, 7, 8))
-        before = np.cumsum([0, *(len(parts[6]) for parts in found)])
-        rows = np.concatenate([*(parts[6] for parts in found), np.zeros(1)])
-        first = np.maximum(address, 0) + np.repeat(before[:-1], [len(parts[4]) for parts in found])
+        address, dim, tangent, cone = (np.concatenate([parts[i] for parts in contacts]) for i in (4, 5, 7, 8))
+        before = np.cumsum([0, *(len(parts[6]) for parts in contacts)])
+        rows = np.concatenate([*(parts[6] for parts in contacts), np.zeros(1)])
+        first = np.maximum(address, 0) + np.repeat(before[:-1], [len(parts[4]) for parts in contacts])
 
         def row(offset: int, valid: NDArray[np.bool_]) -> NDArray[np.float64]:
             return rows[np.where(valid & (address >= 0), first + offset, len(rows) - 1)]
@@ -236,13 +236,13 @@ class _Gatherer:
         self._velocity[..., 3:] = omega
         state = self._state
         owners = [env for env, parts in enumerate(self._contacts) if parts]
-        found = [self._contacts[env] for env in owners]
-        total = sum(len(parts[1]) for parts in found)
+        contacts = [self._contacts[env] for env in owners]
+        total = sum(len(parts[1]) for parts in contacts)
         room = state.contact_env.shape[0]
-        if found:
-            env = np.repeat(owners, [len(parts[1]) for parts in found])
-            columns = [np.concatenate([parts[index] for parts in found])[:room] for index in range(4)]
-            columns += [force[:room] for force in self._forces(found)]
+        if contacts:
+            env = np.repeat(owners, [len(parts[1]) for parts in contacts])
+            columns = [np.concatenate([parts[index] for parts in contacts])[:room] for index in range(4)]
+            columns += [force[:room] for force in self._forces(contacts)]
             keep = len(columns[0])
             state.contact_env.numpy()[:keep] = env[:keep]
             names = ("geom", "distance", "position", "normal", "force", "friction")
@@ -251,6 +251,6 @@ class _Gatherer:
         state.contact_count.fill_(total)
         if total > room and not self._warned:
             self._warned = True
-            enough = max(*(len(parts[1]) for parts in found), -(-total // len(self._data)))
+            enough = max(*(len(parts[1]) for parts in contacts), -(-total // len(self._data)))
             text = f"The engine found {total} contacts and has room for {room}; the last ones are lost. "
             warnings.warn(f"{text}Make it with contacts={enough}.", RuntimeWarning, stacklevel=2)

@@ -120,10 +120,10 @@ class MujocoWarpEngine:
         """Write ``qpos``, ``qvel``, ``ctrl``, … of every environment [B, n] (or one row [n] for all)."""
         wp = warp()
         for name, value in values.items():
-            if not isinstance(own := getattr(self.data, name, None), wp.array):
+            if not isinstance(field := getattr(self.data, name, None), wp.array):
                 arrays = [key for key, item in vars(self.data).items() if isinstance(item, wp.array)]
                 raise unknown_name("array of the simulation", name, arrays)
-            view = wp.to_torch(own)
+            view = wp.to_torch(field)
             rows = value if isinstance(value, torch.Tensor) else torch.as_tensor(np.array(value))
             try:
                 view.copy_(rows.to(view.dtype).expand_as(view))

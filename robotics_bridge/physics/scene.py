@@ -140,14 +140,14 @@ class TouchScene:
     def candidates(self, link: str) -> tuple[int, ...]:
         """Return the numbers of all geometries that may come into contact with a link."""
         free = ~np.isin(self.link_of, list(self._barred(link)))
-        found: set[int] = set()
-        for own in self.geometries_of(link):
-            kind, affinity = self._bits[own]
+        partners: set[int] = set()
+        for geometry in self.geometries_of(link):
+            kind, affinity = self._bits[geometry]
             # MuJoCo's rule: two geometries collide if the type of either is among the affinities of the other.
             meets = ((self._bits[:, 0] & affinity) | (self._bits[:, 1] & kind)) != 0
-            found |= set(np.flatnonzero(meets & free).tolist())
-            found |= {low + high - own for low, high in self.included if own in (low, high)}
-        return tuple(sorted(found))
+            partners |= set(np.flatnonzero(meets & free).tolist())
+            partners |= {low + high - geometry for low, high in self.included if geometry in (low, high)}
+        return tuple(sorted(partners))
 
     def _barred(self, link: str) -> set[int]:
         """Return the numbers of the links that never collide with a link, its own among them."""
@@ -160,14 +160,14 @@ class TouchScene:
         Those of :meth:`candidates`; for a link that collides with nothing, what collides of every other link that is
         not barred, or all that it has.
         """
-        if found := self.candidates(link):
-            return found
-        kept: list[int] = []
-        for other in {*range(len(self.links))} - self._barred(link):
-            mine = [g for g in np.flatnonzero(self.link_of == other).tolist() if self.geometries[g].kind != "other"]
+        if partners := self.candidates(link):
+            return partners
+        around: list[int] = []
+        for neighbour in {*range(len(self.links))} - self._barred(link):
+            mine = [g for g in np.flatnonzero(self.link_of == neighbour).tolist() if self.geometries[g].kind != "other"]
             # Bits of zero collide with nothing at all.
-            kept += [g for g in mine if self._bits[g].any()] or mine
-        return tuple(sorted(kept))
+            around += [g for g in mine if self._bits[g].any()] or mine
+        return tuple(sorted(around))
 
     @classmethod
     def from_mujoco(cls, model: Any, others: Sequence[Any] = (), assignment: Sequence[int] = ()) -> TouchScene:
@@ -180,11 +180,11 @@ class TouchScene:
         for number in assignment:
             check_number("variant of the assignment", number, least=0, below=1 + len(others), whole=True)
         links = tuple(_name(model, 1, index) for index in range(model.nbody))
-        for other in others:
-            if other.nbody != model.nbody or other.ngeom != model.ngeom:
+        for neighbour in others:
+            if neighbour.nbody != model.nbody or neighbour.ngeom != model.ngeom:
                 raise UsageError(
-                    f"Variants of a scene need the same links and geometries; one has {other.nbody} links and "
-                    f"{other.ngeom} geometries, the first {model.nbody} and {model.ngeom}."
+                    f"Variants of a scene need the same links and geometries; one has {neighbour.nbody} links and "
+                    f"{neighbour.ngeom} geometries, the first {model.nbody} and {model.ngeom}."
                 )
         geometries, *rows = (_geometries(each, links) for each in (model, *others))
         order = list(assignment) or range(1 + len(others))
@@ -203,7 +203,7 @@ def _name(model: Any, what: int, index: int) -> str:
 
 
 def _geometries(model: Any, links: tuple[str, ...]) -> tuple[Geometry, ...]:
-    found = []
+    geometries = []
     meshes: dict[int, Mesh] = {}
     for index in range(model.ngeom):
         kind = _MUJOCO_KINDS.get(int(model.geom_type[index]), "other")
@@ -212,7 +212,7 @@ def _geometries(model: Any, links: tuple[str, ...]) -> tuple[Geometry, ...]:
             meshes[data] = _mesh(model, data)
         rows = (model.geom_size[index], model.geom_pos[index], model.geom_quat[index])
         size, position, quaternion = (tuple(row.tolist()) for row in rows)
-        found.append(
+        geometries.append(
             Geometry(
                 name=_name(model, int(mujoco.mjtObj.mjOBJ_GEOM), index), link=links[model.geom_bodyid[index]],
                 kind=kind, size=size[: _SIZES[kind]], position=position, quaternion=quaternion,
@@ -220,7 +220,7 @@ def _geometries(model: Any, links: tuple[str, ...]) -> tuple[Geometry, ...]:
                 affinity=int(model.geom_conaffinity[index]),
             )
         )  # fmt: skip
-    return tuple(found)
+    return tuple(geometries)
 
 
 def _mesh(model: Any, index: int) -> Mesh:
@@ -250,9 +250,9 @@ def _never(model: Any) -> frozenset[tuple[int, int]]:
     filtering = not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_FILTERPARENT
     for body in range(model.nbody):
         above = weld[parent[weld[body]]]
-        for other in np.flatnonzero(weld == weld[body]).tolist():
-            if other != body:
-                pairs.add((min(body, other), max(body, other)))
+        for sibling in np.flatnonzero(weld == weld[body]).tolist():
+            if sibling != body:
+                pairs.add((min(body, sibling), max(body, sibling)))
         # MuJoCo lets children of the world collide with it.
         if filtering and weld[body] and above:
             pairs |= {(min(body, o), max(body, o)) for o in np.flatnonzero(weld == above).tolist()}
@@ -269,12 +269,12 @@ def check_model_fields(model: Any, fields: Mapping[str, ArrayLike], num_envs: in
     """Return the fields as arrays [B, ...] after checking names and shapes."""
     checked = {}
     for name, values in fields.items():
-        own = getattr(model, name, None)
-        if not isinstance(own, np.ndarray):
+        field = getattr(model, name, None)
+        if not isinstance(field, np.ndarray):
             raise unknown_name("model field", name, model_fields(model))
-        array = np.asarray(values, dtype=own.dtype)
-        if array.shape != (num_envs, *own.shape):
-            needed = (num_envs, *own.shape)
+        array = np.asarray(values, dtype=field.dtype)
+        if array.shape != (num_envs, *field.shape):
+            needed = (num_envs, *field.shape)
             raise UsageError(f"The field {name!r} needs a value per environment, {needed}; received {array.shape}.")
         if array.dtype.kind == "f" and np.isnan(array).any():
             raise UsageError(f"The field {name!r} holds values that are no numbers (NaN).")
@@ -286,7 +286,7 @@ def differing_fields(models: Sequence[Any], order: Sequence[int], num_envs: int)
     """Stack per environment e [B, ...] every field in which compiled variants ``order[e % len(order)]`` differ."""
     first = models[0]
     rows = np.array([order[env % len(order)] for env in range(num_envs)])
-    found = {}
+    differing = {}
     for name in model_fields(first):
         values = [getattr(model, name) for model in models]
         if any(value.shape != values[0].shape for value in values):
@@ -296,8 +296,8 @@ def differing_fields(models: Sequence[Any], order: Sequence[int], num_envs: int)
                 "as compile_variants does."
             )
         if any(not np.array_equal(value, values[0], equal_nan=value.dtype.kind == "f") for value in values[1:]):
-            found[name] = np.stack(values)[rows]
-    return found
+            differing[name] = np.stack(values)[rows]
+    return differing
 
 
 def compile_variants(spec: Any, geometry: str, shapes: Sequence[Geometry], *, density: float = 1000.0) -> list[Any]:
@@ -318,9 +318,9 @@ def compile_variants(spec: Any, geometry: str, shapes: Sequence[Geometry], *, de
         if shape.kind not in KINDS[1:-1]:
             raise UsageError(f"A {shape.kind} cannot be a variant of an object; use one of {', '.join(KINDS[1:-1])}.")
         copy = spec.copy()
-        for index, other in enumerate(shapes):
-            if other.mesh is not None:
-                vertices, faces = other.mesh.vertices.ravel().tolist(), other.mesh.faces.ravel().tolist()
+        for index, variant in enumerate(shapes):
+            if variant.mesh is not None:
+                vertices, faces = variant.mesh.vertices.ravel().tolist(), variant.mesh.faces.ravel().tolist()
                 copy.add_mesh(name=f"variant{index}", uservert=vertices, userface=faces)
         target = next((g for g in copy.geoms if g.name == geometry), None)
         if target is None:

@@ -102,8 +102,8 @@ class AfferentFilter:
         for name, state in self._state.items():
             rest = self._rest(name, x if x is not None else state[0][0].new_zeros(self._shape))
             for pair, fresh in zip(state, rest, strict=True):
-                for kept, value in zip(pair, fresh, strict=True):
-                    kept[chosen] = value[chosen]
+                for memory, value in zip(pair, fresh, strict=True):
+                    memory[chosen] = value[chosen]
 
     def _check(self, x: torch.Tensor) -> None:
         if not (hasattr(x, "is_floating_point") and x.is_floating_point()):

@@ -106,14 +106,14 @@ def _beam(device: str) -> Result:
     del device
     steel = ElasticMaterial(2e11, 0.3, 7850.0, 5.0, 3e-8)
     bar = Geometry(name="bar", link="bar", kind="box", size=(0.1, 0.005, 0.005))
-    found = find_modes(bar, steel, count=2, cells=16, cache=False).frequency[0]
-    return found, 4.730041**2 / (2 * math.pi * 0.2**2) * math.sqrt(2e11 * 1e-4 / 12 / 7850), 0.02
+    frequency = find_modes(bar, steel, count=2, cells=16, cache=False).frequency[0]
+    return frequency, 4.730041**2 / (2 * math.pi * 0.2**2) * math.sqrt(2e11 * 1e-4 / 12 / 7850), 0.02
 
 
 def _counts(device: str) -> Result:
     del device
-    own = [hands.load(name) for name in ("xhand1", "sharpa")]
-    total = sum(layouts.active_count(hand.layout(level)) for hand in own for level in layouts.RESOLUTIONS)
+    hand_list = [hands.load(name) for name in ("xhand1", "sharpa")]
+    total = sum(layouts.active_count(hand.layout(level)) for hand in hand_list for level in layouts.RESOLUTIONS)
     return float(total), float(90 + 199 + 667 + 98 + 206 + 781), 0.0
 
 

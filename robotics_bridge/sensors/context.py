@@ -25,11 +25,11 @@ def memory_of(arrays: Iterable[Any], num_envs: int) -> int:
     return sum(array.size * warp().types.type_size_in_bytes(array.dtype) for array in arrays) // num_envs
 
 
-def fill(kind: Any, source: Any, **own: Any) -> Any:
+def fill(kind: Any, source: Any, **fields: Any) -> Any:
     """Return a Warp structure: its fields as given, or as the attributes of a configuration that bear their names."""
     struct = kind()
     for name in kind.vars:
-        setattr(struct, name, own[name] if name in own else getattr(source, name))
+        setattr(struct, name, fields[name] if name in fields else getattr(source, name))
     return struct
 
 

@@ -105,9 +105,9 @@ class Runtime(abc.ABC):
         """Warp structure of the readings: ``truth`` and ``measured``, planar."""
         self.rings = self._noise.rings
         """Those of delays that the user asked for."""
-        kept = [io.truth, io.measured, io.hysteresis, io.walk]
+        arrays = [io.truth, io.measured, io.hysteresis, io.walk]
         wanted = (True, self.noisy, *self.stores)
-        self.readings = [array for array, stored in zip(kept, wanted, strict=True) if stored] + self._noise.lasting
+        self.readings = [array for array, stored in zip(arrays, wanted, strict=True) if stored] + self._noise.lasting
         """Those of readings and their noise."""
         self.readable: list[Any] = [io.truth, *([io.measured] if self.noisy else []), self._noise.late]
         """Those that can be read, planar, which a reset clears."""

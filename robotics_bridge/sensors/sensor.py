@@ -174,10 +174,10 @@ class SensorFidelity:
         """Return the sensors with these settings in place of their own, where they have them."""
         out = {}
         for name, sensor in sensors.items():
-            own = {field.name for field in fields(sensor)}
+            names = {field.name for field in fields(sensor)}
             # An elastomer without points has been told to leave shear out.
             wanted = {"query": self.query} | ({"points": self.points} if getattr(sensor, "points", 0) else {})
-            changed = {key: value for key, value in wanted.items() if key in own}
+            changed = {key: value for key, value in wanted.items() if key in names}
             out[name] = replace(sensor, **changed) if changed else sensor
         return out
 

@@ -47,16 +47,16 @@ def warn_of(scene: TouchScene, sensors: Mapping[str, Sensor]) -> None:
     for name, sensor in sensors.items():
         if isinstance(sensor, TemperatureGrid) and sensor.low is not None and sensor.high is not None:
             sizes.append((f"the grid of {name!r}", float(np.linalg.norm(np.subtract(sensor.high, sensor.low))) / 2))
-    found = [(what, f"{2 * size:g} m across") for what, size in sizes if size > LARGEST]
+    doubts = [(what, f"{2 * size:g} m across") for what, size in sizes if size > LARGEST]
     for name, sensor in probing.items():
         widest = float(sensor.probes.radius.max(initial=0.0))
         patch = float(np.ptp(np.reshape(sensor.probes.position, (-1, 3)), axis=0).max())
         if widest > max(WIDEST, patch) and not isinstance(sensor, SurfaceDistanceProbe):
-            found.append((f"the sensing radius of {name!r}", f"{widest:g} m"))
+            doubts.append((f"the sensing radius of {name!r}", f"{widest:g} m"))
         if isinstance(sensor, ContactProbe) and sensor.threshold > DEEPEST:
-            found.append((f"the threshold of {name!r}", f"{sensor.threshold:g} m"))
-    if found:
-        what, size = found[0]
+            doubts.append((f"the threshold of {name!r}", f"{sensor.threshold:g} m"))
+    if doubts:
+        what, size = doubts[0]
         _warn(f"{what[:1].upper()}{what[1:]}: {size}. Lengths are in metres; scale millimetres by 1e-3.")
     for name, sensor in probing.items():
         buried = int(_buried(scene, sensor.link, sensor.probes).sum())
@@ -74,7 +74,7 @@ def _warn(text: str) -> None:
 
 def _buried(scene: TouchScene, link: str, probes: Probes) -> np.ndarray:
     """Return a mask [N] of active probes whose sensing sphere lies within one convex solid of their link."""
-    found = np.zeros(len(probes), bool)
+    inside = np.zeros(len(probes), bool)
     for geometry in (scene.geometries[g] for g in scene.geometries_of(link)):
         if geometry.kind in _CONVEX:
             local = (np.asarray(probes.position) - geometry.position) @ to_matrices(geometry.quaternion)
@@ -82,8 +82,8 @@ def _buried(scene: TouchScene, link: str, probes: Probes) -> np.ndarray:
             # many directions overestimate it, by less than a fiftieth of its size.
             reach = geometry.reach(_DIRECTIONS)
             depth = (reach - local @ _DIRECTIONS.T).min(axis=1)
-            found |= probes.active & (depth > probes.radius + 0.02 * reach.max())
-    return found
+            inside |= probes.active & (depth > probes.radius + 0.02 * reach.max())
+    return inside
 
 
 def _spread(count: int) -> np.ndarray:
@@ -240,12 +240,12 @@ class SensorSuite:
         self.runtime_of(name)
         if name not in self._histories:
             raise UsageError(f"The sensor {name!r} keeps no history; configure it with history=<readings>.")
-        kept = self._histories[name]
-        first = self._updates % kept.length
+        history = self._histories[name]
+        first = self._updates % history.length
         # Every reading stands twice in the ring, so the window is a slice of it and no copy.
-        window = wp.to_torch(kept.ring)[first : first + kept.length]
-        tensor = window.permute(2, 0, 3, 1).unflatten(2, kept.part.layout)
-        return tensor.squeeze(-1) if kept.part.scalar else tensor
+        window = wp.to_torch(history.ring)[first : first + history.length]
+        tensor = window.permute(2, 0, 3, 1).unflatten(2, history.part.layout)
+        return tensor.squeeze(-1) if history.part.scalar else tensor
 
     def read_nearest(self, name: str) -> torch.Tensor:
         """Return the nearest surface points [B, N, 3] of a SurfaceDistanceProbe (m, link frame); a view."""
@@ -330,8 +330,8 @@ class SensorSuite:
             "rings": [owner.rings for owner in (*self.runtimes, *self._histories.values())],
             "scratch": [runtime.scratch for runtime in self.runtimes],
         }
-        found = {name: sum(memory_of(held, self.num_envs) for held in lists) for name, lists in owners.items()}
-        return {**found, "shared": 8 + self.pairs.state_bytes}
+        sizes = {name: sum(memory_of(held, self.num_envs) for held in lists) for name, lists in owners.items()}
+        return {**sizes, "shared": 8 + self.pairs.state_bytes}
 
     def _launch(self, state: HandState, dt: float) -> None:
         self.pairs.update(state)

@@ -121,8 +121,8 @@ def _grid() -> Probes:
 
 @cache
 def _torus() -> Geometry:
-    made = trimesh.creation.torus(0.012, 0.005, major_sections=72, minor_sections=32)
-    return Geometry(name="o", link="object", kind="mesh", mesh=Mesh(made.vertices, made.faces))
+    torus = trimesh.creation.torus(0.012, 0.005, major_sections=72, minor_sections=32)
+    return Geometry(name="o", link="object", kind="mesh", mesh=Mesh(torus.vertices, torus.faces))
 
 
 @cache
@@ -209,9 +209,9 @@ def plot_tradeoff(rows: Sequence[dict[str, Any]], path: Path) -> None:
         "points": "proximity taxels,\nby number of surface points",
         "taxels": "pad of taxels,\nby number of taxels",
     }
-    for (part, title), one in zip(titles.items(), axes[0], strict=True):
+    for (part, title), axis in zip(titles.items(), axes[0], strict=True):
         chosen = [row for row in rows if row["part"] == part]
-        one.loglog([r["cost"] for r in chosen], [r["error"] for r in chosen], "o", markersize=5)
+        axis.loglog([r["cost"] for r in chosen], [r["error"] for r in chosen], "o", markersize=5)
         for number, row in enumerate(chosen):
             cells = f"{row['resolution']}³" if row.get("resolution") else "no field: each triangle"
             label = f"{row.get('points') or row.get('taxels') or 0:,}" if part != "mesh" else cells
@@ -221,9 +221,9 @@ def plot_tradeoff(rows: Sequence[dict[str, Any]], path: Path) -> None:
             left = side < 0 or number == len(chosen) - 1
             place = {"xytext": (-7 if left else 7, 0) if beside else (0, -12 * side), "textcoords": "offset points"}
             align = ("right" if left else "left") if beside else "center"
-            one.annotate(label, (row["cost"], row["error"]), ha=align, va="center", fontsize=8.5, **place)
-        one.set_title(title)
-        one.set_xlabel("time per environment and update (µs)")
-        one.set_ylabel("relative error of the force (RMS)")
-        one.margins(0.3)
+            axis.annotate(label, (row["cost"], row["error"]), ha=align, va="center", fontsize=8.5, **place)
+        axis.set_title(title)
+        axis.set_xlabel("time per environment and update (µs)")
+        axis.set_ylabel("relative error of the force (RMS)")
+        axis.margins(0.3)
     save_figure(figure, path, dpi=150)

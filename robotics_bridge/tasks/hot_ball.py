@@ -121,7 +121,7 @@ class Thermometers:
             sensors[link] = TemperatureGrid(
                 link=link, cells=thermal.cells, material=thermal.material, base_temperature=thermal.ambient,
                 ambient_temperature=thermal.ambient, source=source, bodies=bodies,
-                other=ThermalBody("plastic", thermal.ambient),
+                unlisted=ThermalBody("plastic", thermal.ambient),
                 conduction=thermal.conduction, convection=thermal.convection,
                 contact_radius=thermal.contact_radius,
             )  # fmt: skip

@@ -31,19 +31,19 @@ def demo(
         "temperature": lambda path: scenes.temperature(path, hand),
         "sound": scenes.sound,
     }
-    made: dict[str, Any] = {}
+    pictures: dict[str, Any] = {}
     for name, job in tracked(list(jobs.items()), "drawing"):
         path = out / f"tactile-{name}.png"
-        made[name] = {"picture": path, **job(path)}
+        pictures[name] = {"picture": path, **job(path)}
     columns = {
         "picture": "{0[picture]}",
-        "shows": lambda item: ", ".join(f"{key} {value:.3g}" for key, value in item.items() if key != "picture"),
+        "shows": lambda row: ", ".join(f"{key} {value:.3g}" for key, value in row.items() if key != "picture"),
     }
-    text = table_of("", made.values(), columns)
-    if not made["forces"]["in contact"]:
+    text = table_of("", pictures.values(), columns)
+    if not pictures["forces"]["in contact"]:
         text += f"\n\nNo taxel of {hand} touched the ball: closed, its fingers do not reach it. "
         text += f"Its probes are listed by: brainbench tactile layouts --hand {hand}"
-    return Output(made, text)
+    return Output(pictures, text)
 
 
 def layouts(
@@ -66,18 +66,18 @@ def layouts(
         layout = {place: layouts.select(whole, chosen.links(place)) for place in layouts.PLACEMENTS}
         counts[resolution] = {place: layouts.active_count(layout[place]) for place in layouts.PLACEMENTS}
         rows.append([resolution, *(str(counts[resolution][place]) for place in layouts.PLACEMENTS)])
-        for link, item in layout["hand"].items():
-            shape = " × ".join(map(str, item.shape))
-            radius = sorted({f"{1e3 * value:g}" for value in item.radius[item.active]})
-            detail.append([resolution, link, shape, str(int(item.active.sum())), ", ".join(radius)])
+        for link, link_probes in layout["hand"].items():
+            shape = " × ".join(map(str, link_probes.shape))
+            radius = sorted({f"{1e3 * value:g}" for value in link_probes.radius[link_probes.active]})
+            detail.append([resolution, link, shape, str(int(link_probes.active.sum())), ", ".join(radius)])
         if out is not None:
             layouts.write_probes(out / f"{chosen.name}_{resolution}.json", layout["hand"])
     text = table(f"{chosen.name}: {len(chosen.joints)} joints, {len(chosen.fingers)} fingers, palm {chosen.palm}",
                  ["resolution", *layouts.PLACEMENTS], rows, right=(1, 2, 3, 4))  # fmt: skip
     if links:
         text += "\n\n" + table("", ["resolution", "link", "grid", "active", "radius (mm)"], detail, right=(3,))
-    told = {name: getattr(chosen, name) for name in ("palm", "joints", "fingers")}
-    data = {"hand": chosen.name, **told, "counts": counts}
+    about = {name: getattr(chosen, name) for name in ("palm", "joints", "fingers")}
+    data = {"hand": chosen.name, **about, "counts": counts}
     return Output(data, text)
 
 
@@ -109,9 +109,9 @@ def bench(
     columns = {
         "sensor": "{0[sensor]}",
         ">probes": "{0[probes]}",
-        ">ms per update": lambda item: f"{1e3 * item['seconds']:.3f}",
+        ">ms per update": lambda row: f"{1e3 * row['seconds']:.3f}",
         ">ns per probe": "{0[per_probe_ns]:.1f}",
-        ">readings/s": lambda item: f"{envs / item['seconds']:,.0f}",
+        ">readings/s": lambda row: f"{envs / row['seconds']:,.0f}",
         ">bytes/environment": "{0[state_bytes]:,}",
     }
     text = table_of(f"{hand}, {resolution} {placement}, {envs} environments on {device}{noise}", results, columns)
@@ -124,15 +124,15 @@ def check(device: Annotated[str, typer.Option(help="cpu or cuda.")] = "cpu") -> 
 
     results = []
     for name, run in tracked(list(CHECKS.items()), "checking"):
-        found, truth, tolerance = run(device)
-        error = abs(found - truth) / max(abs(truth), 1e-30)
-        results.append({"check": name, "found": found, "truth": truth, "error": error, "passed": error <= tolerance})
+        value, truth, tolerance = run(device)
+        error = abs(value - truth) / max(abs(truth), 1e-30)
+        results.append({"check": name, "found": value, "truth": truth, "error": error, "passed": error <= tolerance})
     columns = {
         "check": "{0[check]}",
         ">found": "{0[found]:.6g}",
         ">truth": "{0[truth]:.6g}",
         ">relative error": "{0[error]:.1e}",
-        "": lambda item: "ok" if item["passed"] else "OFF",
+        "": lambda row: "ok" if row["passed"] else "OFF",
     }
     failure = None if all(result["passed"] for result in results) else typer.Exit(1)
     text = table_of(f"Checks on {device}", results, columns)

@@ -74,15 +74,15 @@ def draw_forces(
     peak = max(float(np.linalg.norm(force, axis=1).max()) for force in readings.values()) or 1e-9
     hand, held, marks = [], [], []
     for geometry in scene.geometries:
-        kept, color = (held, OBJECT) if geometry.link == "object" else (hand, SKIN)
-        kept.append(placed(surface(geometry, color), pose[scene.link_index(geometry.link)]))
+        triangles, color = (held, OBJECT) if geometry.link == "object" else (hand, SKIN)
+        triangles.append(placed(surface(geometry, color), pose[scene.link_index(geometry.link)]))
     palette = colormaps["inferno"]
-    for link, item in probes.items():
+    for link, link_probes in probes.items():
         where = pose[scene.link_index(link)]
         turn = link_rotation(where)
-        world, normal = item.position @ turn.T + where[:3], item.normal @ turn.T
+        world, normal = link_probes.position @ turn.T + where[:3], link_probes.normal @ turn.T
         force = readings[link] @ turn.T
-        for index in np.flatnonzero(item.active):
+        for index in np.flatnonzero(link_probes.active):
             share = float(np.linalg.norm(force[index])) / peak
             color = np.array(palette(0.15 + 0.75 * share)[:3]) if share > 1e-3 else np.array([0.30, 0.42, 0.62])
             marks.append(ball(world[index], 0.0007 + 0.0004 * (share > 1e-3), color))
@@ -93,11 +93,11 @@ def draw_forces(
                 line = np.linspace(tip, start, 12)
                 radii = np.r_[np.full(7, 0.00045), np.linspace(0.0011, 0.00015, 5)]
                 marks.append(tube(line, radii, np.broadcast_to(color, line.shape)))
-    solid, shown, seen = Triangles.joined(hand), Triangles.joined(marks), Triangles.joined(held)
+    solid, taxels, seen = Triangles.joined(hand), Triangles.joined(marks), Triangles.joined(held)
     camera = Camera(view=(0.95, -0.55, 0.75))
     lens = camera.lens(np.concatenate([solid.corners.reshape(-1, 3), seen.corners.reshape(-1, 3)]), SIZE)
     fine = lens.supersampled(SAMPLES)
-    image, layer, light = shaded(Triangles.joined([solid, shown]), fine, 0.08)
+    image, layer, light = shaded(Triangles.joined([solid, taxels]), fine, 0.08)
     veil = draw(seen, fine)
     front = veil.nearness.reshape(-1)[veil.pixels] > layer.nearness.reshape(-1)[veil.pixels]
     colors = shade(veil, fine, light)
@@ -122,8 +122,8 @@ def _trimmed(image: NDArray[np.float64], margin: int = 24) -> NDArray[np.float64
     darkest = image.min(axis=2)
     spans = []
     for used in (darkest.min(axis=1) < 0.999, darkest.min(axis=0) < 0.999):
-        found = np.flatnonzero(used)
-        low, high = (int(found[0]), int(found[-1]) + 1) if len(found) else (0, used.size)
+        vertices = np.flatnonzero(used)
+        low, high = (int(vertices[0]), int(vertices[-1]) + 1) if len(vertices) else (0, used.size)
         spans.append(slice(max(low - margin, 0), high + margin))
     return image[spans[0], spans[1]]
 
@@ -170,14 +170,14 @@ def draw_temperature(
     bottom = min(float(field.min()) for field in maps.values())
     # The eye has to tell a tenth of a degree under wood from ten degrees under metal.
     scale = PowerNorm(0.35, bottom, top)
-    shown = None
+    image = None
     for panel, (name, field) in zip(axes[1:], maps.items(), strict=True):
         seen = field.max(axis=0).T
-        shown = panel.imshow(seen, origin="lower", cmap="inferno", norm=scale)
+        image = panel.imshow(seen, origin="lower", cmap="inferno", norm=scale)
         panel.set_title(f"{name} ball, 45 °C: +{seen.max() - bottom:.1f} K", fontsize=10)
         panel.set(xlabel="cell across", xticks=[], yticks=[])
     axes[1].set_ylabel("cell along the finger")
-    bar = figure.colorbar(shown, ax=axes[1:], label="temperature (°C), colour: rise$^{0.35}$", shrink=0.85)
+    bar = figure.colorbar(image, ax=axes[1:], label="temperature (°C), colour: rise$^{0.35}$", shrink=0.85)
     bar.set_ticks([bottom, *(bottom + share * (top - bottom) for share in (0.02, 0.1, 0.3, 0.6)), top])
     bar.ax.yaxis.set_major_formatter("{x:.1f}")
     save_figure(figure, path, dpi=110)
@@ -186,12 +186,12 @@ def draw_temperature(
 def draw_sound(path: Path, signals: Mapping[str, NDArray[np.float64]], rate: float) -> None:
     """Draw spectrograms of signals [T] at a sample rate (Hz)."""
     figure, (axes,) = panels(1, len(signals), (12, 3.8), sharey=True)
-    shown = None
+    image = None
     for panel, (name, signal) in zip(axes, signals.items(), strict=True):
         frequency, time, power = spectrogram(signal, rate, nperseg=1024, noverlap=896)
         level = 10 * np.log10(power / power.max() + 1e-12)
-        shown = panel.pcolormesh(time, frequency / 1e3, level, vmin=-80, vmax=0, cmap="magma", rasterized=True)
+        image = panel.pcolormesh(time, frequency / 1e3, level, vmin=-80, vmax=0, cmap="magma", rasterized=True)
         panel.set(title=f"ball on {name}", xlabel="time (s)")
     axes[0].set_ylabel("frequency (kHz)")
-    figure.colorbar(shown, ax=axes, label="level (dB below the loudest)", shrink=0.9)
+    figure.colorbar(image, ax=axes, label="level (dB below the loudest)", shrink=0.9)
     save_figure(figure, path, dpi=110)

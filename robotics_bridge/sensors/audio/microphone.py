@@ -59,8 +59,8 @@ class Listener:
 
     def __init__(self, microphone: Microphone, suite: SensorSuite) -> None:
         self.microphone, self._suite = microphone, suite
-        found = [name for name, sensor in suite.sensors.items() if isinstance(sensor, AudioSensor)]
-        names = microphone.sources or found
+        sources = [name for name, sensor in suite.sensors.items() if isinstance(sensor, AudioSensor)]
+        names = microphone.sources or sources
         self._sources = {name: suite.runtime_of(name, AudioSensor, "source of sound") for name in names}
         lengths = {cast(AudioSensor, suite.sensors[name]).samples for name in names}
         if len(lengths) != 1:

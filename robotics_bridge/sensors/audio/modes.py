@@ -162,8 +162,8 @@ def find_modes(
     shape = (solid.kind, list(solid.size), None if solid.mesh is None else solid.mesh.content_hash)
     points = [None if point is None else np.asarray(point, float).tolist() for point in (strike, hear)]
     path = cache_dir("modes") / f"{content_hash(_VERSION, shape, to_plain(chosen), count, cells, points)}.npz"
-    if cache and (kept := read_sealed(path, "modes of a solid")) is not None:
-        return Modes(*(tuple(kept[name].tolist()) for name in ("frequency", "decay", "gain")))
+    if cache and (cached := read_sealed(path, "modes of a solid")) is not None:
+        return Modes(*(tuple(cached[name].tolist()) for name in ("frequency", "decay", "gain")))
     frequency, normal, place = solve(fill(solid, cells), chosen, count)
     weights = []
     for point in (strike, hear):

@@ -42,13 +42,16 @@ class ContactAudioRuntime(Runtime):
         super().__init__(sensors, self.samples, context, fusable=False)
         count, envs = len(sensors), context.num_envs
         self._dt = math.nan
-        own, quads = ContactSoundArrays(), self._quads
-        own.sources, own.link_of = context.zeros(count, SourceParams), context.solids.struct.link
-        own.force, own.before, own.rubbing = (context.zeros((envs, count)) for _ in range(3))
-        own.drive = context.zeros((self.samples, envs, count))
-        own.first, own.second, own.gain = (context.zeros((quads, count), wp.vec4) for _ in range(3))
-        own.y1, own.y2 = (context.zeros((quads, envs, count), wp.vec4) for _ in range(2))
-        self._own, self.lasting = own, [own.force, own.before, own.rubbing, own.drive, own.y1, own.y2]
+        arrays, quads = ContactSoundArrays(), self._quads
+        arrays.sources, arrays.link_of = context.zeros(count, SourceParams), context.solids.struct.link
+        arrays.force, arrays.before, arrays.rubbing = (context.zeros((envs, count)) for _ in range(3))
+        arrays.drive = context.zeros((self.samples, envs, count))
+        arrays.first, arrays.second, arrays.gain = (context.zeros((quads, count), wp.vec4) for _ in range(3))
+        arrays.y1, arrays.y2 = (context.zeros((quads, envs, count), wp.vec4) for _ in range(2))
+        self._own, self.lasting = (
+            arrays,
+            [arrays.force, arrays.before, arrays.rubbing, arrays.drive, arrays.y1, arrays.y2],
+        )
 
     def seed(self) -> None:
         """Draw from the context's present seed from now on."""
@@ -96,10 +99,10 @@ class ContactAudioRuntime(Runtime):
     def run_kernels(self, state: HandState, dt: float) -> None:
         """Make the next block from the contacts."""
         self._set_step(dt)
-        c, own, many = self.context, self._own, (self.context.num_envs, len(self._sensors))
-        c.launch(gather_contacts, state.contact_env.shape[0], state.arrays, own)
-        c.launch(excite_modes, (self.samples, *many), own, self.io, self.samples)
-        c.launch(ring_modes, many, own, self.io, self.samples)
+        c, arrays, many = self.context, self._own, (self.context.num_envs, len(self._sensors))
+        c.launch(gather_contacts, state.contact_env.shape[0], state.arrays, arrays)
+        c.launch(excite_modes, (self.samples, *many), arrays, self.io, self.samples)
+        c.launch(ring_modes, many, arrays, self.io, self.samples)
 
 
 class DriveAudioRuntime(Runtime):
@@ -110,12 +113,12 @@ class DriveAudioRuntime(Runtime):
         self.samples = first.samples
         super().__init__(sensors, self.samples, context, fusable=False)
         self._drives = dict(sensors)
-        own, shape = DriveSoundArrays(), (context.num_envs, self.count)
-        own.settings, own.part, own.number = self._settings(), self.part, self.probe
+        arrays, shape = DriveSoundArrays(), (context.num_envs, self.count)
+        arrays.settings, arrays.part, arrays.number = self._settings(), self.part, self.probe
         for name in ("effort", "speed", "last_loud", "last_speed", "phase", "hum_phase"):
-            setattr(own, name, context.zeros(shape))
-            self.lasting.append(getattr(own, name))
-        self._own, self.effort, self.speed = own, own.effort, own.speed
+            setattr(arrays, name, context.zeros(shape))
+            self.lasting.append(getattr(arrays, name))
+        self._own, self.effort, self.speed = arrays, arrays.effort, arrays.speed
 
     def _settings(self) -> Any:
         keys = [stream_key(self.context.seed, f"{name}/sound") for name in self._drives]

@@ -99,7 +99,7 @@ def calibrate(log: Log, *, max_delay: float = 0.5) -> Calibration:
         # Hysteresis can stand for a part of a delay that varies, so lags are also sought without it.
         starts = [fit] + [replace(fit, dynamics=fit.dynamics._replace(hysteresis=0.0))] * bool(fit.dynamics.hysteresis)
         settled = [_settle(living, guess, log.step, quantum, start, longest) for start in starts]
-        fit, lags = min(settled, key=lambda found: _spread(found[0]))
+        fit, lags = min(settled, key=lambda pair: _spread(pair[0]))
         models = [fit.dynamics.response(x, log.step, own) for (x, _y), own in zip(living, fit.creep, strict=True)]
         rest = [calm(model, y, 2 * guess[1]) for model, (_x, y) in zip(models, living, strict=True)]
         if _spread(fit) > 2 * np.median(rest):
@@ -134,11 +134,11 @@ def _settle(
     """Return dynamics and certain lags: each is simple where the other is known, so they are fitted in turn."""
     lags = np.zeros(0, int)
     for _ in range(_ROUNDS):
-        aligned, found = find_lags(living, guess, step, fit, longest)
-        settled, lags = np.array_equal(found, lags), found
+        aligned, fresh = find_lags(living, guess, step, fit, longest)
+        settled, lags = np.array_equal(fresh, lags), fresh
         if settled or (guess[0] == guess[1] and np.all(lags == guess[0])):
             break
-        fit = fit_dynamics(aligned, step, quantum, moving=True, known=fit)
+        fit = fit_dynamics(aligned, step, quantum, moving=True, start=fit)
     return fit, lags
 
 
@@ -174,11 +174,11 @@ def _dead(stuck: NDArray, values: NDArray) -> dict[str, Estimate]:
     count, dead = len(stuck), int(stuck.sum())
     low = float(beta.ppf(0.025, dead, count - dead + 1)) if dead else 0.0
     high = float(beta.ppf(0.975, dead + 1, count - dead)) if dead < count else 1.0
-    found = {"dead_probability": Estimate(dead / count, low, high, f"{dead} of {count} probes are stuck")}
+    estimates = {"dead_probability": Estimate(dead / count, low, high, f"{dead} of {count} probes are stuck")}
     if dead:
         for name, value in {"dead_low": values[stuck].min(), "dead_high": values[stuck].max()}.items():
-            found[name] = Estimate(float(value), math.nan, math.nan, "extreme of the stuck values")
-    return found
+            estimates[name] = Estimate(float(value), math.nan, math.nan, "extreme of the stuck values")
+    return estimates
 
 
 def _gain(fit: Fit) -> dict[str, Estimate]:

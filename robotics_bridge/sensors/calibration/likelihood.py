@@ -133,7 +133,7 @@ class _Likelihood:
     def models(self, d: Dynamics) -> list[tuple[NDArray[np.float64], float]]:
         """Return the transformed signal of each part with its hysteresis, and ξ before the part."""
         extra = self.lagged(d.tau) if d.hysteresis else [(0.0, 0.0)] * len(self.x)
-        found = []
+        models = []
         for x, y, s, (e, k), rate, loaded in zip(
             self.x, self.y, self.signal, extra, self.rate, self.loaded, strict=True
         ):
@@ -142,8 +142,8 @@ class _Likelihood:
                 # What the sensor felt before a load, or whether it crept when it was reset, stands in no log.
                 creep = _creep(y, model, d.hysteresis * k, d.walk**2 + d.white**2 * rate, most=float(np.abs(x).max()))
                 model = model + creep * d.hysteresis * k
-            found.append((model, creep))
-        return found
+            models.append((model, creep))
+        return models
 
     def __call__(self, d: Dynamics) -> float:
         total = 0.0
@@ -162,13 +162,13 @@ class _Likelihood:
 
     def gains(self, d: Dynamics) -> tuple[NDArray, NDArray]:
         """Return gains and their standard errors, of all probes and episodes."""
-        found, errors = [], []
+        gains, errors = [], []
         for y, (model, _), rate in zip(self.y, self.models(d), self.rate, strict=True):
             weight = model / (d.walk**2 + d.white**2 * rate)
             power = max(float(weight @ model), 1e-300)
-            found.append((weight @ y) / power)
+            gains.append((weight @ y) / power)
             errors.append(np.full(y.shape[1], 1 / math.sqrt(power)))
-        return np.concatenate(found), np.concatenate(errors)
+        return np.concatenate(gains), np.concatenate(errors)
 
 
 def _creep(y: NDArray, model: NDArray, fading: NDArray, variance: NDArray, *, most: float) -> float:
@@ -183,8 +183,8 @@ def _creep(y: NDArray, model: NDArray, fading: NDArray, variance: NDArray, *, mo
     return max(choices, key=lambda c: (p + c * (2 * q + c * r)) / max(u + c * (2 * v + c * w), 1e-300))
 
 
-def fit_dynamics(parts: list[Aligned], dt: float, quantum: float, *, moving: bool, known: Fit | None = None) -> Fit:
-    """Fit white noise, drift, hysteresis, gains and bias by maximum likelihood, near ``known`` if that is given.
+def fit_dynamics(parts: list[Aligned], dt: float, quantum: float, *, moving: bool, start: Fit | None = None) -> Fit:
+    """Fit white noise, drift, hysteresis, gains and bias by maximum likelihood, from the fit ``start`` if given.
 
     Drift and hysteresis are kept if they raise the likelihood by more than chance would.
     """
@@ -198,8 +198,8 @@ def fit_dynamics(parts: list[Aligned], dt: float, quantum: float, *, moving: boo
 
     def minimum(dynamics: Callable[[list[float]], Dynamics], start: list[float]) -> tuple[list[float], float]:
         options = {"xatol": 1e-6, "fatol": 1e-7, "maxiter": 4000, "maxfev": 4000}
-        found = minimize(lambda p: target(dynamics(p)), start, method="Nelder-Mead", options=options)
-        return [float(value) for value in found.x], float(found.fun)
+        solution = minimize(lambda p: target(dynamics(p)), start, method="Nelder-Mead", options=options)
+        return [float(value) for value in solution.x], float(solution.fun)
 
     noise, plain_cost = minimum(
         lambda p: dynamics_of(p[0], p[1], 0.0, no_lag), [math.log(spread / 2), math.log(spread / 20)]
@@ -209,12 +209,12 @@ def fit_dynamics(parts: list[Aligned], dt: float, quantum: float, *, moving: boo
     if moving:
         # The likelihood has several maxima in τ: starts spread over the decades that the log can tell.
         taus = np.geomspace(2 * dt, min(duration / 4, 100.0 * dt), 5)
-        if known and known.dynamics.hysteresis:
-            taus = [known.dynamics.tau]
+        if start and start.dynamics.hysteresis:
+            taus = [start.dynamics.tau]
         for tau in taus:
-            found, value = minimum(lambda p: dynamics_of(*p), [*noise, 0.1, math.log(tau)])
+            point, value = minimum(lambda p: dynamics_of(*p), [*noise, 0.1, math.log(tau)])
             if value < cost - 1e-9:
-                best, cost = dynamics_of(*found), value
+                best, cost = dynamics_of(*point), value
     # Likelihood-ratio tests: a knob must earn its place, or every log would have a little drift and hysteresis.
     # Each unknown ξ before an episode under load is one number more.
     more = float(chi2.isf(0.01, 2 + sum(target.loaded)) - chi2.isf(0.01, 2))
@@ -226,10 +226,10 @@ def fit_dynamics(parts: list[Aligned], dt: float, quantum: float, *, moving: boo
     def without_drift(p: list[float]) -> Dynamics:
         return dynamics_of(p[0], tiny, p[1] if hysteresis else 0.0, p[2])
 
-    found, value = minimum(without_drift, [best.log_white, best.hysteresis, best.log_tau])
+    point, value = minimum(without_drift, [best.log_white, best.hysteresis, best.log_tau])
     drifts = 2 * (value - cost) > _SIGNIFICANT
     if not drifts:
-        best = without_drift(found)
+        best = without_drift(point)
     free = ["log_white"] + ["log_walk"] * drifts + ["hysteresis", "log_tau"] * hysteresis
     estimates = _estimates(best, _errors(target, best, free), quantum)
     gains, gain_errors = target.gains(best) if moving else (np.ones(1), np.ones(1))
@@ -271,20 +271,20 @@ def _estimates(best: Dynamics, errors: dict[str, float], quantum: float) -> dict
 
     # Rounding to steps q has the variance q²/12, which the fit has counted as white noise.
     white = [math.sqrt(max(value**2 - quantum**2 / 12, 0.0)) for value in spread("log_white")]
-    found = {"white": Estimate(white[0], white[1], white[2], how)}
+    estimates = {"white": Estimate(white[0], white[1], white[2], how)}
     if Z95 * errors["log_white"] >= _UNTOLD:
-        found["white"] = Estimate(0.0, 0.0, math.nan, "too little beside the drift to be told")
+        estimates["white"] = Estimate(0.0, 0.0, math.nan, "too little beside the drift to be told")
     if "log_walk" in errors:
-        found["walk"] = Estimate(*spread("log_walk"), how)
+        estimates["walk"] = Estimate(*spread("log_walk"), how)
     else:
-        found["walk"] = Estimate(0.0, 0.0, math.nan, "no drift beyond chance")
+        estimates["walk"] = Estimate(0.0, 0.0, math.nan, "no drift beyond chance")
     if "hysteresis" in errors:
         half = Z95 * errors["hysteresis"]
-        found["hysteresis_tau"] = Estimate(*spread("log_tau"), how)
-        found["hysteresis"] = Estimate(best.hysteresis, best.hysteresis - half, best.hysteresis + half, how)
+        estimates["hysteresis_tau"] = Estimate(*spread("log_tau"), how)
+        estimates["hysteresis"] = Estimate(best.hysteresis, best.hysteresis - half, best.hysteresis + half, how)
     else:
-        found["hysteresis"] = Estimate(0.0, math.nan, math.nan, "none beyond chance")
-    return found
+        estimates["hysteresis"] = Estimate(0.0, math.nan, math.nan, "none beyond chance")
+    return estimates
 
 
 def _bias(
@@ -293,9 +293,9 @@ def _bias(
     """Return the common offset and its error: the best linear estimate under drift that starts at zero."""
     estimates, precisions, place = [], [], 0
     white, walk = best.white, best.walk if drifts else 0.0
-    for (x, y, at), own in zip(parts, creep, strict=True):
+    for (x, y, at), past in zip(parts, creep, strict=True):
         count, n = y.shape
-        model = best.response(x, dt, own)[at] if moving else np.zeros(count)
+        model = best.response(x, dt, past)[at] if moving else np.zeros(count)
         rest = y - np.outer(model, gains[place : place + n] if moving else np.ones(n))
         place += n
         # Differences, with the first reading in front: its drift is one step.
@@ -311,9 +311,9 @@ def _bias(
         estimates += ((solved @ z) / solved[0]).tolist()
         precisions += [float(solved[0])] * n
     values = np.array(estimates)
-    own = math.sqrt(1 / np.sum(precisions))
+    statistical = math.sqrt(1 / np.sum(precisions))
     between = float(values.std(ddof=1) / math.sqrt(len(values))) if len(values) > 1 else 0.0
-    return float(np.average(values, weights=precisions)), max(own, between)
+    return float(np.average(values, weights=precisions)), max(statistical, between)
 
 
 _SURE = 25.0
@@ -344,8 +344,8 @@ def find_delays(parts: list[Episode], longest: int) -> tuple[int, int]:
         for (x, _y), step, power in zip(parts, steps, powers, strict=True):
             # Squared correlation of differences: gain, bias and drift of the readings do not enter.
             a = np.diff(blur(x, first, last)[longest:])
-            own = float(a @ a)
-            score += float(((a @ step) ** 2 / own / power).mean()) if own > 0 else 0.0
+            energy = float(a @ a)
+            score += float(((a @ step) ** 2 / energy / power).mean()) if energy > 0 else 0.0
         return score
 
     best = max(((lag, lag) for lag in range(longest + 1)), key=lambda lags: explained(*lags))
@@ -353,10 +353,10 @@ def find_delays(parts: list[Episode], longest: int) -> tuple[int, int]:
         first, last = best
         steps_of = [(-1, 0), (1, 0), (0, -1), (0, 1)]
         near = [(first + a, last + b) for a, b in steps_of if 0 <= first + a <= last + b <= longest]
-        found = max(near, key=lambda lags: explained(*lags), default=best)
-        if explained(*found) <= explained(*best):
+        neighbour = max(near, key=lambda lags: explained(*lags), default=best)
+        if explained(*neighbour) <= explained(*best):
             return best
-        best = found
+        best = neighbour
 
 
 def unknown_past(x: NDArray[np.float64], longest: int) -> int:
@@ -380,7 +380,7 @@ def find_lags(
     dynamics = fit.dynamics
     middle = sum(guess) // 2
     lags = np.arange(2 * guess[1] + 1)
-    found, told, place = [], [], 0
+    episodes, certain, place = [], [], 0
     for (x, y), creep in zip(parts, fit.creep, strict=True):
         n = y.shape[1]
         model = dynamics.response(x, dt, creep)
@@ -392,28 +392,28 @@ def find_lags(
                 f"An episode of the log has {len(x)} readings, no more than twice the delay that would explain it "
                 f"({guess[1]} readings); record longer ones, or allow shorter delays."
             )
-        shown = model[rows[:, None] - lags]
+        lagged = model[rows[:, None] - lags]
         # Dynamics that were fitted to misplaced readings call noise what is late.
         noise = min(dynamics.white**2 + dynamics.walk**2, 4 * calm(model, y, int(lags[-1])))
-        level = _level(y[rows] - np.outer(model[rows - middle], gain), np.ptp(shown, axis=1), noise)
+        level = _level(y[rows] - np.outer(model[rows - middle], gain), np.ptp(lagged, axis=1), noise)
         rest = y[rows] - level
         # Σ (rest − gain · shown)² for every lag, from its three terms.
-        misfit = (rest**2).sum(axis=1)[:, None] - 2 * shown * (rest @ gain)[:, None] + shown**2 * (gain @ gain)
+        misfit = (rest**2).sum(axis=1)[:, None] - 2 * lagged * (rest @ gain)[:, None] + lagged**2 * (gain @ gain)
         order = np.argsort(misfit, axis=1)
         best, second = (np.take_along_axis(misfit, order[:, [k]], axis=1)[:, 0] for k in (0, 1))
         sure = second - best > _SURE * noise
-        told.append(order[sure, 0])
-        found.append((x, y[rows], rows, misfit))
-    lags = np.concatenate(told)
+        certain.append(order[sure, 0])
+        episodes.append((x, y[rows], rows, misfit))
+    lags = np.concatenate(certain)
     first, last = extent(lags, guess)
-    return [(x, y, rows - first - misfit[:, first : last + 1].argmin(axis=1)) for x, y, rows, misfit in found], lags
+    return [(x, y, rows - first - misfit[:, first : last + 1].argmin(axis=1)) for x, y, rows, misfit in episodes], lags
 
 
 def extent(lags: NDArray[np.int64], guess: tuple[int, int]) -> tuple[int, int]:
     """Return the smallest and largest lag that occur more often than mistakes do (2 % of the certain ones)."""
     values, counts = np.unique(lags, return_counts=True)
-    kept = values[counts > 0.02 * max(len(lags), 1)]
-    return (int(kept.min()), int(kept.max())) if len(kept) and len(lags) >= 8 else guess
+    frequent = values[counts > 0.02 * max(len(lags), 1)]
+    return (int(frequent.min()), int(frequent.max())) if len(frequent) and len(lags) >= 8 else guess
 
 
 def calm(model: NDArray[np.float64], y: NDArray[np.float64], longest: int) -> float:

@@ -98,10 +98,10 @@ def segments(log: Log) -> list[Episode]:
     numbers = np.zeros(len(x), int) if log.episode is None else log.episode
     edges = np.flatnonzero(np.diff(numbers)) + 1
     parts = zip(np.split(x, edges), np.split(log.readings, edges), strict=True)
-    kept = [(a, b) for a, b in parts if len(a) >= SHORTEST]
-    if not kept:
+    long = [(a, b) for a, b in parts if len(a) >= SHORTEST]
+    if not long:
         raise DataError(f"Every episode of the log has fewer than {SHORTEST} readings; record longer ones.")
-    return kept
+    return long
 
 
 def find_dead(parts: list[Episode]) -> tuple[list[NDArray[np.bool_]], list[NDArray[np.float64]]]:

@@ -81,7 +81,7 @@ class HeatArrays:
     """[B, L] (°C)."""
     number: wp.array2d(dtype=wp.int32)
     """[B, S] contacts of a grid."""
-    kept: wp.array3d(dtype=wp.int32)
+    listed: wp.array3d(dtype=wp.int32)
     """[B, S, M] their numbers in the state."""
     touched: wp.array2d(dtype=wp.float32)
     """[B, N] time since a contact began (s)."""
@@ -119,8 +119,8 @@ def collect_contacts(state: StateArrays, heat: HeatArrays):
         link = heat.sensors[s].link
         if (a == link) != (b == link):
             place = wp.atomic_add(heat.number, env, s, 1)
-            if place < heat.kept.shape[2]:
-                heat.kept[env, s, place] = c
+            if place < heat.listed.shape[2]:
+                heat.listed[env, s, place] = c
 
 
 @wp.func
@@ -215,12 +215,12 @@ def conduct_contacts(measure: int, state: StateArrays, heat: HeatArrays, io: Rea
     Launched first to ``measure`` the area that is touched in each cell (1), then to add conductances (0).
     """
     env, s, i = wp.tid()
-    count = wp.min(heat.number[env, s], heat.kept.shape[2])
+    count = wp.min(heat.number[env, s], heat.listed.shape[2])
     if i >= count or (io.status[env] & 1) != 0:
         return
     grid = heat.sensors[s]
     frame = state.pose[env, grid.link]
-    c = heat.kept[env, s, i]
+    c = heat.listed[env, s, i]
     other = other_link(state.contact_geom[c], heat.link_of, grid.link)
     # The points that share the other link: their number, centre and mean normal.
     points = int(0)
@@ -229,7 +229,7 @@ def conduct_contacts(measure: int, state: StateArrays, heat: HeatArrays, io: Rea
     spots = float(0.0)
     deepest = float(0.0)
     for j in range(count):
-        d = heat.kept[env, s, j]
+        d = heat.listed[env, s, j]
         if other_link(state.contact_geom[d], heat.link_of, grid.link) == other:
             points = points + 1
             center = center + state.contact_position[d]
@@ -259,7 +259,7 @@ def conduct_contacts(measure: int, state: StateArrays, heat: HeatArrays, io: Rea
         polygon = float(0.0)
         own = float(0.0)
         for j in range(count):
-            d = heat.kept[env, s, j]
+            d = heat.listed[env, s, j]
             if other_link(state.contact_geom[d], heat.link_of, grid.link) == other:
                 p = state.contact_position[d] - center
                 x = wp.dot(p, u)
@@ -269,7 +269,7 @@ def conduct_contacts(measure: int, state: StateArrays, heat: HeatArrays, io: Rea
                 nx = x
                 ny = y
                 for k in range(count):
-                    e = heat.kept[env, s, k]
+                    e = heat.listed[env, s, k]
                     if k != j and other_link(state.contact_geom[e], heat.link_of, grid.link) == other:
                         q = state.contact_position[e] - center
                         qx = wp.dot(q, u)

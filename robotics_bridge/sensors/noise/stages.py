@@ -107,7 +107,7 @@ class ReadingNoise:
     def launch(self, x: Any, out: Any, dt: float) -> None:
         """Measure the signal ``x`` [C, B, N] (after radius noise) into ``out`` if that is staged; record ``out``."""
         context = self._context
-        known, now = [self.params, self.part], [context.age, context.episode, context.env_offset, float(dt)]
+        knobs, now = [self.params, self.part], [context.age, context.episode, context.env_offset, float(dt)]
         if self._mixes:
             first, second = self._buffers
             # Rows into one buffer, columns into the other: threads read neighbours, so no pass writes what it reads.
@@ -117,7 +117,7 @@ class ReadingNoise:
                 )
             x = second
         if self._staged:
-            inputs = [*known, self.probe, self._active, *now, int(self._gained), x, self._hysteresis, self._walk, out]
+            inputs = [*knobs, self.probe, self._active, *now, int(self._gained), x, self._hysteresis, self._walk, out]
             context.launch(measure, self._shape[1:], *inputs)
         if self._longest > 0:
             # The small amount less than a slot keeps a delay of exactly n steps at n despite rounding of the quotient.
@@ -130,7 +130,7 @@ class ReadingNoise:
                     f"A delay of {self._longest:g} s needs {slots} readings at a time step of {dt:g} s, but the first "
                     f"update made room for {self._ring.shape[0]}; build the sensors anew for the shorter step."
                 )
-            inputs = [*known, self._delay, self._jitter, *now, out, self._ring, self.late]
+            inputs = [*knobs, self._delay, self._jitter, *now, out, self._ring, self.late]
             context.launch(delay_line, self._shape[1:], *inputs)
 
     def read(self, measured: Any) -> Any:

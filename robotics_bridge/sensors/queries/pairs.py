@@ -115,12 +115,12 @@ class PairTable:
         }
         self.plan = to_struct(SlotArrays, {name: np.asarray(values) for name, values in plan.items()}, c.device)
         listed = (envs, max(int(first[-1]), 1))
-        found = PairArrays()
-        found.first, found.count = self.plan.first, c.zeros((envs, count), int)
-        found.geometry, found.rotation = c.zeros(listed, int), c.zeros(listed, warp().mat33f)
+        lists = PairArrays()
+        lists.first, lists.count = self.plan.first, c.zeros((envs, count), int)
+        lists.geometry, lists.rotation = c.zeros(listed, int), c.zeros(listed, warp().mat33f)
         for name in ("offset", "velocity", "spin"):
-            setattr(found, name, c.zeros(listed, warp().vec3f))
-        self.struct = found
+            setattr(lists, name, c.zeros(listed, warp().vec3f))
+        self.struct = lists
         self._bits = c.zeros((envs, count * self._words), int)
         self.crowded = c.zeros(envs, int)
 

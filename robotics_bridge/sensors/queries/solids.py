@@ -54,9 +54,9 @@ def sample_field(mesh: Mesh, resolution: int = 64, device: Any = "cpu") -> Field
     # Samples lie symmetrically about the middle of the box, so that a symmetric mesh has a symmetric field.
     origin = (0.5 * (low + high) - 0.5 * spacing * (counts - 1)).astype(np.float32)
     path = cache_dir("fields") / f"{mesh.content_hash}-{resolution}-{_FORMAT}.npz"
-    kept = read_sealed(path, "distance field")
-    if kept is not None and kept["values"].shape == tuple(counts):
-        return Field(kept["values"], origin, spacing)
+    cached = read_sealed(path, "distance field")
+    if cached is not None and cached["values"].shape == tuple(counts):
+        return Field(cached["values"], origin, spacing)
     wp, tree = warp(), mesh_tree(mesh, device, winding=True)
     samples = wp.zeros(tuple(int(n) for n in counts), dtype=wp.float32, device=device)
     reach = 4 * float(spacing * counts.max())
@@ -208,8 +208,8 @@ class Solids:
             for row in range(self.rows if index in scene.variants else 1):
                 geometry = scene.geometry_in(row, index)
                 if id(geometry) not in seen:
-                    asked = ("sdf", index) in queries, ("raycast", index) in queries
-                    seen[id(geometry)] = self._describe(geometry, *asked, resolution)
+                    wanted = ("sdf", index) in queries, ("raycast", index) in queries
+                    seen[id(geometry)] = self._describe(geometry, *wanted, resolution)
                 rows = row if index in scene.variants else slice(None)
                 described = seen[id(geometry)]
                 self.kinds[rows, index], size[rows, index], bound[rows, index] = described[:3]

@@ -111,12 +111,12 @@ def _within(
         cell = at + np.array(step) - 1
         low = origin + cell * edge
         away = np.maximum(np.maximum(low - points, points - low - edge), 0.0)
-        kept = ((away**2).sum(axis=1) <= far**2) & (cell >= 0).all(axis=1) & (cell < counts).all(axis=1)
-        cells.append(np.ravel_multi_index(cell[kept].T, counts))
-        numbers.append(np.nonzero(kept)[0])
-    found, owners = np.concatenate(cells), np.concatenate(numbers)
-    order = np.lexsort((owners, found))
-    return found[order], owners[order]
+        inside = ((away**2).sum(axis=1) <= far**2) & (cell >= 0).all(axis=1) & (cell < counts).all(axis=1)
+        cells.append(np.ravel_multi_index(cell[inside].T, counts))
+        numbers.append(np.nonzero(inside)[0])
+    listed, owners = np.concatenate(cells), np.concatenate(numbers)
+    order = np.lexsort((owners, listed))
+    return listed[order], owners[order]
 
 
 def surface_area(geometry: Geometry) -> float:

@@ -55,8 +55,8 @@ class ElastomerRuntime(ProbeRuntime):
         self.points = cloud.struct if cloud else CloudArrays()
         """Warp structure of the surface points that are followed."""
         total_points = cloud.total if cloud else 0
-        own = [sensor.own(scene) if self._followed else () for sensor in self._sensors]
-        members = [g for one in own for g in one]
+        pad_geometries = [sensor.pad_geometries(scene) if self._followed else () for sensor in self._sensors]
+        members = [g for one in pad_geometries for g in one]
         self._own_kinds = context.solids.kinds_of(sorted(set(members)))
         # Threads of a GPU are environments and want them side by side. A processor walks through the points of one, and
         # through its markers: a thread for each costs more.
@@ -67,7 +67,7 @@ class ElastomerRuntime(ProbeRuntime):
         total, blocks = max(count * self._blocks * BLOCK, 1), max(count * self._blocks, 1)
         rows, columns = (max(side) for side in zip(*map(_sides, self.slices.values()), strict=True))
         pads = ElastomerArrays()
-        pads.gels, pads.blocks = self._describe(own), self._blocks
+        pads.gels, pads.blocks = self._describe(pad_geometries), self._blocks
         pads.weights, pads.reach = self._weigh()
         pads.tracked, pads.own = context.array(tracked or [0], int), context.array(members or [0], int)
         pads.height = context.zeros((2 * self._planes, envs, self.count))
@@ -120,7 +120,7 @@ class ElastomerRuntime(ProbeRuntime):
         """Run a kernel over all environments and markers."""
         self.context.launch(kernel, (self.context.num_envs, self.count if self.side_by_side else 1), *inputs)
 
-    def _describe(self, own: list[tuple[int, ...]]) -> Any:
+    def _describe(self, pad_geometries: list[tuple[int, ...]]) -> Any:
         """Return the structures of the gels; ``own`` are the geometries of each pad."""
         gels, owned = [], 0
         for index, (sensor, place) in enumerate(zip(self._sensors, self.slices.values(), strict=True)):
@@ -135,10 +135,10 @@ class ElastomerRuntime(ProbeRuntime):
                 expansion_x=widening[0], expansion_y=widening[1], frame_x=frame[0], frame_y=frame[1],
                 start=place.start, rows=rows, columns=columns, step_y=pitch[0], step_x=pitch[1],
                 link=self.context.scene.link_index(sensor.link), slot=self.slots[index], own_first=owned,
-                own_last=owned + len(own[index]), along=along, across=across, normal=normal,
+                own_last=owned + len(pad_geometries[index]), along=along, across=across, normal=normal,
                 center=wp.vec3f(*probes.position[probes.active].mean(axis=0).tolist()),
             )  # fmt: skip
-            owned += len(own[index])
+            owned += len(pad_geometries[index])
             gels.append(gel)
         return self.context.array(gels, GelParams)
 
@@ -310,10 +310,10 @@ def _solve(height: torch.Tensor, kernel: torch.Tensor) -> torch.Tensor:
         keep = (~overlap.any(dim=1, keepdim=True).any(dim=2, keepdim=True)).to(p.dtype)
         change, p, before = (new - p).norm(dim=(1, 2)), new, square
         # By environment: beside a large pressure in one, a small one elsewhere would never count.
-        found = change <= _ACCURACY * p.norm(dim=(1, 2))
-        if found.all():
+        converged = change <= _ACCURACY * p.norm(dim=(1, 2))
+        if converged.all():
             break
-    return p.masked_fill(~found[:, None, None], math.nan)
+    return p.masked_fill(~converged[:, None, None], math.nan)
 
 
 def _load(suite: SensorSuite, sensor: ElastomerTaxel, state: HandState) -> torch.Tensor:
@@ -321,13 +321,13 @@ def _load(suite: SensorSuite, sensor: ElastomerTaxel, state: HandState) -> torch
     wp, scene = warp(), suite.scene
     device = wp.to_torch(state.contact_force).device
     number = len(scene.geometries)
-    own, tracked = (torch.zeros(number, dtype=torch.bool, device=device) for _ in range(2))
-    own[list(scene.geometries_of(sensor.link))], tracked[list(sensor.tracked(scene))] = True, True
+    on_pad, tracked = (torch.zeros(number, dtype=torch.bool, device=device) for _ in range(2))
+    on_pad[list(scene.geometries_of(sensor.link))], tracked[list(sensor.tracked(scene))] = True, True
     pair = wp.to_torch(state.contact_geom).long()
     count = wp.to_torch(state.contact_count)
     valid = (torch.arange(len(pair), device=device) < count) & (pair >= 0).all(dim=1)
     first, second = pair.clamp_min(0).unbind(1)
-    valid &= (own[first] & tracked[second]) | (own[second] & tracked[first])
+    valid &= (on_pad[first] & tracked[second]) | (on_pad[second] & tracked[first])
     force = wp.to_torch(state.contact_force).where(valid, 0.0)
     env = wp.to_torch(state.contact_env).long().where(valid, 0)
     return torch.zeros(suite.num_envs, device=device).index_add_(0, env, force)

@@ -75,10 +75,10 @@ class ProximityRuntime(ProbeRuntime):
             # ρ_b of 4.14, by variant: a body with more points does not push harder.
             row[:] = sensor.density / np.maximum(self.cloud.counts, 1)
         options = first.convention == "physical", self.mode, *self.stores
-        self._kernel, own = proximity_kernel(*options), ProximityArrays()
-        own.laws, own.densities = context.array(laws, ProximityParams), context.array(densities, float)
-        own.links = context.array([context.scene.link_index(sensor.link) for sensor in sensors.values()], int)
-        self._own = own
+        self._kernel, arrays = proximity_kernel(*options), ProximityArrays()
+        arrays.laws, arrays.densities = context.array(laws, ProximityParams), context.array(densities, float)
+        arrays.links = context.array([context.scene.link_index(sensor.link) for sensor in sensors.values()], int)
+        self._own = arrays
         reach = max(float(s.probes.radius.max(initial=0.0)) + s.noise.radius for s in sensors.values())
         self._cells = list_by_cells(self.cloud, reach, context.device)
 
@@ -129,14 +129,14 @@ class ContactLoadRuntime(KinematicRuntime):
             self.nodes = self._make_nodes(room)
         plan, nodes, press = self.plan, self.nodes, self.press
         # A processor can look how many contacts there are; on a GPU that would wait for it.
-        found = room if c.device.is_cuda else min(room, int(state.contact_count.numpy()[0]))
+        contacts = room if c.device.is_cuda else min(room, int(state.contact_count.numpy()[0]))
         nodes.head.fill_(-1)
-        known = [plan, c.pairs.plan, c.solids.struct.link, self.probes, state.arrays]
-        c.launch(kernels.list_contacts, 2 * found, *known, state.contact_friction, nodes)
+        scene_arrays = [plan, c.pairs.plan, c.solids.struct.link, self.probes, state.arrays]
+        c.launch(kernels.list_contacts, 2 * contacts, *scene_arrays, state.contact_friction, nodes)
         if c.device.is_cuda:
             c.launch(kernels.sort_contacts, nodes.head.shape, nodes)
         super().run_kernels(state, dt)
-        c.launch(kernels.share_contacts, (2 * found, self._most), *known, press, nodes)
+        c.launch(kernels.share_contacts, (2 * contacts, self._most), *scene_arrays, press, nodes)
         inputs = [plan, self.probes, self.rows, press, nodes, int(self.noisy), self._written, self.io]
         c.launch(kernels.spread_contacts, (c.num_envs, self.rows.shape[0]), *inputs)
 

@@ -1,4 +1,4 @@
-"""Taxels: from depth, normal and relative velocity (thesis 4.4–4.10), from nearby points, and of elastomers (4.17–4.21)."""
+"""Taxels: from depth, normal and velocity (thesis 4.4–4.10), from nearby points, and of elastomers (4.17–4.21)."""
 
 from __future__ import annotations
 
@@ -224,13 +224,15 @@ class ElastomerTaxel(QuerySensor):
         # The factor 1 − κ λ_d r² is no product of two axes, so recoil needs the full convolution.
         return "fft" if self.layer and self.layer.recoil else "separable"
 
-    def own(self, scene: TouchScene) -> tuple[int, ...]:
+    def pad_geometries(self, scene: TouchScene) -> tuple[int, ...]:
         """Return the geometries of its own link that can be indented."""
         return tuple(g for g in scene.geometries_of(self.link) if scene.geometries[g].kind != "other")
 
     def queries(self, scene: TouchScene) -> frozenset[tuple[str, int]]:
         """Return the queries of what it tracks, and of its own link where points are followed."""
-        return super().queries(scene) | {(self.query, geometry) for geometry in self.own(scene) if self.points}
+        return super().queries(scene) | {
+            (self.query, geometry) for geometry in self.pad_geometries(scene) if self.points
+        }
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -111,8 +111,8 @@ class TemperatureGrid(Sensor):
     source: Any = 0.0
     """Heat made inside [W/m³]: one number, or an array [nx, ny, nz]."""
     bodies: Mapping[str, ThermalBody] = field(default_factory=dict)
-    """Link → what it is made of, for links that may touch this one; all others are ``other``."""
-    other: ThermalBody = field(default_factory=ThermalBody)
+    """Link → what it is made of, for links that may touch this one; all others are ``unlisted``."""
+    unlisted: ThermalBody = field(default_factory=ThermalBody)
     """Material and temperature of every other link."""
     conduction: Literal["physical", "thesis"] = "physical"
     """``physical``: the cell (half its depth, and the spreading of a small spot), the interface and the touched body
@@ -153,7 +153,7 @@ class TemperatureGrid(Sensor):
             raise UsageError(f"source is a number or an array {tuple(self.cells)}; received {np.shape(self.source)}.")
         for value in np.ravel(self.source):
             check_number("source", value)
-        for name, body in {**self.bodies, "other": self.other}.items():
+        for name, body in {**self.bodies, "unlisted": self.unlisted}.items():
             check_kind(f"body {name!r}", body, ThermalBody, "ThermalBody(material, temperature)")
             material(body.material)
         material(self.material)
@@ -164,7 +164,7 @@ class TemperatureGrid(Sensor):
 
     def group(self) -> Hashable:
         """Return what is known of other links: grids for which it is the same share one runtime."""
-        return (tuple(sorted(self.bodies.items(), key=lambda item: item[0])), self.other)
+        return (tuple(sorted(self.bodies.items(), key=lambda pair: pair[0])), self.unlisted)
 
     def corners(self, scene: TouchScene) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the lower and upper corner of the grid [3] (m, link frame)."""

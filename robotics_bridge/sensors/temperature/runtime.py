@@ -66,7 +66,7 @@ class TemperatureRuntime(Runtime):
         heat.link_conductivity = context.array([item.conductivity for item in materials], float)
         heat.link_diffusivity = context.array([item.diffusivity for item in materials], float)
         heat.link_temperature = context.array(temperatures, float)
-        heat.number, heat.kept = context.zeros(many, int), context.zeros((*many, CAPACITY), int)
+        heat.number, heat.listed = context.zeros(many, int), context.zeros((*many, CAPACITY), int)
         heat.touched, heat.covered, heat.conductance, heat.inflow = (context.zeros(shape) for _ in range(4))
         heat.temperature, heat.element = (context.zeros(shape, wp.float64) for _ in range(2))
         sizes = np.square([sensor.cells for sensor in self._sensors])
@@ -76,7 +76,7 @@ class TemperatureRuntime(Runtime):
         """Warp structure of contacts, bodies and fields."""
         self._buffers = [context.zeros(shape, wp.float64) for _ in range(2)]
         self.lasting = [*self._buffers, heat.temperature, heat.element, heat.touched, heat.covered]
-        self.lasting += [heat.conductance, heat.inflow, heat.number, heat.kept, heat.link_temperature]
+        self.lasting += [heat.conductance, heat.inflow, heat.number, heat.listed, heat.link_temperature]
         self._axes = [axis for axis in range(3) if any(sensor.cells[axis] > 1 for sensor in self._sensors)]
         # What the element shows differs from the cell where it lags, or where its range ends.
         limits = [value for sensor in self._sensors for value in (sensor.warm_range, sensor.cold_range)]
@@ -91,15 +91,15 @@ class TemperatureRuntime(Runtime):
         low, high = sensor.corners(self.context.scene)
         edges = (high - low) / np.array(sensor.cells)
         self._edges.append(edges)
-        own = material(sensor.material)
+        solid = material(sensor.material)
         contact = sensor.contact_conductance if math.isfinite(sensor.contact_conductance) else 0.0
         cold, warm = (min(value, 1e9) for value in (sensor.cold_range, sensor.warm_range))
         # C = ρ c_p V of a whole cell; the source is given per volume for the same reason, not per area as in 4.36.
-        capacity = own.density * own.specific_heat * edges.prod()
+        capacity = solid.density * solid.specific_heat * edges.prod()
         return fill(
             ThermalParams, sensor, link=self.context.scene.link_index(sensor.link), first=first,
-            shape=wp.vec3i(*sensor.cells), low=wp.vec3f(*low), cell=wp.vec3f(*edges), conductivity=own.conductivity,
-            diffusivity=own.diffusivity, capacity=capacity, emissivity=own.emissivity if sensor.radiates else 0.0,
+            shape=wp.vec3i(*sensor.cells), low=wp.vec3f(*low), cell=wp.vec3f(*edges), conductivity=solid.conductivity,
+            diffusivity=solid.diffusivity, capacity=capacity, emissivity=solid.emissivity if sensor.radiates else 0.0,
             ambient=sensor.ambient_temperature, base=sensor.base_temperature, contact=contact,
             bluntness=sensor.contact_radius, published=int(sensor.conduction == "thesis"), cold=cold, warm=warm,
         )  # fmt: skip
@@ -144,7 +144,7 @@ class TemperatureRuntime(Runtime):
         for part in range(self._parts):
             heat.begins = int(part == 0)
             for measure in (1, 0):
-                c.launch(conduct_contacts, heat.kept.shape, measure, state.arrays, heat, self.io)
+                c.launch(conduct_contacts, heat.listed.shape, measure, state.arrays, heat, self.io)
             # Sources, contacts and surfaces first, then diffusion axis by axis: the exponentials of the axes commute,
             # so their order does not matter. Cells read their neighbours, hence two buffers in turn.
             now, spare = self._buffers
@@ -190,8 +190,8 @@ def _body(sensor: TemperatureGrid, grids: list[TemperatureGrid], link: str) -> T
     """Return the body of a link: as a grid's configuration says, as a grid on the link says, or the default."""
     if link in sensor.bodies:
         return sensor.bodies[link]
-    own = next((grid for grid in grids if grid.link == link), None)
-    return sensor.other if own is None else ThermalBody(own.material, own.base_temperature)
+    own_grid = next((grid for grid in grids if grid.link == link), None)
+    return sensor.unlisted if own_grid is None else ThermalBody(own_grid.material, own_grid.base_temperature)
 
 
 def _exposed(cells: tuple[int, int, int], edges: NDArray[np.float64]) -> NDArray[np.float64]:
