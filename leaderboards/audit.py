@@ -102,7 +102,7 @@ def _value(record: ResultRecord) -> str:
     return "no number" if math.isnan(record.score.value) else f"{record.score.value:.4f}"
 
 
-_CAUSES = ("recordings", "stimuli", "brainbench version", "card.weights", "score.layer")
+_CAUSES = ("recordings", "stimuli", "estimator version", "card.weights", "score.layer")
 
 
 @dataclass(frozen=True)
@@ -118,11 +118,14 @@ class Difference:
         return f"{self.what}: {in_short(self.before)} → {in_short(self.after)}"
 
 
+Kind = Literal["added", "removed", "changed", "moved", "restated"]
+
+
 @dataclass(frozen=True)
 class Change:
     """A change of one model between two builds."""
 
-    kind: Literal["added", "removed", "changed", "moved", "restated"]
+    kind: Kind
     """``moved``: the record is the same, its rank or standing is not, because of others. ``restated``: another record
     with the same inputs and numbers, which says more or less beside them."""
     board: str
@@ -141,20 +144,21 @@ def differences(record: ResultRecord, again: ResultRecord, *, tolerance: float =
     status of the scores. Numbers count as equal within ``tolerance``. What only says when, where and with which
     packages is not compared, nor the content hash of simulated stimuli whose configuration is the same.
     """
-    one, other = record.score.provenance, again.score.provenance
+    stated, repeated = record.score.provenance, again.score.provenance
+    versions = [origin.settings.get("estimator_version") for origin in (stated, repeated)]
     inputs: list[tuple[str, Any, Any]] = [
-        ("recordings", one.recordings_hash, other.recordings_hash),
-        ("stimuli", one.stimuli_hash, other.stimuli_hash),
-        ("brainbench version", one.version, other.version),
+        ("recordings", stated.recordings_hash, repeated.recordings_hash),
+        ("stimuli", stated.stimuli_hash, repeated.stimuli_hash),
+        ("estimator version", versions[0], versions[1]),
     ]
     if record.card and again.card:
         inputs.append(("card.weights", record.card.weights, again.card.weights))
         inputs.append(("card.parameters", record.card.parameters, again.card.parameters))
     before, after = dict(_statements(record)), dict(_statements(again))
     numbers = [(name, before.get(name), after.get(name)) for name in dict.fromkeys([*before, *after])]
-    return [Difference(*item) for item in inputs if item[1] != item[2]] + [
-        Difference(*item) for item in numbers if not _equal(*item[1:], tolerance)
-    ]
+    unequal = [values for values in inputs if values[1] != values[2]]
+    unequal += [values for values in numbers if not _equal(*values[1:], tolerance)]
+    return [Difference(*values) for values in unequal]
 
 
 def open_build(*sources: str | os.PathLike[str]) -> list[StoredRecord]:
@@ -175,36 +179,46 @@ def compare_builds(before: Iterable[StoredRecord], after: Iterable[StoredRecord]
     old, new = _by_model(before), _by_model(after)
     changes = []
     for key in dict.fromkeys([*new, *old]):
-        ones, others = dict(old.get(key, {})), dict(new.get(key, {}))
-        pairs = [(ones.pop(identity), others.pop(identity)) for identity in sorted(ones.keys() & others.keys())]
-        changes += [Change("moved", *one[:2], one[2], other[2]) for one, other in pairs if one[2] != other[2]]
-        while ones and others:
-            (_, one), (_, other) = ones.popitem(), others.popitem()
-            found = differences(one[3], other[3], tolerance=0.0)
-            causes = tuple(str(item) for item in found if item.what in _CAUSES)
-            changes.append(Change("changed" if found else "restated", *other[:2], one[2], other[2], causes))
-        changes += [Change("removed", *one[:3], "") for one in ones.values()]
-        changes += [Change("added", *other[:2], "", other[2]) for other in others.values()]
+        past, present = dict(old.get(key, {})), dict(new.get(key, {}))
+        pairs = [(past.pop(identity), present.pop(identity)) for identity in sorted(past.keys() & present.keys())]
+        changes += [left.change("moved", left.state, right.state) for left, right in pairs if left.state != right.state]
+        while past and present:
+            (_, left), (_, right) = past.popitem(), present.popitem()
+            changed = differences(left.record, right.record, tolerance=0.0)
+            causes = tuple(str(difference) for difference in changed if difference.what in _CAUSES)
+            changes.append(right.change("changed" if changed else "restated", left.state, right.state, causes))
+        changes += [left.change("removed", left.state, "") for left in past.values()]
+        changes += [right.change("added", "", right.state) for right in present.values()]
     order = ("added", "removed", "changed", "moved", "restated")
     return sorted(changes, key=lambda change: (order.index(change.kind), change.board, change.name, change.before))
 
 
-_Placed = tuple[str, str, str, ResultRecord]
-"""Board, name, value and rank in print, and the record."""
+@dataclass(frozen=True)
+class _Placed:
+    """A record on a board."""
+
+    board: str
+    name: str
+    state: str
+    """Value, standing and rank in print."""
+    record: ResultRecord
+
+    def change(self, kind: Kind, before: str, after: str, causes: tuple[str, ...] = ()) -> Change:
+        return Change(kind, self.board, self.name, before, after, causes)
 
 
 def _by_model(stored: Iterable[StoredRecord]) -> dict[tuple[Any, ...], dict[str, _Placed]]:
-    found: dict[tuple[Any, ...], dict[str, _Placed]] = defaultdict(dict)
+    placed: dict[tuple[Any, ...], dict[str, _Placed]] = defaultdict(dict)
     for board in rank(item.record for item in stored if item.record is not None):
         label = f"{board.recordings}, {board.metric or 'metric not stated'}, {board.estimator}"
         for entry, record in ((one, record) for one in board.entries for record in one.records):
             seed, value = record.card.seed if record.card else None, record.score.value
-            shown = f"{entry.name} (seed {seed})" if seed is not None else entry.name
+            name = f"{entry.name} (seed {seed})" if seed is not None else entry.name
             # What a score is worth may change with the other records, though neither score nor rank does.
-            told = f"{'' if math.isnan(value) else f'{value:.3f}, '}{entry.standing}, rank {entry.rank}"
+            state = f"{'' if math.isnan(value) else f'{value:.3f}, '}{entry.standing}, rank {entry.rank}"
             key = (entry.name, seed, board.recordings, board.metric, board.estimator, board.time)
-            found[key][record.identity] = (label, shown, told, record)
-    return found
+            placed[key][record.identity] = _Placed(label, name, state, record)
+    return placed
 
 
 def _statements(record: ResultRecord) -> Iterator[tuple[str, Any]]:
@@ -218,21 +232,21 @@ def _statements(record: ResultRecord) -> Iterator[tuple[str, Any]]:
 
 def _leaves(where: str, value: Any) -> Iterator[tuple[str, Any]]:
     if isinstance(value, Mapping):
-        named = value.get("layer") if where.endswith("]") and "layer" in value and "subject" not in value else None
-        for name, item in value.items():
+        layer = value.get("layer") if where.endswith("]") and "layer" in value and "subject" not in value else None
+        for name, part in value.items():
             if name == "method":
                 continue
-            yield from _leaves(f"{where}.{name}" if named is None else f"{where}({named}).{name}", item)
+            yield from _leaves(f"{where}.{name}" if layer is None else f"{where}({layer}).{name}", part)
     elif isinstance(value, list):
-        for index, item in enumerate(value):
-            yield from _leaves(f"{where}[{index}]", item)
+        for index, part in enumerate(value):
+            yield from _leaves(f"{where}[{index}]", part)
     else:
         yield where, value
 
 
-def _equal(one: Any, other: Any, tolerance: float) -> bool:
-    numbers = all(isinstance(item, (int, float)) and not isinstance(item, bool) for item in (one, other))
-    return abs(one - other) <= tolerance if numbers else one == other
+def _equal(left: Any, right: Any, tolerance: float) -> bool:
+    numbers = all(isinstance(item, (int, float)) and not isinstance(item, bool) for item in (left, right))
+    return abs(left - right) <= tolerance if numbers else left == right
 
 
 def in_short(value: Any) -> str:

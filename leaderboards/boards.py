@@ -85,8 +85,8 @@ def rank(records: Iterable[ResultRecord], remarks: Mapping[str, Sequence[str]] |
             estimator += f", units of reliability {least} and more"
         if origin.pairing:
             estimator += f", labels paired otherwise ({origin.pairing})"
-        brain, shown = origin.recordings_hash, origin.stimuli_hash
-        groups[brain, shown, score.stimuli, origin.time_rule, estimator, score.metric].append(record)
+        brain, stimuli = origin.recordings_hash, origin.stimuli_hash
+        groups[brain, stimuli, score.stimuli, origin.time_rule, estimator, score.metric].append(record)
     boards = [_board(key, group, remarks or {}) for key, group in groups.items()]
     return sorted(boards, key=lambda board: (-len(board.entries), board.recordings, board.estimator, board.metric))
 
@@ -119,8 +119,8 @@ def _board(key: tuple[Any, ...], records: list[ResultRecord], remarks: Mapping[s
 
 def _rank(entries: list[Entry], baselines: Sequence[Baseline], lacks: str) -> list[Entry]:
     """Return the entries with their ranks, those of one computation with one rank."""
-    found = [replace(entry, unranked_because=_unranked(entry, lacks)) for entry in entries]
-    able = [entry for entry in found if not entry.unranked_because]
+    candidates = [replace(entry, unranked_because=_unranked(entry, lacks)) for entry in entries]
+    able = [entry for entry in candidates if not entry.unranked_because]
     groups: list[list[Entry]] = []
     # The shortest name stands for a computation: an encoder before its variants with an attender.
     for entry in sorted(able, key=lambda entry: (len(entry.name), entry.name)):
@@ -136,12 +136,12 @@ def _rank(entries: list[Entry], baselines: Sequence[Baseline], lacks: str) -> li
     models = above[:count, :count]
     ranges: list[Any] = rank_ranges(models) if models.any() else [(None, None)] * count
     best = max(range(count), key=lambda i: (groups[i][0].above_chance, samples[i].value), default=0)
-    ranked = [entry for entry in found if entry.unranked_because]
+    ranked = [entry for entry in candidates if entry.unranked_because]
     for place, (group, (first, last)) in enumerate(zip(groups, ranges, strict=True)):
-        told = {"above_raw": raw is not None and bool(above[count, place]), "below_leader": bool(models[place, best])}
+        flags = {"above_raw": raw is not None and bool(above[count, place]), "below_leader": bool(models[place, best])}
         for entry in group:
             copied = "" if entry is group[0] else group[0].name
-            ranked.append(replace(entry, first=first, last=last, same_as=copied, **told))
+            ranked.append(replace(entry, first=first, last=last, same_as=copied, **flags))
     return ranked
 
 
@@ -163,20 +163,20 @@ def _outcome(score: Score) -> tuple[str, float | None]:
 
 def _baselines(records: list[ResultRecord]) -> list[Baseline]:
     """Take each baseline once; records of one board should agree on it, and a note says when they do not."""
-    found: dict[tuple[str, str], list[Score]] = defaultdict(list)
+    stated: dict[tuple[str, str], list[Score]] = defaultdict(list)
     for record in records:
         if record.animal_to_animal is not None:
-            found["animals", "animal-to-animal"].append(record.animal_to_animal)
+            stated["animals", "animal-to-animal"].append(record.animal_to_animal)
         for name, score in record.baselines.items():
-            found["baseline", name].append(score)
+            stated["baseline", name].append(score)
     baselines = []
-    for (kind, name), scores in found.items():
+    for (kind, name), scores in stated.items():
         counts = Counter(map(_outcome, scores))
-        usual = counts.most_common(1)[0][0]
-        score = next(score for score in scores if _outcome(score) == usual)
+        common = counts.most_common(1)[0][0]
+        score = next(score for score in scores if _outcome(score) == common)
         values = [value for _, value in counts if value is not None]
         span = f" from {min(values):.3f} to {max(values):.3f}" if values else ""
-        note = f"the records disagree: {len(counts)} different values{span}; shown is that of {counts[usual]} of "
+        note = f"the records disagree: {len(counts)} different values{span}; shown is that of {counts[common]} of "
         baselines.append(Baseline(name, score, kind, (f"{note}{len(scores)} records",) if len(counts) > 1 else ()))
     return baselines
 
@@ -189,18 +189,20 @@ def conclusions(board: Board) -> list[str]:
     """Return one sentence or two per conclusion, the most important first."""
     here = [entry for entry in board.entries if not entry.not_repeatable]
     tested = [entry for entry in here if not entry.unranked_because]
-    found = _leader(board, tested)
+    sentences = _leader(board, tested)
     if board.truth:
-        found.append(_truth(board, tested))
+        sentences.append(_truth(board, tested))
     if tested and any(item.name == RAW_INPUT for item in board.baselines):
         above = [entry for entry in tested if entry.above_raw]
         who = f": {_names(above)}" if above else ""
-        found.append(f"Told apart above {RAW_INPUT}: {len(above)} of {plural(len(tested), 'model')}{who}.")
+        sentences.append(f"Told apart above {RAW_INPUT}: {len(above)} of {plural(len(tested), 'model')}{who}.")
     if chance := sum(entry.standing == "not told apart from chance" for entry in here):
-        found.append(f"Not told apart from chance: {chance} of {plural(len(here), 'model')}.")
+        sentences.append(f"Not told apart from chance: {chance} of {plural(len(here), 'model')}.")
     if apart := len(board.entries) - len(here):
-        found.append(f"Standing apart because nobody here can compute them again: {plural(apart, 'entry', 'entries')}.")
-    return found
+        sentences.append(
+            f"Standing apart because nobody here can compute them again: {plural(apart, 'entry', 'entries')}."
+        )
+    return sentences
 
 
 def _leader(board: Board, tested: Sequence[Entry]) -> list[str]:
@@ -225,17 +227,17 @@ def _leader(board: Board, tested: Sequence[Entry]) -> list[str]:
 
 def _truth(board: Board, tested: Sequence[Entry]) -> str:
     """Say whether the network that made the recordings is where it must be."""
-    made = f"These recordings were made by {board.truth}"
+    origin = f"These recordings were made by {board.truth}"
     hidden = next((entry for entry in tested if entry.name == board.truth), None)
     leader = board.leader
     if hidden is None or leader is None:
         listed = any(entry.name == board.truth for entry in board.entries)
-        return f"{made}, which is {'on this board without a rank' if listed else 'not on this board'}."
+        return f"{origin}, which is {'on this board without a rank' if listed else 'not on this board'}."
     if _computation(leader) == _computation(hidden):
-        return f"{made}: the hidden network was found, it has the highest score."
+        return f"{origin}: the hidden network was found, it has the highest score."
     if not hidden.below_leader:
-        return f"{made}: it is among those that are not told apart from the highest score."
-    return f"{made}: the hidden network was not found, its rank is {hidden.rank}."
+        return f"{origin}: it is among those that are not told apart from the highest score."
+    return f"{origin}: the hidden network was not found, its rank is {hidden.rank}."
 
 
 def _computation(entry: Entry) -> str:

@@ -97,8 +97,8 @@ class Entry:
     @cached_property
     def interval(self) -> Interval | None:
         """Interval of :attr:`scaled`."""
-        own = self.score.scaled_interval if self.seeds == 1 else self.sample.interval
-        return own if is_finite(own) else None
+        interval = self.score.scaled_interval if self.seeds == 1 else self.sample.interval
+        return interval if is_finite(interval) else None
 
     @property
     def spread(self) -> float:
@@ -118,8 +118,8 @@ class Entry:
     @property
     def standing(self) -> Standing:
         """Strongest statement about it; of several seeds the least."""
-        found = [standing_of(record.score, above_raw=self.above_raw) for record in self.records]
-        return STANDINGS[max(map(STANDINGS.index, found))]
+        standings = [standing_of(record.score, above_raw=self.above_raw) for record in self.records]
+        return STANDINGS[max(map(STANDINGS.index, standings))]
 
     @property
     def not_repeatable(self) -> str:
@@ -169,13 +169,13 @@ def fold_seeds(
     (:func:`leaderboards.audit.remarks`), kept as notes.
     """
     groups: dict[tuple[object, ...], list[ResultRecord]] = defaultdict(list)
-    taken: dict[tuple[object, ...], int] = defaultdict(int)
+    copies: dict[tuple[object, ...], int] = defaultdict(int)
     # Of the same model and seed the newest is the entry's; older ones stay visible as entries of their own.
     by_age = sorted(records, key=lambda record: (record.score.provenance.time, record.identity))
     for record in reversed(by_age):
         kind, seed = _kind(record), record.card.seed if record.card else None
-        copy = taken[*kind, seed]
-        taken[*kind, seed] += 1
+        copy = copies[*kind, seed]
+        copies[*kind, seed] += 1
         groups[*kind, copy].append(record)
     return [_entry(key, found, board, remarks) for key, found in groups.items()]
 
@@ -185,20 +185,20 @@ def twins(entries: Sequence[Entry]) -> dict[str, Entry]:
     return {entry.architecture: entry for entry in reversed(entries) if not entry.trained}
 
 
-def same_computation(one: Entry, other: Entry) -> bool:
+def same_computation(left: Entry, right: Entry) -> bool:
     """Return whether the chosen layers of two entries are one computation, seed by seed.
 
     Their RDMs are equal up to a factor and every animal has the same score: variants that share an encoder, copies of
     a layer, activations in other units.
     """
-    pairs = zip(one.records, other.records, strict=False)
-    return one.seeds == other.seeds and all(_same_score(a.score, b.score) for a, b in pairs)
+    pairs = zip(left.records, right.records, strict=False)
+    return left.seeds == right.seeds and all(_same_score(a.score, b.score) for a, b in pairs)
 
 
-def _same_score(one: Score, other: Score) -> bool:
-    values = ([item.value for item in score.subjects] for score in (one, other))
-    rdms = [np.array(score.model_rdm, dtype=np.float64) for score in (one, other)]
-    if not len(rdms[0]) or len(rdms[0]) != len(rdms[1]) or len(one.subjects) != len(other.subjects):
+def _same_score(left: Score, right: Score) -> bool:
+    values = ([item.value for item in score.subjects] for score in (left, right))
+    rdms = [np.array(score.model_rdm, dtype=np.float64) for score in (left, right)]
+    if not len(rdms[0]) or len(rdms[0]) != len(rdms[1]) or len(left.subjects) != len(right.subjects):
         return False
     scales = [float(np.linalg.norm(rdm[np.isfinite(rdm)])) or 1.0 for rdm in rdms]
     return all(

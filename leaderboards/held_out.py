@@ -9,31 +9,29 @@ from __future__ import annotations
 import hashlib
 import os
 import secrets
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import msgspec
 
 from brainbench.core.errors import DataError
 from brainbench.core.files import file_hash, read_json, write_text
-from brainbench.core.reading.ranges import check_number
+from brainbench.core.limits import Count
 from brainbench.core.reading.texts import read_text
 
 DATA, SALT = "held-out.h5", "salt.txt"
 """Files of the secret folder."""
 
 
-@dataclass(frozen=True)
-class Commitment:
+class Commitment(msgspec.Struct, frozen=True, rename={"public": "kept"}):
     """The public part of held-out recordings."""
 
     kind: Literal["animals", "stimuli"]
     """Kind that was held back: animals or stimuli."""
-    held: int
+    held: Count
     """Number held back."""
-    kept: int
-    """Number that is public."""
+    public: Count
+    """Number that is public; files call it ``kept``."""
     recordings: str
     """Content hash of the recordings before they were split."""
     digest: str
@@ -43,12 +41,14 @@ class Commitment:
     def read(cls, path: str | os.PathLike[str]) -> Commitment:
         """Read a published commitment; raise DataError if the file is missing or is none."""
         try:
-            found = msgspec.convert(read_json(path, "commitment"), cls)
+            return msgspec.convert(read_json(path, "commitment"), cls)
         except msgspec.ValidationError as error:
             raise DataError(f"{os.fspath(path)!r} is no commitment to held-out recordings ({error}).") from error
-        for name in ("held", "kept"):
-            check_number(f"{name!r} in {os.fspath(path)!r}", getattr(found, name), least=1, whole=True)
-        return found
+
+    @property
+    def plain(self) -> dict[str, Any]:
+        """The commitment as files hold it."""
+        return msgspec.to_builtins(self)
 
     def open(self, secret: str | os.PathLike[str]) -> Path:
         """Return the held-out file of a secret folder, after checking that it is the one committed to."""

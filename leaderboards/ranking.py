@@ -41,14 +41,14 @@ class Sample:
     @classmethod
     def of(cls, scores: Sequence[Score]) -> Sample:
         """Return the sample of one model's scores, which differ in the seed of the weights alone."""
-        known = [[item for item in score.subjects if item.status == "ok"] for score in scores]
-        both = zip(scores, known, strict=True)
-        found = [{item.subject: score.on_scale(item.value) for item in items} for score, items in both]
-        shared = [name for name in found[0] if all(math.isfinite(one.get(name, math.nan)) for one in found)]
+        reliable = [[item for item in score.subjects if item.status == "ok"] for score in scores]
+        both = zip(scores, reliable, strict=True)
+        by_seed = [{item.subject: score.on_scale(item.value) for item in items} for score, items in both]
+        shared = [name for name in by_seed[0] if all(math.isfinite(seed.get(name, math.nan)) for seed in by_seed)]
         left_out = [[score.on_scale(value) for value in score.without_stimulus] for score in scores]
         alike = len({len(values) for values in left_out}) == 1
         seeds = tuple(score.scaled for score in scores)
-        animals = {name: float(np.mean([one[name] for one in found])) for name in shared}
+        animals = {name: float(np.mean([seed[name] for seed in by_seed])) for name in shared}
         return cls(float(np.mean(seeds)), animals, np.mean(left_out, axis=0) if alike else np.empty(0), seeds)
 
     @property

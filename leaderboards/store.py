@@ -93,11 +93,11 @@ def read_record(path: str | os.PathLike[str]) -> ResultRecord:
     record, data = _parse(read_text(path, "result record"), path)
     # The hash is that of what the file says: a field that an earlier writer did not know is not in it.
     identity = record_identity(data)
-    named = path.stem.rpartition("--")[2]
-    if named != identity:
+    digest = path.stem.rpartition("--")[2]
+    if digest != identity:
         raise DataError(
             f"{path.name!r} was edited or renamed: its content has the hash {identity}, its name says "
-            f"{named!r}; restore the original file or score the model again."
+            f"{digest!r}; restore the original file or score the model again."
         )
     return record
 
@@ -119,10 +119,10 @@ def read_records(source: str | os.PathLike[str] | Iterable[str | os.PathLike[str
     """
     sources = [Path(source)] if isinstance(source, (str, os.PathLike)) else [Path(item) for item in source]
     paths: list[Path] = []
-    for item in sources:
-        if not item.exists():
-            raise DataFileNotFoundError(f"There is no file or folder {os.fspath(item)!r} of records; {MAKE_ONE}")
-        paths += record_files(item) if item.is_dir() else [item]
+    for place in sources:
+        if not place.exists():
+            raise DataFileNotFoundError(f"There is no file or folder {os.fspath(place)!r} of records; {MAKE_ONE}")
+        paths += record_files(place) if place.is_dir() else [place]
     if not paths:
         places = ", ".join(repr(os.fspath(item)) for item in sources) or "the empty list of files"
         raise DataFileNotFoundError(f"No result records (*.json) in {places}; {MAKE_ONE}")

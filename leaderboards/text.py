@@ -50,9 +50,9 @@ def count(value: int | None) -> str:
     return "" if value is None else f"{value:,}"
 
 
-def plural(amount: int, one: str, many: str = "") -> str:
+def plural(amount: int, single: str, many: str = "") -> str:
     """Write an amount with its noun: ``1 result``, ``3 results``."""
-    return f"{amount} {one if amount == 1 else many or one + 's'}"
+    return f"{amount} {single if amount == 1 else many or single + 's'}"
 
 
 def span(interval: Interval | None) -> str:
@@ -100,8 +100,8 @@ def methods(records: Sequence[ResultRecord]) -> str:
         "Noise ceiling": [one.ceiling.method if one.ceiling else "" for one in scores],
     }
     # Records of one board may differ in these, such as a model with one layer beside others.
-    told = {label: " / ".join(dict.fromkeys(filter(None, values))) for label, values in stated.items()}
-    text += "".join(f" {label}: {value}." for label, value in told.items() if value)
+    facts = {label: " / ".join(dict.fromkeys(filter(None, values))) for label, values in stated.items()}
+    text += "".join(f" {label}: {value}." for label, value in facts.items() if value)
     if len(names) < len(records):
         text += (
             " Networks that differ in the seed of their weights are one model: its score is the mean over seeds, the "
@@ -123,20 +123,20 @@ def methods(records: Sequence[ResultRecord]) -> str:
 def card_rows(card: ModelCard) -> list[tuple[str, str]]:
     """Return what the model card states, as label and text; fields that do not apply are left out."""
     rows = []
-    for item in fields(card):
-        value = getattr(card, item.name)
+    for entry in fields(card):
+        value = getattr(card, entry.name)
         # The name is the page's heading; the training and the graph have their own places.
-        if item.name in ("name", "training", "graph") or value is None or value == "":
+        if entry.name in ("name", "training", "graph") or value is None or value == "":
             continue
         if isinstance(value, Interval):
             value = f"{span(value)} ({level(value)})"
         elif isinstance(value, bool):
             value = "yes" if value else "no"
-        elif isinstance(value, int) and item.name != "seed":
+        elif isinstance(value, int) and entry.name != "seed":
             value = count(value)
         elif isinstance(value, float):
             value = number(value)
-        rows.append((_CARD_LABELS.get(item.name, item.name.replace("_", " ")), str(value)))
+        rows.append((_CARD_LABELS.get(entry.name, entry.name.replace("_", " ")), str(value)))
     return rows
 
 
@@ -170,9 +170,9 @@ def provenance_rows(provenance: Mapping[str, Any]) -> list[tuple[str, str]]:
         # Groups of facts get a row for each; short lists, such as the packages' versions, stay together.
         if isinstance(value, Mapping) and key not in ("packages", "pairs"):
             # Each layer's p stands in the table of layers; other statistics are measured, so few digits say all.
-            found = {name: item for name, item in value.items() if (key, name) != ("statistics", "layer_tests")}
-            found = _rounded(found) if key == "statistics" else found
-            rows += [(f"{key}: {name}", item) for name, item in found.items()]
+            stated = {name: item for name, item in value.items() if (key, name) != ("statistics", "layer_tests")}
+            stated = _rounded(stated) if key == "statistics" else stated
+            rows += [(f"{key}: {name}", item) for name, item in stated.items()]
         elif key != "command":
             rows.append((key, value))
     return [(key.replace("_", " "), _inline(item)) for key, item in rows if item not in (None, "", {}, [])]

@@ -64,14 +64,14 @@ def score(
         steps = to_plain(explain_file(model)) if explain_file else []
         return Output({"estimator_walk": steps}, walk_text(steps))
     command = _command()
-    kept = record_path(model, options, command)
-    record, note = read_kept(kept), "  (as scored before: nothing has changed since)"
+    cached = record_path(model, options, command)
+    record, note = read_kept(cached), "  (as scored before: nothing has changed since)"
     if record is None:
         from brainbench.scoring.scores import score_record
 
         with progress_bar() as progress:
             record, note = score_record(model, options, command=command, progress=progress), ""
-        keep(record, kept)
+        keep(record, cached)
     path = write_record(record, out)
     report = write_report(record, path.with_suffix(".html"))
     data: dict[str, Any] = {"record": record, "record_path": path, "report_path": report}
@@ -87,10 +87,10 @@ def score(
 def _command() -> str:
     """Return the command as typed, without what only says where and how to print."""
     words = iter(sys.argv[1:])
-    kept = []
+    typed = []
     for word in words:
         if word in ("--out", "-o", "--report"):
             next(words, None)
         elif word not in ("--json", "-v", "--verbose") and not word.startswith(("--out=", "--report=")):
-            kept.append(word)
-    return shlex.join(["brainbench", *kept])
+            typed.append(word)
+    return shlex.join(["brainbench", *typed])

@@ -34,9 +34,9 @@ def _headline(record: ResultRecord) -> Iterator[str]:
     from leaderboards.ranking import CHANCE_LEVEL
 
     score, animals = record.score, record.animal_to_animal
-    known = score.subjects or (animals.subjects if animals else ())
+    subjects = score.subjects or (animals.subjects if animals else ())
     name = score.provenance.recordings_name
-    count = f"{len(known)} animal{'s' * (len(known) != 1)}"
+    count = f"{len(subjects)} animal{'s' * (len(subjects) != 1)}"
     yield f"{score.name}{_weights(record)}  ·  {len(score.stimuli)} stimuli  ·  {count}  ·  {name}"
     yield _against_raw_input(record)
     if score.status == "undefined":
@@ -69,14 +69,16 @@ def _against_raw_input(record: ResultRecord) -> str:
     score, raw = record.score, record.baselines.get(RAW_INPUT)
     if raw is None:
         return "Not compared with raw input: these features came without the input that they were computed from."
-    for one in (score, raw):
-        if one.status != "ok":
-            return f"Not compared with raw input: the score of {one.name} is {one.status} ({'; '.join(one.reasons)})."
-    found = compare_scores(score, raw)
-    if not found.verdict:
+    for scored in (score, raw):
+        if scored.status != "ok":
+            reasons = "; ".join(scored.reasons)
+            return f"Not compared with raw input: the score of {scored.name} is {scored.status} ({reasons})."
+    comparison = compare_scores(score, raw)
+    if not comparison.verdict:
         lacks = lacking(sum(item.status == "ok" for item in score.subjects), len(score.stimuli))
         return f"Not compared with raw input: this needs {lacks or 'values of single animals and stimuli'}."
-    return f"{found.verdict} raw input: difference {spanned(found.difference, found.interval)}, p = {_p(found.p)}"
+    difference = spanned(comparison.difference, comparison.interval)
+    return f"{comparison.verdict} raw input: difference {difference}, p = {_p(comparison.p)}"
 
 
 def _rows(score: Score) -> Iterator[list[str]]:
@@ -87,8 +89,10 @@ def _rows(score: Score) -> Iterator[list[str]]:
         yield ["value", spanned(score.value, score.interval), f"{score.metric}; {limits}"]
     if math.isfinite(score.r):
         ceiling = score.ceiling
-        shown = f"noise ceiling {spanned(ceiling.lower)} to {spanned(ceiling.upper)}" if ceiling else "no noise ceiling"
-        yield ["raw r", spanned(score.r), shown]
+        ceiling_text = (
+            f"noise ceiling {spanned(ceiling.lower)} to {spanned(ceiling.upper)}" if ceiling else "no noise ceiling"
+        )
+        yield ["raw r", spanned(score.r), ceiling_text]
     if math.isfinite(score.reliability):
         reliability = spanned(score.reliability, score.reliability_interval, most=1.0)
         yield ["reliability", reliability, "of the animals' RDMs: split halves, Spearman-Brown, mean"]
@@ -106,8 +110,8 @@ def _notes(record: ResultRecord) -> Iterator[str]:
     score, span = record.score, record.score.reliability_interval
     if span is not None and span.high > 1:
         yield "the interval of the reliability is cut at 1, the largest that can exist"
-    named = {"the score": score, "animal to animal": record.animal_to_animal, **record.baselines}
-    spans = {name: item.scaled_interval for name, item in named.items() if item is not None}
+    scores = {"the score": score, "animal to animal": record.animal_to_animal, **record.baselines}
+    spans = {name: item.scaled_interval for name, item in scores.items() if item is not None}
     beyond = [name for name, found in spans.items() if found is not None and found.high > 1]
     if beyond:
         yield (
@@ -119,8 +123,8 @@ def _notes(record: ResultRecord) -> Iterator[str]:
 def left_out(recordings: Mapping[str, Any]) -> Iterator[str]:
     """Yield what was not used of recordings, by their provenance: trials and units by rule, files by reason."""
     removed = recordings.get("removed") or {}
-    if told := [f"{rule} ({number:,})" for rule, number in removed.items() if number]:
-        yield f"Left out: {'; '.join(told)}."
+    if removals := [f"{rule} ({number:,})" for rule, number in removed.items() if number]:
+        yield f"Left out: {'; '.join(removals)}."
     yield from (f"Skipped: {reason}" for reason in recordings.get("skipped") or ())
 
 
@@ -160,15 +164,15 @@ def _details(statistics: Mapping[str, Any]) -> list[str]:
 
 def _over_time(course: Mapping[str, Any]) -> str:
     """Lay out the best time and the latency of each layer that matches at some lag."""
-    known = []
+    times = []
     for point in course["points"]:
         value, chance = point["value"], point["chance"]
         if value is not None and chance is not None and chance < 1:
-            known.append(((value - chance) / (1 - chance), point["time"]))
+            times.append(((value - chance) / (1 - chance), point["time"]))
     clear = sum(point["p"] is not None and point["p"] <= 0.05 for point in course["points"])
     text = f"Over time, {len(course['points'])} bins of {course['bin']:g} s: "
-    if known:
-        best, when = max(known)
+    if times:
+        best, when = max(times)
         text += f"{clear} differ from chance (p of the best {course['p']:.2g}, corrected for all times); the best "
         text += f"score, {best:.2f} between chance (0) and all that is reliable (1), is at {when:.3g} s"
     else:

@@ -177,11 +177,11 @@ class Mesh:
     def pieces(self) -> tuple[Mesh, ...]:
         """Return the connected pieces of the surface, in the order of their first faces."""
         owner = face_owners(self)
-        found = []
+        parts = []
         for piece in dict.fromkeys(owner.tolist()):
             used, faces = np.unique(self.faces[owner == piece], return_inverse=True)
-            found.append(Mesh(self.vertices[used], faces.reshape(-1, 3), self.name))
-        return tuple(found)
+            parts.append(Mesh(self.vertices[used], faces.reshape(-1, 3), self.name))
+        return tuple(parts)
 
     def to_trimesh(self) -> trimesh.Trimesh:
         """Return a :class:`trimesh.Trimesh` with the same vertices and faces."""
@@ -301,8 +301,8 @@ def _bodies(path: Path) -> Mesh | None:
     mesh = Mesh(joined.vertices, joined.faces, path.stem)
     objects = np.repeat(np.arange(len(parts)), [len(part.faces) for part in parts])
     for owner in (face_owners(mesh), objects):
-        own = np.column_stack([mesh.vertices[mesh.faces].reshape(-1, 3), np.repeat(owner, 3)])
-        keys, merged = np.unique(own, axis=0, return_inverse=True)
+        rows = np.column_stack([mesh.vertices[mesh.faces].reshape(-1, 3), np.repeat(owner, 3)])
+        keys, merged = np.unique(rows, axis=0, return_inverse=True)
         bodies = Mesh(np.asarray(keys[:, :3], float), merged.reshape(-1, 3), path.stem)
         if bodies.diagnosis.watertight:
             return bodies

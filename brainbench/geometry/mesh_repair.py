@@ -144,8 +144,8 @@ def _within_another(bodies: Mapping[int, Mesh], label: int) -> bool:
     low, high = bodies[label].bounds
     around = [
         body
-        for other, body in bodies.items()
-        if other != label and (low > body.bounds[0]).all() and (high < body.bounds[1]).all()
+        for number, body in bodies.items()
+        if number != label and (low > body.bounds[0]).all() and (high < body.bounds[1]).all()
     ]
     # Of a body that only overlaps another some corner lies outside; a few hundred corners tell.
     corners = bodies[label].vertices

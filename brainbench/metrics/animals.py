@@ -102,8 +102,8 @@ def ceiling_of(animals: Animals, comparison: str) -> Ceiling | None:
     """Return the raw noise ceiling of the scored animals, or None for fewer than two."""
     if len(animals.scored) < 2:
         return None
-    found = noise_ceiling(animals.rdms(animals.scored), method=comparison)
-    return None if found.reason else Ceiling(found.lower, found.upper)
+    bounds = noise_ceiling(animals.rdms(animals.scored), method=comparison)
+    return None if bounds.reason else Ceiling(bounds.lower, bounds.upper)
 
 
 def mean_rdm(animals: Animals) -> tuple[float, ...]:

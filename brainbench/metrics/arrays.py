@@ -36,10 +36,10 @@ def find_device(device: Any, *arrays: Any) -> Any:
         device = next((array.device for array in arrays if is_tensor(array)), None)
         if device is None:
             return None
-    found = torch_device(device)
-    if found.type == "mps":
+    chosen = torch_device(device)
+    if chosen.type == "mps":
         raise UsageError("The device 'mps' has no float64, which RDMs need; leave device out.")
-    return found
+    return chosen
 
 
 def place(values: Any, device: Any) -> Array:

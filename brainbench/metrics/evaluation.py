@@ -140,9 +140,9 @@ class LayerComparisons:
     device: Any = None
 
     @cached_property
-    def known(self) -> np.ndarray:
+    def defined(self) -> np.ndarray:
         """[L, K] where a layer has a value for a stimulus."""
-        return np.stack([self.metric.known(layer) for layer in self.layers])
+        return np.stack([self.metric.defined(layer) for layer in self.layers])
 
     def among(self, layers: Sequence[Floats], animals: Sequence[SubjectRDM]) -> LayerComparisons:
         """Return the comparisons of some layers with some animals."""
@@ -150,43 +150,43 @@ class LayerComparisons:
 
     def given(self) -> Floats:
         """Return comparisons [L, A] of the stimuli as they are."""
-        return next(self.under(lambda: [np.arange(self.known.shape[1])[None]]))[0]
+        return next(self.under(lambda: [np.arange(self.defined.shape[1])[None]]))[0]
 
     def under(self, orders: Orders) -> Iterator[Floats]:
         """Yield comparisons [N, L, A] with the model's stimuli in each order of a chunk [N, K]."""
-        if self.known.all():
+        if self.defined.all():
             yield from self.metric.compare_layers(self.layers, self.animals, orders(), self.device)
             return
-        patterns, group = np.unique(self.known, axis=0, return_inverse=True)
+        patterns, group = np.unique(self.defined, axis=0, return_inverse=True)
         streams = [
-            self._some(np.flatnonzero(group.ravel() == index), np.flatnonzero(kept), orders)
-            for index, kept in enumerate(patterns)
+            self._some(np.flatnonzero(group.ravel() == index), np.flatnonzero(present), orders)
+            for index, present in enumerate(patterns)
         ]
         for parts in zip(*streams, strict=True):
-            found = np.empty((len(parts[0]), len(self.layers), len(self.animals)))
+            values = np.empty((len(parts[0]), len(self.layers), len(self.animals)))
             for index, part in enumerate(parts):
-                found[:, group.ravel() == index] = part
-            yield found
+                values[:, group.ravel() == index] = part
+            yield values
 
     def _some(self, layers: Ints, stimuli: Ints, orders: Orders) -> Iterator[Floats]:
         """Yield comparisons of some layers over the stimuli that they have."""
-        count = self.known.shape[1]
+        count = self.defined.shape[1]
         place = np.full(count, -1)
         place[stimuli] = np.arange(len(stimuli))
         # A random order of all stimuli is a random order of those that are left, when the others are passed over.
-        kept = (place[chunk][place[chunk] >= 0].reshape(len(chunk), -1) for chunk in orders())
+        shorter = (place[chunk][place[chunk] >= 0].reshape(len(chunk), -1) for chunk in orders())
         reps = [self.metric.take(self.layers[layer], stimuli) for layer in layers]
-        yield from self.metric.compare_layers(reps, [one.take(stimuli) for one in self.animals], kept, self.device)
+        yield from self.metric.compare_layers(reps, [one.take(stimuli) for one in self.animals], shorter, self.device)
 
     def without_each(self) -> Floats:
         """Return comparisons [K, L, A] without each stimulus in turn."""
-        if self.known.all():
+        if self.defined.all():
             return self.metric.compare_without(self.layers, self.animals)
-        found = np.repeat(self.given()[None], self.known.shape[1], axis=0)
-        for layer, kept in enumerate(map(np.flatnonzero, self.known)):
-            part = [self.metric.take(self.layers[layer], kept)], [one.take(kept) for one in self.animals]
-            found[kept, layer] = self.metric.compare_without(*part)[:, 0]
-        return found
+        values = np.repeat(self.given()[None], self.defined.shape[1], axis=0)
+        for layer, stimuli in enumerate(map(np.flatnonzero, self.defined)):
+            part = [self.metric.take(self.layers[layer], stimuli)], [one.take(stimuli) for one in self.animals]
+            values[stimuli, layer] = self.metric.compare_without(*part)[:, 0]
+        return values
 
 
 _CHUNK_ELEMENTS = 1 << 22
@@ -217,50 +217,69 @@ class LayerEvaluation:
 
 def defined_layers(metric: MetricHooks, layers: Mapping[str, Floats]) -> list[str]:
     """Return the layers with a value for enough stimuli: at least half of them, and as many as the metric needs."""
-    found = []
+    names = []
     for label, layer in layers.items():
-        known = metric.known(layer)
-        enough = known.sum() >= max(metric.fewest, len(known) / 2)
-        if enough and metric.varies(metric.take(layer, np.flatnonzero(known))):
-            found.append(label)
-    return found
+        defined = metric.defined(layer)
+        enough = defined.sum() >= max(metric.fewest, len(defined) / 2)
+        if enough and metric.varies(metric.take(layer, np.flatnonzero(defined))):
+            names.append(label)
+    return names
 
 
 def evaluate(
-    compared: LayerComparisons, names: list[str], animals: Animals, estimator: str, committed: str | None, seed: int
+    every: LayerComparisons, names: list[str], animals: Animals, estimator: str, committed: str | None, seed: int
 ) -> tuple[LayerEvaluation | None, list[str], tuple[str, ...]]:
     """Compare, choose layers by the rule and test; also return the layers with a value, and notes."""
-    metric, factors = compared.metric, animals.factors(animals.scored)
-    given = compared.given()
-    kept = np.flatnonzero(np.isfinite(given).all(axis=1)).tolist()
-    names, given = [names[row] for row in kept], given[kept]
+    metric, factors = every.metric, animals.factors(animals.scored)
+    r = every.given()
+    rows = np.flatnonzero(np.isfinite(r).all(axis=1)).tolist()
+    names, r = [names[row] for row in rows], r[rows]
     if not names or (committed is not None and committed not in names):
         return None, names, ()
-    compared = compared.among([compared.layers[row] for row in kept], compared.animals)
+    compared = every.among([every.layers[row] for row in rows], every.animals)
     voters = 1 if metric.of_model_alone else len(factors)
     rule = layer_rule(names, voters, committed=committed, estimator=estimator, factors=factors)
-    judged, tested, weights = compared, compared, factors
+    votes = _Votes(rule, compared, r, compared, factors)
     if rule.kind == "maximum" and estimator == "default" and len(factors) == 1:
         halves = metric.halves(animals.subjects[animals.scored[0]], animals.order)
         if halves is not None:
             parts, factor = halves
             if not parts:
                 return None, names, ()
-            # The halves stand for animals; fewer of them serve the permutations.
-            rule, judged = HALVES, compared.among(compared.layers, parts)
-            tested = compared.among(compared.layers, parts[: 2 * _HALVES_IN_PERMUTATIONS])
-            weights = np.full(len(parts), factor)
-    r = given if judged is compared else judged.given()
-    chosen = rule.choose(r)
-    held, values = rule.held(r), rule.held(r) * weights
+            votes = _Votes.of_halves(compared, parts, factor)
+    rule, weights, chosen = votes.rule, votes.weights, votes.rule.choose(votes.r)
+    chosen_r = rule.held(votes.r)
+    values = chosen_r * weights
     # The layers of the data serve without a stimulus too: where the choice jumps between layers that are nearly alike,
     # a jackknife that repeats it measures the jumps instead of the stimuli.
-    without = take_layers(judged.without_each(), chosen) @ weights / len(weights)
-    test, null = _test(tested, rule, weights[: len(tested.animals)], seed)
+    without = take_layers(votes.compared.without_each(), chosen) @ weights / len(weights)
+    test, null = _test(votes.permuted, rule, weights[: len(votes.permuted.animals)], seed)
     if rule is HALVES:
-        values, held, chosen = values.mean(keepdims=True), held.mean(keepdims=True), np.array([most_chosen(chosen)])
-    found = LayerEvaluation(rule, values, held, chosen, given * factors, given, without, test, null)
-    return found, names, _partly(compared, names)
+        values, chosen_r = values.mean(keepdims=True), chosen_r.mean(keepdims=True)
+        chosen = np.array([most_chosen(chosen)])
+    evaluation = LayerEvaluation(rule, values, chosen_r, chosen, r * factors, r, without, test, null)
+    return evaluation, names, _partly(compared, names)
+
+
+@dataclass(frozen=True)
+class _Votes:
+    """What chooses the layers and gives the score: the animals, or the halves of a single one."""
+
+    rule: LayerRule
+    compared: LayerComparisons
+    r: Floats
+    """[L, A] its comparisons of the stimuli as they are."""
+    permuted: LayerComparisons
+    """The part that every permutation repeats."""
+    weights: Floats
+    """[A] factors of the comparisons."""
+
+    @classmethod
+    def of_halves(cls, compared: LayerComparisons, halves: Sequence[SubjectRDM], factor: float) -> _Votes:
+        """Let the halves of an animal's splits stand for animals; fewer of them serve the permutations."""
+        parts = compared.among(compared.layers, halves)
+        some = compared.among(compared.layers, halves[: 2 * _HALVES_IN_PERMUTATIONS])
+        return cls(HALVES, parts, parts.given(), some, np.full(len(halves), factor))
 
 
 def _test(judged: LayerComparisons, rule: LayerRule, weights: Floats, seed: int) -> tuple[PermutationTest, Floats]:
@@ -276,24 +295,24 @@ def _test(judged: LayerComparisons, rule: LayerRule, weights: Floats, seed: int)
     for r in judged.under(partial(label_orders, count, seed, exact=exact, draws=draws, step=step)):
         null.append(rule.held(r) @ weights / len(weights))
         means.append((r * weights).mean(axis=-1))
-    found = np.concatenate(null)
+    scores = np.concatenate(null)
     # An order under which a comparison has no value says nothing.
-    found = np.where(np.isfinite(found), found, -np.inf)
-    return make_test(found, exact=count <= exact, smallest=smallest), np.concatenate(means)
+    scores = np.where(np.isfinite(scores), scores, -np.inf)
+    return make_test(scores, exact=count <= exact, smallest=smallest), np.concatenate(means)
 
 
 def attainable_value(metric: MetricHooks, animals: Animals, result: LayerEvaluation, seed: int) -> tuple[float, str]:
     """Return the value of a perfect model, NaN where chance reaches it in one of twenty orders, and why."""
     raw = metric.attainable([animals.subjects[i] for i in animals.scored], seed)
-    found = float((raw * animals.factors(animals.scored)).mean())
+    value = float((raw * animals.factors(animals.scored)).mean())
     null = result.test.null[np.isfinite(result.test.null)]
-    if null.size and not found > (reached := float(np.quantile(null, 0.95))):
-        return math.nan, f"no scale: a perfect model would score {found:.2f}, which chance reaches ({reached:.2f})"
-    return found, ""
+    if null.size and not value > (reached := float(np.quantile(null, 0.95))):
+        return math.nan, f"no scale: a perfect model would score {value:.2f}, which chance reaches ({reached:.2f})"
+    return value, ""
 
 
 def _partly(compared: LayerComparisons, names: Sequence[str]) -> tuple[str, ...]:
-    counts = [(name, (~known).sum(), len(known)) for name, known in zip(names, compared.known, strict=True)]
+    counts = [(name, (~known).sum(), len(known)) for name, known in zip(names, compared.defined, strict=True)]
     lacking = [f"{name} ({number} of {count})" for name, number, count in counts if number]
     if not lacking:
         return ()

@@ -74,7 +74,7 @@ class MetricHooks:
         """Return what is compared of a layer's features [K, F]; a stimulus with a value that is not finite is NaN."""
         return usable_features(features)
 
-    def known(self, layer: Floats) -> np.ndarray:
+    def defined(self, layer: Floats) -> np.ndarray:
         """Return where [K] a layer has a value."""
         return np.asarray(np.isfinite(layer).all(axis=1))
 
@@ -95,14 +95,14 @@ class MetricHooks:
     def compare_without(self, layers: Sequence[Floats], animals: Sequence[SubjectRDM]) -> Floats:
         """Return raw comparisons [K, L, A] without each stimulus in turn."""
         count = animals[0].count
-        found = np.full((count, len(layers), len(animals)), np.nan)
+        values = np.full((count, len(layers), len(animals)), np.nan)
         if count <= 3:
-            return found
+            return values
         for stimulus in range(count):
-            kept = np.delete(np.arange(count), stimulus)
-            parts = [self.take(layer, kept) for layer in layers], [one.take(kept) for one in animals]
-            found[stimulus] = next(iter(self.compare_layers(*parts, [np.arange(count - 1)[None]])))[0]
-        return found
+            rest = np.delete(np.arange(count), stimulus)
+            parts = [self.take(layer, rest) for layer in layers], [one.take(rest) for one in animals]
+            values[stimulus] = next(iter(self.compare_layers(*parts, [np.arange(count - 1)[None]])))[0]
+        return values
 
     def correction(self, animal: SubjectRDM, estimator: str) -> Corrected:
         """Return the factor that corrects a comparison for an animal's noise, and whether the animal is reliable."""
@@ -112,12 +112,12 @@ class MetricHooks:
         """Return the raw value [A] of a model that has each animal's own responses without their noise."""
         # In the order in which stimuli are scored: folds and noise then do not depend on how they were listed.
         order = canonical_order(np.stack([animal.rdm for animal in animals]))
-        found = []
+        means = []
         for animal in animals:
             truth, noisy = simulated_animals(animal.take(order), seed)
             values = next(iter(self.compare_layers([truth], noisy, [np.arange(len(truth))[None]])))
-            found.append(float(np.nanmean(values)) if np.isfinite(values).any() else np.nan)
-        return np.array(found)
+            means.append(float(np.nanmean(values)) if np.isfinite(values).any() else np.nan)
+        return np.array(means)
 
     def halves(self, animal: SubjectRDM, order: Ints) -> tuple[list[SubjectRDM], float] | None:
         """Return an animal's halves (both of each split) as animals, stimuli in an order, and their correction.
@@ -136,7 +136,7 @@ class MetricHooks:
 
     def agreement_null(self, animals: Sequence[SubjectRDM], factors: Floats, orders: Ints) -> Floats:
         """Return the mean corrected agreement [N] with every animal's stimuli in an order of its own [N, A, K]."""
-        found = np.empty(len(orders))
+        agreements = np.empty(len(orders))
         for index, each in enumerate(orders):
             moved = [animal.take(order) for animal, order in zip(animals, each, strict=True)]
             values = []
@@ -144,8 +144,8 @@ class MetricHooks:
                 partner = self.partner(animal, [other for other in moved if other is not animal])
                 identity = [np.arange(animal.count)[None]]
                 values.append(next(iter(self.compare_layers([partner], [animal], identity)))[0, 0, 0])
-            found[index] = np.mean(np.array(values) * factors)
-        return found
+            agreements[index] = np.mean(np.array(values) * factors)
+        return agreements
 
     def statistics(self, layer: Floats, animals: Sequence[SubjectRDM], seed: int) -> dict[str, Any]:
         """Return what else a record keeps of the chosen layer; nothing unless overridden."""

@@ -92,8 +92,8 @@ def score_layers(
     names, result, notes = list(layers), None, ()
     usable = defined = defined_layers(metric, layers)
     if animals.scored and defined and len(stimuli) >= metric.fewest:
-        taken = [metric.take(layers[label], animals.order) for label in defined]
-        compared = LayerComparisons(metric, taken, animals.sorted, device)
+        ordered = [metric.take(layers[label], animals.order) for label in defined]
+        compared = LayerComparisons(metric, ordered, animals.sorted, device)
         result, defined, notes = evaluate(compared, defined, animals, estimator, committed, seed)
     lacking = {
         "constant or not finite": [name for name in names if name not in usable],
@@ -125,8 +125,8 @@ def score_layers(
     layer, scored = layers[defined[chosen]], [animals.subjects[i] for i in animals.scored]
     attainable, hopeless = attainable_value(metric, animals, result, seed)
     if hopeless:
-        told = about["reasons"]
-        about |= {"status": "unreliable", "reasons": (hopeless, *told) if status == "ok" else (*told, hopeless)}
+        earlier = about["reasons"]
+        about |= {"status": "unreliable", "reasons": (hopeless, *earlier) if status == "ok" else (*earlier, hopeless)}
     statistics = {
         "monte_carlo_error": {
             "value": _splits_error(result.values, scored, metric.comparison) if metric.of_rdms else 0.0,
@@ -137,10 +137,10 @@ def score_layers(
     if result.layer_null.size:
         tests = zip(defined, *(p.tolist() for p in layer_p(result.layer_null)), strict=True)
         statistics["layer_tests"] = [{"layer": name, "p": p, "p_corrected": corrected} for name, p, corrected in tests]
-    shown = {label: row for row, label in enumerate(defined)}
+    rows = {label: row for row, label in enumerate(defined)}
     repeated = f"{'layer chosen' if estimator == 'default' else 'maximum over layers taken'} anew in each"
     value = float(result.values.mean())
-    made = Score(
+    score = Score(
         value=value,
         r=float(result.r.mean()),
         interval=two_factor_interval(value, result.values, result.without),
@@ -150,7 +150,7 @@ def score_layers(
         layer_rule=result.rule.words,
         best_layer=defined[best],
         best_layer_value=float(means[best]),
-        layers=tuple(_layer_score(label, shown.get(label), result, status) for label in names),
+        layers=tuple(_layer_score(label, rows.get(label), result, status) for label in names),
         subjects=_subjects(metric, layers, animals, result, defined),
         model_rdm=recorded_rdm(layer) if metric.of_rdms else (),
         chance=float(finite_mean(result.test.null)),
@@ -159,7 +159,7 @@ def score_layers(
         provenance=Provenance.of({"statistics": statistics, **stated}),
         **about,
     )
-    return held_to_scale(made), result.test
+    return held_to_scale(score), result.test
 
 
 def _verdict(
@@ -193,8 +193,8 @@ def _verdict(
     reasons += animals.reasons
     if result.rule.kind == "maximum":
         reasons.append("optimistic: the layer was chosen as the maximum on the data that are scored")
-    told = {why: ", ".join(found) for why, found in lacking.items() if found}
-    reasons += [f"layers without a value ({why}), never chosen: {names}" for why, names in told.items()]
+    without_value = {why: ", ".join(found) for why, found in lacking.items() if found}
+    reasons += [f"layers without a value ({why}), never chosen: {names}" for why, names in without_value.items()]
     reasons += [*metric.reasons, *interval_reasons(len(animals.scored), stimuli)]
     unreliable = not animals.reliable or stimuli < SMALLEST_STIMULI
     return "unreliable" if unreliable else "ok", tuple(reasons)
@@ -213,7 +213,7 @@ def _subjects(
 ) -> tuple[SubjectScore, ...]:
     """Return every animal's part; one that did not vote meets the layer that the others chose."""
     overall = names[most_chosen(result.chosen)]
-    found = []
+    parts = []
     for index, subject in enumerate(animals.subjects):
         if index in animals.scored:
             row = animals.scored.index(index)
@@ -223,8 +223,8 @@ def _subjects(
             part = r * animals.corrections[index].value, r, overall
         else:
             part = math.nan, math.nan, None
-        found.append(_subject(animals, index, *part))
-    return tuple(found)
+        parts.append(_subject(animals, index, *part))
+    return tuple(parts)
 
 
 def _subject(animals: Animals, index: int, value: float, r: float, layer: str | None) -> SubjectScore:
@@ -278,11 +278,11 @@ def score_agreement(
         pairs.append(LayerComparisons(metric, [metric.take(partner, animals.order)], [animal.take(animals.order)]))
     raw = {i: float(pair.given()[0, 0]) for i, pair in zip(compared, pairs, strict=True)}
     values = {i: raw[i] * factors[i].value for i in compared}
-    found = [i for i in compared if math.isfinite(values[i])]
-    parts = np.array([values[i] for i in found])
+    valid = [i for i in compared if math.isfinite(values[i])]
+    parts = np.array([values[i] for i in valid])
     null, without, chance = np.empty(0), np.empty(0), math.nan
-    if found and len(found) == len(compared):
-        weights = np.array([factors[i].value for i in found])
+    if valid and len(valid) == len(compared):
+        weights = np.array([factors[i].value for i in valid])
         without = np.stack([pair.without_each()[:, 0, 0] for pair in pairs], axis=1) @ weights / len(weights)
         if count >= SMALLEST_STIMULI:
             null = _agreement_null(metric, animals, weights, seed)
@@ -290,19 +290,19 @@ def score_agreement(
             orders = list(label_orders(count, seed, exact=0, draws=metric.orders_between))[1:]
             chance = float(np.mean([np.mean(next(pair.under(lambda: orders))) for pair in pairs] * weights))
     smallest = smallest_p_of_animals(count, max(2, len(compared)), metric.orders_between)
-    status, reasons = _agreement_verdict(metric, animals, factors, found, count, smallest)
+    status, reasons = _agreement_verdict(metric, animals, factors, valid, count, smallest)
     reliability, reliability_interval = mean_reliability(animals)
-    value = float(parts.mean()) if found else math.nan
-    scored = [animals.subjects[i] for i in found]
-    attainable = float(np.mean(metric.attainable(scored, seed) * animals.factors(found))) if found else math.nan
+    value = float(parts.mean()) if valid else math.nan
+    scored = [animals.subjects[i] for i in valid]
+    attainable = float(np.mean(metric.attainable(scored, seed) * animals.factors(valid))) if valid else math.nan
     # The two values of two animals are one and the same.
     span = two_factor_interval(value, parts, without) if len(parts) > 2 and without.size else None
-    made = Score(
+    score = Score(
         name="animal-to-animal",
         value=value,
         status=status,
         reasons=reasons,
-        r=float(np.mean([raw[i] for i in found])) if found else math.nan,
+        r=float(np.mean([raw[i] for i in valid])) if valid else math.nan,
         reliability=reliability,
         reliability_interval=reliability_interval,
         interval=span and replace(span, method=f"{span.method}; approximate, since animals meet one another"),
@@ -317,7 +317,7 @@ def score_agreement(
                 value=values.get(index, math.nan),
                 r=raw.get(index, math.nan),
                 reliability=animals.corrections[index].reliability,
-                status=factors[index].status if index in found else "undefined",
+                status=factors[index].status if index in valid else "undefined",
                 units=subject.units,
                 trials=subject.trials,
             )
@@ -332,7 +332,7 @@ def score_agreement(
         without_stimulus=tuple(without[np.argsort(animals.order)].tolist()) if without.size else (),
         provenance=Provenance.of({"seed": seed, "reliability_gate": RELIABILITY_GATE}),
     )
-    return held_to_scale(made)
+    return held_to_scale(score)
 
 
 def _agreement_null(metric: MetricHooks, animals: Animals, factors: Floats, seed: int) -> Floats:
@@ -345,26 +345,26 @@ def _agreement_null(metric: MetricHooks, animals: Animals, factors: Floats, seed
 
 
 def _agreement_verdict(
-    metric: MetricHooks, animals: Animals, factors: dict[int, Corrected], found: list[int], count: int, smallest: float
+    metric: MetricHooks, animals: Animals, factors: dict[int, Corrected], valid: list[int], count: int, smallest: float
 ) -> tuple[Status, tuple[str, ...]]:
     """Return the status of the agreement and its reasons, the gravest first."""
-    told = tuple(f"{animals.subjects[i].subject}: {factors[i].reason}" for i in factors if factors[i].reason)
-    if not found:
+    reasons = tuple(f"{animals.subjects[i].subject}: {factors[i].reason}" for i in factors if factors[i].reason)
+    if not valid:
         if count < metric.fewest:
-            told = (f"{count} stimuli are too few; at least {metric.fewest} are needed",)
+            reasons = (f"{count} stimuli are too few; at least {metric.fewest} are needed",)
         elif not factors:
-            told = ("fewer than two animals can be used",)
-        return "undefined", told + animals.reasons
+            reasons = ("fewer than two animals can be used",)
+        return "undefined", reasons + animals.reasons
     if count < SMALLEST_STIMULI:
-        told = (f"{count} stimuli allow no p below {smallest:.3g}; at least {SMALLEST_STIMULI} are needed", *told)
-    elif len(found) < len(factors):
-        told = ("no p: the agreement of some animals is undefined", *told)
-    if len(found) == 2:
-        told += ("two animals make one comparison: no confidence interval",)
+        reasons = (f"{count} stimuli allow no p below {smallest:.3g}; at least {SMALLEST_STIMULI} are needed", *reasons)
+    elif len(valid) < len(factors):
+        reasons = ("no p: the agreement of some animals is undefined", *reasons)
+    if len(valid) == 2:
+        reasons += ("two animals make one comparison: no confidence interval",)
     else:
-        told += interval_reasons(len(found), count)
+        reasons += interval_reasons(len(valid), count)
     trusted = animals.reliable and count >= SMALLEST_STIMULI and all(factors[i].status == "ok" for i in factors)
-    return "ok" if trusted else "unreliable", told + animals.reasons + metric.reasons
+    return "ok" if trusted else "unreliable", reasons + animals.reasons + metric.reasons
 
 
 def smallest_p_of_animals(stimuli: int, animals: int, draws: int) -> float:

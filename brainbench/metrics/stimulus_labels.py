@@ -111,13 +111,13 @@ def _complete_means(responses: NDArray, codes: Ints, numbers: Floats) -> Floats 
     for start in range(0, responses.shape[1], step):
         columns = slice(start, start + step)
         part = np.ascontiguousarray(responses[:, columns], dtype=np.float64)
-        found = member @ part
-        if not np.isfinite(found).all():
+        mean = member @ part
+        if not np.isfinite(mean).all():
             return None
-        if len(part) and (np.abs(found).max(axis=0) > _OFFSET * np.ptp(found, axis=0)).any():
+        if len(part) and (np.abs(mean).max(axis=0) > _OFFSET * np.ptp(mean, axis=0)).any():
             # Sums about a value from within the data keep the digits that a large offset would cost.
-            found = member @ (part - part[0]) + part[0]
-        means[:, columns] = found
+            mean = member @ (part - part[0]) + part[0]
+        means[:, columns] = mean
     means[numbers[:, 0] == 0] = np.nan
     return means
 
@@ -125,7 +125,7 @@ def _complete_means(responses: NDArray, codes: Ints, numbers: Floats) -> Floats 
 def tensor_means(responses: Any, codes: Ints, count: int, device: Any) -> Array:
     """Return what :func:`stimulus_means` does as a tensor on ``device``, by products with the trials' membership."""
     member = place(membership(codes, count), device)
-    xp, found = library(member), []
+    xp, parts = library(member), []
     for _, part in slices(responses, _SLICE_ELEMENTS, device):
         present = xp.isfinite(part)
         if xp.isinf(part).any():
@@ -134,8 +134,8 @@ def tensor_means(responses: Any, codes: Ints, count: int, device: Any) -> Array:
         # Sums about a value from within the data keep the digits that a large offset would cost.
         shift = xp.where(present, part, 0.0).sum(0) / seen.sum(0).clip(1.0)
         totals, numbers = member @ xp.where(present, part - shift, 0.0), member @ seen
-        found.append(xp.where(numbers > 0, totals / numbers.clip(1.0), np.nan) + shift)
-    return xp.cat(found, -1)
+        parts.append(xp.where(numbers > 0, totals / numbers.clip(1.0), np.nan) + shift)
+    return xp.cat(parts, -1)
 
 
 def check_finite(responses: NDArray) -> None:

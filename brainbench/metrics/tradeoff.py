@@ -83,12 +83,12 @@ def measure_tradeoff(
     ]
     points = []
     for quantity, count, of, default, job in track(jobs, "measuring Monte-Carlo error", progress):
-        found, seconds = [], []
+        values, seconds = [], []
         for seed in range(repeats):
             start = time.perf_counter()
-            found.append(job(seed))
+            values.append(job(seed))
             seconds.append(time.perf_counter() - start)
-        error, middle = float(np.std(found, ddof=1)), float(np.median(seconds))
+        error, middle = float(np.std(values, ddof=1)), float(np.median(seconds))
         points.append(MonteCarloPoint(quantity, count, error, of, middle, default))
     return tuple(points)
 

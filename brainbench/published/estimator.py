@@ -72,8 +72,8 @@ def make_targets(arrays: Mapping[str, Floats], *, splits: int = SPLITS) -> tuple
 
     ``arrays`` are rates [R, K, U] by animal, NaN where a unit's session had fewer trials.
     """
-    named = dict(arrays) if len(arrays) == 1 else {**arrays, POOL: concatenate(list(arrays.values()))}
-    return tuple(_target(name, array, splits) for name, array in named.items())
+    targets = dict(arrays) if len(arrays) == 1 else {**arrays, POOL: concatenate(list(arrays.values()))}
+    return tuple(_target(name, array, splits) for name, array in targets.items())
 
 
 def concatenate(arrays: Sequence[Floats]) -> Floats:
@@ -95,13 +95,13 @@ def _target(name: str, array: Floats, splits: int) -> Target:
             # A unit without a trial among them is 0/0 = NaN, and so is then the whole RDM.
             return correlation_distances((member @ flat / (member @ seen)).reshape(-1, count, units))
 
-    found = np.empty(splits)
+    correlations = np.empty(splits)
     step = max(1, _CHUNK // (8 * count * units))
     for start in range(0, splits, step):
         index = range(start, min(start + step, splits))
         first = np.stack([first_half(trials, FIRST_SEED + split) for split in index]).astype(np.float64)
-        found[start : index.stop] = _correlations(distances(first), distances(1 - first))
-    return Target(name, distances(np.ones((1, trials)))[0], found, units, trials)
+        correlations[start : index.stop] = _correlations(distances(first), distances(1 - first))
+    return Target(name, distances(np.ones((1, trials)))[0], correlations, units, trials)
 
 
 def _correlations(first: Floats, second: Floats) -> Floats:
@@ -135,7 +135,7 @@ def score_published(
     corrected = {target.name: noise_corrected(1.0, target.split_half_r, estimator=estimator) for target in targets}
     used = [item for item in targets if np.isfinite(corrected[item.name].value) and np.isfinite(item.rdm).all()]
     lost = ", ".join(item.name for item in targets if item not in used)
-    told = (f"left out, no split counts (raw correlation of halves below {THESIS_FILTER}): {lost}",) if lost else ()
+    notes = (f"left out, no split counts (raw correlation of halves below {THESIS_FILTER}): {lost}",) if lost else ()
     about = {
         "name": name,
         "estimator": estimator,
@@ -144,7 +144,7 @@ def score_published(
         "provenance": Provenance.of({"splits": len(targets[0].split_half_r), "seed": 0}),
     }
     if not names or not used:
-        return Score(value=math.nan, status="undefined", reasons=told or ("no layer has an RDM",), **about)
+        return Score(value=math.nan, status="undefined", reasons=notes or ("no layer has an RDM",), **about)
     layers, brain = np.stack([rdms[layer] for layer in names]), np.stack([item.rdm for item in used])
     factors = np.array([corrected[item.name].value for item in used])
     raw = compare(layers[:, None], brain[None])
@@ -159,7 +159,7 @@ def score_published(
             f"optimistic: as published, the maximum over {len(names)} layers and {len(used)} targets (best: "
             f"{used[place].name}; mean of the targets' maxima {values.max(axis=0).mean():.2f})",
             "the published estimator averages zeros of slots that a trial did not show, and knows no gate",
-            *told,
+            *notes,
         ),
         r=float(raw[best, place]),
         reliability=corrected[used[place].name].reliability,
@@ -175,8 +175,8 @@ def score_published(
             for row, (layer, column) in enumerate(zip(names, values.argmax(axis=1), strict=True))
         ),
         subjects=tuple(
-            _part(item, values[row, column], raw[row, column], corrected[item.name].reliability, names[row])
-            for column, (item, row) in enumerate(zip(used, values.argmax(axis=0), strict=True))
+            _part(target, values[row, column], raw[row, column], corrected[target.name].reliability, names[row])
+            for column, (target, row) in enumerate(zip(used, values.argmax(axis=0), strict=True))
         ),
         model_rdm=recorded_rdm(layers[best]),
         brain_rdm=recorded_rdm(brain[place]),
@@ -186,9 +186,9 @@ def score_published(
     )
 
 
-def _part(item: Target, value: float, r: float, reliability: float, layer: str | None = None) -> SubjectScore:
+def _part(target: Target, value: float, r: float, reliability: float, layer: str | None = None) -> SubjectScore:
     status = "undefined" if math.isnan(value) else "unreliable"
-    return SubjectScore(item.name, float(value), float(r), reliability, status, item.units, item.trials, layer)
+    return SubjectScore(target.name, float(value), float(r), reliability, status, target.units, target.trials, layer)
 
 
 def score_published_animals(arrays: Mapping[str, Floats], *, stimuli: Sequence[str], splits: int = SPLITS) -> Score:
@@ -198,19 +198,19 @@ def score_published_animals(arrays: Mapping[str, Floats], *, stimuli: Sequence[s
         others = concatenate([other for label, other in arrays.items() if label != name])
         animal, rest = _target(name, array, splits), _target(POOL, others, splits)
         # As for models: a split counts where both sides' halves correlate by .5 or more.
-        kept = np.where(rest.split_half_r >= THESIS_FILTER, animal.split_half_r, np.nan)
+        halves = np.where(rest.split_half_r >= THESIS_FILTER, animal.split_half_r, np.nan)
         r = float(_correlations(animal.rdm, rest.rdm))
-        found = noise_corrected(r, kept, estimator="thesis", other_split_half_r=rest.split_half_r)
-        parts.append(_part(animal, found.value, r, found.reliability))
-    known = [item for item in parts if math.isfinite(item.value)]
+        corrected = noise_corrected(r, halves, estimator="thesis", other_split_half_r=rest.split_half_r)
+        parts.append(_part(animal, corrected.value, r, corrected.reliability))
+    defined = [item for item in parts if math.isfinite(item.value)]
     return Score(
         name="animal-to-animal",
-        value=float(np.mean([item.value for item in known])) if known else math.nan,
-        status="unreliable" if known else "undefined",
+        value=float(np.mean([item.value for item in defined])) if defined else math.nan,
+        status="unreliable" if defined else "undefined",
         reasons=(
-            f"as published: mean over {len(known)} of {len(arrays)} animals, each against the units of the others",
+            f"as published: mean over {len(defined)} of {len(arrays)} animals, each against the units of the others",
         ),
-        r=float(np.mean([item.r for item in known])) if known else math.nan,
+        r=float(np.mean([item.r for item in defined])) if defined else math.nan,
         subjects=tuple(parts),
         estimator="thesis",
         stimuli=tuple(map(str, stimuli)),

@@ -130,11 +130,11 @@ def explain_file(path: str | Path) -> tuple[Step, ...]:
     if missing := {"r_xy", "r_yy"} - arrays.keys():
         raise DataError(f"{path} lacks the array {sorted(missing)[0]!r}; it has {sorted(arrays)}.")
     for name in ("r_xy", "r_yy", "r_xx"):
-        found = arrays.get(name, np.zeros(()))
-        fits = found.ndim == 0 or found.shape == (arrays["r_yy"].size,)
-        if found.dtype.kind not in "fiu" or not fits or (np.abs(found) > 1 + 1e-6).any():
+        array = arrays.get(name, np.zeros(()))
+        fits = array.ndim == 0 or array.shape == (arrays["r_yy"].size,)
+        if array.dtype.kind not in "fiu" or not fits or (np.abs(array) > 1 + 1e-6).any():
             raise DataError(
-                f"{name!r} in {shown(str(path))} is {list(found.shape)} of {found.dtype}; needed are as many "
+                f"{name!r} in {shown(str(path))} is {list(array.shape)} of {array.dtype}; needed are as many "
                 "correlations (-1 to 1, NaN for none) as 'r_yy' has."
             )
     return explain_splits(arrays["r_xy"], arrays["r_yy"], r_xx=arrays.get("r_xx"))
@@ -220,14 +220,14 @@ def _step(change: str, switches: Switches, rdms: Floats, subjects: list[SubjectR
         return Step(change, math.nan, "undefined", "no animal is reliable", switches)
     r = compare(rdms[:, None], np.stack([target[1] for target in targets])[None])
     # A correction is a factor of the raw comparison: one per target.
-    found = [corrected_value(1.0, target[2], switches) for target in targets]
-    factors = np.array([item[0] for item in found])
-    known = np.isfinite(factors)
-    if not known.any():
+    corrections = [corrected_value(1.0, target[2], switches) for target in targets]
+    factors = np.array([item[0] for item in corrections])
+    finite = np.isfinite(factors)
+    if not finite.any():
         return Step(change, math.nan, "undefined", "no split half has a positive reliability", switches)
-    names = [target[0] for target, keep in zip(targets, known, strict=True) if keep]
-    used = sum(item[1] for item in found)
-    values = (r * factors)[:, known]
+    names = [target[0] for target, keep in zip(targets, finite, strict=True) if keep]
+    used = sum(item[1] for item in corrections)
+    values = (r * factors)[:, finite]
     detail = f"{len(names)} of {len(targets)} targets, {used:,} splits"
     if switches.best_target:
         place = int(np.argmax(values.max(axis=0)))
@@ -236,5 +236,5 @@ def _step(change: str, switches: Switches, rdms: Floats, subjects: list[SubjectR
         return Step(change, float(values.mean(axis=1).max()), "ok", detail, switches)
     if len(names) == 1:
         return Step(change, math.nan, "undefined", "one animal: the default chooses on halves of its trials", switches)
-    value = float((held_out(r[:, known]) * factors[known]).mean())
+    value = float((held_out(r[:, finite]) * factors[finite]).mean())
     return Step(change, value, "ok", detail, switches)

@@ -40,10 +40,10 @@ def demo_recordings(name: str = "demo", *, progress: Progress | None = None) -> 
     stimuli = load_stimuli(DEMOS[name], progress=progress)
     if name == "demo-rodgers" and stimuli.dataset is not None:
         return ensure_rodgers_demo(stimuli.dataset, progress=progress)
-    found, design = locate_model(HIDDEN_NETWORK).weights, PopulationDesign()
-    weights = file_hash(found) if found else None
+    weights_file, design = locate_model(HIDDEN_NETWORK).weights, PopulationDesign()
+    weights = file_hash(weights_file) if weights_file else None
     made_of = (stimuli.config_hash, weights, design, HIDDEN_NETWORK, HIDDEN_LAYER, VERSION, _SEED)
-    told = {"stimuli_hash": stimuli.content_hash, "weights": weights, "config_hash": content_hash(name, *made_of)}
+    origin = {"stimuli_hash": stimuli.content_hash, "weights": weights, "config_hash": content_hash(name, *made_of)}
 
     def make(folder: Path) -> None:
         from brainbench.datasets.synthetic import ResponseGeometry, write_files
@@ -66,10 +66,10 @@ def demo_recordings(name: str = "demo", *, progress: Progress | None = None) -> 
             layer=HIDDEN_LAYER,
             distances="squared Euclidean",
             version=VERSION,
-            **told,
+            **origin,
         )
 
-    return ensure_recordings(name, told, design, HIDDEN_NETWORK, HIDDEN_LAYER, VERSION, _SEED, make=make)
+    return ensure_recordings(name, origin, design, HIDDEN_NETWORK, HIDDEN_LAYER, VERSION, _SEED, make=make)
 
 
 def demo_identity(folder: Path, attributes: Mapping[str, Any]) -> str:

@@ -28,11 +28,11 @@ def record_path(model: str, options: ScoreOptions, command: str) -> Path | None:
     if str(options.recordings) not in DEMOS or options.stimuli is not None or options.match is not None:
         return None
     try:
-        found, metric = locate_model(model), get_metric(options.metric)
+        entry, metric = locate_model(model), get_metric(options.metric)
     except UsageError:
         return None
     package = Path(__file__).parents[1]
-    ours = found.record.source == package.name and (found.weights is None or package in found.weights.parents)
+    ours = entry.record.source == package.name and (entry.weights is None or package in entry.weights.parents)
     if not ours or type(metric).__module__.partition(".")[0] != package.name:
         return None
     return cache_dir("scores") / f"{content_hash(model, options, command, code_stamp(), vars(metric))}.json"

@@ -83,7 +83,7 @@ class ResolvedModel:
         if not options.normalize and (self.module is None or _has_contract(self.module)):
             reads = "was computed elsewhere" if self.module is None else "normalises SI values by itself"
             raise UsageError(f"normalize=False gives SI values to plain modules; {card.name!r} {reads}: leave it out.")
-        card, shown = replace(card, layer=options.layer or card.layer), None
+        card, simulated = replace(card, layer=options.layer or card.layer), None
         names = getattr(self.module, "layers", None) if self.module is not None else self.activations
         if options.readout == "published":
             from brainbench.models.activations import find_readout
@@ -98,24 +98,26 @@ class ResolvedModel:
             from brainbench.stimuli import load_stimuli
 
             source = options.stimuli if options.stimuli is not None else DEFAULT_STIMULI
-            shown = load_stimuli(source, whiskers=options.whiskers, fidelity=options.fidelity, progress=progress)
-            labels, origin = shown.labels, {**origin, "stimuli": _stated(shown)}
-        if self.module is None or shown is None:
-            found = self.activations or {}
-            check_each("layer", options.layers or (), found)
-            activations = {layer: _as_steps(layer, found[layer], len(labels)) for layer in options.layers or found}
+            simulated = load_stimuli(source, whiskers=options.whiskers, fidelity=options.fidelity, progress=progress)
+            labels, origin = simulated.labels, {**origin, "stimuli": _stated(simulated)}
+        if self.module is None or simulated is None:
+            computed = self.activations or {}
+            check_each("layer", options.layers or (), computed)
+            activations = {
+                layer: _as_steps(layer, computed[layer], len(labels)) for layer in options.layers or computed
+            }
         else:
             from brainbench.models.activations import extract
 
-            values, comparable, note = _network_input(self.module, shown, options.normalize)
-            if card.objective not in (None, "untrained") and (other := _unlike_training(self.module, shown)):
-                _LOG.warning("%s was trained on other stimuli: here %s.", card.name, other)
-                note += f"; unlike its training: {other}"
+            values, comparable, note = _network_input(self.module, simulated, options.normalize)
+            if card.objective not in (None, "untrained") and (difference := _unlike_training(self.module, simulated)):
+                _LOG.warning("%s was trained on other stimuli: here %s.", card.name, difference)
+                note += f"; unlike its training: {difference}"
             activations = extract(self.module, values, layers=options.layers, readout=options.readout)
             card = replace(card, input=note)
             steps = comparable if comparable.ndim > 2 else comparable[:, None, :]
             model_input = steps.reshape(*steps.shape[:2], -1)
-        seconds = None if shown is None else _seconds(shown)
+        seconds = None if simulated is None else _seconds(simulated)
         return ModelResponses(card, labels, activations, options.time, model_input, origin, seconds)
 
 
@@ -161,21 +163,21 @@ def resolve_model(model: Any, *, seed: int = 0) -> ResolvedModel:
     elif (":" in model and not model.startswith(PREFIXES)) or model.endswith(".py"):
         module, card = load_user_model(model, seed=seed), ModelCard(model, family="user module", seed=seed)
     else:
-        found = locate_model(model)
-        module = found.build(seed)
+        entry = locate_model(model)
+        module = entry.build(seed)
         count = getattr(module, "multiply_adds", None)
         card = ModelCard(
             model,
-            family=found.record.family,
-            encoder=found.architecture.memory_encoder,
-            attender=found.architecture.attender or "none",
+            family=entry.record.family,
+            encoder=entry.architecture.memory_encoder,
+            attender=entry.architecture.attender or "none",
             objective="untrained",
             multiply_adds=count() if count is not None else None,
             seed=seed,
-            citation=found.record.citation or None,
+            citation=entry.record.citation or None,
         )
         with readable(f"{model}/{CONFIG}", "configuration of a trained model"):
-            card = replace(card, **_trained(found.trained))
+            card = replace(card, **_trained(entry.trained))
     lazy = [name for name, value in module.named_parameters() if isinstance(value, torch.nn.UninitializedParameter)]
     if lazy:
         raise UsageError(
@@ -192,7 +194,7 @@ def _trained(config: Mapping[str, Any] | None) -> dict[str, Any]:
     """Return what a checkpoint's configuration says of its training, by the fields of a card."""
     if config is None:
         return {}
-    found, twin = config.get("evaluation") or {}, config.get("twin_evaluation") or {}
+    evaluation, twin = config.get("evaluation") or {}, config.get("twin_evaluation") or {}
     facts = ("epochs", "published_epochs", "best_epoch", "licence", "version", "evaluated_split")
     stated = {name: config.get(name) for name in facts}
     stated |= {f"{name} top-1": item.get("top1") for name, item in (config.get("baselines") or {}).items()}
@@ -201,9 +203,9 @@ def _trained(config: Mapping[str, Any] | None) -> dict[str, Any]:
         **{name: config.get(name) for name in ("objective", "augmentation", "seed")},
         "twin": (config.get("twin") or {}).get("name"),
         "layer": config.get("committed_layer"),
-        **{name: found.get(name) for name in ("top1", "top5", "collapsed")},
-        "accuracy_interval": Interval(**found["interval"]) if found.get("interval") else None,
-        "accuracy_data": found.get("data"),
+        **{name: evaluation.get(name) for name in ("top1", "top5", "collapsed")},
+        "accuracy_interval": Interval(**evaluation["interval"]) if evaluation.get("interval") else None,
+        "accuracy_data": evaluation.get("data"),
         "twin_top1": twin.get("top1"),
         "twin_interval": Interval(**twin["interval"]) if twin.get("interval") else None,
         "training": {name: value for name, value in {**options, **stated}.items() if value is not None},
@@ -219,9 +221,9 @@ def _as_steps(layer: str, values: Any, rows: int) -> NDArray[np.floating]:
 
 def _stated(stimuli: Stimuli) -> dict[str, Any]:
     """Return the provenance of stimuli."""
-    told = {name: getattr(stimuli, name) for name in ("description", "content_hash", "config_hash")}
+    stated = {name: getattr(stimuli, name) for name in ("description", "content_hash", "config_hash")}
     backend = None if stimuli.dataset is None else stimuli.dataset.attrs.get("backend")
-    return {**told, "backend": str(backend)} if backend else told
+    return {**stated, "backend": str(backend)} if backend else stated
 
 
 def _seconds(stimuli: Stimuli) -> float | None:
@@ -266,13 +268,13 @@ def _unlike_training(module: Any, stimuli: Stimuli) -> str:
     dataset = stimuli.dataset
     if dataset is None or not _has_contract(module):
         return ""
-    told = []
+    differences = []
     gaps, axes = np.diff(dataset["time"].values), dataset.attrs.get("axes", "world")
     if len(gaps) and not math.isclose(rate := 1 / (spec.sub_steps * np.median(gaps)), spec.sample_rate, rel_tol=0.05):
-        told.append(f"{rate:.4g} time steps per second, there {spec.sample_rate:.4g}")
+        differences.append(f"{rate:.4g} time steps per second, there {spec.sample_rate:.4g}")
     if not spec.frame.startswith(axes):
-        told.append(f"{axes} axes, there {spec.frame.partition(' ')[0]} axes")
-    return " and ".join(told)
+        differences.append(f"{axes} axes, there {spec.frame.partition(' ')[0]} axes")
+    return " and ".join(differences)
 
 
 def reduce_time(values: NDArray[np.floating], time: str) -> NDArray[np.floating]:

@@ -69,12 +69,12 @@ class NeuralResponses:
         from brainbench.datasets.trials.counting import COVARIATES
         from brainbench.datasets.trials.session_trials import NAMES, fingerprint
 
-        data, found = self.dataset, str(self.dataset.attrs["content_hash"])
+        data, stated = self.dataset, str(self.dataset.attrs["content_hash"])
         if data.attrs.get("fingerprint") not in (None, fingerprint(data)):
             arrays = [data[name].values for name in ("counts", "duration")]
-            found = content_hash(found, *arrays, *(data[name].values.astype(str).tolist() for name in NAMES))
-        known = {name: data[name].values.tolist() for name in COVARIATES if name in data.coords}
-        return content_hash(found, known) if self.covariates and known else found
+            stated = content_hash(stated, *arrays, *(data[name].values.astype(str).tolist() for name in NAMES))
+        covariates = {name: data[name].values.tolist() for name in COVARIATES if name in data.coords}
+        return content_hash(stated, covariates) if self.covariates and covariates else stated
 
     @property
     def origin(self) -> dict[str, Any]:
@@ -107,8 +107,8 @@ class NeuralResponses:
             for pair in (("session", "subject"), ("unit_session", "unit_subject"))
         )
         lost = [f"session {session} of {subject}" for session, subject in trials if (session, subject) not in units]
-        told = [f"{', '.join(lost)}: no unit is left, so the trials are left out"] if lost else []
-        return (*map(str, self.dataset.attrs.get("doubts", ())), *told)
+        notes = [f"{', '.join(lost)}: no unit is left, so the trials are left out"] if lost else []
+        return (*map(str, self.dataset.attrs.get("doubts", ())), *notes)
 
     @property
     def published(self) -> bool:
@@ -132,7 +132,7 @@ class NeuralResponses:
         return join_labels(self.vocabulary, stimuli, match)
 
     def reliable_trials(
-        self, kept: tuple[str, ...], options: ScoreOptions, *, averaged: bool = False
+        self, labels: tuple[str, ...], options: ScoreOptions, *, averaged: bool = False
     ) -> dict[str, tuple[tuple[Trials, ...], str]]:
         """Return each animal's :meth:`trials` with its reliable units, and what was left out in words.
 
@@ -140,19 +140,19 @@ class NeuralResponses:
         """
         from brainbench.metrics.reliability.units import reliable_units
 
-        given, how = self.trials(kept, averaged=averaged), {"least": options.units_reliability, "seed": options.seed}
+        given, how = self.trials(labels, averaged=averaged), {"least": options.units_reliability, "seed": options.seed}
         # Without a gate no unit is judged.
-        whole = given if averaged or options.units_reliability is None else self.trials(kept, averaged=True)
-        return {name: reliable_units(own, len(kept), whole=whole[name], **how) for name, own in given.items()}
+        whole = given if averaged or options.units_reliability is None else self.trials(labels, averaged=True)
+        return {name: reliable_units(own, len(labels), whole=whole[name], **how) for name, own in given.items()}
 
-    def animals(self, kept: tuple[str, ...], metric: Metric, options: ScoreOptions) -> tuple[Any, ...]:
+    def animals(self, labels: tuple[str, ...], metric: Metric, options: ScoreOptions) -> tuple[Any, ...]:
         """Prepare every animal by a metric over the labels ``kept``, in that order."""
         animals = []
         longest = self.dataset["duration"].values.max(axis=0)
         share = np.where(longest > (1 - 1e-6) * longest.max(), 1.0, longest / longest.max())
-        for subject, (chosen, note) in self.reliable_trials(kept, options, averaged=options.time == "mean").items():
+        for subject, (chosen, note) in self.reliable_trials(labels, options, averaged=options.time == "mean").items():
             trials = tuple(replace(item, responses=_flat(item.responses, share)) for item in chosen)
-            animal = metric.animal(subject, trials, len(kept), stimuli=kept, seed=options.seed)
+            animal = metric.animal(subject, trials, len(labels), stimuli=labels, seed=options.seed)
             bins = max((item.responses.shape[1] for item in chosen), default=1)
             animal = replace(animal, units=-(-animal.units // bins))
             if not trials and note:
@@ -162,7 +162,7 @@ class NeuralResponses:
             animals.append(animal)
         return tuple(animals)
 
-    def trials(self, kept: tuple[str, ...], *, averaged: bool = False) -> dict[str, tuple[Trials, ...]]:
+    def trials(self, labels: tuple[str, ...], *, averaged: bool = False) -> dict[str, tuple[Trials, ...]]:
         """Return the sessions of each animal with trials of the labels ``kept``, numbered in that order.
 
         ``averaged`` rates are those of the whole window.
@@ -170,12 +170,12 @@ class NeuralResponses:
         from brainbench.datasets.trials.session_trials import trials_by_subject
 
         index = np.full(len(self.vocabulary), -1)
-        index[[self.vocabulary.index(label) for label in kept]] = np.arange(len(kept))
-        found = {}
+        index[[self.vocabulary.index(label) for label in labels]] = np.arange(len(labels))
+        animals = {}
         for subject, sessions in trials_by_subject(self.dataset, averaged=averaged).items():
             kept_trials = [session.take(index[session.labels] >= 0) for session in sessions]
-            found[subject] = tuple(replace(item, labels=index[item.labels]) for item in kept_trials)
-        return found
+            animals[subject] = tuple(replace(item, labels=index[item.labels]) for item in kept_trials)
+        return animals
 
 
 def open_neural_responses(recordings: Any, *, progress: Progress | None, **selection: Any) -> NeuralResponses:

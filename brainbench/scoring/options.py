@@ -122,8 +122,8 @@ class ScoreOptions:
     @classmethod
     def of(cls, values: Mapping[str, Any]) -> ScoreOptions:
         """Return the options that a mapping of names and values states."""
-        known = [item.name for item in fields(cls)]
-        check_each("option of a score", values, known)
+        names = [item.name for item in fields(cls)]
+        check_each("option of a score", values, names)
         return cls(**values)
 
     @classmethod
@@ -131,8 +131,8 @@ class ScoreOptions:
         """Return the options that the settings of a provenance state, and others that they do not hold."""
         from brainbench.stimuli.sources import is_finished
 
-        known = {item.name for item in fields(cls)} - {*_ELSEWHERE}
-        stated = {name: value for name, value in settings.items() if name in known and value is not None}
+        names = {item.name for item in fields(cls)} - {*_ELSEWHERE}
+        stated = {name: value for name, value in settings.items() if name in names and value is not None}
         if is_finished(stated.get("stimuli", "")):  # of an earlier record, which states one all the same
             stated.pop("fidelity", None)
         if isinstance(stated.get("fidelity"), Mapping):  # of the caller's own: its fields, as JSON states a dataclass
@@ -163,8 +163,8 @@ class ScoreOptions:
 
         stated = {item.name: getattr(self, item.name) for item in fields(self) if item.name not in _ELSEWHERE}
         # Stimuli in memory have no name; their hash stands in the provenance.
-        named = isinstance(self.stimuli, (str, os.PathLike, type(None)))
-        texts = {"select": self.select, "window": self.window, "stimuli": self.stimuli if named else "data"}
+        has_name = isinstance(self.stimuli, (str, os.PathLike, type(None)))
+        texts = {"select": self.select, "window": self.window, "stimuli": self.stimuli if has_name else "data"}
         stated |= {name: value if value is None else str(value) for name, value in texts.items()}
         metric = self.metric if isinstance(self.metric, str) else self.metric.name
         finished = self.stimuli is not None and is_finished(self.stimuli)

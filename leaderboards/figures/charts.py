@@ -73,8 +73,8 @@ def parameters_against_accuracy(entries: Sequence[Entry]) -> Figure:
     """Draw the number of parameters against the task accuracy (figure 3.3 c)."""
     key, title = "parameters-accuracy", "Parameters against task accuracy (as figure 3.3 c)"
     label, read = _accuracy_of(entries)
-    found = [(e.card.parameters, read(e), e) for e in entries]
-    points = [(float(count), value, e) for count, value, e in found if count and value is not None]
+    stated = [(e.card.parameters, read(e), e) for e in entries]
+    points = [(float(count), value, e) for count, value, e in stated if count and value is not None]
     if len(points) < 2:
         return Figure(key, title, lacking="fewer than 2 records state both parameters and a task accuracy")
     return scatter(key, title, points, "parameters", up_label=label, log=True)
@@ -201,13 +201,13 @@ def board_figures(board: Board) -> list[Figure]:
 def fit_per_model(board: Board) -> Figure:
     """Draw the neural fit of every model beside its untrained twin, with all baselines (figure 3.7 b)."""
     title = "Neural fit of every model"
-    shown = [entry for entry in board.entries if math.isfinite(entry.scaled)]
+    drawn = [entry for entry in board.entries if math.isfinite(entry.scaled)]
     # A twin is drawn on the row of the network trained from it, not once more on its own.
-    partnered = {entry.architecture for entry in shown if entry.trained}
-    shown = [entry for entry in shown if entry.trained or entry.architecture not in partnered]
-    if not shown:
+    partnered = {entry.architecture for entry in drawn if entry.trained}
+    drawn = [entry for entry in drawn if entry.trained or entry.architecture not in partnered]
+    if not drawn:
         return Figure("fit", title, lacking="no record has a defined score that states its chance")
-    models, untrained = shown[:SHOWN], twins(board.entries)
+    models, untrained = drawn[:SHOWN], twins(board.entries)
     base = [item for item in board.baselines if math.isfinite(item.score.scaled)]
     colour = colours(map(_objective, models))
     rows = []
@@ -220,10 +220,10 @@ def fit_per_model(board: Board) -> Figure:
         points = (*(seeds if entry.seeds > 1 else ()), *twin, mark)
         label_kind = "end" if not entry.unranked_because else "end quiet"
         rows.append(ChartRow(cut_name(entry.name, 36), points, entry.interval, kind, label_kind))
-    for item in base:
-        kind, shape = ("c7", "square") if item.kind == "animals" else ("c0", "diamond")
-        mark = ChartPoint(item.score.scaled, kind, f"{item.name}: {number(item.score.scaled)}", 4, shape)
-        rows.append(ChartRow(item.name, (mark,), item.score.scaled_interval, kind, "end quiet"))
+    for baseline in base:
+        kind, shape = ("c7", "square") if baseline.kind == "animals" else ("c0", "diamond")
+        mark = ChartPoint(baseline.score.scaled, kind, f"{baseline.name}: {number(baseline.score.scaled)}", 4, shape)
+        rows.append(ChartRow(baseline.name, (mark,), baseline.score.scaled_interval, kind, "end quiet"))
     values = [entry.scaled for entry in models] + [item.score.scaled for item in base]
     scale = score_scale(values, [row.interval for row in rows], 250, WIDTH - 20)
     spans = (item.score.scaled_interval for item in base if item.kind == "animals")
@@ -233,7 +233,7 @@ def fit_per_model(board: Board) -> Figure:
     caption += "The band is the interval of animal-to-animal. " if band else ""
     caption += "Small dots are seeds. " if any(e.seeds > 1 for e in models) else ""
     caption += "Hollow grey points are untrained twins. " if any(e.trained for e in models) else ""
-    return Figure("fit", f"{title} (as figure 3.7 b)", caption + legend_words(colour) + cut_words(len(shown)), drawing)
+    return Figure("fit", f"{title} (as figure 3.7 b)", caption + legend_words(colour) + cut_words(len(drawn)), drawing)
 
 
 def layer_fit(entries: Sequence[Entry]) -> Figure:
@@ -279,10 +279,10 @@ def accuracy(entries: Sequence[Entry]) -> Figure:
     # Untrained networks are drawn as twins; a board of such alone still shows them.
     stated = [e for e in stated if e.trained] or stated
     models, untrained = stated[:SHOWN], twins(entries)
-    found = [_twin_accuracy(entry, untrained) for entry in models]
+    twin_accuracies = [_twin_accuracy(entry, untrained) for entry in models]
     colour = colours(map(_objective, models))
     rows = []
-    for entry, twin in zip(models, found, strict=True):
+    for entry, twin in zip(models, twin_accuracies, strict=True):
         kind, card = colour[_objective(entry)], entry.card
         top1 = card.top1 or 0.0  # only models that state it are drawn
         points = [ChartPoint(top1, kind, f"{entry.name}: top-1 {number(top1)}")]
@@ -294,7 +294,7 @@ def accuracy(entries: Sequence[Entry]) -> Figure:
     reach = max(0.05, *(max(e.card.top1 or 0, e.card.top5 or 0, e.card.twin_top1 or 0) for e in models))
     scale = Scale(0.0, min(1.0, reach * 1.05), 250, WIDTH - 20)
     drawing = row_chart(f"{title}: {len(models)} models", rows, scale, "accuracy on held-out objects")
-    lack = " No record states the accuracy of an untrained twin." if set(found) == {None} else ""
+    lack = " No record states the accuracy of an untrained twin." if set(twin_accuracies) == {None} else ""
     caption = (
         f"Top-1 accuracy with its Wilson interval, top-5 (diamond) and the untrained twin's top-1 (hollow grey).{lack} "
         f"{legend_words(colour)}{cut_words(len(stated))}"

@@ -73,18 +73,18 @@ def rdm_lines(board: Board) -> Figure:
     models = [(name, pairs) for name, pairs in picked.items() if pairs.shape == truth.shape]
     if not models:
         return Figure(key, title, lacking="no record holds the RDMs of a model and of the brain")
-    known = np.isfinite([truth, *(pairs for _, pairs in models)]).all(axis=0)
-    if known.sum() < 3:
+    finite = np.isfinite([truth, *(pairs for _, pairs in models)]).all(axis=0)
+    if finite.sum() < 3:
         return Figure(key, title, lacking="fewer than 3 pairs of stimuli are defined in all RDMs")
-    order = np.argsort(truth[known], kind="stable")
+    order = np.argsort(truth[finite], kind="stable")
     groups = np.array_split(order, min(len(order), MOST_GROUPS))
-    lines = [("brain", truth[known])]
+    lines = [("brain", truth[finite])]
     for name, pairs in models:
         # Comparisons by correlation ignore scale and offset: least squares puts each RDM on the brain's.
-        flat = np.ptp(pairs[known]) == 0
-        slope, offset = (0.0, truth[known].mean()) if flat else np.polyfit(pairs[known], truth[known], 1)
-        lines.append((name, offset + slope * pairs[known]))
-    drawing = Drawing(WIDTH, 300, f"{len(lines)} flattened dissimilarity matrices of {known.sum()} pairs")
+        flat = np.ptp(pairs[finite]) == 0
+        slope, offset = (0.0, truth[finite].mean()) if flat else np.polyfit(pairs[finite], truth[finite], 1)
+        lines.append((name, offset + slope * pairs[finite]))
+    drawing = Drawing(WIDTH, 300, f"{len(lines)} flattened dissimilarity matrices of {finite.sum()} pairs")
     means = [np.array([values[group].mean() for group in groups]) for _, values in lines]
     across = Scale(0, len(groups) - 1, 56, WIDTH - 170)
     up = scale_of(np.concatenate(means).tolist(), 262, 16, floor=None)
@@ -94,10 +94,10 @@ def rdm_lines(board: Board) -> Figure:
         points = "L".join(f"{across.at(i):.1f} {up.at(value):.1f}" for i, value in enumerate(values))
         drawing.path(f"M{points}", f"trace c{place}")
     legend(drawing, [(name, "square", f"c{place}") for place, (name, _) in enumerate(lines)], WIDTH - 156)
-    few = f" in {len(groups)} groups" if len(groups) < known.sum() else ""
+    few = f" in {len(groups)} groups" if len(groups) < finite.sum() else ""
     caption = (
-        f"{known.sum()} pairs of stimuli{few} in the order of the brain's dissimilarity; the other matrices are scaled "
-        "to it by least squares. A line that rises with the brain's orders the pairs as the brain does."
+        f"{finite.sum()} pairs of stimuli{few} in the order of the brain's dissimilarity; the other matrices are "
+        "scaled to it by least squares. A line that rises with the brain's orders the pairs as the brain does."
     )
     return Figure(key, title, caption, drawing)
 
@@ -132,21 +132,21 @@ def rdm_picture(pairs: Sequence[float], labels: Sequence[str]) -> RdmPicture | N
     if size < 2 or len(pairs) != size * (size - 1) // 2:
         return None
     values, places = np.asarray(pairs, dtype=np.float64), np.column_stack(np.triu_indices(size, k=1))
-    known = np.isfinite(values)
-    if not known.any():
+    finite = np.isfinite(values)
+    if not finite.any():
         return None
-    low, high = float(values[known].min()), float(values[known].max())
+    low, high = float(values[finite].min()), float(values[finite].max())
     alike, apart = places[values == low][0], places[values == high][-1]
     scale = (_LEVELS - 1) / (high - low) if high > low else 0.0
     cells = np.where(np.eye(size), -1, _LEVELS)
-    rows, columns = places[known].T
-    cells[rows, columns] = cells[columns, rows] = np.rint((values[known] - low) * scale)
+    rows, columns = places[finite].T
+    cells[rows, columns] = cells[columns, rows] = np.rint((values[finite] - low) * scale)
     description = (
         f"{size} by {size} matrix of dissimilarities from {low:.3g} to {high:.3g}; most alike are "
         f"{labels[alike[0]]} and {labels[alike[1]]}, most different {labels[apart[0]]} and {labels[apart[1]]}."
     )
-    if not known.all():
-        description += f" Undefined pairs: {np.sum(~known)}."
+    if not finite.all():
+        description += f" Undefined pairs: {np.sum(~finite)}."
     return RdmPicture(_png(cells), tuple(labels), low, high, description)
 
 

@@ -89,14 +89,14 @@ def _folded(graph: ModelGraph) -> list[_Box]:
 
 def _lanes(edges: Sequence[tuple[int, int, bool]]) -> list[int]:
     """Give each edge the innermost lane in which it crosses no other."""
-    taken: list[list[tuple[int, int]]] = []
+    spans: list[list[tuple[int, int]]] = []
     lanes = []
     for source, target, _ in edges:
         low, high = min(source, target), max(source, target)
-        lane = next((i for i, used in enumerate(taken) if all(high <= a or low >= b for a, b in used)), len(taken))
-        if lane == len(taken):
-            taken.append([])
-        taken[lane].append((low, high))
+        lane = next((i for i, used in enumerate(spans) if all(high <= a or low >= b for a, b in used)), len(spans))
+        if lane == len(spans):
+            spans.append([])
+        spans[lane].append((low, high))
         lanes.append(lane)
     return lanes
 
@@ -166,22 +166,22 @@ def draw_time_course(statistics: Mapping[str, Any]) -> Drawing | None:
 
 
 def _curve(drawing: Drawing, points: Sequence[Mapping[str, Any]], across: Scale) -> None:
-    shown = []
+    defined = []
     for point in points:
         chance = _number(point["chance"])
         value, *ends = ((one - chance) / (1 - chance) for one in (_number(point["value"]), *_ends(point["interval"])))
         if math.isfinite(value):
-            shown.append((across.at(_number(point["time"])), value, ends, point))
-    held = [min(max(end, -0.5), 1.5) for _, _, ends, _ in shown for end in ends]
-    up = scale_of([*(value for _, value, *_ in shown), *held], _CURVE, 22, top=1.0)
+            defined.append((across.at(_number(point["time"])), value, ends, point))
+    held = [min(max(end, -0.5), 1.5) for _, _, ends, _ in defined for end in ends]
+    up = scale_of([*(value for _, value, *_ in defined), *held], _CURVE, 22, top=1.0)
     drawing.text(_LEFT, 14, "score at each time: 0 chance, 1 all that is reliable", "title small")
     for tick in up.ticks:
         drawing.line(_LEFT, up.at(tick), _COURSE_WIDTH - _RIGHT, up.at(tick), "one" if tick in (0, 1) else "grid")
         drawing.text(_LEFT - 6, up.at(tick) + 4, tick_text(tick), "end quiet small")
     _ticks(drawing, across, _CURVE, "seconds after the window begins")
-    if len(shown) > 1:
-        drawing.path("M" + "L".join(f"{x:.1f} {up.at(value):.1f}" for x, value, *_ in shown), "line edge")
-    for x, value, ends, point in shown:
+    if len(defined) > 1:
+        drawing.path("M" + "L".join(f"{x:.1f} {up.at(value):.1f}" for x, value, *_ in defined), "line edge")
+    for x, value, ends, point in defined:
         if ends:
             drawing.line(x, up.at(ends[0]), x, up.at(ends[1]), "span c1")
         clear = _number(point["p"]) <= ALPHA
@@ -231,13 +231,13 @@ def beside(record: ResultRecord) -> Drawing:
 
     On the common scale where the record states its chance, else in the metric's own unit.
     """
-    known = math.isfinite(record.score.scaled)
+    scaled = math.isfinite(record.score.scaled)
 
     def rows(score: Score) -> tuple[Callable[[float], float], Interval | None]:
-        return (score.on_scale, score.scaled_interval) if known else (float, score.interval)
+        return (score.on_scale, score.scaled_interval) if scaled else (float, score.interval)
 
     animals = record.animal_to_animal
-    label = "score: 0 chance, 1 all that is reliable" if known else record.score.metric
+    label = "score: 0 chance, 1 all that is reliable" if scaled else record.score.metric
     return _chart(record, label, "value", rows, rows(animals)[1] if animals and animals.status == "ok" else None)
 
 
@@ -253,11 +253,11 @@ _Reading = Callable[[Score], tuple[Callable[[float], float], Interval | None]]
 
 def _chart(record: ResultRecord, label: str, name: str, reading: _Reading, band: Interval | None) -> Drawing:
     """Draw one row per score; ``name`` is the field of scores and animals that is drawn."""
-    named = [(record.score.name, "c1", "dot", record.score)]
-    named += [("animal-to-animal", "c7", "square", record.animal_to_animal)] if record.animal_to_animal else []
-    named += [(key, "c0", "diamond", score) for key, score in record.baselines.items()]
+    marks = [(record.score.name, "c1", "dot", record.score)]
+    marks += [("animal-to-animal", "c7", "square", record.animal_to_animal)] if record.animal_to_animal else []
+    marks += [(key, "c0", "diamond", score) for key, score in record.baselines.items()]
     rows, values = [], []
-    for key, kind, shape, score in named:
+    for key, kind, shape, score in marks:
         place, interval = reading(score)
         value = place(getattr(score, name))
         singles = [place(getattr(item, name)) for item in score.subjects]
@@ -280,8 +280,8 @@ def layers(records: Sequence[ResultRecord]) -> Drawing | None:
     for index, layer in enumerate(score.layers):
         kind = PARTS.get(layer.layer.partition(".")[0], "c1")
         chosen = layer.layer == score.layer
-        found = [one[index].value for one in seeds if len(one) == len(score.layers)]
-        finite = [value for value in found if math.isfinite(value)]
+        values = [one[index].value for one in seeds if len(one) == len(score.layers)]
+        finite = [value for value in values if math.isfinite(value)]
         points = [ChartPoint(value, f"{kind} faint", size=2.2) for value in finite if len(records) > 1]
         interval = layer.interval if len(records) == 1 else None
         if finite:

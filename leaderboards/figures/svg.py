@@ -282,13 +282,13 @@ def legend(drawing: Drawing, marks: Iterable[tuple[str, str, str]], x: float, y:
 
 def colours(names: Iterable[str]) -> dict[str, str]:
     """Give each name a colour class, ``untrained`` grey, in the order in which they come."""
-    found: dict[str, str] = {}
+    classes: dict[str, str] = {}
     for name in names:
-        if name not in found:
-            used = sum(kind != "c0" for kind in found.values())
-            found[name] = "c0" if name in ("untrained", "not stated") else f"c{used % COLOURS + 1}"
+        if name not in classes:
+            used = sum(kind != "c0" for kind in classes.values())
+            classes[name] = "c0" if name in ("untrained", "not stated") else f"c{used % COLOURS + 1}"
     # Grey sets untrained networks back behind trained ones; alone they need not step back.
-    return dict.fromkeys(found, "c1") if len(found) == 1 else found
+    return dict.fromkeys(classes, "c1") if len(classes) == 1 else classes
 
 
 _NAMES = ("grey", "blue", "orange", "teal", "violet", "ochre", "pink", "green", "sky")
@@ -297,13 +297,13 @@ _NAMES = ("grey", "blue", "orange", "teal", "violet", "ochre", "pink", "green", 
 
 def legend_words(colour: dict[str, str]) -> str:
     """Return the sentence that says what the colours mean."""
-    told = ", ".join(f"{name} {_NAMES[int(kind[1:])]}" for name, kind in colour.items())
-    return f"Colours: {told}." if told else ""
+    pairs = ", ".join(f"{name} {_NAMES[int(kind[1:])]}" for name, kind in colour.items())
+    return f"Colours: {pairs}." if pairs else ""
 
 
-def cut_words(count: int, shown: int = SHOWN) -> str:
+def cut_words(count: int, limit: int = SHOWN) -> str:
     """Return the sentence that says how many models are shown, empty if all are."""
-    return f" Shown are the first {shown} of {count} models; the table holds all." if count > shown else ""
+    return f" Shown are the first {limit} of {count} models; the table holds all." if count > limit else ""
 
 
 def cut(text: str, length: int) -> str:

@@ -72,7 +72,7 @@ def references(records: Iterable[ResultRecord]) -> list[Reference]:
 
     An architecture's citation that is not known here is kept in its own words as an entry ``@misc``.
     """
-    found: dict[str, Reference] = {"brainbench": _toolkit()}
+    references: dict[str, Reference] = {"brainbench": _toolkit()}
     for record in records:
         score, card = record.score, record.card
         keys = []
@@ -88,11 +88,11 @@ def references(records: Iterable[ResultRecord]) -> list[Reference]:
             keys += [_OBJECTIVES[card.objective]] if card.objective in _OBJECTIVES else []
             keys += ["wilson1927"] if card.accuracy_interval is not None else []
             if card.citation and not any(words in card.citation for words in _ARCHITECTURES):
-                other = _other(card.citation)
-                found.setdefault(other.key, other)
+                reference = _other(card.citation)
+                references.setdefault(reference.key, reference)
         for key in keys:
-            found.setdefault(key, _works()[key])
-    return list(found.values())
+            references.setdefault(key, _works()[key])
+    return list(references.values())
 
 
 def _toolkit() -> Reference:
@@ -145,8 +145,8 @@ def write_paper(
     path = Path(path)
     kind = format or path.suffix.removeprefix(".").lower()
     check_name("report format", kind, FORMATS)
-    found = [item.record if isinstance(item, StoredRecord) else item for item in records]
-    usable = [record for record in found if record is not None]
+    given = [item.record if isinstance(item, StoredRecord) else item for item in records]
+    usable = [record for record in given if record is not None]
     if not usable:
         raise DataError("There are no usable result records for a report; make one with: brainbench score MODEL")
     boards = rank(usable)
@@ -209,14 +209,14 @@ def _section(board: Board, place: int, path: Path) -> dict[str, Any]:
 
 def _single(entry: Entry) -> list[Figure]:
     graph, drawn = entry.card.graph, layers(entry.records)
-    found = []
+    rows = []
     if graph is not None:
         caption = "Solid arrows act within the stream, dashed ones are feedback."
-        found.append(Figure("architecture", f"Architecture of {entry.name}", caption, diagram(graph, entry.name)))
+        rows.append(Figure("architecture", f"Architecture of {entry.name}", caption, diagram(graph, entry.name)))
     if drawn is not None:
         caption = "Score of each layer; filled is the layer chosen on held-out data. For reading only."
-        found.append(Figure("layers", "Layers", caption, drawn))
-    return found
+        rows.append(Figure("layers", "Layers", caption, drawn))
+    return rows
 
 
 def _models(entries: Sequence[Entry]) -> PaperTable:
@@ -244,8 +244,12 @@ def _models(entries: Sequence[Entry]) -> PaperTable:
 
 def _baselines(board: Board) -> PaperTable:
     rows = [
-        (item.name, *map(words.number, (item.score.scaled, item.score.value)), words.span(item.score.scaled_interval))
-        for item in board.baselines
+        (
+            baseline.name,
+            *map(words.number, (baseline.score.scaled, baseline.score.value)),
+            words.span(baseline.score.scaled_interval),
+        )
+        for baseline in board.baselines
     ]
     return PaperTable("Baselines and animal-to-animal.", ("baseline", "score", "value", "interval"), tuple(rows))
 
@@ -254,9 +258,9 @@ def _animals(entry: Entry) -> PaperTable:
     columns = ("animal", "value", "raw r", "reliability", "units", "trials", "layer")
     rows = [
         (
-            item.subject, words.number(item.value), words.number(item.r), words.number(item.reliability, 2),
-            words.count(item.units), words.count(item.trials), item.layer or "",
+            subject.subject, words.number(subject.value), words.number(subject.r), words.number(subject.reliability, 2),
+            words.count(subject.units), words.count(subject.trials), subject.layer or "",
         )
-        for item in entry.score.subjects
+        for subject in entry.score.subjects
     ]  # fmt: skip
     return PaperTable("Animals, each at the layer chosen on the others.", columns, tuple(rows))

@@ -49,10 +49,10 @@ def rebuilt(root: Path) -> Iterator[Callable[[str, str | bytes], Path]]:
     """
     check_site(root)
     with writable(root), lock_folder(root):
-        known, present = check_site(root)
+        listed, present = check_site(root)
         for folder, _, _ in os.walk(root):
             sweep(Path(folder))
-        _write_manifest(root, known)
+        _write_manifest(root, listed)
         new: _Hashes = {}
         with ExitStack() as stack:
 
@@ -63,7 +63,7 @@ def rebuilt(root: Path) -> Iterator[Callable[[str, str | bytes], Path]]:
                 return root / name
 
             yield stage
-            both = {name: known.get(name, []) + new.get(name, []) for name in known.keys() | new.keys()}
+            both = {name: listed.get(name, []) + new.get(name, []) for name in listed.keys() | new.keys()}
             _write_manifest(root, both)
         for name in present - new.keys():
             (root / name).unlink(missing_ok=True)
@@ -76,18 +76,18 @@ def check_site(root: Path) -> tuple[_Hashes, set[str]]:
         raise UsageError(
             f"A leaderboard is a folder; received {str(root)!r}. For a single page use: brainbench leaderboard report"
         )
-    known, present = _read(root), set()
+    manifest, present = _read(root), set()
     for name in sorted(_files(root)):
         path = root / name
-        temporary = is_temporary(path.name) and (known is not None or name.startswith(f".{Path(MANIFEST).stem}-"))
+        temporary = is_temporary(path.name) and (manifest is not None or name.startswith(f".{Path(MANIFEST).stem}-"))
         if name == MANIFEST or (temporary and not path.is_symlink()):
             continue
-        listed = (known or {}).get(name, [])
+        listed = (manifest or {}).get(name, [])
         if path.is_symlink() or not path.is_file() or file_hash(path, length=64) not in listed:
             what = "was changed since the last build" if listed else "no build of a leaderboard wrote"
             raise UsageError(f"The folder {str(root)!r} holds {name[-80:]!r}, which {what}; name a new folder.")
         present.add(name)
-    return known or {}, present
+    return manifest or {}, present
 
 
 def _files(root: Path) -> Iterator[str]:
@@ -146,10 +146,10 @@ def build_leaderboard(
         raise
     except Exception:
         # Whatever a record may hold that no check foresaw: it is found by itself and left out, and the site is built.
-        shown = [_tried(item) for item in stored]
-        if shown == stored:
+        usable = [_tried(item) for item in stored]
+        if usable == stored:
             raise
-        _write(shown, root, title)
+        _write(usable, root, title)
     return root / "index.html"
 
 
@@ -162,13 +162,13 @@ def _stored(record: ResultRecord) -> StoredRecord:
     return StoredRecord(path, record)
 
 
-def _tried(item: StoredRecord) -> StoredRecord:
+def _tried(stored: StoredRecord) -> StoredRecord:
     try:
-        for _ in _pages([item], ""):
+        for _ in _pages([stored], ""):
             pass
     except Exception as error:  # noqa: BLE001 - see build_leaderboard
-        return StoredRecord(item.path, None, f"cannot be shown ({type(error).__name__}: {str(error)[:80]})")
-    return item
+        return StoredRecord(stored.path, None, f"cannot be shown ({type(error).__name__}: {str(error)[:80]})")
+    return stored
 
 
 def _write(stored: Sequence[StoredRecord], root: Path, title: str) -> None:
@@ -199,18 +199,18 @@ def _pages(stored: Sequence[StoredRecord], title: str) -> Iterator[tuple[str, st
             root="",
         ),
     )
-    shown = []
+    sections = []
     for place, board in enumerate(boards, start=1):
         figures = board_figures(board)
         if len(boards) > 1:
             figures = [replace(figure, key=f"{figure.key}-{place}") for figure in figures]
-        shown.append({"label": board_label(board), "figures": figures})
+        sections.append({"label": board_label(board), "figures": figures})
     about = {"title": "Figures", "synthetic": synthetic, "here": "figures", "root": ""}
-    yield "figures.html", render("board_figures.html.j2", boards=shown, **about)
+    yield "figures.html", render("board_figures.html.j2", boards=sections, **about)
     for entry in (entry for board in boards for entry in board.entries):
         yield f"models/{entry.page}", model_page(entry)
-    kept = (record for board in boards for entry in board.entries for record in entry.records)
-    texts = {record.file_name: record_text(record) for record in kept}
+    records = (record for board in boards for entry in board.entries for record in entry.records)
+    texts = {record.file_name: record_text(record) for record in records}
     yield from ((f"records/{name}", text) for name, text in texts.items())
     rows = [row for board in boards for row in table_rows(board)]
     data = (table_csv(rows), to_json(rows) + "\n", _records_zip(texts), to_json(record_schema()) + "\n")

@@ -129,13 +129,13 @@ def comparisons(record: ResultRecord) -> list[str]:
     if record.animal_to_animal is not None:
         others["animal-to-animal"] = record.animal_to_animal
     sentences, untested = [], []
-    for name, other in others.items():
-        found = compare_scores(score, other)
-        if not found.verdict or not "ok" == score.status == other.status:
+    for name, baseline in others.items():
+        comparison = compare_scores(score, baseline)
+        if not comparison.verdict or not "ok" == score.status == baseline.status:
             untested.append(name)
             continue
-        told = f"difference {text.number(found.difference)} {text.span(found.interval)}"
-        sentences.append(f"{found.verdict} {name}: {told}.")
+        words = f"difference {text.number(comparison.difference)} {text.span(comparison.interval)}"
+        sentences.append(f"{comparison.verdict} {name}: {words}.")
     if untested:
         lacks = lacking(sum(item.status == "ok" for item in score.subjects), len(score.stimuli))
         why = f"this needs {lacks}" if lacks else "not both state reliable values of single animals and stimuli"
@@ -148,8 +148,8 @@ def _score_view(record: ResultRecord) -> dict[str, Any]:
     score, card = record.score, record.card
     raw_input = record.baselines.get(RAW_INPUT)
     above = raw_input is not None and compare_scores(score, raw_input).verdict == "Above"
-    named = [("model", score.name, score), ("animals", "animal-to-animal", record.animal_to_animal)]
-    named += [("baseline", name, item) for name, item in record.baselines.items()]
+    rows = [("model", score.name, score), ("animals", "animal-to-animal", record.animal_to_animal)]
+    rows += [("baseline", name, item) for name, item in record.baselines.items()]
     pairs = list(zip(combinations(score.stimuli, 2), score.model_rdm, score.brain_rdm, strict=False))
     return {
         "title": f"{score.name}: brainbench score",
@@ -161,7 +161,7 @@ def _score_view(record: ResultRecord) -> dict[str, Any]:
         "recordings": score.provenance.recordings_name,
         "beside": beside(record),
         "raw": raw(record),
-        "rows": [item for item in named if item[2] is not None],
+        "rows": [item for item in rows if item[2] is not None],
         "layer_chart": layers([record]),
         "layer_p": score.provenance.layer_p,
         "model_rdm": rdm_picture(score.model_rdm, score.stimuli),

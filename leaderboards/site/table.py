@@ -79,18 +79,18 @@ def page_board(key: str, board: Board) -> dict[str, Any]:
     # Records of earlier versions state no chance: a board of such alone shows the metric's own values.
     scaled = any(row["scaled"] is not None for row in rows)
     score, low, high = ("scaled", "scaled_low", "scaled_high") if scaled else ("value", "low", "high")
-    found = []
+    columns = []
     for row, entry in zip(rows, [*board.entries, *[None] * len(board.baselines)], strict=True):
-        shown = {name: value for name, value in row.items() if name not in _COMMON}
-        shown |= {"score": row[score], "score_low": row[low], "score_high": row[high]}
+        cells = {name: value for name, value in row.items() if name not in _COMMON}
+        cells |= {"score": row[score], "score_low": row[low], "score_high": row[high]}
         if entry is not None:
-            shown |= {"apart": entry.not_repeatable or None, "seed": entry.card.seed}
-            shown |= {"runs": [record.score.scaled for record in entry.records] if entry.seeds > 1 else None}
-        found.append({name: _rounded(value) for name, value in shown.items()})
-    trusted = [row for row in found if row["standing"] != "unreliable"]
+            cells |= {"apart": entry.not_repeatable or None, "seed": entry.card.seed}
+            cells |= {"runs": [record.score.scaled for record in entry.records] if entry.seeds > 1 else None}
+        columns.append({name: _rounded(value) for name, value in cells.items()})
+    trusted = [row for row in columns if row["standing"] != "unreliable"]
     values = [row[name] for row in trusted for name in ("score", "score_low", "score_high") if row[name] is not None]
     axis = score_scale(values, [], 0, 1)
-    animals = next((row for row in found if row["kind"] == "animals" and row["score_low"] is not None), None)
+    animals = next((row for row in columns if row["kind"] == "animals" and row["score_low"] is not None), None)
     return {
         "key": key,
         "recordings": board.recordings + (f" ({board.recordings_hash[:6]})" if board.recordings_hash else ""),
@@ -101,7 +101,9 @@ def page_board(key: str, board: Board) -> dict[str, Any]:
         "ranked": bool(board.ranked),
         "axis": {"low": axis.low, "high": axis.high, "ticks": axis.ticks},
         "band": [animals["score_low"], animals["score_high"]] if animals else None,
-        "data": {name: [row.get(name) for row in found] for name in dict.fromkeys(key for row in found for key in row)},
+        "data": {
+            name: [row.get(name) for row in columns] for name in dict.fromkeys(key for row in columns for key in row)
+        },
     }
 
 
@@ -114,8 +116,8 @@ def _rules(board: Board) -> str:
 
 def _about(board: Board) -> list[str]:
     first = f"{board.recordings}: {len(board.conditions)} stimuli, estimator {board.estimator}."
-    brain, shown = board.recordings_hash or "unknown", board.stimuli_hash or "unknown"
-    return [*filter(None, (first, board.stimuli)), f"Hash of the recordings {brain}, of the stimuli {shown}."]
+    brain, stimuli = board.recordings_hash or "unknown", board.stimuli_hash or "unknown"
+    return [*filter(None, (first, board.stimuli)), f"Hash of the recordings {brain}, of the stimuli {stimuli}."]
 
 
 def _entry_row(entry: Entry) -> dict[str, Any]:
@@ -123,10 +125,10 @@ def _entry_row(entry: Entry) -> dict[str, Any]:
     low, high = interval_ends(entry.interval) or (None, None)
     # Where there are several seeds, what one of them states does not stand for all.
     alone = {"low": None, "high": None} if entry.seeds > 1 else {"seed": card.seed, "weights": card.weights}
-    own = ("name", "scaled", "standing", "p", "spread", "value", "r", "seeds", "page")
+    names = ("name", "scaled", "standing", "p", "spread", "value", "r", "seeds", "page")
     return {
         **_score_row(score), **{name: getattr(card, name) for name in _CARD},
-        **{name: getattr(entry, name) for name in own},
+        **{name: getattr(entry, name) for name in names},
         **{name: getattr(entry, name) or None for name in ("same_as", "unranked_because", "layer")},
         "kind": "model", "rank_first": entry.first, "rank_last": entry.last, "scaled_low": low, "scaled_high": high,
         "notes": "; ".join(entry.notes) or None, "version": score.provenance.version or None,

@@ -310,7 +310,7 @@ def _site(folder: Path) -> Path:
 
 
 def _commitment(folder: Path) -> Path:
-    return write_json(folder / "held-out.json", Commitment("animals", 3, 8, "9f3c2a7be1d04455", "0f" * 32))
+    return write_json(folder / "held-out.json", Commitment("animals", 3, 8, "9f3c2a7be1d04455", "0f" * 32).plain)
 
 
 def _whiskers(text: str) -> Any:

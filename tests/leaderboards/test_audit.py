@@ -140,7 +140,8 @@ def _named(truths, **design):
 def test_builds_show_what_came_went_changed_and_moved(tmp_path):
     drawn = _named({"stays": 0.2, "changes": 0.9, "goes": 0.55, "comes": 0.6})
     changed = _named({"stays": 0.2, "changes": 0.4}, seed=1)["changes"]
-    provenance = {**changed.score.provenance, "version": "9.0"}
+    settings = {**changed.score.provenance.settings, "estimator_version": 9}
+    provenance = {**changed.score.provenance, "settings": settings}
     changed = replace(changed, score=replace(changed.score, provenance=provenance))
     old = _build([drawn["stays"], drawn["goes"], drawn["changes"]], tmp_path / "old")
     new = _build([drawn["stays"], changed, drawn["comes"], drawn["goes"]], tmp_path / "new")
@@ -151,7 +152,7 @@ def test_builds_show_what_came_went_changed_and_moved(tmp_path):
         "goes (seed 0)": "removed",
         "changes (seed 0)": "changed",
     }
-    assert found["changes (seed 0)"].causes[0] == "brainbench version: 0.1.0 → 9.0"
+    assert found["changes (seed 0)"].causes[0] == "estimator version: none → 9"
     assert found["changes (seed 0)"].before.endswith("rank 1")
     assert found["changes (seed 0)"].after.endswith("rank 2")
     moved = {change.name: change for change in compare_builds(old, new) if change.kind == "moved"}

@@ -71,10 +71,10 @@ def hold_out(
         write_recordings(out / PUBLIC, public),
         # Stimuli without recordings are left out only where the pairs are named.
         write_json(out / "match.json", {name: name for name in public.attrs["vocabulary"]}),
-        write_json(out / "held-out.json", commitment),
+        write_json(out / "held-out.json", commitment.plain),
     ]
     text = f"published  {out}: {', '.join(path.name for path in files)}\nkept back  {secret}: {held_count} {kind}"
-    return Output({"published": files, "secret": secret, "commitment": commitment}, text)
+    return Output({"published": files, "secret": secret, "commitment": commitment.plain}, text)
 
 
 def split(whole: xr.Dataset, kind: str, names: list[str]) -> xr.Dataset:
@@ -86,11 +86,11 @@ def split(whole: xr.Dataset, kind: str, names: list[str]) -> xr.Dataset:
     else:
         part = whole.isel(trial=whole["stimulus"].isin(names).values)
     labels = [label for label in whole.attrs["vocabulary"] if kind == "animals" or label in names]
-    named = content_hash(whole.attrs["content_hash"], kind, names)
-    return part.assign_attrs(vocabulary=labels, content_hash=named, fingerprint=fingerprint(part))
+    part_hash = content_hash(whole.attrs["content_hash"], kind, names)
+    return part.assign_attrs(vocabulary=labels, content_hash=part_hash, fingerprint=fingerprint(part))
 
 
-def score_held_out(record: ResultRecord, told: Commitment, secret: Path) -> dict[str, Any]:
+def score_held_out(record: ResultRecord, commitment: Commitment, secret: Path) -> dict[str, Any]:
     """Score the model of a record on held-out recordings, with the options that the record states.
 
     The answer is rounded to two digits: many submissions shall learn little of the held-out part.
@@ -99,13 +99,17 @@ def score_held_out(record: ResultRecord, told: Commitment, secret: Path) -> dict
     from brainbench.scoring.options import ScoreOptions
     from brainbench.scoring.scores import score_record
 
-    held = open_recordings(told.open(secret))
+    held = open_recordings(commitment.open(secret))
     pairs = record.score.provenance.pairs
     match = {label: pairs.get(label, label) for label in held.attrs["vocabulary"]}
     settings = {**record.score.provenance.settings, "conditions": None, "select": None, "window": None, "bin": None}
     options = ScoreOptions.stated_in(settings, recordings=held, match=match)
-    found = score_record(str(settings["model"]), options).score
-    return {"held_out": f"{told.held} {told.kind}", "on_public": _rounded(record.score), "on_held_out": _rounded(found)}
+    held_score = score_record(str(settings["model"]), options).score
+    return {
+        "held_out": f"{commitment.held} {commitment.kind}",
+        "on_public": _rounded(record.score),
+        "on_held_out": _rounded(held_score),
+    }
 
 
 def _rounded(score: Score) -> dict[str, Any]:

@@ -73,16 +73,16 @@ def diff(
     old, new = open_build(before), open_build(after)
     changes = compare_builds(old, new)
     problems = _problems([*old, *new])
-    told = [item for item in changes if item.kind != "restated"]
+    rows = [item for item in changes if item.kind != "restated"]
     columns = {
         "": "{0.kind}",
         "model": "{0.name}",
         "before": "{0.before}",
         "after": "{0.after}",
-        "because": lambda item: "; ".join(item.causes),
+        "because": lambda change: "; ".join(change.causes),
     }
-    text = table_of("", told, columns) if told else "No difference."
-    if restated := len(changes) - len(told):
+    text = table_of("", rows, columns) if rows else "No difference."
+    if restated := len(changes) - len(rows):
         text += f"\n{restated} restated: other records with the same inputs and numbers."
     return Output({"changes": changes, "problems": problems}, text + _left_out(problems))
 

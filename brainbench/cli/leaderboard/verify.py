@@ -44,25 +44,25 @@ def verify(
     from leaderboards.store import read_records
 
     # A commitment or a secret that is not usable is told before anything is scored.
-    told = None if held_out is None else Commitment.read(held_out)
-    if told is not None:
-        told.open(secret)
+    commitment = None if held_out is None else Commitment.read(held_out)
+    if commitment is not None:
+        commitment.open(secret)
     stored = read_records(records)
     doubts = remarks(stored)
     results: list[dict[str, Any]] = []
-    for item in tracked(stored, "records verified"):
-        result: dict[str, Any] = {"record": item.path.name, "verdict": "refused", "problem": item.problem}
-        if item.record is not None:
-            result |= {"verdict": "intact", "doubts": doubts.get(item.record.identity, ())}
+    for entry in tracked(stored, "records verified"):
+        result: dict[str, Any] = {"record": entry.path.name, "verdict": "refused", "problem": entry.problem}
+        if entry.record is not None:
+            result |= {"verdict": "intact", "doubts": doubts.get(entry.record.identity, ())}
             try:
                 if score:
-                    again = score_again(item.record, recordings=recordings, trust_code=trust_code)
-                    found = differences(item.record, again, tolerance=tolerance)
-                    result |= {"verdict": "differs" if found else "confirmed", "differences": found}
+                    again = score_again(entry.record, recordings=recordings, trust_code=trust_code)
+                    changes = differences(entry.record, again, tolerance=tolerance)
+                    result |= {"verdict": "differs" if changes else "confirmed", "differences": changes}
                     result |= {"value": again.score.value}
-                if told is not None and result["verdict"] in ("intact", "confirmed"):
-                    refuse_foreign_code(item.record, trusted=trust_code)
-                    result |= score_held_out(item.record, told, secret)
+                if commitment is not None and result["verdict"] in ("intact", "confirmed"):
+                    refuse_foreign_code(entry.record, trusted=trust_code)
+                    result |= score_held_out(entry.record, commitment, secret)
             except BrainbenchError as error:
                 result |= {"verdict": "not repeated", "problem": str(error)}
         results.append(result)
@@ -150,8 +150,8 @@ def _verdict(result: dict[str, Any]) -> str:
         columns = {name: f"{{0[{name}]}}" for name in ("on", "score", "low", "high", "standing")}
         rows = [{"on": "public part", **result["on_public"]}, {"on": f"held-out {held}", **result["on_held_out"]}]
         lines.append(table_of("", rows, columns))
-    if found := result.get("differences"):
-        shown = [(item.what, in_short(item.before), in_short(item.after)) for item in found[:12]]
-        lines.append(table_of("", shown, {"what": "{0[0]}", "record": "{0[1]}", "now": "{0[2]}"}))
-        lines += [f"  and {len(found) - 12} more"] if len(found) > 12 else []
+    if changes := result.get("differences"):
+        cells = [(change.what, in_short(change.before), in_short(change.after)) for change in changes[:12]]
+        lines.append(table_of("", cells, {"what": "{0[0]}", "record": "{0[1]}", "now": "{0[2]}"}))
+        lines += [f"  and {len(changes) - 12} more"] if len(changes) > 12 else []
     return "\n".join(lines)

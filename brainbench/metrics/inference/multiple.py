@@ -80,11 +80,11 @@ def compare_models(
     check_comparison(compare)
     metric, options = RSA(comparison=compare), {"stimuli": stimuli, "seed": seed, "device": device}
     checked = {name: check_layers(layers, stimuli) for name, layers in models.items()}
-    found = {name: score_layers(metric, rdms, subjects, name=name, **options) for name, rdms in checked.items()}
+    results = {name: score_layers(metric, rdms, subjects, name=name, **options) for name, rdms in checked.items()}
     # All models met the same permutations, so the maximum over models keeps the correlations between them.
-    tested = {name: test.null for name, (_, test) in found.items() if test is not None and math.isfinite(test.p)}
+    tested = {name: test.null for name, (_, test) in results.items() if test is not None and math.isfinite(test.p)}
     corrected = dict(zip(tested, step_down(np.stack(list(tested.values()))), strict=True)) if tested else {}
-    scores = {name: score for name, (score, _) in found.items()}
+    scores = {name: score for name, (score, _) in results.items()}
     pairs = [compare_scores(scores[a], scores[b]) for a, b in itertools.combinations(scores, 2)]
     adjusted = adjust([pair.p for pair in pairs], correction)
     return ModelComparison(
@@ -123,15 +123,15 @@ def adjust(p: ArrayLike, correction: str) -> Floats:
     """
     check_name("correction for multiple tests", correction, CORRECTIONS)
     result = np.array(p, dtype=np.float64)
-    known = np.isfinite(result)
+    finite = np.isfinite(result)
     # Benjamini and Hochberg's step-up procedure, which controls the share of false discoveries.
-    if correction == "fdr" and known.any():
+    if correction == "fdr" and finite.any():
         from scipy.stats import false_discovery_control
 
-        result[known] = false_discovery_control(result[known])
+        result[finite] = false_discovery_control(result[finite])
     elif correction == "holm":
         # Holm 1979: the i-th smallest of n is multiplied by n − i + 1, and none may fall below its predecessor.
-        order = np.flatnonzero(known)[np.argsort(result[known], kind="stable")]
+        order = np.flatnonzero(finite)[np.argsort(result[finite], kind="stable")]
         scaled = np.maximum.accumulate(result[order] * np.arange(len(order), 0, -1))
         result[order] = np.minimum(scaled, 1.0)
     return result

@@ -73,11 +73,11 @@ class PermutationTest:
     def summary(self, layers: int, repeated: str = "layer chosen anew in each") -> str:
         """Describe the test of a score, with the score that a model without knowledge gets by the same choice."""
         text = f"{self.method}; {'one layer' if layers == 1 else repeated}"
-        known = self.null[np.isfinite(self.null)]
-        if not known.size:
+        finite = self.null[np.isfinite(self.null)]
+        if not finite.size:
             return text
         # Adding zero keeps a rounded −0.00 out of the sentence.
-        return f"{text}; mean score under permutation {round(float(known.mean()), 2) + 0.0:.2f}"
+        return f"{text}; mean score under permutation {round(float(finite.mean()), 2) + 0.0:.2f}"
 
 
 def tail_p(null: Floats, observed: ArrayLike | None = None) -> Floats:
@@ -164,8 +164,8 @@ def permuted_values(
     # Chunks bound the permuted RDMs [N, L, P]; of each only the statistics are kept.
     step = max(1, _CHUNK_ELEMENTS // layers.size)
     chunks = label_orders(stimulus_count(layers.shape[-1]), seed, step=step)
-    found = permuted_comparisons(layers, brain, chunks, method, device=find_device(device))
-    return np.concatenate([statistic(r) for r in found])
+    comparisons = permuted_comparisons(layers, brain, chunks, method, device=find_device(device))
+    return np.concatenate([statistic(r) for r in comparisons])
 
 
 def layer_p(null: Floats) -> tuple[Floats, Floats]:
@@ -175,8 +175,8 @@ def layer_p(null: Floats) -> tuple[Floats, Floats]:
     """
     # The maximum over layers in each permutation keeps the family-wise error, however layers depend on one another.
     # A layer without a value under some order leaves the maximum to the others.
-    known = np.where(np.isfinite(null), null, -np.inf)
-    return tail_p(null), tail_p(known.max(axis=1, keepdims=True), null[0])
+    defined = np.where(np.isfinite(null), null, -np.inf)
+    return tail_p(null), tail_p(defined.max(axis=1, keepdims=True), null[0])
 
 
 def most_exact(draws: int) -> int:

@@ -163,8 +163,8 @@ def fit_softmax(features: Floats, target: Ints, classes: int, penalty: float) ->
         gradient = np.concatenate([features.T @ rest + weight / penalty, rest.sum(axis=0, keepdims=True)])
         return value, gradient.ravel()
 
-    found = minimize(loss, np.zeros((width + 1) * classes), jac=True, method="L-BFGS-B").x.reshape(width + 1, classes)
-    return found[:-1], found[-1]
+    fit = minimize(loss, np.zeros((width + 1) * classes), jac=True, method="L-BFGS-B").x.reshape(width + 1, classes)
+    return fit[:-1], fit[-1]
 
 
 def label_properties(stimuli: Sequence[str]) -> dict[str, Ints]:
@@ -176,12 +176,12 @@ def label_properties(stimuli: Sequence[str]) -> dict[str, Ints]:
     parts = [str(label).split("-") for label in stimuli]
     if len({len(part) for part in parts}) != 1:
         return {}
-    found = {}
+    properties = {}
     for values in zip(*parts, strict=True):
         names, codes = np.unique(np.asarray(values, dtype=str), return_inverse=True)
         if len(names) > 1 and np.bincount(codes).min() > 1:
-            found["/".join(names.tolist())] = codes.astype(np.int64)
-    return found
+            properties["/".join(names.tolist())] = codes.astype(np.int64)
+    return properties
 
 
 @dataclass(frozen=True)
@@ -213,7 +213,7 @@ class LabelDecoding(Metric):
     of_model_alone = True
     reasons = ("accuracy of the model alone, no likeness: the animals' own stands beside it",)
 
-    def known(self, layer: Any) -> np.ndarray:
+    def defined(self, layer: Any) -> np.ndarray:
         """Return where [K] a layer has a value."""
         return np.isfinite(layer.features).all(axis=1)
 
@@ -237,24 +237,24 @@ class LabelDecoding(Metric):
 
     def compare_without(self, layers: Sequence[Any], animals: Sequence[SubjectRDM]) -> Floats:
         """Return accuracies [K, L, A] without each stimulus in turn, with the corrected spread."""
-        found = []
+        accuracies = []
         for layer in layers:
             right = layer.right(np.arange(len(layer.features))).mean(axis=0)
             count = len(right)
             # Classifiers share their training stimuli: the variance of 1/K grows by the stimuli of a test over those of
             # training, 1/(K − 1) (Nadeau & Bengio 2003). Without that, 95 % intervals held the mean in 83 to 89 %.
             wider = math.sqrt(1 + count / (count - 1))
-            found.append(right.mean() + wider * (right.mean() - right) / (count - 1))
-        return np.repeat(np.stack(found, axis=1)[..., None], len(animals), axis=-1)
+            accuracies.append(right.mean() + wider * (right.mean() - right) / (count - 1))
+        return np.repeat(np.stack(accuracies, axis=1)[..., None], len(animals), axis=-1)
 
     def statistics(self, layer: Any, animals: Sequence[SubjectRDM], seed: int) -> dict[str, Any]:
         """Return the accuracy of every property."""
-        if not self.known(layer).all():
+        if not self.defined(layer).all():
             return {}
         exact = most_exact(self.orders)
         orders = np.concatenate(list(label_orders(len(layer.features), seed, exact=exact, draws=self.orders)))
         values = np.stack([layer.right(order).mean(axis=1) for order in orders])
-        found = [
+        accuracies = [
             {
                 "property": name,
                 "accuracy": float(column[0]),
@@ -264,7 +264,7 @@ class LabelDecoding(Metric):
             }
             for (name, codes), column in zip(layer.classes.items(), values.T, strict=True)
         ]
-        return {"decoding": found}
+        return {"decoding": accuracies}
 
     def score(self, features: Mapping[str, ArrayLike], animals: Sequence[SubjectRDM], **options: Any) -> Score:
         """Score a model by the features [K, F] of its layers; options are those of :meth:`Metric.score`."""
@@ -310,10 +310,10 @@ class _BoundDecoding(LabelDecoding):
 
     def agreement_null(self, animals: Sequence[SubjectRDM], factors: Floats, orders: Ints) -> Floats:
         """Return the mean accuracy [N] with the classes of every animal's stimuli in another order."""
-        found = []
+        accuracies = []
         for animal, given in zip(animals, orders.swapaxes(0, 1), strict=True):
             layer = LabelledFeatures(animal.patterns, self._classes)
             # Orders are relative to the first, which is that of the data.
             moved = given[:, np.argsort(given[0])]
-            found.append([layer.right(order).mean() for order in moved])
-        return np.mean(found, axis=0)
+            accuracies.append([layer.right(order).mean() for order in moved])
+        return np.mean(accuracies, axis=0)

@@ -90,13 +90,13 @@ def variance_partition(
     elif not np.isfinite(partial).all():
         reason = "the model or an animal varies no more than the nuisances explain"
     else:
-        found = [
+        chunks = [
             _partial(model[permuted_pairs(orders)], rest, residual, scale)
             for orders in label_orders(stimuli, seed, step=4096)
         ]
-        null = np.concatenate([item[0] for item in found]).mean(axis=1)
+        null = np.concatenate([item[0] for item in chunks]).mean(axis=1)
         p = float(tail_p(null))
-        chance = float(np.concatenate([item[1] for item in found]).mean())
+        chance = float(np.concatenate([item[1] for item in chunks]).mean())
     return VariancePartition(
         total=float(total.mean()),
         unique_model=float(unique[0].mean()),
@@ -162,8 +162,8 @@ class PartialRSA(PatternMetric):
         animal = super().animal(subject, blocks, n_stimuli, **options)
         nuisances, lacking = _nuisances(blocks, n_stimuli)
         if animal.problem is None and not nuisances:
-            told = f" ({', '.join(lacking)} do not)" if lacking else ""
-            return replace(animal, problem=f"no contacts, licks or choices that differ between stimuli{told}")
+            absent = f" ({', '.join(lacking)} do not)" if lacking else ""
+            return replace(animal, problem=f"no contacts, licks or choices that differ between stimuli{absent}")
         return replace(animal, nuisances=nuisances)
 
     def compare_orders(self, model: Floats, animals: Sequence[SubjectRDM], orders: Ints) -> Floats:
@@ -193,7 +193,7 @@ def _nuisances(blocks: Sequence[Trials], count: int) -> tuple[dict[str, Floats],
     # Sessions without two trials of each stimulus are no part of the animal's RDM either.
     blocks = [block for block in blocks if np.bincount(block.labels, minlength=count).min() > 1]
     labels = [stimulus_codes(block.labels, count)[0] for block in blocks]
-    found, lacking = {}, []
+    rdms, lacking = {}, []
     for name in dict.fromkeys(name for block in blocks for name in block.covariates):
         values = [
             np.asarray(block.covariates.get(name, np.full(len(codes), math.nan)), dtype=np.float64)
@@ -201,7 +201,7 @@ def _nuisances(blocks: Sequence[Trials], count: int) -> tuple[dict[str, Floats],
         ]
         means = stimulus_means(np.concatenate(values)[:, None], np.concatenate(labels), count)[:, 0]
         if np.isfinite(means).all() and np.ptp(means) > 0:
-            found[name] = upper(np.abs(means[:, None] - means))
+            rdms[name] = upper(np.abs(means[:, None] - means))
         else:
             lacking.append(name)
-    return found, lacking
+    return rdms, lacking

@@ -155,15 +155,15 @@ class RidgeEncoding(PatternMetric):
 
     def compare_without(self, layers: Sequence[Floats], animals: Sequence[SubjectRDM]) -> Floats:
         """Return raw values [K, L, A] without each stimulus in turn; the others stay in their folds."""
-        count, found = animals[0].count, []
+        count, shares = animals[0].count, []
         for stimulus in range(count):
-            kept = np.delete(np.arange(count), stimulus)
-            others, order = [animal.take(kept) for animal in animals], np.arange(count - 1)[None]
+            rest = np.delete(np.arange(count), stimulus)
+            others, order = [animal.take(rest) for animal in animals], np.arange(count - 1)[None]
             # Its part in the training of the others must go too: without that, intervals of 14 stimuli were a quarter
             # too narrow.
-            sums = [_errors(layer[kept], others, order, _folds(count)[kept]) for layer in layers]
-            found.append([_share(error[0], base[0], others) for error, base in sums])
-        return np.array(found) * _explainable(animals)
+            sums = [_errors(layer[rest], others, order, _folds(count)[rest]) for layer in layers]
+            shares.append([_share(error[0], base[0], others) for error, base in sums])
+        return np.array(shares) * _explainable(animals)
 
 
 def _share(error: Floats, base: Floats, animals: Sequence[SubjectRDM]) -> Floats:

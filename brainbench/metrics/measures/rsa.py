@@ -64,7 +64,7 @@ class RSA(Metric):
         """Return the RDM [P] of a layer's features [K, F]."""
         return rdm(usable_features(features), method=self.model_method)
 
-    def known(self, layer: Floats) -> np.ndarray:
+    def defined(self, layer: Floats) -> np.ndarray:
         """Return where [K] a stimulus has any distance."""
         count = stimulus_count(len(layer))
         return np.asarray(np.isfinite(square(layer) + np.diag(np.full(count, np.nan))).any(axis=1))
@@ -90,8 +90,8 @@ class RSA(Metric):
         if count <= 3:
             return np.full((count, len(layers), len(animals)), np.nan)
         rdms, brain = np.stack(layers), np.stack([animal.rdm for animal in animals])
-        kept = np.array([np.delete(np.arange(count), stimulus) for stimulus in range(count)])
-        pairs = permuted_pairs(kept, count)
+        rest = np.array([np.delete(np.arange(count), stimulus) for stimulus in range(count)])
+        pairs = permuted_pairs(rest, count)
         step = max(1, _CHUNK_ELEMENTS // (count * count * (len(rdms) + len(brain))))
         return np.concatenate(
             [
@@ -111,12 +111,12 @@ class RSA(Metric):
     def halves(self, animal: SubjectRDM, order: Ints) -> tuple[list[SubjectRDM], float]:
         """Return the halves of the animal's splits; their reliability is the raw split-half comparison."""
         # A half in which a stimulus met silent units has no RDM; such splits say nothing.
-        kept = animal.halves[~is_flat(animal.halves).any(axis=1)]
+        halves = animal.halves[~is_flat(animal.halves).any(axis=1)]
         pairs = permuted_pairs(order[None])[0]
         agreement = animal.split_half_by(self.comparison)
         factor = 1 / math.sqrt(float(agreement[np.isfinite(agreement)].mean()))
         return [
-            replace(animal, rdm=half, halves=half[:0]) for half in kept.reshape(-1, kept.shape[-1])[:, pairs]
+            replace(animal, rdm=half, halves=half[:0]) for half in halves.reshape(-1, halves.shape[-1])[:, pairs]
         ], factor
 
     def partner(self, animal: SubjectRDM, others: Sequence[SubjectRDM]) -> Floats:
@@ -138,13 +138,13 @@ class RSA(Metric):
     def agreement_null(self, animals: Sequence[SubjectRDM], factors: Floats, orders: Ints) -> Floats:
         """Return the mean corrected agreement [N] with every animal's stimuli in an order of its own [N, A, K]."""
         rdms = np.stack([animal.rdm for animal in animals])
-        step, found = max(1, _CHUNK_ELEMENTS // rdms.size), []
+        step, agreements = max(1, _CHUNK_ELEMENTS // rdms.size), []
         for start in range(0, len(orders), step):
             moved = np.take_along_axis(rdms[None], permuted_pairs(orders[start : start + step]), axis=-1)
             # All leave-one-out means from one sum over animals.
             others = (moved.sum(axis=1, keepdims=True) - moved) / (len(rdms) - 1)
-            found.append(compare_rdms(moved, others, method=self.comparison) @ factors / len(factors))
-        return np.concatenate(found)
+            agreements.append(compare_rdms(moved, others, method=self.comparison) @ factors / len(factors))
+        return np.concatenate(agreements)
 
     def describe(self, animals: Sequence[SubjectRDM]) -> str:
         """Name the RDMs, the noise that they are divided by, and their comparison."""

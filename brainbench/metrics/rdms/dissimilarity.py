@@ -96,9 +96,9 @@ def without_shift(patterns: Array) -> Array:
 def products_from_gram(gram: Array, units: int) -> Array:
     """Return (g_ii + g_jj − g_ij − g_ji) / U as [..., P] from products g_ij = a_i·b_j [..., K, K]."""
     xp = library(gram)
-    own = xp.einsum("...ii->...i", gram)
-    own = xp.where(xp.isfinite(own), own, np.nan)
-    total = own[..., :, None] + own[..., None, :] - gram - gram.swapaxes(-1, -2)
+    squares = xp.einsum("...ii->...i", gram)
+    squares = xp.where(xp.isfinite(squares), squares, np.nan)
+    total = squares[..., :, None] + squares[..., None, :] - gram - gram.swapaxes(-1, -2)
     return upper(total) / units
 
 
@@ -118,8 +118,8 @@ def _products_of_present(left: Array, right: Array) -> Array:
     b = xp.where(present, right - _unit_mean(right, present, weight), 0.0)
     turned = weight.swapaxes(-1, -2)
     # Σ (a_i − a_j)(b_i − b_j) over the units of both = own_ij + own_ji − cross_ij − cross_ji, over their number.
-    both, own, cross = weight @ turned, (a * b) @ turned, a @ b.swapaxes(-1, -2)
-    total = own + own.swapaxes(-1, -2) - cross - cross.swapaxes(-1, -2)
+    both, sums, cross = weight @ turned, (a * b) @ turned, a @ b.swapaxes(-1, -2)
+    total = sums + sums.swapaxes(-1, -2) - cross - cross.swapaxes(-1, -2)
     return upper(xp.where(both > 0, total / xp.where(both > 0, both, 1.0), np.nan))
 
 
@@ -322,23 +322,23 @@ def _crossnobis_of_present(given: _Responses, means: Array) -> Array:
     if given.precision is not None:
         # A cell that lacks a unit has no product with any other.
         left, right = (s.reshape(*means.shape[:2], -1) for s in given.sides(*[means.reshape(-1, units)] * 2))
-    total = found = 0.0
+    total = number = 0.0
     for first in range(folds):
         for second in range(first + 1, folds):
             if given.precision is None:
                 distance = product_distances(left[first], right[second], missing=True)
             else:
                 distance = products_from_gram(left[first] @ right[second].T, units)
-            known = xp.isfinite(distance)
-            total = total + xp.where(known, distance, 0.0)
-            found = found + xp.where(known, xp.ones_like(distance), 0.0)
-    return xp.where(found > 0, total / xp.where(found > 0, found, 1.0), np.nan)
+            finite = xp.isfinite(distance)
+            total = total + xp.where(finite, distance, 0.0)
+            number = number + xp.where(finite, xp.ones_like(distance), 0.0)
+    return xp.where(number > 0, total / xp.where(number > 0, number, 1.0), np.nan)
 
 
 def _poisson(given: _Responses) -> Array:
     patterns = given.placed()
-    known = patterns[~library(patterns).isnan(patterns)]
-    low = float(known.min()) if len(known) else 0.0
+    values = patterns[~library(patterns).isnan(patterns)]
+    low = float(values.min()) if len(values) else 0.0
     if low < 0:
         raise DataError(f"method='poisson' needs rates or counts, which are never negative; the smallest is {low:g}.")
     # Σ (λ_i − λ_j)(log λ_i − log λ_j) / U, the divergence in both directions (Schütt 2023).

@@ -163,9 +163,9 @@ def _shrinkage_diag(residuals: Array, freedom: int) -> NoiseModel:
     deviation = _deviation(residuals, freedom)
     scaled = residuals / deviation
     squares = scaled * scaled
-    own, fourth = squares.sum(0), float((squares * squares).sum())
+    variances, fourth = squares.sum(0), float((squares * squares).sum())
     # λ = Σ Var(r_ij) / Σ r_ij² over pairs of units i ≠ j, limited to 0 … 1; both sums come from products of trials.
-    signal = max(_pair_sum(scaled) - float((own * own).sum()), 0.0) / (count - 1) ** 2
+    signal = max(_pair_sum(scaled) - float((variances * variances).sum()), 0.0) / (count - 1) ** 2
     together = float((squares.sum(1) ** 2).sum()) - fourth
     spread = count / freedom**2 * (together / (count - 1) - signal)
     amount = min(max(spread / signal, 0.0), 1.0) if signal > 0 else 1.0

@@ -141,10 +141,10 @@ class RDM:
         """Symmetric matrix [K, K] with a zero diagonal."""
         return square(self.values)
 
-    def between(self, one: str, other: str) -> float:
+    def between(self, first: str, second: str) -> float:
         """Return the dissimilarity of two stimuli."""
-        check_each("stimulus of this RDM", (one, other), self.stimuli)
-        return float(self.matrix[self.stimuli.index(one), self.stimuli.index(other)])
+        check_each("stimulus of this RDM", (first, second), self.stimuli)
+        return float(self.matrix[self.stimuli.index(first), self.stimuli.index(second)])
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
         return np.array(self.values, dtype=dtype, copy=copy)
@@ -165,8 +165,8 @@ class RDM:
         rows = []
         for place, values in enumerate(self.matrix):
             cells = [
-                _cell(float(value), low, high, f"{names[place]} – {other}", max(_SIDE // count, 3))
-                for value, other in zip(values, names, strict=True)
+                _cell(float(value), low, high, f"{names[place]} – {name}", max(_SIDE // count, 3))
+                for value, name in zip(values, names, strict=True)
             ]
             cells[place] = "<td></td>"
             rows.append(f"<tr><th>{heads[place]}</th>{''.join(cells)}</tr>")

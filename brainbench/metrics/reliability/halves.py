@@ -47,20 +47,20 @@ class SplitRDMs:
 
     def whole(self) -> Floats:
         """Return the RDM [P] of all trials."""
-        found = None if self._sums is None else self._from_products(self._sums)
-        return (self._from_patterns(self._every) if found is None else found)[0]
+        rdms = None if self._sums is None else self._from_products(self._sums)
+        return (self._from_patterns(self._every) if rdms is None else rdms)[0]
 
     def halves(self, members: list[Floats]) -> tuple[Floats, Floats]:
         """Return the RDMs [N, P] of both halves, from 1 for the trials [N, R] of each session's first half, else 0."""
         if self._sums is not None:
             sums = self._summed(members)
             rest = [whole.without(half) for whole, half in zip(self._sums, sums, strict=True)]
-            one, two = self._from_products(sums), self._from_products(rest)
-            if one is not None and two is not None:
-                return one, two
+            first, second = self._from_products(sums), self._from_products(rest)
+            if first is not None and second is not None:
+                return first, second
         # Both at once, since what takes time does not grow with the number of halves.
-        found = self._from_patterns([np.concatenate([member, 1.0 - member]) for member in members])
-        return found[: len(found) // 2], found[len(found) // 2 :]
+        rdms = self._from_patterns([np.concatenate([member, 1.0 - member]) for member in members])
+        return rdms[: len(rdms) // 2], rdms[len(rdms) // 2 :]
 
     def _summed(self, members: list[Floats]) -> list[_Sums]:
         return [_Sums(*each, self._count) for each in zip(self._sessions, members, strict=True)]
@@ -73,14 +73,14 @@ class SplitRDMs:
             for index, part in enumerate(sums):
                 number = np.where(part.number > 0, part.number, np.nan)
                 # Inner products of mean patterns, s_k·s_l / (n_k n_l); sessions add up, since their units are joined.
-                own = part.gram / (number[:, :, None] * number[:, None, :])
+                products = part.gram / (number[:, :, None] * number[:, None, :])
                 if self._method == "crossnobis":
                     # The product of a trial with itself holds its noise; those of different trials do not.
                     pairs = part.number * (part.number - 1)
                     free = (np.einsum("nii->ni", part.gram) - part.squares) / np.where(pairs > 0, pairs, np.nan)
-                    diagonal = np.einsum("nii->ni", own)
+                    diagonal = np.einsum("nii->ni", products)
                     diagonal[...] = diagonal - self._sessions[index].inflation * (diagonal - free)
-                gram += own
+                gram += products
                 total += part.units / number
         if self._method != "correlation":
             return products_from_gram(gram, 1) / units
@@ -94,14 +94,14 @@ class SplitRDMs:
         """Return RDMs from mean patterns: any method, missing entries, large common offsets."""
         each = list(zip(self._sessions, members, strict=True))
         if self._method == "correlation":
-            found = [mean_patterns(*item, self._count, variances=False)[0] for item in each]
-            return correlation_distances(np.concatenate(found, axis=-1), missing=True)
+            means = [mean_patterns(*item, self._count, variances=False)[0] for item in each]
+            return correlation_distances(np.concatenate(means, axis=-1), missing=True)
         # The other distances are means over the units that both patterns have, so slices of units add up.
         total = number = 0.0
         for session, member in each:
             for units in session.slices():
-                found = mean_patterns(session, member, self._count, variances=self._method == "crossnobis", units=units)
-                distances, both = self._of_slice(*found)
+                means = mean_patterns(session, member, self._count, variances=self._method == "crossnobis", units=units)
+                distances, both = self._of_slice(*means)
                 total, number = total + np.where(both > 0, distances * both, 0.0), number + both
         return np.divide(total, number, out=np.full(np.shape(total), np.nan), where=number > 0)
 
@@ -116,10 +116,10 @@ class SplitRDMs:
         if self._method == "crossnobis":
             # E‖x̂_i − x̂_j‖² = ‖x_i − x_j‖² + v_i + v_j: the noise of both means is taken away, over the units that both
             # have, which is the crossnobis distance with every trial as its own fold.
-            own = np.where(present, variances, 0.0) @ np.swapaxes(weight, -1, -2)
+            summed = np.where(present, variances, 0.0) @ np.swapaxes(weight, -1, -2)
             seen = np.where(present, patterns, np.nan)
             with np.errstate(invalid="ignore", divide="ignore"):
-                noise = upper((own + np.swapaxes(own, -1, -2)) / shared)
+                noise = upper((summed + np.swapaxes(summed, -1, -2)) / shared)
                 return product_distances(seen, seen, missing=True) - noise, both
         if self._method == "poisson":
             rates = poisson_rates(patterns)
@@ -138,21 +138,21 @@ class _Sums:
             np.matmul(members[:, rows], factor[rows], out=self.patterns[:, stimulus])
         # Trials are sorted by stimulus, so one pass of reduceat sums each of them.
         starts = [rows.start for rows in groups]
-        own = np.einsum("ru,ru->r", factor, factor)
+        squares = np.einsum("ru,ru->r", factor, factor)
         self.number = np.add.reduceat(members, starts, axis=1)
         self.units = np.add.reduceat(members * session.responses.sum(axis=1), starts, axis=1)
-        self.squares = np.add.reduceat(members * own, starts, axis=1)
+        self.squares = np.add.reduceat(members * squares, starts, axis=1)
         self.gram = self.patterns @ self.patterns.swapaxes(-1, -2)
 
     def without(self, half: _Sums) -> _Sums:
         """Return the sums of the other half, whose inner products need no second pass over its patterns."""
-        other = object.__new__(_Sums)
+        rest = object.__new__(_Sums)
         # (S − H)(S − H)ᵀ = SSᵀ − SHᵀ − HSᵀ + HHᵀ for the sums S of all trials and H of one half.
         cross = self.patterns @ half.patterns.swapaxes(-1, -2)
-        other.gram = self.gram - cross - cross.swapaxes(-1, -2) + half.gram
+        rest.gram = self.gram - cross - cross.swapaxes(-1, -2) + half.gram
         for name in ("number", "units", "squares"):
-            setattr(other, name, getattr(self, name) - getattr(half, name))
-        return other
+            setattr(rest, name, getattr(self, name) - getattr(half, name))
+        return rest
 
 
 def mean_patterns(
@@ -198,13 +198,13 @@ def members(random: Hashes) -> Floats:
 
 def split_members(session: SortedTrials, count: int, index: Ints, seed: int) -> Floats:
     """Return 1 for the trials [S, R] in the first half of their stimulus, in the splits ``index`` [S]."""
-    random, found = draws(session.hashes, index, seed), np.empty((len(index), len(session.labels)))
+    random, first = draws(session.hashes, index, seed), np.empty((len(index), len(session.labels)))
     sizes = np.bincount(session.labels, minlength=count)[session.labels]
     # Trials are sorted by stimulus; stimuli with as many trials are drawn in one call.
     for size in np.unique(sizes):
         rows = np.flatnonzero(sizes == size)
-        found[:, rows] = members(random[:, rows].reshape(len(index), -1, size)).reshape(len(index), -1)
-    return found
+        first[:, rows] = members(random[:, rows].reshape(len(index), -1, size)).reshape(len(index), -1)
+    return first
 
 
 def half_rdms(sessions: list[SortedTrials], count: int, method: str, index: Ints, seed: int) -> tuple[Floats, Floats]:

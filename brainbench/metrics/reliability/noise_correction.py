@@ -70,9 +70,9 @@ def corrected_splits(r_xy: ArrayLike, split_half_r: ArrayLike, other_split_half_
 
     As published, two negative reliabilities have a positive product and pass.
     """
-    other = 1.0 if other_split_half_r is None else spearman_brown(other_split_half_r)
+    model_side = 1.0 if other_split_half_r is None else spearman_brown(other_split_half_r)
     # Thesis, equation 3.4, split by split; a negative product has no real root.
-    product = spearman_brown(split_half_r) * other
+    product = spearman_brown(split_half_r) * model_side
     return np.asarray(r_xy, dtype=np.float64) / np.sqrt(np.where(product > 0, product, np.nan))
 
 
@@ -140,8 +140,8 @@ def _by_split(average: Callable[[Floats], Any], least: float, lacking: str) -> _
     def corrected(r_xy: Floats, halves: Floats, others: Floats | None, sides: list[float]) -> tuple[float, int, str]:
         ratio = corrected_splits(np.where(halves >= least, r_xy, np.nan), halves, others)
         # Imaginary ratios vanish, as published.
-        kept = ratio[np.isfinite(ratio)]
-        return (float(average(kept)), kept.size, "") if kept.size else (math.nan, 0, lacking)
+        real = ratio[np.isfinite(ratio)]
+        return (float(average(real)), real.size, "") if real.size else (math.nan, 0, lacking)
 
     return corrected
 

@@ -115,11 +115,11 @@ class SortedTrials(Trials):
         """
         # Sorted by content, sums are formed in one order, so results do not change with the order of trials.
         order = np.lexsort((hashes, labels))
-        taken = np.empty((len(order), responses[:1, units].shape[1]))
+        values = np.empty((len(order), responses[:1, units].shape[1]))
         # Row by row, so that nothing but the result is large.
         for place, row in enumerate(order if rows is None else rows[order]):
-            taken[place] = responses[row, units]
-        return cls(taken, labels[order], hashes=hashes[order])
+            values[place] = responses[row, units]
+        return cls(values, labels[order], hashes=hashes[order])
 
     @cached_property
     def complete(self) -> bool:
@@ -231,15 +231,15 @@ def whitened_sessions(
     sessions: list[SortedTrials], count: int, noise: str, notes: tuple[str, ...]
 ) -> tuple[list[SortedTrials], str | None, tuple[str, ...]]:
     """Whiten every session; return those with a noise covariance, why there is none (or None), and notes for people."""
-    found = [whitened(session, count, noise) for session in sessions]
-    kept = [session for session, _ in found if session is not None]
-    notes += tuple(dict.fromkeys(told for session, told in found if told and session is not None))
-    lost = sorted({told for session, told in found if session is None})
-    if not kept:
+    results = [whitened(session, count, noise) for session in sessions]
+    usable = [session for session, _ in results if session is not None]
+    notes += tuple(dict.fromkeys(told for session, told in results if told and session is not None))
+    lost = sorted({told for session, told in results if session is None})
+    if not usable:
         return sessions, f"no session has a noise covariance: {'; '.join(lost)}", notes
     if lost:
-        notes += (f"{len(found) - len(kept)} sessions left out: {'; '.join(lost)}",)
-    return kept, None, notes
+        notes += (f"{len(results) - len(usable)} sessions left out: {'; '.join(lost)}",)
+    return usable, None, notes
 
 
 def whitened(session: SortedTrials, count: int, noise: str) -> tuple[SortedTrials | None, str]:
@@ -257,7 +257,7 @@ def whitened(session: SortedTrials, count: int, noise: str) -> tuple[SortedTrial
     varies, power, number = (np.concatenate(part) for part in zip(*_noise(session, count), strict=True))
     usable = varies if noise == "diag" else varies & np.isfinite(session.responses).all(axis=0)
     lost = int((~usable).sum())
-    told = f"{lost} units or bins left out: without noise or not in every trial" if lost else ""
+    note = f"{lost} units or bins left out: without noise or not in every trial" if lost else ""
     if not usable.any():
         return None, "no unit has noise to divide by"
     responses = session.responses if usable.all() else session.responses[:, usable]
@@ -267,14 +267,14 @@ def whitened(session: SortedTrials, count: int, noise: str) -> tuple[SortedTrial
         scaled = np.divide(responses, np.sqrt(power[usable] / freedom), out=responses)
         # Units with two degrees of freedom or fewer have no expected factor; four is the least anyone has.
         inflation = float(np.mean(freedom / np.maximum(freedom - 2, 1)))
-        return replace(session, responses=scaled, inflation=inflation), told
+        return replace(session, responses=scaled, inflation=inflation), note
     try:
         precision = estimate_noise(responses, session.labels, count, noise).precision()
     except DataError as error:
         return None, str(error).rstrip(".")
     # With the precision P̂ = L Lᵀ, trials times L have noise of unit covariance.
     inflation = _inflation(responses, session.labels, noise, count)
-    return replace(session, responses=responses @ np.linalg.cholesky(precision), inflation=inflation), told
+    return replace(session, responses=responses @ np.linalg.cholesky(precision), inflation=inflation), note
 
 
 def _noise(session: SortedTrials, count: int) -> Iterator[tuple[NDArray[np.bool_], Floats, Ints]]:
@@ -300,7 +300,7 @@ def _inflation(responses: Floats, codes: Ints, noise: str, count: int) -> float:
     for stimulus in range(count):
         rows = np.flatnonzero(codes == stimulus)
         place[rows] = (np.arange(len(rows)) + stimulus) % _FOLDS
-    found = []
+    ratios = []
     for fold in range(_FOLDS):
         rest, held = residuals[place != fold], residuals[place == fold]
         try:
@@ -308,9 +308,9 @@ def _inflation(responses: Floats, codes: Ints, noise: str, count: int) -> float:
             ratio = _mean_square(held, model, len(held)) / _mean_square(rest, model, len(rest) - 1)
         except DataError:
             return 1.0
-        found.append(ratio)
+        ratios.append(ratio)
     # An estimate from nine tenths errs by ten ninths of what one from all trials does.
-    return 1 + (float(np.mean(found)) - 1) * (1 - 1 / _FOLDS)
+    return 1 + (float(np.mean(ratios)) - 1) * (1 - 1 / _FOLDS)
 
 
 def _mean_square(residuals: Floats, model: NoiseModel, freedom: int) -> float:

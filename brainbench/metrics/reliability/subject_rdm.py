@@ -77,13 +77,13 @@ class SubjectRDM:
     def take(self, stimuli: Ints) -> SubjectRDM:
         """Return the animal with some stimuli [K'], in this order; the split halves' comparisons stay as they are."""
         pairs = permuted_pairs(np.asarray(stimuli)[None], self.count)[0]
-        known = len(self.patterns) > 0
+        prepared = len(self.patterns) > 0
         return replace(
             self,
             rdm=self.rdm[pairs],
             halves=self.halves[:0],
-            patterns=self.patterns[stimuli] if known else self.patterns,
-            noise=self.noise[stimuli] if known else self.noise,
+            patterns=self.patterns[stimuli] if prepared else self.patterns,
+            noise=self.noise[stimuli] if prepared else self.noise,
             nuisances={name: values[pairs] for name, values in self.nuisances.items()},
         )
 
@@ -158,17 +158,17 @@ def subject_rdm(
         sessions = shifted_sessions(sessions, n_stimuli, by_unit=distance != "correlation")
     rdm = SplitRDMs(sessions, n_stimuli, distance).whole()
     halves, r = _split_halves(sessions, n_stimuli, distance, comparison, splits, seed)
-    found = replace(empty, rdm=rdm, split_half_r=r, halves=halves, patterns=patterns, noise=variances)
+    animal = replace(empty, rdm=rdm, split_half_r=r, halves=halves, patterns=patterns, noise=variances)
     finite = r[np.isfinite(r)]
     if not np.isfinite(rdm).all() or not finite.size:
         flat = np.isnan(rdm).any()
         reason = "the mean responses to a stimulus are constant across units" if flat else "all pairs are equal"
-        return replace(found, problem=f"its RDM is undefined: {reason}")
+        return replace(animal, problem=f"its RDM is undefined: {reason}")
     # The formula has a pole at r = −1, across which percentiles mean nothing.
     low, high = np.percentile(spearman_brown(finite), [2.5, 97.5]) if (finite > -1).all() else (math.nan, math.nan)
     spread = Interval(float(low), float(high), 0.95, "percentiles over random splits; not a confidence interval")
     # Correlations are averaged before the formula, which is not linear.
-    return replace(found, reliability=float(spearman_brown(finite.mean())), spread=spread)
+    return replace(animal, reliability=float(spearman_brown(finite.mean())), spread=spread)
 
 
 def _mean_responses(sessions: list[SortedTrials], count: int) -> tuple[Floats, Floats]:
@@ -192,15 +192,15 @@ def _split_halves(
 ) -> tuple[Floats, Floats]:
     """Return the RDMs [S′, 2, P] of the halves that are kept, and the comparison [S] of every split's."""
     pairs = count * (count - 1) // 2
-    kept = max(1, min(splits, _HALVES_BYTES // (16 * pairs)))
-    halves, r = np.empty((kept, 2, pairs)), np.empty(splits)
+    most = max(1, min(splits, _HALVES_BYTES // (16 * pairs)))
+    halves, r = np.empty((most, 2, pairs)), np.empty(splits)
     # Chunks of splits: memory does not grow with their number.
     step = max(1, _CHUNK_BYTES // (8 * pairs))
     for start in range(0, splits, step):
         index = np.arange(start, min(start + step, splits))
         first, second = half_rdms(sessions, count, method, index, seed)
         r[index] = compare(first, second, method=comparison)
-        stored = index[index < kept]
+        stored = index[index < most]
         halves[stored, 0], halves[stored, 1] = first[: len(stored)], second[: len(stored)]
     return halves, r
 
@@ -221,21 +221,21 @@ def denoised(patterns: Floats, noise: Floats) -> Floats:
     """
     mean = patterns.mean(axis=0)
     centred = patterns - mean
-    own = np.diag(noise.sum(axis=1))
+    diagonal = np.diag(noise.sum(axis=1))
     # Both sides centred over stimuli: E[C Cᵀ] = G + H diag(n) H, with the centring matrix H.
-    own = own - own.mean(axis=0)
-    gram = centred @ centred.T - (own - own.mean(axis=1, keepdims=True))
+    diagonal = diagonal - diagonal.mean(axis=0)
+    gram = centred @ centred.T - (diagonal - diagonal.mean(axis=1, keepdims=True))
     values, vectors = np.linalg.eigh(gram)
-    kept = np.flatnonzero(values > 0)[::-1][: patterns.shape[1]]
+    positive = np.flatnonzero(values > 0)[::-1][: patterns.shape[1]]
     total = float(np.trace(gram))
-    if not len(kept) or total <= 0:
+    if not len(positive) or total <= 0:
         return np.broadcast_to(mean, patterns.shape)
     # Dropping what is negative leaves too much in all; the trace is unbiased.
-    values = values[kept] * total / values[kept].sum()
-    directions = centred.T @ vectors[:, kept] * np.sqrt(values)
+    values = values[positive] * total / values[positive].sum()
+    directions = centred.T @ vectors[:, positive] * np.sqrt(values)
     # The nearest orthonormal directions of units keep each unit's part as close to the data as the products allow.
     left, _, right = np.linalg.svd(directions, full_matrices=False)
-    return mean + (vectors[:, kept] * np.sqrt(values)) @ (left @ right).T
+    return mean + (vectors[:, positive] * np.sqrt(values)) @ (left @ right).T
 
 
 def simulated_animals(animal: SubjectRDM, seed: int) -> tuple[Floats, list[SubjectRDM]]:

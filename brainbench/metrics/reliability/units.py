@@ -38,7 +38,7 @@ def unit_reliability(blocks: Sequence[Trials], n_stimuli: int, *, seed: int = 0)
     """
     if n_stimuli < 3:
         raise UsageError(f"A unit's tuning needs at least 3 stimuli; received {n_stimuli}.")
-    found = []
+    reliabilities = []
     for block in blocks:
         values = np.asarray(block.responses)
         values = finite_mean(values, axis=1) if values.ndim == 3 else values
@@ -52,13 +52,13 @@ def unit_reliability(blocks: Sequence[Trials], n_stimuli: int, *, seed: int = 0)
             # Pearson's r over stimuli between the halves' mean responses, of all units and splits at once.
             first, second = (features(half.swapaxes(-1, -2), "pearson") for half in halves)
             r = np.einsum("sfk,sfk->sf", first, second)
-            known = np.isfinite(r)
-            total += np.where(known, r, 0.0).sum(axis=0)
-            number += known.sum(axis=0)
+            finite = np.isfinite(r)
+            total += np.where(finite, r, 0.0).sum(axis=0)
+            number += finite.sum(axis=0)
         # Splits are averaged before Spearman and Brown's formula, as for RDMs.
         mean = np.divide(total, number, out=np.full(total.shape, np.nan), where=number > 0)
-        found.append(spearman_brown(mean))
-    return tuple(found)
+        reliabilities.append(spearman_brown(mean))
+    return tuple(reliabilities)
 
 
 def reliable_units(
@@ -77,11 +77,11 @@ def reliable_units(
     if least is None:
         return tuple(blocks), ""
     values = unit_reliability(blocks if whole is None else whole, n_stimuli, seed=seed)
-    kept = []
+    reliable = []
     for block, value in zip(blocks, values, strict=True):
         good = value >= least
         if good.any():
-            kept.append(replace(block, responses=np.asarray(block.responses)[..., good]))
+            reliable.append(replace(block, responses=np.asarray(block.responses)[..., good]))
     every = sum(len(value) for value in values)
     left = sum(int((~(value >= least)).sum()) for value in values)
-    return tuple(kept), f"{left} of {every} units left out: reliability of their tuning below {least:g}"
+    return tuple(reliable), f"{left} of {every} units left out: reliability of their tuning below {least:g}"

@@ -129,10 +129,10 @@ def score_over_time(
     largest_z = z.max(axis=1)
     p = np.where(np.isfinite(course[0]), tail_p(largest_z[:, None], z[0]), np.nan)
     observed = joined.compared()
-    own = held_out_course(observed)[0][0] * factors
+    corrected = held_out_course(observed)[0][0] * factors
     left_out = [joined.without_stimulus(stimulus) for stimulus in range(joined.stimuli)]
     without_each = [finite_mean(held_out_course(item)[0][0] * factors) for item in left_out]
-    every = zip(finite_mean(own), own, np.stack(without_each, axis=-1), strict=True)
+    every = zip(finite_mean(corrected), corrected, np.stack(without_each, axis=-1), strict=True)
     intervals = [two_factor_interval(float(mean), *item) if np.isfinite(mean) else None for mean, *item in every]
     points = tuple(
         TimePoint(
@@ -141,7 +141,7 @@ def score_over_time(
             r=float(course[0, index]),
             chance=float(finite_mean(value[:, index])),
             reliability=float(finite_mean(reliability[index])),
-            animals=int(np.isfinite(own[index]).sum()),
+            animals=int(np.isfinite(corrected[index]).sum()),
             p=float(p[index]),
             interval=intervals[index],
         )
@@ -175,10 +175,10 @@ def _checked(layers: Mapping[str, ArrayLike], animals: Sequence[AnimalMovie], wi
     for name, movie in zip(layers, movies, strict=True):
         if movie.ndim != 2 or movie.shape[1] != pairs:
             raise UsageError(f"The RDMs of layer {name!r} have shape {movie.shape}; expected [time, {pairs} pairs].")
-    for item in animals:
-        if item.rdms.shape != (bins, pairs):
+    for animal in animals:
+        if animal.rdms.shape != (bins, pairs):
             raise UsageError(
-                f"The RDMs of {item.subject!r} have shape {item.rdms.shape}; those of {animals[0].subject!r} "
+                f"The RDMs of {animal.subject!r} have shape {animal.rdms.shape}; those of {animals[0].subject!r} "
                 f"{(bins, pairs)}."
             )
     if bins < 3 or pairs < 6:

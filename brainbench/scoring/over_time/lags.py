@@ -99,16 +99,16 @@ class LaggedRDMs:
     def without_stimulus(self, stimulus: int) -> Floats:
         """Return comparisons [1, L, G, T, A] without one stimulus."""
         rows, cols = np.triu_indices(self.stimuli, k=1)
-        kept = (rows != stimulus) & (cols != stimulus)
-        r = compare_all(self.layers[:, kept], self.animals[:, kept], method=self.comparison)
+        rest = (rows != stimulus) & (cols != stimulus)
+        r = compare_all(self.layers[:, rest], self.animals[:, rest], method=self.comparison)
         return self._arranged(r[None])
 
     def _arranged(self, r: Floats) -> Floats:
         """Return comparisons [N, M, T·A] as [N, L, G, T, A]; NaN where nothing is compared."""
         _, _, bins, animals = self.usable.shape
         every = r.reshape(*r.shape[:2], bins, animals)
-        found = every[:, self.place, np.arange(bins)]
-        return np.where(self.usable, found, np.nan)
+        shifted = every[:, self.place, np.arange(bins)]
+        return np.where(self.usable, shifted, np.nan)
 
 
 def votes(r: Floats) -> Floats:
@@ -138,8 +138,8 @@ def profile(excess: Floats) -> Floats:
     """
     steps = finite_mean(excess[:, 1:] - excess[:, :-1], axis=(-2, -1))
     total = np.cumsum(np.nan_to_num(steps), axis=-1)
-    found = np.concatenate([np.zeros((len(excess), 1)), total], axis=-1)
-    return np.where(np.isfinite(excess).any(axis=(-2, -1)), found, np.nan)
+    heights = np.concatenate([np.zeros((len(excess), 1)), total], axis=-1)
+    return np.where(np.isfinite(excess).any(axis=(-2, -1)), heights, np.nan)
 
 
 def best_lag(excess: Floats) -> Floats:
@@ -213,7 +213,7 @@ def layer_latencies(
     pseudo = animals * best[:, None] - (animals - 1) * singles
     without = np.stack([latency(item) for item in left_out], axis=-1)
     reached = finite_mean(votes(excess[None])[0])
-    found = []
+    latencies = []
     for index, name in enumerate(names):
         tried, reason = int(np.isfinite(reached[index]).sum()), ""
         if tried < 3:
@@ -224,7 +224,7 @@ def layer_latencies(
             reason = f"the best match lies at the end of the lags tried, {lags[0]:g} to {lags[-1]:g} s"
         # One replicate without a peak would make the error too small.
         steady = bool(np.isfinite(pseudo[index]).all() and np.isfinite(without[index]).all()) and animals > 1
-        found.append(
+        latencies.append(
             LayerLatency(
                 layer=name,
                 latency=math.nan if reason else float(best[index]),
@@ -236,4 +236,4 @@ def layer_latencies(
                 reason=reason,
             )
         )
-    return tuple(found)
+    return tuple(latencies)

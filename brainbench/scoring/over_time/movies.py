@@ -55,14 +55,14 @@ def animal_movie(subject: str, blocks: Sequence[Trials], n_stimuli: int, **optio
             f"shapes {shapes}."
         )
     how = {**_METHOD, **options}
-    found = []
+    subjects = []
     for bin in range(shapes[0][1]):
         parts = [replace(block, responses=np.asarray(block.responses)[:, bin]) for block in blocks]
-        found.append(subject_rdm(subject, parts, n_stimuli, **how))
-    usable = np.array([item.problem is None for item in found])
-    rdms = np.where(usable[:, None], np.stack([item.rdm for item in found]), np.nan)
-    reliability = np.where(usable, [item.reliability for item in found], np.nan)
-    return AnimalMovie(subject, rdms, reliability, tuple(item.problem for item in found))
+        subjects.append(subject_rdm(subject, parts, n_stimuli, **how))
+    usable = np.array([item.problem is None for item in subjects])
+    rdms = np.where(usable[:, None], np.stack([item.rdm for item in subjects]), np.nan)
+    reliability = np.where(usable, [item.reliability for item in subjects], np.nan)
+    return AnimalMovie(subject, rdms, reliability, tuple(item.problem for item in subjects))
 
 
 def layer_movie(values: ArrayLike, step: float, width: float, *, method: str = "sqeuclidean") -> Floats:

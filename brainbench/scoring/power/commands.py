@@ -53,7 +53,7 @@ def power(
     designs = [experiments.ExperimentDesign(effect=one, **options) for one in effects]
     number, origin = _dimensions(dimensions, recordings, conditions, model)
     designs = [replace(design, dimensions=number) for design in designs]
-    found = []
+    rows = []
     for design in tracked(designs, "simulating experiments"):
         enough = {
             vary: experiments.needed(design, vary, target=target, simulations=simulations, seed=seed)
@@ -61,48 +61,50 @@ def power(
             else None
             for vary in ("stimuli", "animals")
         }
-        found.append((experiments.power(design, simulations=max(simulations, 1000), seed=seed), enough))
+        rows.append((experiments.power(design, simulations=max(simulations, 1000), seed=seed), enough))
 
-    def told(item: Any, vary: str) -> str:
-        return str(item[1][vary] or "none tried") if item[0].design.effect > 0 else ""
+    def enough_text(row: Any, vary: str) -> str:
+        return str(row[1][vary] or "none tried") if row[0].design.effect > 0 else ""
 
-    def span(item: Any) -> str:
-        interval = item[0].interval
-        return f"[{interval.low:.2f}, {interval.high:.2f}]" if interval else item[0].reason
+    def span(row: Any) -> str:
+        interval = row[0].interval
+        return f"[{interval.low:.2f}, {interval.high:.2f}]" if interval else row[0].reason
 
-    one = designs[0]
+    first = designs[0]
     title = (
-        f"{one.stimuli} stimuli, {one.animals} animals, consistency {one.consistency:g}, reliability "
-        f"{one.reliability:g}, {one.layers} layer{'s' if one.layers > 1 else ''}, α {one.alpha:g}, "
-        f"{number} dimension{'s' if number > 1 else ''} ({origin}); smallest possible p {found[0][0].p_smallest:.2g}"
+        f"{first.stimuli} stimuli, {first.animals} animals, consistency {first.consistency:g}, reliability "
+        f"{first.reliability:g}, {first.layers} layer{'s' if first.layers > 1 else ''}, α {first.alpha:g}, "
+        f"{number} dimension{'s' if number > 1 else ''} ({origin}); smallest possible p {rows[0][0].p_smallest:.2g}"
     )
     columns = {
         ">true score": "{0[0].design.effect:g}",
-        "power": lambda item: f"{item[0].power:.2f} {span(item)}",
-        f">stimuli for {target:.0%}": lambda item: told(item, "stimuli"),
-        f">animals for {target:.0%}": lambda item: told(item, "animals"),
+        "power": lambda row: f"{row[0].power:.2f} {span(row)}",
+        f">stimuli for {target:.0%}": lambda row: enough_text(row, "stimuli"),
+        f">animals for {target:.0%}": lambda row: enough_text(row, "animals"),
     }
     note = "True score 0 is the rate of false alarms. Animals needed are for the given stimuli, and the reverse."
     data = {
         "dimensions": {"number": number, "origin": origin},
-        "results": [{**to_plain(result), "needed": enough, "target": target} for result, enough in found],
+        "results": [{**to_plain(result), "needed": enough, "target": target} for result, enough in rows],
     }
-    return Output(data, f"{title}\n\n{table_of('', found, columns)}\n\n{note}")
+    return Output(data, f"{title}\n\n{table_of('', rows, columns)}\n\n{note}")
 
 
-def _dimensions(asked: str, recordings: str | None, conditions: str | None, model: str | None) -> tuple[int, str]:
+def _dimensions(dimensions: str, recordings: str | None, conditions: str | None, model: str | None) -> tuple[int, str]:
     """Return the number of dimensions, and where it comes from in words."""
     from brainbench.scoring.power.experiments import DIMENSIONS
 
     if conditions is not None and recordings is None:
         raise UsageError("--conditions labels the trials of --recordings; name those too.")
     sources = [name for name, given in (("--recordings", recordings), ("--model", model)) if given is not None]
-    if asked != "auto":
-        if not asked.isdecimal() or int(asked) < 1:
-            raise UsageError(f"--dimensions is a whole number of at least 1 or 'auto'; received {asked!r}.")
+    if dimensions != "auto":
+        if not dimensions.isdecimal() or int(dimensions) < 1:
+            raise UsageError(f"--dimensions is a whole number of at least 1 or 'auto'; received {dimensions!r}.")
         if sources:
-            raise UsageError(f"--dimensions {asked} is given, so {sources[0]} has nothing to estimate; leave one out.")
-        return int(asked), "given"
+            raise UsageError(
+                f"--dimensions {dimensions} is given, so {sources[0]} has nothing to estimate; leave one out."
+            )
+        return int(dimensions), "given"
     if len(sources) > 1:
         raise UsageError("Dimensions are estimated from --recordings or from --model, not both.")
     if recordings is not None:
@@ -117,8 +119,8 @@ def _of_recordings(recordings: str, conditions: str | None) -> tuple[int, str]:
 
     with progress_bar() as progress:
         brain = open_neural_responses(recordings, progress=progress, conditions=conditions)
-    found = signal_dimensions(trials_by_subject(brain.dataset).values(), len(brain.vocabulary))
-    return round(found), f"{found:.1f} estimated from {brain.source}"
+    estimate = signal_dimensions(trials_by_subject(brain.dataset).values(), len(brain.vocabulary))
+    return round(estimate), f"{estimate:.1f} estimated from {brain.source}"
 
 
 def _of_model(model: str) -> tuple[int, str]:
@@ -132,5 +134,5 @@ def _of_model(model: str) -> tuple[int, str]:
         responses = resolve_model(model).respond(ScoreOptions(), progress=progress)
     layers = responses.features(list(range(len(responses.labels)))).values()
     varied = [layer for layer in layers if np.isfinite(layer).all() and np.ptp(layer, axis=0).any()]
-    found = float(np.median([pattern_dimensions(layer) for layer in varied]))
-    return round(found), f"{found:.1f} estimated from {len(varied)} layers of {model}"
+    estimate = float(np.median([pattern_dimensions(layer) for layer in varied]))
+    return round(estimate), f"{estimate:.1f} estimated from {len(varied)} layers of {model}"

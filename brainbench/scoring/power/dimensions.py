@@ -58,9 +58,9 @@ def signal_dimensions(animals: Iterable[Sequence[Trials]], n_stimuli: int, *, se
                 continue
             generator = np.random.default_rng([seed, index, number])
             for _ in range(_SPLITS):
-                one, two = _split_products(values, labels, n_stimuli, generator)
-                within += _moments(one, two)
-                whole += one + two
+                first, second = _split_products(values, labels, n_stimuli, generator)
+                within += _moments(first, second)
+                whole += first + second
         if whole.any():
             products.append(whole)
     if not products:
@@ -87,8 +87,8 @@ def _split_products(
     member[part, labels, np.arange(len(labels))] = 1.0
     means = (member / member.sum(axis=2, keepdims=True)) @ values
     units = generator.permutation(values.shape[1])
-    one, two = np.array_split(units, 2)
-    return (_products(means[0][:, one], means[1][:, one]), _products(means[2][:, two], means[3][:, two]))
+    first, second = np.array_split(units, 2)
+    return (_products(means[0][:, first], means[1][:, first]), _products(means[2][:, second], means[3][:, second]))
 
 
 def _products(left: Floats, right: Floats) -> Floats:
@@ -97,9 +97,9 @@ def _products(left: Floats, right: Floats) -> Floats:
     return (product + product.T) / 2
 
 
-def _moments(one: Floats, two: Floats) -> Floats:
+def _moments(first: Floats, second: Floats) -> Floats:
     """Return tr G · tr G′ and tr GG′ of inner products [K, K]."""
-    return np.array([np.trace(one) * np.trace(two), (one * two).sum()])
+    return np.array([np.trace(first) * np.trace(second), (first * second).sum()])
 
 
 def _solved(moments: Floats, stimuli: int) -> float:

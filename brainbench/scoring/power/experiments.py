@@ -110,13 +110,13 @@ def power(design: ExperimentDesign, *, simulations: int = SIMULATIONS, seed: int
     places = (orders[:, :, None] * design.stimuli + orders[:, None, :]).reshape(len(orders), -1)
     # Bounds the models' moved entries and the comparisons, held at once over experiments and orders.
     each = len(places) * design.layers * max(design.stimuli**2, design.animals)
-    step, found = max(1, _CHUNK_ELEMENTS // each), 0
+    step, detections = max(1, _CHUNK_ELEMENTS // each), 0
     for start in range(0, simulations, step):
         model, brain = simulate_experiments(generator, design, min(step, simulations - start))
         null = _statistics(model, brain, places)
-        found += int((tail_p(null.T) <= design.alpha).sum())
-    interval = wilson_interval(found, simulations, over="simulated experiments")
-    return Power(design, found / simulations, interval, simulations, smallest)
+        detections += int((tail_p(null.T) <= design.alpha).sum())
+    interval = wilson_interval(detections, simulations, over="simulated experiments")
+    return Power(design, detections / simulations, interval, simulations, smallest)
 
 
 def needed(

@@ -66,9 +66,9 @@ def parse_trials(text: str) -> int | tuple[int, int]:
     >>> parse_trials("16-20")
     (16, 20)
     """
-    found = re.fullmatch(r"\s*(\d{1,9})\s*(?:-\s*(\d{1,9})\s*)?", text)
-    first, last = (int(part or 0) for part in found.groups()) if found else (0, 0)
-    if first < 1 or (found and found[2] and last < first):
+    match = re.fullmatch(r"\s*(\d{1,9})\s*(?:-\s*(\d{1,9})\s*)?", text)
+    first, last = (int(part or 0) for part in match.groups()) if match else (0, 0)
+    if first < 1 or (match and match[2] and last < first):
         raise UsageError(f"Trials are a number above 0 or a range such as 16-20; received {shown(text)}.")
     return (first, last) if last else first
 
@@ -159,19 +159,19 @@ def open_candidates(
         raise UsageError(f"The candidate {twice[0]!r} is given twice; candidates have different names.")
     if any(item.labels is None for item in resolved):
         how = {"whiskers": options.whiskers, "fidelity": options.fidelity}
-        shown = load_stimuli(options.stimuli or "objects", **how, progress=progress)
-        options, stimuli = replace(options, stimuli=shown, whiskers="all"), shown.labels
+        simulated = load_stimuli(options.stimuli or "objects", **how, progress=progress)
+        options, stimuli = replace(options, stimuli=simulated, whiskers="all"), simulated.labels
     else:  # activations from files alone, whose labels name the stimuli
         stimuli = next(item.labels for item in resolved if item.labels)
     candidates, origin = [], {}
-    for item in track(resolved, "running networks", progress):
-        found = item.respond(options)
-        lacking = [label for label in stimuli if label not in found.labels]
+    for network in track(resolved, "running networks", progress):
+        responses = network.respond(options)
+        lacking = [label for label in stimuli if label not in responses.labels]
         if lacking:
-            raise UsageError(f"{item.card.name} has no activations for the stimulus {lacking[0]!r}.")
-        rows = [found.labels.index(label) for label in stimuli]
-        candidates.append(Candidate.of(item.card.name, stimuli, found.features(rows), found.card.weights))
-        origin = dict(found.origin.get("stimuli") or origin)
+            raise UsageError(f"{network.card.name} has no activations for the stimulus {lacking[0]!r}.")
+        rows = [responses.labels.index(label) for label in stimuli]
+        candidates.append(Candidate.of(network.card.name, stimuli, responses.features(rows), responses.card.weights))
+        origin = dict(responses.origin.get("stimuli") or origin)
     return tuple(candidates), origin
 
 
@@ -235,13 +235,13 @@ def draw_board(
     stream = (design.seed, true, number)
     random = np.random.default_rng(stream)
     pool = len(candidates[true].stimuli)
-    shown = design.stimuli or pool
-    rows = np.sort(random.permutation(pool)[:shown]) if shown < pool else np.arange(pool)
+    count = design.stimuli or pool
+    rows = np.sort(random.permutation(pool)[:count]) if count < pool else np.arange(pool)
     layer = candidates[true].choose(design.layer, random)
     metric, animals = get_metric(design.metric), []
     for subject, sessions in draw_animals(candidates[true].geometry(layer, rows), design.population, stream).items():
         trials = [replace(item, responses=item.responses[:, 0]) for item in sessions]
-        animals.append(metric.animal(subject, trials, shown, seed=design.seed, splits=design.splits))
+        animals.append(metric.animal(subject, trials, count, seed=design.seed, splits=design.splits))
     return layer, rows, tuple(animals)
 
 
@@ -253,10 +253,10 @@ def score_board(
     # Metrics may be frozen; the copy is ours.
     object.__setattr__(metric, "orders", design.orders)
     scores = []
-    for item in candidates:
-        layers = {name: metric.take(layer, rows) for name, layer in item.layers(metric).items()}
-        labels = [item.stimuli[row] for row in rows]
-        scores.append(score_layers(metric, layers, animals, name=item.name, stimuli=labels, seed=design.seed)[0])
+    for candidate in candidates:
+        layers = {name: metric.take(layer, rows) for name, layer in candidate.layers(metric).items()}
+        labels = [candidate.stimuli[row] for row in rows]
+        scores.append(score_layers(metric, layers, animals, name=candidate.name, stimuli=labels, seed=design.seed)[0])
     return scores
 
 

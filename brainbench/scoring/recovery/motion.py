@@ -112,13 +112,13 @@ def design_for_networks(
     points = search.find_motions(evaluator.worths, slope, begin, limits, options)
     # What is best at the coarse setting need not be at the finer one, which has the last word.
     fine = _Evaluator(scenes[::2], names, models, options.check, backend)
-    other = _Evaluator(scenes[1::2], names, models, options.check, backend)
-    if other.features(begin) is None:
+    held_out = _Evaluator(scenes[1::2], names, models, options.check, backend)
+    if held_out.features(begin) is None:
         raise DataError("Whiskers are unstable with the given motion; simulate the scenes more finely.")
     worths = np.nan_to_num(fine.worths(points), nan=-math.inf)
     order = np.argsort(-worths, kind="stable").tolist()
-    chosen = next(points[index] for index in order if other.features(points[index]) is not None)
-    margins = [other.margins(point, study, boards) for point in (begin, chosen)]
+    chosen = next(points[index] for index in order if held_out.features(points[index]) is not None)
+    margins = [held_out.margins(point, study, boards) for point in (begin, chosen)]
     gain = t_interval(margins[1] - margins[0], over="boards")
     status, reason = _judge(gain, bool(np.array_equal(begin, chosen)))
     first, last = (fine.contrast(point) for point in (begin, chosen))
@@ -130,7 +130,7 @@ def design_for_networks(
         layers={model.name: model.layer for model in models},
         search="gradient" if evaluator.differentiable else "trials",
         contrast=(first, last),
-        held_out=(other.contrast(begin), other.contrast(chosen)),
+        held_out=(held_out.contrast(begin), held_out.contrast(chosen)),
         leads=(float(margins[0].mean()), float(margins[1].mean())),
         gain=gain,
         won=(float((margins[0] > 0).mean()), float((margins[1] > 0).mean())),
@@ -170,25 +170,27 @@ class _Network:
         """Find a network; the layer is the one it commits to, or else the one asked for."""
         from brainbench.models.activations import named_reader
 
-        found = resolve_model(model)
-        if found.module is None:
+        resolved = resolve_model(model)
+        if resolved.module is None:
             raise UsageError(
-                f"{found.card.name} is a file of activations, which cannot be run on other motions; give the network."
+                f"{resolved.card.name} is a file of activations and cannot be run on other motions; give the network."
             )
-        named = getattr(found.module, "layers", None)
-        chosen = found.card.layer if layer in ("any", "last") else layer
+        layers = getattr(resolved.module, "layers", None)
+        chosen = resolved.card.layer if layer in ("any", "last") else layer
         if chosen is None:
-            if not named:
-                raise UsageError(f"{found.card.name} commits to no layer and names none; choose one with --layer.")
-            chosen = named[-1]
+            if not layers:
+                raise UsageError(f"{resolved.card.name} commits to no layer and names none; choose one with --layer.")
+            chosen = layers[-1]
         # Other modules are read by hooks, which keep no gradient.
-        read = named_reader(found.module, (chosen,)) if takes_si(found.module) else None
-        return cls(found.card.name, found, chosen, read)
+        read = named_reader(resolved.module, (chosen,)) if takes_si(resolved.module) else None
+        return cls(resolved.card.name, resolved, chosen, read)
 
     def features(self, dataset: Any) -> Array:
         """Return the responses [K, F] to a stimulus set, averaged over time."""
-        found = self.model.respond(ScoreOptions(stimuli=load_stimuli(dataset), layers=(self.layer,), layer=self.layer))
-        return found.features(list(range(len(found.labels))))[self.layer].astype(float)
+        responses = self.model.respond(
+            ScoreOptions(stimuli=load_stimuli(dataset), layers=(self.layer,), layer=self.layer)
+        )
+        return responses.features(list(range(len(responses.labels))))[self.layer].astype(float)
 
 
 class _Evaluator:
@@ -214,10 +216,10 @@ class _Evaluator:
 
     def contrast(self, values: Array) -> float:
         """Return 1 − CKA at some values; 0 where a network responds alike to all, NaN with unstable whiskers."""
-        found = self.features(values)
-        if found is None:
+        responses = self.features(values)
+        if responses is None:
             return math.nan
-        alike = LinearCKA().similarity(*found)
+        alike = LinearCKA().similarity(*responses)
         return 0.0 if math.isnan(alike) else 1 - alike
 
     def features(self, values: Array) -> list[Array] | None:
@@ -268,13 +270,13 @@ class _Evaluator:
 
     def margins(self, values: Array, study: RecoveryDesign, boards: int) -> Array:
         """Return the leads of the true network at some values [2 boards]; NaN where there are none."""
-        found = self.features(values)
-        if found is None or not all(np.ptp(some, axis=0).any() for some in found):
+        responses = self.features(values)
+        if responses is None or not all(np.ptp(some, axis=0).any() for some in responses):
             return np.full(2 * boards, math.nan)
         labels = [scene.label for scene in self.scenes]
         candidates = [
             Candidate.of(network.name, labels, {network.layer: some})
-            for network, some in zip(self.networks, found, strict=True)
+            for network, some in zip(self.networks, responses, strict=True)
         ]
         design = replace(study, layer="last")
         return Margins(candidates, design, get_metric(design.metric), boards)(np.arange(len(labels)))

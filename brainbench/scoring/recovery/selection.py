@@ -67,8 +67,8 @@ def select_stimuli(
     margins = Margins(candidates, design, metric, boards)
     random = np.random.default_rng([design.seed, FIRST_BOARD])
     order = random.permutation(pool)
-    kept, spare = order[:keep].copy(), order[keep:].copy()
-    first = margins(kept)
+    chosen, spare = order[:keep].copy(), order[keep:].copy()
+    first = margins(chosen)
     # A margin far above zero is not worth more than one that is safely above it.
     scale = float(np.abs(first).mean()) or 1.0
     best = _worth(first, scale)
@@ -76,26 +76,26 @@ def select_stimuli(
         exchanges = 0
     for tried in range(exchanges):
         out, new = int(random.integers(keep)), int(random.integers(len(spare)))
-        kept[out], spare[new] = spare[new], kept[out]
-        found = _worth(margins(kept), scale)
-        if found > best:
-            best = found
+        chosen[out], spare[new] = spare[new], chosen[out]
+        worth = _worth(margins(chosen), scale)
+        if worth > best:
+            best = worth
         else:
-            kept[out], spare[new] = spare[new], kept[out]
+            chosen[out], spare[new] = spare[new], chosen[out]
         if progress is not None and (tried + 1) % 25 == 0:
             progress(tried + 1, exchanges, "exchanging stimuli")
-    rows = np.sort(kept)
+    rows = np.sort(chosen)
     gain = float(margins(rows).mean() - first.mean())
     return StimulusSelection(tuple(candidates[0].stimuli[row] for row in rows), tuple(rows.tolist()), gain)
 
 
 def keep_stimuli(candidates: Sequence[Candidate], rows: Sequence[int]) -> tuple[Candidate, ...]:
     """Return the candidates with some of their stimuli alone."""
-    names, found = tuple(candidates[0].stimuli[row] for row in rows), []
-    for item in candidates:
-        kept = {layer: values[list(rows)] for layer, values in item.features.items()}
-        found.append(Candidate.of(item.name, names, kept, item.weights))
-    return tuple(found)
+    names, reduced = tuple(candidates[0].stimuli[row] for row in rows), []
+    for candidate in candidates:
+        layers = {layer: values[list(rows)] for layer, values in candidate.features.items()}
+        reduced.append(Candidate.of(candidate.name, names, layers, candidate.weights))
+    return tuple(reduced)
 
 
 def _worth(margins: Floats, scale: float) -> float:
@@ -129,6 +129,6 @@ class Margins:
         several = animals > 1
         # [boards, C]
         scores = np.stack([(held_out(part) if several else part.max(axis=1)).mean(axis=-1) for part in parts], axis=1)
-        own = np.take_along_axis(scores, self.true[:, None], axis=1)[:, 0]
+        true_scores = np.take_along_axis(scores, self.true[:, None], axis=1)[:, 0]
         np.put_along_axis(scores, self.true[:, None], -np.inf, axis=1)
-        return own - scores.max(axis=1)
+        return true_scores - scores.max(axis=1)

@@ -70,7 +70,7 @@ def recover(
         for start in range(first, first + boards, _TOGETHER)
         for true in range(len(candidates))
     ]
-    found: dict[_Job, list[RecoveryBoard]] = {}
+    results: dict[_Job, list[RecoveryBoard]] = {}
     if folder is not None:
         folder.mkdir(parents=True, exist_ok=True)
         config = {"candidates": [item.identity for item in candidates], "design": design}
@@ -78,24 +78,24 @@ def recover(
         for job in jobs:
             if (folder / job.file).is_file():
                 with readable(folder / job.file, "part of a recovery", "Delete it to make it again."):
-                    kept = [RecoveryBoard.of(item) for item in read_json(folder / job.file)]
-                if [item.number for item in kept] == list(job.numbers):
-                    found[job] = kept
-    missing = [job for job in jobs if job not in found]
+                    stored = [RecoveryBoard.of(item) for item in read_json(folder / job.file)]
+                if [item.number for item in stored] == list(job.numbers):
+                    results[job] = stored
+    missing = [job for job in jobs if job not in results]
     total = done = sum(len(job.numbers) for job in jobs)
     done -= sum(len(job.numbers) for job in missing)
     work = partial(_make_boards, tuple(candidates), design)
-    for place, made in run_jobs(work, missing, workers=workers, scheduler=scheduler):
+    for place, finished in run_jobs(work, missing, workers=workers, scheduler=scheduler):
         job = missing[place]
-        found[job] = made
-        done += len(made)
+        results[job] = finished
+        done += len(finished)
         if folder is not None:
-            write_json(folder / job.file, to_plain([board.stored for board in made]))
+            write_json(folder / job.file, to_plain([board.stored for board in finished]))
         if progress is not None:
             progress(done, total, "scoring boards")
-    every = sorted((board for job in jobs for board in found[job]), key=lambda one: (one.true, one.number))
-    shown = design.stimuli or len(candidates[0].stimuli)
-    return Recovery(tuple(item.name for item in candidates), design, shown, tuple(every))
+    every = sorted((board for job in jobs for board in results[job]), key=lambda board: (board.true, board.number))
+    count = design.stimuli or len(candidates[0].stimuli)
+    return Recovery(tuple(item.name for item in candidates), design, count, tuple(every))
 
 
 def _make_boards(candidates: tuple[Candidate, ...], design: RecoveryDesign, job: _Job) -> list[RecoveryBoard]:
@@ -117,8 +117,8 @@ def check_candidates(candidates: Sequence[Candidate], design: RecoveryDesign, bo
             "their data; choose another, such as 'rsa'."
         )
     if design.layer not in ("any", "last"):
-        for item in candidates:
-            item.choose(design.layer, np.random.default_rng(0))
+        for candidate in candidates:
+            candidate.choose(design.layer, np.random.default_rng(0))
 
 
 ANIMALS = (2, 4, 6, 10, 16)
@@ -143,6 +143,12 @@ class TriedDesign:
     """Wilson's interval of ``win_rate``."""
 
 
+def _cost(numbers: tuple[int, int, int, int]) -> tuple[int, int, int]:
+    """Return what a design costs: trials of all animals together, then units, then animals."""
+    animals, units, trials, stimuli = numbers
+    return animals * trials * stimuli, units, animals
+
+
 def find_cheapest(
     candidates: Sequence[Candidate],
     design: RecoveryDesign,
@@ -162,24 +168,24 @@ def find_cheapest(
     check_number("The wanted rate", wanted, above=0, below=1)
     pool = len(candidates[0].stimuli)
     sizes = [size for size in STIMULI if size < pool] + [pool]
-    grid = sorted(product(ANIMALS, UNITS, TRIALS, sizes), key=lambda one: (one[0] * one[2] * one[3], one[1], one[0]))
+    grid = sorted(product(ANIMALS, UNITS, TRIALS, sizes), key=_cost)
     tried: list[TriedDesign] = []
     failed: list[tuple[int, ...]] = []
 
     def measured(animals: int, units: int, trials: int, stimuli: int, **counted: int) -> TriedDesign:
         population = replace(design.population, animals=animals, units=units, trials=trials)
         changed = replace(design, population=population, stimuli=stimuli)
-        found = recover(candidates, changed, **counted, **where)
-        return TriedDesign(animals, units, trials, stimuli, found.win_rate, found.wins())
+        result = recover(candidates, changed, **counted, **where)
+        return TriedDesign(animals, units, trials, stimuli, result.win_rate, result.wins())
 
     for numbers in track(grid, "trying designs", progress):
         if any(all(mine <= other for mine, other in zip(numbers, one, strict=True)) for one in failed):
             continue
-        found = measured(*numbers, boards=boards, first=0)
-        tried.append(found)
-        if found.interval.high < wanted:
+        attempt = measured(*numbers, boards=boards, first=0)
+        tried.append(attempt)
+        if attempt.interval.high < wanted:
             failed.append(numbers)
-        elif found.win_rate >= wanted:
+        elif attempt.win_rate >= wanted:
             # The first to reach a rate by luck would be returned too often: it must do so again.
             again = measured(*numbers, boards=2 * boards, first=boards)
             tried[-1] = again
