@@ -89,6 +89,12 @@ _FAULTS = {
     AT_BASE: "an object reached the whisker's base point, where nothing is felt, at {0:.6g} s; move one of them",
 }
 """Fault in words, given its time (s) and the deepest overlap (mm)."""
+_TOO_FAST = (
+    "an object moves by {:.3g} mm against the whisker in a step at {:.6g} s, further than the {:.3g} mm up to which "
+    "contact is followed; choose a smaller time step (at most 1/{:.0f} of it)"
+)
+_UNSOLVED = "contact forces missed by {:.0%} (root mean square); choose a smaller time step"
+_CROWDED = "more contacts than can be solved together in {} of {} steps"
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,16 +198,10 @@ def judge(facts: RunFacts) -> Verdict:
     # and counts as unsolved.
     unsolved = (until == np.inf) & ~(facts.residual <= LARGEST_RESIDUAL)
     crowded = (until == np.inf) & ~unsolved & (facts.crowded > LARGEST_CROWDED_SHARE * facts.steps)
-    moved = (
-        "an object moves by {:.3g} mm against the whisker in a step at {:.6g} s, further than the {:.3g} mm up to "
-        "which contact is followed; choose a smaller time step (at most 1/{:.0f} of it)"
-    )
-    missed = "contact forces missed by {:.0%} (root mean square); choose a smaller time step"
-    many = "more contacts than can be solved together in {} of {} steps"
     way, most = facts.travel * MILLI, facts.farthest * MILLI
-    blame(fast, lambda i: moved.format(way[i], facts.fast_at[i], most[i], np.ceil(way[i] / most[i])))
-    blame(unsolved, lambda i: missed.format(min(facts.residual[i], 10.0)))
-    blame(crowded, lambda i: many.format(facts.crowded[i], facts.steps[i]))
+    blame(fast, lambda i: _TOO_FAST.format(way[i], facts.fast_at[i], most[i], np.ceil(way[i] / most[i])))
+    blame(unsolved, lambda i: _UNSOLVED.format(min(facts.residual[i], 10.0)))
+    blame(crowded, lambda i: _CROWDED.format(facts.crowded[i], facts.steps[i]))
     bad = unsolved | crowded
     until = np.where(bad, -np.inf, until)
     doubtful = (

@@ -148,6 +148,7 @@ def check_residuals(residual: Array, jacobian: Array, readings: Readings) -> tup
     """Return the tests of whitened residuals [m] with their Jacobian [m, p]; each at its share of :data:`ALPHA`."""
     from scipy.special import chdtrc, ndtr
 
+    # Residuals of a fit lie across the columns of the Jacobian; what is left of white noise there is correlated.
     basis, _ = np.linalg.qr(jacobian)
     free = len(residual) - jacobian.shape[1]
     variance = float(residual @ residual) / free

@@ -179,6 +179,7 @@ class ContactSolver:
     def force(self, arc: Array, deflection: Array) -> Array:
         """Return the force (N) of a small-bending deflection (m) at an arc (m)."""
         whisker = self.whisker
+        # Small bending of a cone under a load f at a: d = f a³ r(0) / (3 E I(0) r(a)).
         stiffness = 3 * float(whisker.bending_stiffness(0.0)) * whisker.radius(arc) / whisker.base_radius
         return stiffness * deflection / arc**3
 
@@ -228,6 +229,7 @@ class ContactSolver:
             values = self.residuals(unknowns + moves, frame, place, noise)
             return (values[:5] - values[5:]).T / (2 * _STEP)
 
+        # The sum of squares has several minima, such as a near contact with a large force and a far one with a small.
         best = None
         for start in self._starts(frame, place, noise, before):
             began = np.clip(start, low + 1e-3, high - 1e-3)
@@ -237,6 +239,7 @@ class ContactSolver:
                 best = minimum
         assert best is not None
         across = residual(best.x)[: len(points)] * noise
+        # Four unknowns follow distances across the shape; a shift along it changes none.
         spread = math.sqrt(float(np.sum(across**2)) / max(len(points) - 4, 1))
         matrix = jacobian(best.x) * (1.0 if self.options.noise else noise / spread)
         covariance: Any = np.linalg.pinv(matrix.T @ matrix, rcond=1e-14)
@@ -319,6 +322,7 @@ class ContactSolver:
             weights = [np.linalg.inv(some[k][1]) for k in use]
             information = sum(d.T @ w @ d for d, w in zip(design, weights, strict=True))
             weighted = sum(d.T @ w @ some[k][0] for d, w, k in zip(design, weights, use, strict=True))
+            # Generalised least squares: each frame weighs by the inverse covariance of its own logarithms.
             line, covariance = np.linalg.solve(information, weighted), np.linalg.inv(information)[:2, :2]
             # Unknowns given the logarithms: the Gaussian law of the frame's own fit, conditioned on them.
             gain = fits[index].covariance @ slope.T @ np.linalg.inv(spread)

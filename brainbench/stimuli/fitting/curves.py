@@ -48,6 +48,7 @@ def offsets_of_samples(place: Array, along: Array, bend: Array, points: Array) -
     ``place``, ``along`` and ``bend`` [n, m, 2 or 3] are positions and their first and second derivatives by any
     parameter that runs along the curve; ``points`` are as for :func:`normal_offsets`.
     """
+    # All points against all samples: some megabytes, and no search.
     between = points[:, :, None, :] - place[:, None]
     squares = np.nan_to_num(np.einsum("nkmi,nkmi->nkm", between, between), nan=np.inf)
     nearest = np.argmin(squares, axis=-1)[..., None]

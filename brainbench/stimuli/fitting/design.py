@@ -217,6 +217,7 @@ def find_motions(
             return -NOTHING, np.zeros(len(x))
         return -value, -by * width
 
+    # The search runs over the unit cube, in which all variables have one scale.
     at = (begin - limits[:, 0]) / width
     others = np.random.default_rng(options.seed).uniform(size=(options.starts, len(at)))
     tried = [at, *others]
@@ -264,6 +265,7 @@ def _soft_least(distances: Array) -> tuple[float, Array]:
     """Return a smooth lower bound of the smallest log D², NaN with unstable whiskers, and its slope by each log D²."""
     if np.isnan(distances).any():
         return math.nan, np.zeros(len(distances))
+    # −s log Σ exp(−xᵢ/s), the largest shift taken out so that nothing overflows.
     logs = np.log(np.maximum(distances, math.exp(NOTHING)))
     least = float(logs.min())
     weights = np.exp(-(logs - least) / SOFTNESS)

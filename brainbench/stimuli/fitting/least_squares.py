@@ -263,6 +263,7 @@ class _Problem:
             self.model.update_noise(self.model.residual(u), before)
             if minimum.status <= 0 or (step < 1e-3 and np.allclose(before, self.model.sigma, rtol=0.05)):
                 break
+        # Minima with other noise have other whitened residuals: only the likelihood compares them.
         deviance = self.model.deviance(self.residual(u))
         return _Solution(u, self.model.sigma.copy(), deviance, minimum is not None and minimum.status > 0, iterations)
 
@@ -277,9 +278,11 @@ def _judge(problem: _Problem, solutions: Sequence[_Solution], began: float) -> F
     stated = bool(np.isfinite(model.readings.noise).all())
     scale = 1.0 if stated else float(residual @ residual) / freedom
     combinations = directions(jacobian, free.names, math.sqrt(scale))
+    # Fisher information of the readings, and that of the priors, which no estimated noise scales.
     information = jacobian.T @ jacobian / scale + problem.prior_jacobian.T @ problem.prior_jacobian
     covariance = _inverse(information)
     errors = _simulation_errors(problem, u, jacobian, scale)
+    # Student's t, because the noise is estimated from the same residuals.
     t = quantile(options.level, math.inf if stated else freedom)
     profile = None
     if options.intervals == "profile":
@@ -432,6 +435,7 @@ def _wrench(trial: Trial, trace: Any) -> Array:
 
 def _inverse(information: Array) -> Array:
     """Return the inverse [p, p] of the information; infinite variances where it is singular."""
+    # An eigenvalue that vanishes is a combination that the data do not tell: all parameters in it are open.
     values, vectors = np.linalg.eigh(information)
     least = values.max(initial=0.0) * 1e-14
     if (values > least).all() and values.max(initial=0.0) > 0:

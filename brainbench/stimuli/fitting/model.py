@@ -146,7 +146,8 @@ class FitModel:
 
     def run(self, u: Array) -> GradientRun:
         """Simulate every trial at coordinates u [p], or return the last run if it was there."""
-        # Packing is differentiated by small changes, which must not lie beyond a bound.
+        # Packing is differentiated by small changes, which must not lie beyond a bound. The last run is kept, since SciPy
+        # asks for the residuals and then for the Jacobian at the same place.
         u = np.clip(u, self.limits[0] + SCALE / 1000, self.limits[1] - SCALE / 1000)
         if self._last is None or not np.array_equal(self._last.values, u):
             self._last = GradientRun(self._jobs, u, scales=np.full(len(u), SCALE), fidelity=self.fidelity)
@@ -168,6 +169,7 @@ class FitModel:
 
     def refined(self, u: Array) -> list[Array]:
         """Return by how much the residuals [m] at coordinates u [p] change in shorter steps, and with more links."""
+        # First the step alone, then step and links: two independent parts of the error, each by its own change.
         shorter = replace(self.fidelity, time_step=max(self.fidelity.time_step / SHORTER, 1e-7))
         finer = replace(shorter, links=min(2 * shorter.links, MOST_LINKS))
         coarse, *others = (self.scan([u], fidelity)[0] for fidelity in (self.fidelity, shorter, finer))
@@ -189,6 +191,8 @@ class FitModel:
 
     def jacobian(self, u: Array) -> Array:
         """Return the derivatives [m, p] of the whitened residuals."""
+        # Chain rule: ∂r/∂u = ∂r/∂(wrench, shape) · ∂(wrench, shape)/∂u + ∂r/∂(whisker) · ∂(whisker)/∂u. The
+        # second factor of the first term is exact.
         tangents = self.run(u).tangents()
         traces = self._traces(u)
         columns = []
@@ -228,6 +232,7 @@ class FitModel:
         Of the squares of n readings with p free parameters, n − p are noise; each group is taken to give up its share.
         Groups with fewer than :data:`FEWEST` readings have the relative noise of all, over the largest of their kind.
         """
+        # E Σ r² = σ² (n − p), so that the mean square is divided by 1 − p/n.
         readings, total = self.readings, len(self.readings)
         share = 1 - len(self.free) / total
         some = [index for index in np.flatnonzero(~np.isfinite(readings.noise)) if (readings.group == index).any()]

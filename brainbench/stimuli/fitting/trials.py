@@ -149,6 +149,7 @@ class Trial:
         frequency = float(references.natural_frequencies(whisker, 1)[0])
         if len(times) > 1:
             check_clock(times, frequency, whisker.damping_ratio)
+        # Long enough for the shaped loads to act and for what they stir up to decay.
         omega = 2 * math.pi * frequency
         settling = SETTLING / (max(whisker.damping_ratio, 0.05) * omega) + math.pi / omega
         job = Job(whisker, StillFollicle(), (), times, start=-settling)

@@ -2,7 +2,6 @@
 
 :class:`JobParameters` names parameters of jobs, :class:`GradientRun` simulates and differentiates
 (:mod:`brainbench.stimuli.fitting.derivatives`), :class:`ContactEvents` say where a gradient holds on one side only.
-:func:`brainbench.stimuli.fitting.gradients.autograd.simulate_tensors` is the same for PyTorch.
 """
 
 from brainbench.stimuli.fitting.gradients.parameters import JobParameters

@@ -162,6 +162,7 @@ class GradientRun:
         self.jobs = tuple(build(self.values.copy()))
         self.device = pick_device(device)
         check_jobs(RodEngine(device), self.jobs, self.fidelity, None)
+        # Two jobs a parameter, a little below and above: how packed numbers change is their difference.
         self._changed = [
             tuple(tuple(build(self.values + sign * width * (np.arange(len(self.values)) == p))) for sign in (-1, 1))
             for p, width in enumerate(self._widths)
