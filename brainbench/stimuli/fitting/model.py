@@ -146,8 +146,8 @@ class FitModel:
 
     def run(self, u: Array) -> GradientRun:
         """Simulate every trial at coordinates u [p], or return the last run if it was there."""
-        # Packing is differentiated by small changes, which must not lie beyond a bound. The last run is kept, since SciPy
-        # asks for the residuals and then for the Jacobian at the same place.
+        # Packing is differentiated by small changes, which must not lie beyond a bound. The last run is kept, because
+        # SciPy asks for the residuals and then for the Jacobian at the same place.
         u = np.clip(u, self.limits[0] + SCALE / 1000, self.limits[1] - SCALE / 1000)
         if self._last is None or not np.array_equal(self._last.values, u):
             self._last = GradientRun(self._jobs, u, scales=np.full(len(u), SCALE), fidelity=self.fidelity)
