@@ -227,9 +227,9 @@ def _timed_launches() -> list[tuple[str, int, int, dict[str, float]]]:
 
     def timed(self: Any, objects: Any, tries: Any = ()) -> Any:
         started = time.perf_counter()
-        result = launch(self, objects, tries)
+        result = launch(self, objects, launch)
         spent = {**self.seconds, "all": time.perf_counter() - started}
-        steps = " and ".join(str(finer) for _, finer in tries) or "1"
+        steps = " and ".join(str(finer) for _, finer in launch) or "1"
         seen.append((steps, result.verdict.until.size, self.solver.slices, spent))
         return result
 
@@ -240,12 +240,12 @@ def _timed_launches() -> list[tuple[str, int, int, dict[str, float]]]:
 def stages(args: argparse.Namespace) -> None:
     """Run the command in this process, and print when each shard was where and what its stages took."""
     from brainbench.cli import app
-    from brainbench.stimuli.engines.rod import tries
+    from brainbench.stimuli.engines.rod import launch
     from brainbench.stimuli.sweeps import running
 
     seen, moments, lock = _timed_launches(), [], threading.Lock()
     if args.ahead:
-        tries.ON_AN_IDLE_GPU = _tries(args.ahead)
+        launch.ON_AN_IDLE_GPU = _tries(args.ahead)
     if args.side_by_side:
         running.SIDE_BY_SIDE = args.side_by_side
     totals: dict[str, float] = {}

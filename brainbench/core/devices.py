@@ -131,10 +131,8 @@ def torch_device(name: Any) -> torch.device:
 def to_struct(kind: Any, values: Mapping[str, np.ndarray], device: Any) -> Any:
     """Fill a Warp structure of arrays; empty arrays become one unused element.
 
-    The fields of a record are the last axis of its array.
+    Arrays of records are structured, with the fields of the record in order.
     """
-    from numpy.lib.recfunctions import unstructured_to_structured
-
     wp = warp()
     struct = kind()
     for name, value in values.items():
@@ -143,6 +141,9 @@ def to_struct(kind: Any, values: Mapping[str, np.ndarray], device: Any) -> Any:
         if array.size == 0:
             array = np.zeros((1, *array.shape[1:]), dtype=array.dtype)
         if hasattr(dtype, "numpy_dtype"):
-            array = unstructured_to_structured(array, dtype.numpy_dtype())
+            record = np.dtype(dtype.numpy_dtype())
+            if array.dtype.names != record.names:
+                raise TypeError(f"{name} holds records of {record.names}; received {array.dtype.names}")
+            array = array.astype(record)
         setattr(struct, name, wp.array(array, dtype=dtype, device=device))
     return struct

@@ -25,6 +25,13 @@ def _turn(axis, angle):
     return np.eye(3) + np.sin(angle) * k + (1 - np.cos(angle)) * k @ k
 
 
+def _records(**columns):
+    records = np.zeros((CAPACITY, 1), dtype=[(name, float) for name in columns])
+    for name, values in columns.items():
+        records[name][: len(values), 0] = values
+    return records
+
+
 @dataclass
 class DenseChain:
     """Links with two hinges each (about y, then z) on a base that moves. mg, mm, ms, mN.
@@ -45,7 +52,7 @@ class DenseChain:
     rate: np.ndarray
     torsion: np.ndarray
     beta: float = 0.1
-    base_turn: np.ndarray = None
+    base_quaternion: np.ndarray = None
     """Unit quaternion (w, x, y, z)."""
     base_twist: np.ndarray = None
     """Angular velocity and velocity [6]."""
@@ -63,7 +70,7 @@ class DenseChain:
             stiffness=rng.uniform(1, 20, links),
             angle=rng.uniform(-0.5, 0.5, (links, 2)),
             rate=rng.normal(size=(links, 2)) * 0.2,
-            base_turn=turn / np.linalg.norm(turn),
+            base_quaternion=turn / np.linalg.norm(turn),
             base_twist=rng.normal(size=6) * 0.2,
             torsion=np.zeros(links),
         )
@@ -94,14 +101,16 @@ class DenseChain:
     def arrays(self):
         """Return the fields of ``ChainArrays``, for one whisker."""
         n = self.links
-        build, inertia, taper = (np.zeros((CAPACITY, 1, width)) for width in (4, 2 + self.hinges, 4))
         rest = np.where(self.torsion > 0, self.rest / 2, self.rest)
-        build[:n, 0] = np.stack([self.length, np.cos(rest), np.sin(rest), self.mass], axis=1)
-        springs = (self.stiffness, self.torsion)[: self.hinges - 1]
-        inertia[:n, 0] = np.column_stack([self.centre, self.inertia, *springs])
+        springs = {"stiffness": self.stiffness, "torsion": self.torsion}
+        if self.hinges == 2:
+            del springs["torsion"]
         radius = np.linspace(0.05, 0.01, n + 1)
         arc = np.concatenate([[0], np.cumsum(self.length)])
-        taper[:n, 0] = np.stack([radius[:-1], radius[1:], arc[:-1], self.length], axis=1)
+        build = _records(length=self.length, bend_cosine=np.cos(rest), bend_sine=np.sin(rest), mass=self.mass)
+        axial, transverse = self.inertia.T
+        inertia = _records(centre=self.centre, axial=axial, transverse=transverse, **springs)
+        taper = _records(start_radius=radius[:-1], end_radius=radius[1:], arc=arc[:-1], arc_length=self.length)
         return {
             "links": np.array([n], dtype=np.int32), "beta": np.array([self.beta]), "friction": np.zeros(1),
             "length": arc[-1:], "build": build, "inertia": inertia, "taper": taper,
@@ -109,7 +118,7 @@ class DenseChain:
 
     def pose(self, time=0.0):
         """Base frame, joints [link + 1, 3], axes (a list [hinge, 3] per link) and frames [link, 3, 3], a time later."""
-        w, *v = self.base_turn
+        w, *v = self.base_quaternion
         k = np.cross(AXES, v)
         frame = np.eye(3) + 2 * w * k + 2 * k @ k
         spin = self.base_twist[:3]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from brainbench.geometry.distance import point_triangle_distance
-from brainbench.stimuli.engines.rod.mesh_bvh import WIDE
+from brainbench.stimuli.engines.rod.limits import WIDE
 
 NONE_LEFT = 2**31 - 1
 
@@ -73,11 +73,13 @@ def pass_joint(_children, joints, joint, twists, step, _each, unit):
     j, w, v = joints[joint], unit.w.values, unit.v.values
 
     def rates(which):
-        return getattr(j, f"axis{which}") @ w + getattr(j, f"moment{which}") @ v
+        motion = getattr(j, f"motion{which}")
+        return motion.w @ w + motion.v @ v
 
     def pass_on(which, rate):
-        w[:] -= np.outer(getattr(j, f"gain{which}_w"), rate)
-        v[:] -= np.outer(getattr(j, f"gain{which}_v"), rate)
+        gain = getattr(j, f"gain{which}")
+        w[:] -= np.outer(gain.w, rate)
+        v[:] -= np.outer(gain.v, rate)
 
     inverse = j.inverse_inertia
     if twists:

@@ -21,8 +21,14 @@ from tests.factories.rod_native import NATIVES
 WARP = 32
 
 
-class Memory:
+class Memory(np.lib.mixins.NDArrayOperatorsMixin):
     """An array or a thread's memory: reading copies, writing counts."""
+
+    def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: object, **options: object) -> object:
+        """Calculate with the values."""
+        return getattr(ufunc, method)(
+            *(part.values if isinstance(part, Memory) else part for part in inputs), **options
+        )
 
     def __init__(self, values: np.ndarray) -> None:
         self.values = values
@@ -32,7 +38,11 @@ class Memory:
         return found.copy() if isinstance(found, np.ndarray) else found
 
     def __setitem__(self, key: object, value: object) -> None:
-        self.values[key] = value
+        self.values[key] = _values(value)
+
+
+def _values(part: object) -> object:
+    return part.values if isinstance(part, Memory) else part
 
 
 class Records(Memory):
@@ -49,10 +59,14 @@ class _Record:
     def __getattr__(self, name: str) -> object:
         values, key = self._at
         found = values[name][key]
+        if found.dtype.names:
+            return SimpleNamespace(**{part: found[part].copy() for part in found.dtype.names})
         return found.copy() if isinstance(found, np.ndarray) else found
 
     def __setattr__(self, name: str, value: object) -> None:
         values, key = self._at
+        if values[name].dtype.names:
+            value = tuple(tuple(_values(getattr(value, part))) for part in values[name].dtype.names)
         values[name][key] = value
 
 
@@ -137,7 +151,7 @@ def _language() -> ModuleType:
     def zeroed(kind):
         def begin(self):
             for name, made in kind.__annotations__.items():
-                setattr(self, name, made() if made in (int, np.float64) or isinstance(made, FunctionType) else 0)
+                setattr(self, name, made() if isinstance(made, type | FunctionType) else 0)
 
         kind.__init__ = begin
         return kind

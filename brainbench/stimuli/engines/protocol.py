@@ -9,7 +9,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +21,7 @@ from brainbench.stimuli.motion.jobs import Job, Trace
 
 if TYPE_CHECKING:
     from brainbench.stimuli.objects.solid import Solid
-    from brainbench.stimuli.sweeps.sweep_scenes import SweepScenes
+    from brainbench.stimuli.whiskers.array import WhiskerArray
 
 
 def run_groups(
@@ -49,6 +49,20 @@ def run_groups(
             pool.shutdown(wait=False, cancel_futures=True)
             raise
     return [traces[index] for index in range(total)]
+
+
+class PassiveSweeps(Protocol):
+    """Sweeps as an engine takes them: an array, objects by name, and how each passes."""
+
+    grid: Any
+    """Has ``mover``, ``head``, ``frames``, ``start``, ``placing``, the ``count`` of passes of an object, and these by
+    ``sweeps(name)`` with ``speed``, ``height``, ``rotation``, ``distance`` and ``size``."""
+    array: WhiskerArray
+    objects: tuple[str, ...]
+
+    def solid(self, name: str) -> Solid:
+        """Return an object."""
+        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,7 +184,7 @@ class WhiskerEngine(ABC):
         """
 
     def prepare_sweeps(  # noqa: B027 — as for prepare
-        self, scenes: SweepScenes, fidelity: Fidelity
+        self, scenes: PassiveSweeps, fidelity: Fidelity
     ) -> None:
         """Do, in a thread, what the first :meth:`run_sweeps` would wait for, such as compiling; no object is loaded."""
 
@@ -180,7 +194,7 @@ class WhiskerEngine(ABC):
 
     def run_sweeps(
         self,
-        scenes: SweepScenes,
+        scenes: PassiveSweeps,
         indices: Sequence[int],
         fidelity: Fidelity,
         *,

@@ -9,7 +9,7 @@ from typing import Any
 
 from brainbench.core.devices import warp
 from brainbench.stimuli.engines.rod.limits import CONTACT_BOUNDS, DISTANCE_BOUNDS, MESHES
-from brainbench.stimuli.engines.rod.streams import turn
+from brainbench.stimuli.engines.rod.slices import lock_of
 
 
 def load_kernels(
@@ -41,7 +41,7 @@ def load_kernels(
             sliced = options.get("sliced", False)
             kernels = build_kernels(real, capacity, sliced=sliced, hinges=hinges, recorder=recorder)
     if device.is_cuda and options.get("sliced"):
-        with kernels.loading, turn(device):
+        with kernels.loading, lock_of(device):
             _load_together(kernels, options["bounds"][0], device)
         return kernels
     if device.is_cuda and options:  # compiled at their launch, for the blocks that it asks for
@@ -49,8 +49,8 @@ def load_kernels(
     block = 1 if device.is_cpu else None
     with kernels.loading:
         module = kernels.run.module
-        kept = Path(warp().config.kernel_cache_dir, module.get_module_identifier(block)).is_dir()
-        tell = (lambda begins: None) if kept or compiling is None else compiling
+        compiled = Path(warp().config.kernel_cache_dir, module.get_module_identifier(block)).is_dir()
+        tell = (lambda begins: None) if compiled or compiling is None else compiling
         tell(True)
         module.load(device, block_dim=block)
         tell(False)

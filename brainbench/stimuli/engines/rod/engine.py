@@ -14,18 +14,23 @@ from numpy.typing import NDArray
 from brainbench.core.devices import pick_device, usable_processors, warp
 from brainbench.core.progress import Progress as NamedProgress
 from brainbench.stimuli.engines.fidelity import Fidelity
-from brainbench.stimuli.engines.protocol import Progress, SweepBatch, WhiskerEngine, run_groups
+from brainbench.stimuli.engines.protocol import PassiveSweeps, Progress, SweepBatch, WhiskerEngine, run_groups
 from brainbench.stimuli.engines.rod.compilation import load_kernels
-from brainbench.stimuli.engines.rod.launch import LaunchResult, WhiskerSolver, real_type
+from brainbench.stimuli.engines.rod.launch import (
+    LaunchResult,
+    Try,
+    WhiskerSolver,
+    real_type,
+    run_with_retries,
+    tries_ahead,
+)
 from brainbench.stimuli.engines.rod.packing import Track, capacity_for
 from brainbench.stimuli.engines.rod.shapes import PackedSurface
 from brainbench.stimuli.engines.rod.tasks import JobTask, PackedTasks, make_task
-from brainbench.stimuli.engines.rod.tries import Try, run_with_retries, tries_ahead
 from brainbench.stimuli.engines.stepping import silent_trace
 from brainbench.stimuli.engines.trust import check_jobs, without_escape
 from brainbench.stimuli.motion.jobs import Job, Trace
 from brainbench.stimuli.objects.solid import Solid
-from brainbench.stimuli.sweeps.sweep_scenes import SweepScenes
 
 SLICE = 65_536
 """Whiskers of one launch on a GPU: bounds the memory of a run."""
@@ -95,7 +100,7 @@ class RodEngine(WhiskerEngine):
         threads = 1 if device.is_cuda else workers or usable_processors()
         return run_groups(slices, run, threads=threads, progress=progress)
 
-    def prepare_sweeps(self, scenes: SweepScenes, fidelity: Fidelity) -> None:
+    def prepare_sweeps(self, scenes: PassiveSweeps, fidelity: Fidelity) -> None:
         """See :meth:`brainbench.stimuli.engines.protocol.WhiskerEngine.prepare_sweeps`."""
         from brainbench.stimuli.engines.rod.sweeps import SweepLauncher
 
@@ -115,7 +120,7 @@ class RodEngine(WhiskerEngine):
 
     def run_sweeps(
         self,
-        scenes: SweepScenes,
+        scenes: PassiveSweeps,
         indices: Sequence[int],
         fidelity: Fidelity,
         *,
@@ -175,8 +180,8 @@ def _simulate_alike(
         return result.split(counts)
 
     result = run_with_retries(launch, retry, ahead=lambda: tries_ahead(device))
-    found = (trace_of(result, row, task.job, fidelity, seconds[row]) for row, task in enumerate(given))
-    return dict(zip(tasks, found, strict=True))
+    traces = (trace_of(result, row, task.job, fidelity, seconds[row]) for row, task in enumerate(given))
+    return dict(zip(tasks, traces, strict=True))
 
 
 def trace_of(result: LaunchResult, row: int, job: Job, fidelity: Fidelity, seconds: float) -> Trace:

@@ -1,10 +1,20 @@
-"""One launch of the whisker kernel, for scenes and for sweeps: packed jobs go in, judged results come out."""
+"""One launch of the whisker kernel: packed jobs go in, judged results come out, and who is in doubt is tried again.
+
+Few whiskers take a GPU as long as the one with most steps. With steps over 2, 5, 10 and 20 one after the other these
+waits add up to 38 times that of the first simulation; with 2 and 5, then 10 and 20 at the same time to 26. But half of
+the tries that are simulated ahead are not needed: where other whiskers would have the GPU meanwhile, they cost more
+time than they save (benchmarks/RESULTS.md, "Sweeps on a GPU, by the public command").
+"""
 
 from __future__ import annotations
 
+import math
+import threading
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
@@ -15,9 +25,8 @@ from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.rod.compilation import load_kernels
 from brainbench.stimuli.engines.rod.limits import LIGHT, LONGEST_SPAN, TO_ROUNDING, contact_iterations
 from brainbench.stimuli.engines.rod.packing import PackedJobs, PackedMotions, capacity_for, pack_chains
-from brainbench.stimuli.engines.rod.scheduling import Slices, allocate, make_problems
 from brainbench.stimuli.engines.rod.shapes import PackedShapes
-from brainbench.stimuli.engines.rod.streams import download, turn
+from brainbench.stimuli.engines.rod.slices import Slices, allocate, download, lock_of, make_problems, parts_of
 from brainbench.stimuli.engines.trust import (
     FEWEST_READINGS,
     RunFacts,
@@ -31,6 +40,50 @@ from brainbench.stimuli.engines.trust import (
 from brainbench.stimuli.engines.units import MILLI
 from brainbench.stimuli.whiskers.chain import Chain
 
+
+@dataclass(frozen=True, eq=False)
+class Approach:
+    """How objects come at whiskers, in the words of :class:`brainbench.stimuli.engines.trust.RunFacts`.
+
+    Numbers of one whisker, or arrays [row, column] of those of a launch.
+    """
+
+    travel: Any = 0.0
+    farthest: Any = math.inf
+    fast_at: Any = math.inf
+    struck: Any = False
+
+    @classmethod
+    def table(cls, approaches: Sequence[Approach]) -> Approach:
+        """Return those of jobs as arrays [job, 1]."""
+        names = [each.name for each in fields(cls)]
+        return cls(**{name: np.array([[getattr(approach, name)] for approach in approaches]) for name in names})
+
+
+@dataclass(frozen=True, eq=False)
+class Launch:
+    """What is simulated in one launch."""
+
+    jobs: PackedJobs
+    motions: PackedMotions
+    """Of bases and objects."""
+    shapes: PackedShapes
+    """Of all scenes."""
+    readings: NDArray[np.float64]
+    """Times (s) at which results are read."""
+    size: tuple[int, int]
+    """Rows and columns of the results; whiskers that stand in none of them are as if at rest."""
+    start: float = 0.0
+    """Beginning of the simulation (s)."""
+    gravity: Sequence[float] = (0.0, 0.0, 0.0)
+    """[3] m/s²."""
+    axes: NDArray[np.float64] | None = None
+    """Rotation [3, 3] of the results; none when None."""
+    approach: Approach = field(default_factory=Approach)
+    record_shape: bool = False
+    """Whether shapes and contact wrenches are results too; jobs then stand in their rows in order."""
+
+
 _NUMBERS = ("depth", "failed", "miss", "load")
 _COUNTS = ("status", "steps", "touching", "crowded", "unsolved")
 """Results of each job besides its readings."""
@@ -38,7 +91,7 @@ _COUNTS = ("status", "steps", "touching", "crowded", "unsolved")
 
 @dataclass(eq=False)
 class LaunchResult:
-    """Results of a launch, in a table of jobs: rows are the jobs of scenes, or sweeps; columns are whiskers, or one."""
+    """Results of a launch in a table of jobs, whose rows and columns the launch names."""
 
     wrench: NDArray[np.floating]
     """[row, reading, column, 6] action of the whisker on its base (N, N·m)."""
@@ -87,7 +140,8 @@ class LaunchResult:
         self.wrench[row, :, column], self.contact[row, :, column] = finer.wrench[:, :, 0], finer.contact[:, :, 0]
         finer.counts["steps"] += self.steps[which][:, None]
         mine, theirs = (
-            [*one.counts.values(), *vars(one.verdict).values(), one.depth, one.residual] for one in (self, finer)
+            [*result.counts.values(), *vars(result.verdict).values(), result.depth, result.residual]
+            for result in (self, finer)
         )
         for values, new in zip(mine, theirs, strict=True):
             values[which] = new[:, 0]
@@ -100,8 +154,8 @@ class LaunchResult:
         """Return these results, some whiskers [row, column] judged by a launch of them alone."""
         row, column = np.nonzero(which)
         change = np.full(which.shape, np.nan)
-        found = force_change(self.wrench[row, :, column, None, :3], half.wrench[..., :3])
-        change[which] = np.where(half.verdict.unstable, np.nan, found)[:, 0]
+        changes = force_change(self.wrench[row, :, column, None, :3], half.wrench[..., :3])
+        change[which] = np.where(half.verdict.unstable, np.nan, changes)[:, 0]
         self.verdict = halved(self.verdict, change, which)
         self.counts["steps"][which] += half.steps[:, 0]
         return self
@@ -142,7 +196,7 @@ class WhiskerSolver:
             options["sliced"] = sliced
         self.kernels = load_kernels(device, self.real, self.capacity, needs, hinges=hinges, **options)
         packed = pack_chains(self.capacity, self.chains, self.quasistatic, hinges)
-        with turn(device):
+        with lock_of(device):
             self.chain_arrays = to_struct(self.kernels.structs.ChainArrays, packed, device)
         self.block = {} if block is None else {"block_dim": block}
         self.steps = np.array([fidelity.step_of(chain) * MILLI for chain in self.chains])
@@ -155,142 +209,108 @@ class WhiskerSolver:
 
     def free(self) -> None:
         """Give back what is on the device; no launch may follow."""
-        with turn(self.device):
+        with lock_of(self.device):
             del self.chain_arrays
 
-    def launch(
-        self,
-        jobs: PackedJobs,
-        motions: PackedMotions,
-        shapes: PackedShapes,
-        readings: NDArray[np.float64],
-        size: tuple[int, int],
-        *,
-        start: float = 0.0,
-        gravity: Sequence[float] = (0.0, 0.0, 0.0),
-        axes: NDArray[np.float64] | None = None,
-        fast: NDArray[np.float64] | None = None,
-        record_shape: bool = False,
-    ) -> LaunchResult:
-        """Simulate jobs.
-
-        Args:
-            jobs, motions, shapes: what to simulate; motions are those of bases and objects, shapes those of all scenes.
-            readings: times (s) at which results are read.
-            size: rows and columns of the results; jobs that stand in none of them are as if at rest.
-            start, gravity: beginning of the simulation (s), acceleration [3] (m/s²).
-            axes: rotation [3, 3] of the results; none when None.
-            fast: [4, row, column] ``travel``, ``farthest``, ``fast_at`` and ``struck`` of
-                :class:`brainbench.stimuli.engines.trust.RunFacts`; never when None.
-            record_shape: also return shapes and contact wrenches; jobs then stand in their rows in order.
-        """
-        device = self.device
+    def launch(self, given: Launch) -> LaunchResult:
+        """Simulate jobs."""
+        device, jobs, size = self.device, given.jobs, given.size
         clock = [time.perf_counter()]
-        count = len(jobs)
-        inputs, out, shapes_of = self._upload(jobs, motions, shapes, readings, size, start, gravity, axes, record_shape)
+        scene, problems, results, shapes_of = self._upload(given)
         clock.append(time.perf_counter())
-        slices = self._take_steps(inputs, count, urgent=bool((jobs.finer > 1).all()))
+        stream = self._take_steps(scene, problems, results, jobs)
         clock.append(time.perf_counter())
-        found = download({name: getattr(out, name) for name in (*shapes_of, "contact")}, slices and slices.stream)
-        with turn(device):
-            # What a GPU holds of this launch is given back in a turn too.
-            del out, inputs, slices
+        values = download({name: getattr(results, name) for name in (*shapes_of, "contact")}, stream)
+        with lock_of(device):
+            # What a GPU holds of this launch is given back under the lock too.
+            del scene, problems, results
         clock.append(time.perf_counter())
 
-        def table(values: NDArray) -> NDArray:
-            whole = np.zeros(size, dtype=values.dtype)
-            whole[jobs.row, jobs.column] = values
+        def table(column: NDArray) -> NDArray:
+            whole = np.zeros(size, dtype=column.dtype)
+            whole[jobs.row, jobs.column] = column
             return whole
 
-        counts = {name: table(found[name]) for name in _COUNTS}
-        wrench, missed = found["wrench"], table(residual(found["miss"], found["load"]))
-        depth = table(found["depth"].astype(float)) / MILLI
+        counts = {name: table(values[name]) for name in _COUNTS}
+        wrench, missed = values["wrench"], table(residual(values["miss"], values["load"]))
+        depth = table(values["depth"].astype(float)) / MILLI
         force = np.sqrt(np.einsum("...d,...d", wrench[..., :3], wrench[..., :3]))
         peak, strongest = force.max(axis=1), table(self.strongest[jobs.whisker])
-        strength, strong_at = _first_beyond(strongest, force, readings)
-        never = np.array([0.0, np.inf, np.inf, 0.0])
-        travel, farthest, fast_at, struck = np.multiply.outer(never, np.ones(size)) if fast is None else fast
+        strength, strong_at = _first_beyond(strongest, force, given.readings)
         facts = RunFacts(
             status=counts["status"],
             # Single precision rounds a late time; the reading at it must not pass for one before it.
-            failed=start + table(found["failed"].astype(float)) * (1 - 2e-7) / MILLI,
+            failed=given.start + table(values["failed"].astype(float)) * (1 - 2e-7) / MILLI,
             strength=strength,
             strong_at=strong_at,
             strongest=strongest,
-            travel=travel,
-            farthest=farthest,
-            fast_at=fast_at,
-            struck=struck.astype(bool),
+            **{name: np.broadcast_to(value, size) for name, value in vars(given.approach).items()},
             residual=missed,
             crowded=counts["crowded"],
             steps=counts["steps"],
             depth=depth,
             peak=peak,
-            third=np.partition(force, -3, axis=1)[:, -3] if len(readings) >= FEWEST_READINGS else peak,
+            third=np.partition(force, -3, axis=1)[:, -3] if len(given.readings) >= FEWEST_READINGS else peak,
         )
-        result = LaunchResult(wrench, found["contact"], counts, depth, missed, judge(facts), np.zeros(size, dtype=bool))
+        result = LaunchResult(
+            wrench, values["contact"], counts, depth, missed, judge(facts), np.zeros(size, dtype=bool)
+        )
         result.seconds = dict(zip(("upload", "kernel", "download"), np.diff(clock).tolist(), strict=True))
-        if record_shape:
-            result.points = np.moveaxis(found["points"].astype(float) / MILLI, 2, 0)
-            forces = found["contact_wrench"].astype(float)
-            result.contact_wrench = np.moveaxis(forces, 2, 0).reshape(count, len(readings), 6)
+        if given.record_shape:
+            result.points = np.moveaxis(values["points"].astype(float) / MILLI, 2, 0)
+            forces = values["contact_wrench"].astype(float)
+            result.contact_wrench = np.moveaxis(forces, 2, 0).reshape(len(jobs), len(given.readings), 6)
         return result
 
-    def _upload(
-        self,
-        jobs: PackedJobs,
-        motions: PackedMotions,
-        shapes: PackedShapes,
-        readings: NDArray[np.float64],
-        size: tuple[int, int],
-        start: float,
-        gravity: Sequence[float],
-        axes: NDArray[np.float64] | None,
-        record_shape: bool,
-    ) -> tuple[list[Any], Any, dict[str, Any]]:
-        """Return the arguments of the kernel but for the last, the results among them, and their shapes."""
-        wp, structs, device = warp(), self.kernels.structs, self.device
-        count, frames = len(jobs), len(readings)
+    def _upload(self, given: Launch) -> tuple[Any, Any, Any, dict[str, Any]]:
+        """Return scene, contact problems and results on the device, and the shapes of the results."""
+        wp, structs, device, jobs = warp(), self.kernels.structs, self.device, given.jobs
+        size, count, frames = given.size, len(jobs), len(given.readings)
         options = structs.StepOptions()
         options.quasistatic = int(self.quasistatic)
         weight = LIGHT if self.quasistatic else 1.0
         # Quasistatic whiskers have masses that are scaled by LIGHT; gravity is scaled back, so that their weight stays.
-        options.gravity = structs.vec3(*np.divide(gravity, MILLI * weight).tolist())
-        options.axes = structs.mat33(*(np.eye(3) if axes is None else axes).ravel().tolist())
-        options.shape = int(record_shape)
+        options.gravity = structs.vec3(*np.divide(given.gravity, MILLI * weight).tolist())
+        options.axes = structs.mat33(*(np.eye(3) if given.axes is None else given.axes).ravel().tolist())
+        options.shape = int(given.record_shape)
         # Readings end a step: where they are nearer than a step, a part of it could be the same step once more.
-        steps, between = self.steps[jobs.whisker], float(np.median(np.diff(readings, prepend=start))) * MILLI
+        steps = self.steps[jobs.whisker]
+        between = float(np.median(np.diff(given.readings, prepend=given.start))) * MILLI
         steps = np.where(jobs.finer > 1, np.minimum(steps, max(between, 1e-4)), steps)
-        given = (
-            (structs.MotionArrays, motions.arrays()),
-            (structs.ShapeArrays, shapes.arrays()),
-            (structs.JobArrays, jobs.arrays(self.chains, steps, start)),
-            (structs.ReadingArrays, _readings(readings - start)),
-        )
+        parts = {
+            "motions": (structs.MotionArrays, given.motions.arrays()),
+            "shapes": (structs.ShapeArrays, given.shapes.arrays()),
+            "jobs": (structs.JobArrays, jobs.arrays(self.chains, steps, given.start)),
+            "readings": (structs.ReadingArrays, _readings(given.readings - given.start)),
+        }
         shapes_of = dict.fromkeys((*_NUMBERS, *_COUNTS), count) | {
             "wrench": (size[0], frames, size[1], 6),
-            "points": (frames, self.capacity + 1, count) if record_shape else (1, 1, 1),
-            "contact_wrench": (frames, 2, count) if record_shape else (1, 1, 1),
+            "points": (frames, self.capacity + 1, count) if given.record_shape else (1, 1, 1),
+            "contact_wrench": (frames, 2, count) if given.record_shape else (1, 1, 1),
         }
-        with turn(device):
-            out = allocate(structs.ResultArrays, device, **shapes_of)
-            out.contact = wp.full((size[0], frames, size[1]), -1.0, dtype=self.real, device=device)
-            *scene, reading = [to_struct(kind, values, device) for kind, values in given]
+        with lock_of(device):
+            results = allocate(structs.ResultArrays, device, **shapes_of)
+            results.contact = wp.full((size[0], frames, size[1]), -1.0, dtype=self.real, device=device)
+            scene = structs.SceneArrays()
+            scene.chains, scene.options = self.chain_arrays, options
+            for name, (kind, values) in parts.items():
+                setattr(scene, name, to_struct(kind, values, device))
             problems = make_problems(self.kernels, self.capacity, count, device, self.iterations)
-        return [self.chain_arrays, *scene, options, reading, out, problems], out, shapes_of
+        return scene, problems, results, shapes_of
 
-    def _take_steps(self, inputs: list[Any], count: int, *, urgent: bool) -> Slices | None:
-        """Take all whiskers to their last reading; return the slices, if these are what it was done in."""
-        wp, device = warp(), self.device
+    def _take_steps(self, scene: Any, problems: Any, results: Any, jobs: PackedJobs) -> Any:
+        """Take all whiskers to their last reading; return the stream in which that is done, None of a processor."""
+        wp, device, count = warp(), self.device, len(jobs)
         if self.sliced:
-            with turn(device):
+            with lock_of(device):
+                # Whiskers that are simulated again go first: others wait for them.
+                urgent = bool((jobs.finer > 1).all())
                 slices = Slices(self.kernels, self.capacity, count, device, urgent=urgent, **self.tuning)
-            self.slices = slices.run(inputs, self.block["block_dim"])
-            return slices
-        with turn(device):
-            wp.launch(
-                self.kernels.run, count, [*inputs, self.kernels.structs.PausedWhiskers()], device=device, **self.block
-            )
+            self.slices = slices.run(scene, problems, results, self.block["block_dim"])
+            return slices.stream
+        with lock_of(device):
+            inputs = [*parts_of(scene), problems, self.kernels.structs.PausedWhiskers(), results]
+            wp.launch(self.kernels.run, count, inputs, device=device, **self.block)
             wp.synchronize_device(device)
         return None
 
@@ -314,7 +334,9 @@ def _readings(times: NDArray[np.float64]) -> dict[str, NDArray]:
     tick = np.floor(all_times)
     row = np.full(len(which), -1, dtype=np.int32)
     row[last] = np.arange(len(times))
-    return {"time": np.stack([tick, all_times - tick], axis=1), "row": row}
+    time = np.zeros(len(which), dtype=[("tick", "i4"), ("part", "f8")])
+    time["tick"], time["part"] = tick, all_times - tick
+    return {"time": time, "row": row}
 
 
 def _first_beyond(
@@ -326,3 +348,98 @@ def _first_beyond(
     first = wild.argmax(axis=1)
     at = np.where(wild.any(axis=1), readings[first], np.inf)
     return np.take_along_axis(strength, first[:, None], axis=1)[:, 0], at
+
+
+Try = tuple[NDArray[np.bool_] | None, int]
+"""Whiskers to simulate, all when None, and what divides their steps."""
+Ahead = tuple[Sequence[int], Sequence[int]]
+"""Multiples of ``retry`` by which steps are divided at once for whiskers in doubt: right after the first simulation,
+and after that with steps over ``retry``."""
+ONE_BY_ONE: Ahead = (), (2,)
+"""Only what is needed: who is in doubt with steps over ``retry`` needs those over twice that, as a half or as a try."""
+ON_AN_IDLE_GPU: Ahead = (1,), (2, 4)
+"""Tries at the same time where nothing else waits for the GPU."""
+
+_FIRST: Counter[str] = Counter()
+"""First simulations that threads of this process have under way, by device."""
+_LOCK = threading.Lock()
+
+
+def run_with_retries(
+    simulate: Callable[[Sequence[Try]], Sequence[LaunchResult]],
+    retry: int,
+    *,
+    ahead: Callable[[], Ahead] = lambda: ONE_BY_ONE,
+) -> LaunchResult:
+    """Simulate whiskers, and those that finer steps may mend again: with steps over ``retry``, then over twice that.
+
+    After each of these, suspicious whiskers are compared with half the step (:func:`.trust.halved`), at first
+    with steps over ``retry`` where they meet a blow.
+
+    Args:
+        simulate: gives the results of tries, which may be simulated at the same time; whiskers of a mask are in its
+            order, and alone.
+        retry: 1 leaves all whiskers as they are.
+        ahead: gives the tries to simulate before it is known whether they are needed, where further whiskers cost
+            less time than further launches; asked before each. Results do not depend on it.
+    """
+    (result,) = simulate([(None, 1)])
+    if retry == 1:
+        return result
+    simulated: dict[int, list[tuple[NDArray[np.bool_], LaunchResult]]] = {}
+
+    def run(wanted: Mapping[int, NDArray[np.bool_]]) -> None:
+        """Simulate whiskers, by what divides their steps, unless that was done before."""
+        tries = []
+        for finer, which in wanted.items():
+            missing = which & ~np.any([some for some, _ in simulated.setdefault(finer, [])], axis=0)
+            if missing.any():
+                tries.append((missing, finer))
+        for (which, finer), part in zip(tries, simulate(tries) if tries else (), strict=True):
+            simulated[finer].append((which, part))
+
+    def parts(which: NDArray[np.bool_], finer: int) -> Iterator[tuple[NDArray[np.bool_], LaunchResult]]:
+        """Yield these whiskers in parts with their results."""
+        for mask, part in simulated[finer]:
+            some = which & mask
+            if some.any():
+                yield some, part.picked(some[mask])
+
+    left = np.ones_like(result.verdict.retryable)
+    for place, finer in enumerate((1, retry, 2 * retry)):
+        if finer > 1:
+            left = result.verdict.retryable.copy()
+            run({finer: left})
+            for some, part in parts(left, finer):
+                result = result.replaced(some, part)
+        suspicious = result.verdict.suspicious & left
+        doubtful = suspicious | result.verdict.retryable
+        # Contacts may cut the step of a blow and its half to the same.
+        divisors = np.where(result.verdict.struck, max(retry, 2 * finer), 2 * finer)
+        compared = {int(divisor): suspicious & (divisors == divisor) for divisor in np.unique(divisors)}
+        run(compared | {retry * k: doubtful for k in (*ahead(), ())[place]})
+        for divisor, which in compared.items():
+            for some, half in parts(which, divisor):
+                result = result.compared(some, half)
+    return result
+
+
+@contextmanager
+def first_simulation(device: Any) -> Iterator[None]:
+    """Tell other threads that all whiskers of some sweeps are simulated on a device, which fills a GPU."""
+    with _LOCK:
+        _FIRST[device.alias] += 1
+    try:
+        yield
+    finally:
+        with _LOCK:
+            _FIRST[device.alias] -= 1
+
+
+def tries_ahead(device: Any) -> Ahead:
+    """Return the tries ahead (:func:`run_with_retries`) as the device is busy now.
+
+    One by one on a processor, and on a GPU while any thread simulates sweeps for the first time: as long as shards
+    queue, one of those that run does.
+    """
+    return ON_AN_IDLE_GPU if device.is_cuda and not _FIRST[device.alias] else ONE_BY_ONE

@@ -47,6 +47,11 @@ ANYWHERE = 1e6
 """The same (mm) for a link that may have got inside unseen: the nearest triangle tells inside from outside."""
 PARTS = 8
 """Parts of a link at whose ends its overlap with a surface is measured."""
+BITS = 3
+WIDE = 1 << BITS
+"""Children of a node of a search tree, and triangles of a leaf."""
+LEVELS = 7
+"""Levels of boxes that a search keeps track of: enough for 16 million triangles."""
 LONGEST_SPAN = 32.0
 """Longest time (ms) between two places where time is kept exactly."""
 TRAVEL = 0.25

@@ -25,6 +25,12 @@ GRID = 32.0
 """Knots are kept as a multiple of this (mm), exact in single precision up to kilometres, and the rest."""
 
 
+KNOT = np.dtype(
+    [("place", "f8", 3), ("velocity", "f8", 3), ("quaternion", "f8", 4), ("spin", "f8", 3), ("surge", "f8", 3)]
+)
+"""A knot of a track: place (mm), velocity, quaternion, angular velocity (rad/ms), angular acceleration."""
+
+
 @dataclass
 class PackedMotions:
     """Motions as cubic pieces, all from the start of the launch: knots and cells of all tracks one behind the other."""
@@ -33,8 +39,8 @@ class PackedMotions:
     count: list[int] = field(default_factory=list)
     cells: list[NDArray[np.int32]] = field(default_factory=list)
     """Per moving track the first knot of each cell, and the last knot of all."""
-    knots: list[NDArray[np.float64]] = field(default_factory=list)
-    """Per track [knot, 16]: place, velocity, quaternion, angular velocity, angular acceleration (mm, ms)."""
+    knots: list[NDArray[np.void]] = field(default_factory=list)
+    """[knot] of :data:`KNOT` per track."""
     _sizes: list[int] = field(default_factory=lambda: [0, 0])
     """Knots and entries of ``cells`` so far."""
 
@@ -49,32 +55,29 @@ class PackedMotions:
         self._sizes[1] += len(track.cells)
         return len(self.first) - 1
 
-    def add_straight(self, knots: NDArray[np.float64]) -> NDArray[np.int32]:
-        """Append bodies [body, 16] that stand or move straight from the start; return their tracks [body]."""
+    def add_straight(self, knots: NDArray[np.void]) -> NDArray[np.int32]:
+        """Append bodies of one knot each [body], which stand or move straight; return their tracks [body]."""
         new = np.arange(len(self.first), len(self.first) + len(knots), dtype=np.int32)
         self.first.extend(range(self._sizes[0], self._sizes[0] + len(knots)))
         self.count.extend([1] * len(knots))
         self._append(knots)
         return new
 
-    def _append(self, knots: NDArray[np.float64]) -> None:
+    def _append(self, knots: NDArray[np.void]) -> None:
         self.knots.append(knots)
         self._sizes[0] += len(knots)
 
     def arrays(self) -> dict[str, NDArray]:
         """Return what the kernel's ``MotionArrays`` hold."""
         knots = np.concatenate(self.knots)
-        coarse = np.round(knots[:, :3] / GRID) * GRID
+        coarse = np.round(knots["place"] / GRID) * GRID
         return {
             "first": np.array(self.first, dtype=np.int32),
             "count": np.array(self.count, dtype=np.int32),
             "cell": np.concatenate(self.cells or [np.zeros(1, dtype=np.int32)]),
             "coarse": coarse,
-            "place": knots[:, :3] - coarse,
-            "velocity": knots[:, 3:6],
-            "turn": knots[:, 6:10],
-            "spin": knots[:, 10:13],
-            "surge": knots[:, 13:16],
+            "place": knots["place"] - coarse,
+            **{name: knots[name] for name in ("velocity", "quaternion", "spin", "surge")},
         }
 
 
@@ -83,11 +86,11 @@ def capacity_for(links: int) -> int:
     return next(capacity for capacity in CAPACITIES if capacity >= links)
 
 
-def still_knots(position: NDArray, quaternion: ArrayLike) -> NDArray[np.float64]:
-    """Return the one knot [1, 16] of a body at rest; position in metres."""
-    knot = np.zeros((1, 16))
-    knot[0, :3] = np.asarray(position) * MILLI
-    knot[0, 6:10] = quaternion
+def still_knots(position: NDArray, quaternion: ArrayLike) -> NDArray[np.void]:
+    """Return the one knot [1] of a body at rest; position in metres."""
+    knot = np.zeros(1, dtype=KNOT)
+    knot["place"] = np.asarray(position) * MILLI
+    knot["quaternion"] = quaternion
     return knot
 
 
@@ -95,8 +98,8 @@ def still_knots(position: NDArray, quaternion: ArrayLike) -> NDArray[np.float64]
 class Track:
     """Motion of a base or a body as cubic pieces, from the start of a launch."""
 
-    knots: NDArray[np.float64]
-    """[knot, 16] as in :class:`PackedMotions`; one for a body that stands or moves straight."""
+    knots: NDArray[np.void]
+    """[knot] of :data:`KNOT`; one for a body that stands or moves straight."""
     cells: NDArray[np.int32]
     """[cell + 1] first knot of each cell, and the last knot."""
     times: NDArray[np.float64]
@@ -127,17 +130,17 @@ def still_track(place: NDArray[np.float64], quaternion: ArrayLike = (1.0, 0.0, 0
 
 def knots_alike(
     track: Track, pose: Pose, to_matrices: Callable[[NDArray], NDArray], span: tuple[float, float], what: str
-) -> NDArray[np.float64]:
-    """Return the knots [knot, 16] of another pose, where a track that begins and ends at ``span`` (s) has its own."""
+) -> NDArray[np.void]:
+    """Return the knots [knot] of another pose, where a track that begins and ends at ``span`` (s) has its own."""
     if track.pieces is None:
         seen = np.linspace(*span, 17)
-        place, turn = pose(seen)
-        place, turn = np.asarray(place, dtype=float), to_matrices(np.asarray(turn, dtype=float))
-        if max(np.ptp(place, axis=0).max(), np.ptp(turn, axis=0).max()) > 1e-12:
+        place, rotation = pose(seen)
+        place, rotation = np.asarray(place, dtype=float), to_matrices(np.asarray(rotation, dtype=float))
+        if max(np.ptp(place, axis=0).max(), np.ptp(rotation, axis=0).max()) > 1e-12:
             raise UsageError(
                 f"A parameter moves {what}, which stands still at the given values; give values at which it moves."
             )
-        knots = still_knots(place[0], rotations.from_matrices(turn[:1])[0])
+        knots = still_knots(place[0], rotations.from_matrices(rotation[:1])[0])
     else:
         times, _ = track.pieces.times(span[0])
         knots = _knots(pose, to_matrices, times, _sides(track.pieces))
@@ -147,70 +150,65 @@ def knots_alike(
                     f"A parameter bends the way of {what}, which is straight at the given values; give others."
                 )
             knots = knots[:1]
-    # Both signs of a quaternion are the same turn.
-    return knots * np.where((knots[0, 6:10] @ track.knots[0, 6:10] < 0) & _QUATERNION, -1.0, 1.0)
-
-
-_QUATERNION = (np.arange(16) >= 6) & (np.arange(16) < 10)
+    # Both signs of a quaternion are the same rotation.
+    if knots["quaternion"][0] @ track.knots["quaternion"][0] < 0:
+        knots["quaternion"] *= -1.0
+    return knots
 
 
 def _sides(pieces: MotionPieces) -> NDArray[np.float64]:
     return side_of(np.append(np.repeat(pieces.count, pieces.count), pieces.count[-1]))
 
 
-def _is_straight(knots: NDArray[np.float64]) -> bool:
+def _is_straight(knots: NDArray[np.void]) -> bool:
     # All velocities together: from one knot to the next that of a very slow motion hardly changes.
-    straight = np.ptp(knots[:, 3:6], axis=0).max() < 1e-9 and not knots[:, 10:13].any()
+    straight = np.ptp(knots["velocity"], axis=0).max() < 1e-9 and not knots["spin"].any()
     # Further away one straight piece would lose digits.
-    return bool(straight and np.linalg.norm(knots[-1, :3] - knots[0, :3]) < 10 * GRID)
+    return bool(straight and np.linalg.norm(knots["place"][-1] - knots["place"][0]) < 10 * GRID)
 
 
 def _track(pose: Pose, to_matrices: Callable[[NDArray], NDArray], pieces: MotionPieces, start: float) -> Track:
     times, cells = pieces.times(start)
     if not pieces.moves:
-        place, turn = (np.asarray(values, dtype=float) for values in pose(times[:1]))
-        return still_track(place[0], rotations.from_matrices(to_matrices(turn))[0])
+        place, rotation = (np.asarray(values, dtype=float) for values in pose(times[:1]))
+        return still_track(place[0], rotations.from_matrices(to_matrices(rotation))[0])
     knots = _knots(pose, to_matrices, times, _sides(pieces))
     return Track(knots[:1] if _is_straight(knots) else knots, cells, times, pieces)
 
 
-def _knots(
-    pose: Pose, to_matrices: Callable[[NDArray], NDArray], times: NDArray, sides: NDArray
-) -> NDArray[np.float64]:
-    """Return knots [n, 16] of a pose from its places and rotations ``sides`` [n] (s) before, at and after the knots."""
+def _knots(pose: Pose, to_matrices: Callable[[NDArray], NDArray], times: NDArray, sides: NDArray) -> NDArray[np.void]:
+    """Return knots [n] of a pose from its places and rotations ``sides`` [n] (s) before, at and after the knots."""
     # At the very start there is no instant before: values there are those of the line through two differences.
     early = times[0] >= 0 and times[0] < sides[0]
     around = []
     for side in (-sides, 0.0, sides):
-        place, turn = pose(np.maximum(times + side, times[0]) if early else times + side)
-        around.append((np.asarray(place, dtype=float), to_matrices(np.asarray(turn, dtype=float))))
-    (place0, turn0), (place, turn), (place1, turn1) = around
+        place, rotation = pose(np.maximum(times + side, times[0]) if early else times + side)
+        around.append((np.asarray(place, dtype=float), to_matrices(np.asarray(rotation, dtype=float))))
+    (place0, rotation0), (place, rotation), (place1, rotation1) = around
     span = sides[:, None]
-    spin0, spin1 = rotation_vectors(turn0, turn) / span, rotation_vectors(turn, turn1) / span
+    spin0, spin1 = rotation_vectors(rotation0, rotation) / span, rotation_vectors(rotation, rotation1) / span
     # Central differences, whose error is of second order; m per s are mm per ms.
     velocity = (place1 - place0) / (2 * span)
     if early:
-        place2, turn2 = pose(times[:1] + 2 * sides[:1])
+        place2, rotation2 = pose(times[:1] + 2 * sides[:1])
         there = (np.asarray(place2, dtype=float) - place1[:1]) / sides[0]
-        beyond = rotation_vectors(turn1[:1], to_matrices(np.asarray(turn2, dtype=float))) / sides[0]
+        beyond = rotation_vectors(rotation1[:1], to_matrices(np.asarray(rotation2, dtype=float))) / sides[0]
         velocity[0] = (3 * (place1[0] - place[0]) / sides[0] - there[0]) / 2
         spin0[0] = 2 * spin1[0] - beyond[0]
-    knots = np.empty((len(times), 16))
-    knots[:, :3] = place * MILLI
-    knots[:, 3:6] = velocity
-    knots[:, 6:10] = _continuous(rotations.from_matrices(turn))
-    knots[:, 10:13] = (spin0 + spin1) / 2 / MILLI
-    knots[:, 13:16] = (spin1 - spin0) / span / MILLI**2
+    knots = np.empty(len(times), dtype=KNOT)
+    knots["place"] = place * MILLI
+    knots["velocity"] = velocity
+    knots["quaternion"] = _continuous(rotations.from_matrices(rotation))
+    knots["spin"] = (spin0 + spin1) / 2 / MILLI
+    knots["surge"] = (spin1 - spin0) / span / MILLI**2
     return knots
 
 
 def rotation_vectors(before: NDArray, after: NDArray) -> NDArray[np.float64]:
     """Return the rotation vectors [n, 3] (rad, world) between rotations [n, 3, 3]; small angles."""
-    turn = after @ np.swapaxes(before, -1, -2)
+    relative = after @ np.swapaxes(before, -1, -2)
     # Antisymmetric part of the relative rotation, sin(angle) times the axis; angles between neighbours are tiny.
-    return np.stack(
-        [turn[:, 2, 1] - turn[:, 1, 2], turn[:, 0, 2] - turn[:, 2, 0], turn[:, 1, 0] - turn[:, 0, 1]], axis=-1
-    ) / 2  # fmt: skip
+    return np.stack([relative[:, k, j] - relative[:, j, k] for j, k in ((1, 2), (2, 0), (0, 1))], axis=-1) / 2
 
 
 def _continuous(quaternion: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -224,21 +222,25 @@ def pack_chains(capacity: int, chains: Sequence[Chain], quasistatic: bool, hinge
     """Return what the kernel's ``ChainArrays`` hold: whiskers as chains, [link, whisker] of ``capacity`` links."""
     count = len(chains)
     mass = LIGHT if quasistatic else 1.0
-    build, inertia, taper = (np.zeros((capacity, count, width)) for width in (4, 2 + hinges, 4))
+    springs = ("stiffness", "torsion")[: hinges - 1]
+    build = _links(capacity, count, "length", "bend_cosine", "bend_sine", "mass")
+    inertia = _links(capacity, count, "centre", "axial", "transverse", *springs)
+    taper = _links(capacity, count, "start_radius", "end_radius", "arc", "arc_length")
     for w, chain in enumerate(chains):
         n = chain.links
-        # kg to mg, kg·m² to mg·mm², N·m to µN·m.
         # A joint that twists does so between two halves of its rest bend.
         bends = chain.rest_angles / np.where((chain.torsion > 0) & (hinges == 3), 2, 1)
-        build[:n, w] = np.stack(
-            [chain.lengths * MILLI, np.cos(bends), np.sin(bends), chain.masses * (mass * MICRO)], axis=1
-        )
-        springs = (chain.stiffness * MICRO, chain.torsion * MICRO)[: hinges - 1]
-        inertia[:n, w] = np.stack(
-            [chain.centres * MILLI, *(chain.inertias.T * (mass * MICRO * MILLI**2)), *springs], axis=1
-        )
+        build["length"][:n, w] = chain.lengths * MILLI
+        build["bend_cosine"][:n, w], build["bend_sine"][:n, w] = np.cos(bends), np.sin(bends)
+        # kg to mg, kg·m² to mg·mm², N·m to µN·m.
+        build["mass"][:n, w] = chain.masses * (mass * MICRO)
+        inertia["centre"][:n, w] = chain.centres * MILLI
+        inertia["axial"][:n, w], inertia["transverse"][:n, w] = chain.inertias.T * (mass * MICRO * MILLI**2)
+        for name in springs:
+            inertia[name][:n, w] = getattr(chain, name) * MICRO
         radii = chain.whisker.radius(chain.nodes) * MILLI
-        taper[:n, w] = np.stack([radii[:-1], radii[1:], chain.nodes[:-1] * MILLI, np.diff(chain.nodes) * MILLI], axis=1)
+        taper["start_radius"][:n, w], taper["end_radius"][:n, w] = radii[:-1], radii[1:]
+        taper["arc"][:n, w], taper["arc_length"][:n, w] = chain.nodes[:-1] * MILLI, np.diff(chain.nodes) * MILLI
     # Damping ratio ζ of the first mode ω₁ as stiffness-proportional damping, β = 2 ζ / ω₁.
     beta = [0 if quasistatic else 2 * c.whisker.damping_ratio / c.frequencies()[0] * MILLI for c in chains]
     return {
@@ -250,6 +252,11 @@ def pack_chains(capacity: int, chains: Sequence[Chain], quasistatic: bool, hinge
         "inertia": inertia,
         "taper": taper,
     }
+
+
+def _links(capacity: int, count: int, *names: str) -> NDArray[np.void]:
+    """Return records [link, whisker] of numbers with these names, all zero."""
+    return np.zeros((capacity, count), dtype=[(name, "f8") for name in names])
 
 
 @dataclass

@@ -13,10 +13,63 @@ from numpy.typing import NDArray
 from brainbench.core import rotations
 from brainbench.geometry.mesh import Mesh, hull_faces
 from brainbench.stimuli.engines.rod import limits
-from brainbench.stimuli.engines.rod.mesh_bvh import WIDE, in_eights, spatial_order, tree_boxes
+from brainbench.stimuli.engines.rod.limits import WIDE
 from brainbench.stimuli.engines.rod.packing import PackedMotions, Track
 from brainbench.stimuli.engines.units import MILLI
 from brainbench.stimuli.objects.obstacle import Box, Capsule, ConvexPart, Cylinder, Obstacle, Sphere
+
+EMPTY = 1e30
+"""Coordinate of children that a node lacks: further away than any search goes."""
+
+
+def spatial_order(corners: NDArray[np.float64]) -> NDArray[np.intp]:
+    """Return the order [triangle] of triangles [triangle, 3, 3] in which aligned runs of 8, 16, 32, … lie together.
+
+    Runs are halved along the longest side of the box of their middles, from the whole down to leaves.
+    """
+    middles = corners.mean(axis=1)
+    count = len(middles)
+    order = np.arange(count)
+    run = WIDE
+    while run < count:
+        run *= 2
+    while run > WIDE:
+        here = middles[order]
+        begins = np.arange(0, count, run)
+        # All runs of one level at once: boxes by reduceat, then one sort whose keys hold the run and the place along
+        # its side.
+        low, high = np.minimum.reduceat(here, begins), np.maximum.reduceat(here, begins)
+        axis = np.argmax(high - low, axis=1)
+        which = np.arange(count) // run
+        rows = np.arange(len(begins))
+        base, side = low[rows, axis], (high - low)[rows, axis]
+        along = (here[np.arange(count), axis[which]] - base[which]) / np.maximum(side, 1e-300)[which]
+        order = order[np.argsort(which + 0.999 * along.clip(0, 1), kind="stable")]
+        run //= 2
+    return order
+
+
+def tree_boxes(corners: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the nodes [node, 6, 8] above ordered triangles: boxes (lowest, highest corner) of eight children each.
+
+    Children of the first nodes are leaves, of the next ones these nodes, and so on; the last node is the top. A level
+    above ``n`` boxes has ⌈n / 8⌉ nodes.
+    """
+    low, high = corners.min(axis=1), corners.max(axis=1)
+    levels = []
+    while not levels or len(low) > WIDE:
+        begins = np.arange(0, len(low), WIDE)
+        # Parents from the boxes of their children, level by level.
+        low, high = np.minimum.reduceat(low, begins), np.maximum.reduceat(high, begins)
+        levels.append(in_eights(np.concatenate([low, high], axis=1)))
+    return np.concatenate(levels)
+
+
+def in_eights(rows: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return rows [row, number] as runs of eight [run, number, 8]: a processor reads a number of all eight at once."""
+    missing = np.full((-len(rows) % WIDE, rows.shape[1]), EMPTY)
+    return np.concatenate([rows, missing]).reshape(-1, WIDE, rows.shape[1]).swapaxes(1, 2)
+
 
 SLIVER = 1e-6
 """Height over longest side below which a triangle has no direction of its own: vertices are rounded to some 1e-9."""
@@ -34,7 +87,7 @@ class PackedSurface:
     outward: NDArray[np.float64]
     """[triangle, 7, 3] as :func:`pseudo_normals` returns it; up to the last place of the last leaf."""
     boxes: NDArray[np.float64]
-    """[node, 6, 8] as :func:`brainbench.stimuli.engines.rod.mesh_bvh.tree_boxes` returns it."""
+    """[node, 6, 8] as :func:`brainbench.stimuli.engines.rod.shapes.tree_boxes` returns it."""
     outline: NDArray[np.float64]
     """[corner, 2] of the convex hull of its shadow along z: how far it reaches when it is turned about z."""
     radius: float
@@ -82,7 +135,7 @@ class PackedShapes:
     surfaces: list[PackedSurface] = field(default_factory=list)
     leaves: int = 0
     nodes: int = 0
-    _known: dict[int, dict[str, Any]] = field(default_factory=dict)
+    _packed: dict[int, dict[str, Any]] = field(default_factory=dict)
 
     def add_scene(self, bodies: Sequence[TrackedObstacle], motions: PackedMotions) -> int:
         """Append the shapes of one scene and return its index."""
@@ -91,7 +144,7 @@ class PackedShapes:
         for body in bodies:
             obstacle, knots = body.obstacle, body.track.knots
             if id(knots) not in tracks:
-                speeds = (np.linalg.norm(knots[:, some], axis=1) for some in (slice(3, 6), slice(10, 13)))
+                speeds = (np.linalg.norm(knots[name], axis=1) for name in ("velocity", "spin"))
                 tracks[id(knots)] = motions.add(body.track), *speeds
             track, linear, angular = tracks[id(knots)]
             friction = -1.0 if obstacle.friction is None else obstacle.friction
@@ -112,11 +165,11 @@ class PackedShapes:
     def add_placed(self, surface: PackedSurface, **columns: Any) -> None:
         """Append scenes of one shape each, all of the same surface.
 
-        ``columns`` are what the kernel's ``ShapeArrays`` hold that differs, [shape, …]; of all ``track``, ``turn``,
-        ``scale``, ``radius`` and ``speed``.
+        ``columns`` are what the kernel's ``ShapeArrays`` hold that differs, [shape, …]; of all ``track``,
+        ``quaternion``, ``scale``, ``radius`` and ``speed``.
         """
         count = len(columns["track"])
-        still = {"size": np.ones(3), "place": np.zeros(3), "turn": np.array([1.0, 0, 0, 0])}
+        still = {"size": np.ones(3), "place": np.zeros(3), "quaternion": np.array([1.0, 0, 0, 0])}
         alike = still | {"kind": limits.MESH, "friction": -1.0} | self.add_mesh(surface)
         self.columns.append({name: np.tile(value, (count, *[1] * np.ndim(value))) for name, value in alike.items()})
         self.columns[-1] |= columns
@@ -124,7 +177,7 @@ class PackedShapes:
 
     def _row(self, solid: ConvexPart | Sphere | Capsule | Cylinder | Box | Mesh) -> dict[str, Any]:
         """Return the columns of a solid in its body, but for those that its motion and friction give."""
-        row: dict[str, Any] = {"size": np.ones(3), "place": np.zeros(3), "turn": np.array([1.0, 0, 0, 0])}
+        row: dict[str, Any] = {"size": np.ones(3), "place": np.zeros(3), "quaternion": np.array([1.0, 0, 0, 0])}
         row |= {"scale": 1.0, "face": 0, "faces": 0, "box": 0}
         match solid:
             case Sphere():
@@ -137,26 +190,25 @@ class PackedShapes:
                 }
             case Box():
                 box = {"kind": limits.BOX, "size": _mm(solid.half_sizes), "place": _mm(solid.centre)}
-                return row | box | {"turn": np.array(solid.quaternion), "radius": math.hypot(*box["size"])}
+                return row | box | {"quaternion": np.array(solid.quaternion), "radius": math.hypot(*box["size"])}
             case Capsule() | Cylinder():
                 ends = _mm(solid.start), _mm(solid.end)
-                # Capsules and cylinders are kept by half length, middle and a turn from z, so that the kernel measures
-                # in their frame.
+                # Half length, middle and a rotation from z: the kernel measures in their frame.
                 half = float(np.linalg.norm(ends[1] - ends[0])) / 2
                 kind = limits.CAPSULE if isinstance(solid, Capsule) else limits.CYLINDER
                 size = np.array([solid.radius * MILLI, half, 0.0])
-                turn = rotations.from_z_axis((ends[1] - ends[0]) / (2 * half))
+                quaternion = rotations.from_z_axis((ends[1] - ends[0]) / (2 * half))
                 place, radius = (ends[0] + ends[1]) / 2, math.hypot(size[0], half)
                 radius = size[0] + half if kind == limits.CAPSULE else radius
-                return row | {"kind": kind, "size": size, "place": place, "turn": turn, "radius": radius}
+                return row | {"kind": kind, "size": size, "place": place, "quaternion": quaternion, "radius": radius}
             case _:
-                if id(solid) not in self._known:
+                if id(solid) not in self._packed:
                     faces = solid.faces if isinstance(solid, Mesh) else hull_faces(solid.vertices)
                     # About its own middle, where single precision is finest.
                     middle = middle_of(solid.vertices) * MILLI
                     surface = PackedSurface.of(solid.vertices * MILLI - middle, faces)
-                    self._known[id(solid)] = self.add_mesh(surface) | {"place": middle, "radius": surface.radius}
-                return row | self._known[id(solid)] | {"kind": limits.MESH}
+                    self._packed[id(solid)] = self.add_mesh(surface) | {"place": middle, "radius": surface.radius}
+                return row | self._packed[id(solid)] | {"kind": limits.MESH}
 
     def add_mesh(self, surface: PackedSurface) -> dict[str, int]:
         """Append a surface; return where its triangles and boxes are."""
@@ -182,10 +234,10 @@ class PackedShapes:
             "first": np.array(self.first, dtype=np.int32),
             **{name: column(name, np.int32) for name in ("kind", "track", "face", "faces", "box")},
             **{name: column(name, float) for name in ("scale", "radius", "speed", "friction")},
-            **{name: column(name, float, (width,)) for name, width in (("size", 3), ("place", 3), ("turn", 4))},
-            "boxes": np.concatenate([one.boxes for one in self.surfaces] or [np.zeros((1, 6, WIDE))]),
-            "corners": np.concatenate([one.corners for one in self.surfaces] or [np.zeros((1, 9, WIDE))]),
-            "outward": np.concatenate([one.outward for one in self.surfaces] or [np.zeros((1, 7, 3))]),
+            **{name: column(name, float, (width,)) for name, width in (("size", 3), ("place", 3), ("quaternion", 4))},
+            "boxes": np.concatenate([surface.boxes for surface in self.surfaces] or [np.zeros((1, 6, WIDE))]),
+            "corners": np.concatenate([surface.corners for surface in self.surfaces] or [np.zeros((1, 9, WIDE))]),
+            "outward": np.concatenate([surface.outward for surface in self.surfaces] or [np.zeros((1, 7, 3))]),
         }
 
 
@@ -211,9 +263,9 @@ def pseudo_normals(vertices: NDArray[np.float64], faces: NDArray[np.integer]) ->
             at_vertex[:, axis] += np.bincount(faces[:, k], at_corner[:, axis] * angle, len(vertices))
     spread = across.reshape(-1, 3)
     at_edge = np.stack([np.bincount(which.ravel(), spread[:, axis]) for axis in range(3)], axis=1)
-    found = np.concatenate([at_corner[:, None], at_vertex[faces], at_edge[which]], axis=1)
-    length = np.linalg.norm(found, axis=2, keepdims=True)
-    return found / np.where(length > 0, length, 1.0)
+    outward = np.concatenate([at_corner[:, None], at_vertex[faces], at_edge[which]], axis=1)
+    length = np.linalg.norm(outward, axis=2, keepdims=True)
+    return outward / np.where(length > 0, length, 1.0)
 
 
 def slivers(corners: NDArray[np.float64]) -> NDArray[np.bool_]:

@@ -20,17 +20,25 @@ from brainbench.core.devices import pick_device
 from brainbench.core.errors import UsageError
 from brainbench.core.rotations import base_rotation, euler_matrix, from_matrices
 from brainbench.stimuli.engines.fidelity import Fidelity
-from brainbench.stimuli.engines.protocol import SweepBatch, describe_unstable, join_batches
-from brainbench.stimuli.engines.rod.launch import LaunchResult, WhiskerSolver
+from brainbench.stimuli.engines.protocol import PassiveSweeps, SweepBatch, describe_unstable, join_batches
+from brainbench.stimuli.engines.rod.launch import (
+    Ahead,
+    Approach,
+    Launch,
+    LaunchResult,
+    Try,
+    WhiskerSolver,
+    first_simulation,
+    run_with_retries,
+    tries_ahead,
+)
 from brainbench.stimuli.engines.rod.limits import MESHES
-from brainbench.stimuli.engines.rod.packing import PackedJobs, PackedMotions, still_knots
+from brainbench.stimuli.engines.rod.packing import KNOT, PackedJobs, PackedMotions, still_knots
 from brainbench.stimuli.engines.rod.shapes import PackedShapes, PackedSurface
 from brainbench.stimuli.engines.rod.tasks import followed
-from brainbench.stimuli.engines.rod.tries import Ahead, Try, first_simulation, run_with_retries, tries_ahead
 from brainbench.stimuli.engines.trust import BLOW
 from brainbench.stimuli.engines.units import MILLI
 from brainbench.stimuli.objects.solid import Solid
-from brainbench.stimuli.sweeps.sweep_scenes import SweepScenes
 
 BLOCK = 64
 """Threads of one block on a GPU."""
@@ -45,7 +53,7 @@ class SweepLauncher:
 
     def __init__(
         self,
-        scenes: SweepScenes,
+        scenes: PassiveSweeps,
         fidelity: Fidelity,
         device: str = "cpu",
         sliced: bool | None = None,
@@ -70,8 +78,8 @@ class SweepLauncher:
         self._packed = packed or {}
         self._objects: dict[str, tuple[float, PackedSurface]] = {}
         angles = base_rotation([mount.angles for mount in mounts])
-        turns = from_matrices(angles)
-        self._bases = [still_knots(np.asarray(m.position), turn) for m, turn in zip(mounts, turns, strict=True)]
+        frames = zip(mounts, from_matrices(angles), strict=True)
+        self._bases = [still_knots(np.asarray(mount.position), quaternion) for mount, quaternion in frames]
         # Steps between readings, rounded as the kernel rounds them.
         spans = np.diff(grid.frames.readings * MILLI, prepend=0.0)
         steps = self.solver.steps
@@ -109,18 +117,14 @@ class SweepLauncher:
         radii = np.array([chain.whisker.base_radius for chain in self.solver.chains])
         speeds = speed[sweep]
         way, farthest = followed(speeds, speeds, self.solver.steps[whisker] / MILLI, radii[whisker])
-        fast = np.empty((4, *size))
-        fast[:, row, column] = way, farthest, np.where(way > farthest, 0.0, np.inf), speeds > BLOW
+        numbers = way, farthest, np.where(way > farthest, 0.0, np.inf), speeds > BLOW
+        approach = Approach(*(np.empty(size, dtype=values.dtype) for values in numbers))
+        for whole, values in zip(vars(approach).values(), numbers, strict=True):
+            whole[row, column] = values
         placed = time.perf_counter() - started
-        result = self.solver.launch(
-            PackedJobs(whisker, sweep, bases[whisker], row, column, finer),
-            motions,
-            shapes,
-            self.grid.frames.readings,
-            size,
-            axes=self._head,
-            fast=fast,
-        )
+        jobs = PackedJobs(whisker, sweep, bases[whisker], row, column, finer)
+        readings = self.grid.frames.readings
+        result = self.solver.launch(Launch(jobs, motions, shapes, readings, size, axes=self._head, approach=approach))
         self.seconds = {"objects": placed, **result.seconds}
         return result
 
@@ -179,9 +183,11 @@ class SweepLauncher:
         Those of the last launch are kept: whiskers are simulated again, and large objects come in several launches.
         """
         # Launches may run side by side.
-        known = {**self._objects, **self._packed}
-        self._objects = {name: known.get(name) or pack_object(self.scenes.solid(name)) for name in dict.fromkeys(names)}
-        return {**known, **self._objects}
+        packed = {**self._objects, **self._packed}
+        self._objects = {
+            name: packed.get(name) or pack_object(self.scenes.solid(name)) for name in dict.fromkeys(names)
+        }
+        return {**packed, **self._objects}
 
     def _add(
         self, shapes: PackedShapes, motions: PackedMotions, diagonal: float, surface: PackedSurface, sweeps: Sequence
@@ -192,12 +198,12 @@ class SweepLauncher:
         """
         grid, head = self.grid, self._head
         rotations = sorted({sweep.rotation for sweep in sweeps})
-        turns = np.array([_turn(rotation) for rotation in rotations])
+        about_z = np.array([_about_z(rotation) for rotation in rotations])
         # Turned about z: how far it then reaches along x and y.
         x, y = surface.outline.T
         # The lowest corner of the outline's convex hull is that of the whole surface.
-        low = np.stack([(turns[:, k, 0, None] * x + turns[:, k, 1, None] * y).min(axis=1) for k in (0, 1)], axis=1)
-        quaternion = from_matrices(head.T @ turns)
+        low = np.stack([(about_z[:, k, 0, None] * x + about_z[:, k, 1, None] * y).min(axis=1) for k in (0, 1)], axis=1)
+        quaternion = from_matrices(head.T @ about_z)
         which = np.searchsorted(rotations, [sweep.rotation for sweep in sweeps])
         speed, height, distance, size = (
             np.array([getattr(sweep, name) for sweep in sweeps]) for name in ("speed", "height", "distance", "size")
@@ -208,15 +214,17 @@ class SweepLauncher:
         reach = low[which] * (scale / MILLI)[:, None]
         side = grid.start - reach[:, 1] if grid.placing == "clear" else grid.start + reach[:, 1]
         place = np.stack([distance - reach[:, 0], side, height], axis=1) - self._origin
-        knots = np.zeros((len(sweeps), 16))
+        knots = np.zeros(len(sweeps), dtype=KNOT)
         for k in range(3):
-            knots[:, k] = (place[:, 0] * head[0, k] + place[:, 1] * head[1, k] + place[:, 2] * head[2, k]) * MILLI
+            knots["place"][:, k] = (
+                place[:, 0] * head[0, k] + place[:, 1] * head[1, k] + place[:, 2] * head[2, k]
+            ) * MILLI
             # The world velocity (0, −v, 0) in the axes of the array; m/s are mm/ms.
-            knots[:, 3 + k] = -speed * head[1, k]
-        knots[:, 6:10] = quaternion[which]
+            knots["velocity"][:, k] = -speed * head[1, k]
+        knots["quaternion"] = quaternion[which]
         still = np.tile([1.0, 0.0, 0.0, 0.0], (len(sweeps), 1))
         radius, track = surface.radius * scale, motions.add_straight(knots)
-        shapes.add_placed(surface, track=track, turn=still, scale=scale, radius=radius, speed=speed)
+        shapes.add_placed(surface, track=track, quaternion=still, scale=scale, radius=radius, speed=speed)
 
 
 def pack_object(solid: Solid) -> tuple[float, PackedSurface]:
@@ -227,6 +235,6 @@ def pack_object(solid: Solid) -> tuple[float, PackedSurface]:
 
 
 @cache
-def _turn(rotation: float) -> NDArray[np.float64]:
+def _about_z(rotation: float) -> NDArray[np.float64]:
     """Return the matrix of a rotation about z (rad); grids have few."""
     return euler_matrix((0.0, 0.0, rotation))

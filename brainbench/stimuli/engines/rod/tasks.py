@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -13,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.motion_pieces import KNOT, Cutting
 from brainbench.stimuli.engines.reach import Reach, reachable, stays_in_plane
-from brainbench.stimuli.engines.rod.launch import LaunchResult, WhiskerSolver
+from brainbench.stimuli.engines.rod.launch import Approach, Launch, LaunchResult, WhiskerSolver
 from brainbench.stimuli.engines.rod.limits import FINEST, WIDEST
 from brainbench.stimuli.engines.rod.packing import (
     GRID,
@@ -44,11 +43,10 @@ class JobTask:
     indices: tuple[int, ...]
     """Which obstacles of the job these are."""
     names: tuple[int, ...]
-    """What tells them from other bodies."""
+    """Identities of their tracks, surfaces and parts: jobs with the same ones share a scene."""
     limit: NDArray[np.float64] | None
     """[cell] longest step from each cell of the motions on (s); None for any."""
-    fast: tuple[float, float, float, bool]
-    """``travel``, ``farthest``, ``fast_at`` and ``struck`` of :class:`brainbench.stimuli.engines.trust.RunFacts`."""
+    approach: Approach
     twists: bool
     """Whether it may leave its plane, and may twist at this fidelity."""
 
@@ -67,7 +65,7 @@ def make_task(
     base = follicle_track(job.follicle, job.whisker.arc_length, cutting)
 
     # All that stands still is one body, near the base of the whisker and of its neighbours.
-    place = tuple((np.round(base.knots[0, :3] / GRID) * GRID / MILLI).tolist())
+    place = tuple((np.round(base.knots["place"][0] / GRID) * GRID / MILLI).tolist())
     if place not in bodies:
         bodies[place] = np.array(place), still_track(np.array(place))
     moving = [obstacle for obstacle in job.obstacles if obstacle.motion is not None]
@@ -78,7 +76,7 @@ def make_task(
     # What moves is looked at wherever its motion, or that of the base, has a knot.
     ends = np.array([start, stop])
     seen = np.unique(
-        np.concatenate([track.times for track in (base, *(bodies[id(item)][1] for item in moving))] + [ends])
+        np.concatenate([track.times for track in (base, *(bodies[id(obstacle)][1] for obstacle in moving))] + [ends])
     )
     position, euler = (np.asarray(values, dtype=float) for values in job.follicle.pose(seen))
     reach = reachable(job.whisker, position, job.obstacles, seen, surfaces=True)
@@ -100,9 +98,9 @@ def make_task(
     steps = np.full(len(seen) - 1, step)
     if limit is not None:
         steps = limit[np.clip(((seen[:-1] - start) / KNOT).astype(int), 0, len(limit) - 1)]
-    fast = _too_fast(job, reach, (position, euler), seen, steps, step)
+    approach = _approach(job, reach, (position, euler), seen, steps, step)
     twists = fidelity.twist is not False and not stays_in_plane(job, reach, position, euler, seen)
-    return JobTask(job, chain, base, near, reach.indices, names, limit, fast, twists)
+    return JobTask(job, chain, base, near, reach.indices, names, limit, approach, twists)
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,7 +140,7 @@ class PackedTasks:
     def launch(self, solver: WhiskerSolver, *, record_shape: bool) -> LaunchResult:
         """Simulate the tasks in a solver of :attr:`chains`; a row of results each."""
         first = self.tasks[0].job
-        return solver.launch(
+        given = Launch(
             self.jobs,
             self.motions,
             self.shapes,
@@ -150,9 +148,10 @@ class PackedTasks:
             (len(self.tasks), 1),
             start=first.start,
             gravity=first.gravity,
-            fast=np.array([task.fast for task in self.tasks]).T[..., None],
+            approach=Approach.table([task.approach for task in self.tasks]),
             record_shape=record_shape,
         )
+        return solver.launch(given)
 
 
 def followed(
@@ -168,10 +167,10 @@ def followed(
     return np.where(hard, blow * step, speed * step / FINEST), np.where(hard, stride, WIDEST / MILLI)
 
 
-def _too_fast(
+def _approach(
     job: Job, reach: Reach, pose: tuple[NDArray, NDArray], times: NDArray, steps: NDArray, step: float
-) -> tuple[float, float, float, bool]:
-    """Return :attr:`JobTask.fast` from the base's ``pose`` at ``times`` [n] (s).
+) -> Approach:
+    """Return how the objects within reach come, from the base's ``pose`` at ``times`` [n] (s).
 
     ``steps`` [n − 1] (s) are the longest there, ``step`` is the longest of the whisker.
     """
@@ -191,5 +190,5 @@ def _too_fast(
         way, farthest = followed(speed, blow, steps, job.whisker.base_radius)
         if (way > farthest).any():
             first = int(np.argmax(way > farthest))
-            return float(way[first]), float(farthest[first]), float(times[first]), struck
-    return 0.0, math.inf, math.inf, struck
+            return Approach(float(way[first]), float(farthest[first]), float(times[first]), struck)
+    return Approach(struck=struck)

@@ -101,7 +101,7 @@ def packed_change(task: JobTask, low: Job, high: Job, width: float, quasistatic:
         add(lambda job: {"gravity": np.asarray(job.gravity, dtype=float) / weight})
     _require("obstacles", len(low.obstacles), len(task.job.obstacles))
     _require("obstacles", len(high.obstacles), len(task.job.obstacles))
-    if any(one is not other for one, other in zip(low.obstacles, high.obstacles, strict=True)):
+    if any(before is not after for before, after in zip(low.obstacles, high.obstacles, strict=True)):
         add(lambda job: _shapes(task, job))
     return changes
 
@@ -114,13 +114,13 @@ def _chain(whisker: Whisker, links: int) -> Chain:
 def _whisker(task: JobTask, job: Job, quasistatic: bool) -> Numbers:
     chain = _chain(job.whisker, task.chain.links)
     packed = pack_chains(chain.links, [chain], quasistatic, 2 + task.twists)
-    length, cosine, sine, mass = packed["build"][:, 0].T
-    centre, axial, transverse, *springs = packed["inertia"][:, 0].T
-    torsion = springs[1] if task.twists else np.zeros_like(length)
-    radii = packed["taper"][:, 0, :2].T
-    bend = np.arctan2(sine, cosine)
+    build, inertia, taper = (packed[name][:, 0] for name in ("build", "inertia", "taper"))
+    torsion = inertia["torsion"] if task.twists else np.zeros(chain.links)
+    bend = np.arctan2(build["bend_sine"], build["bend_cosine"])
+    numbers = [build["length"], bend, build["mass"], *(inertia[name] for name in ("centre", "axial", "transverse"))]
+    numbers += [inertia["stiffness"], torsion, taper["start_radius"], taper["end_radius"]]
     return {
-        "link": np.stack([length, bend, mass, centre, axial, transverse, springs[0], torsion, *radii]),
+        "link": np.stack(numbers),
         "beta": packed["beta"][0],
         "friction": packed["friction"][0],
     }
@@ -128,9 +128,14 @@ def _whisker(task: JobTask, job: Job, quasistatic: bool) -> Numbers:
 
 def _base(task: JobTask, job: Job, span: tuple[float, float]) -> Numbers:
     return {
-        "base": knots_alike(task.base, job.follicle.pose, base_rotation, span, "the base of a whisker"),
+        "base": _numbers(knots_alike(task.base, job.follicle.pose, base_rotation, span, "the base of a whisker")),
         "positions": np.asarray(job.follicle.pose(job.times)[0], dtype=float),
     }
+
+
+def _numbers(knots: NDArray[np.void]) -> NDArray[np.float64]:
+    """Return the numbers [knot, 16] of knots in the order of their record."""
+    return knots.view(np.float64).reshape(len(knots), -1)
 
 
 def _loads(task: JobTask, job: Job) -> Numbers:
@@ -159,7 +164,7 @@ def _shapes(task: JobTask, job: Job) -> Numbers:
             frictions.append(-1.0 if moved.friction is None else moved.friction)
         if whole.motion is not None:
             pose, span = carried_pose(moved.motion, body.anchor), (task.job.start, float(task.job.times[-1]))
-            knots.append(knots_alike(body.track, pose, np.asarray, span, "an object"))
+            knots.append(_numbers(knots_alike(body.track, pose, np.asarray, span, "an object")))
     return {
         "shape_place": np.array(places).reshape(-1, 3),
         "shape_turn": np.array(turns).reshape(-1, 3, 3),
@@ -192,7 +197,7 @@ def _shape(nominal: Any, moved: Any) -> tuple[NDArray[np.float64], NDArray[np.fl
         middle = middle_of(nominal.vertices)
         return (turn @ middle + shift) * MILLI, turn, np.ones(3)
     row = PackedShapes()._row(moved)
-    return row["place"], rotations.to_matrices(row["turn"]), row["size"]
+    return row["place"], rotations.to_matrices(row["quaternion"]), row["size"]
 
 
 def _rigid(nominal: Mesh | ConvexPart, moved: Mesh | ConvexPart) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -45,8 +45,8 @@ from brainbench.core.devices import warp
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.rod.launch import WhiskerSolver
 from brainbench.stimuli.engines.rod.limits import contacts_for
-from brainbench.stimuli.engines.rod.scheduling import allocate
-from brainbench.stimuli.engines.rod.streams import turn
+from brainbench.stimuli.engines.rod.packing import PackedJobs
+from brainbench.stimuli.engines.rod.slices import allocate, lock_of, parts_of
 from brainbench.stimuli.engines.units import MICRO, MILLI
 from brainbench.stimuli.whiskers.chain import Chain
 
@@ -65,18 +65,19 @@ class RecordingSolver(WhiskerSolver):
     def __init__(self, chains: Sequence[Chain], fidelity: Fidelity, device: Any, needs: int, *, twists: bool) -> None:
         """Load kernels; arguments as for :class:`.launch.WhiskerSolver`."""
         super().__init__(chains, fidelity, device, needs, twists=twists, recorder=KERNELS)
-        self.inputs: list[Any] = []
-        """Arguments of the last launch."""
+        self.scene: Any = None
+        """What the last launch was given, on the device; its contact problems and results beside it."""
+        self.problems: Any = None
+        self.results: Any = None
         self.checkpoints: list[tuple[Any, Any, Any]] = []
         """States of whiskers, their links and their contacts at the beginning of each segment."""
 
-    def _take_steps(self, inputs: list[Any], count: int, *, urgent: bool) -> None:
-        wp, device, structs = warp(), self.device, self.kernels.structs
-        jobs, readings = inputs[3], inputs[5]
-        time = readings.time.numpy()
+    def _take_steps(self, scene: Any, problems: Any, results: Any, jobs: PackedJobs) -> None:
+        wp, device, structs, count = warp(), self.device, self.kernels.structs, len(jobs)
+        time = scene.readings.time.numpy()
         spans = np.diff(time["tick"] + time["part"], prepend=0.0)
-        steps = int(np.ceil(spans / jobs.step.numpy().min()).sum()) + 8
-        with turn(device):
+        steps = int(np.ceil(spans / scene.jobs.step.numpy().min()).sum()) + 8
+        with lock_of(device):
             links = (self.capacity, count)
             self.paused = allocate(structs.PausedWhiskers, device, state=count, ended=count, link=links)
             single = self._records(1, count)
@@ -84,9 +85,9 @@ class RecordingSolver(WhiskerSolver):
             self.paused.budget = budget = max(8, math.ceil(math.sqrt(steps)), min(steps, affordable))
             self.paused.records = self._records(budget, count)
             self.paused.keep = int(budget >= steps)
-            self.inputs, self.checkpoints = inputs, []
+            self.scene, self.problems, self.results, self.checkpoints = scene, problems, results, []
             while not self.checkpoints or not self.paused.ended.numpy().all():
-                held = inputs[-1].held
+                held = problems.held
                 self.checkpoints.append((wp.clone(self.paused.state), wp.clone(self.paused.link), wp.clone(held)))
                 self._run()
             wp.synchronize_device(device)
@@ -100,7 +101,8 @@ class RecordingSolver(WhiskerSolver):
 
     def _run(self) -> None:
         self.paused.records.count.zero_()
-        warp().launch(self.kernels.run, self.count, [*self.inputs, self.paused], device=self.device)
+        arguments = [*parts_of(self.scene), self.problems, self.paused, self.results]
+        warp().launch(self.kernels.run, self.count, arguments, device=self.device)
 
     def _segments(self) -> Iterator[Any]:
         """Yield the records of the segments that begin at checkpoints; each is run again unless there is one."""
@@ -109,7 +111,7 @@ class RecordingSolver(WhiskerSolver):
         self.paused.keep = 1
         for checkpoint in self.checkpoints:
             if not whole:
-                current = self.paused.state, self.paused.link, self.inputs[-1].held
+                current = self.paused.state, self.paused.link, self.problems.held
                 for before, now in zip(checkpoint, current, strict=True):
                     wp.copy(now, before)
                 self._run()
@@ -123,13 +125,13 @@ class RecordingSolver(WhiskerSolver):
     @property
     def packed_shapes(self) -> dict[str, tuple[int, ...]]:
         """Shapes of the packed arrays that changes are of, see ``kernels.adjoint.tangent.PackedTangents``."""
-        _, motions, shapes, jobs, *_ = self.inputs
-        loads, solids = int(jobs.load_force.shape[0]), int(shapes.kind.shape[0])
+        scene = self.scene
+        loads, solids = int(scene.jobs.load_force.shape[0]), int(scene.shapes.kind.shape[0])
         return {
             "link": (10, self.capacity, self.count),
             **dict.fromkeys(("beta", "friction"), (self.count,)),
             "gravity": (self.count, 3),
-            "knots": (int(motions.place.shape[0]), 16),
+            "knots": (int(scene.motions.place.shape[0]), 16),
             "load_force": (loads, 3),
             "load_share": (loads,),
             **{f"shape_{name}": (solids, 3) for name in ("place", "turn", "size")},
@@ -152,10 +154,9 @@ class RecordingSolver(WhiskerSolver):
         wp, device = warp(), self.device
         with BUILDING:
             kernels = specialize("recorder.tangent", **self.kernels.parameters)
-        chains, motions, shapes, jobs, options, readings, *_ = self.inputs
         count, some = self.count, len(changes["beta"])
-        frames = int(readings.row.numpy().max()) + 1
-        with turn(device):
+        frames = int(self.scene.readings.row.numpy().max()) + 1
+        with lock_of(device):
             state = (some, self.capacity, count)
             tangents = allocate(kernels.PackedTangents, device, angle=state, rate=state)
             for name, values in changes.items():
@@ -173,7 +174,7 @@ class RecordingSolver(WhiskerSolver):
                 contacts=count,
             )
             for records in self._segments():
-                arguments = [chains, motions, shapes, jobs, options, records, system, tangents, outputs]
+                arguments = [self.scene, records, system, tangents, outputs]
                 wp.launch(kernels.tangent_segment, count, arguments, device=device)
             wrench, points, contact = (
                 np.moveaxis(values.numpy(), 3, 1) for values in (outputs.wrench, outputs.points, outputs.contact)

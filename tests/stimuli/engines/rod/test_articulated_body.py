@@ -15,22 +15,20 @@ def _passes(chain, accelerations, load=None):
     """Joint accelerations [n, hinge], wrenches on the base [n, 6] and accelerations of the tip [n, 3]."""
     kernels = in_double("articulated_body", hinges=chain.hinges)
     real, JointVector, vec3 = wp.float64, kernels.JointVector, kernels.vec3
-    ChainArrays, JobArrays, StepOptions = kernels.ChainArrays, kernels.JobArrays, kernels.StepOptions
+    SceneArrays, Step = kernels.SceneArrays, kernels.Step
     WhiskerJob, WhiskerState, ChainState = kernels.WhiskerJob, kernels.WhiskerState, kernels.ChainState
     ProximityState, ContactCandidates, BodyMotion = (
         kernels.ProximityState,
         kernels.ContactCandidates,
         kernels.BodyMotion,
     )
-    Twist, SpatialAcceleration = kernels.Twist, kernels.SpatialAcceleration
+    spatial = kernels.spatial
     forward_kinematics, articulated_inertia = kernels.forward_kinematics, kernels.articulated_inertia
     joint_accelerations, row = kernels.joint_accelerations, kernels.row
 
     @wp.kernel(enable_backward=False, module="unique")
     def passes(
-        chains: ChainArrays,
-        jobs: JobArrays,
-        options: StepOptions,
+        scene: SceneArrays,
         pose: BodyMotion,
         angle: wp.array(dtype=JointVector),
         rate: wp.array(dtype=JointVector),
@@ -43,8 +41,8 @@ def _passes(chain, accelerations, load=None):
     ):
         k = wp.tid()
         job = WhiskerJob()
-        job.links = chains.links[0]
-        job.beta = chains.beta[0]
+        job.links = scene.chains.links[0]
+        job.beta = scene.chains.beta[0]
         job.end_load = loads
         chain = ChainState()
         proximity = ProximityState()
@@ -53,17 +51,15 @@ def _passes(chain, accelerations, load=None):
         for i in range(job.links):
             chain.angle[i] = angle[i]
             chain.rate[i] = rate[i]
-        moving = Twist()
-        moving.angular = pose.spin
-        moving.linear = pose.velocity
-        base = SpatialAcceleration()
-        base.angular = acceleration[k, 0]
-        base.linear = acceleration[k, 1]
-        last = forward_kinematics(chains, job, pose, chain, proximity, state)
-        felt = articulated_inertia(chains, jobs, job, chain, proximity, last, base, real(0.0), h, 1)
-        tip[k] = joint_accelerations(job, options, chain, candidates, state, moving, base, real(0.0), h, 1)
-        wrench[k, 0] = felt.moment
-        wrench[k, 1] = felt.force
+        step = Step()
+        step.length = h
+        step.pose = pose
+        step.base = spatial(acceleration[k, 0], acceleration[k, 1])
+        last = forward_kinematics(scene.chains, job, pose, chain, proximity, state)
+        felt = articulated_inertia(scene, job, chain, proximity, step, last, 1)
+        tip[k] = joint_accelerations(scene, job, chain, candidates, state, step, 1)
+        wrench[k, 0] = felt.w
+        wrench[k, 1] = felt.v
         for i in range(job.links):
             joints[k, i] = row(chain.acceleration, i)
 
@@ -72,12 +68,15 @@ def _passes(chain, accelerations, load=None):
     loads |= {"step": np.zeros(1), "load_link": np.array([link], dtype=np.int32), "load_share": np.array([share])}
     loads |= {"load_force": np.array([force]), "load_stop": np.array([1e30])}
     pose = BodyMotion()
-    pose.turn, pose.spin, pose.velocity = chain.base_turn, chain.base_twist[:3], chain.base_twist[3:]
+    pose.quaternion, pose.spin, pose.velocity = chain.base_quaternion, chain.base_twist[:3], chain.base_twist[3:]
     n = len(accelerations)
     joints, wrench = wp.zeros((n, chain.links), dtype=JointVector), wp.zeros((n, 2), dtype=vec3)
     tip = wp.zeros(n, dtype=vec3)
+    scene, structs = SceneArrays(), in_double("state", hinges=chain.hinges)
+    scene.chains = to_struct(structs.ChainArrays, chain.arrays(), "cpu")
+    scene.jobs = to_struct(structs.JobArrays, loads, "cpu")
     inputs = [
-        to_struct(ChainArrays, chain.arrays(), "cpu"), to_struct(JobArrays, loads, "cpu"), StepOptions(), pose,
+        scene, pose,
         wp.array(chain.angle, dtype=JointVector), wp.array(chain.rate, dtype=JointVector),
         wp.array(np.reshape(accelerations, (n, 2, 3)), dtype=vec3), STEP, int(load is not None), joints, wrench, tip,
     ]  # fmt: skip

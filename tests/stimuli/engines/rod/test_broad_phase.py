@@ -22,8 +22,8 @@ def _run(chain, centres, radii, velocity):
     real, vec2, vec3 = wp.float64, kernels.vec3, kernels.vec3
     vec2 = in_double("algebra").vec2
     passes = in_double("articulated_body")
-    ChainArrays, MotionArrays, ShapeArrays = kernels.ChainArrays, kernels.MotionArrays, kernels.ShapeArrays
-    StepOptions, PausedWhiskers, WhiskerJob = kernels.StepOptions, kernels.PausedWhiskers, kernels.WhiskerJob
+    SceneArrays, Step = kernels.SceneArrays, kernels.Step
+    PausedWhiskers, WhiskerJob = kernels.PausedWhiskers, kernels.WhiskerJob
     ChainState, ProximityState, WhiskerState = kernels.ChainState, kernels.ProximityState, kernels.WhiskerState
     ContactCandidates, NearShapes, row = kernels.ContactCandidates, kernels.NearShapes, kernels.row
     instant, pose_at = kernels.instant, in_double("motion").pose_at
@@ -34,10 +34,7 @@ def _run(chain, centres, radii, velocity):
 
     @wp.kernel(enable_backward=False, module="unique")
     def follow(
-        chains: ChainArrays,
-        motions: MotionArrays,
-        shapes: ShapeArrays,
-        options: StepOptions,
+        scene: SceneArrays,
         paused: PausedWhiskers,
         angle: wp.array(dtype=vec2),
         rate: wp.array(dtype=vec2),
@@ -51,8 +48,8 @@ def _run(chain, centres, radii, velocity):
         measured: wp.array(dtype=wp.int32),
     ):
         job = WhiskerJob()
-        job.links = chains.links[0]
-        job.end_shape = shapes.kind.shape[0]
+        job.links = scene.chains.links[0]
+        job.end_shape = scene.shapes.kind.shape[0]
         job.object_speed = speed
         chain = ChainState()
         proximity = ProximityState()
@@ -64,28 +61,18 @@ def _run(chain, centres, radii, velocity):
             chain.rate[i] = rate[i]
         for t in range(nodes.shape[0]):
             when = instant(0, real(t) * h)
-            pose = pose_at(motions, 0, when)
-            forward_kinematics(chains, job, pose, chain, proximity, state)
-            reach = search_range(job, options, state, h)
-            measured[t] = count_near_links(chains, job, proximity, reach)
+            step = Step()
+            step.now = when
+            step.length = h
+            step.pose = pose_at(scene.motions, 0, when)
+            pose = step.pose
+            forward_kinematics(scene.chains, job, pose, chain, proximity, state)
+            reach = search_range(scene, job, state, h)
+            measured[t] = count_near_links(scene, job, proximity, reach)
             lower_clearance(job, proximity, near, reach)
             state.last_step = h
-            found = find_candidates(
-                chains,
-                motions,
-                shapes,
-                job,
-                paused,
-                chain,
-                proximity,
-                near,
-                candidates,
-                state,
-                pose,
-                reach.margin,
-                when,
-                h,
-            )
+            step.margin = reach.margin
+            found = find_candidates(scene, paused, job, chain, proximity, near, candidates, state, step)
             margin[t] = reach.margin
             for j in range(found):
                 gap[t, j] = row(candidates.gap, j)
@@ -102,13 +89,13 @@ def _run(chain, centres, radii, velocity):
         "first": np.arange(count + 1, dtype=np.int32), "count": np.ones(count + 1, dtype=np.int32),
         "cell": np.zeros(1, dtype=np.int32), "coarse": np.zeros((count + 1, 3)),
         "place": np.vstack([np.zeros(3), centres]),
-        "velocity": np.vstack([chain.base_twist[3:], velocity]), "turn": still,
+        "velocity": np.vstack([chain.base_twist[3:], velocity]), "quaternion": still,
         "spin": np.zeros((count + 1, 3)), "surge": np.zeros((count + 1, 3)),
     }  # fmt: skip
-    motions["turn"][0] = chain.base_turn
+    motions["quaternion"][0] = chain.base_quaternion
     shapes = {
         "kind": np.full(count, SPHERE, dtype=np.int32), "size": np.stack([radii] * 3, axis=1),
-        "place": np.zeros((count, 3)), "turn": still[1:], "scale": np.ones(count), "friction": np.zeros(count),
+        "place": np.zeros((count, 3)), "quaternion": still[1:], "scale": np.ones(count), "friction": np.zeros(count),
         "track": np.arange(1, count + 1, dtype=np.int32),
     }  # fmt: skip
     shapes |= dict.fromkeys(("face", "faces", "box"), np.zeros(count, dtype=np.int32))
@@ -116,9 +103,12 @@ def _run(chain, centres, radii, velocity):
     gap, link = wp.full((STEPS, most), np.inf, dtype=real), wp.full((STEPS, most), -1, dtype=wp.int32)
     margin, measured = wp.zeros(STEPS, dtype=real), wp.zeros(STEPS, dtype=wp.int32)
     speed = np.linalg.norm(velocity, axis=1).max()
+    scene, structs = SceneArrays(), in_double("state")
+    scene.chains = to_struct(structs.ChainArrays, chain.arrays(), "cpu")
+    scene.motions = to_struct(structs.MotionArrays, motions, "cpu")
+    scene.shapes = to_struct(structs.ShapeArrays, shapes, "cpu")
     inputs = [
-        to_struct(ChainArrays, chain.arrays(), "cpu"), to_struct(MotionArrays, motions, "cpu"),
-        to_struct(ShapeArrays, shapes, "cpu"), StepOptions(), PausedWhiskers(), wp.array(chain.angle, dtype=vec2),
+        scene, PausedWhiskers(), wp.array(chain.angle, dtype=vec2),
         wp.array(chain.rate, dtype=vec2), float(speed), STEP, nodes, bound, gap, link, margin, measured,
     ]  # fmt: skip
     wp.launch(follow, 1, inputs, device="cpu")

@@ -8,7 +8,7 @@ import pytest
 
 from brainbench.core.devices import to_struct
 from brainbench.stimuli.engines.rod.limits import contact_iterations
-from brainbench.stimuli.engines.rod.scheduling import make_problems
+from brainbench.stimuli.engines.rod.slices import make_problems
 from tests.factories.rod_chain import CAPACITY, DenseChain, in_double
 from tests.factories.rod_threads import Records, thread_warp
 
@@ -47,19 +47,18 @@ def _problem(count, friction, seed, links=8, hinges=2):
 def _factorised(problem, tolerance=None):
     """What ``write_problem`` leaves of these candidates: fields of ``ContactProblems`` for one job."""
     hinges = problem.chain.hinges
-    kernels, passes = (in_double(name, hinges=hinges) for name in ("contact_problem", "articulated_body"))
+    kernels, passes = (in_double(name, hinges=hinges) for name in ("contact_solver", "articulated_body"))
     real, JointVector, vec3 = wp.float64, passes.JointVector, passes.vec3
-    ChainArrays, JobArrays, ContactProblems = passes.ChainArrays, passes.JobArrays, kernels.ContactProblems
+    SceneArrays, Step, ContactProblems = passes.SceneArrays, passes.Step, kernels.ContactProblems
     ChainState, ProximityState, ContactCandidates = passes.ChainState, passes.ProximityState, passes.ContactCandidates
     WhiskerJob, WhiskerState, BodyMotion = passes.WhiskerJob, passes.WhiskerState, passes.BodyMotion
-    SpatialAcceleration, forward_kinematics = passes.SpatialAcceleration, passes.forward_kinematics
-    articulated_inertia, write_problem = passes.articulated_inertia, kernels.write_problem
+    forward_kinematics, articulated_inertia = passes.forward_kinematics, passes.articulated_inertia
+    write_problem = kernels.write_problem
     any_gap_closes = kernels.any_gap_closes
 
     @wp.kernel(enable_backward=False, module="unique")
     def write(
-        chains: ChainArrays,
-        jobs: JobArrays,
+        scene: SceneArrays,
         pose: BodyMotion,
         angle: wp.array(dtype=JointVector),
         link: wp.array(dtype=wp.int32),
@@ -73,8 +72,8 @@ def _factorised(problem, tolerance=None):
         problems: ContactProblems,
     ):
         job = WhiskerJob()
-        job.links = chains.links[0]
-        job.beta = chains.beta[0]
+        job.links = scene.chains.links[0]
+        job.beta = scene.chains.beta[0]
         chain = ChainState()
         proximity = ProximityState()
         candidates = ContactCandidates()
@@ -89,20 +88,23 @@ def _factorised(problem, tolerance=None):
             candidates.gap[j] = gap[j]
             candidates.friction[j] = friction[j]
             candidates.arc[j] = arc[j]
-        last = forward_kinematics(chains, job, pose, chain, proximity, state)
-        base = SpatialAcceleration()
-        felt = articulated_inertia(chains, jobs, job, chain, proximity, last, base, real(0.0), h, 1)
+        last = forward_kinematics(scene.chains, job, pose, chain, proximity, state)
+        step = Step()
+        step.length = h
+        step.pose = pose
+        problems.given[0].base = articulated_inertia(scene, job, chain, proximity, step, last, 1)
         any_gap_closes(candidates, link.shape[0], h)
-        none = vec3(real(0.0), real(0.0), real(0.0))
-        write_problem(problems, chains, job, chain, proximity, candidates, state, felt, none, h, link.shape[0])
+        write_problem(scene, problems, job, chain, proximity, candidates, 0, h, link.shape[0])
 
     problems = make_problems(SimpleNamespace(structs=kernels), CAPACITY, 1, "cpu", contact_iterations(tolerance))
     pose = BodyMotion()
-    pose.turn = problem.chain.base_turn
+    pose.quaternion = problem.chain.base_quaternion
     vectors = (wp.array(values, dtype=vec3) for values in (problem.point, problem.normal, problem.free))
     numbers = (wp.array(values, dtype=real) for values in (problem.gap, problem.friction, problem.arc))
+    scene = SceneArrays()
+    scene.chains = to_struct(in_double("state", hinges=hinges).ChainArrays, problem.chain.arrays(), "cpu")
     inputs = [
-        to_struct(ChainArrays, problem.chain.arrays(), "cpu"), JobArrays(), pose,
+        scene, pose,
         wp.array(problem.chain.angle, dtype=JointVector), wp.array(problem.link), *vectors, *numbers, STEP, problems,
     ]  # fmt: skip
     wp.launch(write, 1, inputs, device="cpu")

@@ -16,7 +16,6 @@ from brainbench.stimuli.engines.rod.engine import RodEngine
 from brainbench.stimuli.motion.jobs import Job, StillFollicle
 from brainbench.stimuli.objects.collections import resolve_objects
 from brainbench.stimuli.objects.obstacle import Box, Capsule, Obstacle
-from brainbench.stimuli.sweeps.grid import SweepGrid
 from brainbench.stimuli.sweeps.sweep_scenes import GRIDS, SweepScenes
 from brainbench.stimuli.validation import bench_tests
 from brainbench.stimuli.whiskers.chain import build_chain
@@ -147,56 +146,6 @@ def test_single_precision_loses_nothing_that_matters():
     assert np.abs(single - double).max(axis=0) == pytest.approx(0, abs=2e-3 * np.abs(double[:, :3]).max())
 
 
-def test_sweeps_through_the_fast_path_equal_their_scenes():
-    from brainbench.stimuli import simulate
-    from brainbench.stimuli.sweeps.simulation import simulate_sweeps
-
-    objects = resolve_objects(["ellipsoid-1"], surfaces=True)
-    grid = SweepGrid(speed=(0.05,), rotation=(0.0, 0.7), distance=(0.005,), size=(0.03,))
-    scenes = SweepScenes(grid, {name: item.load for name, item in objects.items()}, whiskers="C1,C2,D2")
-    fidelity = Fidelity(links=10, time_step=5e-4)
-    fast = simulate_sweeps(scenes, [0, 1], fidelity=fidelity)
-    slow = simulate([scenes[0], scenes[1]], fidelity=fidelity, backend="rod", cache=False)
-    assert not fast.unstable.any()
-    assert (fast.contact > 0).any()
-    assert fast.steps < 0.6 * fast.steps_in_full
-    peak = np.abs(slow["wrench"].values[..., :3]).max()
-    # The same contacts, rounded differently: friction makes a few readings differ by more.
-    assert np.median(np.abs(fast.wrench - slow["wrench"].values)[..., :3]) < 1e-4 * peak
-    assert np.abs(fast.wrench - slow["wrench"].values)[..., :3].mean() < 2e-3 * peak
-
-
-def test_sweeps_do_not_depend_on_which_share_a_launch():
-    from brainbench.stimuli.sweeps.simulation import simulate_sweeps
-
-    objects = resolve_objects(["ellipsoid-1", "brick-2"], surfaces=True)
-    grid = SweepGrid(speed=(0.05,), rotation=(0.0, 0.7), distance=(0.005,), size=(0.03,))
-    scenes = SweepScenes(grid, {name: item.load for name, item in objects.items()}, whiskers="C1,D2")
-    together = simulate_sweeps(scenes, [0, 1, 2, 3], fidelity=COARSE, workers=2)
-    single = [simulate_sweeps(scenes, [index], fidelity=COARSE) for index in range(4)]
-    assert np.concatenate([batch.wrench for batch in single]).tobytes() == together.wrench.tobytes()
-
-
-def test_whiskers_that_cannot_be_trusted_are_simulated_again_and_no_other_changes():
-    from brainbench.stimuli.sweeps.simulation import simulate_sweeps
-
-    objects = resolve_objects(["chair-0"], surfaces=True)
-    scenes = SweepScenes(GRIDS["thesis-high"], {name: item.load for name, item in objects.items()})
-    fidelity, chosen = Fidelity(links=10, time_step=5e-4), [0, 140]
-    once = simulate_sweeps(scenes, chosen, fidelity=fidelity)
-    again = simulate_sweeps(scenes, chosen, fidelity=fidelity, retry=5)
-    bad, left = once.unstable, again.unstable
-    assert left.sum() <= bad.sum() / 2
-    assert (again.retried, once.retried) == (2, 0)
-    assert [bool(words) for words in again.reasons] == left.any(axis=1).tolist()
-    # What was simulated again is what a finer simulation of everything gives; nothing else changes.
-    runs = [once, *(simulate_sweeps(scenes, chosen, fidelity=Fidelity(links=10, time_step=h)) for h in (1e-4, 5e-5))]
-    same = np.array([(run.wrench == again.wrench).all(axis=(1, 3)) for run in runs])
-    assert (same[0] | same[1:].any(axis=0) | left).all()
-    assert (same[1:].any(axis=0) & ~left)[bad].sum() >= bad.sum() / 2
-    assert same[0][~bad].mean() > 0.9
-
-
 def test_whiskers_of_a_scene_that_cannot_be_trusted_are_simulated_again_and_no_other_changes():
     from brainbench.stimuli import simulate
 
@@ -215,89 +164,6 @@ def test_whiskers_of_a_scene_that_cannot_be_trusted_are_simulated_again_and_no_o
     assert (np.isfinite(again["wrench"].values).all(axis=(1, 3)) == ~left).all()
 
 
-def test_whiskers_that_finer_steps_do_not_mend_take_steps_twice_as_fine(monkeypatch):
-    from brainbench.stimuli.engines.rod.sweeps import SweepLauncher
-
-    # Without steps that only compare.
-    monkeypatch.setattr("brainbench.stimuli.engines.trust.SUSPICIOUS_PEAK", 1e9)
-    objects = resolve_objects(["brick-0"], surfaces=True)
-    scenes = SweepScenes(GRIDS["thesis-high"], {name: item.load for name, item in objects.items()})
-    launcher = SweepLauncher(scenes, Fidelity(links=12, time_step=5e-4))
-    chosen = [("brick-0", [scenes.grid.sweeps("brick-0")[74]])]
-    once = launcher.launch(chosen)
-    bad = once.verdict.unstable
-    five = launcher.launch(chosen, [(bad, 5)])
-    left = bad.copy()
-    left[bad] = five.verdict.unstable[:, 0]
-    assert left.any()
-    result = launcher.trusted(chosen, 5)
-    assert (result.unstable.any(), result.reasons, result.retried) == (False, ("",), 1)
-    ten = launcher.launch(chosen, [(left, 10)])
-    np.testing.assert_array_equal(np.moveaxis(result.wrench[0], 1, 0)[left[0]], ten.wrench[:, :, 0])
-    # All that was computed is counted.
-    assert result.steps == once.steps.sum() + five.steps.sum() + ten.steps.sum()
-
-
-def test_a_whisker_that_cannot_be_trusted_says_why():
-    from brainbench.stimuli.engines.rod.sweeps import SweepLauncher
-
-    objects = resolve_objects(["brick-0", "chair-0"], surfaces=True)
-    scenes = SweepScenes(GRIDS["thesis-high"], {name: item.load for name, item in objects.items()})
-    launcher = SweepLauncher(scenes, Fidelity(links=12, time_step=5e-4))
-    found = set()
-    for name, index in (("brick-0", 74), ("chair-0", 168)):
-        result = launcher.launch([(name, [scenes.grid.sweeps(name)[index]])])
-        status, unstable, reasons = result.counts["status"][0], result.verdict.unstable[0], result.verdict.reasons[0]
-        first = int(np.argmax(unstable))
-        told = f"{scenes.array.names[first]}: {reasons[first]}"
-        assert launcher.batch(result).reasons[0].startswith(told)
-        assert [bool(reason) for reason in reasons] == unstable.tolist()
-        assert ["a joint bent by" in reason for reason in reasons] == (status == 1).tolist()
-        found |= {reason.split(" ")[0] for reason in reasons[unstable]}
-    assert len(found) > 1
-
-
-def _few_sweeps(**grid):
-    objects = resolve_objects(["ellipsoid-1"], surfaces=True)
-    grid = SweepGrid(**{"speed": (0.05,), "rotation": (0.0,), "distance": (0.005,), "size": (0.03,), **grid})
-    return SweepScenes(grid, {name: item.load for name, item in objects.items()}, whiskers="C1,C2,D2")
-
-
-@pytest.mark.parametrize(("speed", "step", "way"), [(3.0, 5e-3, "0.938 mm"), (4.0, 1e-4, "0.4 mm")])
-@pytest.mark.parametrize("path", ["sweeps", "scenes"])
-def test_an_object_too_fast_to_be_followed_is_told_of_in_sweeps_as_in_scenes(path, speed, step, way):
-    from brainbench.stimuli import simulate
-    from brainbench.stimuli.sweeps.simulation import simulate_sweeps
-
-    scenes, fidelity = _few_sweeps(speed=(0.05, speed)), Fidelity(links=10, time_step=step)
-    if path == "sweeps":
-        batch = simulate_sweeps(scenes, [0, 1], fidelity=fidelity, retry=5)
-        unstable, reasons = batch.unstable.any(axis=1), batch.reasons
-    else:
-        dataset = simulate([scenes[0], scenes[1]], fidelity=fidelity, cache=False)
-        unstable = (dataset["status"].values != "ok").any(axis=1)
-        reasons = ["".join(words) for words in dataset["reason"].values]
-    assert unstable.tolist() == [False, True]
-    assert f"moves by {way}" in reasons[1]
-    assert not reasons[0]
-
-
-def test_a_force_that_no_whisker_bears_is_flagged_in_sweeps_and_not_tried_again():
-    from brainbench.stimuli.engines.rod.sweeps import SweepLauncher
-
-    scenes = _few_sweeps()
-    launcher = SweepLauncher(scenes, COARSE)
-    (name,) = scenes.objects
-    sound = launcher.trusted([(name, scenes.grid.sweeps(name))], 5)
-    assert not sound.unstable.any()
-    peaks = np.linalg.norm(sound.wrench[0, ..., :3], axis=-1).max(axis=0)
-    launcher.solver.strongest[:] = 0.5 * peaks.max()
-    found = launcher.trusted([(name, scenes.grid.sweeps(name))], 5)
-    assert found.unstable.tolist() == [(peaks > 0.5 * peaks.max()).tolist()]
-    assert "stretch the whisker" in found.reasons[0]
-    assert found.retried == 0
-
-
 def test_an_unknown_device_is_refused_in_words():
     with pytest.raises(UsageError, match="received 'tpu'"):
         RodEngine(device="tpu").run([Job(C2, StillFollicle(), (), np.array([1e-3]))], COARSE)
@@ -306,27 +172,6 @@ def test_an_unknown_device_is_refused_in_words():
 def test_more_precision_than_there_is_is_refused_in_words():
     with pytest.raises(UsageError, match=r"'quad'.*'single', 'double'"):
         Fidelity(precision="quad")
-
-
-@pytest.mark.parametrize("budget", [None, 4])
-def test_whiskers_that_pause_for_every_look_at_a_mesh_feel_the_same(budget):
-    from brainbench.stimuli.engines.rod.sweeps import SweepLauncher
-
-    objects = resolve_objects(["torus-1", "gear-0"], surfaces=True)
-    grid = SweepGrid(speed=(0.06,), rotation=(0.0, 0.4), distance=(0.005,), size=(0.04,))
-    scenes = SweepScenes(grid, {name: item.load for name, item in objects.items()})
-    results = []
-    for sliced in (False, True):
-        launcher = SweepLauncher(scenes, COARSE, sliced=sliced)
-        launcher.solver.tuning = {"budget": budget}
-        results.append(launcher.launch([(name, grid.sweeps(name)) for name in scenes.objects]))
-        assert (launcher.solver.slices > 1) == sliced
-    whole, parts = results
-    assert whole.counts["touching"].sum() > 100
-    for name in ("wrench", "contact", "depth", "residual"):
-        np.testing.assert_array_equal(getattr(whole, name), getattr(parts, name))
-    for name, values in whole.counts.items():
-        np.testing.assert_array_equal(values, parts.counts[name])
 
 
 @pytest.mark.parametrize("step", [2e-4, 2e-3])
@@ -359,20 +204,6 @@ def test_a_weight_bends_a_whisker_without_inertia_as_it_does_with():
         _run(jobs, Fidelity(links=10, time_step=1e-4, solver=solver))[0] for solver in ("dynamic", "quasistatic")
     )
     np.testing.assert_allclose(balance.wrench[-1], dynamic.wrench[-1], atol=1e-3 * np.abs(dynamic.wrench[-1]).max())
-
-
-def test_sweeps_through_the_fast_path_may_leave_inertia_out():
-    from brainbench.stimuli.sweeps.simulation import simulate_sweeps
-
-    objects = resolve_objects(["ellipsoid-1"], surfaces=True)
-    grid = SweepGrid(speed=(0.03,), rotation=(0.0,), distance=(0.005,), size=(0.03,))
-    scenes = SweepScenes(grid, {name: item.load for name, item in objects.items()}, whiskers="C1,C2")
-    moving, still = (
-        simulate_sweeps(scenes, [0], fidelity=Fidelity(links=10, time_step=5e-4, solver=solver))
-        for solver in ("dynamic", "quasistatic")
-    )
-    peak = np.abs(moving.wrench[..., 3:]).max()
-    assert 0 < np.median(np.abs(moving.wrench - still.wrench)[..., 3:][moving.wrench[..., 3:] != 0]) < 0.02 * peak
 
 
 @pytest.mark.parametrize("name", ["mujoco", "bullet"])

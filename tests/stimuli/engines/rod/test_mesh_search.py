@@ -8,8 +8,8 @@ import pytest
 from brainbench.core.devices import to_struct
 from brainbench.geometry import Mesh
 from brainbench.stimuli.engines.rod.kernels import specialize
-from brainbench.stimuli.engines.rod.mesh_bvh import EMPTY, WIDE, spatial_order, tree_boxes
-from brainbench.stimuli.engines.rod.shapes import PackedShapes, PackedSurface
+from brainbench.stimuli.engines.rod.limits import WIDE
+from brainbench.stimuli.engines.rod.shapes import EMPTY, PackedShapes, PackedSurface, spatial_order, tree_boxes
 from tests.factories.rod_threads import WARP, Memory, thread_warp
 
 wp = pytest.importorskip("warp")
@@ -59,7 +59,7 @@ def test_every_aligned_run_of_triangles_is_a_box_that_holds_them():
 def _ask(surface, starts, stops, radius, within, leaf):
     """Squared distances [segment, 3] of the kernel's search from the segments, their ends and their starts."""
     wp.init()
-    search = specialize("mesh_bvh", real=wp.float64)
+    search = specialize("narrow_phase", real=wp.float64)
     nearest_triangles, ShapeArrays = search.nearest_triangles, search.ShapeArrays
     filled = to_struct(ShapeArrays, _shapes(surface), "cpu")
 
@@ -89,7 +89,7 @@ def _shapes(surface):
     shapes = PackedShapes()
     one, still = np.ones(1), np.array([[1.0, 0, 0, 0]])
     prepared = PackedSurface.of(surface.vertices, surface.faces)
-    shapes.add_placed(prepared, track=np.zeros(1), turn=still, scale=one, radius=one, speed=np.zeros(1))
+    shapes.add_placed(prepared, track=np.zeros(1), quaternion=still, scale=one, radius=one, speed=np.zeros(1))
     return shapes.arrays()
 
 
@@ -156,7 +156,7 @@ def test_a_link_outside_is_never_told_that_it_overlaps_wherever_the_search_begin
     wp.init()
     phase = specialize("narrow_phase", real=wp.float64)
     link_shape_distance, ShapeArrays, BodyMotion = phase.link_shape_distance, phase.ShapeArrays, phase.BodyMotion
-    LinkTaper = phase.LinkTaper
+    LinkTaper, cone = specialize("state", real=wp.float64).LinkTaper, phase.cone
 
     @wp.kernel(enable_backward=False, module="unique")
     def ask(
@@ -169,9 +169,9 @@ def test_a_link_outside_is_never_told_that_it_overlaps_wherever_the_search_begin
     ):
         k = wp.tid()
         body = BodyMotion()
-        body.turn = wp.vec4d(wp.float64(1.0), wp.float64(0.0), wp.float64(0.0), wp.float64(0.0))
+        body.quaternion = wp.vec4d(wp.float64(1.0), wp.float64(0.0), wp.float64(0.0), wp.float64(0.0))
         thin = LinkTaper(wp.float64(1e-3), wp.float64(1e-3), wp.float64(0.0), wp.float64(1.0))
-        found = link_shape_distance(shapes, 0, body, a[k], b[k], thin, margin, wp.float64(1.0), leaf[k], 0, 1)
+        found = link_shape_distance(shapes, 0, body, cone(a[k], b[k], thin), margin, wp.float64(1.0), leaf[k], 0, 1)
         out[k, 0] = wp.where(found.between == 1, found.gap, wp.float64(1e30))
         out[k, 1] = wp.where(found.end == 1, found.end_gap, wp.float64(1e30))
 
@@ -212,7 +212,7 @@ def test_a_link_outside_is_never_told_that_it_overlaps_wherever_the_search_begin
 
 def _measure_leaves(arrays, starts, stops, threads):
     """Numbers [thread, segment, 7] that the threads of a group find in the leaf of each segment's rank."""
-    nodes = specialize("mesh_bvh", real=wp.float64, group_size=threads)
+    nodes = specialize("narrow_phase", real=wp.float64, group_size=threads)
     measure_triangles, NearestTriangles = nodes.measure_triangles, nodes.NearestTriangles
     SearchSegment, SearchBounds, LeafCorners = nodes.SearchSegment, nodes.SearchBounds, nodes.LeafCorners
     own = WIDE // threads
@@ -287,7 +287,7 @@ def test_threads_that_search_together_find_what_one_finds(lanes):
     alone = np.where((alone == alone.min(axis=1, keepdims=True)) | counts, alone, np.nan)
     arrays = _shapes(surface)
     with thread_warp() as (threads, load):
-        nearest = load("mesh_bvh", group_size=lanes).nearest_triangles
+        nearest = load("narrow_phase", group_size=lanes).nearest_triangles
         bodies = SimpleNamespace(**{name: Memory(values) for name, values in arrays.items()})
         for begin in range(0, len(starts), count):
             found = {}

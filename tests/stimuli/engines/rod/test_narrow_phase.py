@@ -37,8 +37,8 @@ def _segments(rng, count, size=3.0):
 def test_a_tapered_link_meets_a_turned_primitive_where_its_gap_is_least(kind, scale):
     kernels = in_double("narrow_phase")
     real, vec3 = wp.float64, kernels.vec3
-    ShapeArrays, BodyMotion, LinkTaper = kernels.ShapeArrays, kernels.BodyMotion, kernels.LinkTaper
-    link_shape_distance = kernels.link_shape_distance
+    ShapeArrays, BodyMotion, LinkTaper = kernels.ShapeArrays, kernels.BodyMotion, in_double("state").LinkTaper
+    link_shape_distance, cone = kernels.link_shape_distance, kernels.cone
 
     @wp.kernel(enable_backward=False, module="unique")
     def measure(
@@ -51,7 +51,7 @@ def test_a_tapered_link_meets_a_turned_primitive_where_its_gap_is_least(kind, sc
         normals: wp.array2d(dtype=vec3),
     ):
         k = wp.tid()
-        found = link_shape_distance(shapes, 0, body, a[k], b[k], taper, real(1.0), real(1.0), 0, 0, 1)
+        found = link_shape_distance(shapes, 0, body, cone(a[k], b[k], taper), real(1.0), real(1.0), 0, 0, 1)
         numbers[k, 0] = found.share
         numbers[k, 1] = found.gap
         numbers[k, 2] = found.end_gap
@@ -69,10 +69,10 @@ def test_a_tapered_link_meets_a_turned_primitive_where_its_gap_is_least(kind, sc
     world = [body.apply(own.apply(x) + place) + at for x in (starts, stops)]
     size = np.array(SIZES[kind], dtype=float)
     given = {"kind": np.array([kind], dtype=np.int32), "size": size[None], "place": place[None]}
-    given |= {"turn": np.roll(own.as_quat(), 1)[None], "scale": np.array([scale])}
+    given |= {"quaternion": np.roll(own.as_quat(), 1)[None], "scale": np.array([scale])}
     given |= dict.fromkeys(("face", "faces", "box"), np.zeros(1, dtype=np.int32))
     motion, taper = BodyMotion(), LinkTaper()
-    motion.place, motion.turn = at, np.roll(body.as_quat(), 1)
+    motion.place, motion.quaternion = at, np.roll(body.as_quat(), 1)
     taper.start_radius, taper.end_radius = 0.2, 0.05
     numbers, normals = wp.zeros((300, 4), dtype=real), wp.zeros((300, 2), dtype=vec3)
     points = (wp.array(x, dtype=vec3) for x in world)

@@ -127,24 +127,94 @@ def reader(*kinds: tuple[Any, Any]) -> Any:
 
 
 @wp.struct
-class Twist:
-    """Angular velocity, and velocity of the point of the body that is at the base point."""
+class Spatial:
+    """A spatial vector at the base point: rotation and velocity there (a motion), or moment and force."""
 
-    angular: vec3
-    linear: vec3
+    w: vec3
+    v: vec3
+
+
+@wp.func
+def spatial(w: vec3, v: vec3) -> Spatial:
+    """Return a spatial vector."""
+    both = Spatial()
+    both.w = w
+    both.v = v
+    return both
+
+
+@wp.func
+def hinge_motion(at: vec3, axis: vec3) -> Spatial:
+    """Return the motion S of what turns at rate 1 about an axis through a point: its other part is at × axis."""
+    return spatial(axis, wp.cross(at, axis))
+
+
+@wp.func
+def spatial_dot(a: Spatial, b: Spatial) -> real:
+    """Return the power of a force b at a motion a."""
+    return wp.dot(a.w, b.w) + wp.dot(a.v, b.v)
+
+
+@wp.func
+def scaled(a: Spatial, x: real) -> Spatial:
+    """Return a x."""
+    return spatial(a.w * x, a.v * x)
+
+
+@wp.func
+def combined(a: Spatial, x: real, b: Spatial, y: real) -> Spatial:
+    """Return a x + b y."""
+    return spatial(a.w * x + b.w * y, a.v * x + b.v * y)
+
+
+@wp.func
+def plus(a: Spatial, b: Spatial, x: real) -> Spatial:
+    """Return a + b x."""
+    return spatial(a.w + b.w * x, a.v + b.v * x)
+
+
+@wp.func
+def minus(a: Spatial, b: Spatial, x: real) -> Spatial:
+    """Return a − b x."""
+    return spatial(a.w - b.w * x, a.v - b.v * x)
+
+
+@wp.func
+def cross_motion(a: Spatial, b: Spatial) -> Spatial:
+    """Return the spatial cross product a × b of two motions."""
+    return spatial(wp.cross(a.w, b.w), wp.cross(a.w, b.v) + wp.cross(a.v, b.w))
+
+
+@wp.func
+def plus_cross(c: Spatial, a: Spatial, b: Spatial) -> Spatial:
+    """Return c + a × b of motions, added up from the left."""
+    return spatial(c.w + wp.cross(a.w, b.w), c.v + wp.cross(a.w, b.v) + wp.cross(a.v, b.w))
+
+
+@wp.func
+def minus_dot(x: real, a: Spatial, b: Spatial) -> real:
+    """Return x − a·b, subtracted from the left."""
+    return x - wp.dot(a.w, b.w) - wp.dot(a.v, b.v)
 
 
 @wp.struct
-class SpatialAcceleration:
-    """Angular acceleration, and rate of the linear part of a twist."""
+class SpatialInertia:
+    """A symmetric spatial matrix (a b; bᵀ c)."""
 
-    angular: vec3
-    linear: vec3
+    a: vec6
+    b: mat33
+    c: vec6
 
 
-@wp.struct
-class Wrench:
-    """Moment about the base point, and force."""
+@wp.func
+def inertia_times(inertia: SpatialInertia, s: Spatial) -> Spatial:
+    """Return the force that a spatial inertia has at a motion."""
+    return spatial(symmetric_times(inertia.a, s.w) + inertia.b * s.v, s.w * inertia.b + symmetric_times(inertia.c, s.v))
 
-    moment: vec3
-    force: vec3
+
+@wp.func
+def plus_inertia_times(f: Spatial, inertia: SpatialInertia, s: Spatial) -> Spatial:
+    """Return a force and that of an inertia at a motion, added up from the left."""
+    return spatial(
+        f.w + symmetric_times(inertia.a, s.w) + inertia.b * s.v, f.v + s.w * inertia.b + symmetric_times(inertia.c, s.v)
+    )

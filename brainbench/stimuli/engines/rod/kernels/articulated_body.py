@@ -16,37 +16,57 @@ from brainbench.stimuli.engines.rod.limits import BENT, FOLD, LARGEST_BEND, LOST
 from .algebra import (
     JointInverse,
     JointVector,
-    SpatialAcceleration,
-    Twist,
-    Wrench,
+    Spatial,
+    SpatialInertia,
+    combined,
     cosine,
+    cross_motion,
     first_axis,
+    hinge_motion,
+    inertia_times,
     mat33,
+    minus,
+    minus_dot,
+    plus,
+    plus_cross,
+    plus_inertia_times,
     rotate,
+    scaled,
     sine,
+    spatial,
+    spatial_dot,
     symmetric_outer,
-    symmetric_times,
     upper_outer,
+    vec2,
     vec3,
     vec6,
 )
-from .motion import BodyMotion
+from .motion import BodyMotion, elapsed
 from .parameters import hinges, real
 from .state import (
     ChainArrays,
     ContactCandidates,
-    JobArrays,
+    JointRecord,
     PerLink1,
     PerLink3,
     PerLinkInt,
     PerLinkInverse,
     PerLinkJoint,
     PerNode3,
-    StepOptions,
+    SceneArrays,
+    Step,
     WhiskerJob,
     WhiskerState,
     row,
 )
+
+
+@wp.struct
+class HingeGains:
+    """U D⁻¹ of one hinge of each joint."""
+
+    w: PerLink3
+    v: PerLink3
 
 
 @wp.struct
@@ -59,17 +79,19 @@ class ChainState:
     """Second axis of the joint."""
     node: PerNode3
     """Joints and tip, from the base point."""
-    gain1_w: PerLink3
-    """U D⁻¹ of each axis (``articulated_body``), rotation and translation."""
-    gain1_v: PerLink3
-    gain2_w: PerLink3
-    gain2_v: PerLink3
+    gain1: HingeGains
+    gain2: HingeGains
     if hinges == 3:
         axis3: PerLink3
-        gain3_w: PerLink3
-        gain3_v: PerLink3
+        gain3: HingeGains
     acceleration: PerLinkJoint
     """D⁻¹u of the joint, then its accelerations."""
+
+
+@wp.func
+def gain_at(gains: wp.ref[HingeGains], i: int) -> Spatial:
+    """Return U D⁻¹ of a hinge of joint i."""
+    return spatial(row(gains.w, i), row(gains.v, i))
 
 
 @wp.func
@@ -96,6 +118,72 @@ class ProximityState:
 
 
 @wp.func(inline=True)
+def joint_record(chain: wp.ref[ChainState], proximity: wp.ref[ProximityState], i: int) -> JointRecord:
+    """Return a joint after the pass of the articulated inertia."""
+    joint = JointRecord()
+    at = row(chain.node, i)
+    axis2 = row(chain.axis2, i)
+    joint.motion1 = hinge_motion(at, first_axis(axis2, hinge_direction(chain, i), row(chain.angle, i)[1]))
+    joint.motion2 = hinge_motion(at, axis2)
+    joint.gain1 = gain_at(chain.gain1, i)
+    joint.gain2 = gain_at(chain.gain2, i)
+    if wp.static(hinges == 3):
+        if i % 2 == 1:
+            joint.motion3 = hinge_motion(at, row(chain.axis3, i))
+            joint.gain3 = gain_at(chain.gain3, i)
+    joint.inverse_inertia = row(proximity.inverse_inertia, i)
+    return joint
+
+
+@wp.func
+def force_over_joint(joint: JointRecord, i: int, force: wp.ref[Spatial]) -> JointVector:
+    """Return what joint i feels of a force behind it, u = Sᵀf, and leave what goes on, f − UD⁻¹u."""
+    felt = JointVector()
+    passed = spatial(force.w, force.v)
+    if wp.static(hinges == 3):
+        if i % 2 == 1:
+            felt[2] = spatial_dot(joint.motion3, passed)
+            passed = minus(passed, joint.gain3, felt[2])
+    felt[0] = spatial_dot(joint.motion1, passed)
+    felt[1] = spatial_dot(joint.motion2, passed)
+    passed = minus(minus(passed, joint.gain1, felt[0]), joint.gain2, felt[1])
+    force.w = passed.w
+    force.v = passed.v
+    return felt
+
+
+@wp.func
+def inverse_times(inverse: JointInverse, u: JointVector) -> JointVector:
+    """Return D⁻¹u."""
+    moved = JointVector()
+    moved[0] = inverse[0] * u[0] + inverse[1] * u[1]
+    moved[1] = inverse[1] * u[0] + inverse[2] * u[1]
+    if wp.static(hinges == 3):
+        moved[2] = inverse[3] * u[2]
+    return moved
+
+
+@wp.func
+def acceleration_over_joint(joint: JointRecord, i: int, given: JointVector, a: wp.ref[Spatial]) -> JointVector:
+    """Return the accelerations of joint i, D⁻¹u − (UD⁻¹)ᵀa, and leave the acceleration a of the link behind it.
+
+    ``given`` is D⁻¹u, ``a`` the acceleration of the link before.
+    """
+    moved = given
+    before = spatial(a.w, a.v)
+    moved[0] = minus_dot(given[0], joint.gain1, before)
+    moved[1] = minus_dot(given[1], joint.gain2, before)
+    behind = plus(plus(before, joint.motion1, moved[0]), joint.motion2, moved[1])
+    if wp.static(hinges == 3):
+        if i % 2 == 1:
+            moved[2] = minus_dot(given[2], joint.gain3, behind)
+            behind = plus(behind, joint.motion3, moved[2])
+    a.w = behind.w
+    a.v = behind.v
+    return moved
+
+
+@wp.func(inline=True)
 def forward_kinematics(
     chains: ChainArrays,
     job: WhiskerJob,
@@ -103,11 +191,11 @@ def forward_kinematics(
     chain: wp.ref[ChainState],
     proximity: wp.ref[ProximityState],
     state: wp.ref[WhiskerState],
-) -> Twist:
+) -> Spatial:
     """First pass, down the chain: place links and find their velocities; return the twist of the last one."""
     zero = real(0.0)
-    x = rotate(pose.turn, vec3(real(1.0), zero, zero))
-    y = rotate(pose.turn, vec3(zero, real(1.0), zero))
+    x = rotate(pose.quaternion, vec3(real(1.0), zero, zero))
+    y = rotate(pose.quaternion, vec3(zero, real(1.0), zero))
     z = wp.cross(x, y)
     # All positions count from the base point: single precision keeps its digits however far away the head is.
     vw = pose.spin
@@ -156,192 +244,178 @@ def forward_kinematics(
         speed = end_speed
     chain.node[job.links] = at
     state.top_speed = wp.sqrt(fastest)
-    last = Twist()
-    last.angular = vw
-    last.linear = vv
-    return last
+    return spatial(vw, vv)
+
+
+@wp.struct
+class ArticulatedBody:
+    """Articulated inertia Iᴬ and bias force pᴬ of a link and all behind it, and the twist V of the body before it."""
+
+    inertia: SpatialInertia
+    bias: Spatial
+    twist: Spatial
+
+
+@wp.func
+def spring_state(angle: real, rate: real, lag: real) -> vec2:
+    """Return the stretch of a joint's spring, q + lag q̇, and how many times steeper than its stiffness it is there."""
+    stretch = angle + lag * rate
+    steepness = real(1.0)
+    bend = wp.abs(angle)
+    # A joint bent beyond FOLD stiffens.
+    if bend > real(wp.static(FOLD)):
+        steepness = real(1.0 + wp.static(STOP))
+        # The further spring has no force at FOLD and is implicit too: no jump, and no limit of the time step.
+        past = angle * (real(1.0) - real(wp.static(FOLD)) / bend)
+        stretch = stretch + real(wp.static(STOP)) * (past + lag * rate)
+    return vec2(stretch, steepness)
+
+
+@wp.func(inline=True)
+def add_link(
+    scene: SceneArrays, job: WhiskerJob, chain: wp.ref[ChainState], body: wp.ref[ArticulatedBody], i: int, now: real
+) -> vec3:
+    """Add the inertia of a link, its bias force v × Iv, and what loads on it take from that; return its direction."""
+    zero = real(0.0)
+    link = scene.chains.build[i, job.whisker]
+    inertia = scene.chains.inertia[i, job.whisker]
+    at = row(chain.node, i)
+    xa = (row(chain.node, i + 1) - at) / link.length
+    com = at + xa * inertia.centre
+    # Inertia of the link about the base point: parallel axes, and a thin part along the axis xa.
+    m = link.mass
+    thin = inertia.axial - inertia.transverse
+    common = m * wp.dot(com, com) + inertia.transverse
+    mc = com * m
+    body.inertia.a = body.inertia.a + vec6(
+        common + thin * xa[0] * xa[0] - mc[0] * com[0],
+        common + thin * xa[1] * xa[1] - mc[1] * com[1],
+        common + thin * xa[2] * xa[2] - mc[2] * com[2],
+        thin * xa[0] * xa[1] - mc[0] * com[1],
+        thin * xa[0] * xa[2] - mc[0] * com[2],
+        thin * xa[1] * xa[2] - mc[1] * com[2],
+    )
+    # The block that couples rotation and translation is m [com]×, as a matrix of the cross product.
+    body.inertia.b = body.inertia.b + mat33(zero, -mc[2], mc[1], mc[2], zero, -mc[0], -mc[1], mc[0], zero)
+    body.inertia.c = body.inertia.c + vec6(m, m, m, zero, zero, zero)
+    # Linear momentum, and angular momentum about the base point (``spin``).
+    vw = body.twist.w
+    vv = body.twist.v
+    momentum = vv * m + wp.cross(vw, mc)
+    spin = wp.cross(com, momentum) + vw * inertia.transverse + xa * (thin * wp.dot(xa, vw))
+    pw = body.bias.w + wp.cross(vw, spin) + wp.cross(vv, momentum)
+    pv = body.bias.v + wp.cross(vw, momentum)
+    if job.end_load > job.first_load:
+        for load in range(job.first_load, job.end_load):
+            if scene.jobs.load_link[load] == i and now < scene.jobs.load_stop[load]:
+                pull = scene.jobs.load_force[load]
+                pw = pw - wp.cross(at + xa * (link.length * scene.jobs.load_share[load]), pull)
+                pv = pv - pull
+    body.bias = spatial(pw, pv)
+    return xa
 
 
 @wp.func(inline=True)
 def articulated_inertia(
-    chains: ChainArrays,
-    jobs: JobArrays,
+    scene: SceneArrays,
     job: WhiskerJob,
     chain: wp.ref[ChainState],
     proximity: wp.ref[ProximityState],
-    last: Twist,
-    base: SpatialAcceleration,
-    now: real,
-    h: real,
+    step: Step,
+    last: Spatial,
     candidate_count: int,
-) -> Wrench:
+) -> Spatial:
     """Second pass, up the chain: articulated inertia Iᴬ and bias pᴬ, gains UD⁻¹ and forces D⁻¹u of each joint.
 
-    ``last`` is the twist of the last link, ``base`` the acceleration of the base; returned is the wrench on the base.
+    ``last`` is the twist of the last link; returned is the wrench on the base.
     """
     zero = real(0.0)
     one = real(1.0)
-    # A linearly implicit step of length h damps like h k by itself (``Chain.damping``): only the rest of βk is added.
-    step_damping = wp.max(job.beta - h, zero)
-    vw = last.angular
-    vv = last.linear
-    ia = vec6(zero, zero, zero, zero, zero, zero)
-    ib = mat33(zero, zero, zero, zero, zero, zero, zero, zero, zero)
-    ic = vec6(zero, zero, zero, zero, zero, zero)
-    pw = vec3(zero, zero, zero)
-    pv = vec3(zero, zero, zero)
+    h = step.length
+    # Springs and dampers act at the end of the step: τ = −k (q + lag q̇), D gains h k lag. A linearly implicit step of
+    # length h damps like h k by itself (``Chain.damping``): only the rest of βk is added.
+    lag = h + wp.max(job.beta - h, zero)
+    body = ArticulatedBody()
+    body.twist = last
     for back in range(job.links):
         i = job.links - 1 - back
-        link = chains.build[i, job.whisker]
-        inertia = chains.inertia[i, job.whisker]
+        x = add_link(scene, job, chain, body, i, elapsed(step.now))
+        inertia = scene.chains.inertia[i, job.whisker]
         at = row(chain.node, i)
-        xa = (row(chain.node, i + 1) - at) / link.length
-        com = at + xa * inertia.centre
-        # Inertia of the link about the base point: parallel axes, and a thin part along the axis xa.
-        m = link.mass
-        thin = inertia.axial - inertia.transverse
-        common = m * wp.dot(com, com) + inertia.transverse
-        mc = com * m
-        ia = ia + vec6(
-            common + thin * xa[0] * xa[0] - mc[0] * com[0],
-            common + thin * xa[1] * xa[1] - mc[1] * com[1],
-            common + thin * xa[2] * xa[2] - mc[2] * com[2],
-            thin * xa[0] * xa[1] - mc[0] * com[1],
-            thin * xa[0] * xa[2] - mc[0] * com[2],
-            thin * xa[1] * xa[2] - mc[1] * com[2],
-        )
-        # The block that couples rotation and translation is m [com]×, as a matrix of the cross product.
-        ib = ib + mat33(zero, -mc[2], mc[1], mc[2], zero, -mc[0], -mc[1], mc[0], zero)
-        ic = ic + vec6(m, m, m, zero, zero, zero)
-        # Bias force v × Iv, less what loads give.
-        # Linear momentum, and angular momentum about the base point (``spin``).
-        momentum = vv * m + wp.cross(vw, mc)
-        spin = wp.cross(com, momentum) + vw * inertia.transverse + xa * (thin * wp.dot(xa, vw))
-        pw = pw + wp.cross(vw, spin) + wp.cross(vv, momentum)
-        pv = pv + wp.cross(vw, momentum)
-        if job.end_load > job.first_load:
-            for load in range(job.first_load, job.end_load):
-                if jobs.load_link[load] == i and now < jobs.load_stop[load]:
-                    pull = jobs.load_force[load]
-                    pw = pw - wp.cross(at + xa * (link.length * jobs.load_share[load]), pull)
-                    pv = pv - pull
-        k = inertia.stiffness
         angle = row(chain.angle, i)
         rate = row(chain.rate, i)
-        # Springs and dampers at the end of the step: τ = −k (q + lag q̇), D gains h k lag.
-        lag = h + step_damping
         force = JointVector()
         inverse = JointInverse()
-        x = xa
         if wp.static(hinges == 3):
             x = row(chain.axis3, i)
             if i % 2 == 1:
-                m3 = wp.cross(at, x)
-                u3w = symmetric_times(ia, x) + ib * m3
-                u3v = x * ib + symmetric_times(ic, m3)
-                soft3 = h * lag * inertia.torsion
-                spring3 = angle[2] + lag * rate[2]
-                twist = wp.abs(angle[2])
-                if twist > real(wp.static(FOLD)):
-                    soft3 = soft3 * real(1.0 + wp.static(STOP))
-                    past = angle[2] * (one - real(wp.static(FOLD)) / twist)
-                    spring3 = spring3 + real(wp.static(STOP)) * (past + lag * rate[2])
-                i33 = one / (wp.dot(x, u3w) + wp.dot(m3, u3v) + soft3)
-                f3 = i33 * (-inertia.torsion * spring3 - wp.dot(x, pw) - wp.dot(m3, pv))
-                g3w = u3w * i33
-                g3v = u3v * i33
-                chain.gain3_w[i] = g3w
-                chain.gain3_v[i] = g3v
+                s3 = hinge_motion(at, x)
+                u3 = inertia_times(body.inertia, s3)
+                spring3 = spring_state(angle[2], rate[2], lag)
+                i33 = one / (spatial_dot(s3, u3) + h * lag * inertia.torsion * spring3[1])
+                f3 = i33 * minus_dot(-inertia.torsion * spring3[0], s3, body.bias)
+                g3 = scaled(u3, i33)
+                chain.gain3.w[i] = g3.w
+                chain.gain3.v[i] = g3.v
                 force[2] = f3
                 inverse[3] = i33
-                s3 = x * rate[2]
-                m3 = m3 * rate[2]
-                cw = wp.cross(vw, s3)
-                cv = wp.cross(vw, m3) + wp.cross(vv, s3)
-                vw = vw - s3
-                vv = vv - m3
-                ia = ia - upper_outer(u3w, g3w)
-                ic = ic - upper_outer(u3v, g3v)
-                ib = ib - wp.outer(u3w, g3v)
-                pw = pw + symmetric_times(ia, cw) + ib * cv + u3w * f3
-                pv = pv + cw * ib + symmetric_times(ic, cv) + u3v * f3
-        s2 = row(chain.axis2, i)
+                turned = scaled(s3, rate[2])
+                c3 = cross_motion(body.twist, turned)
+                body.twist = minus(body.twist, turned, one)
+                body.inertia.a = body.inertia.a - upper_outer(u3.w, g3.w)
+                body.inertia.c = body.inertia.c - upper_outer(u3.v, g3.v)
+                body.inertia.b = body.inertia.b - wp.outer(u3.w, g3.v)
+                body.bias = plus(plus_inertia_times(body.bias, body.inertia, c3), u3, f3)
+        axis2 = row(chain.axis2, i)
         # First axis of the joint: the y axis of the link before the turn about the second axis.
-        s1 = wp.cross(s2, x) * cosine(angle[1]) + x * sine(angle[1])
-        m1 = wp.cross(at, s1)
-        m2 = wp.cross(at, s2)
+        s1 = hinge_motion(at, wp.cross(axis2, x) * cosine(angle[1]) + x * sine(angle[1]))
+        s2 = hinge_motion(at, axis2)
         # U = IᴬS of both axes.
-        u1w = symmetric_times(ia, s1) + ib * m1
-        u1v = s1 * ib + symmetric_times(ic, m1)
-        u2w = symmetric_times(ia, s2) + ib * m2
-        u2v = s2 * ib + symmetric_times(ic, m2)
+        u1 = inertia_times(body.inertia, s1)
+        u2 = inertia_times(body.inertia, s2)
+        k = inertia.stiffness
         soft = h * k * lag
-        spring1 = angle[0] + lag * rate[0]
-        spring2 = angle[1] + lag * rate[1]
-        # A joint bent beyond FOLD stiffens.
-        soft1 = soft
-        soft2 = soft
-        bend = wp.abs(angle[0])
-        if bend > real(wp.static(FOLD)):
-            soft1 = soft * real(1.0 + wp.static(STOP))
-            # The further spring has no force at FOLD and is implicit too: no jump, and no limit of the time step.
-            past = angle[0] * (one - real(wp.static(FOLD)) / bend)
-            spring1 = spring1 + real(wp.static(STOP)) * (past + lag * rate[0])
-        bend = wp.abs(angle[1])
-        if bend > real(wp.static(FOLD)):
-            soft2 = soft * real(1.0 + wp.static(STOP))
-            past = angle[1] * (one - real(wp.static(FOLD)) / bend)
-            spring2 = spring2 + real(wp.static(STOP)) * (past + lag * rate[1])
+        spring1 = spring_state(angle[0], rate[0], lag)
+        spring2 = spring_state(angle[1], rate[1], lag)
         # D of the axes, its inverse, and u = τ − Sᵀpᴬ.
-        d11 = wp.dot(s1, u1w) + wp.dot(m1, u1v) + soft1
-        d12 = wp.dot(s1, u2w) + wp.dot(m1, u2v)
-        d22 = wp.dot(s2, u2w) + wp.dot(m2, u2v) + soft2
+        d11 = spatial_dot(s1, u1) + soft * spring1[1]
+        d12 = spatial_dot(s1, u2)
+        d22 = spatial_dot(s2, u2) + soft * spring2[1]
         whole = one / (d11 * d22 - d12 * d12)
         i11 = d22 * whole
         i12 = -d12 * whole
         i22 = d11 * whole
-        t1 = -k * spring1 - wp.dot(s1, pw) - wp.dot(m1, pv)
-        t2 = -k * spring2 - wp.dot(s2, pw) - wp.dot(m2, pv)
+        t1 = minus_dot(-k * spring1[0], s1, body.bias)
+        t2 = minus_dot(-k * spring2[0], s2, body.bias)
         f1 = i11 * t1 + i12 * t2
         f2 = i12 * t1 + i22 * t2
         # Gains UD⁻¹. The contact solver reads them again instead of the inertias, which are not kept.
-        g1w = u1w * i11 + u2w * i12
-        g1v = u1v * i11 + u2v * i12
-        g2w = u1w * i12 + u2w * i22
-        g2v = u1v * i12 + u2v * i22
+        g1 = combined(u1, i11, u2, i12)
+        g2 = combined(u1, i12, u2, i22)
         force[0] = f1
         force[1] = f2
-        chain.gain1_w[i] = g1w
-        chain.gain1_v[i] = g1v
-        chain.gain2_w[i] = g2w
-        chain.gain2_v[i] = g2v
+        chain.gain1.w[i] = g1.w
+        chain.gain1.v[i] = g1.v
+        chain.gain2.w[i] = g2.w
+        chain.gain2.v[i] = g2.v
         chain.acceleration[i] = force
         if candidate_count > 0:
             inverse[0] = i11
             inverse[1] = i12
             inverse[2] = i22
             proximity.inverse_inertia[i] = inverse
-        # Velocity-product acceleration of the joint.
         # Going up, the twist of the link before is that of this link less what the joint adds.
-        jw = s1 * rate[0] + s2 * rate[1]
-        jv = m1 * rate[0] + m2 * rate[1]
-        vw = vw - jw
-        vv = vv - jv
-        both = rate[0] * rate[1]
+        added = combined(s1, rate[0], s2, rate[1])
+        body.twist = minus(body.twist, added, one)
         # c = v × S q̇ with the twist v before the joint, and the first hinge carries the axis of the second one.
-        cw = wp.cross(vw, jw) + wp.cross(s1, s2) * both
-        cv = wp.cross(vw, jv) + wp.cross(vv, jw) + (wp.cross(s1, m2) + wp.cross(m1, s2)) * both
+        c = plus(cross_motion(body.twist, added), cross_motion(s1, s2), rate[0] * rate[1])
         # Iᴬ − UD⁻¹Uᵀ, and pᴬ + Iᴬc + UD⁻¹u with the velocity product c.
-        ia = ia - symmetric_outer(u1w, g1w, u2w, g2w)
-        ic = ic - symmetric_outer(u1v, g1v, u2v, g2v)
-        ib = ib - wp.outer(u1w, g1v) - wp.outer(u2w, g2v)
-        pw = pw + symmetric_times(ia, cw) + ib * cv + u1w * f1 + u2w * f2
-        pv = pv + cw * ib + symmetric_times(ic, cv) + u1v * f1 + u2v * f2
+        body.inertia.a = body.inertia.a - symmetric_outer(u1.w, g1.w, u2.w, g2.w)
+        body.inertia.c = body.inertia.c - symmetric_outer(u1.v, g1.v, u2.v, g2.v)
+        body.inertia.b = body.inertia.b - wp.outer(u1.w, g1.v) - wp.outer(u2.w, g2.v)
+        body.bias = plus(plus(plus_inertia_times(body.bias, body.inertia, c), u1, f1), u2, f2)
     # f = Iᴬa + pᴬ at the base, whose acceleration is given.
-    base_wrench = Wrench()
-    base_wrench.moment = symmetric_times(ia, base.angular) + ib * base.linear + pw
-    base_wrench.force = base.angular * ib + symmetric_times(ic, base.linear) + pv
-    return base_wrench
+    return plus(inertia_times(body.inertia, step.base), body.bias, one)
 
 
 @wp.func(inline=True)
@@ -374,74 +448,55 @@ def integrate_joint(
 
 @wp.func(inline=True)
 def joint_accelerations(
+    scene: SceneArrays,
     job: WhiskerJob,
-    options: StepOptions,
     chain: wp.ref[ChainState],
     candidates: wp.ref[ContactCandidates],
     state: wp.ref[WhiskerState],
-    moving: Twist,
-    base: SpatialAcceleration,
-    now: real,
-    h: real,
+    step: Step,
     candidate_count: int,
 ) -> vec3:
     """Third pass, down the chain: joint accelerations without contact, q̈ = D⁻¹u − (UD⁻¹)ᵀa.
 
-    Without contact candidates the joints move on at once. ``moving`` is the twist of the base, ``base`` its
-    acceleration; returned is the acceleration of the tip.
+    Without contact candidates the joints move on at once. Returned is the acceleration of the tip.
     """
-    aw = base.angular
-    av = base.linear
-    vw = moving.angular
-    vv = moving.linear
+    h = step.length
+    a = step.base
+    v = spatial(step.pose.spin, step.pose.velocity)
     for i in range(job.links):
         at = row(chain.node, i)
-        s2 = row(chain.axis2, i)
-        s1 = first_axis(s2, hinge_direction(chain, i), row(chain.angle, i)[1])
-        m1 = wp.cross(at, s1)
-        m2 = wp.cross(at, s2)
+        axis2 = row(chain.axis2, i)
+        s1 = hinge_motion(at, first_axis(axis2, hinge_direction(chain, i), row(chain.angle, i)[1]))
+        s2 = hinge_motion(at, axis2)
         rate = row(chain.rate, i)
-        jw = s1 * rate[0] + s2 * rate[1]
-        jv = m1 * rate[0] + m2 * rate[1]
-        # Velocity product c of the joint.
-        both = rate[0] * rate[1]
-        aw = aw + wp.cross(vw, jw) + wp.cross(s1, s2) * both
-        av = av + wp.cross(vw, jv) + wp.cross(vv, jw) + (wp.cross(s1, m2) + wp.cross(m1, s2)) * both
-        vw = vw + jw
-        vv = vv + jv
-        # q̈ = D⁻¹u − (UD⁻¹)ᵀa′ with a′ = a + c.
-        f = row(chain.acceleration, i)
-        a1 = f[0] - wp.dot(row(chain.gain1_w, i), aw) - wp.dot(row(chain.gain1_v, i), av)
-        a2 = f[1] - wp.dot(row(chain.gain2_w, i), aw) - wp.dot(row(chain.gain2_v, i), av)
-        a = JointVector()
-        a[0] = a1
-        a[1] = a2
-        aw = aw + s1 * a1 + s2 * a2
-        av = av + m1 * a1 + m2 * a2
+        added = combined(s1, rate[0], s2, rate[1])
+        # a′ = a + c with the velocity product c of the joint.
+        a = plus(plus_cross(a, v, added), cross_motion(s1, s2), rate[0] * rate[1])
+        v = plus(v, added, real(1.0))
+        # q̈ = D⁻¹u − (UD⁻¹)ᵀa′.
+        found = row(chain.acceleration, i)
+        found[0] = minus_dot(found[0], gain_at(chain.gain1, i), a)
+        found[1] = minus_dot(found[1], gain_at(chain.gain2, i), a)
+        a = plus(plus(a, s1, found[0]), s2, found[1])
         if wp.static(hinges == 3):
             if i % 2 == 1:
-                s3 = row(chain.axis3, i)
-                m3 = wp.cross(at, s3)
-                aw = aw + wp.cross(vw, s3) * rate[2]
-                av = av + (wp.cross(vw, m3) + wp.cross(vv, s3)) * rate[2]
-                a3 = f[2] - wp.dot(row(chain.gain3_w, i), aw) - wp.dot(row(chain.gain3_v, i), av)
-                aw = aw + s3 * a3
-                av = av + m3 * a3
-                vw = vw + s3 * rate[2]
-                vv = vv + m3 * rate[2]
-                a[2] = a3
+                s3 = hinge_motion(at, row(chain.axis3, i))
+                a = plus(a, cross_motion(v, s3), rate[2])
+                found[2] = minus_dot(found[2], gain_at(chain.gain3, i), a)
+                a = plus(a, s3, found[2])
+                v = plus(v, s3, rate[2])
         if candidate_count > 0:
-            chain.acceleration[i] = a
+            chain.acceleration[i] = found
         else:
-            integrate_joint(chain, state, i, a, h, now + h, options.quasistatic)
+            integrate_joint(chain, state, i, found, h, elapsed(step.now) + h, scene.options.quasistatic)
         for j in range(candidate_count):
             if row(candidates.link, j) == i:
                 # Gravity was added to the base's acceleration; it moves nothing by itself.
                 candidates.free_velocity[j] = (
-                    vv
-                    + av * h
-                    + options.gravity * h
-                    + wp.cross(vw + aw * h, row(candidates.point, j))
+                    v.v
+                    + a.v * h
+                    + scene.options.gravity * h
+                    + wp.cross(v.w + a.w * h, row(candidates.point, j))
                     - row(candidates.object_velocity, j)
                 )
-    return av + wp.cross(aw, row(chain.node, job.links))
+    return a.v + wp.cross(a.w, row(chain.node, job.links))

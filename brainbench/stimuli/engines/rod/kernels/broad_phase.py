@@ -32,18 +32,16 @@ from .parameters import hinges, real, recorded, sliced
 from .state import (
     WAIT_DISTANCES,
     WAIT_SLICE,
-    ChainArrays,
     ContactCandidates,
-    Instant,
     LinkDistance,
-    MotionArrays,
     PausedWhiskers,
     PerListed1,
     PerListedInt,
-    ShapeArrays,
-    StepOptions,
+    SceneArrays,
+    Step,
     WhiskerJob,
     WhiskerState,
+    cone,
     most_candidates,
     row,
 )
@@ -78,7 +76,7 @@ class SearchRange:
 
 
 @wp.func(inline=True)
-def search_range(job: WhiskerJob, options: StepOptions, state: wp.ref[WhiskerState], h: real) -> SearchRange:
+def search_range(scene: SceneArrays, job: WhiskerJob, state: wp.ref[WhiskerState], h: real) -> SearchRange:
     """Return how far a step of length h looks for contacts."""
     reach = SearchRange()
     # Contacts that may close within this step.
@@ -88,7 +86,7 @@ def search_range(job: WhiskerJob, options: StepOptions, state: wp.ref[WhiskerSta
     # How far links and objects have come since the last step: its rates at the end are those now.
     reach.time = real(1.02) * wp.max(h, state.last_step)
     reach.unknown_speed = job.object_speed
-    if options.quasistatic == 1:
+    if scene.options.quasistatic == 1:
         # Quasi-static steps forget their rates, so ``end_speed`` does not contain the way of the last step.
         reach.unknown_speed = job.object_speed + state.velocity_jump
     return reach
@@ -96,10 +94,10 @@ def search_range(job: WhiskerJob, options: StepOptions, state: wp.ref[WhiskerSta
 
 @wp.func(inline=True)
 def may_be_near(
-    chains: ChainArrays, job: WhiskerJob, proximity: wp.ref[ProximityState], reach: SearchRange, i: int
+    scene: SceneArrays, job: WhiskerJob, proximity: wp.ref[ProximityState], reach: SearchRange, i: int
 ) -> bool:
     """Return whether a link may be so near, for all that its bound tells."""
-    taper = chains.taper[i, job.whisker]
+    taper = scene.chains.taper[i, job.whisker]
     return (
         row(proximity.clearance, i) - reach.time * (row(proximity.end_speed, i) + reach.unknown_speed)
         <= reach.margin + taper.start_radius
@@ -107,13 +105,11 @@ def may_be_near(
 
 
 @wp.func(inline=True)
-def count_near_links(
-    chains: ChainArrays, job: WhiskerJob, proximity: wp.ref[ProximityState], reach: SearchRange
-) -> int:
+def count_near_links(scene: SceneArrays, job: WhiskerJob, proximity: wp.ref[ProximityState], reach: SearchRange) -> int:
     """Return the number of links whose distance must be measured."""
     near_count = int(0)
     for i in range(job.links):
-        if may_be_near(chains, job, proximity, reach, i):
+        if may_be_near(scene, job, proximity, reach, i):
             near_count = near_count + 1
     return near_count
 
@@ -137,15 +133,7 @@ def from_segment(point: vec3, end: vec3) -> vec3:
 
 
 @wp.func(inline=True)
-def list_shapes(
-    motions: MotionArrays,
-    shapes: ShapeArrays,
-    job: WhiskerJob,
-    chain: wp.ref[ChainState],
-    near: wp.ref[NearShapes],
-    pose: BodyMotion,
-    now: Instant,
-):
+def list_shapes(scene: SceneArrays, job: WhiskerJob, chain: wp.ref[ChainState], near: wp.ref[NearShapes], step: Step):
     """List the shapes nearest to the whisker, and how far off all others are.
 
     A shape counts as the ball around it, a capsule or a cylinder as the capsule around it.
@@ -162,11 +150,11 @@ def list_shapes(
     body = BodyMotion()
     last_track = int(-1)
     for s in range(job.first_shape, job.end_shape):
-        if shapes.track[s] != last_track:
-            last_track = shapes.track[s]
-            body = pose_from(motions, last_track, now, pose)
-        centre = body.place + rotate(body.turn, shapes.place[s])
-        round = shapes.radius[s]
+        if scene.shapes.track[s] != last_track:
+            last_track = scene.shapes.track[s]
+            body = pose_from(scene.motions, last_track, step.now, step.pose)
+        centre = body.place + rotate(body.quaternion, scene.shapes.place[s])
+        round = scene.shapes.radius[s]
         full = near.count == wp.static(LISTED)
         if full:
             beyond = wp.length(from_segment(centre, chord)) - sag - round
@@ -174,10 +162,12 @@ def list_shapes(
                 near.room = wp.min(near.room, beyond)
                 continue
         along = vec3(real(0.0), real(0.0), real(0.0))
-        slender = shapes.kind[s] == wp.static(CAPSULE) or shapes.kind[s] == wp.static(CYLINDER)
+        slender = scene.shapes.kind[s] == wp.static(CAPSULE) or scene.shapes.kind[s] == wp.static(CYLINDER)
         if slender:
-            round = shapes.size[s][0]
-            along = rotate(body.turn, rotate(shapes.turn[s], vec3(real(0.0), real(0.0), shapes.size[s][1])))
+            round = scene.shapes.size[s][0]
+            along = rotate(
+                body.quaternion, rotate(scene.shapes.quaternion[s], vec3(real(0.0), real(0.0), scene.shapes.size[s][1]))
+            )
         square = real(1e20)
         for i in range(job.links):
             start = row(chain.node, i)
@@ -208,15 +198,14 @@ def list_shapes(
 
 @wp.func(inline=True)
 def query_distances(
-    chains: ChainArrays,
-    job: WhiskerJob,
+    scene: SceneArrays,
     paused: PausedWhiskers,
+    job: WhiskerJob,
     chain: wp.ref[ChainState],
     proximity: wp.ref[ProximityState],
     state: wp.ref[WhiskerState],
     reach: SearchRange,
-    pose: BodyMotion,
-    now: Instant,
+    step: Step,
     near_count: int,
 ) -> int:
     """Ask for the distances of these links; return what to wait for: the next slice, when there is no room for more."""
@@ -225,7 +214,7 @@ def query_distances(
         return WAIT_SLICE
     place = state.first_query
     for i in range(job.links):
-        if may_be_near(chains, job, proximity, reach, i):
+        if may_be_near(scene, job, proximity, reach, i):
             paused.query[place].job = job.index
             paused.query[place].link = i
             paused.query[place].start = row(chain.node, i)
@@ -233,9 +222,9 @@ def query_distances(
             nearer = reach.time * (row(proximity.end_speed, i) + reach.unknown_speed)
             paused.query[place].bound = row(proximity.clearance, i) - nearer
             place = place + 1
-    paused.query_frame[job.index].time = now
-    paused.query_frame[job.index].coarse = pose.coarse
-    paused.query_frame[job.index].place = pose.place
+    paused.query_frame[job.index].time = step.now
+    paused.query_frame[job.index].coarse = step.pose.coarse
+    paused.query_frame[job.index].place = step.pose.place
     paused.query_margin[job.index] = reach.margin
     return WAIT_DISTANCES
 
@@ -296,23 +285,22 @@ def judge_overlap(state: wp.ref[WhiskerState], deepest: real, crossing: int, bas
 
 @wp.func(inline=True)
 def find_candidates(
-    chains: ChainArrays,
-    motions: MotionArrays,
-    shapes: ShapeArrays,
-    job: WhiskerJob,
+    scene: SceneArrays,
     paused: PausedWhiskers,
+    job: WhiskerJob,
     chain: wp.ref[ChainState],
     proximity: wp.ref[ProximityState],
     near: wp.ref[NearShapes],
     candidates: wp.ref[ContactCandidates],
     state: wp.ref[WhiskerState],
-    pose: BodyMotion,
-    margin: real,
-    now: Instant,
-    h: real,
+    step: Step,
 ) -> int:
     """Find the contact candidates of all links and renew their bounds; return the number of candidates."""
     zero = real(0.0)
+    pose = step.pose
+    now = step.now
+    h = step.length
+    margin = step.margin
     # Counts that the compiler does not know keep it from writing loops out.
     sides = int(2) + wp.min(0, job.index)
     count = int(0)
@@ -324,14 +312,14 @@ def find_candidates(
     linear = pose.velocity
     looked_at = job.end_shape - job.first_shape
     others = real(1e20)
-    enough = margin + chains.taper[0, job.whisker].start_radius
+    enough = margin + scene.chains.taper[0, job.whisker].start_radius
     if wp.static(not sliced) and looked_at > wp.static(LISTED):
         stale = near.room - near.moved <= enough
         if near.moved > real(wp.static(STALE)):
             for place in range(near.count):
                 stale = stale or row(near.distance, place) - near.moved <= enough
         if stale:
-            list_shapes(motions, shapes, job, chain, near, pose, now)
+            list_shapes(scene, job, chain, near, step)
         # More of them within the margin than are listed: all are looked at.
         if near.room - near.moved > enough:
             looked_at = near.count
@@ -348,7 +336,7 @@ def find_candidates(
                 spun = spun + row(chain.axis3, i) * rate[2]
         angular = angular + spun
         linear = linear + wp.cross(joint, spun)
-        taper = chains.taper[i, job.whisker]
+        taper = scene.chains.taper[i, job.whisker]
         if row(proximity.clearance, i) <= margin + taper.start_radius:
             # One shape after the other, each at two places: between the ends, and at the far end.
             closest = others
@@ -361,8 +349,8 @@ def find_candidates(
                         closest = wp.min(closest, away)
                         continue
                 # Places count from the base, where the digits are needed.
-                body = pose_from(motions, shapes.track[s], now, pose)
-                turn_s = shapes.turn[s]
+                body = pose_from(scene.motions, scene.shapes.track[s], now, pose)
+                local_quaternion = scene.shapes.quaternion[s]
                 found = LinkDistance()
                 if wp.static(sliced):
                     found = paused.answer[query]
@@ -370,14 +358,14 @@ def find_candidates(
                 else:
                     bound = row(proximity.clearance, i)
                     leaf = row(proximity.leaf, i)
-                    end = joint + link
-                    found = link_shape_distance(shapes, s, body, joint, end, taper, margin, bound, leaf, 0, 1)
+                    link_here = cone(joint, joint + link, taper)
+                    found = link_shape_distance(scene.shapes, s, body, link_here, margin, bound, leaf, 0, 1)
                 proximity.leaf[i] = found.leaf
                 closest = wp.min(closest, found.clearance)
                 deepest = wp.max(deepest, found.depth)
                 crossing = wp.max(crossing, found.crossing)
                 if i == 0 and found.start == 1 and found.start_gap < margin:
-                    way = rotate(body.turn, rotate(turn_s, found.start_normal))
+                    way = rotate(body.quaternion, rotate(local_quaternion, found.start_normal))
                     approach = wp.dot(way, pose.velocity - body.velocity - wp.cross(body.spin, -body.place))
                     base_gap = wp.min(base_gap, found.start_gap + h * wp.min(approach, zero))
                 for which in range(sides):
@@ -392,27 +380,27 @@ def find_candidates(
                         way = found.end_normal
                     if offered == 1 and gap < margin:
                         deepest = wp.max(deepest, -gap)
-                        normal = rotate(body.turn, rotate(turn_s, way))
+                        normal = rotate(body.quaternion, rotate(local_quaternion, way))
                         radius = taper.start_radius + (taper.end_radius - taper.start_radius) * share
                         # The force acts on the skin of the whisker: its radius is the lever of friction.
                         point = joint + link * share - normal * radius
                         # The object's velocity in the middle of the step.
                         middle = instant(now.tick, now.part + real(0.5) * h)
-                        half = pose_from(motions, shapes.track[s], middle, pose)
+                        half = pose_from(scene.motions, scene.shapes.track[s], middle, pose)
                         object_velocity = half.velocity + wp.cross(half.spin, point - half.place)
                         approach = wp.dot(normal, linear + wp.cross(angular, point) - object_velocity)
                         # Where the gap will be: tells apart what only passes by.
                         ahead = gap + real(1.5) * h * wp.min(approach, zero)
                         if gap + real(1.5) * job.longest_step * wp.min(approach, zero) <= real(wp.static(CLOSED)):
                             state.closes = 1
-                            state.closing_speed = wp.max(state.closing_speed, shapes.speed[s])
+                            state.closing_speed = wp.max(state.closing_speed, scene.shapes.speed[s])
                         slot = candidate_slot(candidates, count, point, normal, ahead, link)
                         if slot == count:
                             count = count + 1
                         if slot >= 0:
-                            mu = shapes.friction[s]
+                            mu = scene.shapes.friction[s]
                             if mu < zero:
-                                mu = chains.friction[job.whisker]
+                                mu = scene.chains.friction[job.whisker]
                             candidates.link[slot] = i
                             candidates.gap[slot] = gap
                             candidates.predicted_gap[slot] = ahead

@@ -13,9 +13,10 @@ the source is the same. Forces in mN, compliance in mm/ms per mN.
 
 import warp as wp
 
-from brainbench.stimuli.engines.rod.limits import CONTACT_BOUNDS, CONTACT_ROUNDS, LARGEST_FORCE, WARP
+from brainbench.stimuli.engines.rod.limits import CONTACT_BOUNDS, CONTACT_ROUNDS, GROUPS, LARGEST_FORCE, WARP
 
-from .algebra import vec3, vec4, vec6
+from .algebra import spatial, vec3, vec4, vec6
+from .articulated_body import ChainState, ProximityState, joint_record
 from .delassus import (
     DelassusRows,
     NormalMatrix,
@@ -32,9 +33,97 @@ from .delassus import (
     select_contacts,
     stride,
 )
-from .parameters import group_size, max_contacts, module_options, queue, real, recorded
-from .state import ContactProblems, PausedWhiskers, PerLinkJoint
+from .parameters import capacity, cuda, group_size, max_contacts, module_options, queue, real, recorded
+from .state import (
+    ContactCandidates,
+    ContactProblems,
+    PausedWhiskers,
+    PerLinkJoint,
+    SceneArrays,
+    WhiskerJob,
+    WhiskerState,
+    most_candidates,
+)
+from .state import row as chain_row
 from .thread_groups import broadcast, group_max, group_or, group_sum, warp_max
+
+
+@wp.func(inline=True)
+def any_gap_closes(candidates: wp.ref[ContactCandidates], count: int, h: real) -> int:
+    """Predict the gap of each candidate without contact forces, g + h vₙ; return 1 if any is negative."""
+    any_one = int(0)
+    for j in range(count):
+        predicted = chain_row(candidates.gap, j) + h * wp.dot(
+            chain_row(candidates.normal, j), chain_row(candidates.free_velocity, j)
+        )
+        candidates.predicted_gap[j] = predicted
+        if predicted < real(0.0):
+            any_one = 1
+    return any_one
+
+
+@wp.func(inline=True)
+def write_problem(
+    scene: SceneArrays,
+    problems: ContactProblems,
+    job: WhiskerJob,
+    chain: wp.ref[ChainState],
+    proximity: wp.ref[ProximityState],
+    candidates: wp.ref[ContactCandidates],
+    previous_contacts: int,
+    h: real,
+    count: int,
+):
+    """Write the factorised chain and its candidates where the solver reads them."""
+    index = job.index
+    problems.given[index].links = job.links
+    problems.given[index].candidates = count
+    problems.given[index].contacts = previous_contacts
+    problems.given[index].step = h
+    problems.given[index].tip = chain_row(chain.node, job.links)
+    for i in range(job.links):
+        problems.joint[index * wp.static(capacity) + i] = joint_record(chain, proximity, i)
+        problems.free_acceleration[index, i] = chain_row(chain.acceleration, i)
+    for j in range(count):
+        i = chain_row(candidates.link, j)
+        place = index * wp.static(most_candidates) + j
+        problems.candidate_link[place] = i
+        problems.candidate[place].gap = chain_row(candidates.gap, j)
+        problems.candidate[place].arc = chain_row(candidates.arc, j)
+        problems.candidate[place].friction = chain_row(candidates.friction, j)
+        problems.candidate[place].link_arc = scene.chains.taper[i, job.whisker].arc_length
+        problems.candidate[place].point = chain_row(candidates.point, j)
+        problems.candidate[place].normal = chain_row(candidates.normal, j)
+        problems.candidate[place].free_velocity = chain_row(candidates.free_velocity, j)
+        problems.candidate[place].along = chain_row(chain.node, i + 1) - chain_row(chain.node, i)
+        problems.predicted_gap[place] = chain_row(candidates.predicted_gap, j)
+
+
+@wp.func(inline=True)
+def queue_problem(paused: PausedWhiskers, index: int, count: int):
+    """Queue a problem with those of like size."""
+    queue = int(0)
+    if wp.static(cuda):
+        # A small group would not hold many contacts, and a large one would idle on few.
+        if count > wp.static(GROUPS[1][0]):
+            queue = int(2)
+        elif count > wp.static(GROUPS[0][0]):
+            queue = int(1)
+    paused.problem_queue[queue, wp.atomic_add(paused.next_problem_size, queue, 1)] = index
+
+
+@wp.func(inline=True)
+def read_solution(problems: ContactProblems, job: WhiskerJob, chain: wp.ref[ChainState], state: wp.ref[WhiskerState]):
+    """Add the contacts' part to the accelerations of the joints, and to the totals how well it was found."""
+    index = job.index
+    state.contacts = problems.solution[index].contacts
+    state.crowded = state.crowded + problems.solution[index].crowded
+    state.unsolved = state.unsolved + problems.solution[index].unsolved
+    state.miss = state.miss + problems.solution[index].miss
+    state.load = state.load + problems.solution[index].load
+    for i in range(job.links):
+        chain.acceleration[i] = problems.free_acceleration[index, i] + problems.added_acceleration[index, i]
+
 
 if recorded:
     from .recorder.newton import CAUTIOUS, DIRECT, newton_forces
@@ -377,22 +466,22 @@ def iterate_forces(
     solver.gap_error = real(0.0)
     solver.force_change = real(0.0)
     solver.force_sum = real(0.0)
-    for turn in range(sweeps_most):
+    for sweep in range(sweeps_most):
         if warp_max(1 - solver.converged) == 1:
             if warp_max(refresh) == 1:
                 contact_rates(solver, own, matrix, refresh)
                 refresh = 0
             gauss_seidel_sweep(solver, own, matrix, slip_tries)
             if wp.static(recorded):
-                if solver.converged == 0 and turn >= 2 and turn % 2 == 0:
+                if solver.converged == 0 and sweep >= 2 and sweep % 2 == 0:
                     caution = real(wp.static(CAUTIOUS))
-                    if turn % 4 == 2:
+                    if sweep % 4 == 2:
                         caution = real(wp.static(DIRECT))
                     solver.converged = newton_forces(solver, own, matrix, caution)
                     solver.slip_missed = 1 - solver.converged
                     refresh = 1
             guessing = int(0)
-            if solver.converged == 0 and solver.contacts > 1 and turn % 2 == 1:
+            if solver.converged == 0 and solver.contacts > 1 and sweep % 2 == 1:
                 guessing = 1
             if warp_max(guessing) == 1:
                 refresh = share_normal_forces(solver, own, matrix, normals, work, guessing, guess_tries)
@@ -427,8 +516,7 @@ def store_forces(problems: ContactProblems, solver: wp.ref[SolverState], own: wp
     if solver.thread == 0 and solver.live == 1:
         problems.solution[solver.job].normal_sum = normal_sum
         problems.solution[solver.job].arc_sum = arc_sum
-        problems.solution[solver.job].contact_force = force
-        problems.solution[solver.job].contact_moment = moment
+        problems.solution[solver.job].contact = spatial(moment, force)
 
 
 @wp.func

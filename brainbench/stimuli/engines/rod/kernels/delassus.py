@@ -12,7 +12,8 @@ import warp as wp
 
 from brainbench.stimuli.engines.rod.limits import CLOSED, CREVICE
 
-from .algebra import JointVector, reader, vec3, vec6
+from .algebra import JointVector, Spatial, minus, reader, vec3, vec6
+from .articulated_body import acceleration_over_joint, force_over_joint, inverse_times
 from .distances import NUMBERS
 from .parameters import capacity, group_size, hinges, max_contacts, real, recorded
 from .state import ContactProblems, JointRecord, PerLinkJoint, most_candidates
@@ -122,7 +123,7 @@ def add_contact(problems: ContactProblems, solver: wp.ref[SolverState], own: wp.
     along = candidate.along
     tangent = along - normal * wp.dot(along, normal)
     if wp.length_sq(tangent) < real(1e-8) * wp.length_sq(along):
-        e2 = problems.joint[first_joint + i].axis2
+        e2 = problems.joint[first_joint + i].motion2.w
         tangent = e2 - normal * wp.dot(e2, normal)
     tangent = wp.normalize(tangent)
     own.link[k] = i
@@ -202,8 +203,8 @@ LANES = "for (int k = 0; k < rows; k += lanes) SIDE_BY_SIDE for (int r = k; r < 
 
 TWIST = """
     if (twists) {
-        const real u3 = dot(j.axis3.c, w) + dot(j.moment3.c, v);
-        for (int d = 0; d < 3; d++) { w[d] = w[d] - j.gain3_w.c[d] * u3; v[d] = v[d] - j.gain3_v.c[d] * u3; }
+        const real u3 = dot(j.motion3.w.c, w) + dot(j.motion3.v.c, v);
+        for (int d = 0; d < 3; d++) { w[d] = w[d] - j.gain3.w.c[d] * u3; v[d] = v[d] - j.gain3.v.c[d] * u3; }
         unit.joint_rate.data[2][r] = u3;
         unit.impulse.data[2][r] = step * j.inverse_inertia.c[3] * u3;
     }
@@ -219,10 +220,10 @@ const real i11 = j.inverse_inertia.c[0], i12 = j.inverse_inertia.c[1], i22 = j.i
     real w[3], v[3];
     for (int d = 0; d < 3; d++) {{ w[d] = unit.w.data[d][r]; v[d] = unit.v.data[d][r]; }}
     {TWIST if hinges == 3 else ""}
-    const real u1 = dot(j.axis1.c, w) + dot(j.moment1.c, v), u2 = dot(j.axis2.c, w) + dot(j.moment2.c, v);
+    const real u1 = dot(j.motion1.w.c, w) + dot(j.motion1.v.c, v), u2 = dot(j.motion2.w.c, w) + dot(j.motion2.v.c, v);
     for (int d = 0; d < 3; d++) {{
-        unit.w.data[d][r] = w[d] - j.gain1_w.c[d] * u1 - j.gain2_w.c[d] * u2;
-        unit.v.data[d][r] = v[d] - j.gain1_v.c[d] * u1 - j.gain2_v.c[d] * u2;
+        unit.w.data[d][r] = w[d] - j.gain1.w.c[d] * u1 - j.gain2.w.c[d] * u2;
+        unit.v.data[d][r] = v[d] - j.gain1.v.c[d] * u1 - j.gain2.v.c[d] * u2;
     }}
     unit.joint_rate.data[0][r] = u1;
     unit.joint_rate.data[1][r] = u2;
@@ -389,77 +390,45 @@ def apply_forces(
     that do not take part, with room for them: then another round is needed.
     """
     zero = real(0.0)
-    none = vec3(zero, zero, zero)
     first_joint = solver.job * wp.static(capacity)
     first_candidate = solver.job * wp.static(most_candidates)
-    tw = none
-    tv = none
+    force = Spatial()
     for back in range(solver.last_link + 1):
         i = solver.last_link - back
         for k in range(solver.own_count):
             if solver.thread + k < solver.contacts and row(own.link, k) == i:
                 force_k = contact_force(own, k)
-                tv = tv + force_k
-                tw = tw + wp.cross(row(own.point, k), force_k)
-        u1 = zero
-        u2 = zero
-        u3 = zero
+                force.v = force.v + force_k
+                force.w = force.w + wp.cross(row(own.point, k), force_k)
+        felt = JointVector()
         if i < solver.links:
-            joint = problems.joint[first_joint + i]
-            if wp.static(hinges == 3):
-                if i % 2 == 1:
-                    u3 = wp.dot(joint.axis3, tw) + wp.dot(joint.moment3, tv)
-                    tw = tw - joint.gain3_w * u3
-                    tv = tv - joint.gain3_v * u3
-            u1 = wp.dot(joint.axis1, tw) + wp.dot(joint.moment1, tv)
-            u2 = wp.dot(joint.axis2, tw) + wp.dot(joint.moment2, tv)
-            tw = tw - joint.gain1_w * u1 - joint.gain2_w * u2
-            tv = tv - joint.gain1_v * u1 - joint.gain2_v * u2
+            felt = force_over_joint(problems.joint[first_joint + i], i, force)
         # Joint accelerations D⁻¹u of all contacts' forces.
-        u1 = group_sum(u1)
-        u2 = group_sum(u2)
-        if wp.static(hinges == 3):
-            u3 = group_sum(u3)
+        for d in range(wp.static(hinges)):
+            felt[d] = group_sum(felt[d])
         if i < solver.links:
-            inv = problems.joint[first_joint + i].inverse_inertia
-            joint_change[i, 0] = inv[0] * u1 + inv[1] * u2
-            joint_change[i, 1] = inv[1] * u1 + inv[2] * u2
-            if wp.static(hinges == 3):
-                joint_change[i, 2] = inv[3] * u3
-    tw = vec3(group_sum(tw[0]), group_sum(tw[1]), group_sum(tw[2]))
-    tv = vec3(group_sum(tv[0]), group_sum(tv[1]), group_sum(tv[2]))
+            joint_change[i] = inverse_times(problems.joint[first_joint + i].inverse_inertia, felt)
+    force.w = vec3(group_sum(force.w[0]), group_sum(force.w[1]), group_sum(force.w[2]))
+    force.v = vec3(group_sum(force.v[0]), group_sum(force.v[1]), group_sum(force.v[2]))
     unsolved = group_or(wp.max(solver.slip_missed, 1 - solver.converged))
-    # The forces that no joint takes up reach the base (tw, tv); they are subtracted from its wrench below.
+    # The force that no joint takes up reaches the base; it is subtracted from its wrench below.
     # Down again, and where the other candidates are then.
     more = int(0)
     if active == 1:
-        aw = none
-        av = none
+        a = Spatial()
         for i in range(solver.links):
             extra = JointVector()
             # Joints behind the last contact are only carried along.
             if i <= solver.last_link:
                 extra = row(joint_change, i)
-            joint = problems.joint[first_joint + i]
-            a1 = extra[0] - wp.dot(joint.gain1_w, aw) - wp.dot(joint.gain1_v, av)
-            a2 = extra[1] - wp.dot(joint.gain2_w, aw) - wp.dot(joint.gain2_v, av)
-            aw = aw + joint.axis1 * a1 + joint.axis2 * a2
-            av = av + joint.moment1 * a1 + joint.moment2 * a2
-            if wp.static(hinges == 3):
-                a3 = real(0.0)
-                if i % 2 == 1:
-                    a3 = extra[2] - wp.dot(joint.gain3_w, aw) - wp.dot(joint.gain3_v, av)
-                    aw = aw + joint.axis3 * a3
-                    av = av + joint.moment3 * a3
-                if solver.thread == 0:
-                    problems.added_acceleration[solver.job, i] = JointVector(a1, a2, a3)
-            elif solver.thread == 0:
-                problems.added_acceleration[solver.job, i] = JointVector(a1, a2)
+            extra = acceleration_over_joint(problems.joint[first_joint + i], i, extra, a)
+            if solver.thread == 0:
+                problems.added_acceleration[solver.job, i] = extra
             if solver.contacts < solver.candidates:
                 for j in range(solver.candidates):
                     if problems.candidate_link[first_candidate + j] == i and (solver.selected >> j) % 2 == 0:
                         candidate = problems.candidate[first_candidate + j]
-                        moved = candidate.free_velocity + (av + wp.cross(aw, candidate.point)) * solver.step
+                        moved = candidate.free_velocity + (a.v + wp.cross(a.w, candidate.point)) * solver.step
                         predicted = candidate.gap + solver.step * wp.dot(candidate.normal, moved)
                         problems.predicted_gap[first_candidate + j] = predicted
                         if predicted < real(-wp.static(CLOSED)):
@@ -481,10 +450,9 @@ def apply_forces(
             problems.solution[index].contacts = solver.contacts
             problems.solution[index].crowded = crowded
             problems.solution[index].unsolved = unsolved
-            problems.solution[index].base_moment = problems.given[index].base_moment - tw
-            problems.solution[index].base_force = problems.given[index].base_force - tv
+            problems.solution[index].base = minus(problems.given[index].base, force, real(1.0))
             problems.solution[index].tip_acceleration = (
-                problems.given[index].tip_acceleration + av + wp.cross(aw, problems.given[index].tip)
+                problems.given[index].tip_acceleration + a.v + wp.cross(a.w, problems.given[index].tip)
             )
             problems.solution[index].miss = miss
             if wp.static(recorded):

@@ -15,6 +15,7 @@ from brainbench.stimuli.engines.rod.limits import CAPSULE, CYLINDER, SPHERE
 
 from .algebra import vec2, vec3, vec4, vec5
 from .parameters import real
+from .state import Cone
 
 # As fine as the numbers: 2⁻²⁰ is about 1e-6, 2⁻⁴⁴ about 6e-14 of a link.
 halvings = 20 if real is wp.float32 else 44
@@ -76,14 +77,17 @@ def primitive(kind: int, size: vec3, x: vec3) -> vec4:
 
 
 @wp.func
-def segment_primitive(kind: int, size: vec3, a: vec3, b: vec3, ra: real, rb: real) -> vec5:
-    """Return the place along a–b (0 to 1) of the least gap, that gap (negative inside) and the normal.
+def segment_primitive(kind: int, size: vec3, link: Cone) -> vec5:
+    """Return the place along a link (0 to 1) of the least gap, that gap (negative inside) and the normal.
 
     The gap is convex along the segment: its slope is halved to zero.
     """
     low = real(0.0)
     high = real(1.0)
-    along = b - a
+    a = link.a
+    ra = link.start_radius
+    rb = link.end_radius
+    along = link.b - a
     for _ in range(wp.static(halvings)):
         middle = real(0.5) * (low + high)
         here = primitive(kind, size, a + along * middle)

@@ -48,7 +48,7 @@ class MotionArrays:
     """[knot] the rest of it."""
     velocity: wp.array(dtype=vec3)
     """[knot]"""
-    turn: wp.array(dtype=vec4)
+    quaternion: wp.array(dtype=vec4)
     """[knot] unit quaternion (w, x, y, z), without jumps of sign."""
     spin: wp.array(dtype=vec3)
     """[knot] angular velocity, world axes."""
@@ -97,7 +97,7 @@ class BodyMotion:
     place: vec3
     """The rest of it."""
     velocity: vec3
-    turn: vec4
+    quaternion: vec4
     spin: vec3
 
 
@@ -123,7 +123,7 @@ def cell_at(when: Instant, count: int) -> int:
 
 
 @wp.func
-def turning(q: vec4, w: vec3) -> vec4:
+def quaternion_rate(q: vec4, w: vec3) -> vec4:
     """Return the rate of a quaternion: half of (0, w) times q."""
     half = real(0.5)
     return vec4(
@@ -144,7 +144,7 @@ def pose_at(motions: MotionArrays, index: int, when: Instant) -> BodyMotion:
         pose.velocity = motions.velocity[first]
         pose.coarse = motions.coarse[first]
         pose.place = motions.place[first] + pose.velocity * elapsed(when)
-        pose.turn = motions.turn[first]
+        pose.quaternion = motions.quaternion[first]
         pose.spin = vec3(real(0.0), real(0.0), real(0.0))
         return pose
     cell = cell_at(when, count - 1)
@@ -175,14 +175,14 @@ def pose_at(motions: MotionArrays, index: int, when: Instant) -> BodyMotion:
     pose.place = motions.place[a] + way * v1 + motions.velocity[a] * s0 + motions.velocity[b] * s1
     # The derivatives of both value weights differ in sign only.
     pose.velocity = motions.velocity[a] * ds0 + motions.velocity[b] * ds1 - way * dv
-    turn = (
-        motions.turn[a] * v0
-        + turning(motions.turn[a], motions.spin[a]) * s0
-        + motions.turn[b] * v1
-        + turning(motions.turn[b], motions.spin[b]) * s1
+    quaternion = (
+        motions.quaternion[a] * v0
+        + quaternion_rate(motions.quaternion[a], motions.spin[a]) * s0
+        + motions.quaternion[b] * v1
+        + quaternion_rate(motions.quaternion[b], motions.spin[b]) * s1
     )
     # A cubic between quaternions is nearly one; normalised.
-    pose.turn = turn / wp.length(turn)
+    pose.quaternion = quaternion / wp.length(quaternion)
     pose.spin = motions.spin[a] * v0 + motions.surge[a] * s0 + motions.spin[b] * v1 + motions.surge[b] * s1
     return pose
 

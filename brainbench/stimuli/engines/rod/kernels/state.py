@@ -11,11 +11,10 @@ from typing import Any
 
 import warp as wp
 
-from brainbench.stimuli.engines.rod.limits import LISTED, SPARE, contacts_for
-from brainbench.stimuli.engines.rod.mesh_bvh import WIDE
+from brainbench.stimuli.engines.rod.limits import LISTED, SPARE, WIDE, contacts_for
 
-from .algebra import JointInverse, JointVector, mat33, reader, vec3, vec4
-from .motion import Instant, JobArrays, MotionArrays, ReadingArrays  # noqa: F401 — launches take all arrays from here
+from .algebra import JointInverse, JointVector, Spatial, mat33, reader, vec3, vec4
+from .motion import BodyMotion, Instant, JobArrays, MotionArrays, ReadingArrays, instant, pose_at
 from .parameters import capacity, hinges, real, recorded
 
 if recorded:
@@ -113,7 +112,7 @@ class ShapeArrays:
     """[shape]"""
     place: wp.array(dtype=vec3)
     """[shape] origin of the shape in its body."""
-    turn: wp.array(dtype=vec4)
+    quaternion: wp.array(dtype=vec4)
     """[shape] quaternion, shape to body."""
     scale: wp.array(dtype=real)
     """[shape] length of one unit of the shape (mm)."""
@@ -132,7 +131,7 @@ class ShapeArrays:
     box: wp.array(dtype=wp.int32)
     """[shape] first of its nodes below."""
     boxes: wp.array(dtype=NodeBoxes)
-    """[node] boxes of its children, as in ``brainbench.stimuli.engines.rod.mesh_bvh``."""
+    """[node] boxes of its children, as in ``brainbench.stimuli.engines.rod.shapes``."""
     corners: wp.array(dtype=LeafCorners)
     """[leaf] of its triangles; each surface begins with a leaf of its own."""
     outward: wp.array2d(dtype=vec3)
@@ -150,6 +149,38 @@ class StepOptions:
     """1: rates are forgotten after each step, and a reading takes the wrench of the step that ends at it."""
     shape: wp.int32
     """1: shapes and contact wrenches are recorded."""
+
+
+@wp.struct
+class SceneArrays:
+    """All that a launch is given: whiskers, motions, shapes, what each job does with them, and when it is read."""
+
+    chains: ChainArrays
+    motions: MotionArrays
+    shapes: ShapeArrays
+    jobs: JobArrays
+    readings: ReadingArrays
+    options: StepOptions
+
+
+@wp.func(inline=True)
+def scene_of(
+    chains: ChainArrays,
+    motions: MotionArrays,
+    shapes: ShapeArrays,
+    jobs: JobArrays,
+    readings: ReadingArrays,
+    options: StepOptions,
+) -> SceneArrays:
+    """Return the scene of a kernel that takes its parts: given as one argument, every read of it costs two moves."""
+    scene = SceneArrays()
+    scene.chains = chains
+    scene.motions = motions
+    scene.shapes = shapes
+    scene.jobs = jobs
+    scene.readings = readings
+    scene.options = options
+    return scene
 
 
 @wp.struct
@@ -204,6 +235,36 @@ class WhiskerJob:
     end_load: wp.int32
     can_rest: wp.int32
     """1: nothing but contact can move it."""
+
+
+@wp.struct
+class Step:
+    """A step of a whisker: when it begins, how long it takes, and how its base moves."""
+
+    now: Instant
+    length: real
+    pose: BodyMotion
+    """Of the base at the beginning."""
+    base: Spatial
+    """Acceleration of the base, less gravity."""
+    margin: real
+    """Gap up to which a contact takes part, once that is known."""
+
+
+@wp.func(inline=True)
+def begin_step(scene: SceneArrays, job: WhiskerJob, now: Instant, h: real) -> Step:
+    """Return a step of length h; the base moves as its track does within it, and gravity is an acceleration of it."""
+    step = Step()
+    step.now = now
+    step.length = h
+    step.pose = pose_at(scene.motions, job.base, now)
+    later = pose_at(scene.motions, job.base, instant(now.tick, now.part + h))
+    # Spatial acceleration is the rate of the twist at a fixed point: v̇ − ω × v (Featherstone 2008, chapter 2).
+    step.base.w = (later.spin - step.pose.spin) / h
+    step.base.v = (
+        (later.velocity - step.pose.velocity) / h - wp.cross(step.pose.spin, step.pose.velocity) - scene.options.gravity
+    )
+    return step
 
 
 @wp.struct
@@ -274,6 +335,7 @@ class ContactCandidates:
     free_velocity: PerCandidate3
     """Velocity against the object without contact forces."""
     if recorded:
+        count: wp.int32
         shape: PerCandidateInt
         share: PerCandidate1  # place along the link, 0 to 1
         lead: PerCandidate1  # how much nearer (mm) than the neighbouring link it is, if that touches the same
@@ -317,29 +379,22 @@ class ContactProblem:
     """Contacts of the last step."""
     step: real
     tip: vec3
-    base_moment: vec3
-    base_force: vec3
+    base: Spatial
+    """Wrench on the base."""
     tip_acceleration: vec3
 
 
 @wp.struct
 class JointRecord:
-    """A joint after the pass of the articulated inertia."""
+    """A joint after the pass of the articulated inertia: motion S and gains UD⁻¹ of each hinge."""
 
-    axis1: vec3
-    axis2: vec3
-    moment1: vec3
-    """Moments of the axes about the base point: velocity there of a unit rate."""
-    moment2: vec3
-    gain1_w: vec3
-    gain1_v: vec3
-    gain2_w: vec3
-    gain2_v: vec3
+    motion1: Spatial
+    motion2: Spatial
+    gain1: Spatial
+    gain2: Spatial
     if hinges == 3:
-        axis3: vec3
-        moment3: vec3
-        gain3_w: vec3
-        gain3_v: vec3
+        motion3: Spatial
+        gain3: Spatial
     inverse_inertia: JointInverse
 
 
@@ -381,14 +436,13 @@ class ContactSolution:
     miss: real
     """Square of what the last iteration changed in the forces; of the forces."""
     load: real
-    base_moment: vec3
-    base_force: vec3
+    base: Spatial
     tip_acceleration: vec3
     normal_sum: real
     """Sum of the normal forces; of these times arc."""
     arc_sum: real
-    contact_force: vec3
-    contact_moment: vec3
+    contact: Spatial
+    """Moment about the base point and force of all contacts."""
     if recorded:
         inexact: wp.int32  # 1: the forces were not solved to rounding
 
@@ -438,6 +492,27 @@ class DistanceQuery:
     stop: vec3
     bound: real
     """Lower bound of its distance, as far as that is known; 0 or less: it may be inside."""
+
+
+@wp.struct
+class Cone:
+    """A link: its axis from a to b and the radii at both ends."""
+
+    a: vec3
+    b: vec3
+    start_radius: real
+    end_radius: real
+
+
+@wp.func
+def cone(a: vec3, b: vec3, taper: LinkTaper) -> Cone:
+    """Return a link between two places."""
+    link = Cone()
+    link.a = a
+    link.b = b
+    link.start_radius = taper.start_radius
+    link.end_radius = taper.end_radius
+    return link
 
 
 @wp.struct

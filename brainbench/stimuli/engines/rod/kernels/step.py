@@ -10,7 +10,7 @@ import warp as wp
 
 from brainbench.stimuli.engines.rod.limits import AFTERMATH, FINEST, NOTHING, REST, TRAVEL
 
-from .algebra import SpatialAcceleration, Twist, Wrench, vec3
+from .algebra import Spatial, vec3
 from .articulated_body import (
     ChainState,
     ProximityState,
@@ -20,12 +20,10 @@ from .articulated_body import (
     joint_accelerations,
 )
 from .broad_phase import NearShapes, count_near_links, find_candidates, lower_clearance, query_distances, search_range
-from .contact_problem import any_gap_closes, queue_problem, read_solution, write_problem
-from .contact_solver import solve_contacts
-from .motion import cell_at, elapsed, instant, pose_at
+from .contact_solver import any_gap_closes, queue_problem, read_solution, solve_contacts, write_problem
+from .motion import cell_at, elapsed, instant
 from .parameters import against, bounds, module_options, real, recorded, sliced
-from .scheduling import keep, next_job, resume, stand_in_queue
-from .sleeping import check_rest
+from .pausing import check_rest, keep, next_job, resume, stand_in_queue
 from .state import (
     ENDED,
     WAIT_DISTANCES,
@@ -40,11 +38,14 @@ from .state import (
     PausedWhiskers,
     ReadingArrays,
     ResultArrays,
+    SceneArrays,
     ShapeArrays,
     StepOptions,
     WhiskerJob,
     WhiskerState,
+    begin_step,
     row,
+    scene_of,
 )
 
 if recorded:
@@ -52,42 +53,43 @@ if recorded:
 
 
 @wp.func(inline=True)
-def load_job(
-    chains: ChainArrays, motions: MotionArrays, shapes: ShapeArrays, jobs: JobArrays, options: StepOptions, index: int
-) -> WhiskerJob:
+def load_job(scene: SceneArrays, index: int) -> WhiskerJob:
     """Return the constants of a job."""
     zero = real(0.0)
     job = WhiskerJob()
     job.index = index
-    job.whisker = jobs.whisker[index]
-    job.base = jobs.base[index]
-    job.links = chains.links[job.whisker]
-    job.beta = chains.beta[job.whisker]
-    job.longest_step = jobs.step[index]
-    job.first_limit = jobs.limit_first[index]
-    job.limits = jobs.limit_first[index + 1] - job.first_limit
-    scene = jobs.scene[index]
-    job.first_shape = shapes.first[scene]
+    job.whisker = scene.jobs.whisker[index]
+    job.base = scene.jobs.base[index]
+    job.links = scene.chains.links[job.whisker]
+    job.beta = scene.chains.beta[job.whisker]
+    job.longest_step = scene.jobs.step[index]
+    job.first_limit = scene.jobs.limit_first[index]
+    job.limits = scene.jobs.limit_first[index + 1] - job.first_limit
+    place = scene.jobs.scene[index]
+    job.first_shape = scene.shapes.first[place]
     # Times 0 in a kernel against nothing: the compiler then drops the loops over shapes.
-    job.end_shape = job.first_shape + (shapes.first[scene + 1] - job.first_shape) * wp.static(min(against, 1))
+    job.end_shape = job.first_shape + (scene.shapes.first[place + 1] - job.first_shape) * wp.static(min(against, 1))
     for s in range(job.first_shape, job.end_shape):
-        job.object_speed = wp.max(job.object_speed, shapes.speed[s])
-    job.first_load = jobs.load_first[index]
-    job.end_load = jobs.load_first[index + 1]
+        job.object_speed = wp.max(job.object_speed, scene.shapes.speed[s])
+    job.first_load = scene.jobs.load_first[index]
+    job.end_load = scene.jobs.load_first[index + 1]
     # Rest is skipped, so the base stands still, nothing pulls, and no shape is to be recorded.
-    if motions.count[job.base] == 1 and wp.length_sq(motions.velocity[motions.first[job.base]]) == zero:
-        if job.first_load == job.end_load and wp.length_sq(options.gravity) == zero and options.shape == 0:
+    if (
+        scene.motions.count[job.base] == 1
+        and wp.length_sq(scene.motions.velocity[scene.motions.first[job.base]]) == zero
+    ):
+        if job.first_load == job.end_load and wp.length_sq(scene.options.gravity) == zero and scene.options.shape == 0:
             job.can_rest = 1
     return job
 
 
 @wp.func(inline=True)
-def preferred_step(jobs: JobArrays, job: WhiskerJob, state: wp.ref[WhiskerState], now: Instant) -> real:
+def preferred_step(scene: SceneArrays, job: WhiskerJob, state: wp.ref[WhiskerState], now: Instant) -> real:
     """Return the step to take: short enough for the motions, and near an object no point of the whisker moves further
     in it than contacts are sought."""
     wanted = job.longest_step
     if job.limits > 0:
-        wanted = wp.min(wanted, jobs.limit[job.first_limit + cell_at(now, job.limits)])
+        wanted = wp.min(wanted, scene.jobs.limit[job.first_limit + cell_at(now, job.limits)])
     pace = state.top_speed + state.near_speed
     if state.split_time > real(0.0) and pace * wanted > real(wp.static(TRAVEL)):
         wanted = wp.max(wanted / real(wp.static(FINEST)), real(wp.static(TRAVEL)) / pace)
@@ -96,53 +98,54 @@ def preferred_step(jobs: JobArrays, job: WhiskerJob, state: wp.ref[WhiskerState]
 
 @wp.func(inline=True)
 def write_reading(
+    scene: SceneArrays,
     results: ResultArrays,
-    jobs: JobArrays,
-    options: StepOptions,
     problems: ContactProblems,
     job: WhiskerJob,
     chain: wp.ref[ChainState],
     reading: int,
-    base_wrench: Wrench,
-    force_sum: real,
-    arc_sum: real,
+    base_wrench: Spatial,
     solved: int,
 ):
     """Write the wrench on the base and the contact, as of the beginning of the step."""
-    none = vec3(real(0.0), real(0.0), real(0.0))
     index = job.index
-    first = jobs.row[index]
-    column = jobs.column[index]
+    first = scene.jobs.row[index]
+    column = scene.jobs.column[index]
     # The wrench found is that of the base on the whisker; reported is the reaction, in N and N·m.
-    acting = options.axes * base_wrench.force * real(-1e-3)
-    turning = options.axes * base_wrench.moment * real(-1e-6)
+    force = scene.options.axes * base_wrench.v * real(-1e-3)
+    moment = scene.options.axes * base_wrench.w * real(-1e-6)
     for d in range(3):
-        results.wrench[first, reading, column, d] = acting[d]
-        results.wrench[first, reading, column, 3 + d] = turning[d]
-    # Mean arc of the contacts, weighted by their normal forces; mm to m.
-    if force_sum > real(0.0):
-        results.contact[first, reading, column] = real(1e-3) * arc_sum / force_sum
-    if options.shape == 1:
+        results.wrench[first, reading, column, d] = force[d]
+        results.wrench[first, reading, column, 3 + d] = moment[d]
+    if wp.static(against > NOTHING) and solved == 1:
+        # Mean arc of the contacts, weighted by their normal forces; mm to m.
+        normal_sum = problems.solution[index].normal_sum
+        if normal_sum > real(0.0):
+            results.contact[first, reading, column] = real(1e-3) * problems.solution[index].arc_sum / normal_sum
+    if scene.options.shape == 1:
         for i in range(job.links + 1):
             results.points[reading, i, index] = row(chain.node, i)
-        results.contact_wrench[reading, 0, index] = none
-        results.contact_wrench[reading, 1, index] = none
+        contact = Spatial()
         if solved == 1:
-            results.contact_wrench[reading, 0, index] = problems.solution[index].contact_force * real(1e-3)
-            results.contact_wrench[reading, 1, index] = problems.solution[index].contact_moment * real(1e-6)
+            contact = problems.solution[index].contact
+        results.contact_wrench[reading, 0, index] = contact.v * real(1e-3)
+        results.contact_wrench[reading, 1, index] = contact.w * real(1e-6)
 
 
 @wp.kernel(enable_backward=False, module="unique", module_options=module_options(), launch_bounds=bounds)
 def run(
+    # Model:
     chains: ChainArrays,
     motions: MotionArrays,
     shapes: ShapeArrays,
     jobs: JobArrays,
-    options: StepOptions,
     readings: ReadingArrays,
-    results: ResultArrays,
+    options: StepOptions,
+    # Data in and out:
     problems: ContactProblems,
     paused: PausedWhiskers,
+    # Data out:
+    results: ResultArrays,
 ):
     """Take each whisker to its last reading, or to where it pauses.
 
@@ -150,13 +153,14 @@ def run(
     queues of ``paused``. A run that is recorded pauses as well, but has no queues.
     """
     index = wp.tid()
+    scene = scene_of(chains, motions, shapes, jobs, readings, options)
     if wp.static(sliced):
         index = next_job(paused, index)
         if index < 0:
             return
     zero = real(0.0)
     none = vec3(zero, zero, zero)
-    job = load_job(chains, motions, shapes, jobs, options, index)
+    job = load_job(scene, index)
     chain = ChainState()
     proximity = ProximityState()
     near = NearShapes()
@@ -176,23 +180,21 @@ def run(
     used = int(0)
     wait = int(0)
     first_reading = state.reading
-    count_readings = readings.time.shape[0]
+    count_readings = scene.readings.time.shape[0]
     for reading in range(first_reading, count_readings + 1):
         until = instant(state.reading_time.tick, state.reading_time.part + job.longest_step)
         result = int(-1)
         if reading < count_readings:
-            until = readings.time[reading]
-            result = readings.row[reading]
+            until = scene.readings.time[reading]
+            result = scene.readings.row[reading]
         span = real(until.tick - state.reading_time.tick) + (until.part - state.reading_time.part)
         if span <= zero:
             # A reading at the very start.
             state.pending_reading = result
             continue
         if state.at_rest == 1 and elapsed(until) > state.safe_until and state.time_left == zero:
-            end = elapsed(readings.time[count_readings - 1])
-            wait = check_rest(
-                chains, motions, shapes, job, paused, chain, proximity, state, elapsed(until), end
-            )  # fmt: skip
+            end = elapsed(scene.readings.time[count_readings - 1])
+            wait = check_rest(scene, paused, job, chain, proximity, state, elapsed(until), end)
             if wp.static(sliced):
                 if wait != 0:
                     state.reading = reading
@@ -219,18 +221,18 @@ def run(
             now = instant(until.tick, until.part - left)
             # Equal steps up to the next reading.
             # The thousandth keeps rounding from adding a step.
-            steps = wp.max(1, int(wp.ceil(left / preferred_step(jobs, job, state, now) - real(1e-3))))
+            steps = wp.max(1, int(wp.ceil(left / preferred_step(scene, job, state, now) - real(1e-3))))
             h = left / real(steps)
             left_whole = left
             left = left - h
             if steps == 1:
                 last = 1
-                if options.quasistatic == 1:
+                if scene.options.quasistatic == 1:
                     state.pending_reading = result
             state.largest_change = zero
             count = int(0)
             solved = int(0)
-            base_wrench = Wrench()
+            base_wrench = Spatial()
             tip_acceleration = none
             if wp.static(sliced) and state.waiting_for == WAIT_FORCES:
                 # The forces of this step have been found meanwhile.
@@ -242,32 +244,18 @@ def run(
                 count = 1
                 solved = 1
             else:
-                pose = pose_at(motions, job.base, now)
-                later = pose_at(motions, job.base, instant(now.tick, now.part + h))
-                moving = Twist()
-                moving.angular = pose.spin
-                moving.linear = pose.velocity
-                # The base moves as its track does within the step; gravity is an acceleration of the base.
-                # Spatial acceleration is the rate of the twist at a fixed point: v̇ − ω × v (Featherstone 2008, chapter
-                # 2).
-                base = SpatialAcceleration()
-                base.angular = (later.spin - moving.angular) / h
-                base.linear = (
-                    (later.velocity - moving.linear) / h - wp.cross(moving.angular, moving.linear) - options.gravity
-                )
+                step = begin_step(scene, job, now, h)
                 # A whisker that pauses takes this step again: with these restored, the step has the same length.
                 previous_split = state.split_time
                 previous_near_speed = state.near_speed
                 previous_speed = state.top_speed
-                tip = forward_kinematics(chains, job, pose, chain, proximity, state)
+                tip = forward_kinematics(scene.chains, job, step.pose, chain, proximity, state)
                 if wp.static(against > NOTHING):
-                    reach = search_range(job, options, state, h)
-                    near_count = count_near_links(chains, job, proximity, reach)
+                    reach = search_range(scene, job, state, h)
+                    near_count = count_near_links(scene, job, proximity, reach)
                     if wp.static(sliced):
                         if near_count > 0 and state.waiting_for != WAIT_DISTANCES:
-                            wait = query_distances(
-                                chains, job, paused, chain, proximity, state, reach, pose, now, near_count
-                            )
+                            wait = query_distances(scene, paused, job, chain, proximity, state, reach, step, near_count)
                             state.top_speed = previous_speed
                             break
                     lower_clearance(job, proximity, near, reach)
@@ -275,10 +263,8 @@ def run(
                     state.closes = 0
                     state.closing_speed = zero
                     if near_count > 0:
-                        count = find_candidates(
-                            chains, motions, shapes, job, paused, chain, proximity, near, candidates, state, pose,
-                            reach.margin, now, h
-                        )  # fmt: skip
+                        step.margin = reach.margin
+                        count = find_candidates(scene, paused, job, chain, proximity, near, candidates, state, step)
                 if wp.static(sliced or recorded):
                     state.waiting_for = 0
                     state.time_left = zero
@@ -302,19 +288,14 @@ def run(
                 if wp.static(recorded):
                     if paused.keep == 1:
                         record_state(paused, job, chain, state, state.steps - first_step, now, h)
-                base_wrench = articulated_inertia(
-                    chains, jobs, job, chain, proximity, tip, base, elapsed(now), h, count
-                )
-                tip_acceleration = joint_accelerations(
-                    job, options, chain, candidates, state, moving, base, elapsed(now), h, count
-                )
+                base_wrench = articulated_inertia(scene, job, chain, proximity, step, tip, count)
+                tip_acceleration = joint_accelerations(scene, job, chain, candidates, state, step, count)
                 if wp.static(against > NOTHING) and count > 0:
                     solved = any_gap_closes(candidates, count, h)
                     if solved == 1:
-                        write_problem(
-                            problems, chains, job, chain, proximity, candidates, state, base_wrench, tip_acceleration,
-                            h, count
-                        )  # fmt: skip
+                        problems.given[index].base = base_wrench
+                        problems.given[index].tip_acceleration = tip_acceleration
+                        write_problem(scene, problems, job, chain, proximity, candidates, state.contacts, h, count)
                         if wp.static(sliced):
                             wait = WAIT_FORCES
                             state.step_split_time = state.split_time
@@ -330,22 +311,16 @@ def run(
                             solve_contacts(problems, index, 0, 1)
                 if wp.static(recorded):
                     if paused.keep == 1:
-                        record_contacts(
-                            chains, motions, shapes, paused, problems, job, chain, pose, state.steps - first_step, now,
-                            count, solved, candidates
-                        )  # fmt: skip
+                        candidates.count = count
+                        place = state.steps - first_step
+                        record_contacts(scene, paused, problems, job, chain, candidates, step, place, solved)
             state.contacts = int(0)
             touched = int(0)
-            arc_sum = zero
-            force_sum = zero
             if wp.static(against > NOTHING) and solved == 1:
                 read_solution(problems, job, chain, state)
-                base_wrench.moment = problems.solution[index].base_moment
-                base_wrench.force = problems.solution[index].base_force
+                base_wrench = problems.solution[index].base
                 tip_acceleration = problems.solution[index].tip_acceleration
-                force_sum = problems.solution[index].normal_sum
-                arc_sum = problems.solution[index].arc_sum
-                if force_sum > zero:
+                if problems.solution[index].normal_sum > zero:
                     touched = 1
                     # A whisker that slips off swings back fast.
                     state.split_time = real(wp.static(AFTERMATH)) * job.longest_step
@@ -353,15 +328,12 @@ def run(
             state.velocity_jump = wp.max(h * wp.length(tip_acceleration), real(0.5) * state.velocity_jump)
             state.touching = state.touching + touched
             if state.pending_reading >= 0:
-                write_reading(
-                    results, jobs, options, problems, job, chain, state.pending_reading, base_wrench,
-                    force_sum, arc_sum, solved
-                )  # fmt: skip
+                write_reading(scene, results, problems, job, chain, state.pending_reading, base_wrench, solved)
                 state.pending_reading = int(-1)
             if count > 0:
                 for i in range(job.links):
                     integrate_joint(
-                        chain, state, i, row(chain.acceleration, i), h, elapsed(now) + h, options.quasistatic
+                        chain, state, i, row(chain.acceleration, i), h, elapsed(now) + h, scene.options.quasistatic
                     )
             if wp.static(recorded):
                 if paused.keep == 1:
@@ -377,7 +349,7 @@ def run(
             state.reading = reading
             break
         state.reading_time = until
-        if options.quasistatic == 0:
+        if scene.options.quasistatic == 0:
             state.pending_reading = result
         if state.status != 0:
             break

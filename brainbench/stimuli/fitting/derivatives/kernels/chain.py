@@ -8,23 +8,28 @@ from typing import Any
 
 import warp as wp
 
-from brainbench.stimuli.engines.rod.limits import FOLD, STOP
-
-from ..algebra import JointVector, SpatialAcceleration, Wrench, first_axis, reader, vec2, vec3
-from ..articulated_body import ChainState, ProximityState, articulated_inertia, forward_kinematics, hinge_direction
+from ..algebra import JointVector, Spatial, first_axis, minus, reader, spatial_dot, vec3
+from ..articulated_body import (
+    ChainState,
+    ProximityState,
+    acceleration_over_joint,
+    articulated_inertia,
+    forward_kinematics,
+    hinge_direction,
+    inverse_times,
+    joint_record,
+)
 from ..delassus import PerContact3
-from ..motion import BodyMotion, Instant, elapsed, instant, pose_at, pose_from
+from ..motion import Instant, instant, pose_from
 from ..parameters import capacity, hinges, real
 from ..state import (
-    ChainArrays,
-    JobArrays,
-    MotionArrays,
     PerLink3,
     PerLinkJoint,
-    ShapeArrays,
-    StepOptions,
+    SceneArrays,
+    Step,
     WhiskerJob,
     WhiskerState,
+    begin_step,
     row,
 )
 from .contacts import StepContacts, contact_row, set_state
@@ -51,6 +56,14 @@ class StepLinks:
 
 
 @wp.struct
+class HingeTangents:
+    """Change of axis and moment of each hinge."""
+
+    axis: PerHinge3
+    moment: PerHinge3
+
+
+@wp.struct
 class Fields:
     """Twist V and acceleration A of a link: angular, and of its point at the base point."""
 
@@ -74,15 +87,12 @@ class FieldTangents:
 
 @wp.struct
 class StepFrame:
-    """Base of a recorded step: at its beginning, half-way and at its end."""
+    """A recorded step: its beginning, its middle and its end, and the result that it wrote."""
 
-    now: Instant
+    step: Step
     middle: Instant
     later: Instant
-    length: real
     reading: wp.int32
-    pose: BodyMotion
-    base: SpatialAcceleration
 
 
 @wp.func
@@ -113,8 +123,7 @@ def move_hinge(
     acceleration: real,
     angle_d: real,
     rate_d: real,
-    axis_d: wp.ref[PerHinge3],
-    moment_d: wp.ref[PerHinge3],
+    hinges_d: wp.ref[HingeTangents],
 ):
     """Take the change of the fields over hinge j, at a fixed acceleration; write those of its axis and moment."""
     s = hinge_row(links.axis, j)
@@ -132,22 +141,8 @@ def move_hinge(
     moved.vw = moved.vw + s_d * rate + s * rate_d
     moved.vv = moved.vv + m_d * rate + m * rate_d
     moved.turn = moved.turn + s * angle_d
-    axis_d[j] = s_d
-    moment_d[j] = m_d
-
-
-@wp.func
-def spring_state(angle: real, rate: real, lag: real) -> vec2:
-    """Return the stretch of a joint's spring, q + lag q̇, and how many times steeper than its stiffness it is there."""
-    stretch = angle + lag * rate
-    steepness = real(1.0)
-    bend = wp.abs(angle)
-    if bend > real(wp.static(FOLD)):
-        # Beyond FOLD it stiffens, see ``articulated_body``.
-        past = angle * (real(1.0) - real(wp.static(FOLD)) / bend)
-        stretch = stretch + real(wp.static(STOP)) * (past + lag * rate)
-        steepness = steepness + real(wp.static(STOP))
-    return vec2(stretch, steepness)
+    hinges_d.axis[j] = s_d
+    hinges_d.moment[j] = m_d
 
 
 @wp.func
@@ -155,80 +150,51 @@ def solve_chain(
     job: WhiskerJob,
     chain: wp.ref[ChainState],
     proximity: wp.ref[ProximityState],
-    links: wp.ref[StepLinks],
     asked: wp.ref[PerLinkJoint],
     contacts: wp.ref[StepContacts],
     pushing: int,
     acceleration_d: wp.ref[PerLinkJoint],
     at_contacts: wp.ref[PerContact3],
-) -> Wrench:
+) -> Spatial:
     """Solve the symmetric system of the chain: two passes over the factorised chain of the step.
 
     ``asked`` is the right-hand side, and with ``pushing`` the change of the contacts' forces; the base stays. Found
     are the accelerations of the joints and that at each contact; returned is what the base must hold.
     """
-    zero = real(0.0)
-    tw = vec3(zero, zero, zero)
-    tv = vec3(zero, zero, zero)
+    held = Spatial()
     for back in range(job.links):
         i = job.links - 1 - back
         if pushing == 1:
             for k in range(contacts.count):
                 if contact_row(contacts.link, k) == i:
                     push = contact_row(contacts.change, k)
-                    tv = tv + push
-                    tw = tw + wp.cross(contact_row(contacts.point, k), push)
-        j = wp.static(hinges) * i
-        b = row(asked, i)
-        found = JointVector()
-        inverse = row(proximity.inverse_inertia, i)
+                    held.v = held.v + push
+                    held.w = held.w + wp.cross(contact_row(contacts.point, k), push)
+        # A moment asked of a joint is felt by it beside the force.
+        joint = joint_record(chain, proximity, i)
+        due = row(asked, i)
+        felt = JointVector()
         if wp.static(hinges == 3):
             if i % 2 == 1:
-                u3 = b[2] + wp.dot(hinge_row(links.axis, j + 2), tw) + wp.dot(hinge_row(links.moment, j + 2), tv)
-                found[2] = inverse[3] * u3
-                tw = tw - row(chain.gain3_w, i) * u3
-                tv = tv - row(chain.gain3_v, i) * u3
-        u1 = b[0] + wp.dot(hinge_row(links.axis, j), tw) + wp.dot(hinge_row(links.moment, j), tv)
-        u2 = b[1] + wp.dot(hinge_row(links.axis, j + 1), tw) + wp.dot(hinge_row(links.moment, j + 1), tv)
-        found[0] = inverse[0] * u1 + inverse[1] * u2
-        found[1] = inverse[1] * u1 + inverse[2] * u2
-        tw = tw - row(chain.gain1_w, i) * u1 - row(chain.gain2_w, i) * u2
-        tv = tv - row(chain.gain1_v, i) * u1 - row(chain.gain2_v, i) * u2
-        acceleration_d[i] = found
-    held = Wrench()
-    held.moment = tw
-    held.force = tv
-    aw = vec3(zero, zero, zero)
-    av = vec3(zero, zero, zero)
+                felt[2] = due[2] + spatial_dot(joint.motion3, held)
+                held = minus(held, joint.gain3, felt[2])
+        felt[0] = due[0] + spatial_dot(joint.motion1, held)
+        felt[1] = due[1] + spatial_dot(joint.motion2, held)
+        held = minus(minus(held, joint.gain1, felt[0]), joint.gain2, felt[1])
+        acceleration_d[i] = inverse_times(joint.inverse_inertia, felt)
+    a = Spatial()
     for i in range(job.links):
-        j = wp.static(hinges) * i
-        found = row(acceleration_d, i)
-        a1 = found[0] - wp.dot(row(chain.gain1_w, i), aw) - wp.dot(row(chain.gain1_v, i), av)
-        a2 = found[1] - wp.dot(row(chain.gain2_w, i), aw) - wp.dot(row(chain.gain2_v, i), av)
-        aw = aw + hinge_row(links.axis, j) * a1 + hinge_row(links.axis, j + 1) * a2
-        av = av + hinge_row(links.moment, j) * a1 + hinge_row(links.moment, j + 1) * a2
-        found[0] = a1
-        found[1] = a2
-        if wp.static(hinges == 3):
-            if i % 2 == 1:
-                a3 = found[2] - wp.dot(row(chain.gain3_w, i), aw) - wp.dot(row(chain.gain3_v, i), av)
-                aw = aw + hinge_row(links.axis, j + 2) * a3
-                av = av + hinge_row(links.moment, j + 2) * a3
-                found[2] = a3
-        acceleration_d[i] = found
+        joint = joint_record(chain, proximity, i)
+        acceleration_d[i] = acceleration_over_joint(joint, i, row(acceleration_d, i), a)
         for k in range(contacts.count):
             if contact_row(contacts.link, k) == i:
-                at_contacts[k] = av + wp.cross(aw, contact_row(contacts.point, k))
+                at_contacts[k] = a.v + wp.cross(a.w, contact_row(contacts.point, k))
     return held
 
 
 @wp.func
 def restore_step(
-    chains: ChainArrays,
-    motions: MotionArrays,
-    shapes: ShapeArrays,
-    jobs: JobArrays,
-    options: StepOptions,
+    scene: SceneArrays,
     records: StepRecords,
     job: WhiskerJob,
     place: int,
@@ -240,35 +206,28 @@ def restore_step(
 ) -> StepFrame:
     """Factorise the chain of a recorded step; find its hinges and contacts, and ``on`` the fields of its last link."""
     index = job.index
-    step = records.step[place, index]
-    now = step.time
-    h = step.length
+    record = records.step[place, index]
+    now = record.time
+    h = record.length
     frame = StepFrame()
-    frame.now = now
+    frame.step = begin_step(scene, job, now, h)
     frame.middle = instant(now.tick, now.part + real(0.5) * h)
     frame.later = instant(now.tick, now.part + h)
-    frame.length = h
-    frame.reading = step.reading
-    pose = pose_at(motions, job.base, now)
-    after = pose_at(motions, job.base, frame.later)
-    frame.pose = pose
+    frame.reading = record.reading
+    pose = frame.step.pose
     state = WhiskerState()
     for i in range(job.links):
         chain.angle[i] = records.angle[place, i, index]
         chain.rate[i] = records.rate[place, i, index]
-    base = SpatialAcceleration()
-    base.angular = (after.spin - pose.spin) / h
-    base.linear = (after.velocity - pose.velocity) / h - wp.cross(pose.spin, pose.velocity) - options.gravity
-    frame.base = base
-    tip = forward_kinematics(chains, job, pose, chain, proximity, state)
-    articulated_inertia(chains, jobs, job, chain, proximity, tip, base, elapsed(now), h, 1)
+    last = forward_kinematics(scene.chains, job, pose, chain, proximity, state)
+    articulated_inertia(scene, job, chain, proximity, frame.step, last, 1)
 
     # Twists and accelerations down the chain, with those of the contacts at the end of the step.
-    contacts.count = step.contacts
+    contacts.count = record.contacts
     on.vw = pose.spin
     on.vv = pose.velocity
-    on.aw = base.angular
-    on.av = base.linear
+    on.aw = frame.step.base.w
+    on.av = frame.step.base.v
     for k in range(contacts.count):
         contacts.link[k] = records.contact[place, k, index].link
     for i in range(job.links):
@@ -296,13 +255,13 @@ def restore_step(
         for k in range(contacts.count):
             if contact_row(contacts.link, k) == i:
                 contact = records.contact[place, k, index]
-                taper = chains.taper[i, job.whisker]
+                taper = scene.chains.taper[i, job.whisker]
                 radius = taper.start_radius + (taper.end_radius - taper.start_radius) * contact.share
                 point = at + (row(chain.node, i + 1) - at) * contact.share - contact.normal * radius
-                half = pose_from(motions, shapes.track[contact.shape], frame.middle, pose)
+                half = pose_from(scene.motions, scene.shapes.track[contact.shape], frame.middle, pose)
                 velocity = (
                     on.vv
-                    + (on.av + options.gravity) * h
+                    + (on.av + scene.options.gravity) * h
                     + wp.cross(on.vw + on.aw * h, point)
                     - half.velocity
                     - wp.cross(half.spin, point - half.place)

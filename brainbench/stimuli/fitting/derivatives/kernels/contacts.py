@@ -13,11 +13,11 @@ that the virtual motion without contacts has there, and the derivative f̄ of th
 
 import warp as wp
 
-from ..algebra import JointVector, first_axis, mat33, vec3
-from ..articulated_body import ChainState, ProximityState, hinge_direction
+from ..algebra import JointVector, mat33, spatial, vec3
+from ..articulated_body import ChainState, ProximityState, force_over_joint, inverse_times, joint_record
 from ..delassus import PerContact1, PerContact3, PerContactInt
 from ..delassus import row as contact_row
-from ..parameters import hinges, real
+from ..parameters import real
 from ..state import WhiskerJob, row
 from .newton import DenseSystem, dense_entry, solve_dense, width
 from .records import ContactRecord, StepRecord
@@ -194,31 +194,20 @@ def force_block(contacts: wp.ref[StepContacts], k: int) -> mat33:
 
 
 @wp.func
-def carry_units(job: WhiskerJob, chain: wp.ref[ChainState], contacts: wp.ref[StepContacts], system: ContactSystem):
+def carry_units(
+    job: WhiskerJob,
+    chain: wp.ref[ChainState],
+    proximity: wp.ref[ProximityState],
+    contacts: wp.ref[StepContacts],
+    system: ContactSystem,
+):
     """Carry unit forces at the contacts up the factorised chain, as ``delassus.build_delassus`` does."""
     for k in range(contacts.count):
         for d in range(3):
-            tv = unit(d)
-            tw = wp.cross(contact_row(contacts.point, k), tv)
+            force = spatial(wp.cross(contact_row(contacts.point, k), unit(d)), unit(d))
             for back in range(contact_row(contacts.link, k) + 1):
                 i = contact_row(contacts.link, k) - back
-                at = row(chain.node, i)
-                felt = JointVector()
-                if wp.static(hinges == 3):
-                    if i % 2 == 1:
-                        s3 = row(chain.axis3, i)
-                        u3 = wp.dot(s3, tw) + wp.dot(wp.cross(at, s3), tv)
-                        tw = tw - row(chain.gain3_w, i) * u3
-                        tv = tv - row(chain.gain3_v, i) * u3
-                        felt[2] = u3
-                s2 = row(chain.axis2, i)
-                s1 = first_axis(s2, hinge_direction(chain, i), row(chain.angle, i)[1])
-                u1 = wp.dot(s1, tw) + wp.dot(wp.cross(at, s1), tv)
-                u2 = wp.dot(s2, tw) + wp.dot(wp.cross(at, s2), tv)
-                tw = tw - row(chain.gain1_w, i) * u1 - row(chain.gain2_w, i) * u2
-                tv = tv - row(chain.gain1_v, i) * u1 - row(chain.gain2_v, i) * u2
-                felt[0] = u1
-                felt[1] = u2
+                felt = force_over_joint(joint_record(chain, proximity, i), i, force)
                 system.unit[3 * k + d, i, job.index] = felt
 
 
@@ -237,14 +226,9 @@ def compliance(
     for i in range(wp.min(contact_row(contacts.link, k), contact_row(contacts.link, e)) + 1):
         inverse = row(proximity.inverse_inertia, i)
         for a in range(3):
-            one = system.unit[3 * k + a, i, job.index]
-            i1 = h * (inverse[0] * one[0] + inverse[1] * one[1])
-            i2 = h * (inverse[1] * one[0] + inverse[2] * one[1])
+            moved = inverse_times(inverse, system.unit[3 * k + a, i, job.index]) * h
             for b in range(3):
-                other = system.unit[3 * e + b, i, job.index]
-                shared = i1 * other[0] + i2 * other[1]
-                if wp.static(hinges == 3):
-                    shared = shared + h * inverse[3] * one[2] * other[2]
+                shared = wp.dot(moved, system.unit[3 * e + b, i, job.index])
                 block[a, b] = block[a, b] + shared
     return block
 
@@ -260,7 +244,7 @@ def build_system(
     matrix: wp.ref[DenseSystem],
 ):
     """Write the matrix A G + B of the change of the forces."""
-    carry_units(job, chain, contacts, system)
+    carry_units(job, chain, proximity, contacts, system)
     for k in range(contacts.count):
         own = compliance(job, proximity, contacts, system, k, k, h)
         contacts.scale[k] = (own[0, 0] + own[1, 1] + own[2, 2]) / real(3.0)

@@ -3,7 +3,7 @@
 import warp as wp
 
 from ..algebra import vec3, vec4
-from ..motion import Instant, MotionArrays, cell_at, elapsed, turning
+from ..motion import Instant, MotionArrays, cell_at, elapsed, quaternion_rate
 from ..parameters import real
 
 
@@ -52,10 +52,10 @@ def raw_turn(motions: MotionArrays, piece: TrackPiece) -> vec4:
     a = piece.first
     b = a + 1
     return (
-        motions.turn[a] * piece.v0
-        + turning(motions.turn[a], motions.spin[a]) * piece.s0
-        + motions.turn[b] * piece.v1
-        + turning(motions.turn[b], motions.spin[b]) * piece.s1
+        motions.quaternion[a] * piece.v0
+        + quaternion_rate(motions.quaternion[a], motions.spin[a]) * piece.s0
+        + motions.quaternion[b] * piece.v1
+        + quaternion_rate(motions.quaternion[b], motions.spin[b]) * piece.s1
     )
 
 
@@ -99,7 +99,7 @@ def move_pose(motions: MotionArrays, knots: wp.array3d(dtype=real), p: int, inde
     if count == 1:
         found.velocity = knot_vector(knots, p, first, 3)
         found.place = knot_vector(knots, p, first, 0) + found.velocity * elapsed(when)
-        found.turn = turn_between(motions.turn[first], knot_quaternion(knots, p, first))
+        found.turn = turn_between(motions.quaternion[first], knot_quaternion(knots, p, first))
         return found
     piece = piece_at(motions, first, count, when)
     a = piece.first
@@ -121,9 +121,9 @@ def move_pose(motions: MotionArrays, knots: wp.array3d(dtype=real), p: int, inde
     turn_b = knot_quaternion(knots, p, b)
     change = (
         turn_a * piece.v0
-        + (turning(turn_a, motions.spin[a]) + turning(motions.turn[a], spin_a)) * piece.s0
+        + (quaternion_rate(turn_a, motions.spin[a]) + quaternion_rate(motions.quaternion[a], spin_a)) * piece.s0
         + turn_b * piece.v1
-        + (turning(turn_b, motions.spin[b]) + turning(motions.turn[b], spin_b)) * piece.s1
+        + (quaternion_rate(turn_b, motions.spin[b]) + quaternion_rate(motions.quaternion[b], spin_b)) * piece.s1
     )
     turn = raw_turn(motions, piece)
     size = wp.length(turn)

@@ -7,22 +7,21 @@ the digit.
 
 import warp as wp
 
-from brainbench.stimuli.engines.rod.limits import ANYWHERE, CAPSULE, CYLINDER, MESH, SPHERE
-from brainbench.stimuli.engines.rod.mesh_bvh import WIDE
+from brainbench.stimuli.engines.rod.limits import ANYWHERE, CAPSULE, CYLINDER, MESH, SPHERE, WIDE
 
 from ..algebra import rotate, unrotate, vec3, vec6
 from ..articulated_body import ChainState
-from ..mesh_bvh import corner, nearest_triangles
 from ..motion import BodyMotion, pose_from
+from ..narrow_phase import corner, nearest_triangles
 from ..parameters import real
 from ..state import (
-    ChainArrays,
     ContactCandidates,
     ContactProblems,
     Instant,
-    MotionArrays,
     PausedWhiskers,
+    SceneArrays,
     ShapeArrays,
+    Step,
     WhiskerJob,
     WhiskerState,
     most_candidates,
@@ -167,11 +166,11 @@ def curvature_at(
 
     ``normal`` is its gradient there and ``distance`` its value; places count from the base.
     """
-    turn_s = shapes.turn[s]
+    local_quaternion = shapes.quaternion[s]
     scale = shapes.scale[s]
-    a = unrotate(turn_s, unrotate(body.turn, start - body.place) - shapes.place[s]) / scale
-    b = unrotate(turn_s, unrotate(body.turn, stop - body.place) - shapes.place[s]) / scale
-    n = unrotate(turn_s, unrotate(body.turn, normal))
+    a = unrotate(local_quaternion, unrotate(body.quaternion, start - body.place) - shapes.place[s]) / scale
+    b = unrotate(local_quaternion, unrotate(body.quaternion, stop - body.place) - shapes.place[s]) / scale
+    n = unrotate(local_quaternion, unrotate(body.quaternion, normal))
     found = PrincipalCurvature()
     if shapes.kind[s] == wp.static(MESH):
         found = mesh_curvature(shapes, s, a, b, share, n, distance / scale)
@@ -179,7 +178,7 @@ def curvature_at(
         found = primitive_curvature(shapes.kind[s], shapes.size[s] / scale, a + (b - a) * share, n)
     k1 = found.first / scale
     k2 = found.second / scale
-    t = rotate(body.turn, rotate(turn_s, found.direction))
+    t = rotate(body.quaternion, rotate(local_quaternion, found.direction))
     u = wp.cross(normal, t)
     return vec6(
         k1 * t[0] * t[0] + k2 * u[0] * u[0],
@@ -217,19 +216,15 @@ def record_state(
 
 @wp.func
 def record_contacts(
-    chains: ChainArrays,
-    motions: MotionArrays,
-    shapes: ShapeArrays,
+    scene: SceneArrays,
     paused: PausedWhiskers,
     problems: ContactProblems,
     job: WhiskerJob,
     chain: wp.ref[ChainState],
-    pose: BodyMotion,
-    place: int,
-    now: Instant,
-    count: int,
-    solved: int,
     candidates: wp.ref[ContactCandidates],
+    step: Step,
+    place: int,
+    solved: int,
 ):
     """Write the contacts of the step that press, and how far the others are from closing."""
     index = job.index
@@ -247,7 +242,7 @@ def record_contacts(
             share = row(candidates.share, held.slot)
             if wp.dot(held.force, given.normal) > real(0.0):
                 i = problems.candidate_link[first + held.slot]
-                taper = chains.taper[i, job.whisker]
+                taper = scene.chains.taper[i, job.whisker]
                 radius = taper.start_radius + (taper.end_radius - taper.start_radius) * share
                 start = row(chain.node, i)
                 lead = wp.min(lead, row(candidates.lead, held.slot))
@@ -259,9 +254,9 @@ def record_contacts(
                 record.friction = given.friction
                 record.normal = given.normal
                 record.force = held.force
-                body = pose_from(motions, shapes.track[shape], now, pose)
+                body = pose_from(scene.motions, scene.shapes.track[shape], step.now, step.pose)
                 record.curvature = curvature_at(
-                    shapes,
+                    scene.shapes,
                     shape,
                     body,
                     start,
@@ -273,7 +268,7 @@ def record_contacts(
                 paused.records.contact[place, pressing, index] = record
                 pressing = pressing + 1
     least = real(1e30)
-    for j in range(count):
+    for j in range(candidates.count):
         if (taken >> j) % 2 == 0:
             ahead = row(candidates.predicted_gap, j)
             if solved == 1:

@@ -13,17 +13,17 @@ import warp as wp
 
 from brainbench.stimuli.engines.rod.limits import CAPSULE, CREVICE, CYLINDER, MESH, SPHERE
 
-from ..algebra import JointVector, Wrench, rotate, symmetric_times, unrotate, vec3, vec4
-from ..articulated_body import ChainState, ProximityState
+from ..algebra import JointVector, Spatial, rotate, symmetric_times, unrotate, vec3, vec4
+from ..articulated_body import ChainState, ProximityState, spring_state
 from ..delassus import PerContact3
-from ..motion import MotionArrays, elapsed, pose_from
+from ..motion import elapsed, pose_from
 from ..parameters import hinges, module_options, real
-from ..state import ChainArrays, JobArrays, PerLink3, PerLinkJoint, ShapeArrays, StepOptions, WhiskerJob, row
+from ..state import PerLink3, PerLinkJoint, SceneArrays, WhiskerJob, row
 from ..step import load_job
 from .chain import (
     Fields,
     FieldTangents,
-    PerHinge3,
+    HingeTangents,
     StepFrame,
     StepLinks,
     add_hinge,
@@ -32,7 +32,6 @@ from .chain import (
     move_hinge,
     restore_step,
     solve_chain,
-    spring_state,
 )
 from .contacts import (
     ContactSummary,
@@ -115,6 +114,22 @@ class LinkFields:
 
 
 @wp.struct
+class MovingLink:
+    """A link with a contact in a step, and its change with a parameter."""
+
+    at: vec3
+    """Its joint."""
+    span: vec3
+    """From there to its far end."""
+    span_d: vec3
+    turning: vec3
+    """Its angular velocity at the end of the step."""
+    base_place: vec3
+    """Change of the base's place."""
+    fields: FieldTangents
+
+
+@wp.struct
 class ContactTangent:
     """Change of a contact at fixed accelerations and forces."""
 
@@ -158,51 +173,51 @@ def grow(kind: int, size: vec3, x: vec3, size_d: vec3) -> vec4:
 
 @wp.func
 def move_contact(
-    motions: MotionArrays,
-    shapes: ShapeArrays,
+    scene: SceneArrays,
     tangents: PackedTangents,
     contacts: wp.ref[StepContacts],
     k: int,
     contact: ContactRecord,
     frame: StepFrame,
     p: int,
-    index: int,
-    turning: vec3,
-    moved: FieldTangents,
-    base_place: vec3,
-    at: vec3,
-    link: vec3,
-    link_d: vec3,
-    radii: vec3,
-    radii_d: vec3,
+    job: WhiskerJob,
+    moving: MovingLink,
 ) -> ContactTangent:
-    """Return the change of a contact's point and of its condition c.
-
-    ``turning`` is the angular velocity of the link at the end of the step, ``radii`` are those at both of its ends;
-    ``link`` goes from the joint ``at`` to its far end.
-    """
+    """Return the change of a contact's point and of its condition c."""
     zero = real(0.0)
-    h = frame.length
+    motions = scene.motions
+    shapes = scene.shapes
+    index = job.index
+    h = frame.step.length
+    at = moving.at
+    link = moving.span
+    link_d = moving.span_d
+    moved = moving.fields
+    base_place = moving.base_place
+    taper = scene.chains.taper[contact.link, job.whisker]
+    slope_r = taper.end_radius - taper.start_radius
+    start_d = tangents.link[p, wp.static(START_RADIUS), contact.link, index]
+    end_d = tangents.link[p, wp.static(END_RADIUS), contact.link, index]
     shape = contact.shape
     n = contact.normal
     f = contact.force
     s = contact.share
     # The object: its shift at the place x of the axis, and its turn.
-    body = pose_from(motions, shapes.track[shape], frame.now, frame.pose)
-    body_d = move_pose(motions, tangents.knots, p, shapes.track[shape], frame.now)
+    body = pose_from(motions, shapes.track[shape], frame.step.now, frame.step.pose)
+    body_d = move_pose(motions, tangents.knots, p, shapes.track[shape], frame.step.now)
     x = at + link * s
-    origin = body.place + rotate(body.turn, shapes.place[shape])
-    turn_in = rotate(body.turn, tangents.shape_turn[p, shape])
+    origin = body.place + rotate(body.quaternion, shapes.place[shape])
+    turn_in = rotate(body.quaternion, tangents.shape_turn[p, shape])
     turned = body_d.turn + turn_in
     shift = body_d.place - base_place + wp.cross(body_d.turn, x - body.place)
-    shift = shift + rotate(body.turn, tangents.shape_place[p, shape]) + wp.cross(turn_in, x - origin)
+    shift = shift + rotate(body.quaternion, tangents.shape_place[p, shape]) + wp.cross(turn_in, x - origin)
     gap_d = zero
     if shapes.kind[shape] != wp.static(MESH):
-        inside = unrotate(shapes.turn[shape], unrotate(body.turn, x - origin))
+        inside = unrotate(shapes.quaternion[shape], unrotate(body.quaternion, x - origin))
         size_d = tangents.shape_size[p, shape]
         grown = grow(shapes.kind[shape], shapes.size[shape], inside, size_d)
         gap_d = grown[3]
-        shift = shift + rotate(body.turn, rotate(shapes.turn[shape], vec3(grown[0], grown[1], grown[2])))
+        shift = shift + rotate(body.quaternion, rotate(shapes.quaternion[shape], vec3(grown[0], grown[1], grown[2])))
 
     # The place on the axis, gap and normal there.
     away = moved.at + link_d * s - shift
@@ -213,22 +228,22 @@ def move_contact(
     if s < real(1.0) and curved > real(1e-9) * wp.length_sq(link):
         slope = wp.dot(n, link_d) + wp.dot(n_d, link)
         if shapes.kind[shape] != wp.static(MESH):
-            slope = slope - (radii_d[1] - radii_d[0])
+            slope = slope - (end_d - start_d)
         share_d = -slope / curved
     n_d = n_d + bent * share_d
-    radius = radii[0] + (radii[1] - radii[0]) * s
-    radius_d = radii_d[0] * (real(1.0) - s) + radii_d[1] * s + (radii[1] - radii[0]) * share_d
+    radius = taper.start_radius + slope_r * s
+    radius_d = start_d * (real(1.0) - s) + end_d * s + slope_r * share_d
     gap_d = gap_d + wp.dot(n, away + link * share_d) - radius_d
     found = ContactTangent()
     found.point = moved.at + link_d * s + link * share_d - n_d * radius - n * radius_d
 
     # The velocity against the object at the end of the step.
     point = contact_row(contacts.point, k)
-    half = pose_from(motions, shapes.track[shape], frame.middle, frame.pose)
+    half = pose_from(motions, shapes.track[shape], frame.middle, frame.step.pose)
     half_d = move_pose(motions, tangents.knots, p, shapes.track[shape], frame.middle)
     v = contact_row(contacts.velocity, k)
     v_d = moved.vv + (moved.av + tangents.gravity[p, index]) * h
-    v_d = v_d + wp.cross(moved.vw + moved.aw * h, point) + wp.cross(turning, found.point)
+    v_d = v_d + wp.cross(moved.vw + moved.aw * h, point) + wp.cross(moving.turning, found.point)
     v_d = v_d - half_d.velocity - wp.cross(half_d.spin, point - half.place)
     v_d = v_d - wp.cross(half.spin, found.point - (half_d.place - base_place))
 
@@ -265,11 +280,7 @@ def spring_load(
 
 @wp.func
 def tangent_step(
-    chains: ChainArrays,
-    motions: MotionArrays,
-    shapes: ShapeArrays,
-    jobs: JobArrays,
-    options: StepOptions,
+    scene: SceneArrays,
     records: StepRecords,
     system: ContactSystem,
     tangents: PackedTangents,
@@ -279,18 +290,18 @@ def tangent_step(
 ):
     """Take the changes of all parameters over one step."""
     zero = real(0.0)
-    none = vec3(zero, zero, zero)
+    chains = scene.chains
+    motions = scene.motions
+    jobs = scene.jobs
     index = job.index
     chain = ChainState()
     proximity = ProximityState()
     links = StepLinks()
     contacts = StepContacts()
     on = Fields()
-    frame = restore_step(
-        chains, motions, shapes, jobs, options, records, job, place, chain, proximity, links, contacts, on
-    )  # fmt: skip
-    h = frame.length
-    pose = frame.pose
+    frame = restore_step(scene, records, job, place, chain, proximity, links, contacts, on)
+    h = frame.step.length
+    pose = frame.step.pose
     matrix = DenseSystem()
     if contacts.count > 0:
         build_system(job, chain, proximity, contacts, system, h, matrix)
@@ -301,8 +312,8 @@ def tangent_step(
     fields = LinkFields()
     on.vw = pose.spin
     on.vv = pose.velocity
-    on.aw = frame.base.angular
-    on.av = frame.base.linear
+    on.aw = frame.step.base.w
+    on.av = frame.step.base.v
     for i in range(job.links):
         inertia = chains.inertia[i, job.whisker]
         at = row(chain.node, i)
@@ -324,7 +335,7 @@ def tangent_step(
         f = ac * chains.build[i, job.whisker].mass
         m = wp.cross(com, f) + on.aw * inertia.transverse + own * (inertia.axial - inertia.transverse)
         for load in range(job.first_load, job.end_load):
-            if jobs.load_link[load] == i and elapsed(frame.now) < jobs.load_stop[load]:
+            if jobs.load_link[load] == i and elapsed(frame.step.now) < jobs.load_stop[load]:
                 pull = jobs.load_force[load]
                 f = f - pull
                 m = m - wp.cross(at + (row(chain.node, i + 1) - at) * jobs.load_share[load], pull)
@@ -338,8 +349,7 @@ def tangent_step(
         i = job.links - 1 - back
         fields.force[i] = row(fields.force, i) + row(fields.force, i + 1)
         fields.moment[i] = row(fields.moment, i) + row(fields.moment, i + 1)
-    axis_d = PerHinge3()
-    arm_d = PerHinge3()
+    hinges_d = HingeTangents()
     moment_d = PerLink3()
     force_d = PerLink3()
     asked = PerLinkJoint()
@@ -348,7 +358,7 @@ def tangent_step(
     missed = PerContact3()
     there = PerContact3()
     for p in range(tangents.angle.shape[0]):
-        pose_d = move_pose(motions, tangents.knots, p, job.base, frame.now)
+        pose_d = move_pose(motions, tangents.knots, p, job.base, frame.step.now)
         after_d = move_pose(motions, tangents.knots, p, job.base, frame.later)
         lag_d = zero
         if job.beta > h:
@@ -376,7 +386,7 @@ def tangent_step(
             moved.turn = moved.turn + row(links.before, i) * bend_d
             for d in range(hinges_of(i)):
                 j = wp.static(hinges) * i + d
-                move_hinge(links, j, moved, at, rate[d], a[d], angle_d[d], rate_d[d], axis_d, arm_d)
+                move_hinge(links, j, moved, at, rate[d], a[d], angle_d[d], rate_d[d], hinges_d)
             if wp.static(hinges == 3):
                 moved.turn = moved.turn + row(links.behind, i) * bend_d
             x_d = wp.cross(moved.turn, x)
@@ -400,7 +410,7 @@ def tangent_step(
             m_d = wp.cross(com_d, ac * build.mass) + wp.cross(com, f_d) + row(fields.own, i) * thin_d + own_d * thin
             m_d = m_d + aw * transverse_d + moved.aw * inertia.transverse
             for load in range(job.first_load, job.end_load):
-                if jobs.load_link[load] == i and elapsed(frame.now) < jobs.load_stop[load]:
+                if jobs.load_link[load] == i and elapsed(frame.step.now) < jobs.load_stop[load]:
                     pull = jobs.load_force[load]
                     pull_d = tangents.load_force[p, load]
                     share = jobs.load_share[load]
@@ -410,18 +420,14 @@ def tangent_step(
             for k in range(contacts.count):
                 if contact_row(contacts.link, k) == i:
                     contact = records.contact[place, k, index]
-                    taper = chains.taper[i, job.whisker]
-                    radii = vec3(taper.start_radius, taper.end_radius, zero)
-                    radii_d = vec3(
-                        tangents.link[p, wp.static(START_RADIUS), i, index],
-                        tangents.link[p, wp.static(END_RADIUS), i, index],
-                        zero,
-                    )
-                    turning = vw + aw * h
-                    changed = move_contact(
-                        motions, shapes, tangents, contacts, k, contact, frame, p, index, turning, moved,
-                        pose_d.place, at, span, span_d, radii, radii_d
-                    )  # fmt: skip
+                    moving = MovingLink()
+                    moving.at = at
+                    moving.span = span
+                    moving.span_d = span_d
+                    moving.turning = vw + aw * h
+                    moving.base_place = pose_d.place
+                    moving.fields = moved
+                    changed = move_contact(scene, tangents, contacts, k, contact, frame, p, job, moving)
                     point_d[k] = changed.point
                     missed[k] = changed.condition
                     m_d = m_d - wp.cross(changed.point, contact.force)
@@ -432,14 +438,12 @@ def tangent_step(
                 outputs.points[p, frame.reading, i + 1, index] = moved.at
 
         # Up the chain: what the joints miss.
-        total_d = Wrench()
-        total_d.moment = none
-        total_d.force = none
+        total_d = Spatial()
         for back in range(job.links):
             i = job.links - 1 - back
             inertia = chains.inertia[i, job.whisker]
-            total_d.moment = total_d.moment + row(moment_d, i)
-            total_d.force = total_d.force + row(force_d, i)
+            total_d.w = total_d.w + row(moment_d, i)
+            total_d.v = total_d.v + row(force_d, i)
             angle = row(chain.angle, i)
             rate = row(chain.rate, i) + records.acceleration[place, i, index] * h
             angle_d = tangents.angle[p, i, index]
@@ -454,18 +458,16 @@ def tangent_step(
                         stiffness = inertia.torsion
                         stiffness_d = tangents.link[p, wp.static(TORSION), i, index]
                 due[d] = -spring_load(stiffness, stiffness_d, angle[d], angle_d[d], rate[d], rate_d[d], lag, lag_d) - (
-                    wp.dot(hinge_row(axis_d, j), row(fields.moment, i))
-                    + wp.dot(hinge_row(links.axis, j), total_d.moment)
-                    + wp.dot(hinge_row(arm_d, j), row(fields.force, i))
-                    + wp.dot(hinge_row(links.moment, j), total_d.force)
+                    wp.dot(hinge_row(hinges_d.axis, j), row(fields.moment, i))
+                    + wp.dot(hinge_row(links.axis, j), total_d.w)
+                    + wp.dot(hinge_row(hinges_d.moment, j), row(fields.force, i))
+                    + wp.dot(hinge_row(links.moment, j), total_d.v)
                 )
             asked[i] = due
 
         # Accelerations without a change of contact forces, then with it.
-        held = solve_chain(job, chain, proximity, links, asked, contacts, 0, acceleration_d, there)
-        contact_d = Wrench()
-        contact_d.moment = none
-        contact_d.force = none
+        held = solve_chain(job, chain, proximity, asked, contacts, 0, acceleration_d, there)
+        contact_d = Spatial()
         if contacts.count > 0:
             for k in range(contacts.count):
                 there[k] = -contact_row(missed, k) - velocity_block(contacts, k) * contact_row(there, k) * h
@@ -476,19 +478,19 @@ def tangent_step(
                 summary.degenerate = summary.degenerate + degenerate
             for k in range(contacts.count):
                 push = contact_row(contacts.change, k)
-                contact_d.force = contact_d.force + push
-                contact_d.moment = contact_d.moment + wp.cross(contact_row(contacts.point, k), push)
-                contact_d.moment = contact_d.moment + wp.cross(contact_row(point_d, k), contact_row(contacts.force, k))
-            held = solve_chain(job, chain, proximity, links, asked, contacts, 1, acceleration_d, there)
+                contact_d.v = contact_d.v + push
+                contact_d.w = contact_d.w + wp.cross(contact_row(contacts.point, k), push)
+                contact_d.w = contact_d.w + wp.cross(contact_row(point_d, k), contact_row(contacts.force, k))
+            held = solve_chain(job, chain, proximity, asked, contacts, 1, acceleration_d, there)
         if frame.reading >= 0:
-            outputs.wrench[p, frame.reading, 0, index] = total_d.moment - held.moment
-            outputs.wrench[p, frame.reading, 1, index] = total_d.force - held.force
-            outputs.contact[p, frame.reading, 0, index] = contact_d.force
-            outputs.contact[p, frame.reading, 1, index] = contact_d.moment
+            outputs.wrench[p, frame.reading, 0, index] = total_d.w - held.w
+            outputs.wrench[p, frame.reading, 1, index] = total_d.v - held.v
+            outputs.contact[p, frame.reading, 0, index] = contact_d.v
+            outputs.contact[p, frame.reading, 1, index] = contact_d.w
         for i in range(job.links):
             rate_d = tangents.rate[p, i, index] + row(acceleration_d, i) * h
             tangents.angle[p, i, index] = tangents.angle[p, i, index] + rate_d * h
-            if options.quasistatic == 1:
+            if scene.options.quasistatic == 1:
                 rate_d = JointVector()
             tangents.rate[p, i, index] = rate_d
     outputs.contacts[index] = summary
@@ -496,18 +498,17 @@ def tangent_step(
 
 @wp.kernel(enable_backward=False, module="unique", module_options=module_options())
 def tangent_segment(
-    chains: ChainArrays,
-    motions: MotionArrays,
-    shapes: ShapeArrays,
-    jobs: JobArrays,
-    options: StepOptions,
+    # Model:
+    scene: SceneArrays,
     records: StepRecords,
+    # Data in and out:
     system: ContactSystem,
     tangents: PackedTangents,
+    # Data out:
     outputs: OutputTangents,
 ):
     """Take the changes of each whisker over the recorded steps."""
     index = wp.tid()
-    job = load_job(chains, motions, shapes, jobs, options, index)
+    job = load_job(scene, index)
     for place in range(records.count[index]):
-        tangent_step(chains, motions, shapes, jobs, options, records, system, tangents, outputs, job, place)
+        tangent_step(scene, records, system, tangents, outputs, job, place)

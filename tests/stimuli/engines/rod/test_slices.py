@@ -1,5 +1,7 @@
 """Whiskers in slices as a GPU takes them, recorded and by several threads, played on a processor."""
 
+from __future__ import annotations
+
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import fields
@@ -13,9 +15,9 @@ from brainbench.core.devices import warp
 from brainbench.core.files import content_hash, portable
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.protocol import SweepBatch
-from brainbench.stimuli.engines.rod import launch, scheduling, streams, sweeps
+from brainbench.stimuli.engines.rod import launch, slices, sweeps
+from brainbench.stimuli.engines.rod.launch import ON_AN_IDLE_GPU, ONE_BY_ONE, first_simulation, tries_ahead
 from brainbench.stimuli.engines.rod.sweeps import SweepLauncher
-from brainbench.stimuli.engines.rod.tries import ON_AN_IDLE_GPU, ONE_BY_ONE, first_simulation, tries_ahead
 from brainbench.stimuli.objects.collections import resolve_objects
 from brainbench.stimuli.sweeps.grid import SweepGrid
 from brainbench.stimuli.sweeps.sweep_scenes import GRIDS, SweepScenes
@@ -51,20 +53,20 @@ class _Stream:
 def as_a_gpu(monkeypatch):
     """Streams, turns and late counts as on a GPU; graphs are those that Warp records for processors."""
     lock = threading.RLock()
-    for module in (scheduling, launch, streams):
-        monkeypatch.setattr(module, "turn", lambda device: lock)
+    for module in (slices, launch, slices):
+        monkeypatch.setattr(module, "lock_of", lambda device: lock)
     own = threading.local()
 
     def streams_of(device, side, priority):
         if not hasattr(own, "made"):
-            counts = [warp().zeros(3, dtype=int, device="cpu") for _ in range(scheduling.AHEAD + 1)]
+            counts = [warp().zeros(3, dtype=int, device="cpu") for _ in range(slices.AHEAD + 1)]
             side_streams = [_Stream(device) for _ in range(side)]
             own.made = _Stream(device), side_streams, [(_Event(device), each) for each in counts]
         return own.made
 
-    monkeypatch.setattr(scheduling, "streams_of", streams_of)
+    monkeypatch.setattr(slices, "streams_of", streams_of)
     monkeypatch.setattr(type(warp().get_device("cpu")), "stream", None)
-    monkeypatch.setattr(scheduling, "SMALL", 8)
+    monkeypatch.setattr(slices, "SMALL", 8)
 
 
 def _launch(scenes, name, **tuning):
@@ -99,11 +101,11 @@ def test_sweeps_are_placed_as_ever(monkeypatch):
     launcher = SweepLauncher(scenes, COARSE)
     placed = []
 
-    def record(self, jobs, motions, shapes, *given, **options):
-        moving, count = motions.arrays(), len(shapes.first) - 1
+    def record(self, given):
+        moving, count = given.motions.arrays(), len(given.shapes.first) - 1
         for row in range(count):
-            knot = [moving[name][row - count] for name in ("coarse", "place", "velocity", "turn")]
-            placed.append(np.concatenate([*knot, [shapes.arrays()["scale"][row]]]).tolist())
+            knot = [moving[name][row - count] for name in ("coarse", "place", "velocity", "quaternion")]
+            placed.append(np.concatenate([*knot, [given.shapes.arrays()["scale"][row]]]).tolist())
         return SimpleNamespace(seconds={})
 
     monkeypatch.setattr(launch.WhiskerSolver, "launch", record)

@@ -1,5 +1,7 @@
 """Whiskers that are simulated again come to what the rule says, in whatever order the tries are made."""
 
+from __future__ import annotations
+
 from collections import Counter
 from itertools import cycle
 
@@ -8,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from brainbench.stimuli.engines.rod.tries import ONE_BY_ONE, run_with_retries
+from brainbench.stimuli.engines.rod.launch import ONE_BY_ONE, run_with_retries
 from brainbench.stimuli.engines.trust import LARGEST_STRUCK_CHANGE, Verdict, halved
 
 FINE, SUSPICIOUS, STRUCK, MENDABLE, HOPELESS = range(5)

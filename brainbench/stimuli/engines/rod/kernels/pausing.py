@@ -1,12 +1,15 @@
-"""Whiskers at rest: straight out of a base that stands still, without loads, until an object may come near.
+"""Whiskers that pause or rest: which whisker a thread takes, what is kept of it, and how long nothing can come near.
 
-While a whisker rests, ``clearance`` of a link is the time until which nothing can reach it, from its distance and the
-speed of the fastest object; no step is computed until the first such time is over.
+Where one thread walks through a tree of triangles, or solves for the forces of eight contacts, 31 neighbours wait. So
+on a GPU a whisker pauses where it needs distances or contact forces; kernels of their own find these for all.
+
+A whisker that stands straight out of a still base, without loads, rests until an object may come near: ``clearance`` of
+a link is then the time until which nothing can reach it, from its distance and the speed of the fastest object.
 """
 
 import warp as wp
 
-from brainbench.stimuli.engines.rod.limits import NOTHING
+from brainbench.stimuli.engines.rod.limits import AFTER_CONTACTS, AFTER_DISTANCES, AFTER_OTHERS, NOTHING, WARP
 
 from .algebra import JointVector, rotate, vec3
 from .articulated_body import ChainState, ProximityState
@@ -14,16 +17,86 @@ from .motion import BodyMotion, elapsed, pose_at, pose_from
 from .narrow_phase import link_shape_distance
 from .parameters import against, hinges, real, sliced
 from .state import (
+    WAIT_DISTANCES,
+    WAIT_FORCES,
     WAIT_REST,
     WAIT_SLICE,
-    ChainArrays,
-    MotionArrays,
     PausedWhiskers,
-    ShapeArrays,
+    SceneArrays,
     WhiskerJob,
     WhiskerState,
+    cone,
     row,
 )
+
+
+@wp.func(inline=True)
+def next_job(paused: PausedWhiskers, thread: int) -> int:
+    """Return the job of a thread, −1 without. Each queue begins with a block of threads of its own."""
+    index = int(-1)
+    place = thread
+    for which in range(3):
+        if place >= 0 and index < 0:
+            many = paused.queue_size[which]
+            if place < many:
+                index = paused.queue[which, place]
+            # Whole warps for each queue: threads of one warp then run the same part of the step.
+            place = place - ((many + wp.static(WARP - 1)) // wp.static(WARP)) * wp.static(WARP)
+    return index
+
+
+@wp.func(inline=True)
+def resume(
+    paused: PausedWhiskers, index: int, links: int, chain: wp.ref[ChainState], proximity: wp.ref[ProximityState]
+):
+    """Read the joints of a whisker that paused."""
+    for i in range(links):
+        chain.angle[i] = paused.link[i, index].angle
+        chain.rate[i] = paused.link[i, index].rate
+        proximity.clearance[i] = paused.link[i, index].clearance
+        proximity.leaf[i] = paused.link[i, index].leaf
+
+
+@wp.func(inline=True)
+def keep(
+    paused: PausedWhiskers,
+    index: int,
+    links: int,
+    chain: wp.ref[ChainState],
+    proximity: wp.ref[ProximityState],
+    state: WhiskerState,
+):
+    """Keep all that the next slice needs."""
+    paused.state[index] = state
+    for i in range(links):
+        paused.link[i, index].angle = row(chain.angle, i)
+        paused.link[i, index].rate = row(chain.rate, i)
+        paused.link[i, index].clearance = row(proximity.clearance, i)
+        paused.link[i, index].leaf = row(proximity.leaf, i)
+
+
+@wp.func(inline=True)
+def stand_in_queue(paused: PausedWhiskers, index: int, state: WhiskerState):
+    """Queue for the next slice."""
+    # Whiskers that continue at the same place of the step go into one queue.
+    queue = wp.static(AFTER_DISTANCES)
+    if state.waiting_for == WAIT_FORCES:
+        queue = wp.static(AFTER_CONTACTS)
+    elif state.waiting_for != WAIT_DISTANCES:
+        queue = wp.static(AFTER_OTHERS)
+    paused.next_queue[queue, wp.atomic_add(paused.next_queue_size, queue, 1)] = index
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def swap_queues(paused: PausedWhiskers):
+    """Make the next slice's queues this one's. One thread; the host exchanges the two arrays of jobs."""
+    for which in range(3):
+        paused.queue_size[which] = paused.next_queue_size[which]
+        paused.problem_size[which] = paused.next_problem_size[which]
+        paused.next_queue_size[which] = 0
+        paused.next_problem_size[which] = 0
+    paused.query_count[0] = paused.next_query_count[0]
+    paused.next_query_count[0] = 0
 
 
 @wp.func(inline=True)
@@ -54,11 +127,9 @@ def query_rest_distances(
 
 @wp.func(inline=True)
 def check_rest(
-    chains: ChainArrays,
-    motions: MotionArrays,
-    shapes: ShapeArrays,
-    job: WhiskerJob,
+    scene: SceneArrays,
     paused: PausedWhiskers,
+    job: WhiskerJob,
     chain: wp.ref[ChainState],
     proximity: wp.ref[ProximityState],
     state: wp.ref[WhiskerState],
@@ -77,9 +148,9 @@ def check_rest(
     # Without objects nothing of this remains in the kernel, nor what it keeps.
     # Objects that never move need to be looked at only once.
     if wp.static(against > NOTHING) and (job.object_speed > zero or before == zero):
-        pose = pose_at(motions, job.base, state.reading_time)
-        x = rotate(pose.turn, vec3(one, zero, zero))
-        y = rotate(pose.turn, vec3(zero, one, zero))
+        pose = pose_at(scene.motions, job.base, state.reading_time)
+        x = rotate(pose.quaternion, vec3(one, zero, zero))
+        y = rotate(pose.quaternion, vec3(zero, one, zero))
         at = vec3(zero, zero, zero)
         # Nothing can come near after the last reading.
         far = job.object_speed * (end - before) + real(0.5)
@@ -96,7 +167,7 @@ def check_rest(
             links = int(0)
         # Time in which the fastest object covers the distance of each link; a distance stays a bound while it rests.
         for i in range(links):
-            link = chains.build[i, job.whisker]
+            link = scene.chains.build[i, job.whisker]
             # At rest only the bends of the rest shape are left.
             turned = x * link.bend_cosine + y * link.bend_sine
             y = y * link.bend_cosine - x * link.bend_sine
@@ -121,16 +192,16 @@ def check_rest(
                     paused.query[place].bound = bound
                 else:
                     slack = real(1e30)
-                    taper = chains.taper[i, job.whisker]
+                    taper = scene.chains.taper[i, job.whisker]
                     if wp.static(sliced):
                         slack = paused.answer[place].clearance
                         proximity.leaf[i] = paused.answer[place].leaf
                     else:
                         for s in range(job.first_shape, job.end_shape):
-                            body = pose_from(motions, shapes.track[s], state.reading_time, pose)
-                            found = link_shape_distance(
-                                shapes, s, body, at, end_at, taper, -far, bound, row(proximity.leaf, i), 0, 1
-                            )
+                            body = pose_from(scene.motions, scene.shapes.track[s], state.reading_time, pose)
+                            link_here = cone(at, end_at, taper)
+                            leaf = row(proximity.leaf, i)
+                            found = link_shape_distance(scene.shapes, s, body, link_here, -far, bound, leaf, 0, 1)
                             slack = wp.min(slack, found.clearance)
                             proximity.leaf[i] = found.leaf
                     # A little is kept off here and less than that given back below, so that rounding never raises the
@@ -157,7 +228,7 @@ def check_rest(
                 if until > before:
                     bound = (
                         (until - before) * real(1.02) * job.object_speed
-                        + chains.taper[i, job.whisker].start_radius
+                        + scene.chains.taper[i, job.whisker].start_radius
                         + real(0.04)
                     )
                 if fresh == 1:

@@ -1,21 +1,109 @@
 """Whiskers in slices: on a GPU a whisker pauses where it needs distances from a mesh, which are found for all at once.
 
 Every whisker takes steps until it needs to know what is near, or what its contacts do; further kernels answer these
-questions (``kernels.scheduling`` says why); then the whiskers go on, those with like answers side by side. Results do
-not depend on the slicing.
+questions (``kernels.pausing`` says why); then the whiskers go on, those with like answers side by side. Results do not
+depend on the slicing.
+
+Threads simulate on one GPU side by side, each with streams of its own: a launch of few whiskers, whose slices follow
+one another however idle the GPU is, then costs the others next to nothing. Warp's streams, recordings and memory know
+no threads, so a thread calls Warp while it holds :func:`lock_of`, and waits for the GPU without.
 """
 
 from __future__ import annotations
 
+import ctypes
+import sys
+import threading
+import time
+from collections.abc import Mapping
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brainbench.core.devices import warp
 from brainbench.core.jobs import STOPPING
 from brainbench.stimuli.engines.rod import limits
 from brainbench.stimuli.engines.rod.limits import AFTER_OTHERS, WARP, contacts_for
-from brainbench.stimuli.engines.rod.streams import AHEAD, streams_of, turn, wait_for
+
+AHEAD = 1
+"""Counts that may be outstanding when the next graphs are launched, so that a GPU does not wait for the host."""
+POLL = 4e-4
+"""Time (s) between two looks at whether a GPU is done."""
+LONG = 10_000
+"""Looks after which the GPU is asked with Warp's own call, which tells of a failure."""
+PIECE = 2**21
+"""Numbers that are copied to the host under one hold of the lock: some 2 ms."""
+
+_LOCK = threading.RLock()
+_OWN = threading.local()
+
+
+def lock_of(device: Any) -> AbstractContextManager[Any]:
+    """Return what a thread holds while it calls Warp for a device; threads on a processor need not wait."""
+    return _LOCK if device.is_cuda else nullcontext()
+
+
+def streams_of(device: Any, side: int, priority: int) -> tuple[Any, list[Any], list[tuple[Any, Any]]]:
+    """Return what the calling thread has on a GPU, made once: a stream, and ``side`` streams beside it.
+
+    Last come :data:`AHEAD` + 1 pairs of an event and an array [3] in pinned memory, to which whiskers are counted.
+    """
+    wp, key = warp(), f"{device.alias} {side} {priority}"
+    if not hasattr(_OWN, key):
+        stream, *others = [_independent_stream(device, priority) for _ in range(1 + side)]
+        counts = [wp.empty(3, dtype=wp.int32, device="cpu", pinned=True) for _ in range(AHEAD + 1)]
+        setattr(_OWN, key, (stream, others, [(wp.Event(device), each) for each in counts]))
+    return getattr(_OWN, key)
+
+
+def _independent_stream(device: Any, priority: int) -> Any:
+    """Return a stream that does not wait for the default stream, nor that for it.
+
+    Warp gives memory back on the default stream; streams that it makes itself would all wait there for one another.
+    """
+    wp, handle, independent = warp(), ctypes.c_void_p(), 1
+    try:
+        driver = ctypes.CDLL("nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1")
+    except OSError:
+        return wp.Stream(device, priority=priority)
+    with wp.ScopedDevice(device):
+        failed = driver.cuStreamCreateWithPriority(ctypes.byref(handle), independent, priority)
+    return wp.Stream(device, priority=priority) if failed else wp.Stream(device, cuda_stream=handle.value)
+
+
+def wait_for(event: Any) -> None:
+    """Wait until a GPU has come to an event, without the lock; a failure of the GPU is Warp's ``RuntimeError``."""
+    for _ in range(LONG):
+        if event.is_complete:
+            return
+        time.sleep(POLL)
+    with lock_of(event.device):
+        warp().synchronize_event(event)
+
+
+def download(arrays: Mapping[str, Any], stream: Any) -> dict[str, NDArray[Any]]:
+    """Return arrays of a device as they are once a stream has come so far; None for those of a processor."""
+    if stream is None:
+        return {name: array.numpy() for name, array in arrays.items()}
+    wp = warp()
+    host = {name: wp.empty(array.shape, dtype=array.dtype, device="cpu") for name, array in arrays.items()}
+    with lock_of(stream.device):
+        event = stream.record_event()
+    wait_for(event)
+    for name, array in arrays.items():
+        for first in range(0, array.size, PIECE):
+            with lock_of(stream.device):
+                wp.copy(host[name], array, first, first, min(PIECE, array.size - first), stream)
+            # A lock goes to whoever asks next; others have waited longer.
+            if first + PIECE < array.size:
+                time.sleep(POLL)
+    with lock_of(stream.device):
+        stream.record_event(event)
+    wait_for(event)
+    return {name: array.numpy() for name, array in host.items()}
+
 
 BUDGET = 4
 """Steps that a whisker begins in one slice."""
@@ -84,23 +172,21 @@ class Slices:
         size[AFTER_OTHERS] = lanes
         on.queue, on.queue_size = (wp.array(values, device=device) for values in (queue, size))
 
-    def run(self, inputs: list[Any], block: int) -> int:
-        """Take all whiskers to their end; return the number of slices.
-
-        ``inputs`` are the arguments of the kernel ``run`` but for the last, ``block`` the threads of a block.
-        """
-        wp, asked, slices, left = warp(), 0, 0, self.lanes
+    def run(self, scene: Any, problems: Any, results: Any, block: int) -> int:
+        """Take all whiskers to their end with ``block`` threads of a block; return the number of slices."""
+        wp, waits, slices, left = warp(), 0, 0, self.lanes
+        inputs = scene, problems, results
         graphs: list[Any] = []
         capture, fits = None, 0
         while left:
             if STOPPING.is_set():
                 raise KeyboardInterrupt
             # What is left is counted rarely and late; whiskers end meanwhile, but none are added.
-            with turn(self.device):
-                if asked == 0 and self.stream is not None:
+            with lock_of(self.device):
+                if waits == 0 and self.stream is not None:
                     self.stream.wait_stream(self.device.stream)
                 slices += SLICES_PER_CHECK
-                if not self.recorded or asked == 0:
+                if not self.recorded or waits == 0:
                     self._several(inputs, left, block)
                 else:
                     # A graph launches as many threads as when it was recorded; it is renewed once half of many have no
@@ -117,28 +203,30 @@ class Slices:
                 if self.stream is None:
                     left = int(self.struct.queue_size.numpy().sum())
                 else:
-                    event, count = self.counts[asked % len(self.counts)]
+                    event, count = self.counts[waits % len(self.counts)]
                     wp.copy(count, self.struct.queue_size, stream=self.stream)
                     self.stream.record_event(event)
-            asked += 1
-            if self.stream is not None and asked > AHEAD:
-                event, count = self.counts[(asked - 1 - AHEAD) % len(self.counts)]
+            waits += 1
+            if self.stream is not None and waits > AHEAD:
+                event, count = self.counts[(waits - 1 - AHEAD) % len(self.counts)]
                 wait_for(event)
                 left = int(count.numpy().sum())
         if graphs:
             # Those that were launched after the last whisker had ended.
-            wait_for(self.counts[(asked - 1) % len(self.counts)][0])
-        with turn(self.device):
+            wait_for(self.counts[(waits - 1) % len(self.counts)][0])
+        with lock_of(self.device):
             graphs.clear()
             capture = None
         return slices
 
-    def _several(self, inputs: list[Any], left: int, block: int) -> None:
+    def _several(self, inputs: tuple[Any, Any, Any], left: int, block: int) -> None:
         """Launch some slices for at most ``left`` whiskers."""
         wp, on, device, kernels = warp(), self.struct, self.device, self.kernels
+        scene, problems, results = inputs
         on.budget = self.budget or (1 if left < FEW else BUDGET)
         for _ in range(SLICES_PER_CHECK):
-            wp.launch(kernels.run, left + 3 * WARP, [*inputs, on], device=device, stream=self.stream, block_dim=block)
+            arguments = [*parts_of(scene), problems, on, results]
+            wp.launch(kernels.run, left + 3 * WARP, arguments, device=device, stream=self.stream, block_dim=block)
             # After an even number of slices both arrays are back in place, so a recorded graph can be repeated.
             on.queue, on.next_queue = on.next_queue, on.queue
             wp.launch(kernels.swap_queues, 1, [on], device=device, stream=self.stream)
@@ -150,7 +238,7 @@ class Slices:
                 wp.launch(
                     kernel,
                     many,
-                    [inputs[-1], on],
+                    [problems, on],
                     device=device,
                     stream=stream or self.stream,
                     block_dim=limits.CONTACT_BOUNDS[0],
@@ -160,7 +248,7 @@ class Slices:
             wp.launch(
                 kernels.measure_distances,
                 many,
-                [*inputs[:4], on, many],
+                [*parts_of(scene)[:4], on, many],
                 device=device,
                 stream=self.stream,
                 block_dim=limits.DISTANCE_BOUNDS[0],
@@ -168,6 +256,11 @@ class Slices:
             for stream in self.streams:
                 if stream is not None:
                     self.stream.wait_stream(stream)
+
+
+def parts_of(scene: Any) -> list[Any]:
+    """Return a scene as kernels take it, part by part."""
+    return [scene.chains, scene.motions, scene.shapes, scene.jobs, scene.readings, scene.options]
 
 
 def allocate(kind: Any, device: Any, **shapes: int | tuple[int, ...]) -> Any:

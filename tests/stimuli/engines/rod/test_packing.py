@@ -1,0 +1,67 @@
+"""Whiskers and motions as arrays of named numbers."""
+
+import numpy as np
+import pytest
+
+from brainbench.core import rotations
+from brainbench.core.errors import UsageError
+from brainbench.stimuli.engines.motion_pieces import Cutting
+from brainbench.stimuli.engines.rod.kernels import specialize
+from brainbench.stimuli.engines.rod.packing import (
+    KNOT,
+    PackedMotions,
+    capacity_for,
+    follicle_track,
+    knots_alike,
+    pack_chains,
+    still_knots,
+)
+from brainbench.stimuli.motion.jobs import StillFollicle
+from brainbench.stimuli.whiskers.chain import build_chain
+from tests.factories.gradients import Swing
+from tests.factories.whiskers import C2
+
+wp = pytest.importorskip("warp")
+
+CUTTING = Cutting(0.0, 0.05, 1e-4, 1e-4)
+
+
+@pytest.mark.parametrize("hinges", [2, 3])
+def test_packed_links_are_the_records_of_the_kernels(hinges):
+    wp.init()
+    structs = specialize("state", hinges=hinges)
+    packed = pack_chains(12, [build_chain(C2, 8)], False, hinges)
+    for name, kind in (("build", structs.LinkBuild), ("inertia", structs.LinkInertia), ("taper", structs.LinkTaper)):
+        assert packed[name].dtype.names == np.dtype(kind.numpy_dtype()).names
+    # mm and mg; places without a link stay empty.
+    assert packed["build"]["length"][:, 0].sum() == pytest.approx(C2.arc_length * 1e3)
+    assert (packed["build"]["mass"][8:] == 0).all()
+    assert (packed["build"]["mass"][:8] > 0).all()
+
+
+def test_a_chain_takes_the_smallest_kernel_that_holds_it():
+    assert [capacity_for(links) for links in (1, 12, 13, 100)] == [12, 12, 24, 100]
+
+
+def test_tracks_stand_one_behind_the_other_and_far_places_keep_their_digits():
+    motions = PackedMotions()
+    moving = follicle_track(Swing(), C2.arc_length, CUTTING)
+    still = motions.add_straight(still_knots(np.array([1000.0, 0.0, 0.001]), (1.0, 0.0, 0.0, 0.0)))
+    index = motions.add(moving)
+    arrays = motions.arrays()
+    assert (still.tolist(), index) == ([0], 1)
+    assert arrays["cell"][arrays["first"][1]] == 1
+    assert arrays["cell"][arrays["first"][1] + arrays["count"][1] - 1] == len(moving.knots)
+    np.testing.assert_allclose(arrays["coarse"][0] + arrays["place"][0], [1e6, 0.0, 1.0])
+    assert (np.abs(arrays["place"]) <= 16).all()
+
+
+def test_knots_of_another_motion_have_the_signs_of_the_first_and_one_that_bends_is_refused():
+    track = follicle_track(Swing(), C2.arc_length, CUTTING)
+    track.knots["quaternion"] *= -1
+    knots = knots_alike(track, Swing().pose, rotations.base_rotation, (0.0, 0.05), "a base")
+    assert knots.dtype == KNOT
+    np.testing.assert_allclose(knots["quaternion"], track.knots["quaternion"])
+    still = follicle_track(StillFollicle(), C2.arc_length, CUTTING)
+    with pytest.raises(UsageError, match="stands still at the given values"):
+        knots_alike(still, Swing().pose, rotations.base_rotation, (0.0, 0.05), "a base")

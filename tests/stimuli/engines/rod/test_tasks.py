@@ -1,0 +1,35 @@
+"""What the solver needs of jobs: who shares a scene, and what comes too fast."""
+
+import numpy as np
+import pytest
+
+from brainbench.stimuli.engines.rod.launch import Approach
+from brainbench.stimuli.engines.rod.tasks import PackedTasks, followed, make_task
+from brainbench.stimuli.objects.obstacle import Capsule
+from tests.factories.gradients import COARSE, touching_job
+
+POST = Capsule((11e-3, 2.2e-3, -8e-3), (11e-3, 2.7e-3, 8e-3), 5e-4)
+
+
+def test_jobs_beside_the_same_object_share_its_shapes_unless_they_are_to_have_their_own():
+    job, bodies = touching_job(POST), {}
+    tasks = [make_task(job, COARSE, bodies) for _ in range(2)]
+    assert tasks[0].names == tasks[1].names
+    shared, apart = (PackedTasks.of(tasks, shared=shared) for shared in (True, False))
+    assert shared.jobs.scene.tolist() == [0, 0]
+    assert apart.jobs.scene.tolist() == [0, 1]
+    assert len(shared.chains) == len(apart.chains) == 1
+    assert shared.shapes.arrays()["quaternion"].shape == (1, 4)
+
+
+def test_a_blow_is_followed_up_to_a_part_of_the_radius_and_others_as_far_as_contacts_are_sought():
+    speed, blow, step = np.array([1.0, 20.0]), np.array([1.0, 20.0]), np.array([1e-3, 1e-3])
+    way, farthest = followed(speed, blow, step, 1e-4)
+    np.testing.assert_allclose(way, [1e-3 / 16, 20e-3])
+    np.testing.assert_allclose(farthest, [0.8e-3, 0.25e-4])
+
+
+def test_approaches_of_jobs_become_a_table():
+    table = Approach.table([Approach(), Approach(1e-3, 8e-4, 0.02, True)])
+    assert table.fast_at.tolist() == [[np.inf], [pytest.approx(0.02)]]
+    assert table.struck.tolist() == [[False], [True]]
