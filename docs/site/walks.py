@@ -107,34 +107,12 @@ def _simulate() -> None:
 
     array = WhiskerArray.of("mouse", whiskers="C2")
     (torus,) = resolve_objects(["torus"], surfaces=True).values()
-    placed = PlacedObject(torus.load(), position=(0.012, 0.002, 0.003))
+    placed = PlacedObject(torus.load(), position=(0.03, 0.0, 0.0))
     simulate([Scene("way", array, (placed,), Whisking(frequency=10))], fidelity="fast", cache=False)
-
-
-def _feel() -> None:
-    import warnings
-
-    from robotics_bridge import tasks
-
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        env = tasks.make("in_palm_rotate", num_envs=1)
-    env.reset()
-    env.step(env.zero_actions() if hasattr(env, "zero_actions") else 0 * env.sample_actions())
 
 
 _STIMULI = "brainbench.stimuli"
 WAYS = (
-    Way(
-        "The name of a model, to a score",
-        (
-            "brainbench.scoring.scores:score_record",
-            "brainbench.models.registry:locate_model",
-            "brainbench.models.activations:extract",
-            "brainbench.metrics.measures.rsa:RSA.similarity",
-        ),
-        _score,
-    ),
     Way(
         "Young's modulus of a whisker, to the kernel",
         (
@@ -148,6 +126,26 @@ WAYS = (
         "The motion of a whisk, to the pose of a base",
         (f"{_STIMULI}.scenes.scene:Scene.jobs", f"{_STIMULI}.motion.trajectories:ArrayFollicle.pose"),
         _simulate,
+    ),
+    Way(
+        "A mesh, to the shape that a whisker touches",
+        (
+            f"{_STIMULI}.objects.procedural.families:make",
+            f"{_STIMULI}.objects.mesh_solids:shape_solid",
+            f"{_STIMULI}.objects.placed_object:PlacedObject.obstacle",
+            f"{_STIMULI}.engines.reach:reachable",
+        ),
+        _simulate,
+    ),
+    Way(
+        "The name of a model, to a score",
+        (
+            "brainbench.scoring.scores:score_record",
+            "brainbench.models.registry:locate_model",
+            "brainbench.models.activations:extract",
+            "brainbench.metrics.measures.rsa:RSA.compare_layers",
+        ),
+        _score,
     ),
     Way(
         "A record, to a page",
