@@ -25,7 +25,6 @@ COMMANDS = {
     "stimuli": "Simulate whiskers on objects; look at scenes and forces.",
     "tactile": "Tactile sensors of robot hands: demo, layouts, speed, checks, calibration.",
     "policy": "Dexterous tasks of robot hands: play, train, evaluate, deploy.",
-    "tradeoff": "Measure accuracy against cost.",
     "leaderboard": "Collect result records, check them, and show them as a leaderboard.",
 }
 """Command or group of commands → its line in the help."""

@@ -45,6 +45,7 @@ DISTRIBUTIONS = {
 }  # fmt: skip
 """Packages whose name for pip is another one than that of the module."""
 _PICTURES = Requirement(("matplotlib",), "report", "Drawing pictures")
+PICTURES_IF_PLOT = replace(_PICTURES, when=_given("plot"))
 _MP4 = Requirement(("imageio_ffmpeg",), "report", "Writing an MP4")
 _POLICIES = Requirement(("rsl_rl", "tensordict"), "policies", "Training policies")
 _CLUSTER = Requirement(("distributed",), "cluster", "A --scheduler", _given("scheduler"))
@@ -73,15 +74,13 @@ EXTRAS: dict[str, tuple[Requirement, ...]] = {
     "stimuli sweep": (_CLUSTER,),
     "leaderboard add": (_CLUSTER,),
     "leaderboard report": (_PDF,),
-    "tradeoff whisker": (replace(_PICTURES, when=_given("plot")),),
-    "tradeoff tactile": (replace(_PICTURES, when=_given("plot")),),
     "tactile demo": (_PICTURES, Requirement(("skfem",), "tactile", "The sound of a struck ball")),
 }  # fmt: skip
 
 CACHED = (
     "score", "train", "stimuli simulate", "stimuli render", "stimuli plot", "stimuli separability",
     "tactile demo", "tactile bench", "policy play", "policy train", "policy evaluate", "policy distill",
-    "tradeoff score", "tradeoff model", "leaderboard add", "leaderboard verify",
+    "leaderboard add", "leaderboard verify",
 )  # fmt: skip
 """Commands that keep what they compute in the cache."""
 

@@ -1,4 +1,4 @@
-"""Figures: force traces, trade-offs, and pictures and films of scenes, without a display or OpenGL.
+"""Figures: force traces, and pictures and films of scenes, without a display or OpenGL.
 
 ``camera`` frames the world, ``surfaces`` makes triangles of objects and whiskers, ``rays`` finds and lights the visible
 ones, ``pictures`` joins these and writes around them, and ``scenes`` makes files of them, films too. ``traces`` are

@@ -6,7 +6,7 @@ import pytest
 
 from brainbench.cli.stimuli import draw, sweep
 from brainbench.cli.stimuli import simulate as simulate_command
-from brainbench.stimuli import load_stimuli, simulation, tradeoff, whisker_shapes
+from brainbench.stimuli import load_stimuli, simulation, whisker_shapes
 from brainbench.stimuli.engines import fidelity, get_engine, list_engines
 from brainbench.stimuli.engines.fidelity import DEFAULT_ENGINE
 from brainbench.stimuli.figures import scenes
@@ -19,7 +19,7 @@ ASKED = (
     simulation.simulate, simulation.prepare, load_stimuli, whisker_shapes.record, scenes.render, simulate_sweeps,
     bench_tests.peg, bench_tests.point_load, ringing.ringdown, bench_tests.slip_off, out_of_plane.load_aside,
     out_of_plane.push_aside, fidelity.measured,
-    fidelity.Fidelity.auto, GenerationSettings, tradeoff.SimulationSetting, draw.render, draw.plot,
+    fidelity.Fidelity.auto, GenerationSettings, draw.render, draw.plot,
     simulate_command.simulate, sweep.sweep,
 )  # fmt: skip
 

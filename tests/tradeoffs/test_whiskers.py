@@ -8,66 +8,66 @@ from dataclasses import replace
 import pytest
 
 from brainbench.core.errors import DataError, MissingDependencyError, UsageError
-from brainbench.stimuli import tradeoff
 from brainbench.stimuli.engines.fidelity import Fidelity
-from brainbench.stimuli.figures.tradeoff import plot_tradeoff
-from brainbench.stimuli.tradeoff import SimulationSetting
 from brainbench.stimuli.validation import contact_scenes
+from brainbench.tradeoffs import whiskers
+from brainbench.tradeoffs.study import draw_study, run_study, write_csv
+from brainbench.tradeoffs.whiskers import SimulationSetting
 
 
 @pytest.fixture
 def quick(monkeypatch):
     """A coarse reference, one peg and four kinds of scenes, so that a point takes a moment."""
     coarse = SimulationSetting(Fidelity(links=8, time_step=2e-4, steps_per_period=10), "mujoco")
-    monkeypatch.setattr(tradeoff, "REFERENCE", coarse)
-    monkeypatch.setattr(tradeoff, "PEGS", ((0.5, 0.1),))
+    monkeypatch.setattr(whiskers, "REFERENCE", coarse)
+    monkeypatch.setattr(whiskers, "PEGS", ((0.5, 0.1),))
     monkeypatch.setattr(contact_scenes, "SPECIES", ("mouse",))
     monkeypatch.setattr(contact_scenes, "FREQUENCIES", (20.0,))
     monkeypatch.setattr(contact_scenes, "FRICTIONS", (0.0,))
 
 
 COARSE = SimulationSetting(Fidelity(links=6, time_step=2e-4, steps_per_period=10), "mujoco")
-SOLVED = tradeoff.REFERENCE.fidelity.contact_tolerance
+SOLVED = whiskers.REFERENCE.fidelity.contact_tolerance
 FINE = SimulationSetting(Fidelity(links=8, time_step=2e-4, steps_per_period=10), "mujoco")
 
 
 def test_a_setting_is_measured_once_and_the_reference_differs_from_itself_by_nothing(quick, tmp_path):
     path = tmp_path / "table.json"
-    (first,) = tradeoff.measure_tradeoff(path, [FINE])
+    (first,) = run_study(whiskers.study([FINE]), path)
     assert first["error_50"] == first["error_90"] == first["error_95"] == first["untrusted"] == 0
     assert min(first["static_error"], first["ring_error"]) > 0
-    both = tradeoff.measure_tradeoff(path, [FINE, COARSE])
+    both = run_study(whiskers.study([FINE, COARSE]), path)
     # Cost is a measured time, so an equal number means that the point was kept.
     assert both[0] == first
     assert both[1]["error_95"] >= both[1]["error_90"] >= both[1]["error_50"] > 0
     assert json.loads(path.read_text())["points"] == both
-    tradeoff.write_csv(both, tmp_path / "table.csv")
+    write_csv(both, tmp_path / "table.csv")
     with (tmp_path / "table.csv").open() as stream:
         assert [int(row["links"]) for row in csv.DictReader(stream)] == [8, 6]
     if importlib.util.find_spec("matplotlib"):
-        assert plot_tradeoff(both, tmp_path / "plot.png").stat().st_size > 1000
+        assert draw_study(whiskers.charts(both), tmp_path / "plot.png").stat().st_size > 1000
     else:
         with pytest.raises(MissingDependencyError, match=r"\[report\]"):
-            plot_tradeoff(both, tmp_path / "plot.png")
+            draw_study(whiskers.charts(both), tmp_path / "plot.png")
 
 
 def test_a_table_of_other_experiments_is_refused(tmp_path):
     path = tmp_path / "table.json"
     path.write_text(json.dumps({"protocol": 1, "points": []}))
-    with pytest.raises(DataError, match=r"table\.json'.*MuJoCo"):
-        tradeoff.measure_tradeoff(path, [COARSE])
+    with pytest.raises(DataError, match=r"table\.json' was not measured with protocol 5, mujoco"):
+        run_study(whiskers.study([COARSE]), path)
 
 
 def test_an_unknown_backend_is_refused_before_anything_is_measured(tmp_path):
     with pytest.raises(UsageError, match="did you mean 'mujoco'"):
-        tradeoff.measure_tradeoff(tmp_path / "table.json", [SimulationSetting(COARSE.fidelity, "mujocco")])
+        run_study(whiskers.study([SimulationSetting(COARSE.fidelity, "mujocco")]), tmp_path / "table.json")
 
 
 @pytest.mark.slow
 def test_collision_geometries_of_a_concave_object_are_measured_beside_the_bench_tests(quick, tmp_path):
     path = tmp_path / "table.json"
     chosen = [FINE, *(replace(FINE, collision=name) for name in ("exact", "decomposition-0.02", "hull"))]
-    bench, exact, cut, hull = tradeoff.measure_tradeoff(path, chosen)
+    bench, exact, cut, hull = run_study(whiskers.study(chosen), path)
     assert exact["error_95"] == exact["untrusted"] == 0
     assert exact["pieces"] == 24
     # A hull fills the hollow that whiskers move in: some start inside and cannot be trusted.
@@ -75,13 +75,13 @@ def test_collision_geometries_of_a_concave_object_are_measured_beside_the_bench_
     assert hull["untrusted"] > 0.1 + cut["untrusted"]
     assert hull["error_90"] is None
     assert 1 < cut["pieces"] < 24
-    assert [point.settings["links"] for point in tradeoff.front([bench, exact, cut, hull])] == [8]
-    assert tradeoff.collision_points([bench, exact, cut, hull]) == [exact, cut, hull]
+    assert [point.settings["links"] for point in whiskers.best([bench, exact, cut, hull])] == [8]
+    assert whiskers.collision_rows([bench, exact, cut, hull]) == [exact, cut, hull]
     # Kept points are not measured again.
-    assert tradeoff.measure_tradeoff(path, chosen[1:]) == [bench, exact, cut, hull]
+    assert run_study(whiskers.study(chosen[1:]), path) == [bench, exact, cut, hull]
     if importlib.util.find_spec("matplotlib"):
         known = [{**bench, "error_90": 0.1}, {**exact, "error_90": 0.01}, {**cut, "error_90": 0.2}, hull]
-        assert plot_tradeoff(known, tmp_path / "plot.png").stat().st_size > 1000
+        assert draw_study(whiskers.charts(known), tmp_path / "plot.png").stat().st_size > 1000
 
 
 @pytest.mark.parametrize("text", ["hul", "decomposition", "decomposition-fine", "hull-0.1"])
@@ -91,7 +91,7 @@ def test_an_unknown_collision_geometry_is_refused(text):
 
 
 def test_every_backend_and_collision_geometry_that_is_asked_for_is_in_the_grid():
-    chosen = tradeoff.settings(links=(), backends=("mujoco", "bullet"), collisions=("hull", "exact"))
+    chosen = whiskers.settings(links=(), backends=("mujoco", "bullet"), collisions=("hull", "exact"))
     assert len([item for item in chosen if item.collision is None]) == 2 * 3
     hollow = [item for item in chosen if item.collision is not None]
     assert {(item.backend, item.collision) for item in hollow} == {
@@ -106,37 +106,37 @@ def test_the_front_leaves_out_failed_and_beaten_settings():
                 "backend": "mujoco", "error_90": error, "cost": cost}  # fmt: skip
 
     points = [point(6, 0.1, 1.0), point(8, 0.2, 2.0), point(10, 0.05, 3.0), point(4, None, None)]
-    assert [best.settings["links"] for best in tradeoff.front(points)] == [6, 10]
+    assert [best.settings["links"] for best in whiskers.best(points)] == [6, 10]
 
 
 def test_the_grid_holds_the_presets_and_no_setting_twice():
-    chosen = tradeoff.settings()
+    chosen = whiskers.settings()
     assert len(set(chosen)) == len(chosen)
     assert SimulationSetting(Fidelity.preset("balanced")) in chosen
 
 
 def test_the_solver_is_an_axis_of_the_backend_that_has_two_and_no_rival_of_the_presets():
-    chosen = tradeoff.settings(
+    chosen = whiskers.settings(
         links=(8,), time_steps=((1e-3, 25.0),), backends=("mujoco", "rod"), solvers=("quasistatic",)
     )
     assert [(item.backend, item.fidelity) for item in chosen] == [
         ("rod", Fidelity(links=8, time_step=1e-3, solver="quasistatic", contact_tolerance=1e-6))
     ]
     with pytest.raises(UsageError, match="'static'; did you mean 'quasistatic'"):
-        tradeoff.settings(solvers=("static",))
+        whiskers.settings(solvers=("static",))
     point = {"links": 8, "links_per_mm": None, "time_step": 1e-3, "steps_per_period": None, "backend": "rod"}
     moving, still = ({**point, "solver": name, "error_90": 0.1, "cost": 1.0} for name in ("dynamic", "quasistatic"))
-    assert len(tradeoff.front([moving, {**still, "error_90": 0.01}])) == 1
-    assert tradeoff.front([still]) == []
+    assert len(whiskers.best([moving, {**still, "error_90": 0.01}])) == 1
+    assert whiskers.best([still]) == []
 
 
 def test_what_few_iterations_leave_of_contact_forces_is_among_the_errors(quick, monkeypatch, tmp_path):
     pytest.importorskip("warp")
     monkeypatch.setattr(contact_scenes, "FRICTIONS", (0.8,))
     same = Fidelity(links=8, time_step=2e-4, steps_per_period=10, precision="double")
-    monkeypatch.setattr(tradeoff, "REFERENCE", SimulationSetting(replace(same, contact_tolerance=SOLVED), "rod"))
+    monkeypatch.setattr(whiskers, "REFERENCE", SimulationSetting(replace(same, contact_tolerance=SOLVED), "rod"))
     chosen = [SimulationSetting(replace(same, contact_tolerance=each), "rod") for each in (None, 1e-6)]
-    few, solved = tradeoff.measure_tradeoff(tmp_path / "table.json", chosen)
+    few, solved = run_study(whiskers.study(chosen), tmp_path / "table.json")
     # Two points, though they differ in the tolerance alone.
     assert few["error_90"] > 0.1
     assert solved["error_90"] < 1e-4
@@ -145,8 +145,8 @@ def test_what_few_iterations_leave_of_contact_forces_is_among_the_errors(quick, 
 @pytest.mark.slow
 def test_a_setting_without_inertia_is_measured_in_all_that_does_not_ring(tmp_path):
     pytest.importorskip("warp")
-    chosen = tradeoff.settings(links=(10,), time_steps=((1e-3, None),), backends=("rod",), solvers=("quasistatic",))
-    (point,) = tradeoff.measure_tradeoff(tmp_path / "table.json", chosen)
+    chosen = whiskers.settings(links=(10,), time_steps=((1e-3, None),), backends=("rod",), solvers=("quasistatic",))
+    (point,) = run_study(whiskers.study(chosen), tmp_path / "table.json")
     assert point["ring_error"] is None
     assert point["static_error"] < 0.02
     assert point["error_90"] > point["error_50"] > 0.01

@@ -1,4 +1,4 @@
-"""Measure error and cost of tactile queries over their settings: the data behind ``Fidelity.auto``.
+"""Error and cost of tactile queries over their settings: the data behind ``Fidelity.auto``.
 
 Three parts, each against a reference in double precision:
 
@@ -13,12 +13,10 @@ the processor that measured.
 
 from __future__ import annotations
 
-import os
-import platform
+import math
 import time
-from collections.abc import Sequence
-from functools import cache, partial
-from pathlib import Path
+from collections.abc import Mapping, Sequence
+from functools import cache
 from typing import Any, cast
 
 import numpy as np
@@ -26,10 +24,8 @@ import trimesh
 from numpy.typing import NDArray
 from trimesh.triangles import closest_point
 
-from brainbench.core.figures.style import panels, save_figure
-from brainbench.core.files import write_json
-from brainbench.core.progress import Progress, track
 from brainbench.geometry import Mesh, winding_number
+from brainbench.tradeoffs.study import Panel, Row, Study
 from robotics_bridge.physics import Geometry, HandState, TouchScene
 from robotics_bridge.sensors.probes.placement import Probes
 from robotics_bridge.sensors.queries.surface_points import surface_points
@@ -42,30 +38,49 @@ POINTS = (250, 500, 1000, 2000, 4000, 16_000)
 TAXELS = (5, 10, 20, 40, 80)
 HEIGHTS = {"mesh": 0.010, "primitive": 0.017}
 """Height (m) above the pad at which the torus and the sphere touch it."""
+WITHOUT_CELLS = {"mesh": "raycast", "primitive": "sdf"}
+"""Query of the parts that need no distance field."""
 _POSES = 12
 _CYLINDER = Geometry(name="o", link="object", kind="cylinder", size=(0.008, 0.012))
 _PAD = Geometry(name="pad", link="hand", kind="box", size=(0.03, 0.03, 0.005))
 
 
-def measure_tradeoff(path: Path | None = None, *, progress: Progress | None = None) -> list[dict[str, Any]]:
-    """Measure every setting; with ``path`` write them as a table (JSON).
-
-    Returns:
-        One row per setting: ``part``, what was set, ``error`` and ``cost``.
-    """
-    jobs = [partial(_mesh_point, "mesh", "sdf", n) for n in RESOLUTIONS]
-    jobs += [partial(_mesh_point, "mesh", "raycast", None), partial(_mesh_point, "primitive", "sdf", None)]
-    jobs += [partial(_points_point, n) for n in POINTS] + [partial(_taxels_point, n) for n in TAXELS]
-    rows = [job() for job in track(jobs, "settings", progress)]
-    if path is not None:
-        about = {
+def study() -> Study:
+    """Return the study of every setting; its rows have ``part``, what was set, ``error`` and ``cost``."""
+    measures = {"mesh": _field, "primitive": _field, "points": _proximity, "taxels": _pad}
+    settings = [{"part": "mesh", "query": "sdf", "resolution": cells} for cells in RESOLUTIONS]
+    settings += [{"part": part, "query": query, "resolution": None} for part, query in WITHOUT_CELLS.items()]
+    settings += [{"part": "points", "points": count} for count in POINTS]
+    settings += [{"part": "taxels", "taxels": side * side} for side in TAXELS]
+    return Study(
+        "brainbench tradeoff tactile",
+        settings,
+        lambda row: measures[row["part"]](row),
+        about={
             "error": "relative RMS of forces against double precision",
             "cost": "microseconds per environment and update",
-            "machine": f"{platform.machine()}, {os.cpu_count()} processors",
-            "made_by": "brainbench tradeoff tactile",
-        }
-        write_json(path, {**about, "points": rows})
-    return rows
+        },
+    )
+
+
+def charts(rows: Sequence[Row]) -> list[Panel]:
+    """Return the chart of each part of a table."""
+    titles = {
+        "mesh": "distance to 4,608 triangles,\nby cells of the distance field",
+        "points": "proximity taxels,\nby number of surface points",
+        "taxels": "pad of taxels,\nby number of taxels",
+    }
+    words = "time per environment and update (µs)", "relative error of the force (RMS)", "error"
+
+    def label(row: Row) -> str:
+        if row["part"] == "mesh":
+            return f"{row['resolution']}³" if row["resolution"] else "no field: each triangle"
+        return f"{row.get('points') or row['taxels']:,}"
+
+    return [
+        Panel(title, *words, [row for row in rows if row["part"] == part], label=label)
+        for part, title in titles.items()
+    ]
 
 
 def triangle_distance(mesh: Mesh, points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -147,13 +162,13 @@ def _exact_field(part: str) -> NDArray[np.float64]:
     return exact
 
 
-def _mesh_point(part: str, query: str, resolution: int | None) -> dict[str, Any]:
+def _field(row: Mapping[str, Any]) -> Row:
+    part, resolution = row["part"], row["resolution"]
     solid = _torus() if part == "mesh" else Geometry(name="o", link="object", kind="sphere", size=(0.012,))
-    taxel = KinematicTaxel(link="hand", probes=_grid(), query=query)  # type: ignore[arg-type]
+    taxel = KinematicTaxel(link="hand", probes=_grid(), query=row["query"])
     read, cost = _run(solid, taxel, _places(HEIGHTS[part]), resolution or 64)
     exact = _exact_field(part)
-    error = _error(read[..., :3].reshape(exact.shape), exact)
-    return {"part": part, "query": query, "resolution": resolution, "error": error, "cost": cost}
+    return {"error": _error(read[..., :3].reshape(exact.shape), exact), "cost": cost}
 
 
 @cache
@@ -173,19 +188,19 @@ def _pads() -> Probes:
     return Probes.grid(6, 6, size=(0.02, 0.02), center=(0, 0, 0.005), radius=0.008)
 
 
-def _points_point(points: int) -> dict[str, Any]:
-    read, cost = _run(_CYLINDER, ProximityTaxel(link="hand", probes=_pads(), points=points), _places(0.019))
+def _proximity(row: Mapping[str, Any]) -> Row:
+    read, cost = _run(_CYLINDER, ProximityTaxel(link="hand", probes=_pads(), points=row["points"]), _places(0.019))
     exact = _exact_proximity()
-    return {"part": "points", "points": points, "error": _error(read[..., 2].reshape(exact.shape), exact), "cost": cost}
+    return {"error": _error(read[..., 2].reshape(exact.shape), exact), "cost": cost}
 
 
-def _taxels_point(side: int) -> dict[str, Any]:
+def _pad(row: Mapping[str, Any]) -> Row:
+    side = math.isqrt(row["taxels"])
     solid = Geometry(name="o", link="object", kind="sphere", size=(0.012,))
     places, pitch = _places(0.017), 0.03 / side
     grid = Probes.grid(side, side, size=(0.03 - pitch, 0.03 - pitch), center=(0, 0, 0.005), radius=1e-6)
     read, cost = _run(solid, KinematicTaxel(link="hand", probes=grid, stiffness=1e7 * pitch**2), places)
-    error = _error(read[..., 2].sum((1, 2)), _integral(places))
-    return {"part": "taxels", "taxels": side * side, "error": error, "cost": cost}
+    return {"error": _error(read[..., 2].sum((1, 2)), _integral(places)), "cost": cost}
 
 
 def _integral(places: NDArray) -> NDArray[np.float64]:
@@ -199,31 +214,3 @@ def _integral(places: NDArray) -> NDArray[np.float64]:
         # Midpoint rule over the pad: force density times the z part of the normal.
         exact.append((1e7 * (0.03 / 600) ** 2 * np.maximum(0.012 - far, 0) ** 1.2 * away[2] / far).sum())
     return np.array(exact)
-
-
-def plot_tradeoff(rows: Sequence[dict[str, Any]], path: Path) -> None:
-    """Draw error against cost of every part."""
-    figure, axes = panels(1, 3, (10.5, 3.6))
-    titles = {
-        "mesh": "distance to 4,608 triangles,\nby cells of the distance field",
-        "points": "proximity taxels,\nby number of surface points",
-        "taxels": "pad of taxels,\nby number of taxels",
-    }
-    for (part, title), axis in zip(titles.items(), axes[0], strict=True):
-        chosen = [row for row in rows if row["part"] == part]
-        axis.loglog([r["cost"] for r in chosen], [r["error"] for r in chosen], "o", markersize=5)
-        for number, row in enumerate(chosen):
-            cells = f"{row['resolution']}³" if row.get("resolution") else "no field: each triangle"
-            label = f"{row.get('points') or row.get('taxels') or 0:,}" if part != "mesh" else cells
-            # On alternate sides, because neighbours are close: beside a column of points, else above and below.
-            side = 1 if number % 2 else -1
-            beside = part == "mesh"
-            left = side < 0 or number == len(chosen) - 1
-            place = {"xytext": (-7 if left else 7, 0) if beside else (0, -12 * side), "textcoords": "offset points"}
-            align = ("right" if left else "left") if beside else "center"
-            axis.annotate(label, (row["cost"], row["error"]), ha=align, va="center", fontsize=8.5, **place)
-        axis.set_title(title)
-        axis.set_xlabel("time per environment and update (µs)")
-        axis.set_ylabel("relative error of the force (RMS)")
-        axis.margins(0.3)
-    save_figure(figure, path, dpi=150)

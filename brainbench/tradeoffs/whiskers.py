@@ -1,4 +1,4 @@
-"""Measure error and cost of whisker simulations over their settings: the data behind ``Fidelity.auto``.
+"""Error and cost of whisker simulations over their settings: the data behind ``Fidelity.auto``.
 
 Per setting, in the random scenes of contact of :mod:`brainbench.stimuli.validation.contact_scenes`, against a converged
 simulation (:data:`REFERENCE`):
@@ -16,8 +16,6 @@ And against exact solutions, for mouse whisker C2, straightened:
 Points with a ``collision`` measure instead how a concave object is touched: the scenes with a hollow, where its solid
 is exact, cut into convex pieces at a threshold, or its hull; ``pieces`` counts the convex parts or triangles that
 stand for it.
-
-A table is a JSON file; points that it holds already are kept, so an interrupted run goes on where it stopped.
 """
 
 from __future__ import annotations
@@ -25,18 +23,16 @@ from __future__ import annotations
 import itertools
 import math
 import os
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, fields, replace
 from functools import cache
-from pathlib import Path
+from importlib import metadata
 from typing import Any
 
 import numpy as np
 
-from brainbench.core.errors import BrainbenchError, DataError, check_each, unknown_name
-from brainbench.core.files import read_json, write_json, write_text
-from brainbench.core.progress import Progress, track
-from brainbench.core.tradeoffs import TradeoffPoint, pareto_front
+from brainbench.core.errors import BrainbenchError, check_each, unknown_name
+from brainbench.core.tradeoffs import TradeoffPoint
 from brainbench.geometry import DecompositionSettings
 from brainbench.stimuli.engines import get_engine
 from brainbench.stimuli.engines.fidelity import DEFAULT_ENGINE, RESOLUTION, SHARES, Fidelity, list_presets
@@ -51,6 +47,7 @@ from brainbench.stimuli.validation.bench_tests import peg
 from brainbench.stimuli.validation.ringing import ringdown
 from brainbench.stimuli.whiskers.array import WhiskerArray
 from brainbench.stimuli.whiskers.whisker import Whisker
+from brainbench.tradeoffs.study import Panel, Row, Study, front
 
 PROTOCOL = 5
 """Counts up when the experiments change, so that points of different experiments never share a table."""
@@ -126,111 +123,87 @@ def settings(
     return chosen + [SimulationSetting(*point) for point in itertools.product(presets, backends, collisions)]
 
 
-def measure_tradeoff(
-    path: str | os.PathLike[str], chosen: Iterable[SimulationSetting] | None = None, *, progress: Progress | None = None
-) -> list[dict[str, Any]]:
-    """Measure the settings that the table at ``path`` lacks, writing it (atomically) after each.
+def study(chosen: Sequence[SimulationSetting] | None = None) -> Study:
+    """Return the study of some settings, all by default.
 
-    Returns:
-        All points of the table: the fields of the module's text, ``backend`` and the fields of :class:`Fidelity`;
-        ``collision`` only where a concave object was touched.
+    Its rows have the fields of the module's text, ``backend`` and the fields of :class:`Fidelity`; ``collision`` only
+    where a concave object is touched.
     """
-    wanted = settings() if chosen is None else list(chosen)
-    for name in {setting.backend for setting in wanted}:
+    chosen = settings() if chosen is None else chosen
+    for name in {setting.backend for setting in chosen}:
         get_engine(name)
-    head, points = _header(), []
-    if Path(path).exists():
-        table = read_json(path)
-        if not isinstance(table, dict) or any(table.get(key) != head[key] for key in ("protocol", "mujoco")):
-            raise DataError(
-                f"{os.fspath(path)!r} was measured by other experiments or with another MuJoCo than {head['mujoco']}; "
-                "write to another file, or delete it to measure everything again."
-            )
-        points = list(table["points"])
-    known = {_key(point) for point in points}
-    missing = [setting for setting in wanted if _key(_fields(setting)) not in known]
-    references = cache(_references)
-    for setting in track(missing, "measuring settings", progress):
-        points.append(_measure(setting, references))
-        write_json(path, {**head, "points": points})
-    return points
-
-
-def write_csv(points: Iterable[dict[str, Any]], path: str | os.PathLike[str]) -> Path:
-    """Write points as comma-separated values, one row each, atomically; what is not known stays empty."""
-    import pandas as pd
-
-    # Columns of objects, so that whole numbers stay whole beside missing ones.
-    return write_text(path, pd.DataFrame(list(points), dtype=object).sort_index(axis=1).to_csv(index=False))
-
-
-def front(points: Iterable[dict[str, Any]]) -> list[TradeoffPoint]:
-    """Return the points of the bench tests that none beats in both error and cost, cheapest first.
-
-    Points with a collision geometry are other experiments and are left out, and so are those without inertia, for
-    which some of the errors mean nothing.
-    """
-    return pareto_front(
-        TradeoffPoint(
-            math.inf if p[ERROR] is None else p[ERROR], p["cost"], {n: p.get(n) for n in (*RESOLUTION, "backend")}
-        )
-        for p in points
-        if p["cost"] is not None and not p.get("collision") and _moves(p)
+    return Study(
+        "brainbench tradeoff whisker",
+        [_fields(setting) for setting in chosen],
+        lambda row: _measure(_setting(row)),
+        about={
+            "subject": f"{contact_scenes.CELLS} kinds of contact, seed {SEED}",
+            "error": "of base force or moment, root mean square; so many per cent of the whiskers stay below it",
+            "cost": "processor seconds per whisker-second",
+        },
+        fixed={"protocol": PROTOCOL, "mujoco": metadata.version("mujoco-core")},
     )
 
 
-def collision_points(points: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return the points of a table that touch a concave object."""
-    return [point for point in points if point.get("collision")]
+def best(rows: Sequence[Row]) -> list[TradeoffPoint]:
+    """Return the settings that none beats in both error and cost, cheapest first.
+
+    Rows with a collision geometry are other experiments and are left out, and so are those without inertia, for
+    which some of the errors mean nothing.
+    """
+    return front([row for row in rows if not row.get("collision") and _moves(row)], ERROR, (*RESOLUTION, "backend"))
 
 
-def preset_of(point: dict[str, Any]) -> str:
-    """Return the name of the preset with the resolution of a point; empty when there is none."""
+def collision_rows(rows: Sequence[Row]) -> list[Row]:
+    """Return the rows of a table that touch a concave object."""
+    return [row for row in rows if row.get("collision")]
+
+
+def charts(rows: Sequence[Row]) -> list[Panel]:
+    """Return the charts of a table: by engine, and by collision geometry where the table has any."""
+    words = "processor time per second of one whisker (s/s)", "relative error that 90 % stay below", ERROR
     presets = {tuple(vars(Fidelity.preset(name))[item] for item in RESOLUTION): name for name in list_presets()}
-    return presets.get(tuple(point.get(item) for item in RESOLUTION), "")
+    bench, hollow = [row for row in rows if not row.get("collision")], collision_rows(rows)
+    in_contact = Panel(
+        "whiskers in contact, against a converged simulation", *words, bench,
+        series=lambda row: row["backend"] + ("" if _moves(row) else ", without inertia"),
+        label=lambda row: presets.get(tuple(row.get(item) for item in RESOLUTION), ""),
+    )  # fmt: skip
+    by_surface = Panel(
+        "hollow objects, by collision surface", *words, hollow,
+        series=lambda row: f"{row['collision']}, {row['backend']}",
+    )  # fmt: skip
+    return [in_contact, by_surface] if hollow else [in_contact]
 
 
-def _fields(setting: SimulationSetting) -> dict[str, Any]:
-    fields = {**asdict(setting.fidelity), "backend": setting.backend}
-    return fields if setting.collision is None else {**fields, "collision": setting.collision}
+def _fields(setting: SimulationSetting) -> Row:
+    values = {**asdict(setting.fidelity), "backend": setting.backend}
+    return values if setting.collision is None else {**values, "collision": setting.collision}
 
 
-def _key(point: dict[str, Any]) -> tuple[Any, ...]:
-    return (*(point.get(name) for name in (*RESOLUTION, "backend", "collision")), _moves(point))
+def _setting(row: Mapping[str, Any]) -> SimulationSetting:
+    fidelity = Fidelity(**{item.name: row[item.name] for item in fields(Fidelity)})
+    return SimulationSetting(fidelity, row["backend"], row.get("collision"))
 
 
-def _moves(point: dict[str, Any]) -> bool:
-    return point.get("solver", "dynamic") == "dynamic"
+def _moves(row: Mapping[str, Any]) -> bool:
+    return row.get("solver", "dynamic") == "dynamic"
 
 
-def _header() -> dict[str, Any]:
-    import platform
-    from importlib import metadata
-
-    return {
-        "made_by": "brainbench tradeoff whisker",
-        "protocol": PROTOCOL,
-        "subject": f"{contact_scenes.CELLS} kinds of contact, seed {SEED}",
-        "error": "of base force or moment, root mean square; so many per cent of the whiskers stay below it",
-        "cost": "processor seconds per whisker-second",
-        "mujoco": metadata.version("mujoco-core"),
-        "machine": platform.machine(),
-    }
-
-
-def _references(objects: tuple[str, ...]) -> dict[int, Trace]:
+@cache
+def _references(reference: SimulationSetting, objects: tuple[str, ...]) -> dict[int, Trace]:
     """Return what a converged simulation says of the scenes with some objects, by the index of their job.
 
     Only traces are there that can be trusted and touch something.
     """
     jobs = contact_scenes.contact_jobs(SEED, objects=objects)
-    traces = get_engine(REFERENCE.backend).run(jobs, REFERENCE.fidelity.resolved(True))
+    traces = get_engine(reference.backend).run(jobs, reference.fidelity.resolved(True))
     return {i: trace for i, trace in enumerate(traces) if trace.status == "ok" and trace.contact.any()}
 
 
-def _measure(setting: SimulationSetting, references: Callable[[tuple[str, ...]], dict[int, Trace]]) -> dict[str, Any]:
+def _measure(setting: SimulationSetting) -> Row:
     objects = ("hollow",) if setting.collision else contact_scenes.OBJECTS
-    values: dict[str, Any] = {**_fields(setting), **dict.fromkeys((*SHARES.values(), "untrusted", "cost")), "note": ""}
+    values: Row = {**dict.fromkeys((*SHARES.values(), "untrusted", "cost")), "note": ""}
     try:
         solid = None
         if setting.collision:
@@ -238,10 +211,11 @@ def _measure(setting: SimulationSetting, references: Callable[[tuple[str, ...]],
             body = touched(Obstacle(solid.parts, surface=solid.surface), surfaces=get_engine(setting.backend).surfaces)
             values["pieces"] = len(body.parts) if body.surface is None else len(body.surface.faces)
         else:
-            _test_bench(setting, values)
-        jobs, known = contact_scenes.contact_jobs(SEED, objects=objects, hollow=solid), references(objects)
-        traces, values["cost"] = run_for_cost(setting, [jobs[index] for index in known])
-        errors = [contact_scenes.difference(*pair) for pair in zip(traces, known.values(), strict=True)]
+            values |= _test_bench(setting)
+        references = _references(REFERENCE, objects)
+        jobs = contact_scenes.contact_jobs(SEED, objects=objects, hollow=solid)
+        traces, values["cost"] = run_for_cost(setting, [jobs[index] for index in references])
+        errors = [contact_scenes.difference(*pair) for pair in zip(traces, references.values(), strict=True)]
         values["untrusted"] = float(np.isinf(errors).mean())
         for share, name in SHARES.items():
             bound = float(np.quantile(errors, share, method="higher"))
@@ -263,15 +237,16 @@ def run_for_cost(setting: SimulationSetting, jobs: Sequence[Job]) -> tuple[list[
     return traces, used / sum(job.times[-1] for job in jobs)
 
 
-def _test_bench(setting: SimulationSetting, values: dict[str, Any]) -> None:
-    """Measure pegs and ring-downs."""
+def _test_bench(setting: SimulationSetting) -> Row:
+    """Return the errors of pegs and ring-downs."""
     whisker = _straight("C2")
     length, how = whisker.arc_length, {"backend": setting.backend, "fidelity": setting.fidelity}
     pegs = [peg(whisker, at * length, offset * length, **how) for at, offset in PEGS]
-    values["static_error"] = max(max(test.moment_error, test.force_error) for test in pegs)
-    values["ring_error"] = None
-    if _moves(values):
-        values["ring_error"] = max(_ring_error(_straight(name), setting) for name in ("C2", "E5"))
+    rings = [_ring_error(_straight(name), setting) for name in ("C2", "E5") if setting.fidelity.solver == "dynamic"]
+    return {
+        "static_error": max(max(test.moment_error, test.force_error) for test in pegs),
+        "ring_error": max(rings, default=None),
+    }
 
 
 def _collision(text: str) -> tuple[str, DecompositionSettings | None]:

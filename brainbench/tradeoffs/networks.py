@@ -6,45 +6,37 @@ Every setting is compared with the same network in float32, unrolled biologicall
 from __future__ import annotations
 
 import time
-from collections.abc import Collection, Iterable
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from itertools import product
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
 from torch import nn
 
-from brainbench.core.errors import UsageError, check_name
-from brainbench.core.reading.ranges import check_fields
-from brainbench.core.tradeoffs import TradeoffPoint
-from brainbench.models.graph.spec import UNROLLS, Unroll
+from brainbench.core.errors import UsageError
+from brainbench.core.limits import Count, limited
+from brainbench.models.graph.spec import Unroll
 from brainbench.models.graph.temporal_graph import TemporalGraph
 from brainbench.models.network import EncoderAttenderDecoder
 from brainbench.models.registry import load_model
-
-PRECISIONS = ("float32", "bf16", "int8")
-"""``bf16`` computes in mixed precision; ``int8`` stores weights in 8 bits, with one scale per output channel, and
-computes in float32."""
-
+from brainbench.tradeoffs.study import Row, Study
 
 REPEATS = 5
 """Sweeps that are timed, after one that is not."""
 
 
 @dataclass(frozen=True)
+@limited
 class ModelSetting:
     """One way to run a network."""
 
-    precision: str = "float32"
+    precision: Literal["float32", "bf16", "int8"] = "float32"
+    """``bf16`` computes in mixed precision; ``int8`` stores weights in 8 bits, with one scale per output channel, and
+    computes in float32."""
     unroll: Unroll = "biological"
-    steps: int = 22
+    steps: Count = 22
     """The sweep's last steps that are shown."""
-
-    def __post_init__(self) -> None:
-        check_name("precision", self.precision, PRECISIONS)
-        check_name("unrolling", self.unroll, UNROLLS)
-        check_fields(self, "steps", least=1)
 
 
 class Reduced(nn.Module):
@@ -94,32 +86,36 @@ def round_weights(model: nn.Module) -> None:
             weight.copy_((weight / scale).round() * scale)
 
 
-def settings(
-    precisions: Iterable[str] = PRECISIONS, unrolls: Iterable[str] = ("biological",), steps: Iterable[int] = (22,)
-) -> list[ModelSetting]:
-    """Return every combination of the choices."""
-    return [ModelSetting(p, u, s) for p, u, s in product(precisions, unrolls, steps)]  # pyright: ignore[reportArgumentType]
+def study(
+    name: str,
+    settings: Sequence[ModelSetting],
+    sweeps: Any,
+    *,
+    seed: int = 0,
+    more: Callable[[Reduced], Mapping[str, Any]] = lambda network: {},
+) -> Study:
+    """Return the study of a network on sweeps [K, T, C, H, W] in SI.
 
-
-def measure(name: str, setting: ModelSetting, sweeps: Any, *, seed: int = 0) -> TradeoffPoint:
-    """Measure one setting on sweeps [K, T, C, H, W] in SI.
-
-    ``error`` is the relative difference of the answers from those of the reference setting on all steps, ``cost`` the
-    median time of one sweep at batch 1 (ms); settings, stored size and p99 time stand beside them.
+    A row has the setting, the ``error`` (relative difference of the answers from those of the reference setting on all
+    steps), the median time ``ms`` of one sweep at batch 1 with its ``p99_ms``, the stored size, and what ``more`` tells
+    of the network in that setting.
     """
     x = torch.as_tensor(sweeps, dtype=torch.float32)
-    if x.ndim != 5 or x.shape[1] < setting.steps:
-        raise UsageError(f"{setting.steps} steps cannot be taken from sweeps of shape {list(x.shape)}.")
-    reduced = Reduced(name, setting, seed=seed)
-    with torch.no_grad():
-        expected = load_model(name, seed=seed)(x)
-        found = reduced(x)
-        times = []
-        for _ in range(REPEATS + 1):
-            start = time.perf_counter()
-            reduced(x[:1])
-            times.append((time.perf_counter() - start) * 1e3)
-    error = float((found - expected).norm() / expected.norm().clamp_min(1e-30))
-    p50, p99 = np.percentile(times[1:], [50, 99])
-    described = {**asdict(setting), "p99_ms": float(p99), "stored_bytes": reduced.stored_bytes()}
-    return TradeoffPoint(error, float(p50), described)
+    for setting in settings:
+        if x.ndim != 5 or x.shape[1] < setting.steps:
+            raise UsageError(f"{setting.steps} steps cannot be taken from sweeps of shape {list(x.shape)}.")
+
+    def measure(row: Mapping[str, Any]) -> Row:
+        reduced = Reduced(name, ModelSetting(**row), seed=seed)
+        with torch.no_grad():
+            expected, answers, times = load_model(name, seed=seed)(x), reduced(x), []
+            for _ in range(REPEATS + 1):
+                start = time.perf_counter()
+                reduced(x[:1])
+                times.append((time.perf_counter() - start) * 1e3)
+        error = float((answers - expected).norm() / expected.norm().clamp_min(1e-30))
+        p50, p99 = (float(value) for value in np.percentile(times[1:], [50, 99]))
+        measured = {"error": error, "ms": p50, "p99_ms": p99, "stored_bytes": reduced.stored_bytes()}
+        return {"setting": dict(row), **measured, **more(reduced)}
+
+    return Study("brainbench tradeoff model", [asdict(setting) for setting in settings], measure)

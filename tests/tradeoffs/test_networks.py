@@ -3,23 +3,29 @@ import torch
 
 from brainbench.core.errors import UsageError
 from brainbench.models.registry import load_model
-from brainbench.models.tradeoff import ModelSetting, Reduced, measure, round_weights, settings
+from brainbench.tradeoffs.networks import ModelSetting, Reduced, round_weights, study
+from brainbench.tradeoffs.study import run_study
 from tests.factories.training_sweeps import random_sweeps
 
 NAME = "zhuang-ugrnn-ln-small"
 
 
+def _measure(*settings, steps=10):
+    return run_study(study(NAME, settings, random_sweeps(3, steps)))
+
+
 def test_the_reference_setting_has_no_error():
-    point = measure(NAME, ModelSetting(steps=10), random_sweeps(3, 10))
-    assert point.error == pytest.approx(0.0, abs=1e-6)
-    assert 0 < point.cost <= point.settings["p99_ms"]
+    (row,) = _measure(ModelSetting(steps=10))
+    assert row["error"] == pytest.approx(0.0, abs=1e-6)
+    assert 0 < row["ms"] <= row["p99_ms"]
 
 
 def test_lower_precision_costs_a_little_accuracy_and_saves_memory():
-    points = {item.precision: measure(NAME, item, random_sweeps(3, 10)) for item in settings(steps=(10,))}
-    assert 0 < points["bf16"].error < 0.1
-    assert 0 < points["int8"].error < 0.2
-    sizes = [points[name].settings["stored_bytes"] for name in ("float32", "bf16", "int8")]
+    rows = _measure(*(ModelSetting(name, steps=10) for name in ("float32", "bf16", "int8")))
+    _, bf16, int8 = (row["error"] for row in rows)
+    assert 0 < bf16 < 0.1
+    assert 0 < int8 < 0.2
+    sizes = [row["stored_bytes"] for row in rows]
     assert sizes[0] > 1.8 * sizes[1] > 3 * sizes[2]
 
 
@@ -37,8 +43,8 @@ def test_rounding_to_eight_bits_moves_no_weight_by_more_than_half_a_level():
 
 
 def test_fewer_steps_and_another_unrolling_change_the_answer():
-    assert measure(NAME, ModelSetting(steps=5), random_sweeps(3, 10)).error > 0.01
-    assert measure(NAME, ModelSetting(unroll="full", steps=10), random_sweeps(3, 10)).error > 0.01
+    rows = _measure(ModelSetting(steps=5), ModelSetting(unroll="full", steps=10))
+    assert all(row["error"] > 0.01 for row in rows)
 
 
 def test_a_reduced_network_is_scored_like_the_network():
@@ -56,4 +62,4 @@ def test_wrong_settings_are_refused():
     with pytest.raises(UsageError, match=r"'s4-small' .*'full'"):
         Reduced("s4-small", ModelSetting(unroll="full"))
     with pytest.raises(UsageError, match="22 steps cannot"):
-        measure(NAME, ModelSetting(), random_sweeps(3, 10))
+        _measure(ModelSetting())

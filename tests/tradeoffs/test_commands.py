@@ -10,11 +10,11 @@ from brainbench.core.files import read_json
 def test_the_cost_of_tactile_queries_is_measured_against_their_error(
     run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    from robotics_bridge.sensors import tradeoff
+    from brainbench.tradeoffs import sensors
 
     # From 16 cells on; fewer cannot resolve the torus, and its triangles are asked instead.
     for name, values in {"RESOLUTIONS": (16, 32), "POINTS": (50, 500), "TAXELS": (4, 20)}.items():
-        monkeypatch.setattr(tradeoff, name, values)
+        monkeypatch.setattr(sensors, name, values)
     out = tmp_path / "table.json"
     found = run("tradeoff", "tactile", "--out", str(out), "--plot", str(tmp_path / "plot.png"), "--json")
     assert found.status == 0, found.err
@@ -28,3 +28,17 @@ def test_the_cost_of_tactile_queries_is_measured_against_their_error(
     assert errors["taxels"][0] > errors["taxels"][1]
     assert errors["primitive"][0] < 1e-5
     assert (tmp_path / "plot.png").stat().st_size > 5000
+
+
+@pytest.mark.slow
+def test_the_error_of_a_score_is_measured_against_its_time(run):
+    result = run("tradeoff", "score", "--animals", "2", "--units", "10", "--trials", "12", "--repeats", "2", "--json")
+    assert result.status == 0, result.err
+    points = json.loads(result.out)["points"]
+    assert {point["quantity"] for point in points} == {"splits", "permutations"}
+
+
+def test_misuse_is_told_in_a_sentence(run):
+    result = run("tradeoff", "score", "--repeats", "1")
+    assert result.status == 2
+    assert "--repeats must be a whole number, at least 2; received 1." in result.err

@@ -1,0 +1,184 @@
+"""``brainbench tradeoff``: measure accuracy against cost."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict
+from itertools import product
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from brainbench.cli.destinations import out_file, out_file_option, picture_file
+from brainbench.cli.options import items, numbers, with_options
+from brainbench.cli.output import Output, progress_bar, table_of
+from brainbench.cli.requirements import PICTURES_IF_PLOT, needs
+from brainbench.stimuli.engines.fidelity import DEFAULT_ENGINE
+
+PlotOption = Annotated[
+    Path | None, typer.Option(callback=picture_file, help="Also draw error against cost (.png, .svg, .pdf).")
+]
+
+app = typer.Typer(no_args_is_help=True, help="Measure accuracy against cost.")
+
+
+@app.command("whisker")
+@needs(PICTURES_IF_PLOT)
+def whisker(
+    out: Annotated[Path, out_file_option("Table (.json); points in it are kept.")] = Path("whisker-tradeoff.json"),
+    links: Annotated[str, typer.Option(help="Links per whisker, comma-separated; the default grid if empty.")] = "",
+    time_steps: Annotated[str, typer.Option(help="Time steps in ms, comma-separated; the default grid if empty.")] = "",
+    backends: Annotated[str, typer.Option(help="Backends, comma-separated.")] = DEFAULT_ENGINE,
+    collisions: Annotated[
+        str, typer.Option(help="Collision geometries of concave objects to measure too, comma-separated, or all.")
+    ] = "",
+    solvers: Annotated[
+        str, typer.Option(help="dynamic, quasistatic (of the backend rod), or both, comma-separated.")
+    ] = "dynamic",
+    csv: Annotated[Path | None, typer.Option(callback=out_file, help="Also write the table as CSV.")] = None,
+    plot: PlotOption = None,
+) -> Output:
+    """Measure error and cost of whisker simulations over links, time step, solver, backend and collision geometry.
+
+    The table that ships with the package (brainbench/stimuli/fidelity_table.json) is made by this command.
+    """
+    from brainbench.tradeoffs import study, whiskers
+
+    shapes = tuple(items(collisions))
+    chosen = whiskers.settings(
+        links=numbers(links, "--links") or whiskers.LINKS,
+        time_steps=tuple((1e-3 * step, None) for step in numbers(time_steps, "--time-steps", float))
+        or whiskers.TIME_STEPS,
+        backends=tuple(items(backends)),
+        collisions=whiskers.COLLISIONS if shapes == ("all",) else shapes,
+        solvers=tuple(items(solvers)),
+    )
+    with progress_bar() as progress:
+        rows = study.run_study(whiskers.study(chosen), out, progress=progress)
+    if csv is not None:
+        study.write_csv(rows, csv)
+    if plot is not None:
+        study.draw_study(whiskers.charts(rows), plot)
+    best = whiskers.best(rows)
+    setting = {
+        ">links": "{0[links]}",
+        ">step ms": lambda row: f"{row['time_step'] * 1e3:g}",
+        ">contacts to": lambda row: _number(row.get("contact_tolerance"), "g"),
+    }
+    cost = {">processor s / whisker-s": lambda row: _number(row["cost"], ".3g")}
+    error = {">error": lambda row: _number(row[whiskers.ERROR], ".2%")}
+    text = table_of(
+        f"{len(rows)} settings measured; those that no other beats in cost and error (90 % of whiskers stay below):",
+        [point.settings | {whiskers.ERROR: point.error, "cost": point.cost} for point in best],
+        {**error, **cost, **setting, "backend": "{0[backend]}"},
+    )
+    if still := [row for row in rows if row.get("solver") == "quasistatic"]:
+        columns = {**error, ">pegs": "{0[static_error]:.2%}", **cost, **setting}
+        text += "\n\n" + table_of("without inertia (rod, quasistatic):", still, columns)
+    if hollow := whiskers.collision_rows(rows):
+        pieces = {"collision": "{0[collision]}", ">pieces": lambda row: row.get("pieces", "")}
+        columns = {**error, **cost, **pieces, **setting, "backend": "{0[backend]}", "note": "{0[note]}"}
+        text += "\n\n" + table_of("whisking into the hollow of concave objects:", hollow, columns)
+    return Output({"points": rows, "front": best, "path": out}, f"{text}\n\ntable  {out}")
+
+
+@app.command("score")
+@needs(cache=True)
+@with_options("brainbench.tradeoffs.scores:SyntheticData")
+def score(options: Any) -> Output:
+    """Measure the Monte-Carlo error of a score against its time: split halves and permutations."""
+    from brainbench.tradeoffs import scores, study
+
+    with progress_bar() as progress:
+        rows = study.run_study(scores.study(options), progress=progress)
+    columns = {
+        "quantity": lambda row: row["quantity"].replace("_", " "),
+        "number": lambda row: f"{row['count']:,}" + ("  (default)" if row["default"] else ""),
+        ">error": "{0[error]:.2g}",
+        "of": "{0[of]}",
+        ">s": "{0[seconds]:.2f}",
+    }
+    of = f"{options.animals} animals, {options.units} units, {options.trials} trials per stimulus"
+    title = f"{of}; standard deviation over {options.repeats} seeds"
+    return Output({"points": rows}, table_of(title, rows, columns))
+
+
+@app.command("model")
+@needs(cache=True)
+def model(
+    name: Annotated[str, typer.Argument(help="A registry name, or local-dir:FOLDER of a trained model.")],
+    precisions: Annotated[str, typer.Option(help="float32, bf16, int8, comma-separated.")] = "float32,bf16,int8",
+    unrolls: Annotated[str, typer.Option(help="biological, full, comma-separated.")] = "biological",
+    steps: Annotated[str, typer.Option(help="Last steps of the sweeps that are shown, comma-separated.")] = "22",
+    score: Annotated[bool, typer.Option(help="Also score every setting on the demo recordings.")] = False,
+    data: Annotated[Path | None, typer.Option(help="Folder of sweeps: also measure test accuracy.")] = None,
+    seed: Annotated[int, typer.Option(help="Seed of untrained weights.")] = 0,
+) -> Output:
+    """Measure error, latency, score and accuracy of a network over precision, unrolling and number of steps."""
+    from brainbench.stimuli import load_stimuli
+    from brainbench.tradeoffs import networks, study
+
+    axes: Any = (items(precisions), items(unrolls), numbers(steps, "--steps"))
+    chosen = [networks.ModelSetting(*values) for values in product(*axes)]
+
+    def more(network: networks.Reduced) -> Mapping[str, Any]:
+        values: dict[str, Any] = {}
+        if score:
+            import brainbench
+
+            values["score"] = brainbench.score(network).value
+        if data is not None:
+            from brainbench.datasets import WhiskingDataset
+            from brainbench.models.training.evaluation import evaluate
+
+            accuracy = asdict(evaluate(network, WhiskingDataset(data, split="test", shuffle=False)))
+            values |= {"top1": accuracy["top1"], "top5": accuracy["top5"]}
+        return values
+
+    with progress_bar() as progress:
+        sweeps = load_stimuli("rodgers", whiskers="all", fidelity=None, progress=progress).input
+        rows = study.run_study(networks.study(name, chosen, sweeps, seed=seed, more=more), progress=progress)
+    columns = {
+        "precision": "{0[precision]}",
+        "unrolling": "{0[unroll]}",
+        ">steps": "{0[steps]}",
+        ">error": "{0[error]:.2%}",
+        ">ms / sweep": "{0[ms]:.2f}",
+        ">p99 ms": "{0[p99_ms]:.2f}",
+        ">MB": lambda row: f"{row['stored_bytes'] / 1e6:.2f}",
+        ">score": lambda row: _number(row.get("score"), ".3f"),
+        ">top-1": lambda row: _number(row.get("top1"), ".3f"),
+    }
+    return Output(rows, table_of(f"{name}, batch 1:", rows, columns))
+
+
+@app.command("tactile")
+@needs(PICTURES_IF_PLOT)
+def tactile(
+    out: Annotated[Path, out_file_option("Table (.json); points in it are kept.")] = Path("tactile-tradeoff.json"),
+    plot: PlotOption = None,
+) -> Output:
+    """Measure error and cost of tactile queries over backend, resolution, surface points and taxels.
+
+    The table that ships with the package (robotics_bridge/sensors/fidelity_table.json) is made by this command.
+    """
+    from brainbench.tradeoffs import sensors, study
+
+    with progress_bar() as progress:
+        rows = study.run_study(sensors.study(), out, progress=progress)
+    if plot is not None:
+        study.draw_study(sensors.charts(rows), plot)
+    columns = {
+        "part": "{0[part]}",
+        ">setting": lambda row: row.get("points") or row.get("taxels") or row["query"],
+        "resolution": lambda row: f"{row['resolution']} cells" if row.get("resolution") else "",
+        ">error": "{0[error]:.2e}",
+        ">µs / environment": "{0[cost]:.2f}",
+    }
+    text = table_of("relative force errors against double precision", rows, columns)
+    return Output({"points": rows, "path": out}, f"{text}\n\ntable  {out}")
+
+
+def _number(value: float | None, form: str) -> str:
+    return "—" if value is None else format(value, form)
