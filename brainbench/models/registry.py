@@ -10,17 +10,19 @@ Importing this module imports no framework.
 
 from __future__ import annotations
 
+import functools
 import inspect
 import logging
 import os
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields, replace
 from fnmatch import fnmatchcase
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from brainbench.core.errors import UsageError, shown, unknown_name
+from brainbench.core.files import read_mapping
 from brainbench.core.plugins import load_entry_points
 from brainbench.models.architecture import OBJECTIVES, Architecture, check_new_name
 from brainbench.models.training.checkpoints import PREFIXES, WEIGHTS, find_folder, load_weights, read_config, shipped
@@ -30,6 +32,8 @@ if TYPE_CHECKING:
     from torch import nn
 
 ENTRY_POINTS = "brainbench.models"
+SIZES = Path(__file__).with_name("sizes.json")
+"""Sizes of the models that come with the package, by name."""
 _LOG = logging.getLogger(__name__)
 
 
@@ -223,18 +227,37 @@ def load_model(
 
 def describe_model(name: str) -> ModelDescription:
     """Return a model's record with its size and cost, computed without allocating its weights."""
-    found = locate_model(name)
-    record, model = found.record, found.outline()
+    located = locate_model(name)
+    record, is_ours = located.record, located.record.source == __name__.partition(".")[0]
+    # Sizes of the models that come with the package are shipped: to measure all of them takes half a minute.
+    size = (_shipped_sizes().get(name) if is_ours else None) or measure(located)
+    label = record.name if located.trained is None else name
+    facts = {field.name: getattr(record, field.name) for field in fields(ModelFacts)} | {"name": label}
+    return ModelDescription(**facts, **asdict(size), source=record.source, trained=located.trained)
+
+
+@dataclass(frozen=True)
+class ModelSize:
+    """Size and cost of a network, as :class:`ModelDescription` states them."""
+
+    parameters: int
+    multiply_adds: int | None
+    layers: tuple[str, ...]
+
+
+def measure(located: LocatedModel) -> ModelSize:
+    """Count a network's parameters and multiply-adds."""
+    model = located.outline()
     count: Callable[[], int] | None = getattr(model, "multiply_adds", None)
-    shown = record.name if found.trained is None else name
-    return ModelDescription(
-        **{item.name: getattr(record, item.name) for item in fields(ModelFacts)} | {"name": shown},
-        source=record.source,
-        parameters=sum(parameter.numel() for parameter in model.parameters()),
-        multiply_adds=count() if count is not None else None,
-        layers=tuple(getattr(model, "layers", ())),
-        trained=found.trained,
-    )
+    parameters = sum(parameter.numel() for parameter in model.parameters())
+    return ModelSize(parameters, count() if count is not None else None, tuple(getattr(model, "layers", ())))
+
+
+@functools.cache
+def _shipped_sizes() -> dict[str, ModelSize]:
+    # Written by tests/factories/model_sizes.py and held by tests/models/test_registry.py.
+    stated = read_mapping(SIZES, "file of the sizes of models")
+    return {name: ModelSize(**{**size, "layers": tuple(size["layers"])}) for name, size in stated.items()}
 
 
 def _known() -> dict[str, ModelRecord]:

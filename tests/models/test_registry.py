@@ -11,8 +11,10 @@ from torch.nn.attention import SDPBackend, sdpa_kernel
 from torch.utils.flop_counter import FlopCounterMode
 
 from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError
+from brainbench.core.files import read_mapping
 from brainbench.models import registry
-from brainbench.models.registry import describe_model, list_models, load_model, locate_model, register_model
+from brainbench.models.registry import SIZES, describe_model, list_models, load_model, locate_model, register_model
+from tests.factories.model_sizes import names_with_sizes, plain_size
 
 SMALL = "zhuang-ugrnn-small"
 
@@ -229,3 +231,18 @@ def test_a_builder_that_gives_no_module_is_answered_in_one_sentence(use):
     register_model("no-module", family="theirs")(lambda: {"weights": 3})
     with pytest.raises(UsageError, match=r"'no-module' .*dict"):
         use("no-module")
+
+
+def test_every_model_of_ours_has_a_shipped_size():
+    assert set(read_mapping(SIZES)) == set(names_with_sizes())
+
+
+@pytest.mark.parametrize("name", ["zhuang", "resnet18-small+gpt.simclr", "s4-small+mamba"])
+def test_shipped_sizes_are_those_that_are_measured(name):
+    hint = "write them again: python -m tests.factories.model_sizes"
+    assert read_mapping(SIZES)[name] == plain_size(name), hint
+
+
+@pytest.mark.slow
+def test_all_shipped_sizes_are_those_that_are_measured():
+    assert read_mapping(SIZES) == {name: plain_size(name) for name in names_with_sizes()}
