@@ -50,27 +50,27 @@ def _trained(config: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     """Yield what a folder of weights says of its training, where it says so."""
     parts = [f"trained: {config.get('objective') or 'objective not stated'}"]
     if config.get("epochs"):
-        asked = f" of {config['published_epochs']} published" if config.get("published_epochs") else ""
-        parts.append(f"{config['epochs']}{asked} epochs")
+        published = f" of {config['published_epochs']} published" if config.get("published_epochs") else ""
+        parts.append(f"{config['epochs']}{published} epochs")
     parts += [f"{key} {config[key]}" for key in ("augmentation", "seed") if config.get(key) is not None]
     yield "weights", ", ".join(parts)
-    if found := config.get("evaluation"):
-        yield "accuracy (top-1)", _accuracy(found)
+    if evaluation := config.get("evaluation"):
+        yield "accuracy (top-1)", _accuracy(evaluation)
         others = dict(config.get("baselines") or {}) | {"untrained twin": config.get("twin_evaluation")}
-        told = [f"{key.replace('-', ' ')} {item['top1']:.1%}" for key, item in others.items() if item]
-        if told:
-            yield "same readout of", ", ".join(told)
+        readouts = [f"{key.replace('-', ' ')} {item['top1']:.1%}" for key, item in others.items() if item]
+        if readouts:
+            yield "same readout of", ", ".join(readouts)
     if data := config.get("data"):
         yield "trained on", f"{data.get('train') or 0:,} sweeps of {data.get('classes')} classes ({data.get('hash')})"
     if config.get("licence"):
         yield "licence of weights", str(config["licence"])
 
 
-def _accuracy(found: Mapping[str, Any]) -> str:
-    span = found.get("interval") or {}
+def _accuracy(evaluation: Mapping[str, Any]) -> str:
+    span = evaluation.get("interval") or {}
     bounds = f" [{span['low']:.1%}, {span['high']:.1%}]" if {"low", "high"} <= span.keys() else ""
-    count = f", {found['count']:,} sweeps that were held out" if found.get("count") else ""
-    return f"{found['top1']:.1%}{bounds}{count}{', collapsed to one class' if found.get('collapsed') else ''}"
+    count = f", {evaluation['count']:,} sweeps that were held out" if evaluation.get("count") else ""
+    return f"{evaluation['top1']:.1%}{bounds}{count}{', collapsed to one class' if evaluation.get('collapsed') else ''}"
 
 
 def _tagged(name: str) -> Iterator[str]:

@@ -35,8 +35,12 @@ def list_(pattern: Annotated[str, typer.Argument(help="Shell pattern, e.g. '*-ln
     tags = {name: [str(Architecture.parse(one).tag) for one in list_recipes(f"{name}.*")] for name in names}
     data = [{**to_plain(item), "recipes": tags[item.name]} for item in records]
     rows = [
-        [item.name, "trained" if item.trained else "your code" if item.family == FAMILY else "untrained", *_size(item)]
-        for item in records
+        [
+            record.name,
+            "trained" if record.trained else "your code" if record.family == FAMILY else "untrained",
+            *_size(record),
+        ]
+        for record in records
     ]
     sizes = dict(zip(names, map(_size, records), strict=True))
     for name in list_recipes(pattern):
@@ -52,8 +56,8 @@ def list_(pattern: Annotated[str, typer.Argument(help="Shell pattern, e.g. '*-ln
         "needs training: published, to be trained with brainbench train.\n"
         "MACs/step: multiply-adds per time step."
     )
-    shown = table("", ["model", "weights", "parameters", "MACs/step"], rows, right=(2, 3))
-    return Output(data, f"{shown}\n\n{legend}")
+    lines = table("", ["model", "weights", "parameters", "MACs/step"], rows, right=(2, 3))
+    return Output(data, f"{lines}\n\n{legend}")
 
 
 list_without_command(app, list_)
@@ -65,18 +69,18 @@ def recipes(pattern: Annotated[str, typer.Argument(help="Shell pattern, e.g. '*.
     from brainbench.models.recipes import find_recipe, list_recipes
     from brainbench.models.registry import describe_model
 
-    found = [find_recipe(name) for name in list_recipes(pattern)]
-    sizes = {name: describe_model(name) for name in {item.architecture for item in found}}
+    chosen = [find_recipe(name) for name in list_recipes(pattern)]
+    sizes = {name: describe_model(name) for name in {item.architecture for item in chosen}}
     columns = {
         "recipe": "{0.name}",
-        ">parameters": lambda item: f"{sizes[item.architecture].parameters:,}",
-        ">multiply-adds/step": lambda item: _millions(sizes[item.architecture].multiply_adds),
+        ">parameters": lambda recipe: f"{sizes[recipe.architecture].parameters:,}",
+        ">multiply-adds/step": lambda recipe: _millions(sizes[recipe.architecture].multiply_adds),
         "default setting": "{0.setting}",
         ">batch": "{0.batch_size}",
-        ">settings in the search": lambda item: len(item.search),
+        ">settings in the search": lambda recipe: len(recipe.search),
     }
-    data = [{"name": item.name, **to_plain(item)} for item in found]
-    return Output(data, table_of("", found, columns))
+    data = [{"name": item.name, **to_plain(item)} for item in chosen]
+    return Output(data, table_of("", chosen, columns))
 
 
 @app.command("show")
@@ -96,8 +100,8 @@ def show(
     if twin:
         from brainbench.models.training.twins import draw_twin
 
-        _, told = draw_twin(twin, data["trained"]["options"])
-        data["twin"] = told or f"{twin['name']} with seed {twin['seed']}, drawn here to the last bit"
+        _, difference = draw_twin(twin, data["trained"]["options"])
+        data["twin"] = difference or f"{twin['name']} with seed {twin['seed']}, drawn here to the last bit"
     return Output(data, model_card(name, record, recipe, data.get("twin")))
 
 
@@ -110,9 +114,9 @@ def add(
     from brainbench.models.registry import list_models
     from brainbench.models.user_models import add_user_model, settings_file
 
-    made = add_user_model(target, name, taken=list_models())
-    shown = {"model": made.name, "code": made.target, "kept in": settings_file()}
-    return Output(made, f"{facts(shown)}\n\nscore it: brainbench score {made.name}")
+    model = add_user_model(target, name, names=list_models())
+    rows = {"model": model.name, "code": model.target, "kept in": settings_file()}
+    return Output(model, f"{facts(rows)}\n\nscore it: brainbench score {model.name}")
 
 
 @app.command("remove")
@@ -122,8 +126,8 @@ def remove(
     """Take the name of a model of your own away; its code stays."""
     from brainbench.models.user_models import remove_user_model
 
-    made = remove_user_model(name)
-    return Output(made, f"{made.name} is no longer a name of {made.target}; the code was not touched.")
+    model = remove_user_model(name)
+    return Output(model, f"{model.name} is no longer a name of {model.target}; the code was not touched.")
 
 
 def export(
@@ -140,12 +144,12 @@ def export(
     name = find_folder(model).resolve().name if model.startswith(PREFIXES) else model
     target = out or Path(f"{name}{SUFFIXES.get(format, '')}")
     with progress_bar("exporting the network"):
-        made = export_model(load_model(model, seed=seed), target, format=format, name=model)
+        exported = export_model(load_model(model, seed=seed), target, format=format, name=model)
     text = (
-        f"{model}: {made.features} features, {made.state_size:,} numbers of state; the file agrees with the network "
-        f"to {made.difference:.1e}\n\nfile      {made.path}\ncontract  {made.contract}"
+        f"{model}: {exported.features} features, {exported.state_size:,} numbers of state; the file agrees with the "
+        f"network to {exported.difference:.1e}\n\nfile      {exported.path}\ncontract  {exported.contract}"
     )
-    return Output(made, text)
+    return Output(exported, text)
 
 
 def _size(model: ModelDescription) -> tuple[str, str]:

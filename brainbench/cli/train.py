@@ -59,8 +59,8 @@ def train(
     from brainbench.models.training.trainer import train as run
 
     options = (read_mapping(config) if config is not None else {}) | options
-    if (named := options.pop("model", model)) != model:
-        raise UsageError(f"The configuration is for the model {named!r} and the command names {model!r}.")
+    if (stated := options.pop("model", model)) != model:
+        raise UsageError(f"The configuration is for the model {stated!r} and the command names {model!r}.")
     wanted = options.pop("objective", "supervised")
     chosen = TrainingConfig.published(model, wanted, **options)
     where = out or Path("brainbench-training") / f"{model}.{wanted}"
@@ -71,10 +71,10 @@ def train(
     results: dict[str, TrainingResult] = {}
     with progress_bar() as progress:
         source = SweepFolder(data, progress)
-        for item, folder in runs:
-            told = _named(progress, folder.name) if sweep is not None else progress
+        for training, folder in runs:
+            report = _named(progress, folder.name) if sweep is not None else progress
             results[str(folder)] = run(
-                item, source, out=folder, device=device, stop_after=stop_after, progress=told,
+                training, source, out=folder, device=device, stop_after=stop_after, progress=report,
                 controls=where if sweep is not None else None,
             )  # fmt: skip
     if os.environ.get("RANK", "0") != "0":
@@ -83,13 +83,13 @@ def train(
         "run": "{0[0]}",
         "status": "{0[1].status}",
         ">epochs": "{0[1].epochs}",
-        ">best": lambda item: "–" if item[1].best_epoch is None else item[1].best_epoch,
-        ">top-1": lambda item: _told(item[1], "{0.top1:.3f} [{0.interval.low:.3f}, {0.interval.high:.3f}]"),
-        ">top-5": lambda item: _told(item[1], "{0.top5:.3f}"),
-        ">raw": lambda item: _control(item[1], RAW),
-        ">random": lambda item: _control(item[1], RANDOM),
-        ">twin": lambda item: _control(item[1], TWIN),
-        "collapsed": lambda item: _told(item[1], "{0.reason}") or "no",
+        ">best": lambda row: "–" if row[1].best_epoch is None else row[1].best_epoch,
+        ">top-1": lambda row: _evaluated(row[1], "{0.top1:.3f} [{0.interval.low:.3f}, {0.interval.high:.3f}]"),
+        ">top-5": lambda row: _evaluated(row[1], "{0.top5:.3f}"),
+        ">raw": lambda row: _control(row[1], RAW),
+        ">random": lambda row: _control(row[1], RANDOM),
+        ">twin": lambda row: _control(row[1], TWIN),
+        "collapsed": lambda row: _evaluated(row[1], "{0.reason}") or "no",
     }
     text = table_of("", results.items(), columns)
     text += "".join(f"\n{folder}: {result.reason}" for folder, result in results.items() if result.reason)
@@ -142,5 +142,5 @@ def _control(result: TrainingResult, name: str) -> str:
     return f"{result.controls[name].top1:.3f}" if name in result.controls else "–"
 
 
-def _told(result: TrainingResult, form: str) -> str:
+def _evaluated(result: TrainingResult, form: str) -> str:
     return "–" if result.evaluation is None else form.format(result.evaluation)

@@ -85,10 +85,10 @@ def extract(
         raise UsageError(f"Stimuli are real numbers; received {values.dtype}.")
     like = next((p for p in model.parameters() if p.is_floating_point()), torch.zeros(()))
     if readout != "default":
-        named = reader = partial(find_readout(readout).activations, model, layers=layers)
+        own_reader = reader = partial(find_readout(readout).activations, model, layers=layers)
     else:
-        named = named_reader(model, layers)
-        reader = named or partial(_hooked_run, model, _hooked(model, layers), layers is not None, {})
+        own_reader = named_reader(model, layers)
+        reader = own_reader or partial(_hooked_run, model, _hooked(model, layers), layers is not None, {})
     result = Activations()
     with evaluating(model), torch.no_grad():
 
@@ -111,7 +111,7 @@ def extract(
                 result[name][start:stop] = rows
         # In another batch, after others: what depends on these is no answer to a stimulus. Ours do not.
         first = 3 if values.shape[1] == 2 else 2
-        _check_repeated(result, read(0, min(len(values), first)) if named is None else iter(()), model)
+        _check_repeated(result, read(0, min(len(values), first)) if own_reader is None else iter(()), model)
     if not result:
         raise UsageError(
             f"Nothing in {type(model).__name__} gives an activation per stimulus: no output of it or of its parts has "
@@ -136,14 +136,14 @@ def find_readout(name: str) -> Any:
 def _check_repeated(result: Activations, again: Iterator[tuple[str, np.ndarray]], model: nn.Module) -> None:
     """Raise UsageError if the first stimuli give other activations than before."""
     try:
-        found = dict(again)
+        repeated = dict(again)
     except UsageError:  # a model may be made for batches of one size
         return
-    for name, rows in found.items():
+    for name, rows in repeated.items():
         before = result[name][: len(rows)]
-        known = np.isfinite(before) & np.isfinite(rows)
-        one, two = before[known].astype(np.float64), rows[known].astype(np.float64)
-        if np.linalg.norm(two - one) > _REPEATED * np.linalg.norm(one):
+        finite = np.isfinite(before) & np.isfinite(rows)
+        first, two = before[finite].astype(np.float64), rows[finite].astype(np.float64)
+        if np.linalg.norm(two - first) > _REPEATED * np.linalg.norm(first):
             raise UsageError(
                 f"{type(model).__name__} answers the same stimuli otherwise when it is run again (layer {name!r}): it "
                 "keeps a state between calls, draws random numbers or normalises over the batch. Begin anew in "
@@ -215,11 +215,11 @@ class _LayerError(UsageError):
 
 def named_reader(model: nn.Module, layers: Collection[str] | None) -> Any:
     """Return a function from stimuli to activations if the model names its layers itself."""
-    named, read = getattr(model, "layers", None), getattr(model, "activations", None)
-    if not isinstance(named, tuple) or not all(isinstance(name, str) for name in named) or not callable(read):
+    names, read = getattr(model, "layers", None), getattr(model, "activations", None)
+    if not isinstance(names, tuple) or not all(isinstance(name, str) for name in names) or not callable(read):
         return None
-    check_each("layer", layers or (), named)
-    wanted = named if layers is None else tuple(name for name in named if name in layers)
+    check_each("layer", layers or (), names)
+    wanted = names if layers is None else tuple(name for name in names if name in layers)
     return lambda part: read(part, wanted)
 
 
@@ -243,29 +243,29 @@ def _hooked_run(
     calls = _recorded(model, modules, part)
     batch, steps = part.shape[:2]
     joined = [name for name, outputs in calls.items() for item in outputs[:1] if item.shape[:1] == (batch * steps,)]
-    if min(batch, steps) > 1 and (asked := [name for name in joined if name not in time_first]):
+    if min(batch, steps) > 1 and (undecided := [name for name in joined if name not in time_first]):
         # Both orders have one shape. Stimuli in another order tell which one it is: a layer's rows move with them.
-        moved = _recorded(model, {name: modules[name] for name in asked}, part.roll(1, 0))
-        for name in asked:
-            one, two = calls[name][0].float(), moved[name][0].float()
-            ours = (one.unflatten(0, (batch, steps)).roll(1, 0).flatten(0, 1) - two).abs().nan_to_num().sum()
-            theirs = (one.unflatten(0, (steps, batch)).roll(1, 1).flatten(0, 1) - two).abs().nan_to_num().sum()
+        moved = _recorded(model, {name: modules[name] for name in undecided}, part.roll(1, 0))
+        for name in undecided:
+            before, two = calls[name][0].float(), moved[name][0].float()
+            ours = (before.unflatten(0, (batch, steps)).roll(1, 0).flatten(0, 1) - two).abs().nan_to_num().sum()
+            theirs = (before.unflatten(0, (steps, batch)).roll(1, 1).flatten(0, 1) - two).abs().nan_to_num().sum()
             # Where rows are equal, later stimuli tell.
-            if max(ours, theirs) > 1e-3 * one.abs().nan_to_num().sum():
+            if max(ours, theirs) > 1e-3 * before.abs().nan_to_num().sum():
                 time_first[name] = bool(theirs < ours)
-    found = {}
+    activities = {}
     for name, outputs in calls.items():
         if time_first.get(name):
             outputs = [
-                item.unflatten(0, (steps, batch)).transpose(0, 1) if item.shape[:1] == (batch * steps,) else item
-                for item in outputs
+                value.unflatten(0, (steps, batch)).transpose(0, 1) if value.shape[:1] == (batch * steps,) else value
+                for value in outputs
             ]
         activity = _over_calls(name, outputs, batch, steps)
         if not activity and strict:
             seen = [list(output.shape) for output in outputs] or "nothing"
             raise _LayerError(f"Layer {name!r} gave {seen} for {batch} stimuli of {steps} steps, not one each.")
-        found |= activity
-    return found
+        activities |= activity
+    return activities
 
 
 def _recorded(model: nn.Module, modules: dict[str, nn.Module], part: torch.Tensor) -> dict[str, list[torch.Tensor]]:

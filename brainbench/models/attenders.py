@@ -285,8 +285,8 @@ class MambaAttender(nn.Module):
         sizes = {"expansion": expansion, "states": states, "convolution": convolution}
         given = {"features": features, "blocks": blocks, **sizes}
         if min(given.values()) < 1:
-            told = ", ".join(f"{name} {value}" for name, value in given.items())
-            raise UsageError(f"A Mamba attender needs positive sizes; received {told}.")
+            received = ", ".join(f"{name} {value}" for name, value in given.items())
+            raise UsageError(f"A Mamba attender needs positive sizes; received {received}.")
         self.features = features
         self.blocks: Any = nn.ModuleList(MambaBlock(features, depth=blocks, **sizes) for _ in range(blocks))
         self.norm = nn.LayerNorm(features)

@@ -72,10 +72,10 @@ def _chain(module: Any, part: str, last: str, nodes: list[GraphNode], edges: lis
     inside = dict(module.named_modules())
     names: tuple[str, ...] = module.layers
     for name in names:
-        found = inside.get(name)
-        if found is None and name.startswith("block"):
-            found = inside.get(f"blocks.{int(name.removeprefix('block')) - 1}")
-        count = None if found is None else sum(parameter.numel() for parameter in found.parameters())
+        boxes = inside.get(name)
+        if boxes is None and name.startswith("block"):
+            boxes = inside.get(f"blocks.{int(name.removeprefix('block')) - 1}")
+        count = None if boxes is None else sum(parameter.numel() for parameter in boxes.parameters())
         described = _KINDS.get(kind, {}).get(name) or _BLOCKS.get(kind, "layer")
         width = (int(module.features),) if name == names[-1] else ()
         nodes.append(GraphNode(f"{part}.{name}", part, described, shape=width, parameters=count))

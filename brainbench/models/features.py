@@ -79,16 +79,16 @@ def _layers(group: h5py.Group, rows: int, path: str) -> dict[str, NDArray[np.flo
 
     layers: dict[str, NDArray[np.floating]] = {}
 
-    def visit(name: str, item: object) -> None:
-        if not isinstance(item, h5py.Dataset):
+    def visit(name: str, node: object) -> None:
+        if not isinstance(node, h5py.Dataset):
             return
-        _check_shape(name, item.shape, rows, path)
-        whole = np.issubdtype(item.dtype, np.integer)
-        if not whole and not np.issubdtype(item.dtype, np.floating):
-            raise DataError(f"Layer {name!r} of {path!r} has type {item.dtype}; activations must be real numbers.")
+        _check_shape(name, node.shape, rows, path)
+        whole = np.issubdtype(node.dtype, np.integer)
+        if not whole and not np.issubdtype(node.dtype, np.floating):
+            raise DataError(f"Layer {name!r} of {path!r} has type {node.dtype}; activations must be real numbers.")
         # Single precision where it holds every value of the type.
-        single = np.result_type(item.dtype, np.float32) == np.float32
-        values = item.astype(np.float32 if single else np.float64)[()]
+        single = np.result_type(node.dtype, np.float32) == np.float32
+        values = node.astype(np.float32 if single else np.float64)[()]
         if whole and (np.abs(values) >= 2**53).any():
             raise DataError(
                 f"Layer {shown(name)} of {shown(path)} has whole numbers of 2**53 or more, which floating point "

@@ -156,14 +156,14 @@ class EncoderAttenderDecoder(nn.Module):
         """
         wanted = self.layers if layers is None else tuple(layers)
         check_each("layer", wanted, self.layers)
-        features, found = _named(self.encoder, self._normalise(x), "encoder", wanted, **self._unroll)
+        features, activities = _named(self.encoder, self._normalise(x), "encoder", wanted, **self._unroll)
         if self.attender is not None and any(not name.startswith("encoder.") for name in wanted):
             features, attended = _named(self.attender, features, "attender", wanted)
-            found |= attended
+            activities |= attended
         if "decoder" in wanted:
             answer = self.decoder.every_step if isinstance(self.decoder, AllStepsDecoder) else self.decoder
-            found["decoder"] = answer(features)
-        return {name: found[name] for name in self.layers if name in wanted}
+            activities["decoder"] = answer(features)
+        return {name: activities[name] for name in self.layers if name in wanted}
 
     def multiply_adds(self) -> int:
         """Return the multiply-adds of matrix products and convolutions in the first time step of one stimulus."""
@@ -211,7 +211,8 @@ class EncoderAttenderDecoder(nn.Module):
                 f"The model expects {self._expected('batch', 'time')} ({self.spec.sub_steps} sub-steps × "
                 f"{len(CHANNELS)} channels on the whisker grid, SI units); received {list(x.shape)}."
             )
-        # On CUDA, and inside compiled or training steps, looking would stop the queue; training checks its loss.
+        # On CUDA the check would make the processor wait for all work that is queued on the device, and in a compiled
+        # step it would break the graph. In training a stimulus that is not finite shows in the loss, which is checked.
         quick = x.is_cuda or self.training or torch.compiler.is_compiling() or torch.compiler.is_exporting()
         if not quick and not torch.isfinite(x).all():
             count = int((~torch.isfinite(x)).sum())
@@ -229,5 +230,5 @@ def _named(
     module: Encoder | Attender, x: torch.Tensor, prefix: str, wanted: Collection[str], **options: Any
 ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
     inner = [name.removeprefix(f"{prefix}.") for name in wanted if name.startswith(f"{prefix}.")]
-    features, found = module(x, return_activations=inner, **options) if inner else (module(x, **options), {})
-    return features, {f"{prefix}.{name}": value for name, value in found.items()}
+    features, activities = module(x, return_activations=inner, **options) if inner else (module(x, **options), {})
+    return features, {f"{prefix}.{name}": value for name, value in activities.items()}

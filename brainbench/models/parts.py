@@ -72,15 +72,15 @@ class Attender(Part, Protocol):
 
 
 def run_layers(
-    x: torch.Tensor, layers: Iterable[tuple[str, Callable[..., torch.Tensor]]], asked: bool | Collection[str]
+    x: torch.Tensor, layers: Iterable[tuple[str, Callable[..., torch.Tensor]]], returned: bool | Collection[str]
 ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
     """Pass ``x`` through named layers in turn; return the answer and those of the layers that were asked for."""
-    found: dict[str, torch.Tensor] = {}
+    activities: dict[str, torch.Tensor] = {}
     for name, layer in layers:
         x = layer(x)
-        if asked is True or (asked and name in asked):
-            found[name] = x
-    return x, found
+        if returned is True or (returned and name in returned):
+            activities[name] = x
+    return x, activities
 
 
 def check_sweep(x: torch.Tensor, input_shape: tuple[int, int, int], who: str) -> None:
@@ -89,8 +89,8 @@ def check_sweep(x: torch.Tensor, input_shape: tuple[int, int, int], who: str) ->
         raise UsageError(f"{who} expects [batch, time, {', '.join(map(str, input_shape))}]; received {list(x.shape)}.")
 
 
-def wanted(layers: tuple[str, ...], asked: bool | Collection[str]) -> Collection[str]:
+def wanted(layers: tuple[str, ...], returned: bool | Collection[str]) -> Collection[str]:
     """Return the layers that ``return_activations`` asks for: all, none, or those named."""
-    if isinstance(asked, bool):
-        return layers if asked else ()
-    return asked
+    if isinstance(returned, bool):
+        return layers if returned else ()
+    return returned

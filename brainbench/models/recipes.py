@@ -94,16 +94,16 @@ def recipe_for(architecture: str, objective: str) -> PublishedTraining:
 
     A ``-small`` model is trained like the full one. Other architectures follow the row of their attender.
     """
-    known = _recipes()
+    recipes = _recipes()
     full = Architecture.parse(architecture).full
-    if (name := f"{full}.{objective}") in known:
-        return replace(known[name], architecture=architecture)
-    objectives = tuple(dict.fromkeys(recipe.objective for recipe in known.values()))
+    if (name := f"{full}.{objective}") in recipes:
+        return replace(recipes[name], architecture=architecture)
+    objectives = tuple(dict.fromkeys(recipe.objective for recipe in recipes.values()))
     check_name("objective", objective, objectives)
     relative = f"zhuang{'+' + full.attender if full.attender in ('gpt', 'mamba') else ''}.{objective}"
     if full.layer_norm and not full.attender and objective == "supervised":
         relative = "zhuang-intersection-ln.supervised"
-    return replace(known[relative], architecture=architecture, source=f"as {relative} of {SOURCE}")
+    return replace(recipes[relative], architecture=architecture, source=f"as {relative} of {SOURCE}")
 
 
 @cache

@@ -58,10 +58,10 @@ class ModelRecord(ModelFacts):
     @property
     def source(self) -> str:
         """Top-level package that the code comes from."""
-        made = self.build.func if isinstance(self.build, partial) else self.build
+        function = self.build.func if isinstance(self.build, partial) else self.build
         if self.family == FAMILY:
             return "user"
-        return made.__module__.partition(".")[0]
+        return function.__module__.partition(".")[0]
 
 
 @dataclass(frozen=True)
@@ -191,12 +191,12 @@ def locate_model(name: str, pretrained: str | os.PathLike[str] | None = None) ->
     given = Path(pretrained) if pretrained is not None and Path(pretrained).is_dir() else None
     folder = find_folder(name) if is_path else given or (shipped().get(name) if pretrained is None else None)
     trained = None if folder is None else read_config(folder)
-    asked = trained["architecture"] if is_path and trained else name
-    parts, known = Architecture.parse(asked), _known()
-    if parts.untrained not in known:
+    full_name = trained["architecture"] if is_path and trained else name
+    parts, records = Architecture.parse(full_name), _known()
+    if parts.untrained not in records:
         # A tag stays in the suggestion: the untrained model is another one.
-        choices = known if parts.tag is None else [*shipped(), *(f"{item}.{parts.tag}" for item in known)]
-        raise unknown_name("model", asked, choices, hint="See them all with: brainbench models")
+        choices = records if parts.tag is None else [*shipped(), *(f"{item}.{parts.tag}" for item in records)]
+        raise unknown_name("model", full_name, choices, hint="See them all with: brainbench models")
     if parts.tag is not None and parts.tag not in OBJECTIVES:
         raise unknown_name(f"weights tag of {parts.untrained!r}", parts.tag, OBJECTIVES)
     if parts.tag is None and pretrained is not None:
@@ -206,7 +206,7 @@ def locate_model(name: str, pretrained: str | os.PathLike[str] | None = None) ->
         )
     weights = folder / WEIGHTS if folder is not None else None if pretrained is None else Path(pretrained)
     # A look-up returns a copy: nobody changes the registry by what it gave.
-    return LocatedModel(name, replace(known[parts.untrained]), parts, trained, weights)
+    return LocatedModel(name, replace(records[parts.untrained]), parts, trained, weights)
 
 
 def load_model(
@@ -264,10 +264,12 @@ def _known() -> dict[str, ModelRecord]:
     """Return the registry, with what other packages and the user add entered on first use."""
     if ENTRY_POINTS not in _loaded:
         _loaded.add(ENTRY_POINTS)
-        load_entry_points(ENTRY_POINTS, lambda name, made: None)
-        for own in read_user_models().values():
-            if own.name in _records:
-                _LOG.warning("The model %r of a package hides the one that you added (%s).", own.name, own.target)
+        load_entry_points(ENTRY_POINTS, lambda name, model: None)
+        for added in read_user_models().values():
+            if added.name in _records:
+                _LOG.warning("The model %r of a package hides the one that you added (%s).", added.name, added.target)
                 continue
-            _records[own.name] = ModelRecord(own.name, FAMILY, f"added from {own.target}", "", "unstated", own.build)
+            _records[added.name] = ModelRecord(
+                added.name, FAMILY, f"added from {added.target}", "", "unstated", added.build
+            )
     return _records

@@ -64,12 +64,12 @@ class StreamingStep(nn.Module):
         innermost = h_in.is_cuda and not torch.compiler.is_exporting()
         parts = [_part(part, shape, innermost) for part, shape in zip(h_in.split(sizes, 1), self.shapes, strict=True)]
         count = len(self.encoder.shapes)
-        features, kept = self.encoder(self.model.normaliser(obs), parts[:count])
+        features, memories = self.encoder(self.model.normaliser(obs), parts[:count])
         if self.attender is not None:
             features, after = self.attender(features, parts[count:])
-            kept = [*kept, *after]
-        kept = kept or parts
-        return features, torch.cat([_flat(part, innermost) for part in kept], 1)
+            memories = [*memories, *after]
+        memories = memories or parts
+        return features, torch.cat([_flat(part, innermost) for part in memories], 1)
 
 
 def _part(flat: torch.Tensor, shape: tuple[int, ...], innermost: bool) -> torch.Tensor:
@@ -141,8 +141,8 @@ class _S4Part(nn.Module):
     @torch.no_grad()
     def _discretise(self) -> None:
         self._versions = [weight._version for weight in self._weights]
-        for kept, block in zip(self._kept(), self.part.blocks, strict=True):
-            for old, new in zip(kept, block.memory.system(), strict=True):
+        for retained, block in zip(self._kept(), self.part.blocks, strict=True):
+            for old, new in zip(retained, block.memory.system(), strict=True):
                 old.copy_(new)
 
     def _kept(self) -> list[System]:

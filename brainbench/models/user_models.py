@@ -56,13 +56,13 @@ class UserModel:
                 f"The model {self.name!r} was added from {str(self.path)!r}, which is gone; put the file back, or "
                 f"take the name away with: brainbench models remove {self.name}"
             )
-        made = build_user_model(self.target, **options)
+        model = build_user_model(self.target, **options)
         if self.path is not None and content_hash(*files_of(self.path)) != self.hash:
             _LOG.warning(
                 "%s, or what it imports from its folder, has changed since the model %r was added; it is used as it is "
                 "now.", self.path, self.name,
             )  # fmt: skip
-        return made
+        return model
 
 
 def load_user_model(target: str, *, seed: int = 0) -> nn.Module:
@@ -81,25 +81,25 @@ def build_user_model(target: str, **options: Any) -> nn.Module:
     """Build a model from its code with the random state as it is; see :func:`load_user_model`."""
     from torch import nn
 
-    made = load_object(target, "model")
-    if callable(made) and not isinstance(made, nn.Module):
+    builder = load_object(target, "model")
+    if callable(builder) and not isinstance(builder, nn.Module):
         try:
-            made = made(**options)
+            builder = builder(**options)
         except Exception as error:
             given = f"with {', '.join(options)}" if options else "without arguments"
             raise DataError(
                 f"Building the model {target!r} failed with {type(error).__name__}: {error} (it is called {given})."
             ) from error
-    return check_module(made, target)
+    return check_module(builder, target)
 
 
-def check_module(made: Any, target: str) -> nn.Module:
+def check_module(module: Any, target: str) -> nn.Module:
     """Return what a user's or another package's code made, which must be a module."""
     from torch import nn
 
-    if not isinstance(made, nn.Module):
-        raise UsageError(f"{target!r} gave a {type(made).__name__}, not a torch.nn.Module; return the model itself.")
-    return made
+    if not isinstance(module, nn.Module):
+        raise UsageError(f"{target!r} gave a {type(module).__name__}, not a torch.nn.Module; return the model itself.")
+    return module
 
 
 def settings_file() -> Path:
@@ -118,24 +118,24 @@ def read_user_models() -> dict[str, UserModel]:
     stored = read_json(path) if path.is_file() else {}
     fields = {"target", "hash"}
     if not isinstance(stored, dict) or not all(
-        isinstance(item, dict) and item.keys() == fields and all(isinstance(text, str) for text in item.values())
-        for item in stored.values()
+        isinstance(entry, dict) and entry.keys() == fields and all(isinstance(text, str) for text in entry.values())
+        for entry in stored.values()
     ):
         raise DataError(f"{str(path)!r} is not what brainbench models add writes; remove it and add your models again.")
     return {name: UserModel(name, **item) for name, item in stored.items()}
 
 
-def add_user_model(target: str, name: str, *, taken: Collection[str]) -> UserModel:
+def add_user_model(target: str, name: str, *, names: Collection[str]) -> UserModel:
     """Store a model of the user's own under a name; nothing is stored unless it can be built.
 
-    ``target`` is ``path/to/FILE.py:NAME`` or ``package.module:NAME``; ``taken`` are the names of the registry. Raises
+    ``target`` is ``path/to/FILE.py:NAME`` or ``package.module:NAME``; ``names`` are those of the registry. Raises
     UsageError: the name is taken or breaks the grammar, or the target gives no module; DataFileNotFoundError: there is
     no such file or module; DataError: the code fails, or the settings cannot be written.
     """
     check_new_name(name)
-    known = read_user_models()
-    if name in known or name in taken:
-        hint = f"; or first: brainbench models remove {name}" if name in known else ""
+    models = read_user_models()
+    if name in models or name in names:
+        hint = f"; or first: brainbench models remove {name}" if name in models else ""
         raise UsageError(f"There is already a model named {name!r}; choose another name{hint}.")
     place, _, part = target.rpartition(":")
     if place.endswith(".py"):
@@ -143,18 +143,18 @@ def add_user_model(target: str, name: str, *, taken: Collection[str]) -> UserMod
         target = f"{place}:{part}"
     check_folder(settings_file().parent, CONFIG_VARIABLE)
     load_user_model(target)
-    made = UserModel(name, target, content_hash(*files_of(Path(place))) if place.endswith(".py") else "")
-    _write({**known, name: made})
-    return made
+    model = UserModel(name, target, content_hash(*files_of(Path(place))) if place.endswith(".py") else "")
+    _write({**models, name: model})
+    return model
 
 
 def remove_user_model(name: str) -> UserModel:
     """Take a stored name away and return what it stood for; the file with the code stays."""
-    known = read_user_models()
-    check_name("model of your own", name, known)
-    made = known.pop(name)
-    _write(known)
-    return made
+    models = read_user_models()
+    check_name("model of your own", name, models)
+    model = models.pop(name)
+    _write(models)
+    return model
 
 
 def _write(models: dict[str, UserModel]) -> None:

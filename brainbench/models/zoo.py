@@ -30,22 +30,26 @@ CITATIONS = {
 """Papers that the parts come from."""
 
 
-def description(item: Architecture) -> str:
+def description(architecture: Architecture) -> str:
     """Return one line for people."""
-    if item.encoder == "resnet18":
+    if architecture.encoder == "resnet18":
         text = "Residual network of every step alone"
-    elif item.encoder == "s4":
+    elif architecture.encoder == "s4":
         text = "Structured state-space encoder"
-    elif item.cell == "feedforward":
+    elif architecture.cell == "feedforward":
         text = "Convolutional encoder without memory or feedback"
     else:
-        text = f"Recurrent convolutional encoder, {GATED[item.cell] if item.cell else 'time-decay memory'}"
-    words = {None: "", "gpt": ", GPT attender", "mamba": ", Mamba attender"}[item.attender]
-    return f"{text}{', LayerNorm' if item.layer_norm else ''}{words}{', 3/16 width' if item.small else ''}"
+        text = (
+            f"Recurrent convolutional encoder, {GATED[architecture.cell] if architecture.cell else 'time-decay memory'}"
+        )
+    words = {None: "", "gpt": ", GPT attender", "mamba": ", Mamba attender"}[architecture.attender]
+    return (
+        f"{text}{', LayerNorm' if architecture.layer_norm else ''}{words}{', 3/16 width' if architecture.small else ''}"
+    )
 
 
 def build(
-    item: Architecture, *, classes: int = 117, decoder: str = "linear", unroll: Unroll = "biological"
+    architecture: Architecture, *, classes: int = 117, decoder: str = "linear", unroll: Unroll = "biological"
 ) -> EncoderAttenderDecoder:
     """Build the network with new random weights.
 
@@ -55,8 +59,8 @@ def build(
     from brainbench.models.network import EncoderAttenderDecoder
     from brainbench.models.ops.layers import draw_silent_biases
 
-    encoder = _encoder(item)
-    attender = _attender(item, encoder.features)
+    encoder = _encoder(architecture)
+    attender = _attender(architecture, encoder.features)
     # Before the decoder, so that features do not depend on the number of classes; here, so that the model by name is
     # the network that training starts from.
     for part in (encoder, attender):
@@ -66,30 +70,30 @@ def build(
     return EncoderAttenderDecoder(encoder, attender, make_decoder(decoder, features, classes), unroll=unroll)
 
 
-def _encoder(item: Architecture) -> Encoder:
-    if item.encoder == "resnet18":
+def _encoder(architecture: Architecture) -> Encoder:
+    if architecture.encoder == "resnet18":
         from brainbench.models.encoders import ResNet18Encoder
 
-        return ResNet18Encoder(small=item.small)
-    if item.encoder == "s4":
+        return ResNet18Encoder(small=architecture.small)
+    if architecture.encoder == "s4":
         from brainbench.models.encoders import S4Encoder
 
-        return S4Encoder(small=item.small)
+        return S4Encoder(small=architecture.small)
     from brainbench.models.encoders import zhuang_graph
     from brainbench.models.graph.temporal_graph import TemporalGraph
 
-    if item.cell == "feedforward":
-        return TemporalGraph(zhuang_graph(small=item.small, feedforward=True))
-    return TemporalGraph(zhuang_graph(item.cell or "time-decay", item.layer_norm, item.small))
+    if architecture.cell == "feedforward":
+        return TemporalGraph(zhuang_graph(small=architecture.small, feedforward=True))
+    return TemporalGraph(zhuang_graph(architecture.cell or "time-decay", architecture.layer_norm, architecture.small))
 
 
-def _attender(item: Architecture, features: int) -> Attender | None:
-    if item.attender == "gpt":
+def _attender(architecture: Architecture, features: int) -> Attender | None:
+    if architecture.attender == "gpt":
         from brainbench.models.attenders import GPTAttender
 
         # As published, the ResNet's transformer is half as wide as its features.
-        return GPTAttender(features, features // 2 if item.encoder == "resnet18" else features)
-    if item.attender == "mamba":
+        return GPTAttender(features, features // 2 if architecture.encoder == "resnet18" else features)
+    if architecture.attender == "mamba":
         from brainbench.models.attenders import MambaAttender
 
         return MambaAttender(features)
@@ -110,10 +114,10 @@ def architectures() -> Iterator[Architecture]:
 
 def register() -> None:
     """Enter every architecture into the registry."""
-    for item in architectures():
-        papers = "; ".join(CITATIONS[part] for part in (item.encoder, item.attender) if part)
+    for architecture in architectures():
+        papers = "; ".join(CITATIONS[part] for part in (architecture.encoder, architecture.attender) if part)
         # Encoder and attender, for grouping on leaderboards.
-        family = f"{item.encoder}-feedforward" if item.cell == "feedforward" else item.encoder
-        family += f"+{item.attender}" if item.attender else ""
-        text = {"family": family, "description": description(item), "citation": papers}
-        register_model(str(item), licence="MIT", **text)(partial(build, item))
+        family = f"{architecture.encoder}-feedforward" if architecture.cell == "feedforward" else architecture.encoder
+        family += f"+{architecture.attender}" if architecture.attender else ""
+        text = {"family": family, "description": description(architecture), "citation": papers}
+        register_model(str(architecture), licence="MIT", **text)(partial(build, architecture))

@@ -54,8 +54,8 @@ def read_weights(path: str | os.PathLike[str]) -> ForeignWeights:
     read = read_tensors if path.suffix == ".safetensors" else read_checkpoint
     content: Mapping[str, Any] = read(path, kind)
     state: Any = content.get("state_dict", content)
-    named = isinstance(state, Mapping) and all(isinstance(name, str) for name in state)
-    if not named or not state or not all(isinstance(value, torch.Tensor) for value in state.values()):
+    has_names = isinstance(state, Mapping) and all(isinstance(name, str) for name in state)
+    if not has_names or not state or not all(isinstance(value, torch.Tensor) for value in state.values()):
         raise DataError(
             f"{shown(os.fspath(path))} holds no weights: expected tensors by name, or such a mapping as 'state_dict'; "
             f"found {listing(map(str, content)) if content else 'nothing'}."
@@ -79,8 +79,8 @@ def read_settings(path: str | os.PathLike[str]) -> Settings:
     if graph := _inner(values, "model", "encoder", "model_config_file"):
         words = Path(str(graph)).stem.removeprefix("rnn_fdb_converted_modern").strip("_").split("_")
         # A name of another pattern says nothing; the weights tell the cell, or the user is asked.
-        if known := _CELLS.get(words[0]):
-            cell = known + ("-ln" if "ln" in words else "")
+        if cell_name := _CELLS.get(words[0]):
+            cell = cell_name + ("-ln" if "ln" in words else "")
     if cell is None and objective is None:
         raise DataError(
             f"{shown(os.fspath(path))} says nothing of a network: expected 'model.encoder.model_config_file', "
@@ -129,17 +129,17 @@ def recognise(
     """Recognise a network; ``architecture`` (a registry name without a tag) and settings decide where names do not."""
     settings = settings or Settings()
     name = architecture or f"{_encoder(state, settings)}{_attender(state)}"
-    found = Architecture.parse(name).untrained
+    untrained = Architecture.parse(name).untrained
     layers = sorted(name for name in state if name.startswith("model.decoder.mlp.") and name.endswith(".weight"))
     decoder, classes = None, CLASSES
     if layers:
         classes, wide = state[layers[-1]].shape[0], state[layers[0]].shape[-1]
-        features = 256 if Architecture.parse(found).attender == "gpt" and found.startswith("resnet18") else 512
+        features = 256 if Architecture.parse(untrained).attender == "gpt" and untrained.startswith("resnet18") else 512
         decoder = "linear" if len(layers) == 1 else "mlp" if wide == features else "all-steps"
     head = next((objective for begin, objective in _HEADS.items() if _any(state, begin)), None)
     # Only supervised networks were read by a perceptron; a linear layer may be the probe of another objective.
     alone = "supervised" if decoder in ("mlp", "all-steps") else None
-    return Recognised(found, decoder, classes, head or settings.objective or alone)
+    return Recognised(untrained, decoder, classes, head or settings.objective or alone)
 
 
 def _encoder(state: Mapping[str, torch.Tensor], settings: Settings) -> str:

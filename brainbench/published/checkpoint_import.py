@@ -89,13 +89,13 @@ def published_names(model: EncoderAttenderDecoder) -> dict[str, str]:
     """Return the name in a Lightning file of every entry of a network's state, the normaliser's aside."""
     graph = model.encoder.tnn_parameters() if isinstance(model.encoder, TemporalGraph) else {}
     nodes = {id(value): f"TG.{name}" for name, value in graph.items()}
-    found = {}
+    names = {}
     for part, module in model.named_children():
         entries = module.state_dict(keep_vars=True) if part != "normaliser" else {}
         for name, value in entries.items():
             theirs = nodes[id(value)] if nodes and part == "encoder" else _renamed(module, name)
-            found[f"{part}.{name}"] = f"model.{part}.{theirs}"
-    return found
+            names[f"{part}.{name}"] = f"model.{part}.{theirs}"
+    return names
 
 
 def _renamed(module: torch.nn.Module, name: str) -> str:
@@ -159,29 +159,38 @@ def import_checkpoint(
     """
     settings = None if config is None else read_settings(config)
     weights = read_weights(path)
-    found = recognise(weights.state, settings, architecture)
-    model, used = build_published(weights.state, found)
+    recognised = recognise(weights.state, settings, architecture)
+    model, used = build_published(weights.state, recognised)
     left: dict[str, list[str]] = {}
     for name in _others(weights.state, used):
         part = "self-supervised head" if name.startswith("loss.") else "attention masks and kernel lengths"
         left.setdefault(part, []).append(name)
     facts = {
-        "objective": found.objective,
+        "objective": recognised.objective,
         "origin": {"file": weights.path.name, "sha256": weights.sha256, "epoch": weights.epoch, "step": weights.step},
         "not_imported": left,
-        "decoder_in_file": found.decoder is not None,
+        "decoder_in_file": recognised.decoder is not None,
         "twin": None,
         "provenance": provenance(),
     }
-    folder = Path(out) if out is not None else Path(f"{found.architecture}-{weights.sha256[:8]}")
-    options = {"classes": found.classes, "decoder": found.decoder or "linear"}
+    folder = Path(out) if out is not None else Path(f"{recognised.architecture}-{weights.sha256[:8]}")
+    options = {"classes": recognised.classes, "decoder": recognised.decoder or "linear"}
     counts = {part: len(names) for part, names in left.items()}
-    card = _card(weights, found, counts)
-    save_checkpoint(folder, model, architecture=found.architecture, options=options, info=facts, card=card)
-    in_file = [value for name, value in model.named_parameters() if found.decoder or not name.startswith("decoder.")]
+    card = _card(weights, recognised, counts)
+    save_checkpoint(folder, model, architecture=recognised.architecture, options=options, info=facts, card=card)
+    in_file = [
+        value for name, value in model.named_parameters() if recognised.decoder or not name.startswith("decoder.")
+    ]
     parameters = sum(value.numel() for value in in_file)
-    told = (found.architecture, found.decoder, found.objective, parameters, counts, weights.sha256)
-    return ImportedModel(folder, f"local-dir:{folder}", *told)
+    facts_of_file = (
+        recognised.architecture,
+        recognised.decoder,
+        recognised.objective,
+        parameters,
+        counts,
+        weights.sha256,
+    )
+    return ImportedModel(folder, f"local-dir:{folder}", *facts_of_file)
 
 
 def import_to_cache(path: Path, config: Path | None = None) -> Path:
@@ -197,13 +206,15 @@ def import_to_cache(path: Path, config: Path | None = None) -> Path:
     return folder
 
 
-def build_published(state: Mapping[str, torch.Tensor], found: Recognised) -> tuple[EncoderAttenderDecoder, set[str]]:
+def build_published(
+    state: Mapping[str, torch.Tensor], recognised: Recognised
+) -> tuple[EncoderAttenderDecoder, set[str]]:
     """Build a recognised network with its weights; return it with the names of the entries that it took."""
-    name = found.architecture
-    model = load_model(name, classes=found.classes, decoder=found.decoder or "linear")
+    name = recognised.architecture
+    model = load_model(name, classes=recognised.classes, decoder=recognised.decoder or "linear")
     if not isinstance(model, EncoderAttenderDecoder):
         raise DataError(f"{name!r} is no architecture of the study, so published weights cannot be read into it.")
-    targets = matched_entries(state, model, found)
+    targets = matched_entries(state, model, recognised)
     copy_named(targets, {key: state[key].reshape(target.shape) for key, target in targets.items()})
     for index, block in enumerate(model.encoder.blocks if isinstance(model.encoder, S4Encoder) else ()):
         _adapt_s4(block.memory, int(state.get(f"model.encoder.s4_layers.{index}.layer.kernel.l_kernel", 0)))
@@ -212,18 +223,18 @@ def build_published(state: Mapping[str, torch.Tensor], found: Recognised) -> tup
 
 
 def matched_entries(
-    state: Mapping[str, torch.Tensor], model: EncoderAttenderDecoder, found: Recognised
+    state: Mapping[str, torch.Tensor], model: EncoderAttenderDecoder, recognised: Recognised
 ) -> dict[str, torch.Tensor]:
     """Return the entries of a file that are a network's weights, each with its place in ours."""
     places, names = model.state_dict(), published_names(model)
-    if found.decoder is None:
+    if recognised.decoder is None:
         names = {ours: theirs for ours, theirs in names.items() if not ours.startswith("decoder.")}
     targets = {theirs: places[ours] for ours, theirs in names.items()}
     # Axes of length one are the authors' layout; all else must agree.
     shapes = {theirs: _squeezed(target) for theirs, target in targets.items()}
     others = _others(state, targets)
     given = {key: value.reshape(_squeezed(value)) for key, value in state.items() if key not in others}
-    check_named(shapes, given, what=f"the architecture {found.architecture!r}")
+    check_named(shapes, given, what=f"the architecture {recognised.architecture!r}")
     return targets
 
 
@@ -245,17 +256,17 @@ def _squeezed(value: torch.Tensor) -> tuple[int, ...]:
     return tuple(size for size in value.shape if size != 1)
 
 
-def _card(weights: ForeignWeights, found: Recognised, left: Mapping[str, int]) -> str:
+def _card(weights: ForeignWeights, recognised: Recognised, left: Mapping[str, int]) -> str:
     rows = {
-        "architecture": found.architecture,
-        "objective": found.objective or "not told by the file",
+        "architecture": recognised.architecture,
+        "objective": recognised.objective or "not told by the file",
         "origin": f"{weights.path.name}, SHA-256 {weights.sha256}",
         "trained for": f"{weights.epoch} epochs, {weights.step} steps (as the file says)" if weights.epoch else None,
         "input": "sweeps [B, T, 30, 5, 7] in N and N·m; the network itself sees mN and µN·m, as published",
-        "decoder": found.decoder or "not in the file: a linear one with weights drawn from seed 0",
+        "decoder": recognised.decoder or "not in the file: a linear one with weights drawn from seed 0",
         "not imported": "; ".join(f"{part}: {count} entries" for part, count in left.items()) or "nothing",
         "untrained twin": "unknown",
         "licence": "that of the file's authors",
     }
     table = "".join(f"| {name} | {told} |\n" for name, told in rows.items() if told)
-    return f"# {found.architecture}\n\nPublished weights, imported by brainbench.\n\n| | |\n|---|---|\n{table}"
+    return f"# {recognised.architecture}\n\nPublished weights, imported by brainbench.\n\n| | |\n|---|---|\n{table}"

@@ -54,7 +54,7 @@ def published_activations(model: nn.Module, x: torch.Tensor, layers: Collection[
     names = published_layers(model)
     check_each("published layer", layers or (), names)
     assert isinstance(model, EncoderAttenderDecoder)
-    features, found = _encode(model, model.normaliser(x), names)
+    features, activities = _encode(model, model.normaliser(x), names)
     attended, stream = _through(features, _attender_layers(model.attender))
     if isinstance(model.attender, MambaAttender):
         # What a block adds to the stream, without the stream itself.
@@ -65,8 +65,8 @@ def published_activations(model: nn.Module, x: torch.Tensor, layers: Collection[
         stream = stream[:, 1::2]
     stream = stream if isinstance(model.decoder, AllStepsDecoder) else stream[:, -1]
     read, _ = _through(stream, _decoder_layers(model.decoder))
-    found |= attended | {name: value[:, None] for name, value in read.items()}
-    return {name: found[name].flatten(2) for name in names if layers is None or name in layers}
+    activities |= attended | {name: value[:, None] for name, value in read.items()}
+    return {name: activities[name].flatten(2) for name in names if layers is None or name in layers}
 
 
 def _encode(model: EncoderAttenderDecoder, x: torch.Tensor, names: Iterable[str]) -> tuple[torch.Tensor, Named]:
@@ -75,15 +75,15 @@ def _encode(model: EncoderAttenderDecoder, x: torch.Tensor, names: Iterable[str]
         maps, y = _through(x.flatten(0, 1), _resnet_layers(encoder))
         return y.unflatten(0, x.shape[:2]), {name: value.unflatten(0, x.shape[:2]) for name, value in maps.items()}
     if isinstance(encoder, TemporalGraph):
-        y, found = encoder(x, unroll=model.unroll, return_activations=True)
-        for name, value in found.items():
+        y, activities = encoder(x, unroll=model.unroll, return_activations=True)
+        for name, value in activities.items():
             # A node is read from the step that the first number in its name sets, if the sweep is that long.
             if number := re.search(r"\d+", name):
-                found[name] = value[:, min(max(int(number[0]) - 1, 0), value.shape[1] - 1) :]
-        return y, found
+                activities[name] = value[:, min(max(int(number[0]) - 1, 0), value.shape[1] - 1) :]
+        return y, activities
     y, activations = encoder(x, return_activations=True)
-    found = dict(zip(names, activations.values(), strict=False))
-    return y, {name: value.transpose(1, 2) if "_l" in name else value for name, value in found.items()}
+    activities = dict(zip(names, activations.values(), strict=False))
+    return y, {name: value.transpose(1, 2) if "_l" in name else value for name, value in activities.items()}
 
 
 def _attender_layers(attender: Attender | None) -> Layers:
@@ -121,10 +121,10 @@ def _decoder_layers(decoder: nn.Module) -> Layers:
 
 
 def _through(x: torch.Tensor, layers: Layers) -> tuple[Named, torch.Tensor]:
-    found: Named = {}
+    activities: Named = {}
     for name, layer in layers:
-        x = found[name] = layer(x)
-    return found, x
+        x = activities[name] = layer(x)
+    return activities, x
 
 
 @dataclass(frozen=True)

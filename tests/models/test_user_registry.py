@@ -23,7 +23,7 @@ def _settings(tmp_path, monkeypatch):
 def still(tmp_path):
     path = tmp_path / "still.py"
     path.write_text(CODE)
-    add_user_model(f"{path}:make", "still", taken=[])
+    add_user_model(f"{path}:make", "still", names=[])
     return path
 
 
@@ -50,7 +50,7 @@ def test_a_change_of_what_the_file_imports_beside_it_is_told(tmp_path, caplog):
     (tmp_path / "unrelated.py").write_text("WIDTH = 2\n")
     path = tmp_path / "wide.py"
     path.write_text("from sizes_of_mine import WIDTH\n" + CODE.replace("2", "WIDTH"))
-    add_user_model(f"{path}:make", "wide", taken=[])
+    add_user_model(f"{path}:make", "wide", names=[])
     (tmp_path / "unrelated.py").write_text("WIDTH = 5\n")
     with caplog.at_level(logging.WARNING):
         load_model("wide")
@@ -65,14 +65,14 @@ def test_nothing_is_stored_of_code_that_gives_no_module(tmp_path):
     path = tmp_path / "wrong.py"
     path.write_text("def make():\n    return 3\n")
     with pytest.raises(UsageError, match="int"):
-        add_user_model(f"{path}:make", "wrong", taken=[])
+        add_user_model(f"{path}:make", "wrong", names=[])
     assert read_user_models() == {}
 
 
 def test_names_are_taken_once_and_follow_the_grammar(still):
     for name, taken in (("still", []), ("zhuang", ["zhuang"]), ("Still life", [])):
         with pytest.raises(UsageError, match=name):
-            add_user_model(f"{still}:make", name, taken=taken)
+            add_user_model(f"{still}:make", name, names=taken)
     with pytest.raises(UsageError, match="'still'"):
         remove_user_model("stil")
     remove_user_model("still")

@@ -79,10 +79,10 @@ def check_same(folder: Path, stated: object, identity: Mapping[str, Any], what: 
         raise UsageError(f"{str(folder)!r} holds another {what}: {changes}. Choose another folder, or delete this one.")
 
 
-def begin_run(folder: Path, config: Mapping[str, Any], what: str, *, made: str) -> None:
+def begin_run(folder: Path, config: Mapping[str, Any], what: str, *, results: str) -> None:
     """Note in an existing folder what is begun there, or check that it is what was begun.
 
-    A first try that made none of the files ``made`` (a pattern) does not stand in the way: its note is replaced.
+    A first try that made none of its ``results`` (a pattern of files) does not stand in the way: its note is replaced.
     """
     path, config = folder / CONFIG, to_plain(config)
     if not path.exists():
@@ -90,7 +90,7 @@ def begin_run(folder: Path, config: Mapping[str, Any], what: str, *, made: str) 
             raise UsageError(
                 f"{str(folder)!r} is not empty and holds no {what} (it has {strange[0]!r}); choose a new folder."
             )
-    elif any(folder.glob(made)):
+    elif any(folder.glob(results)):
         check_same(folder, read_mapping(path), config, what)
         return
     write_json(path, config)

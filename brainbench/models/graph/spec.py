@@ -24,8 +24,8 @@ MEMORIES = ("time-decay", "ugrnn", "intersection", "gru", "lstm")
 def _check_pair(what: str, pair: Any, *, least: int = 1) -> None:
     if not isinstance(pair, (tuple, list)) or len(pair) != 2:
         raise UsageError(f"The {what} must be two whole numbers (rows, columns); received {shown(pair)}.")
-    for item in pair:
-        check_number(f"The {what}", item, least=least, whole=True)
+    for size in pair:
+        check_number(f"The {what}", size, least=least, whole=True)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -262,8 +262,8 @@ class TemporalGraph(nn.Module):
             (True for every node, or names) also ``{node: [B, T, ...]}``.
         """
         check_name("unrolling", unroll, UNROLLS)
-        asked = set(wanted(self.layers, return_activations))
-        check_each("node", asked, self.layers)
+        returned = set(wanted(self.layers, return_activations))
+        check_each("node", returned, self.layers)
         if x.ndim != 5 or x.shape[1] < 1:
             raise UsageError(f"A graph takes [batch, time, channels, rows, columns]; received {list(x.shape)}.")
         self._accept(tuple(x.shape[2:]))
@@ -271,17 +271,17 @@ class TemporalGraph(nn.Module):
             # Tensor cores and norms over channels both want channels innermost.
             x = x.flatten(0, 1).to(memory_format=torch.channels_last).unflatten(0, x.shape[:2])
         output = self.spec.output
-        whole, final = (asked, {output}) if last else (asked | {output}, set())
+        whole, final = (returned, {output}) if last else (returned | {output}, set())
         if self.training and any(isinstance(m, (nn.BatchNorm1d, nn.BatchNorm2d)) for m in self.modules()):
-            kept = self._stepwise(x, unroll, whole | final)
+            outputs = self._stepwise(x, unroll, whole | final)
         else:
             steps = needed_steps(self.spec, unroll, x.shape[1], whole=whole, last=final)
-            kept = UnrolledSweep(self, x, unroll, steps).run(whole | final)
-        y = kept[output][1]
+            outputs = UnrolledSweep(self, x, unroll, steps).run(whole | final)
+        y = outputs[output][1]
         y = y[:, -1] if last else y
         if return_activations is False:
             return y
-        return y, {name: kept[name][1] for name in self.layers if name in asked}
+        return y, {name: outputs[name][1] for name in self.layers if name in returned}
 
     def _stepwise(self, x: torch.Tensor, unroll: Unroll, names: set[str]) -> dict[str, tuple[int, torch.Tensor]]:
         """Compute every step of every node in turn: each batch norm then sees one step of all stimuli, as published."""
@@ -304,9 +304,9 @@ class TemporalGraph(nn.Module):
 def _tnn_operation(owner: str, operation: nn.Module, after: nn.Module) -> dict[str, torch.Tensor]:
     """Return the entries of an operation and of the batch norm after it under PyTorchTNN's names."""
     kind = "lin" if isinstance(operation, Linear) else "conv"
-    found: dict[str, torch.Tensor] = {f"{owner}.{kind}.{key}": value for key, value in operation.named_parameters()}
+    entries: dict[str, torch.Tensor] = {f"{owner}.{kind}.{key}": value for key, value in operation.named_parameters()}
     norm = after[0].state_dict(keep_vars=True) if isinstance(after, nn.Sequential) else {}
-    return found | {f"{owner}.bn.{key}": value for key, value in norm.items()}
+    return entries | {f"{owner}.bn.{key}": value for key, value in norm.items()}
 
 
 def needed_steps(

@@ -115,8 +115,8 @@ def _graph(source: Mapping[str, Any]) -> GraphSpec:
     config = _Section(source, "the top level")
     nodes = tuple(_node(item) for item in config.take("nodes"))
     ends = []
-    for item in config.take("edges"):
-        edge = _Section(item, "an edge")
+    for entry in config.take("edges"):
+        edge = _Section(entry, "an edge")
         ends.append((str(edge.take("from")), str(edge.take("to"))))
         edge.done()
     inputs, output = tuple(config.take("input_nodes")), config.take("output_node")
@@ -143,8 +143,8 @@ def _graph(source: Mapping[str, Any]) -> GraphSpec:
     return GraphSpec(nodes, edges, inputs, output, (*shape,))
 
 
-def _node(item: Any) -> Node:
-    node = _Section(item, "a node")
+def _node(entry: Any) -> Node:
+    node = _Section(entry, "a node")
     name = str(node.take("name"))
     node.where = f"node {name!r}"
     node.only(residual=(None, False))
@@ -159,9 +159,9 @@ def _node(item: Any) -> Node:
     source, resize = node.take("shape_from", None), policy == "ResizeConcat"
     built = Node(name, operation, memory, activation, pool, chain, source, resize)
     node.done()
-    made = {Convolution: "channels", Dense: "features"}.get(type(operation))
-    if made is not None and getattr(operation, made) != channels:
-        raise DataError(f"Node {name!r} has out_channels {channels}, its pre-memory {getattr(operation, made)}.")
+    field = {Convolution: "channels", Dense: "features"}.get(type(operation))
+    if field is not None and getattr(operation, field) != channels:
+        raise DataError(f"Node {name!r} has out_channels {channels}, its pre-memory {getattr(operation, field)}.")
     return built
 
 
@@ -234,19 +234,19 @@ def _after(part: _Section) -> tuple[str | None, Pool | None, tuple[str | Pool | 
         return (*_layer(part), ())
     part.take("name")
     chain: list[str | Pool | Operation] = []
-    for index, item in enumerate(part.take("list_of_func_kwargs")):
-        step = _Section(item, f"step {index} of {part.where}")
-        found = [_operation(step)] if step.data.get("name") in ("Conv2dCell", "FullyConnected") else _layer(step)
+    for index, entry in enumerate(part.take("list_of_func_kwargs")):
+        step = _Section(entry, f"step {index} of {part.where}")
+        parts = [_operation(step)] if step.data.get("name") in ("Conv2dCell", "FullyConnected") else _layer(step)
         # Every step keeps its place, from which the names of its parameters are made.
-        chain.append(next((value for value in found if value is not None), "identity"))
+        chain.append(next((value for value in parts if value is not None), "identity"))
     part.done(*_OVERWRITTEN, "out_channels")
     return None, None, tuple(chain)
 
 
 def _layer(part: _Section) -> tuple[str | None, Pool | None]:
     kind = part.take("name")
-    known = ("ActivationLayer", "MaxPool", "AdaptiveAvgPool", "Identity", "Sequential")
-    check_name(f"module in {part.where}", kind, known)
+    kinds = ("ActivationLayer", "MaxPool", "AdaptiveAvgPool", "Identity", "Sequential")
+    check_name(f"module in {part.where}", kind, kinds)
     activation, pool = None, None
     if kind == "ActivationLayer":
         activation = part.take("activation", "ReLU")

@@ -199,6 +199,6 @@ class _Convolution(torch.autograd.Function):
             return None, None, *(None for _ in ctx.inputs)
         back = deferred.geometry.reversed()
         # Taken back by the same kernels: windows of the gradient times the turned weights.
-        taken = _maps(unfolded([gradient], back) @ deferred.back, back)
-        parts = taken.split([channels for channels, _ in ctx.inputs], 1)
+        gradients = _maps(unfolded([gradient], back) @ deferred.back, back)
+        parts = gradients.split([channels for channels, _ in ctx.inputs], 1)
         return None, None, *(part.to(kind) for part, (_, kind) in zip(parts, ctx.inputs, strict=True))

@@ -95,8 +95,8 @@ def draw_silent_biases(part: nn.Module) -> None:
 
 def _onednn_orders(dtype: torch.dtype) -> bool:
     """Return whether oneDNN orders matrices of this type here: private operations, half precision not everywhere."""
-    known = hasattr(torch.ops.mkldnn, "_reorder_linear_weight")
-    return known and (dtype != torch.bfloat16 or torch.ops.mkldnn._is_mkldnn_bf16_supported())
+    available = hasattr(torch.ops.mkldnn, "_reorder_linear_weight")
+    return available and (dtype != torch.bfloat16 or torch.ops.mkldnn._is_mkldnn_bf16_supported())
 
 
 class PackedMatrix:

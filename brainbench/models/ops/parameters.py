@@ -47,8 +47,8 @@ def check_named(shapes: Mapping[str, tuple[int, ...]], state: Mapping[str, Any],
         if name in state and tuple(state[name].shape) != shape
     ]
     if wrong:
-        shown = "; ".join(wrong[:4]) + (f"; and {len(wrong) - 4} more" if len(wrong) > 4 else "")
-        problems.append(f"shapes that do not fit: {shown}")
+        described = "; ".join(wrong[:4]) + (f"; and {len(wrong) - 4} more" if len(wrong) > 4 else "")
+        problems.append(f"shapes that do not fit: {described}")
     if problems:
         raise DataError(f"The parameters do not fit {what}: {'; '.join(problems)}.")
 

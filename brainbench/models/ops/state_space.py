@@ -158,8 +158,8 @@ class StateSpace(nn.Module):
         poles, low_rank, _, _, step = self._double()
         column = torch.cat((low_rank, low_rank.conj()), 1)
         a = torch.diag_embed(torch.cat((poles, poles.conj()), 1)) - column[:, :, None] * column[:, None].conj()
-        half, one = step[:, None, None] / 2 * a, torch.eye(column.shape[1], dtype=a.dtype, device=a.device)
-        return torch.linalg.solve(one - half, one + half)
+        half, identity = step[:, None, None] / 2 * a, torch.eye(column.shape[1], dtype=a.dtype, device=a.device)
+        return torch.linalg.solve(identity - half, identity + half)
 
     def init_state(self, batch: int) -> tuple[torch.Tensor, System]:
         """Return the empty memory [batch, H, N, 2] and the discretised system."""
@@ -237,6 +237,6 @@ def _legs(pairs: int) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
     skew = matrix + np.outer(low_rank, low_rank) + 0.5 * np.eye(2 * pairs)
     # −i times a real skew-symmetric matrix is Hermitian: real frequencies in pairs ±ω and a unitary basis.
     frequencies, basis = np.linalg.eigh(-1j * skew)
-    kept = frequencies > 0
-    into = basis.conj().T[kept]
-    return -0.5 + 1j * frequencies[kept], into @ low_rank, into @ scale
+    retained = frequencies > 0
+    into = basis.conj().T[retained]
+    return -0.5 + 1j * frequencies[retained], into @ low_rank, into @ scale

@@ -113,8 +113,8 @@ def mask_steps(x: torch.Tensor, share: float, draw: SampledAugmentation) -> torc
     count = min(round(share * steps), steps - 1)
     # A random order of the steps: those numbered below ``count`` go, exactly as many in every sample.
     order = draw.uniform(batch, steps).argsort(1)
-    kept = (order >= count).to(device=x.device, dtype=x.dtype)
-    return x * kept.view(batch, steps, *(1,) * (x.ndim - 2))
+    retained = (order >= count).to(device=x.device, dtype=x.dtype)
+    return x * retained.view(batch, steps, *(1,) * (x.ndim - 2))
 
 
 @cache
@@ -161,15 +161,15 @@ def _thesis(x: torch.Tensor, draw: SampledAugmentation, _how: Augmentation) -> t
 def _turned_places(rows: int, columns: int) -> tuple[int, ...]:
     """Return for both flips and four turns (2 × 2 × 4 outcomes) each cell's source, −1 where the turn lost it."""
     margin = (columns - rows) // 2
-    found: list[int] = []
+    places: list[int] = []
     for dims in ((), (1,), (0,), (0, 1)):
         grid = torch.arange(rows * columns).view(rows, columns).flip(dims)
         for turns in range(4):
             turned = torch.rot90(grid, turns, (0, 1))
             if turns % 2:
                 turned = functional.pad(turned[margin : margin + rows], (margin, margin), value=-1)
-            found += turned.flatten().tolist()
-    return tuple(found)
+            places += turned.flatten().tolist()
+    return tuple(places)
 
 
 def _image(x: torch.Tensor, draw: SampledAugmentation, _how: Augmentation) -> torch.Tensor:

@@ -52,11 +52,11 @@ def checkpoint_info(
 
 def model_card(config: TrainingConfig, info: Mapping[str, Any]) -> str:
     """Return the text of the model card (Mitchell et al. 2019), in Markdown."""
-    known = describe_model(config.model)
-    found, data = info["evaluation"], info.get("data")
+    model = describe_model(config.model)
+    evaluation, data = info["evaluation"], info.get("data")
     rows = {
-        "architecture": f"{config.model} ({known.citation})",
-        "parameters": f"{known.parameters:,} with 117 classes; {len(info['classes'])} classes here",
+        "architecture": f"{config.model} ({model.citation})",
+        "parameters": f"{model.parameters:,} with 117 classes; {len(info['classes'])} classes here",
         "input": "sweeps [B, T, 30, 5, 7] in N and N·m; normalised inside",
         "data": data
         and f"{data['hash']}: {data['train']:,} sweeps to train, {data['validation']:,} to validate, "
@@ -67,43 +67,43 @@ def model_card(config: TrainingConfig, info: Mapping[str, Any]) -> str:
         "augmentation": info["augmentation"],
         "seed": str(config.seed),
     }
-    if found is not None:
-        low, high = found["interval"]["low"], found["interval"]["high"]
+    if evaluation is not None:
+        low, high = evaluation["interval"]["low"], evaluation["interval"]["high"]
         read = "linear probe on the frozen network" if config.objective != "supervised" else "its own decoder"
         split = info.get("evaluated_split")
         rows |= {
-            "top-1": f"{found['top1']:.3f} [{low:.3f}, {high:.3f}] on {found['count']} sweeps ({read})",
+            "top-1": f"{evaluation['top1']:.3f} [{low:.3f}, {high:.3f}] on {evaluation['count']} sweeps ({read})",
             "beware": split and f"these accuracies are of the {split} sweeps, which chose the weights",
-            "top-5": f"{found['top5']:.3f}",
-            "test data": found["data"],
-            "collapsed": f"yes: {found['reason']}" if found["collapsed"] else "no",
+            "top-5": f"{evaluation['top5']:.3f}",
+            "test data": evaluation["data"],
+            "collapsed": f"yes: {evaluation['reason']}" if evaluation["collapsed"] else "no",
         }
-    for name, told in (info.get("baselines") or {}).items():
-        rows[name.replace("-", " ")] = f"linear probe: {_top1(told)}"
+    for name, text in (info.get("baselines") or {}).items():
+        rows[name.replace("-", " ")] = f"linear probe: {_top1(text)}"
     twin = info["twin"]
-    rows["untrained twin"] = f"{twin['name']}, seed {twin['seed']}{_beside(found, info.get('twin_evaluation'))}"
+    rows["untrained twin"] = f"{twin['name']}, seed {twin['seed']}{_beside(evaluation, info.get('twin_evaluation'))}"
     rows["licence"] = info["licence"]
     table = "".join(f"| {name} | {told} |\n" for name, told in rows.items() if told)
     return (
-        f"# {config.model}.{config.objective}\n\n{known.description}, trained with brainbench: {config.objective}.\n\n"
+        f"# {config.model}.{config.objective}\n\n{model.description}, trained with brainbench: {config.objective}.\n\n"
         f"| | |\n|---|---|\n{table}\n"
         "Trained on simulated touch alone; what it says about brains is what `brainbench score` measures.\n"
     )
 
 
-def _beside(found: Mapping[str, Any] | None, twin: Mapping[str, Any] | None) -> str:
+def _beside(trained: Mapping[str, Any] | None, twin: Mapping[str, Any] | None) -> str:
     """Return how a twin, read by a linear probe, compares with what was trained."""
-    if not found or not twin:
+    if not trained or not twin:
         return ""
     low, high = twin["interval"]["low"], twin["interval"]["high"]
-    if found["interval"]["low"] > high:
+    if trained["interval"]["low"] > high:
         verdict = "training helped"
-    elif found["interval"]["high"] < low:
+    elif trained["interval"]["high"] < low:
         verdict = "**training made it worse**"
     else:
         verdict = "**training changed less than these intervals can tell**"
     return f", linear probe: {_top1(twin)}; {verdict}"
 
 
-def _top1(found: Mapping[str, Any]) -> str:
-    return f"top-1 {found['top1']:.3f} [{found['interval']['low']:.3f}, {found['interval']['high']:.3f}]"
+def _top1(evaluation: Mapping[str, Any]) -> str:
+    return f"top-1 {evaluation['top1']:.3f} [{evaluation['interval']['low']:.3f}, {evaluation['interval']['high']:.3f}]"

@@ -86,15 +86,17 @@ def read_config(folder: str | os.PathLike[str]) -> dict[str, Any]:
             "brainbench train writes them."
         )
     config = read_mapping(path)
-    if (found := config.get("brainbench_model")) != FORMAT:
-        raise DataError(f"{os.fspath(path)!r} is no configuration of a model (format {found!r}, expected {FORMAT}).")
+    if (format_number := config.get("brainbench_model")) != FORMAT:
+        raise DataError(
+            f"{os.fspath(path)!r} is no configuration of a model (format {format_number!r}, expected {FORMAT})."
+        )
     if not isinstance(config.get("architecture"), str) or not isinstance(config.get("options"), dict):
         raise DataError(f"{os.fspath(path)!r} lacks the name 'architecture' or the mapping 'options'.")
-    version, known = config.get("version", 1), Architecture.parse(config["architecture"]).version
-    if version != known:
+    version, current = config.get("version", 1), Architecture.parse(config["architecture"]).version
+    if version != current:
         raise DataError(
             f"{os.fspath(folder)!r} holds version {version!r} of {config['architecture']!r}; this brainbench computes "
-            f"version {known}: train anew with brainbench train, or install the brainbench that made it."
+            f"version {current}: train anew with brainbench train, or install the brainbench that made it."
         )
     return config
 
@@ -152,19 +154,19 @@ def _imported(folder: Path, source: str) -> Path:
     """Return a folder of ours as it is, and that of its import for one with a foreign checkpoint."""
     if (folder / CONFIG).is_file():
         return folder
-    found = sorted(folder.glob(FOREIGN)) or (sorted(folder.rglob(FOREIGN)) if source.startswith(HUB) else [])
+    files = sorted(folder.glob(FOREIGN)) or (sorted(folder.rglob(FOREIGN)) if source.startswith(HUB) else [])
     # Of the files of one run, the study scored this one.
-    found = [path for path in found if path == folder / SCORED] or found
-    if len(found) > 1:
+    files = [path for path in files if path == folder / SCORED] or files
+    if len(files) > 1:
         raise UsageError(
-            f"{source!r} holds {listing([os.fspath(path.relative_to(folder)) for path in found])}; name the folder of "
+            f"{source!r} holds {listing([os.fspath(path.relative_to(folder)) for path in files])}; name the folder of "
             "one of them, or import it with: brainbench models import FILE"
         )
-    if not found:
+    if not files:
         return folder
     importer = load_optional(IMPORTERS, "published", "importer of published weights")
-    settings = found[0].with_name(SETTINGS)
-    return importer(found[0], settings if settings.is_file() else None) if importer is not None else folder
+    settings = files[0].with_name(SETTINGS)
+    return importer(files[0], settings if settings.is_file() else None) if importer is not None else folder
 
 
 def shipped() -> dict[str, Path]:

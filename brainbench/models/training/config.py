@@ -98,12 +98,12 @@ class TrainingConfig:
     @classmethod
     def from_mapping(cls, values: Mapping[str, Any]) -> TrainingConfig:
         """Build a configuration from names and values."""
-        known = {field.name: str(field.type) for field in fields(cls)}
+        names = {field.name: str(field.type) for field in fields(cls)}
         for name, value in values.items():
-            check_name("training option", name, known)
-            kinds = {"str": str, "int": int, "float": (int, float)}[known[name]]
+            check_name("training option", name, names)
+            kinds = {"str": str, "int": int, "float": (int, float)}[names[name]]
             if not isinstance(value, kinds) or isinstance(value, bool):
-                raise UsageError(f"The training option {name!r} is a {known[name]}; received {shown(value)}.")
+                raise UsageError(f"The training option {name!r} is a {names[name]}; received {shown(value)}.")
         if "model" not in values:
             raise UsageError("A training configuration needs the option 'model'.")
         return cls(**values)
@@ -130,11 +130,11 @@ def config_warnings(config: TrainingConfig, model: Any) -> list[str]:
 
     Of its network ``spec.receptive_field`` is read, if there is one.
     """
-    found: list[str] = []
+    warnings: list[str] = []
     if config.objective not in ("simclr", "simsiam"):
-        return found
+        return warnings
     if config.augmentation == "none" and not config.masking:
-        found.append(
+        warnings.append(
             f"Without augmentation or masking both views of a sweep are equal, so {config.objective} has nothing to "
             "ignore: only telling sweeps apart is rewarded, without bound, and such runs tend to diverge. Choose an "
             "augmentation, or masking."
@@ -143,10 +143,10 @@ def config_warnings(config: TrainingConfig, model: Any) -> list[str]:
     # These augmentations reverse time.
     if seen is not None and config.augmentation in ("physical", "thesis"):
         steps = "the last step" if seen == 1 else f"the last {seen} steps"
-        found.append(
+        warnings.append(
             f"{config.model} has no memory: its last answer sees {steps} of a sweep alone. The augmentation "
             f"{config.augmentation!r} plays half of the views backwards, which end before the whiskers touch anything "
             f"and look all alike, so the loss of {config.objective} cannot fall far. A network with memory or an "
             "attender, or the augmentation 'image', can learn."
         )
-    return found
+    return warnings

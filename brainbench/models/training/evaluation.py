@@ -69,10 +69,10 @@ def topk(answers: torch.Tensor, labels: torch.Tensor, k: int) -> int:
 
     Ties count against the network: a constant answer knows nothing. NaN answers are wrong.
     """
-    own = answers.gather(1, labels[:, None])
+    correct = answers.gather(1, labels[:, None])
     # The label's own answer is among those not smaller, so it is taken off.
-    ahead = (answers >= own).sum(1) - 1
-    return int(((ahead < k) & torch.isfinite(own[:, 0])).sum())
+    ahead = (answers >= correct).sum(1) - 1
+    return int(((ahead < k) & torch.isfinite(correct[:, 0])).sum())
 
 
 class SweepsHash:
@@ -105,10 +105,10 @@ class SweepsHash:
 
 def sweeps_hash(batches: Iterable[tuple[torch.Tensor, torch.Tensor]]) -> str:
     """Return the hash of labelled sweeps that :attr:`Evaluation.data` of them would have."""
-    found = SweepsHash()
+    digest = SweepsHash()
     for x, labels in batches:
-        found.add(x, labels)
-    return found.value()
+        digest.add(x, labels)
+    return digest.value()
 
 
 def collapse(predicted: int, classes: int, spread: float) -> str:
@@ -138,8 +138,8 @@ def evaluate(model: nn.Module, batches: Iterable[tuple[Any, Any]], *, device: An
             else:
                 features, answers = None, model(x).float()
             if answers.ndim != 2 or len(answers) != len(labels):
-                told = f"{list(answers.shape)} to {len(labels)} sweeps; expected [batch, classes]"
-                raise DataError(f"{type(model).__name__} answers {told}.")
+                shapes = f"{list(answers.shape)} to {len(labels)} sweeps; expected [batch, classes]"
+                raise DataError(f"{type(model).__name__} answers {shapes}.")
             seen += len(labels)
             first += topk(answers, labels, 1)
             # Of five classes or fewer every one would be among the first five: one answer fewer keeps it a test.
@@ -236,18 +236,18 @@ def _feature_pools(
     model: Any, batches: Iterable[tuple[torch.Tensor, torch.Tensor]], device: Any, memory: float
 ) -> Iterator[tuple[torch.Tensor, torch.Tensor]]:
     """Yield the last step's features [N, F] and labels [N] of one pass, as many together as fit into ``memory``."""
-    found: list[tuple[torch.Tensor, torch.Tensor]] = []
+    pool: list[tuple[torch.Tensor, torch.Tensor]] = []
     size = 0
     for x, labels in batches:
         with evaluating(model), torch.no_grad():
             features = model.encode(x.to(device), last=True).float()
-        if found and size + features.nbytes > memory:
-            yield torch.cat([item for item, _ in found]), torch.cat([item for _, item in found])
-            found, size = [], 0
-        found.append((features, labels.to(device).long()))
+        if pool and size + features.nbytes > memory:
+            yield torch.cat([item for item, _ in pool]), torch.cat([item for _, item in pool])
+            pool, size = [], 0
+        pool.append((features, labels.to(device).long()))
         size += features.nbytes
-    if found:
-        yield torch.cat([item for item, _ in found]), torch.cat([item for _, item in found])
+    if pool:
+        yield torch.cat([item for item, _ in pool]), torch.cat([item for _, item in pool])
 
 
 def _check_repeatable(batches: Iterable[Any], what: str) -> None:
@@ -304,8 +304,8 @@ def baselines(
     """
     for batches in (train, test):
         _check_repeatable(batches, "sweeps of a baseline")
-    found = {}
+    evaluations = {}
     for name, reader in ((RAW, RawInput()), (RANDOM, RawInput(features, seed=seed))):
         fit_probe(reader, train, classes=classes, epochs=epochs, seed=seed, device=device, memory=memory)
-        found[name] = evaluate(reader, test, device=device)
-    return found
+        evaluations[name] = evaluate(reader, test, device=device)
+    return evaluations

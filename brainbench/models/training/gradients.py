@@ -78,8 +78,8 @@ class Gradients:
 
     def __call__(self, views: tuple[torch.Tensor, ...], labels: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Return (loss, norm of the gradients before clipping), not yet waited for."""
-        found = self._pass((*views, labels))
-        return found if self.average is None else self._clip(self._averaged(found[0]))
+        results = self._pass((*views, labels))
+        return results if self.average is None else self._clip(self._averaged(results[0]))
 
     def _pass(self, given: tuple[torch.Tensor, ...]) -> tuple[torch.Tensor, torch.Tensor]:
         if not self.record:
@@ -88,8 +88,8 @@ class Gradients:
             self._record(given)
         if [item.shape for item in given] != [item.shape for item in self._inputs]:
             return self._compute(given)
-        for mine, item in zip(self._inputs, given, strict=True):
-            mine.copy_(item)
+        for mine, tensor in zip(self._inputs, given, strict=True):
+            mine.copy_(tensor)
         self._replay()
         # The recorded pass writes to these, whatever stood in the parameters meanwhile.
         for parameter, gradient in zip(self.parameters, self._kept, strict=True):

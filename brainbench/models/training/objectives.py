@@ -27,16 +27,18 @@ def nt_xent(first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:
     compared, so the loss is that of one large batch.
     """
     both = functional.normalize(torch.stack((first.float(), second.float()), 1), dim=-1)  # [B, 2, D]
-    own = both.flatten(0, 1)
+    embeddings = both.flatten(0, 1)
     every, start = _gathered(both)
     every = every.flatten(0, 1)
-    row = torch.arange(len(own), device=own.device)
+    row = torch.arange(len(embeddings), device=embeddings.device)
     itself = row + 2 * start
     # Mixed precision would round cosines to three digits before they are divided by the temperature.
-    with torch.autocast(own.device.type, enabled=False):
-        similarity = own @ every.T / TEMPERATURE
+    with torch.autocast(embeddings.device.type, enabled=False):
+        similarity = embeddings @ every.T / TEMPERATURE
     # A view is no candidate of its own: the softmax runs over the 2 B − 1 others.
-    similarity = similarity.index_put((row, itself), torch.full((), -torch.inf, device=own.device).expand(len(own)))
+    similarity = similarity.index_put(
+        (row, itself), torch.full((), -torch.inf, device=embeddings.device).expand(len(embeddings))
+    )
     # Both views of a sweep stand side by side, so indices of partners differ in the last bit.
     return functional.cross_entropy(similarity, itself ^ 1)
 

@@ -191,12 +191,12 @@ class _Run:
         """Return what is told of the network that the run started from, which may have been drawn elsewhere."""
         if not self.where.first:
             return now
-        kept = read_mapping(self.out / RUN).get("twin")
-        if kept is None:
+        stored = read_mapping(self.out / RUN).get("twin")
+        if stored is None:
             mark(self.out / RUN, twin=now)
-        elif told := difference(kept, now):
-            _log.warning("The run goes on, but without its untrained twin: %s.", told)
-        return kept or now
+        elif reason := difference(stored, now):
+            _log.warning("The run goes on, but without its untrained twin: %s.", reason)
+        return stored or now
 
     def run(self, stop: Stop) -> TrainingResult:
         """Train until all epochs are done or it is to stop; return how it ended."""
@@ -244,9 +244,9 @@ class _Run:
         # The rate is a function of the step alone, so a resumed run needs no state of a scheduler.
         for group in self.optimizer.param_groups:
             group["lr"] = config.learning_rate * factor
-        found = self.gradients(views, labels)
+        results = self.gradients(views, labels)
         # This waits for the device: a step that is not finite must be found before it changes the weights.
-        value, norm = map(float, found)
+        value, norm = map(float, results)
         # Loss and gradients are averaged over processes, so all of them decide alike.
         if not math.isfinite(norm) or not math.isfinite(value):
             return self._keep_failure(views, labels, value, norm)
@@ -277,8 +277,8 @@ class _Run:
         speed = {"seconds": round(seconds, 3), "sweeps_per_second": round(rate, 1)}
         self.log.write("epoch", self.at.step, epoch=self.at.epoch, loss=loss, **speed)
         if self.where.first:
-            told = (self.config.model, self.at.epoch, self.config.epochs, loss, seconds, rate)
-            _log.info("%s: epoch %d of %d, loss %.4f, %.1f s, %.0f sweeps/s.", *told)
+            facts = (self.config.model, self.at.epoch, self.config.epochs, loss, seconds, rate)
+            _log.info("%s: epoch %d of %d, loss %.4f, %.1f s, %.0f sweeps/s.", *facts)
         score = self._validate(loss)
         # Strictly better, so of equal epochs the first is kept, and a NaN never is.
         if score < self.at.best:
@@ -296,9 +296,11 @@ class _Run:
             return loss
         if self.config.objective == "supervised":
             with self._precision():
-                found = evaluate(self.model, batches, device=self.where.device)
-            self.log.write("validation", self.at.step, top1=found.top1, top5=found.top5, spread=found.spread)
-            return 1.0 - found.top1
+                evaluation = evaluate(self.model, batches, device=self.where.device)
+            self.log.write(
+                "validation", self.at.step, top1=evaluation.top1, top5=evaluation.top5, spread=evaluation.spread
+            )
+            return 1.0 - evaluation.top1
         total, count = 0.0, 0
         with evaluating(self.learner), torch.no_grad(), self._precision():
             for index, (x, labels) in enumerate(batches):
@@ -314,9 +316,9 @@ class _Run:
     def _finish(self) -> TrainingResult:
         result, split = None, "test"
         if self.where.first:
-            told = read_mapping(self.out / RUN)
-            self.controls = _evaluations(told.get("controls") or {})
-            done = told.get("evaluation")
+            document = read_mapping(self.out / RUN)
+            self.controls = _evaluations(document.get("controls") or {})
+            done = document.get("evaluation")
             if done is not None:
                 return self._result("finished", "", Evaluation.from_plain(done))
             # The best weights as they were published, so that what is evaluated is what is shipped.
@@ -348,8 +350,8 @@ class _Run:
                 self.log.write("test", self.at.step, top1=result.top1, top5=result.top5, spread=result.spread)
                 if result.collapsed:
                     _log.warning("%s has collapsed: %s.", self.config.model, result.reason)
-            found = {name: asdict(item) for name, item in self.controls.items()}
-            mark(self.out / RUN, evaluation=asdict(result) if result else None, controls=found, status="finished")
+            controls = {name: asdict(item) for name, item in self.controls.items()}
+            mark(self.out / RUN, evaluation=asdict(result) if result else None, controls=controls, status="finished")
         self.where.wait()
         return self._result("finished", "", result)
 
@@ -364,19 +366,21 @@ class _Run:
         key = {**probe, "classes": list(self.data.classes), "data": result.data, "train": fitted, "twin": self.twin}
         # Batches of another size bring the sweeps to the probes in another order.
         key["batch_size"] = self.config.batch_size
-        if self.controls_file.is_file() and (kept := read_mapping(self.controls_file)).get("of") == key:
-            return _evaluations(kept["controls"])
+        if self.controls_file.is_file() and (stored := read_mapping(self.controls_file)).get("of") == key:
+            return _evaluations(stored["controls"])
         self.progress(self._steps, self._steps, "probing raw input, random features and the untrained twin")
         device = self.where.device
         probe |= {"classes": len(self.data.classes), "device": device}
         memory = torch.cuda.get_device_properties(device).total_memory // 8 if device.type == "cuda" else 2**31
-        found = baselines(train, test, features=features, memory=memory, **probe)
-        twin, other = draw_twin(self.twin, self.options)
-        if not other:
+        evaluations = baselines(train, test, features=features, memory=memory, **probe)
+        twin, reason = draw_twin(self.twin, self.options)
+        if not reason:
             fit_probe(twin.to(device), train, **probe)
-            found[TWIN] = evaluate(twin, test, device=device)
-        write_json(self.controls_file, {"of": key, "controls": {name: asdict(item) for name, item in found.items()}})
-        return found
+            evaluations[TWIN] = evaluate(twin, test, device=device)
+        write_json(
+            self.controls_file, {"of": key, "controls": {name: asdict(item) for name, item in evaluations.items()}}
+        )
+        return evaluations
 
     @property
     def _probe(self) -> dict[str, Any]:
@@ -384,10 +388,15 @@ class _Run:
 
     def _publish(self, result: Evaluation | None, split: str = "test") -> None:
         config, reached = self.config, {"epochs_done": self.at.epoch, "best_epoch": self.at.best_epoch}
-        told = {"twin": self.twin, "controls": self.controls, "data": self.data.summary, "split": split}
-        info = checkpoint_info(config, self.data.classes, evaluation=result, **reached, **told)
-        kept = {"options": self.options, "info": info, "card": model_card(config, info), "dtype": config.stored_dtype}
-        save_checkpoint(self.out / BEST, self.model, architecture=config.model, **kept)
+        facts = {"twin": self.twin, "controls": self.controls, "data": self.data.summary, "split": split}
+        info = checkpoint_info(config, self.data.classes, evaluation=result, **reached, **facts)
+        contents = {
+            "options": self.options,
+            "info": info,
+            "card": model_card(config, info),
+            "dtype": config.stored_dtype,
+        }
+        save_checkpoint(self.out / BEST, self.model, architecture=config.model, **contents)
 
     def _save(self) -> None:
         self.saved = time.monotonic()

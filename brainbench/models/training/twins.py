@@ -26,13 +26,13 @@ def describe_twin(name: str, seed: int, model: nn.Module) -> dict[str, Any]:
     return {"name": name, "seed": seed, "state": state, "torch": torch.__version__}
 
 
-def difference(twin: Mapping[str, Any], found: Mapping[str, Any]) -> str:
+def difference(twin: Mapping[str, Any], drawn: Mapping[str, Any]) -> str:
     """Return why a network that was drawn again is not the twin, as :func:`describe_twin` tells of both; else ''."""
-    if twin["state"] == found["state"]:
+    if twin["state"] == drawn["state"]:
         return ""
     return (
         f"{twin['name']} with seed {twin['seed']} is not the network that training started from: PyTorch "
-        f"{found['torch']} here draws other weights than PyTorch {twin['torch']} there"
+        f"{drawn['torch']} here draws other weights than PyTorch {twin['torch']} there"
     )
 
 

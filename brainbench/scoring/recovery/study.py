@@ -74,7 +74,7 @@ def recover(
     if folder is not None:
         folder.mkdir(parents=True, exist_ok=True)
         config = {"candidates": [item.identity for item in candidates], "design": design}
-        begin_run(folder, config, "recovery", made="boards-*.json")
+        begin_run(folder, config, "recovery", results="boards-*.json")
         for job in jobs:
             if (folder / job.file).is_file():
                 with readable(folder / job.file, "part of a recovery", "Delete it to make it again."):

@@ -83,7 +83,7 @@ def write_data_set(
     """
     folder = Path(out).absolute()
     with lock_folder(folder, wait=False):
-        begin_run(folder, plan.config, "data set", made="*.h5")
+        begin_run(folder, plan.config, "data set", results="*.h5")
         _clean(folder)
         missing = [task for task in plan.shards if not is_complete(folder / task.name, task)]
         _check_space(missing, folder)

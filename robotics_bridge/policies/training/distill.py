@@ -183,7 +183,7 @@ class _Run:
     def _act(self, share: float) -> Rollout:
         recorder = Recorder(self.config.steps_per_env, self.memory)
         targets = [head.target for head in self.decoders]
-        kept = [name for name in (*self.groups, *targets) if self.front is None or name != TACTILE]
+        recorded = [name for name in (*self.groups, *targets) if self.front is None or name != TACTILE]
         self.student.eval()
         for _ in range(self.config.steps_per_env):
             obs = self.observations
@@ -194,17 +194,17 @@ class _Run:
                 features, self.touched = features.float(), self.touched.float()
                 recorder.put(features=features)
             # The environment may write its next observations over these.
-            recorder.put(**{name: obs[name] for name in kept})
+            recorder.put(**{name: obs[name] for name in recorded})
             now = {name: obs[name][None] for name in self.groups}
             latent, memory = self.student.unroll(now, self.memory, None, None if features is None else features[None])
-            own = self.student.action_of(latent[0]).float()
+            action = self.student.action_of(latent[0]).float()
             right = self.teacher(obs).float()
             # Ross et al. 2011: the student's own states are visited, a share of actions being the teacher's, and the
             # teacher labels them all.
-            taught = torch.rand(len(own), 1, device=self.device) < share
-            self.observations, _, terminated, truncated, _ = self.env.step(torch.where(taught, right, own))
+            taught = torch.rand(len(action), 1, device=self.device) < share
+            self.observations, _, terminated, truncated, _ = self.env.step(torch.where(taught, right, action))
             ended = terminated | truncated
-            recorder.put(teacher=right, student=own, ended=ended)
+            recorder.put(teacher=right, student=action, ended=ended)
             recorder.next()
             self.memory = torch.where(ended[:, None], 0.0, memory.float())
             if self.front is not None:
@@ -219,8 +219,8 @@ class _Run:
             self.kept = [*self.kept, (self.iteration, rollout)][-self.config.aggregate :]
         losses: dict[str, torch.Tensor] = {}
         for _ in range(self.config.epochs or 1):
-            found = self._pass(rollout)
-            losses = losses or found
+            means = self._pass(rollout)
+            losses = losses or means
             older = [item for _, item in self.kept if item is not rollout]
             if older:
                 self._pass(older[int(torch.randint(len(older), ()))])

@@ -50,14 +50,14 @@ def begin_with(student: TactilePolicy, start: str | Path) -> None:
     """Give a student the weights of another, by folder or shipped name; learning begins anew."""
     path = policy_path("student", start) / MODEL
     with readable(path, "student", "It is damaged, or of another student."):
-        found = read_tensors(path, "file of weights (safetensors)")
-    if odd := odd_shape(found, student.state_dict()):
+        weights = read_tensors(path, "file of weights (safetensors)")
+    if odd := odd_shape(weights, student.state_dict()):
         name, theirs, mine = odd
         raise DataError(
             f"The student {str(start)!r} has {name!r} of shape {theirs}, here {mine}: start from one that feels and "
             "acts alike."
         )
-    student.load_state_dict(found)
+    student.load_state_dict(weights)
 
 
 def load_student(folder: str | Path, *, device: str = "cpu") -> tuple[TactilePolicy, dict[str, Any]]:
@@ -72,18 +72,18 @@ def load_student(folder: str | Path, *, device: str = "cpu") -> tuple[TactilePol
     if not (folder / MODEL).is_file():
         raise DataError(f"The student in {str(folder)!r} has no weights yet; its run was interrupted early.")
     check_version(described, str(folder))
-    found = from_json(_Described, described, CONFIG)
-    config = from_json(DistillConfig, found.distill, CONFIG)
-    own = {name: value for name, value in config.encoder_settings.items() if value is not None}
+    stated = from_json(_Described, described, CONFIG)
+    config = from_json(DistillConfig, stated.distill, CONFIG)
+    settings = {name: value for name, value in config.encoder_settings.items() if value is not None}
     # Which settings it may have depends on the encoder's name.
-    from_json(EncoderConfig, {**own, "name": config.encoder}, f"encoder_settings of {CONFIG}")
-    shapes, actions = shapes_of(found.groups, CONFIG, "groups"), found.actions
+    from_json(EncoderConfig, {**settings, "name": config.encoder}, f"encoder_settings of {CONFIG}")
+    shapes, actions = shapes_of(stated.groups, CONFIG, "groups"), stated.actions
     with readable(folder / MODEL, "student", "It is damaged, or of another student."):
         _require_sizes(folder / MODEL, config, shapes)
         with torch.random.fork_rng(devices=[]):
             student = build_student(config, shapes, list(shapes), actions)
         student.load_state_dict(read_tensors(folder / MODEL, "file of weights (safetensors)"))
-    check_probes(config.resolution, found.deployment.get("probes"))
+    check_probes(config.resolution, stated.deployment.get("probes"))
     return student.to(device).eval(), described
 
 

@@ -98,8 +98,8 @@ class Trainer:
         # rsl_rl prints its networks; what a command prints is its own business.
         with contextlib.redirect_stdout(io.StringIO()) as said:
             wrapped: Any = self.env
-            own = json.loads(json.dumps(self.config))
-            self.algorithm = PPO.construct_algorithm(observations, wrapped, own, str(env.device))
+            config = json.loads(json.dumps(self.config))
+            self.algorithm = PPO.construct_algorithm(observations, wrapped, config, str(env.device))
         _LOG.info("%s", said.getvalue())
         self.iteration = 0
         self._observations = observations
@@ -171,18 +171,18 @@ class Trainer:
         Actions begin with the standard deviation ``std``; None takes that of the other run.
         """
         file = model_file(path)
-        found, own = load_state(file), self.algorithm.save()
+        given, state = load_state(file), self.algorithm.save()
         for name in ("actor", "critic"):
-            trees = (found[name], own[f"{name}_state_dict"])
+            trees = (given[name], state[f"{name}_state_dict"])
             if odd := odd_shape(*trees):
                 key, theirs, mine = odd
                 raise DataError(
                     f"The {name} of {str(file)!r} does not fit: {key!r} has the shape {theirs}, here {mine}. Take a "
                     "run of a task with the same observations, actions and layers."
                 )
-            own[f"{name}_state_dict"] = found[name]
+            state[f"{name}_state_dict"] = given[name]
         parts = {"actor": True, "critic": True, "optimizer": False, "iteration": False, "rnd": False}
-        self.algorithm.load(own, parts, strict=True)
+        self.algorithm.load(state, parts, strict=True)
         if std is not None:
             spread: Any = self.algorithm.get_policy().distribution
             log = spread.std_type == "log"
@@ -357,15 +357,15 @@ def newest(run: Path) -> Path:
         DataFileNotFoundError: the folder holds no model.
     """
     numbers = [path.stem.removeprefix("model_") for path in run.glob("model_*.safetensors")]
-    if not (found := [int(number) for number in numbers if number.isdecimal()]):
+    if not (iterations := [int(number) for number in numbers if number.isdecimal()]):
         raise DataFileNotFoundError(f"{str(run)!r} holds no trained policy (model_<iteration>.safetensors).")
-    return run / f"model_{max(found)}.safetensors"
+    return run / f"model_{max(iterations)}.safetensors"
 
 
 def model_file(path: Path) -> Path:
     """Return the last model of a run, given its folder or the name of a shipped one, or the model itself."""
-    found = policy_path("teacher", path)
-    return newest(found) if found.is_dir() else found
+    located = policy_path("teacher", path)
+    return newest(located) if located.is_dir() else located
 
 
 def load_teacher(run: str | Path, env: Env) -> Policy:

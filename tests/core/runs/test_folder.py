@@ -40,4 +40,4 @@ def test_a_run_of_an_earlier_format_is_refused(tmp_path):
 def test_a_folder_of_something_else_is_not_taken_for_a_run(tmp_path):
     (tmp_path / "thesis.tex").touch()
     with pytest.raises(UsageError, match=r"holds no data set \(it has 'thesis\.tex'\)"):
-        begin_run(tmp_path, {"seed": 0}, "data set", made="*.h5")
+        begin_run(tmp_path, {"seed": 0}, "data set", results="*.h5")
