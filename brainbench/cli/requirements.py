@@ -65,7 +65,7 @@ EXTRAS: dict[str, tuple[Requirement, ...]] = {
     "policy distill": (_POLICIES,),
     "policy sweep": (replace(_POLICIES, when=lambda values: not (values.get("count") or values.get("names"))),),
     "policy play": (
-        replace(_PICTURES, when=_given("video", "strip")), replace(_MP4, when=_ends("video", ".mp4")),
+        replace(_PICTURES, when=_given("video")), replace(_MP4, when=_ends("video", ".mp4")),
     ),
     "policy deploy": (Requirement(("pyarrow",), "board", "Writing a LeRobot data set", _given("record")),),
     "stimuli render": (_PICTURES, replace(_MP4, when=_ends("out", ".mp4"))),

@@ -125,16 +125,32 @@ class GymEnv(gymnasium.Env):
         return observations, float(reward[0]), bool(terminated[0]), bool(truncated[0]), info
 
 
-def make(task: str, *, groups: tuple[str, ...] = (), privileged: bool = False, **options: Any) -> GymEnv:
+def make(task: str, **options: Any) -> GymEnv:
     """Return one environment of a task for gymnasium; options as for :func:`make_vec`."""
-    return GymEnv(make_vec(task, 1, groups=groups, privileged=privileged, **options))
+    return GymEnv(make_vec(task, 1, **options))
 
 
 def make_vec(
-    task: str, num_envs: int = 1, *, groups: tuple[str, ...] = (), privileged: bool = False, **options: Any
+    task: str,
+    num_envs: int = 1,
+    *,
+    touch: str = "none",
+    groups: tuple[str, ...] = (),
+    privileged: bool = False,
+    **options: Any,
 ) -> GymVectorEnv:
-    """Return the environments of a task for gymnasium; options are those of :func:`robotics_bridge.tasks.make`."""
-    return GymVectorEnv(tasks.make(task, num_envs=num_envs, keep_final=True, **options), groups, privileged=privileged)
+    """Return the environments of a task for gymnasium.
+
+    Args:
+        task: Name of a task.
+        num_envs: Environments.
+        touch: Type of the observation ``tactile``, such as ``force_torque``; by default the hand feels nothing.
+        groups: Observation groups, by default all that a hand has.
+        privileged: Give groups that only the simulation knows, too.
+        **options: Those of :func:`robotics_bridge.tasks.make`.
+    """
+    native = tasks.make(task, num_envs=num_envs, keep_final=True, **{"observe": touch, **options})
+    return GymVectorEnv(native, groups, privileged=privileged)
 
 
 def register() -> None:

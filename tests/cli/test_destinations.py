@@ -42,7 +42,6 @@ def test_other_commands_refuse_such_an_out_too(run, tmp_path, command):
         (("tradeoff", "whisker"), "--csv"),
         (("tradeoff", "tactile"), "--plot"),
         (("policy", "play", "in_palm_rotate"), "--video"),
-        (("policy", "play", "in_palm_rotate"), "--strip"),
         (("policy", "report", "none"), "--records"),
         (("policy", "sweep"), "--out"),
         (("policy", "export", "none"), "--out"),

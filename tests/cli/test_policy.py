@@ -49,13 +49,6 @@ def test_tasks_are_listed() -> None:
     assert {"in_palm_rotate", "in_hand_repose", "screwdriver", "hot_ball"} <= {row["task"] for row in found}
 
 
-def test_a_played_task_leaves_a_strip_of_frames(tmp_path: Path) -> None:
-    strip = tmp_path / "strip.png"
-    out = _run("play", "in_palm_rotate", "--seconds", "0.1", "--strip", str(strip), "--width", "96", "--json")
-    assert json.loads(out)["seconds"] == pytest.approx(0.1)
-    assert strip.read_bytes().startswith(b"\x89PNG")
-
-
 def test_what_a_shipped_policy_did_is_told_in_goals_turns_and_drops() -> None:
     words = ("play", "in_palm_rotate", "--agent", "in_palm_rotate.teacher", "--seconds", "2", "--seed", "2")
     told = {line.split("  ")[0]: line.split("  ")[-1].strip() for line in _run(*words).splitlines()}

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from brainbench.cli.tactile import figures
-from brainbench.core.figures.style import panels, save_figure
 from brainbench.stimuli.figures.camera import Camera
 from brainbench.stimuli.figures.canvas import Style
 from brainbench.stimuli.figures.rays import Triangles
@@ -80,15 +79,3 @@ def write_video(path: Path, frames: Sequence[NDArray[np.uint8]], size: tuple[int
     """Write frames to an ``.mp4`` or ``.gif``."""
     style, sample = Style(size=size, frames_per_second=rate), frames[:: max(1, len(frames) // 4)]
     write_film(path, frames, style, palette_from=sample)
-
-
-def write_strip(path: Path, frames: Sequence[NDArray[np.uint8]], times: Sequence[float]) -> None:
-    """Write a PNG of frames side by side, each with its time (s)."""
-    height, width = frames[0].shape[:2]
-    scale = 2.2
-    figure, (axes,) = panels(1, len(frames), (scale * len(frames) * width / height, scale))
-    for ax, frame, time in zip(axes, frames, times, strict=True):
-        ax.imshow(frame)
-        ax.set_title(f"{time:.1f} s", fontsize=8)
-        ax.set_axis_off()
-    save_figure(figure, path, dpi=110)

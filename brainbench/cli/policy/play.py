@@ -59,9 +59,6 @@ def play(
     options: dict[str, Any],
     agent: Annotated[str, typer.Option(help="zero, random, a shipped policy, or a run's folder.")] = "random",
     video: Annotated[Path | None, typer.Option(callback=out_file, help="Write a film here (.mp4 or .gif).")] = None,
-    strip: Annotated[
-        Path | None, typer.Option(callback=out_file, help="Write six frames side by side here (.png).")
-    ] = None,
     seconds: Annotated[float, typer.Option(help="Simulated time.")] = 4.0,
     rate: Annotated[float, typer.Option(help="Frames per simulated second of a film.")] = 20.0,
     width: Annotated[int, typer.Option(help="Of a frame [pixels].")] = 480,
@@ -74,12 +71,9 @@ def play(
     for flag, number, bound in (("--seconds", seconds, 0), ("--rate", rate, 0), ("--width (pixels)", width, 63)):
         check_number(flag, number, above=bound)
     world.check([agent])
-    pictures = [path for path in (video, strip) if path is not None]
-    for path, endings in ((video, (".mp4", ".gif")), (strip, (".png",))):
-        if path is not None:
-            check_format(path, endings)
-    if pictures:
-        from brainbench.cli.policy import pictures as drawing
+    if video is not None:
+        check_format(video, (".mp4", ".gif"))
+        from brainbench.cli.policy.pictures import Stage, write_video
     # After the checks of names, which need no torch.
     from robotics_bridge.policies.evaluate import forget
 
@@ -90,19 +84,12 @@ def play(
     rewards: list[float] = []
     ended, dropped, goals, turned = 0, 0, 0, 0.0
     with progress_bar() as progress:
-        size = (width, round(width * 5 / 6))
-        stage = drawing.Stage(env, size) if pictures else None
+        size, film = (width, round(width * 5 / 6)), []
+        stage = None if video is None else Stage(env, size)
         every = max(round(1 / (rate * env.step_dt)), 1)
-        marks = {round(index * (steps - 1) / 5) for index in range(6)}
-        film, stills, times = [], [], []
         for step in range(steps):
-            wanted = (video is not None and step % every == 0) or (strip is not None and step in marks)
-            if stage is not None and wanted:
-                frame = stage.frame()
-                film += [frame] if step % every == 0 else []
-                if step in marks:
-                    stills.append(frame)
-                    times.append(step * env.step_dt)
+            if stage is not None and step % every == 0:
+                film.append(stage.frame())
             _, reward, terminated, truncated, info = env.step(act(env.observations))
             rewards.append(float(reward))
             over = bool(terminated | truncated)
@@ -114,13 +101,11 @@ def play(
                 goals, turned = goals + int(info["goals"]), turned + float(info["turned"])
             progress(step + 1, steps, "playing")
         if video is not None:
-            drawing.write_video(video, film, size, 1 / (every * env.step_dt))
-        if strip is not None:
-            drawing.write_strip(strip, stills, times)
+            write_video(video, film, size, 1 / (every * env.step_dt))
     result = {
         "task": env.task.name, "hand": env.hand.name, "contacts": contacts_name(env.task.contacts), "agent": agent,
         "seconds": steps * env.step_dt, "reward": sum(rewards), "episodes_ended": ended,
-        "metric": env.task.success.metric, "files": pictures, "goals": goals, "turned": turned, "dropped": dropped,
+        "metric": env.task.success.metric, "files": [] if video is None else [video], "goals": goals, "turned": turned, "dropped": dropped,
     }  # fmt: skip
     lines: dict[str, object] = {
         "task": result["task"], "hand": result["hand"], "contacts": result["contacts"], "agent": agent,
@@ -130,7 +115,7 @@ def play(
         **({"turned": f"{round(turned, 2) + 0:.2f} rad about the commanded axis"} if env.task.turns else {}),
         "dropped": f"{dropped} times", "episodes ended": ended, "reward": f"{sum(rewards):.3g}",
     }  # fmt: skip
-    lines |= {"files": ", ".join(map(str, pictures))} if pictures else {}
+    lines |= {} if video is None else {"files": video}
     return Output(result, f"{env.task.text}\n\n{facts(lines)}")
 
 

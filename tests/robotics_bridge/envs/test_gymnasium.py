@@ -118,3 +118,11 @@ def test_what_a_hand_has_not_is_given_to_who_asks_for_it_alone() -> None:
     asked = GymVectorEnv(native, ("proprio", "priv_obj_state"), privileged=True)
     assert set(asked.single_observation_space.spaces) == {"proprio", "priv_obj_state"}
     assert {"goal", "aux_goal_dist"} < set(GymVectorEnv(native, privileged=True).single_observation_space.spaces)
+
+
+def test_touch_is_a_keyword_of_make() -> None:
+    env = gymnasium.make(
+        "brainbench/InPalmRotate-v0", touch="force_torque", placement="tips", resolution="low", threads=1
+    )
+    assert env.observation_space["tactile"].shape == (5, 45, 6)
+    assert "tactile" not in gymnasium.make("brainbench/InPalmRotate-v0", threads=1).observation_space.spaces
