@@ -136,8 +136,9 @@ class _SourceNames(dict[str, Any]):
             module, inner = stated
             if module == limits.__name__:
                 return getattr(limits, inner)
-            # What a limit needs is a constant; types stay unknown.
-            return _SourceNames(module)[inner] if name.isupper() else _Unknown
+            # Constants and annotations with a name of their own are read where they are assigned; classes stay unknown.
+            ours = module.partition(".")[0] in ("brainbench", "robotics_bridge")
+            return _SourceNames(module)[inner] if ours else _Unknown
         return _Unknown if stated is None else self.evaluated(stated)
 
     def evaluated(self, node: ast.expr) -> Any:

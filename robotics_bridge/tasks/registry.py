@@ -71,7 +71,10 @@ def _names(subject: Any) -> list[str]:
 
 Maker = Callable[[], Task]
 _MADE: dict[str, dict[str, Maker]] = {}
-_OWN = ("in_palm_rotate", "in_hand_repose", "screwdriver", "hot_ball")
+_SHIPPED = {
+    "in_palm_rotate": "turning", "in_hand_repose": "turning", "screwdriver": "turning", "hot_ball": "hot_ball",
+}  # fmt: skip
+"""Task of the package → the module that registers it, imported when the task is loaded."""
 
 
 def register(name: str, config: str = "default") -> Callable[[Maker], Maker]:
@@ -85,7 +88,7 @@ def register(name: str, config: str = "default") -> Callable[[Maker], Maker]:
     """
 
     def keep(maker: Maker) -> Maker:
-        shipped = name in _OWN and not maker.__module__.startswith("robotics_bridge.tasks.")
+        shipped = name in _SHIPPED and not maker.__module__.startswith("robotics_bridge.tasks.")
         if shipped or config in _MADE.get(name, {}):
             raise UsageError(f"There is a task {name!r} with a configuration {config!r} already; take another name.")
         _MADE.setdefault(name, {})[config] = maker
@@ -111,20 +114,20 @@ def bounded(task: Task) -> Task:
 
 def forget(name: str) -> None:
     """Remove a task that was registered; raise UsageError for any other, since tasks of the package stay."""
-    if name not in _MADE or name in _OWN:
-        raise unknown_name("task of yours", name, [n for n in _MADE if n not in _OWN])
+    if name not in _MADE or name in _SHIPPED:
+        raise unknown_name("task of yours", name, [n for n in _MADE if n not in _SHIPPED])
     del _MADE[name]
 
 
 def list_tasks() -> tuple[str, ...]:
     """Return the names of all registered tasks."""
-    return (*_OWN, *(name for name in _MADE if name not in _OWN))
+    return (*_SHIPPED, *(name for name in _MADE if name not in _SHIPPED))
 
 
 def load(name: str, config: str = "default") -> Task:
     """Return a task in one of its configurations (``default``, ``published``, …)."""
-    if name in _OWN:
-        import_module(f"robotics_bridge.tasks.{name}")
+    if name in _SHIPPED:
+        import_module(f"robotics_bridge.tasks.{_SHIPPED[name]}")
     if name not in _MADE:
         hint = "A task of your own: import its file first (brainbench policy: --task-file FILE)."
         raise unknown_name("task", name, list_tasks(), hint=hint)

@@ -195,7 +195,7 @@ def test_a_task_of_ones_own_is_trained_and_evaluated(tmp_path: Path, quick: Path
     ("words", "told"),
     [
         (("--hidden", "12,x"), "--hidden takes whole numbers joined by commas; received '12,x'"),
-        (("--hidden", "12,-4"), "width of the hidden layers .*received -4"),
+        (("--hidden", "12,-4"), "--hidden .*received -4"),
         (("--encoder", "rnn", "--unroll", "full"), "'options' = {'unroll': 'full'} is for .* network .*'rnn'"),
         (("--encoder", "mlp", "--time", "resampled"), "'time' = 'resampled' is for .* network .*'mlp'"),
         (("--encoder", "reservoir", "--units", "3"), "'units' = 3 is for .*'reservoir'"),

@@ -105,7 +105,8 @@ def play(
     result = {
         "task": env.task.name, "hand": env.hand.name, "contacts": contacts_name(env.task.contacts), "agent": agent,
         "seconds": steps * env.step_dt, "reward": sum(rewards), "episodes_ended": ended,
-        "metric": env.task.success.metric, "files": [] if video is None else [video], "goals": goals, "turned": turned, "dropped": dropped,
+        "metric": env.task.success.metric, "files": [] if video is None else [video],
+        "goals": goals, "turned": turned, "dropped": dropped,
     }  # fmt: skip
     lines: dict[str, object] = {
         "task": result["task"], "hand": result["hand"], "contacts": result["contacts"], "agent": agent,

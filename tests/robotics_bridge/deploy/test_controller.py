@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import gc
-import itertools
 import os
 import re
-from collections import Counter
-from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -16,8 +13,7 @@ from brainbench.core.errors import UsageError
 from robotics_bridge import hands
 from robotics_bridge.deploy.controller import PRIORITY, Clock, Controller, LatencyHistogram, RateMonitor, realtime
 from robotics_bridge.deploy.driver import HandReading, LinkCounters
-from robotics_bridge.deploy.safety import ClockOffset, SafetyLimits
-from robotics_bridge.deploy.session import PressureCalibration, RealTouch
+from robotics_bridge.deploy.safety import SafetyLimits
 from robotics_bridge.policies.contract import PolicyContract
 
 linux = pytest.mark.skipif(not hasattr(os, "SCHED_FIFO"), reason="SCHED_FIFO is Linux's")
@@ -225,58 +221,6 @@ def test_slow_control_is_noticed() -> None:
     assert report.overruns > 15
 
 
-def test_targets_keep_to_limits_of_joint_and_speed() -> None:
-    report, hand, _ = _control(policy=lambda obs, forget: np.array([9.0, 9.0]))
-    sent = np.array(hand.sent)
-    assert np.abs(np.diff(sent, axis=0, prepend=np.zeros((1, 3)))).max() <= 8.0 / 40 + 1e-9
-    np.testing.assert_allclose(sent[-1], [1.0, 0.3, 0.4])
-    assert report.limited == 4  # until the slowest joint has come the 1 rad, 0.2 rad a tick
-
-
-def test_ages_are_told_without_a_common_clock() -> None:
-    offset = ClockOffset()
-    assert offset.age(5.0, 105.02, 105.02) == pytest.approx(0.0)
-    assert offset.age(5.1, 105.11, 105.11) == pytest.approx(0.0)  # came faster: the new zero
-    assert offset.age(5.2, 105.31, 105.35) == pytest.approx(0.14, abs=1e-3)
-
-
-def test_a_clock_that_runs_slow_makes_no_report_old() -> None:
-    offset = ClockOffset()
-    ages = [offset.age(0.9999 * t, t, t) for t in np.arange(0.0, 7200.0, 0.1)]  # 100 ppm
-    assert max(ages) < 1e-4
-    assert offset.age(0.9999 * 7200, 7200.15, 7200.15) == pytest.approx(0.15, abs=1e-3)
-
-
-def _touching(observe: str, shape: tuple[int, ...]) -> PolicyContract:
-    body = hands.load("xhand1")
-    links = (body.palm, body.fingers["index"][-1], body.fingers["thumb"][-1])
-    return PolicyContract({"tactile": shape}, 40.0, "xhand1", JOINTS, JOINTS, {}, {}, links, observe)
-
-
-def test_real_values_fill_all_slots_and_simulated_ones_the_rest() -> None:
-    pressure = np.array([[0.0, 0.0, 0.03], [0.02, 0.0, 0.1]])
-    reading = HandReading(0, 0.0, 0.0, np.zeros(3), np.zeros(3), pressure)
-    fallback = lambda r: np.full((5, 3, 1), 7.0)  # noqa: E731
-    touch = RealTouch(_touching("agg_bool", (5, 3, 1)), ("thumb", "index"), fallback=fallback)
-    assert touch(reading)[:, :, 0].tolist() == [[7.0, 1.0, 0.0]] * 5  # 4.31: |f| > 0.05
-    force = RealTouch(_touching("agg_force", (5, 3, 3)), ("thumb", "index"))
-    assert force(reading)[2].tolist() == [[0, 0, 0], [-20.0, 0.0, 100.0], [0.0, 0.0, 30.0]]
-    calibration = PressureCalibration(per_finger={"index": 500.0})
-    again = calibration.pressure(("thumb", "index"), calibration.force(("thumb", "index"), pressure))
-    np.testing.assert_allclose(again, pressure)
-    simulated = RealTouch(_touching("force", (5, 9, 3)), (), fallback=lambda r: np.ones((5, 9, 3)))
-    assert simulated(reading).all()
-    with pytest.raises(UsageError, match=r"'force', .*'agg_force'"):
-        RealTouch(_touching("force", (5, 9, 3)), ())
-
-
-@pytest.mark.parametrize("observe", ["agg_force", "agg_bool"])
-def test_a_calibration_of_a_finger_that_the_hand_lacks_is_refused(observe) -> None:
-    calibration = PressureCalibration(per_finger={"indx": 5.0})
-    with pytest.raises(UsageError, match="'indx'; did you mean 'index'"):
-        RealTouch(_touching(observe, (5, 3, 3)), ("thumb", "index"), calibration=calibration)
-
-
 def test_what_does_not_fit_is_refused_before_anything_moves() -> None:
     with pytest.raises(UsageError, match="group 'command'"):
         _control(groups=("proprio", "command"))
@@ -305,84 +249,6 @@ def test_histogram_and_rate() -> None:
     assert rates[-1] == pytest.approx(20)
 
 
-def test_limits_are_of_the_joints_of_the_hand() -> None:
-    one = SafetyLimits(np.array([-1.0]), np.array([1.0]), np.array([8.0]))
-    clock = OwnClock()
-    with pytest.raises(UsageError, match="limits of 1 joints; the hand has 3"):
-        Controller(lambda obs, forget: np.zeros(2), PaperHand(clock), _contract(), one, clock=clock)
-
-
 def test_a_source_that_the_policy_does_not_read_is_refused() -> None:
     with pytest.raises(UsageError, match=r"'comand'.*did you mean 'command'"):
         _control(groups=("proprio", "command"), sources={"comand": None, "command": lambda reading: np.zeros(1)})
-
-
-class StallingHand(PaperHand):
-    """Stalls once after it took a report; notes how old the newest report is at each command."""
-
-    def __init__(self, clock: OwnClock, stall: Callable[[str], None]) -> None:
-        super().__init__(clock)
-        self.stall, self.ages = stall, []
-
-    def read(self) -> HandReading | None:
-        reading = super().read()
-        self.stall("read")
-        return reading
-
-    def send(self, targets) -> None:
-        super().send(targets)
-        self.ages.append(self.clock() - self.last.arrived)
-
-
-STALLS = (0.05, 0.09, 0.2, 0.5, 1.0, 2.0, 5.0, 20.0)
-TIMEOUTS = (0.06, 0.1, 0.3, 1.0, 2.0)
-
-
-@pytest.mark.parametrize("place", ["read", "source", "policy", "record"])
-@pytest.mark.parametrize("call", [1, 30], ids=["first", "later"])
-def test_no_command_comes_from_an_old_report_wherever_time_is_lost(place: str, call: int) -> None:
-    for stall, timeout in itertools.product(STALLS, TIMEOUTS):
-        clock, calls = OwnClock(), Counter()
-
-        def lose_time(where: str, stall=stall, clock=clock, calls=calls) -> None:
-            calls[where] += 1
-            # The first report is only waited for.
-            if where == place and calls[where] == call + (where == "read"):
-                clock.now += stall
-
-        def policy(obs, forget, lose_time=lose_time):
-            lose_time("policy")
-            return np.zeros(2, np.float32)
-
-        def source(reading, lose_time=lose_time):
-            lose_time("source")
-            return np.zeros(1)
-
-        hand = StallingHand(clock, lose_time)
-        controller = Controller(
-            policy, hand, _contract(("proprio", "goal")), _limits(timeout=timeout), sources={"goal": source},
-            clock=clock, record=lambda *_, lose_time=lose_time: lose_time("record"),
-        )  # fmt: skip
-        report, case = controller.run(2.0), (stall, timeout)
-        assert max(hand.ages, default=0.0) <= timeout, case
-        assert hand.stops == 1, case
-        if place != "record" and stall > timeout:
-            # The place alone says in which words: a report that is old when it is read, or a command.
-            assert report.status == "stopped", case
-            assert re.search(rf"{1e3 * stall:.0f} ms .*allowed {1e3 * timeout:.0f} ms", report.reason), case
-            assert len(hand.sent) == report.ticks == call - 1, case
-        elif stall <= 0.1:
-            assert report.status == "finished", case
-
-
-def test_a_stall_before_every_command_sends_none() -> None:
-    clock = OwnClock()
-    hand = PaperHand(clock)
-
-    def slow(obs, forget):
-        clock.now += 0.101
-        return np.zeros(2)
-
-    report = Controller(slow, hand, _contract(), _limits(), clock=clock).run(5.0)
-    assert (report.status, hand.sent, hand.stops) == ("stopped", [], 1)
-    assert report.reason == "a command came 101 ms after the report it was decided from (allowed 100 ms)"

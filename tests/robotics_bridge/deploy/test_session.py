@@ -12,10 +12,10 @@ import pytest
 import torch
 
 from brainbench.core.errors import UsageError
-from robotics_bridge import tasks
+from robotics_bridge import hands, tasks
 from robotics_bridge.deploy.controller import Clock
 from robotics_bridge.deploy.driver import Driver, HandReading, LinkCounters
-from robotics_bridge.deploy.session import DeployedPolicy, PressureCalibration, read_deployed
+from robotics_bridge.deploy.session import DeployedPolicy, PressureCalibration, RealTouch, read_deployed
 from robotics_bridge.policies.contract import PolicyContract
 from robotics_bridge.policies.evaluate import Policy
 from robotics_bridge.policies.export import export_policy
@@ -116,3 +116,36 @@ def test_a_deployed_policy_sees_and_does_what_evaluation_does(tmp_path: Path) ->
     assert np.ptp(wanted, axis=0).max() > 0.1
     assert hand.largest == pytest.approx(task.action_limit)
     np.testing.assert_allclose(sent, wanted, atol=2e-4)
+
+
+JOINTS = ("a", "b", "c")
+
+
+def _touching(observe: str, shape: tuple[int, ...]) -> PolicyContract:
+    body = hands.load("xhand1")
+    links = (body.palm, body.fingers["index"][-1], body.fingers["thumb"][-1])
+    return PolicyContract({"tactile": shape}, 40.0, "xhand1", JOINTS, JOINTS, {}, {}, links, observe)
+
+
+def test_real_values_fill_all_slots_and_simulated_ones_the_rest() -> None:
+    pressure = np.array([[0.0, 0.0, 0.03], [0.02, 0.0, 0.1]])
+    reading = HandReading(0, 0.0, 0.0, np.zeros(3), np.zeros(3), pressure)
+    fallback = lambda r: np.full((5, 3, 1), 7.0)  # noqa: E731
+    touch = RealTouch(_touching("agg_bool", (5, 3, 1)), ("thumb", "index"), fallback=fallback)
+    assert touch(reading)[:, :, 0].tolist() == [[7.0, 1.0, 0.0]] * 5  # 4.31: |f| > 0.05
+    force = RealTouch(_touching("agg_force", (5, 3, 3)), ("thumb", "index"))
+    assert force(reading)[2].tolist() == [[0, 0, 0], [-20.0, 0.0, 100.0], [0.0, 0.0, 30.0]]
+    calibration = PressureCalibration(per_finger={"index": 500.0})
+    again = calibration.pressure(("thumb", "index"), calibration.force(("thumb", "index"), pressure))
+    np.testing.assert_allclose(again, pressure)
+    simulated = RealTouch(_touching("force", (5, 9, 3)), (), fallback=lambda r: np.ones((5, 9, 3)))
+    assert simulated(reading).all()
+    with pytest.raises(UsageError, match=r"'force', .*'agg_force'"):
+        RealTouch(_touching("force", (5, 9, 3)), ())
+
+
+@pytest.mark.parametrize("observe", ["agg_force", "agg_bool"])
+def test_a_calibration_of_a_finger_that_the_hand_lacks_is_refused(observe) -> None:
+    calibration = PressureCalibration(per_finger={"indx": 5.0})
+    with pytest.raises(UsageError, match="'indx'; did you mean 'index'"):
+        RealTouch(_touching(observe, (5, 3, 3)), ("thumb", "index"), calibration=calibration)

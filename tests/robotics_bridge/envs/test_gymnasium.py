@@ -126,3 +126,13 @@ def test_touch_is_a_keyword_of_make() -> None:
     )
     assert env.observation_space["tactile"].shape == (5, 45, 6)
     assert "tactile" not in gymnasium.make("brainbench/InPalmRotate-v0", threads=1).observation_space.spaces
+
+
+def test_an_option_that_a_reset_in_gymnasium_lacks_is_refused() -> None:
+    pytest.importorskip("gymnasium")
+    from robotics_bridge.envs.gymnasium import make_vec
+
+    envs = make_vec("in_palm_rotate", 2)
+    with pytest.raises(UsageError, match="reset_mask"):
+        envs.reset(options={"reset_masks": [True, False]})
+    envs.reset(seed=3, options={"reset_mask": [True, False]})

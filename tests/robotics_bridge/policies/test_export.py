@@ -8,12 +8,16 @@ import shutil
 import numpy as np
 import onnx
 import pytest
+import torch
 from onnx import numpy_helper
+from rsl_rl.utils import resolve_class
+from tensordict import TensorDict
 
 from brainbench.core.errors import BrainbenchError, DataError
 from brainbench.core.files import write_json
 from robotics_bridge.deploy.session import read_deployed
-from robotics_bridge.policies.export import read_policy
+from robotics_bridge.policies.export import compare, export_policy, read_policy
+from robotics_bridge.policies.student import StepPolicy, TactilePolicy
 from tests.factories.mutations import mutate_text
 from tests.factories.policies import contract_of, export_small
 from tests.factories.reading_trials import time_limit
@@ -126,3 +130,103 @@ def test_files_that_fit_another_contract_are_refused(exported, tmp_path) -> None
     for path in (tmp_path, tmp_path / "empty.onnx", tmp_path / "none.onnx"):
         with pytest.raises(DataError, match=path.name):
             read_policy(path, SHAPES)
+
+
+NETWORK = "zhuang-intersection-ln-small"
+
+
+ITEMS = 45
+
+
+GROUPS = {"student": ["proprio", "goal", "tactile"]}
+
+
+def _observations(batch: int, steps: int = 1, seed: int = 0) -> TensorDict:
+    generator = torch.Generator().manual_seed(seed)
+
+    def values(*shape: int) -> torch.Tensor:
+        return torch.randn(steps, batch, *shape, generator=generator)
+
+    touch = values(5, ITEMS, 6) * torch.tensor([0.2] * 3 + [2e-3] * 3)
+    groups = {"proprio": values(30), "goal": values(1), "tactile": touch}
+    return TensorDict(groups, batch_size=[steps, batch])
+
+
+def _make_policy(name: str = NETWORK, **settings) -> TactilePolicy:
+    cfg = {
+        "class_name": "robotics_bridge.policies.student:TactilePolicy",
+        "tactile": {"name": name, "placement": "tips", "resolution": "low", **settings.pop("tactile", {})},
+        **settings,
+    }
+    kind, arguments = resolve_class(cfg)
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        policy = kind(_observations(1)[0], GROUPS, "student", 12, **arguments)
+    policy.update_normalization(_observations(64)[0])
+    return policy
+
+
+SLOWER = [
+    pytest.param(name, marks=pytest.mark.slow)
+    for name in (NETWORK, "tactile_convrnn", "tactile_canvas_cnn", "s4-small")
+]
+
+
+@pytest.mark.parametrize("name", ["mlp", *SLOWER])
+def test_onnx_file_follows_the_policy_for_sixty_steps_with_resets(name, tmp_path) -> None:
+    policy = _make_policy(name, tactile={"time": "resampled"} if name == NETWORK else {})
+    found = export_policy(policy, tmp_path / "policy", deployment={"rate": 40})
+    assert found.path == tmp_path / "policy.onnx"
+    assert found.difference < 1e-4
+    run = read_policy(found.path, policy.shapes, threads=1)
+    other = _make_policy(name, tactile={"seed": 1} if name == NETWORK else {})
+    with torch.no_grad():
+        for weight in other.mlp.parameters():
+            weight.add_(0.05)
+    assert compare(other, run) > 1e-2
+    assert '"rate": 40' in found.contract.read_text()
+
+
+class _Forgetful(TactilePolicy):
+    """What a user would write who overrides the latent alone: exports fall back on rsl_rl's, without encoders."""
+
+    exported: type
+
+    def as_onnx(self, verbose: bool = False):
+        return self.exported(self)
+
+
+class _HeadOnly(torch.nn.Module):
+    def __init__(self, policy: TactilePolicy) -> None:
+        super().__init__()
+        full = StepPolicy(policy)
+        self.mlp, self.latent = full.mlp, policy.core.features
+        self.shapes = {name: shape for name, shape in full.shapes.items() if name != "tactile"}
+        self.input_names, self.output_names = [*self.shapes, "h_in"], ["actions", "h_out"]
+
+    def forward(self, *inputs):
+        proprio, goal, h_in = inputs
+        latent = torch.nn.functional.pad(torch.cat((proprio, goal), 1), (0, self.latent - 31))
+        return self.mlp(latent), h_in + 0
+
+    def get_dummy_inputs(self, batch: int = 1):
+        return torch.zeros(batch, 30), torch.zeros(batch, 1), torch.zeros(batch, 1)
+
+
+class _Numb(StepPolicy):
+    """Takes touch, and does not use it."""
+
+    def forward(self, *inputs):
+        return super().forward(*(0.0 * item if item.ndim > 2 else item for item in inputs))
+
+
+@pytest.mark.parametrize(("wrong", "message"), [(_HeadOnly, "no input 'tactile'"), (_Numb, "differs from the policy")])
+def test_an_export_that_loses_the_encoder_fails_and_leaves_no_file(wrong, message, tmp_path) -> None:
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        tactile = {"name": "mlp", "placement": "tips", "resolution": "low"}
+        policy = _Forgetful(_observations(1)[0], GROUPS, "student", 12, tactile=tactile)
+    policy.exported = wrong
+    with pytest.raises(DataError, match=message):
+        export_policy(policy, tmp_path / "policy")
+    assert not list(tmp_path.iterdir())

@@ -3,23 +3,25 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import asdict
 
-import numpy as np
 import pytest
 import torch
 from rsl_rl.utils import resolve_class, split_and_pad_trajectories
 from tensordict import TensorDict
 
 from brainbench import load_model
-from brainbench.core.errors import DataError, UsageError
-from robotics_bridge.policies.encoders.arms import ARMS, EncoderConfig, RunningScale
-from robotics_bridge.policies.export import compare, export_policy, read_policy
-from robotics_bridge.policies.student import StepPolicy, TactilePolicy
+from brainbench.core.errors import UsageError
+from robotics_bridge.policies.encoders.arms import ARMS
+from robotics_bridge.policies.export import export_policy
+from robotics_bridge.policies.student import TactilePolicy
 from robotics_bridge.policies.training.distill_config import DistillConfig
 
 NETWORK = "zhuang-intersection-ln-small"
+
+
 ITEMS = 45
+
+
 GROUPS = {"student": ["proprio", "goal", "tactile"]}
 
 
@@ -120,105 +122,11 @@ SLOWER = [
 ]
 
 
-@pytest.mark.parametrize("name", ["mlp", *SLOWER])
-def test_onnx_file_follows_the_policy_for_sixty_steps_with_resets(name, tmp_path) -> None:
-    policy = _make_policy(name, tactile={"time": "resampled"} if name == NETWORK else {})
-    found = export_policy(policy, tmp_path / "policy", deployment={"rate": 40})
-    assert found.path == tmp_path / "policy.onnx"
-    assert found.difference < 1e-4
-    run = read_policy(found.path, policy.shapes, threads=1)
-    other = _make_policy(name, tactile={"seed": 1} if name == NETWORK else {})
-    with torch.no_grad():
-        for weight in other.mlp.parameters():
-            weight.add_(0.05)
-    assert compare(other, run) > 1e-2
-    assert '"rate": 40' in found.contract.read_text()
-
-
 def test_a_policy_that_was_sampled_in_training_is_exported_and_never_as_a_program(tmp_path) -> None:
     policy = _make_policy("zhuang-small", distribution_cfg={"class_name": "GaussianDistribution", "init_std": 1.0})
     assert export_policy(policy, tmp_path / "policy").difference < 1e-4
     with pytest.raises(UsageError, match="ONNX"):
         policy.as_jit()
-
-
-class _Forgetful(TactilePolicy):
-    """What a user would write who overrides the latent alone: exports fall back on rsl_rl's, without encoders."""
-
-    exported: type
-
-    def as_onnx(self, verbose: bool = False):
-        return self.exported(self)
-
-
-class _HeadOnly(torch.nn.Module):
-    def __init__(self, policy: TactilePolicy) -> None:
-        super().__init__()
-        full = StepPolicy(policy)
-        self.mlp, self.latent = full.mlp, policy.core.features
-        self.shapes = {name: shape for name, shape in full.shapes.items() if name != "tactile"}
-        self.input_names, self.output_names = [*self.shapes, "h_in"], ["actions", "h_out"]
-
-    def forward(self, *inputs):
-        proprio, goal, h_in = inputs
-        latent = torch.nn.functional.pad(torch.cat((proprio, goal), 1), (0, self.latent - 31))
-        return self.mlp(latent), h_in + 0
-
-    def get_dummy_inputs(self, batch: int = 1):
-        return torch.zeros(batch, 30), torch.zeros(batch, 1), torch.zeros(batch, 1)
-
-
-class _Numb(StepPolicy):
-    """Takes touch, and does not use it."""
-
-    def forward(self, *inputs):
-        return super().forward(*(0.0 * item if item.ndim > 2 else item for item in inputs))
-
-
-@pytest.mark.parametrize(("wrong", "message"), [(_HeadOnly, "no input 'tactile'"), (_Numb, "differs from the policy")])
-def test_an_export_that_loses_the_encoder_fails_and_leaves_no_file(wrong, message, tmp_path) -> None:
-    with torch.random.fork_rng():
-        torch.manual_seed(0)
-        tactile = {"name": "mlp", "placement": "tips", "resolution": "low"}
-        policy = _Forgetful(_observations(1)[0], GROUPS, "student", 12, tactile=tactile)
-    policy.exported = wrong
-    with pytest.raises(DataError, match=message):
-        export_policy(policy, tmp_path / "policy")
-    assert not list(tmp_path.iterdir())
-
-
-def test_running_scale_counts_only_what_touches() -> None:
-    scale = RunningScale(2)
-    assert scale(torch.ones(1, 2)).tolist() == [[1.0, 1.0]]
-    scale.update(torch.tensor([[0.0, 4.0], [3.0, 0.0], [0.0, float("nan")]]))
-    assert scale(torch.tensor([[3.0, 4.0]])).tolist() == [[1.0, 1.0]]
-
-
-def test_configurations_survive_a_file_and_name_what_is_wrong() -> None:
-    config = EncoderConfig(name="mlp", calibration=EncoderConfig().calibration)
-    assert EncoderConfig.of(asdict(config)) == config
-    assert EncoderConfig(observe="agg_bool").arm == "rnn"
-    assert EncoderConfig(observe="force").arm == "tactile_convrnn"
-    with pytest.raises(UsageError, match="did you mean 'resolution'"):
-        EncoderConfig.of({"resolutio": "med"})
-    with pytest.raises(UsageError, match="did you mean 'tactile_cnn'"):
-        EncoderConfig(name="tactil_cnn").build()
-    with pytest.raises(UsageError, match=r"'tactile_cnn' .*'agg_bool'"):
-        EncoderConfig(name="tactile_cnn", observe="agg_bool").build()
-    with pytest.raises(UsageError, match=r"\[5, 199, 6\]; .*\[5, 45, 6\]"):
-        TactilePolicy(_observations(1)[0], GROUPS, "student", 12, tactile={"name": "mlp"})
-    with pytest.raises(UsageError, match=r"tactile={'name'"):
-        TactilePolicy(_observations(1)[0], GROUPS, "student", 12)
-
-
-def test_per_link_images_hold_each_taxel_once() -> None:
-    encoder = EncoderConfig(name="tactile_cnn", placement="hand", resolution="high").build()
-    slots, items, channels = encoder.shape
-    assert items == 667
-    taxels = torch.arange(1.0, items + 1).view(1, 1, items, 1).expand(1, slots, items, channels)
-    pictures = encoder.pictures(taxels)  # type: ignore[attr-defined]
-    values = pictures[:, 0].flatten()
-    assert sorted(values[values != 0].tolist()) == np.arange(1.0, items + 1).tolist()
 
 
 def test_a_network_keeps_the_weights_that_were_scored() -> None:
@@ -246,29 +154,6 @@ def test_many_steps_at_once_are_those_steps_one_by_one(name) -> None:
     torch.testing.assert_close(after, h, atol=1e-5, rtol=1e-4)
 
 
-@pytest.mark.parametrize("name", ["tactile_convrnn", "tactile_canvas_convrnn"])
-def test_convolutions_as_products_give_the_same_answers_and_gradients(name) -> None:
-    encoder = EncoderConfig(name=name, placement="tips", resolution="low").build()
-    with torch.no_grad():
-        for weight in encoder.parameters():
-            weight += 0.1 * torch.randn(weight.shape, generator=torch.Generator().manual_seed(2))
-    touch = _observations(6, 3)["tactile"]
-    ended = torch.tensor([[0, 1, 0, 0, 0, 1], [1, 0, 0, 0, 0, 0], [0, 0, 1, 0, 0, 0]], dtype=torch.bool)
-    found = []
-    for unroll in (super(type(encoder), encoder).unroll, encoder.unroll_as_products):  # type: ignore[operator]
-        encoder.zero_grad()
-        h = torch.full((6, encoder.state_size), 0.1, requires_grad=True)
-        y, after = unroll(touch, h, ended)
-        (y.pow(2).mean() + after.pow(3).mean()).backward()
-        found.append([y.detach(), after.detach(), h.grad, *(weight.grad for weight in encoder.parameters())])
-    for slow, fast in zip(*found, strict=True):
-        scale = float(slow.abs().max())
-        torch.testing.assert_close(fast, slow, rtol=1e-3, atol=1e-5 * scale)
-    with torch.no_grad(), torch.autocast("cpu", torch.bfloat16):
-        mixed, _ = encoder.unroll_as_products(touch, h.detach(), ended)  # type: ignore[operator]
-    torch.testing.assert_close(mixed.float(), found[0][0], rtol=0, atol=0.05 * float(found[0][0].abs().max()))
-
-
 def test_what_a_frozen_network_gave_needs_no_memory_of_touch() -> None:
     policy = _make_policy(embedder="lstm").eval()
     front = policy.core.tactile.frozen_part  # type: ignore[union-attr]
@@ -281,41 +166,6 @@ def test_what_a_frozen_network_gave_needs_no_memory_of_touch() -> None:
         kept, after = policy.unroll(obs, policy.zeros(2, stored=True), None, torch.stack(features))
     assert after.shape == (2, policy.core.stored_size)
     torch.testing.assert_close(kept, whole, atol=1e-5, rtol=1e-4)
-
-
-def test_units_are_of_the_lstm_alone() -> None:
-    small, usual = (EncoderConfig(name="rnn", **own).build() for own in ({"units": 9}, {}))
-    assert (small.state_size, usual.state_size) == (18, 128)
-    count = [sum(weight.numel() for weight in each.parameters()) for each in (small, usual)]
-    assert count[0] < count[1] / 6
-
-
-@pytest.mark.parametrize(
-    ("name", "own", "told"),
-    [
-        ("reservoir", {"units": 9}, "'units' = 9 .*'rnn'; 'reservoir'"),
-        ("zhuang-small", {"units": 9}, "'units' = 9 .*'rnn'; 'zhuang-small'"),
-        ("auto", {"time": "resampled"}, "'time' .*network.*'tactile_convrnn'"),
-        ("reservoir", {"learning": "finetuned"}, "'learning' .*network.*'reservoir'"),
-        ("mlp", {"pretrained": "a.safetensors"}, "'pretrained' .*network.*'mlp'"),
-        ("rnn", {"options": {"unroll": "full"}}, "'options' .*network.*'rnn'"),
-        ("tactile_cnn", {"calibration": {"force": 2.0}}, "'calibration' .*network.*'tactile_cnn'"),
-        ("zhuang-small", {"time": "resample"}, "did you mean 'resampled'"),
-        ("zhuang-small", {"learning": "froze"}, "did you mean 'frozen'"),
-        ("reservoir", {"seed": -1}, "'seed' .*at least 0"),
-    ],
-)
-def test_settings_that_an_encoder_does_not_have_are_refused(name, own, told) -> None:
-    with pytest.raises(UsageError, match=told):
-        EncoderConfig.of({"name": name, **own})
-    with pytest.raises(UsageError, match=told):
-        DistillConfig(task="in_palm_rotate", encoder=name, encoder_settings=own)
-
-
-@pytest.mark.parametrize("name", [*ARMS, "zhuang-small"])
-def test_settings_at_their_defaults_are_of_every_encoder(name) -> None:
-    config = EncoderConfig(name=name)
-    assert EncoderConfig.of(asdict(config)) == config
 
 
 @pytest.mark.parametrize("own", ["hand", "observe", "placement", "resolution", "name"])

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
+
 import pytest
+import torch
 
 from brainbench.core.errors import UsageError
 from robotics_bridge import tasks
 from robotics_bridge.tasks.registry import apply_overrides
+from robotics_bridge.tasks.task import ObjectRandomisation
 
 TASK = tasks.load("in_palm_rotate")
 
@@ -67,3 +72,50 @@ def test_words_that_name_nothing_or_hold_no_such_value_are_refused(word: str, me
 def test_a_number_is_changed_once() -> None:
     with pytest.raises(UsageError, match="'episode' more than once"):
         apply_overrides(TASK, ["episode=15", "entropy=0", "episode=20"])
+
+
+MY_TASK = """
+from dataclasses import replace
+from robotics_bridge import tasks
+from robotics_bridge.tasks import terms
+
+@tasks.register("keep_still")
+def keep_still() -> tasks.Task:
+    rotate = tasks.load("in_palm_rotate")
+    rewards = {"stay": tasks.Reward(-10.0, terms.far_from, {"target": None, "margin": 0.0})}
+    return replace(rotate, name="keep_still", text="hold a block still", rewards=rewards, goal=None, goal_terms=(),
+                   endings={}, auxiliary=(), decoders=(),
+                   groups={"actor": ("priv_proprio", "priv_obj_state"), "student": ("proprio",)})
+"""
+
+
+def test_a_task_of_ones_own_is_one_file(tmp_path: Path) -> None:
+    from brainbench.core.plugins import load_module
+
+    file = tmp_path / "keep_still.py"
+    file.write_text(MY_TASK)
+    load_module(str(file))
+    try:
+        assert "keep_still" in tasks.list_tasks()
+        env = tasks.make("keep_still", num_envs=2, threads=1)
+        observations, reward, *_ = env.step(torch.zeros(2, env.num_actions))
+        assert set(observations) == {"proprio", "priv_proprio", "priv_obj_state"}
+        assert (reward <= 0).all()
+        with pytest.raises(UsageError, match="already"):
+            load_module(str(file))
+    finally:
+        tasks.forget("keep_still")
+    assert "keep_still" not in tasks.list_tasks()
+
+
+def test_unknown_names_are_met_with_the_nearest() -> None:
+    with pytest.raises(UsageError, match="did you mean 'screwdriver'"):
+        tasks.load("screwdrivr")
+    with pytest.raises(UsageError, match="did you mean 'published'"):
+        tasks.load("screwdriver", "publish")
+    with pytest.raises(UsageError, match="'priv_obj_stat'; did you mean"):
+        replace(tasks.load("screwdriver"), groups={"actor": ("priv_obj_stat",)})
+    with pytest.raises(UsageError, match=r"'screwdriver' .*received 0\.0"):
+        replace(tasks.load("screwdriver"), episode=0.0)
+    with pytest.raises(UsageError, match="range"):
+        replace(tasks.load("screwdriver"), object_changes=ObjectRandomisation(friction=(2.0, 1.0)))

@@ -10,8 +10,10 @@ import torch
 from brainbench.core.errors import UsageError
 from robotics_bridge import tasks
 from robotics_bridge.envs import Env
+from robotics_bridge.tasks.goals import SteppingRotation
+from robotics_bridge.tasks.hot_ball import ThermalSettings
 from robotics_bridge.tasks.registry import apply_overrides
-from robotics_bridge.tasks.settings import CONTACTS, ContactModel
+from robotics_bridge.tasks.settings import CONTACTS, ContactModel, TeacherSettings
 
 TASK = tasks.load("in_palm_rotate")
 
@@ -64,3 +66,16 @@ def test_words_name_contacts_and_their_numbers() -> None:
     ):  # fmt: skip
         with pytest.raises(UsageError, match=culprit):
             apply_overrides(TASK, [word])
+
+
+@pytest.mark.parametrize(
+    ("kind", "name", "value"),
+    [
+        (ThermalSettings, "hot", 10.0), (ThermalSettings, "emissivity", 3.0), (ThermalSettings, "ball", "aluminum"),
+        (SteppingRotation, "start_threshold", 0.01), (TeacherSettings, "learning_rate", 0.1),
+    ],
+)  # fmt: skip
+def test_numbers_of_a_part_fit_one_another(kind, name, value) -> None:
+    expected = {"hot": "hotter", "ball": "aluminium", "learning_rate": "learning rate"}.get(name, name)
+    with pytest.raises(UsageError, match=expected):
+        kind(**{name: value})

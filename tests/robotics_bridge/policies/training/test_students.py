@@ -104,22 +104,3 @@ def test_resampled_time_is_for_readings_as_often_as_the_encoder_assumes(tmp_path
     config = _config(task="in_palm_rotate", teacher="in_palm_rotate.teacher", encoder_settings={"time": "resampled"})
     with pytest.raises(UsageError, match=r"every 0\.005 s; those of 'in_palm_rotate' come every 0\.004 s"):
         train_student(config, tmp_path)
-
-
-@pytest.mark.parametrize(
-    ("options", "told"),
-    [
-        ({"observe": "none", "encoder": "rnn"}, "'none' has no touch; leave out 'encoder'"),
-        ({"observe": "none", "placement": "tips", "noisy": True}, "leave out 'placement', 'noisy'"),
-        ({"observe": "none", "encoder_settings": {"seed": 1}}, "leave out 'encoder_settings'"),
-        ({"noisy": "no"}, "'noisy' must be true or false; received 'no'"),
-        ({"encoder_settings": []}, "'encoder_settings' must be names and values"),
-        ({"placement": "tip"}, "did you mean 'tips'"),
-        ({"resolution": "mid"}, "did you mean 'med'"),
-        ({"teacher_iterations": 5}, "'teacher_share' falls, and that is 0"),
-        ({"encoder": 5}, "tactile encoder 5"),
-    ],
-)
-def test_settings_of_a_student_that_reach_nothing_are_refused(options, told) -> None:
-    with pytest.raises(UsageError, match=told):
-        DistillConfig(task="in_palm_rotate", **options)

@@ -7,15 +7,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 
 from brainbench.core.errors import UsageError
-from robotics_bridge import hands, tasks
+from robotics_bridge import tasks
 from robotics_bridge.tasks import terms
 from robotics_bridge.tasks.goals import SteppingRotation, TimedRotation
-from robotics_bridge.tasks.hot_ball import ThermalSettings
-from robotics_bridge.tasks.objects import ObjectPrimitive, ObjectShape, ball
-from robotics_bridge.tasks.scenes import build
+from robotics_bridge.tasks.objects import ObjectPrimitive
 from robotics_bridge.tasks.settings import TeacherSettings
 from robotics_bridge.tasks.task import ActuatorRandomisation, Ending, ObjectRandomisation, Placement, Push, Success
 
@@ -91,19 +88,6 @@ def test_ranges_are_two_numbers_in_order(kind, name) -> None:
         kind(**{name: (0.002, 0.001)})
 
 
-@pytest.mark.parametrize(
-    ("kind", "name", "value"),
-    [
-        (ThermalSettings, "hot", 10.0), (ThermalSettings, "emissivity", 3.0), (ThermalSettings, "ball", "aluminum"),
-        (SteppingRotation, "start_threshold", 0.01), (TeacherSettings, "learning_rate", 0.1),
-    ],
-)  # fmt: skip
-def test_numbers_of_a_part_fit_one_another(kind, name, value) -> None:
-    expected = {"hot": "hotter", "ball": "aluminium", "learning_rate": "learning rate"}.get(name, name)
-    with pytest.raises(UsageError, match=expected):
-        kind(**{name: value})
-
-
 @pytest.mark.parametrize("value", [(0, 0, 0, 0), (np.nan, 0, 0, 1), (1.0, 0, 0), "wxyz"])
 def test_orientations_have_a_length(value) -> None:
     makers = (
@@ -114,44 +98,6 @@ def test_orientations_have_a_length(value) -> None:
     for make in makers:
         with pytest.raises(UsageError, match="quaternion"):
             make()
-
-
-def test_axes_and_orientations_count_by_their_direction() -> None:
-    assert Placement(quaternion=(2, 0, 0, 0)) == Placement()
-    assert _changed(turn_axis=(0.0, 0.0, 2.0)).turn_axis == (0.0, 0.0, 1.0)
-    start, draw = torch.tensor([[1.0, 0, 0, 0]]), torch.zeros(1, 2)
-    near, far = (SteppingRotation(axis=(0, 0, length), step=0.5).following(start, start, draw) for length in (1.0, 3.0))
-    assert torch.equal(near, far)
-    for make in (lambda axis: SteppingRotation(axis=axis), lambda axis: _changed(turn_axis=axis)):
-        for axis in ((0, 0, 0), (0, np.nan, 1), (0.0, 1.0)):
-            with pytest.raises(UsageError, match="axis"):
-                make(axis)
-
-
-@pytest.mark.parametrize("size", [20.0, 0.0, np.nan, np.inf, "a"])
-def test_objects_have_sizes_in_metres(size) -> None:
-    with pytest.raises(UsageError, match="metres"):
-        ObjectPrimitive("sphere", (size,))
-    with pytest.raises(UsageError, match="sphere"):
-        ObjectPrimitive("sphere", 0.01)  # type: ignore[arg-type]
-
-
-@pytest.mark.parametrize(
-    ("name", "value"), [("solids", ()), ("extent", (np.nan, 1, 1)), ("extent", (1, 1)), ("bottom", np.nan)]
-)
-def test_outer_measures_of_objects_are_lengths(name, value) -> None:
-    with pytest.raises(UsageError, match="solid" if name == "solids" else name):
-        replace(ball(0.02), **{name: value})
-    assert isinstance(ball(0.02).scaled(2.0), ObjectShape)
-
-
-def test_joints_rest_within_their_limits() -> None:
-    hand = hands.load("xhand1")
-    joint = hand.joints[0]
-    with pytest.raises(UsageError, match=f"{joint}.*received 45"):
-        build(_changed(joints={"xhand1": {joint: 45.0}}), hand)
-    with pytest.raises(UsageError, match=joint):
-        _changed(joints={"xhand1": {joint: np.nan}})
 
 
 def test_a_carriage_has_a_range_and_positive_numbers() -> None:

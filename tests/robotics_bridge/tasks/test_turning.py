@@ -12,23 +12,31 @@ from robotics_bridge import tasks
 from robotics_bridge.tasks import terms
 
 TASKS = ("in_palm_rotate", "in_hand_repose", "screwdriver")
+
+
 TABLE_4_4 = {
     # environments, steps, iterations, lr, epochs, minibatches, gamma, lambda, clip, KL, entropy, value, norm, seconds
     "in_palm_rotate": (8192, 24, 6000, 1e-3, 5, 4, 0.998, 0.95, 0.2, 0.01, 2e-3, 1.0, 1.0, 10),
     "in_hand_repose": (8192, 24, 20000, 1e-3, 5, 4, 0.998, 0.95, 0.2, 0.01, 2e-3, 1.0, 1.0, 20),
     "screwdriver": (8192, 12, 5000, 1e-3, 5, 4, 0.99, 0.95, 0.2, 0.01, 0.0, 1.0, 1.0, 20),
 }
+
+
 TABLE_4_4_STUDENT = {
     # iterations, lr, epochs, gradient length, clip, norm, loss
     "in_palm_rotate": (6000, 1e-4, 5, 2, None, 2.0, "mse"),
     "in_hand_repose": (6000, 1e-4, 5, 2, None, None, "mse"),
     "screwdriver": (2000, 1e-5, 5, 4, 0.1, 0.5, "inv_var_mse"),
 }
+
+
 TABLE_4_5 = {
     "in_palm_rotate": [("aux_obj_size", 1.0, 20.0, (128, 64)), ("aux_goal_dist", 1.0, 1.0, (128, 64))],
     "in_hand_repose": [],
     "screwdriver": [("aux_obj_tilt", 0.5, 1.0, (512, 128)), ("aux_rotation_progress", 0.5, 1.0, (512, 128))],
 }
+
+
 TABLE_4_8 = {
     # row: in_palm_rotate, in_hand_repose, screwdriver; by function of ours
     terms.goal_reached: (150.0, 500.0, None),
@@ -47,6 +55,8 @@ TABLE_4_8 = {
     terms.beyond_limits: (-40.0, -20.0, -40.0),
     terms.work: (-5e-3, -1e-3, -1e-3),
 }
+
+
 TABLE_4_9 = {
     # friction, mass, placement x and y, yaw, force x, y, z, interval
     "in_palm_rotate": ((0.5, 1.5), (0.0, 0.1), 0.02, math.pi / 12, (-1, 1), (-1, 1), (-1, 1), (2, 4)),
@@ -114,18 +124,6 @@ def test_groups_are_those_of_table_4_7(name: str) -> None:
     props = () if name == "screwdriver" else ("priv_obj_props",)
     assert groups["critic"] == (*goal, "priv_proprio", "priv_obj_state", *props)
     assert groups["student"] == ("proprio", *goal)
-
-
-def test_hot_ball_is_that_of_section_4_6_3() -> None:
-    from robotics_bridge.tasks.hot_ball import BALLS, DIAMETER, SIDE, ThermalSettings
-
-    task, thermal = tasks.load("hot_ball", "published"), ThermalSettings()
-    assert (SIDE, BALLS, DIAMETER, task.copies, task.episode) == (0.5, 8, 0.08, 8, 20.0)
-    assert (thermal.ambient, thermal.hot, thermal.margin) == (22.0, 45.0, 0.12)
-    assert thermal.threshold == pytest.approx(42.24)
-
-
-# --- released settings --------------------------------------------------------------------------------------------
 
 
 def _read(path: Path) -> dict[str, Any]:
@@ -279,26 +277,9 @@ RELEASED_ENDINGS = {
     "threshold": "height", "max_consecutive_successes": "count", "local_up_axis": "local_up",
     "min_alignment": "min_alignment", "stagnation_eps": "angle",
 }  # fmt: skip
+
+
 RELEASED_GOALS = {
     "rotation_axis_world": "axis", "step_rad": "step", "allowed_off_axis_error": "allowed_off_axis",
     "orientation_success_threshold": "threshold", "y_range": "tilt", "x_range": "tilt",
 }  # fmt: skip
-
-
-@pytest.mark.shared
-@pytest.mark.parametrize("hand", ["xhand1", "sharpa"])
-def test_grasps_are_sought_as_released(reference: Path, hand: str) -> None:
-    yaml = pytest.importorskip("yaml")
-    from robotics_bridge.envs.reset import SETTINGS
-    from robotics_bridge.tasks.screwdriver import POSES, REST
-
-    c = yaml.safe_load((reference / "tasks" / f"screwdrivers_{hand}.yaml").read_text())
-    g, robot, ours = c["grasp_generation"], c["scene_options"]["robot"], SETTINGS[hand]
-    assert (ours.count, ours.perturb, ours.near_fingers, ours.near, ours.max_penetration, ours.max_displacement) == (
-        g["num_grasps"], g["perturb_range"], g["required_num_surface_distance_fingers"],
-        g["surface_distance_threshold"], g["max_penetration"], g["max_displacement"],
-    )  # fmt: skip
-    assert POSES[hand][0] == pytest.approx(robot["default_root_pos"])
-    assert POSES[hand][1] == pytest.approx(robot["default_root_quat"])
-    rest = {name: angle for name, angle in robot["default_dofs_pos"].items() if angle}
-    assert REST[hand] == pytest.approx(rest)

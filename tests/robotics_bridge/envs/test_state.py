@@ -1,0 +1,84 @@
+"""The native environment, on C MuJoCo; what MuJoCo Warp does differently is in test_engines."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from brainbench.core.rotations import to_matrices
+from robotics_bridge import tasks
+from robotics_bridge.envs import Env
+from robotics_bridge.tasks.goals import SteppingRotation
+from robotics_bridge.tasks.task import ObjectRandomisation
+
+
+def _make(num_envs: int = 4, task: Any = "in_palm_rotate", **options: Any) -> Env:
+    return tasks.make(task, num_envs=num_envs, threads=1, **options)
+
+
+def _actions(env: Env, count: int, seed: int = 0) -> list[torch.Tensor]:
+    g = torch.Generator().manual_seed(seed)
+    return [torch.randn(env.num_envs, env.num_actions, generator=g) for _ in range(count)]
+
+
+def _calm(**changes: Any) -> Any:
+    """The rotation task without anything random but where the object lies."""
+    still = {"actuators": None, "push": None, "object_changes": ObjectRandomisation()}
+    return replace(tasks.load("in_palm_rotate", "published"), **(still | changes))
+
+
+def test_the_goal_narrows_when_enough_episodes_succeed_and_only_while_a_teacher_learns() -> None:
+    goal = SteppingRotation(start_threshold=0.4, narrowing=0.5, mastered=0.4)
+    goals = _make(4, _calm(goal=goal)).goals
+    assert float(goals.threshold) == pytest.approx(0.1)
+    goals.start_curriculum()
+    assert float(goals.threshold) == pytest.approx(0.4)
+    some, all_of_them = torch.tensor([True, True, False, False]), torch.ones(4, dtype=torch.bool)
+    goals.count.copy_(torch.tensor([1.0, 0.0, 2.0, 0.0]))
+    goals.count_episodes(some)
+    assert float(goals.threshold) == pytest.approx(0.4)
+    goals.count_episodes(~some)
+    assert float(goals.threshold) == pytest.approx(0.2)
+    goals.count.copy_(torch.tensor([1.0, 0.0, 0.0, 0.0]))
+    goals.count_episodes(all_of_them)
+    assert float(goals.threshold) == pytest.approx(0.2)
+    goals.count.fill_(1.0)
+    for _ in range(3):
+        goals.count_episodes(all_of_them)
+    assert float(goals.threshold) == pytest.approx(0.1)
+    assert not _make(4, _calm(goal=SteppingRotation())).goals.curriculum()
+
+
+def test_poses_of_links_and_objects_are_quaternions_with_the_scalar_first() -> None:
+    env = _make(2, observe="bool", placement="fingers", resolution="low", link_pose=True)
+    for a in _actions(env, 3):
+        env.step(a)
+    assert env.touch is not None
+    pose = env.observations["link_pose"].numpy()
+    for number, data in enumerate(env.simulation.engine.data):
+        palm = data.body(env.hand.palm)
+        axes = palm.xmat.reshape(3, 3).T
+        for row, name in zip(pose[number], env.touch.links, strict=True):
+            body = data.body(name)
+            np.testing.assert_allclose(row[:3], axes @ (body.xpos - palm.xpos), atol=1e-5, err_msg=name)
+            turn = axes @ body.xmat.reshape(3, 3)
+            np.testing.assert_allclose(to_matrices(row[3:]), turn, atol=1e-5, err_msg=name)
+        np.testing.assert_allclose(env.object_pose[number, 0, 3:], data.body("object").xquat, atol=1e-5)
+
+
+def test_a_saved_state_goes_on_exactly() -> None:
+    one = _make(3, seed=2)
+    for a in _actions(one, 6):
+        one.step(a)
+    state = {name: value.clone() for name, value in one.state_dict().items()}
+    two = _make(3, seed=7)
+    two.load_state_dict(state)
+    for a in _actions(one, 6, seed=4):
+        first, second = one.step(a), two.step(a)
+        assert torch.equal(first[1], second[1])
+        for name, value in first[0].items():
+            assert torch.equal(value, second[0][name]), name

@@ -1,0 +1,123 @@
+"""Tasks as data: registry, goals, objects, scenes, reset, thermometers."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from brainbench.core.errors import UsageError
+from robotics_bridge import tasks
+from robotics_bridge.deploy.safety import SafetyLimits
+from robotics_bridge.envs import Env
+from robotics_bridge.tasks.task import ObjectRandomisation
+
+
+def test_the_carriage_moves_no_faster_than_an_arm() -> None:
+    task = tasks.load("hot_ball")
+    env = tasks.make(task, num_envs=2, threads=1)
+    slides = [env.action_names.index(f"carriage_{axis}") for axis in "xyz"]
+    targets = env.state.actuators.target
+    before = targets[:, slides].clone()
+    env.step(torch.full((2, env.num_actions), 2.0))
+    most = task.carriage_speed * env.step_dt
+    assert (targets[:, slides] - before).flatten().tolist() == pytest.approx([most] * 6)
+    # As high as published, counted from a lower start.
+    published = tasks.load("hot_ball", "published")
+    reach = [t.hand_poses["xhand1"][0][2] + np.array(t.carriage["z"][0]) for t in (task, published)]
+    assert reach[0] == pytest.approx(reach[1])
+
+
+def _make(num_envs: int = 4, task: Any = "in_palm_rotate", **options: Any) -> Env:
+    return tasks.make(task, num_envs=num_envs, threads=1, **options)
+
+
+def _actions(env: Env, count: int, seed: int = 0) -> list[torch.Tensor]:
+    g = torch.Generator().manual_seed(seed)
+    return [torch.randn(env.num_envs, env.num_actions, generator=g) for _ in range(count)]
+
+
+def _calm(**changes: Any) -> Any:
+    """The rotation task without anything random but where the object lies."""
+    still = {"actuators": None, "push": None, "object_changes": ObjectRandomisation()}
+    return replace(tasks.load("in_palm_rotate", "published"), **(still | changes))
+
+
+def test_groups_have_the_sizes_of_table_4_7() -> None:
+    env = _make(3)
+    joints, actions, tips = 12, 5, 5
+    assert env.observation_shapes == {
+        "proprio": (2 * joints + actions,), "command": (1,), "goal": (1,),
+        "priv_proprio": (2 * joints + actions + 3 * tips,),
+        "priv_obj_state": (3 + 6 + 3 + 3,), "priv_obj_props": (2 + tips,), "aux_obj_size": (3,), "aux_goal_dist": (1,),
+    }  # fmt: skip
+    assert (env.step_dt, env.max_episode_length) == (0.025, 400)
+    observations, reward, terminated, truncated, info = env.step(torch.zeros(3, actions))
+    assert all(value.dtype == torch.float32 and value.isfinite().all() for value in observations.values())
+    assert reward.shape == terminated.shape == truncated.shape == info["diverged"].shape == (3,)
+
+
+def test_targets_at_rated_speed_are_those_that_deployment_sends() -> None:
+    env = _make(2, task=_calm(rated_speed=True))
+    moved, limits = env.state.moved, SafetyLimits.of_hand(env.hand, env.state.model.moved)
+    target = env.state.actuators.target
+    for action in _actions(env, 6):
+        before, wanted = target[:, moved].clone().numpy(), env.action_map.targets(action.numpy())
+        env.step(action)
+        assert np.abs(wanted - before).max() > 0.025 * limits.speed.max()
+        np.testing.assert_allclose(target[:, moved], limits.limit(wanted, before, env.step_dt), atol=1e-6)
+
+
+def test_an_environment_that_diverges_is_reset_and_counted_and_the_others_are_unharmed() -> None:
+    one, two = _make(3, seed=5), _make(3, seed=5)
+    for env in (one, two):
+        for a in _actions(env, 3):
+            env.step(a)
+    two.simulation.engine.data[1].qpos[:] = np.nan
+    action = _actions(one, 1, seed=9)[0]
+    _, _, _, _, _ = one.step(action)
+    observations, reward, terminated, truncated, info = two.step(action)
+    assert info["diverged"].tolist() == [False, True, False]
+    assert bool(terminated[1])
+    assert not bool(truncated[1])
+    assert float(reward[1]) == 0.0
+    assert all(value.isfinite().all() for value in observations.values())
+    for env in (0, 2):
+        assert torch.equal(one.simulation.qpos[env], two.simulation.qpos[env])
+    assert two.statistics()["diverged"] == 1.0
+    two.step(action)
+    assert two.simulation.qpos.isfinite().all()
+
+
+def test_episodes_end_when_their_time_is_up_and_say_so() -> None:
+    env = _make(2, _calm(episode=0.1))
+    flags = [env.step(torch.zeros(2, 5)) for _ in range(4)]
+    assert [bool(step[3].all()) for step in flags] == [False, False, False, True]
+    assert not any(bool(step[2].any()) for step in flags)
+    assert env.episode_length_buf.tolist() == [0, 0]
+    assert env.statistics()["length"] == 4.0
+
+
+def test_actions_map_to_targets_within_the_joints_limits() -> None:
+    env = _make(1, config="published")
+    low, high = env.action_map.low, env.action_map.high
+    targets = env.action_map.targets(np.array([1.0, 1.0, 1.0, 1.0, 1.0]))
+    np.testing.assert_allclose(targets, np.clip(0.5 * (high - low), low, high))
+    assert (env.action_map.targets(np.full(5, -9.0)) == low).all()
+
+
+def test_an_action_beyond_the_limit_counts_as_the_limit_and_moves_the_same_joints() -> None:
+    far, near = _make(2, _calm(action_limit=100.0)), _make(2, _calm(action_limit=100.0))
+    free = _make(2, _calm())
+    for env, size in ((far, 1e9), (near, 100.0), (free, 1e9)):
+        env.reset()
+        env.step(torch.full((2, env.num_actions), -size))
+    assert far.observations["proprio"][:, -5:].unique().tolist() == [-100.0]
+    assert free.observations["proprio"][:, -5:].unique().tolist() == [-1e9]
+    assert torch.equal(far.simulation.qpos, near.simulation.qpos)
+    assert torch.equal(far.simulation.qpos, free.simulation.qpos)
+    with pytest.raises(UsageError, match=r"action_limit .* received 0"):
+        _calm(action_limit=0.0)
