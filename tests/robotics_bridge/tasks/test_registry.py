@@ -115,7 +115,7 @@ def test_unknown_names_are_met_with_the_nearest() -> None:
         tasks.load("screwdriver", "publish")
     with pytest.raises(UsageError, match="'priv_obj_stat'; did you mean"):
         replace(tasks.load("screwdriver"), groups={"actor": ("priv_obj_stat",)})
-    with pytest.raises(UsageError, match=r"'screwdriver' .*received 0\.0"):
+    with pytest.raises(UsageError, match=r"episode of a task .*received 0"):
         replace(tasks.load("screwdriver"), episode=0.0)
     with pytest.raises(UsageError, match="range"):
         replace(tasks.load("screwdriver"), object_changes=ObjectRandomisation(friction=(2.0, 1.0)))

@@ -14,7 +14,7 @@ from robotics_bridge.policies.training.distill_config import DistillConfig
         ({"observe": "none", "encoder": "rnn"}, "'none' has no touch; leave out 'encoder'"),
         ({"observe": "none", "placement": "tips", "noisy": True}, "leave out 'placement', 'noisy'"),
         ({"observe": "none", "encoder_settings": {"seed": 1}}, "leave out 'encoder_settings'"),
-        ({"noisy": "no"}, "'noisy' must be true or false; received 'no'"),
+        ({"noisy": "no"}, "'noisy' of a student must be True or False; received 'no'"),
         ({"encoder_settings": []}, "'encoder_settings' must be names and values"),
         ({"placement": "tip"}, "did you mean 'tips'"),
         ({"resolution": "mid"}, "did you mean 'med'"),
