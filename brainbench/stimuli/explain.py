@@ -83,11 +83,13 @@ class Explanation:
         if text is None:
             raise UsageError("This stimulus set does not say how it was made; simulate it again to have it explained.")
         try:
-            found = msgspec.json.decode(text, type=cls)
+            explanation = msgspec.json.decode(text, type=cls)
         except (TypeError, msgspec.MsgspecError) as error:
             raise DataError(f"The explanation in this stimulus set is damaged ({error!r}).") from error
         source = dataset.encoding.get("source")
-        return replace(found, seconds=dataset.encoding.get(SECONDS, {}), source=None if source is None else str(source))
+        return replace(
+            explanation, seconds=dataset.encoding.get(SECONDS, {}), source=None if source is None else str(source)
+        )
 
     def to_attribute(self) -> str:
         """Return the JSON that :meth:`of` reads, equal whenever the same is simulated."""

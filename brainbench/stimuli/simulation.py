@@ -91,10 +91,10 @@ def read_entry(path: Path) -> xr.Dataset | None:
         return _read_entry(file, state.st_size, state.st_mtime_ns).copy(deep=True)
 
     # The package's own entry goes first; a damaged one does not hide that of the cache.
-    found = (
+    candidates = (
         sealed.read_entry(file, "set of stimuli", read) for file in dict.fromkeys((find_entry(path) or path, path))
     )
-    return next((dataset for dataset in found if dataset is not None), None)
+    return next((dataset for dataset in candidates if dataset is not None), None)
 
 
 @functools.lru_cache(maxsize=1)
@@ -219,7 +219,7 @@ def _assemble(
     arc = _mean_of_known(readings("contact_arc")).astype(np.float32)
     # Scenes may differ in material; the hash beside this covers every number of every scene's array.
     about = {"species": array.species, "side": array.side, "whiskers": list(names), "citation": array.citation}
-    told = {
+    meanings = {
         "contact_arc": {"units": "m", "long_name": "arc length of the force-weighted contact point"},
         "first_contact": {"units": "s", "long_name": "time of the first reading with contact"},
         "penetration": {"units": "m", "long_name": "deepest overlap of whisker and object"},
@@ -231,9 +231,9 @@ def _assemble(
         {
             "wrench": ((*over_time, "channel"), wrench, {"units": "N (F), N m (M)"}),
             "contact": (over_time, readings("contact").any(axis=2)),
-            "contact_arc": (over_time, arc, told["contact_arc"]),
-            "first_contact": (grid, first, told["first_contact"]),
-            "penetration": (grid, of("penetration", np.float32), told["penetration"]),
+            "contact_arc": (over_time, arc, meanings["contact_arc"]),
+            "first_contact": (grid, first, meanings["first_contact"]),
+            "penetration": (grid, of("penetration", np.float32), meanings["penetration"]),
             "status": (grid, of("status")),
             "reason": (grid, of("reason")),
         },
@@ -276,9 +276,9 @@ def _count_clipped(dataset: xr.Dataset, clipped: NDArray[np.bool_], limit: float
 
 def _mean_of_known(values: NDArray[np.float64]) -> NDArray[np.float64]:
     """Mean over axis 2 of what is not NaN; NaN where nothing is known."""
-    known = np.isfinite(values)
-    count = known.sum(axis=2)
-    total = np.where(known, values, 0.0).sum(axis=2)
+    finite = np.isfinite(values)
+    count = finite.sum(axis=2)
+    total = np.where(finite, values, 0.0).sum(axis=2)
     return np.divide(total, count, out=np.full(total.shape, np.nan), where=count > 0)
 
 

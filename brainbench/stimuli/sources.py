@@ -126,9 +126,9 @@ def _stimulus_set(
     from brainbench.stimuli.simulation import read_entry, simulate
 
     if cache and isinstance(backend, str) and is_packaged(source):
-        kept = find_kept(source, whiskers, Fidelity.of(fidelity), backend)
-        if kept is not None and (shipped := read_entry(kept[0])) is not None:
-            return shipped, kept[1]
+        packaged = find_kept(source, whiskers, Fidelity.of(fidelity), backend)
+        if packaged is not None and (shipped := read_entry(packaged[0])) is not None:
+            return shipped, packaged[1]
     if (recipe := _recipe(source, whiskers)) is not None:
         dataset = simulate(recipe.scenes, fidelity=fidelity, backend=backend, progress=progress, cache=cache)
         return dataset, recipe.description.strip() or recipe.name
@@ -227,15 +227,15 @@ def _read_arrays(file: Any, name: str, whiskers: str) -> Stimuli:
 
     if whiskers != "all":
         raise UsageError(f"{name!r} holds arrays, in which whiskers have no names; leave the selection at 'all'.")
-    found = {key: item for key, item in file.items() if isinstance(item, h5py.Dataset)}
-    missing = [key for key in ("stimuli", "labels") if key not in found]
+    arrays = {key: item for key, item in file.items() if isinstance(item, h5py.Dataset)}
+    missing = [key for key in ("stimuli", "labels") if key not in arrays]
     if missing:
-        held = listing(f"{key} {list(item.shape)}" for key, item in found.items())
+        held = listing(f"{key} {list(item.shape)}" for key, item in arrays.items())
         raise DataError(
             f"{name!r} is neither a stimulus set (no 'wrench') nor an array file: it lacks {' and '.join(missing)};"
             f" an array file has 'stimuli' [K, T, …] and 'labels' [K]. It holds: {held}."
         )
-    stimuli, labels = found["stimuli"], found["labels"]
+    stimuli, labels = arrays["stimuli"], arrays["labels"]
     if stimuli.ndim < 2 or stimuli.dtype.kind not in "fiu":
         raise DataError(
             f"'stimuli' in {name!r} must be numbers of shape [K, T, …]; it is {list(stimuli.shape)} of {stimuli.dtype}."

@@ -62,12 +62,12 @@ def new_stimulus_set(
 def hash_stimulus_set(dataset: xr.Dataset) -> str:
     """Hash what a stimulus set says: labels, whiskers and cells, times, forces and the configuration behind them."""
     cells = [*zip(dataset["row"].values.tolist(), dataset["col"].values.tolist(), strict=True)]
-    named = [_CELL.fullmatch(str(name)) for name in dataset["whisker"].values]
+    matches = [_CELL.fullmatch(str(name)) for name in dataset["whisker"].values]
     # Names that tell their own cells need no word of them, as in sets that were hashed when cells were not.
-    own = [cell if of is None else (ROWS.index(of[1]), int(of[2])) for cell, of in zip(cells, named, strict=True)]
+    places = [cell if of is None else (ROWS.index(of[1]), int(of[2])) for cell, of in zip(cells, matches, strict=True)]
     return content_hash(
         {
-            **({} if own == cells else {"cells": cells}),
+            **({} if places == cells else {"cells": cells}),
             "stimulus": [str(label) for label in dataset["stimulus"].values],
             "whisker": [str(name) for name in dataset["whisker"].values],
             **{key: dataset.attrs[key] for key in ("array", "scene", "fidelity", "seed", "backend")},

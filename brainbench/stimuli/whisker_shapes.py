@@ -77,9 +77,9 @@ def record(
     if cache and isinstance(backend, str):
         path = cache_path([scene], fidelity, engine, times, folder="shapes").with_suffix(".npz")
     names = [f"whisker{index}" for index in range(len(jobs))]
-    kept = None if path is None else read_sealed(path, "shapes of whiskers")
-    if kept is not None:
-        local: list[NDArray[np.float64]] = [kept[name].astype(float) for name in names]
+    stored = None if path is None else read_sealed(path, "shapes of whiskers")
+    if stored is not None:
+        local: list[NDArray[np.float64]] = [stored[name].astype(float) for name in names]
     else:
         local = _simulate(jobs, fidelity, engine, progress)
         if path is not None:

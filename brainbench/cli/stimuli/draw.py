@@ -64,8 +64,8 @@ def render(
         target=None if target is None else tuple(1e-3 * value for value in target),  # type: ignore[arg-type]
         width=None if width is None else width * 1e-3,
     )
-    usual = Style().size if suffix == ".png" else drawing.FILM_SIZE
-    pixels = usual if size is None else numbers(size, "--size", count=2)
+    default_size = Style().size if suffix == ".png" else drawing.FILM_SIZE
+    pixels = default_size if size is None else numbers(size, "--size", count=2)
     style = Style(
         color=color,  # type: ignore[arg-type]
         moment_limit=None if moment_limit is None else moment_limit * 1e-6,

@@ -46,8 +46,8 @@ def objects(
     settings = DecompositionSettings(method=method, threshold=threshold)  # type: ignore[arg-type]
     diagonal = None if diagonal_mm is None else diagonal_mm / _MILLI
     if source is None or Path(source).is_dir():
-        one = {"--unit": unit, "--diagonal-mm": diagonal_mm, "--collision": collision, "--export": export}
-        refuse(one, "without a family or a mesh file")
+        single = {"--unit": unit, "--diagonal-mm": diagonal_mm, "--collision": collision, "--export": export}
+        refuse(single, "without a family or a mesh file")
         data, text = _families() if source is None else _folder(source, ids, categories)
         return Output(data, text)
     refuse({"--ids": ids, "--categories": categories}, "for one object")
@@ -74,10 +74,10 @@ def _families() -> tuple[dict[str, Any], str]:
 def _folder(source: str, ids: Path | None, categories: Path | None) -> tuple[dict[str, Any], str]:
     from brainbench.stimuli.objects.shapenet import load_shapenet
 
-    found = load_shapenet(source, ids=ids, categories=categories)
-    data = {"models": len(found), "labels": found.counts, "missing": list(found.missing)}
-    text = table("", ["label", "models"], [[label, str(n)] for label, n in found.counts.items()], right=(1,))
-    return data, f"{len(found)} models of {len(found.labels)} labels, {len(found.missing)} missing\n\n{text}"
+    bodies = load_shapenet(source, ids=ids, categories=categories)
+    data = {"models": len(bodies), "labels": bodies.counts, "missing": list(bodies.missing)}
+    text = table("", ["label", "models"], [[label, str(n)] for label, n in bodies.counts.items()], right=(1,))
+    return data, f"{len(bodies)} models of {len(bodies.labels)} labels, {len(bodies.missing)} missing\n\n{text}"
 
 
 def _member(

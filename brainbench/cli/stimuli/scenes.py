@@ -92,8 +92,8 @@ def _of_recipe(recipe: Recipe, scenes: list[Scene]) -> dict[str, Any]:
     described = []
     for scene in scenes:
         config = scene.config()
-        for item, written in zip(scene.objects, config["objects"], strict=True):
-            low, high = item.solid.bounds
+        for placed, written in zip(scene.objects, config["objects"], strict=True):
+            low, high = placed.solid.bounds
             written["solid"]["size"] = (high - low).tolist()
         described.append(config)
     return {
@@ -112,14 +112,14 @@ def _of_file(dataset: xr.Dataset, stimulus: str | None) -> dict[str, Any]:
     if stimulus is not None:
         check_name("stimulus", stimulus, labels)
         scenes = [scenes[labels.index(stimulus)]]
-    made = {name: dataset.attrs[name] for name in ("backend", "version", "content_hash")}
+    origin = {name: dataset.attrs[name] for name in ("backend", "version", "content_hash")}
     return {
         "name": "stimulus set",
-        "description": f"simulated by {made['backend']}, written by brainbench {made['version']}",
+        "description": f"simulated by {origin['backend']}, written by brainbench {origin['version']}",
         "array": json.loads(dataset.attrs["array"]),
         "scenes": scenes,
         "fidelity": json.loads(dataset.attrs["fidelity"]),
-        **made,
+        **origin,
     }
 
 
@@ -154,20 +154,20 @@ def _rows(scene: dict[str, Any]) -> list[list[str]]:
         [scene["label"], "head", _point(head["position"]), _angles(head["rotation"]), _motion(head["motion"]), ""],
         ["", "whiskers", "", "", _motion(scene["whisking"]), ""],
     ]
-    for other in scene.get("others", ()):
-        place = _point(other["head"]["position"]), _angles(other["head"]["rotation"])
-        rows.append(["", f"head of {other['animal']}", *place, _motion(other["head"]["motion"]), ""])
-        rows.append(["", f"whiskers of {other['animal']}", "", "", _motion(other["whisking"]), ""])
-    for item in scene["objects"]:
-        solid, friction = item["solid"], item["friction"]
+    for animal in scene.get("others", ()):
+        place = _point(animal["head"]["position"]), _angles(animal["head"]["rotation"])
+        rows.append(["", f"head of {animal['animal']}", *place, _motion(animal["head"]["motion"]), ""])
+        rows.append(["", f"whiskers of {animal['animal']}", "", "", _motion(animal["whisking"]), ""])
+    for body in scene["objects"]:
+        solid, friction = body["solid"], body["friction"]
         size = " × ".join(map(_milli, solid.get("size", ()))) or f"diagonal {_milli(solid['diagonal'])}"
         count = solid["parts"]
         touched = f"{count} convex part{'s' if count > 1 else ''}" if count else "the triangles of its surface"
         notes = [touched, f"{size} mm"]
         notes += [] if friction is None else [f"friction {friction:g}"]
         notes += solid["notes"]
-        place = _point(item["position"]), _angles(item["rotation"])
-        rows.append(["", solid["name"], *place, _motion(item["motion"]), "; ".join(notes)])
+        place = _point(body["position"]), _angles(body["rotation"])
+        rows.append(["", solid["name"], *place, _motion(body["motion"]), "; ".join(notes)])
     return rows
 
 

@@ -34,7 +34,7 @@ def simulate(
         dataset, description = load_stimulus_set(
             source, whiskers=whiskers, fidelity=fidelity, backend=backend, progress=progress, cache=cache
         )
-    told = Explanation.of(dataset) if explain else None
+    explanation = Explanation.of(dataset) if explain else None
     if out is not None:
         write_stimulus_set(dataset, out)
     unstable = _unstable(dataset)
@@ -44,7 +44,7 @@ def simulate(
     whiskers_in_all = dataset.sizes["whisker"]
     columns = {
         "stimulus": "{0[stimulus]}",
-        "whiskers touched": lambda item: f"{len(item['whiskers_touched'])} of {whiskers_in_all}",
+        "whiskers touched": lambda row: f"{len(row['whiskers_touched'])} of {whiskers_in_all}",
         "peak force mN": "{0[peak_force_mN]:.3g}",
         "peak moment µN·m": "{0[peak_moment_uNm]:.3g}",
     }
@@ -54,9 +54,9 @@ def simulate(
             f"{len(unstable)} whiskers cannot be trusted; their numbers are missing, and networks refuse the set",
             unstable, {"stimulus": "{0[stimulus]}", "whisker": "{0[whisker]}", "reason": "{0[reason]}"},
         )  # fmt: skip
-    if told is not None:
-        data["explanation"] = told
-        text += f"\n\n{told}"
+    if explanation is not None:
+        data["explanation"] = explanation
+        text += f"\n\n{explanation}"
     return Output(data, text + ("" if out is None else f"\n\nstimuli  {out}"))
 
 
@@ -114,26 +114,26 @@ def separability(
     data = WhiskingDataset(folder, split=split, view="raw")
     chosen = {"classes": None if classes is None else items(classes), "counts": numbers(counts, "--counts")}
     with progress_bar() as progress:
-        found = measure(data, **chosen, sweeps_per_class=sweeps_per_class, seed=seed, progress=progress)
-    used = dict.fromkeys(name for item in found for choice in item.choices for name in choice)
-    title = f"{', '.join(used)}: {found[0].objects} objects, {found[0].sweeps} sweeps"
+        scores = measure(data, **chosen, sweeps_per_class=sweeps_per_class, seed=seed, progress=progress)
+    used = dict.fromkeys(name for item in scores for choice in item.choices for name in choice)
+    title = f"{', '.join(used)}: {scores[0].objects} objects, {scores[0].sweeps} sweeps"
     columns = {
         "classes": "{0.count}",
         "accuracy": "{0.accuracy:.3f}",
         "95 % interval": "[{0.interval.low:.3f}, {0.interval.high:.3f}]",
         "chance": "{0.chance:.3f}",
-        "": lambda item: (
-            ("above chance" if item.above_chance else "not above chance")
-            + (f" ({item.status}: {item.reason})" if item.status != "ok" else "")
+        "": lambda score: (
+            ("above chance" if score.above_chance else "not above chance")
+            + (f" ({score.status}: {score.reason})" if score.status != "ok" else "")
         ),
     }
-    text = table_of(title, found, columns)
+    text = table_of(title, scores, columns)
     if data.skipped:
         text += f"\n\n{data.skipped} unstable sweeps were left out"
     result = {
         "content_hash": data.manifest["content_hash"],
         "split": split,
         "unstable": data.skipped,
-        "results": [{**vars(item), "above_chance": item.above_chance} for item in found],
+        "results": [{**vars(item), "above_chance": item.above_chance} for item in scores],
     }
     return Output(result, text)

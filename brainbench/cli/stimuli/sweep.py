@@ -62,13 +62,13 @@ def sweep(
     check_name("sweep grid", grid, GRIDS)
     if out is None and scheduler is not None:
         raise UsageError("--scheduler simulates, and needs a folder for it: --out.")
-    surfaces, named = get_engine(backend).surfaces, [*(objects or ()), *(more_objects or ())]
-    found = resolve_objects(named, unit=unit, collision=collision, surfaces=surfaces)
-    scenes = SweepScenes(GRIDS[grid], {name: item.load for name, item in found.items()}, whiskers=whiskers)
+    surfaces, names = get_engine(backend).surfaces, [*(objects or ()), *(more_objects or ())]
+    bodies = resolve_objects(names, unit=unit, collision=collision, surfaces=surfaces)
+    scenes = SweepScenes(GRIDS[grid], {name: item.load for name, item in bodies.items()}, whiskers=whiskers)
     settings = GenerationSettings(Fidelity.parse(fidelity), backend=backend, **options)
-    plan = GenerationPlan(grid, GRIDS[grid], found, settings, whiskers)
+    plan = GenerationPlan(grid, GRIDS[grid], bodies, settings, whiskers)
     summary = counts(scenes)
-    shown = {
+    rows = {
         "objects": f"{summary['objects']} of {len(plan.classes)} classes",
         "sweeps per object": summary["sweeps_per_object"],
         "scenes": f"{summary['scenes']:,} of {summary['whiskers']} whiskers, {summary['bytes'] / 1e6:.3g} MB of forces",
@@ -76,16 +76,16 @@ def sweep(
         "data set": _describe(plan),
     }
     data: dict[str, Any] = {**summary, "classes": len(plan.classes), "shards": len(plan.shards), "files": []}
-    text = facts(shown, grid)
+    text = facts(rows, grid)
     if out is None:
         data["labels"] = list(scenes.labels)
         first = "\n".join(data["labels"][:_SHOWN])
         more = len(scenes) - _SHOWN
         text += f"\n\n{first}" + (f"\n… and {more:,} more (all with --json)" if more > 0 else "")
     else:
-        made, told = _generate(plan, out, workers, scheduler)
-        data |= made
-        text += f"\n\n{told}"
+        manifest, report = _generate(plan, out, workers, scheduler)
+        data |= manifest
+        text += f"\n\n{report}"
     return Output(data, text)
 
 

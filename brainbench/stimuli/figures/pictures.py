@@ -83,25 +83,25 @@ class Picture:
         from matplotlib import colormaps
         from matplotlib.colors import to_rgb
 
-        found = []
+        parts = []
         recording = self.recording
         whiskers = zip(recording.scene.mounts, recording.joints, recording.moments, strict=True)
         for which, (mount, joints, moments) in enumerate(whiskers):
-            points, row, known = joints[index], np.array(to_rgb(ROW_COLORS[mount.row])), True
+            points, row, finite = joints[index], np.array(to_rgb(ROW_COLORS[mount.row])), True
             if not np.isfinite(points).all():
-                points, row, known = recording.unbent(which, index), np.array(to_rgb(UNSTABLE_COLOR)), False
+                points, row, finite = recording.unbent(which, index), np.array(to_rgb(UNSTABLE_COLOR)), False
             along = np.column_stack([points, np.linspace(0.0, 1.0, len(points)), np.nan_to_num(moments[index])])
             *line, share, bending = smoothed(along, _PER_LINK).T
             line = np.stack(line, axis=-1)
             radii = self.style.thickness * mount.whisker.radius(share * mount.whisker.arc_length)
             thinnest = _THINNEST * self.style.supersampling * lens.pixel_size(line)
             colors = np.broadcast_to(row, line.shape)
-            if self.style.color == "moment" and known:
+            if self.style.color == "moment" and finite:
                 colors = colormaps[MOMENT_MAP](np.clip(bending / self.moment_limit, 0, 1))[:, :3]
-            found.append(tube(line, np.maximum(radii, thinnest), colors))
+            parts.append(tube(line, np.maximum(radii, thinnest), colors))
             ink = 0.45 * row if self.style.color == "row" else np.full(3, 0.25)
-            found.append(ball(points[0], 1.6 * max(radii[0], float(thinnest[0])), ink))
-        return Triangles.joined(found)
+            parts.append(ball(points[0], 1.6 * max(radii[0], float(thinnest[0])), ink))
+        return Triangles.joined(parts)
 
     @cached_property
     def _framed(self) -> NDArray[np.float64]:
@@ -129,12 +129,12 @@ class Picture:
         """Corners of the objects [n, 3] at the first, middle and last instant."""
         times = self.recording.times
         moments = {0, len(times) // 2, len(times) - 1}
-        found = [
+        corners = [
             surface.at(float(times[index]), OBJECT_COLOR).corners.reshape(-1, 3)
             for surface in self._surfaces
             for index in ({0} if surface.motion is None else moments)
         ]
-        return np.concatenate([np.zeros((0, 3)), *found])
+        return np.concatenate([np.zeros((0, 3)), *corners])
 
 
 AXES = ("right", "rostral", "dorsal")

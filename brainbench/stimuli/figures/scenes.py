@@ -142,11 +142,11 @@ def render(
     if suffix == ".png" and len(times) != 1:
         raise UsageError(f"A .png shows one instant; received {len(times)}: write a film ({listing(FORMATS[1:])}).")
     require_writer(suffix)
-    asked, last = times.max(initial=0.0) * MILLI, float(scene.frames.times[-1]) * MILLI
-    if asked > last + 1e-6:
+    latest, last = times.max(initial=0.0) * MILLI, float(scene.frames.times[-1]) * MILLI
+    if latest > last + 1e-6:
         raise UsageError(
-            f"The scene {scene.label!r} ends at {last:g} ms; received the instant {asked:g} ms: choose an earlier one, "
-            "or give the scene more frames."
+            f"The scene {scene.label!r} ends at {last:g} ms; received the instant {latest:g} ms: choose an earlier "
+            "one, or give the scene more frames."
         )
     recording = record(scene, times, fidelity=fidelity, backend=backend, progress=progress, cache=cache)
     if recording.unstable:

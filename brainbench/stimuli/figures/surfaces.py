@@ -48,16 +48,16 @@ class DrawnSurface:
         return Triangles(self.corners @ turn.T + positions[0], self.normals @ turn.T, colors)
 
 
-def object_surface(item: PlacedObject) -> DrawnSurface:
+def object_surface(placed: PlacedObject) -> DrawnSurface:
     """Return the surface of an object: its mesh, or what whiskers touch when it has none."""
-    obstacle = item.obstacle()
-    if item.solid.mesh is None and obstacle.surface is not None:
+    obstacle = placed.obstacle()
+    if placed.solid.mesh is None and obstacle.surface is not None:
         meshes = [obstacle.surface]
-    elif item.solid.mesh is None:
+    elif placed.solid.mesh is None:
         meshes = [part_mesh(part) for part in obstacle.parts]
     else:
-        place = (0.0, 0.0, 0.0) if isinstance(item.motion, (Spin, Path)) else item.position
-        meshes = [item.solid.mesh.transformed(euler_matrix(item.rotation), place)]
+        place = (0.0, 0.0, 0.0) if isinstance(placed.motion, (Spin, Path)) else placed.position
+        meshes = [placed.solid.mesh.transformed(euler_matrix(placed.rotation), place)]
     corners = np.concatenate([mesh.vertices[mesh.faces] for mesh in meshes])
     normals = np.concatenate([corner_normals(mesh) for mesh in meshes])
     return DrawnSurface(corners, normals, obstacle.motion)

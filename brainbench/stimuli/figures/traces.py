@@ -77,8 +77,8 @@ def plot(
     several = len(chosen) > 1
     names = [re.sub(r"[^\w.+-]+", "_", label) for label in chosen]
     paths = [path.with_name(f"{path.stem}-{name}{path.suffix}") if several else path for name in names]
-    for label, one in zip(chosen, paths, strict=True):
-        save_figure(_figure(dataset.isel(stimulus=labels.index(label)), label, channel, limits, size), one)
+    for label, file in zip(chosen, paths, strict=True):
+        save_figure(_figure(dataset.isel(stimulus=labels.index(label)), label, channel, limits, size), file)
     return tuple(paths)
 
 
@@ -168,11 +168,11 @@ def _legend(figure: Figure, label: str, channel: str, axes: str, points: float) 
     unit = _UNITS[channel[0]][0]
     what = f"|{channel}|" if channel in _UNITS else ", ".join(QUANTITIES[channel])
     about = f"{kind} of the whisker on its base, {what} ({unit}), {axes} axes"
-    usual: dict[str, Any] = {"fontsize": 16 * points}
+    font: dict[str, Any] = {"fontsize": 16 * points}
     figure.text(0.02, 0.965, label, fontsize=26 * points, fontweight="bold", color=INK, va="center")
-    figure.text(0.02, 0.92, about, color=PALE, va="center", **usual)
-    figure.text(0.52, 0.018, "time (ms)", color=INK, ha="center", va="center", **usual)
-    figure.text(0.014, 0.48, f"{kind} ({unit})", color=INK, rotation=90, va="center", ha="center", **usual)
+    figure.text(0.02, 0.92, about, color=PALE, va="center", **font)
+    figure.text(0.52, 0.018, "time (ms)", color=INK, ha="center", va="center", **font)
+    figure.text(0.014, 0.48, f"{kind} ({unit})", color=INK, rotation=90, va="center", ha="center", **font)
     colors = LINE_COLORS if channel.endswith("xyz") else (INK,)
     names: Sequence[str] = QUANTITIES[channel] if channel.endswith("xyz") else (what,)
     handles: list[Any] = [

@@ -181,7 +181,7 @@ class Recorded:
                 f"The recorded trajectory has no whisker of row {name[1]} on the {mount.side} side, which {name} needs;"
                 f" it has {listing(self.trajectory.names)}."
             )
-        chosen = min(row, key=lambda other: abs(int(other[2:]) - mount.col))
+        chosen = min(row, key=lambda line: abs(int(line[2:]) - mount.col))
         _LOG.info("the recording lacks %s, which moves as %s", name, chosen)
         return chosen
 
@@ -244,10 +244,10 @@ def _names(path: str | os.PathLike[str], lines: int, layout: str | None) -> tupl
     fitting = [name for name, names in LAYOUTS.items() if len(names) == lines]
     if layout is None:
         if len(fitting) != 1:
-            known = ", ".join(f"{name} ({len(names)})" for name, names in LAYOUTS.items())
+            layouts = ", ".join(f"{name} ({len(names)})" for name, names in LAYOUTS.items())
             raise UsageError(
                 f"{os.fspath(path)!r} has {lines} lines, which does not tell whose whiskers they are; "
-                f"say it with layout=… (lines): {known}."
+                f"say it with layout=… (lines): {layouts}."
             )
         return LAYOUTS[fitting[0]]
     check_name("layout of whisker lines", layout, LAYOUTS)

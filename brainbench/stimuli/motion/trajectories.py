@@ -235,10 +235,10 @@ class Path(_Motion):
             longer |= ((shorter.inv() * between).magnitude() > math.pi / 2) & ~wrapped
         if longer.any():
             first = int(np.argmax(longer))
-            told = [[round(math.degrees(angle), 3) for angle in row] for row in self.rotations[first : first + 2]]
+            degrees = [[round(math.degrees(angle), 3) for angle in row] for row in self.rotations[first : first + 2]]
             raise UsageError(
-                f"Between keyframes a path turns the shorter way; from {told[0]} to {told[1]}° that is not the way of "
-                "the angles: add keyframes less than half a turn apart."
+                f"Between keyframes a path turns the shorter way; from {degrees[0]} to {degrees[1]}° that is not the "
+                "way of the angles: add keyframes less than half a turn apart."
             )
 
     @property

@@ -70,16 +70,16 @@ def resolve_objects(
         surfaces: build shape families as their exact surface alone, without convex parts, which takes tens of
             milliseconds instead of a second; for engines that collide meshes. Not with ``collision``.
     """
-    found: dict[str, NamedObject] = {}
+    named_objects: dict[str, NamedObject] = {}
     collision = SURFACE if surfaces and collision is None else collision
     for text in texts:
-        for item in _resolve(text, unit, collision):
-            if item.name in found:
-                raise UsageError(f"Several objects have the same name, {item.name!r}; name each object once.")
-            found[item.name] = item
-    if not found:
+        for body in _resolve(text, unit, collision):
+            if body.name in named_objects:
+                raise UsageError(f"Several objects have the same name, {body.name!r}; name each object once.")
+            named_objects[body.name] = body
+    if not named_objects:
         raise UsageError("There is no object; name a family (torus), a collection (procedural-24:40) or a mesh file.")
-    return found
+    return named_objects
 
 
 def _resolve(text: str, unit: str | None, collision: str | None) -> Iterator[NamedObject]:
@@ -147,8 +147,8 @@ def _files(pattern: str, unit: str | None, collision: str) -> Iterator[NamedObje
     # In alphabetical order; ``**`` stands for any number of folders.
     with readable(pattern, "pattern of mesh files"):
         below = str(given.relative_to(given.anchor))
-        found = [given] if _is_file(pattern) else sorted(Path(given.anchor or ".").glob(below))
-        paths = [path for path in found if path.is_file()]
+        matches = [given] if _is_file(pattern) else sorted(Path(given.anchor or ".").glob(below))
+        paths = [path for path in matches if path.is_file()]
     if not paths:
         raise DataFileNotFoundError(f"No mesh file matches {shown(pattern)}.")
     if unit is None:

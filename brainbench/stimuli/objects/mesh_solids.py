@@ -51,8 +51,8 @@ def mesh_solid(
     if diagonal is not None:
         return solid.to_diagonal(diagonal)
     if not SIZES[0] <= solid.diagonal <= SIZES[1]:
-        told = f"the object is {solid.diagonal * 1e3:.3g} mm across: are its lengths in {unit}?"
-        _LOG.warning("%s: %s", os.fspath(path), told)
+        doubt = f"the object is {solid.diagonal * 1e3:.3g} mm across: are its lengths in {unit}?"
+        _LOG.warning("%s: %s", os.fspath(path), doubt)
     return solid
 
 
@@ -78,10 +78,10 @@ def shape_solid(
         return touchable(mesh, collision, decomposition).to_diagonal(diagonal)
     notes: tuple[str, ...] = ()
     if len(shape.parts) > 1:
-        found = deviation(mesh, shape.parts, samples=1000)
+        gap = deviation(mesh, shape.parts, samples=1000)
         notes = (
             f"whiskers touch {len(shape.parts)} convex parts of the shape, which stand out from its mesh by at most"
-            f" {found.outward:.2%} and fall short of it by at most {found.inward:.2%} of its diagonal (sampled)",
+            f" {gap.outward:.2%} and fall short of it by at most {gap.inward:.2%} of its diagonal (sampled)",
         )
     parts = tuple(ConvexPart(part.vertices) for part in shape.parts)
     origin = {"mesh": mesh.content_hash, "parts": content_hash([*shape.part_points])}

@@ -110,7 +110,7 @@ def load_shapenet(
     labels = SYNSETS if given is None else given
     models, missing = [], []
     for name in names:
-        path = next((found for mesh in MESHES if (found := folder / name / mesh).is_file()), None)
+        path = next((file for mesh in MESHES if (file := folder / name / mesh).is_file()), None)
         synset = name.partition("/")[0]
         if path is None:
             missing.append(name)
@@ -153,8 +153,8 @@ def read_categories(path: str | os.PathLike[str]) -> dict[str, str]:
 
 
 def _everything(folder: Path) -> tuple[str, ...]:
-    found = {path.relative_to(folder).parts[:2] for mesh in MESHES for path in folder.glob(f"*/*/{mesh}")}
-    return tuple("/".join(parts) for parts in sorted(found))
+    places = {path.relative_to(folder).parts[:2] for mesh in MESHES for path in folder.glob(f"*/*/{mesh}")}
+    return tuple("/".join(parts) for parts in sorted(places))
 
 
 def _checked(names: Iterable[str], where: str) -> tuple[str, ...]:

@@ -146,10 +146,10 @@ def low_pass(values: NDArray[np.float64], rate: float, cutoff: float, *, phase: 
     sections = butter(_ORDER, cutoff, fs=rate, output="sos")
     flat = np.asarray(values, dtype=float).reshape(len(values), -1)
     # Readings before the first one that is not finite; signals with as many are filtered together.
-    known = np.where(np.isfinite(flat).all(axis=0), len(flat), np.argmin(np.isfinite(flat), axis=0))
+    lengths = np.where(np.isfinite(flat).all(axis=0), len(flat), np.argmin(np.isfinite(flat), axis=0))
     result = np.full_like(flat, np.nan)
-    for end in np.unique(known[known > 0]).tolist():
-        columns = known == end
+    for end in np.unique(lengths[lengths > 0]).tolist():
+        columns = lengths == end
         signal = flat[:end, columns]
         if phase == "causal":
             result[:end, columns] = sosfilt(sections, signal, axis=0)

@@ -129,14 +129,14 @@ class Scene:
             return replace(self, array=self.array.select(whiskers))
         mounts = self.mounts
         chosen = match_whiskers(whiskers, self.names, [mount.row for mount in mounts], [mount.col for mount in mounts])
-        kept, begin = [], 0
+        animals, begin = [], 0
         for part in self.split():
             stay = [index - begin for index in chosen if begin <= index < begin + len(part.array)]
             begin += len(part.array)
             if stay:
                 array = replace(part.array, mounts=tuple(part.array.mounts[index] for index in stay))
-                kept.append(Animal(part.animal, array, part.whisking, part.head))
-        first, *rest = kept
+                animals.append(Animal(part.animal, array, part.whisking, part.head))
+        first, *rest = animals
         return replace(
             self, array=first.array, whisking=first.whisking, head=first.head, animal=first.name, others=tuple(rest)
         )

@@ -100,16 +100,16 @@ def write_data_set(
 def _reporter(total: int, what: str, progress: Progress | None) -> Callable[[int], None]:
     """Return what tells how far the run is: a progress bar, and the log every half minute with the time left."""
     done, started = 0, time.monotonic()
-    told = started
+    logged = started
 
     def report(sweeps: int) -> None:
-        nonlocal done, told
+        nonlocal done, logged
         done += sweeps
         if progress is not None:
             progress(done, total, what)
         now = time.monotonic()
-        if now - told >= 30 or done == total:
-            told = now
+        if now - logged >= 30 or done == total:
+            logged = now
             rate = done / max(now - started, 1e-9)
             rest = timedelta(seconds=round((total - done) / rate))
             _LOG.info("%d of %d sweeps, %.3g sweeps/s, about %s left", done, total, rate, rest)
@@ -119,9 +119,9 @@ def _reporter(total: int, what: str, progress: Progress | None) -> Callable[[int
 
 def _clean(folder: Path) -> None:
     """Remove what processes that were killed left half-written."""
-    for item in folder.iterdir():
-        if is_temporary(item.name):
-            item.unlink(missing_ok=True)
+    for path in folder.iterdir():
+        if is_temporary(path.name):
+            path.unlink(missing_ok=True)
 
 
 def _check_space(missing: Sequence[PlannedShard], folder: Path) -> None:

@@ -164,7 +164,7 @@ class SweepGrid:
         The name matters only where something is sampled.
         """
         generator = np.random.default_rng(int(content_hash(["sweeps", self.seed, name]), 16))
-        found = []
+        sweeps = []
         for draw in range(self.draws):
             # The order of the draws belongs to the grid: another order would give other sweeps for the same seed.
             speed, rotation, distance, size = (
@@ -172,8 +172,8 @@ class SweepGrid:
             )
             heights = self._heights(draw, generator)
             combined = itertools.product(heights, rotation, self.turns, distance, speed, size)
-            found += [Sweep(v, h, r + turn, d, s, draw) for h, r, turn, d, v, s in combined]
-        return tuple(found)
+            sweeps += [Sweep(v, h, r + turn, d, s, draw) for h, r, turn, d, v, s in combined]
+        return tuple(sweeps)
 
     def scene(
         self, solid: Solid, sweep: Sweep, *, label: str | None = None, array: WhiskerArray | None = None

@@ -33,13 +33,13 @@ def is_complete(path: Path, task: PlannedShard) -> bool:
         return False
     try:
         with readable(path, "shard"), h5py.File(path, "r") as file:
-            found = str(file.attrs["config_hash"])
+            owner = str(file.attrs["config_hash"])
             wrench: Any = file["wrench"]
             end = wrench.id.get_offset() + wrench.size * wrench.dtype.itemsize
             whole = wrench.shape[0] == len(task) and path.stat().st_size >= end
     except DataError:
         return False
-    if found != task.config_hash:
+    if owner != task.config_hash:
         raise DataError(f"{str(path)!r} belongs to another data set; choose an empty folder, or remove what is there.")
     return whole
 
@@ -86,11 +86,11 @@ def _read(path: Path, task: PlannedShard, objects: dict[str, dict[str, Any]]) ->
         owner, status, reasons = file["owner"][:], file["status"][:], file["reason"][:]
         # Sweeps that failed, and converted ones whose contacts are NaN, are not known to be untouched.
         touched = ((file["contact"][:] != 0) | (status != OK)).any(axis=1)
-    for index, item in enumerate(task.objects):
-        mine, entry = np.flatnonzero(owner == index), objects[item.name]
+    for index, body in enumerate(task.objects):
+        mine, entry = np.flatnonzero(owner == index), objects[body.name]
         if entry["hash"] not in (None, hashes[index]):
             raise DataError(
-                f"The object {item.name!r} was not built alike in all shards (hashes {entry['hash']} and "
+                f"The object {body.name!r} was not built alike in all shards (hashes {entry['hash']} and "
                 f"{hashes[index]}): its file changed meanwhile, or machines differ; generate the data set again in an "
                 "empty folder."
             )

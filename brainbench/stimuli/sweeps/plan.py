@@ -63,8 +63,8 @@ class GenerationSettings:
     @property
     def sweeps_per_shard(self) -> int:
         """Sweeps of every shard but the last of each split."""
-        usual = USUAL_SHARD if self.device == "cpu" else GPU_SHARD
-        return self.shard_size or SHARD_SIZES.get(self.backend, usual)
+        default = USUAL_SHARD if self.device == "cpu" else GPU_SHARD
+        return self.shard_size or SHARD_SIZES.get(self.backend, default)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -100,15 +100,15 @@ def run_on_gpus(tasks: Sequence[ShardTask], folder: Path, workers: int, done: Do
             ready = connection.wait(list(heard))
             for pipe in [pipe for pipe in heard if pipe in ready]:
                 try:
-                    told = pipe.recv()
+                    message = pipe.recv()
                 except EOFError:
                     raise DataError(pool_died("Every finished shard")) from None
-                if isinstance(told, str):
-                    raise DataError(told)
-                if told is None:
+                if isinstance(message, str):
+                    raise DataError(message)
+                if message is None:
                     heard.pop(pipe).join()
                 else:
-                    done(told)
+                    done(message)
     finally:
         for process in heard.values():
             process.terminate()

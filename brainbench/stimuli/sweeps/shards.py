@@ -65,10 +65,10 @@ def make_shard(task: ShardTask, folder: str, workers: int | None = None) -> int:
     return write_shard(simulate_shard(task, workers=workers), folder)
 
 
-def build_object(item: NamedObject, settings: GenerationSettings, grid: SweepGrid) -> BuiltObject:
+def build_object(source: NamedObject, settings: GenerationSettings, grid: SweepGrid) -> BuiltObject:
     """Build one object of a data set, as its engine takes it."""
     try:
-        solid = item.load()
+        solid = source.load()
     except (DataError, UsageError) as error:
         return BuiltObject(None, str(error) or type(error).__name__)
     engine = get_engine(settings.backend, device=settings.device)
@@ -100,10 +100,10 @@ def simulate_shard(task: ShardTask, objects: Sequence[BuiltObject] = (), workers
     counts: dict[str, int] = dict.fromkeys(COUNTS, 0)
     wrench = np.empty((0, *shape[1:]), dtype=np.float32)
     if len(chosen):
-        named = {task.objects[owner].name: one.solid for owner, one in usable.items() if one.solid is not None}
+        solids = {task.objects[owner].name: one.solid for owner, one in usable.items() if one.solid is not None}
         settings = {name: getattr(task.settings, name) for name in ("fidelity", "backend", "device", "retry")}
         indices = [place[int(task.owner[i])] * count + int(task.within[i]) for i in chosen.tolist()]
-        scenes = SweepScenes(task.grid, named, whiskers=task.whiskers)
+        scenes = SweepScenes(task.grid, solids, whiskers=task.whiskers)
         packed = {task.objects[owner].name: one.packed for owner, one in usable.items() if one.packed is not None}
         batch = simulate_sweeps(scenes, indices, workers=workers, packed=packed, **settings)
         if batch.wrench.shape != (len(chosen), *shape[1:]):
@@ -114,8 +114,8 @@ def simulate_shard(task: ShardTask, objects: Sequence[BuiltObject] = (), workers
         counts = {name: getattr(batch, name) for name in counts}
         wrench = batch.wrench
     if len(chosen) < len(task):
-        known, wrench = wrench, np.full(shape, np.nan, dtype=np.float32)
-        wrench[chosen] = known
+        simulated, wrench = wrench, np.full(shape, np.nan, dtype=np.float32)
+        wrench[chosen] = simulated
     arrays = {
         **shard_tables(task, array, frames.times, [one.hash for one in built]),
         **_conditions(task),
@@ -195,8 +195,8 @@ def _hash_solid(solid: Solid) -> str:
 def _conditions(task: ShardTask) -> dict[str, NDArray[Any]]:
     """Return, for each sweep, its number, class, object and conditions."""
     sweeps: list[Sweep] = []
-    for owner, item in enumerate(task.objects):
-        every = task.grid.sweeps(item.name)
+    for owner, body in enumerate(task.objects):
+        every = task.grid.sweeps(body.name)
         sweeps += [every[within] for within in task.within[task.owner == owner].tolist()]
     labels = np.array([task.classes.index(item.label) for item in task.objects], dtype=np.int32)
     kinds = {name: np.int32 if name == "draw" else np.float64 for name in _CONDITIONS}

@@ -53,14 +53,14 @@ def _one_by_one(
     """Simulate sweeps as any other scenes."""
     dataset = simulate_uncached([scenes[index] for index in indices], fidelity, engine, workers=workers)
     unstable = dataset["status"].values != "ok"
-    told = Explanation.of(dataset)
+    explanation = Explanation.of(dataset)
     names = [str(name) for name in dataset["whisker"].values]
     return SweepBatch(
         wrench=dataset["wrench"].values,
         contact=dataset["contact"].values.mean(axis=1).astype(np.float32),
         unstable=unstable,
         reasons=describe_unstable(names, unstable, dataset["reason"].values),
-        steps=told.steps,
-        steps_in_full=told.steps_in_full,
-        unsolved=told.unsolved,
+        steps=explanation.steps,
+        steps_in_full=explanation.steps_in_full,
+        unsolved=explanation.unsolved,
     )

@@ -29,11 +29,11 @@ def split_objects(labels: Mapping[str, str], *, seed: int) -> NDArray[np.int8]:
     members: dict[str, list[int]] = {}
     for index, name in enumerate(names):
         members.setdefault(labels[name], []).append(index)
-    found = np.zeros(len(names), dtype=np.int8)
+    splits = np.zeros(len(names), dtype=np.int8)
     for indices in members.values():
         ordered = sorted(indices, key=lambda index: content_hash(["split", seed, names[index]]))
-        found[ordered] = _in_order(len(ordered))
-    return found
+        splits[ordered] = _in_order(len(ordered))
+    return splits
 
 
 def split_sweeps(labels: Sequence[str], count: int, *, seed: int) -> NDArray[np.int8]:
@@ -41,14 +41,14 @@ def split_sweeps(labels: Sequence[str], count: int, *, seed: int) -> NDArray[np.
 
     Within each class all sweeps of all objects are shuffled.
     """
-    found = np.zeros((len(labels), count), dtype=np.int8)
+    splits = np.zeros((len(labels), count), dtype=np.int8)
     given = np.array(labels, dtype=object)
     for label in dict.fromkeys(labels):
         indices = np.flatnonzero(given == label)
         generator = np.random.default_rng(int(content_hash(["split sweeps", seed, label]), 16))
         shuffled = generator.permutation(_in_order(len(indices) * count))
-        found[indices] = shuffled.reshape(len(indices), count)
-    return found
+        splits[indices] = shuffled.reshape(len(indices), count)
+    return splits
 
 
 def _in_order(count: int) -> NDArray[np.int8]:

@@ -73,9 +73,9 @@ class SweepScenes(Sequence[Scene]):
         # Neighbouring scenes share their object, and loading one may mean decomposing a mesh.
         last = self._last
         if last is None or last[0] != name:
-            item = self._objects[name]
+            source = self._objects[name]
             # Threads may ask for different objects.
-            self._last = last = (name, item if isinstance(item, Solid) else item())
+            self._last = last = (name, source if isinstance(source, Solid) else source())
         return last[1]
 
 

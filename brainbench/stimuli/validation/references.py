@@ -197,8 +197,8 @@ class _Branch:
             return -self._height(angle, solution) if self._valid(solution) else 0.0
 
         span = low[0], points[top][0] + self._STRIDE
-        found = minimize_scalar(fall, bounds=span, method="bounded", options={"xatol": 1e-9})
-        return self.side * max(points[top][2], -float(found.fun))
+        optimum = minimize_scalar(fall, bounds=span, method="bounded", options={"xatol": 1e-9})
+        return self.side * max(points[top][2], -float(optimum.fun))
 
     def _walk(self):  # noqa: ANN202
         """Yield (slope, (force, arc), peg offset) from the first touch on, while equilibria exist."""

@@ -92,8 +92,8 @@ def ringdown(
     trace = run_one(backend, Job(whisker, StillFollicle(), (), times, loads=(load,)), fidelity)
     times = times - release
     # Stiffness-proportional damping kills the second mode much sooner: one period is enough.
-    kept = times > 1 / expected
-    fits = [fit_decay(times[kept], trace.wrench[kept, 5], expected, whisker.damping_ratio)]
+    later = times > 1 / expected
+    fits = [fit_decay(times[later], trace.wrench[later, 5], expected, whisker.damping_ratio)]
     fits += [_ring_mode(whisker, mode, references_hz, backend, fidelity, own_step) for mode in range(1, modes)]
     frequencies, ratios = np.array(fits).T
     return Ringdown(frequencies, ratios, references_hz, times, trace.wrench)
@@ -143,9 +143,11 @@ def fit_decay(times: NDArray, signal: NDArray, frequency: float, ratio: float) -
 
     start = (2 * math.pi * frequency, ratio, 1.0, 0.0)
     try:
-        found, _ = curve_fit(model, times, signal / scale, p0=start, bounds=((0, 0, -1e6, -1e6), (np.inf, 1, 1e6, 1e6)))
+        fitted, _ = curve_fit(
+            model, times, signal / scale, p0=start, bounds=((0, 0, -1e6, -1e6), (np.inf, 1, 1e6, 1e6))
+        )
     except (RuntimeError, ValueError) as error:
         raise DataError(
             f"No decaying oscillation could be fitted to the ring-down ({error}); choose a smaller time step."
         ) from error
-    return float(found[0]) / (2 * math.pi), float(found[1])
+    return float(fitted[0]) / (2 * math.pi), float(fitted[1])

@@ -141,8 +141,8 @@ class WhiskerArray:
         if self.side == "both":
             mounts = tuple(mount for mount in self.mounts if mount.side == side)
         else:
-            other = tuple(mount.mirrored() for mount in self.mounts)
-            pair = (self.mounts, other) if self.side == "right" else (other, self.mounts)
+            mirrored = tuple(mount.mirrored() for mount in self.mounts)
+            pair = (self.mounts, mirrored) if self.side == "right" else (mirrored, self.mounts)
             mounts = {"right": pair[0], "left": pair[1], "both": pair[0] + pair[1]}[side]
         return dataclasses.replace(self, mounts=mounts)
 
@@ -161,12 +161,12 @@ class WhiskerArray:
         ``changes`` are fields of :class:`Whisker` (SI units), or ``position`` and ``angles``; others are a
         :class:`UsageError`.
         """
-        own = {"position", "angles"}
-        allowed = own | {field.name for field in dataclasses.fields(Whisker)}
+        places = {"position", "angles"}
+        allowed = places | {field.name for field in dataclasses.fields(Whisker)}
         check_each("whisker property", changes, sorted(allowed))
-        mounted = {key: tuple(map(float, value)) for key, value in changes.items() if key in own}
+        mounted = {key: tuple(map(float, value)) for key, value in changes.items() if key in places}
         check_numbers("angles of a whisker (rad)", mounted.get("angles", (0, 0, 0)), 3, least=-TURN, most=TURN)
-        rod = {key: value for key, value in changes.items() if key not in own}
+        rod = {key: value for key, value in changes.items() if key not in places}
         chosen = set(self.select(pattern).mounts)
         mounts = tuple(
             dataclasses.replace(mount, whisker=dataclasses.replace(mount.whisker, **rod), **mounted)
@@ -226,13 +226,13 @@ def _modelled(species: str) -> WhiskerArray:
     model = _read(species)["model"]
     mounts = []
     for average in _published(species):
-        known = {"row": float(average.row + 1), "column": float(average.col + 1)}
+        values = {"row": float(average.row + 1), "column": float(average.col + 1)}
         for key in ("theta_bp", "phi_bp", "r_bp"):
-            known[key] = _evaluate(model[key], known)
-        azimuth, elevation = math.radians(known["theta_bp"]), math.radians(known["phi_bp"])
-        radius = known["r_bp"] * _MM
-        theta, phi, zeta = (math.radians(_evaluate(model[key], known)) for key in ("theta", "phi", "zeta"))
-        length, curvature = math.exp(_evaluate(model["log_arc_length"], known)), _evaluate(model["curvature"], known)
+            values[key] = _evaluate(model[key], values)
+        azimuth, elevation = math.radians(values["theta_bp"]), math.radians(values["phi_bp"])
+        radius = values["r_bp"] * _MM
+        theta, phi, zeta = (math.radians(_evaluate(model[key], values)) for key in ("theta", "phi", "zeta"))
+        length, curvature = math.exp(_evaluate(model["log_arc_length"], values)), _evaluate(model["curvature"], values)
         mounts.append(
             dataclasses.replace(
                 average,
@@ -245,10 +245,10 @@ def _modelled(species: str) -> WhiskerArray:
     return WhiskerArray(species=species, mounts=tuple(mounts), citation=model["citation"])
 
 
-def _evaluate(terms: dict[str, float], known: dict[str, float]) -> float:
+def _evaluate(terms: dict[str, float], quantities: dict[str, float]) -> float:
     """Sum the terms of one equation: a constant and coefficients of known quantities or of their squares."""
     # The published equations are linear in row, column, the base-point coordinates and their squares.
-    values = {"constant": 1.0, **known, **{f"{key}_squared": value**2 for key, value in known.items()}}
+    values = {"constant": 1.0, **quantities, **{f"{key}_squared": value**2 for key, value in quantities.items()}}
     return sum(factor * values[name] for name, factor in terms.items())
 
 

@@ -38,10 +38,10 @@ def _match(term: str, names: list[str], short: list[str], cells: list[tuple[int,
     span = _RANGE.fullmatch(term)
     if span is None:
         shape = re.compile(".*".join(map(re.escape, term.split("*"))), re.IGNORECASE)
-        found = [i for i, name in enumerate(names) if shape.fullmatch(name) or shape.fullmatch(short[i])]
-        if not found:
+        matches = [i for i, name in enumerate(names) if shape.fullmatch(name) or shape.fullmatch(short[i])]
+        if not matches:
             raise unknown_name("whisker", term, dict.fromkeys([*short, *names]))
-        return found
+        return matches
     row0, col0, row1, col1 = span.groups()
     for end in (row0 + col0, row1 + col1):
         _match(end, names, short, cells)

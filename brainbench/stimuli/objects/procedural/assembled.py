@@ -24,9 +24,9 @@ def chair(draw: ShapeSampler, detail: int) -> Body:
 
 def _legs(length: float, width: float, height: float, leg: float) -> Body:
     """Four legs below z = 0, sunk a little into what stands on them."""
-    one = block(leg, leg, height + 0.05).moved(z=0.025 - height / 2)
+    corner = block(leg, leg, height + 0.05).moved(z=0.025 - height / 2)
     x, y = (length - leg) / 2, (width - leg) / 2
-    return one.moved(x, y) + one.moved(-x, y) + one.moved(x, -y) + one.moved(-x, -y)
+    return corner.moved(x, y) + corner.moved(-x, y) + corner.moved(x, -y) + corner.moved(-x, -y)
 
 
 def stairs(draw: ShapeSampler, detail: int) -> Body:
@@ -121,8 +121,8 @@ def jack(draw: ShapeSampler, detail: int) -> Body:
     bar, knob, arm = draw(bar=(0.08, 0.14), knob=(0.15, 0.22), arm=(0.5, 0.75))
     facets = around(detail)
     end = rod(knob, 0.16, facets)
-    one = rod(bar, 2 * arm, facets) + end.moved(z=arm) + end.moved(z=-arm)
-    return one + one.turned(x=90.0) + one.turned(y=90.0)
+    axle = rod(bar, 2 * arm, facets) + end.moved(z=arm) + end.moved(z=-arm)
+    return axle + axle.turned(x=90.0) + axle.turned(y=90.0)
 
 
 def house(draw: ShapeSampler, detail: int) -> Body:

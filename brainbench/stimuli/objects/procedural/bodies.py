@@ -53,14 +53,14 @@ class Body:
         self.solid = solid
         self.parts = None if parts is None else list(parts)
 
-    def __add__(self, other: Body) -> Body:
+    def __add__(self, body: Body) -> Body:
         """Union."""
-        known = self.parts is not None and other.parts is not None
-        return Body(self.solid + other.solid, [*(self.parts or ()), *(other.parts or ())] if known else None)
+        convex = self.parts is not None and body.parts is not None
+        return Body(self.solid + body.solid, [*(self.parts or ()), *(body.parts or ())] if convex else None)
 
-    def __sub__(self, other: Body) -> Body:
+    def __sub__(self, body: Body) -> Body:
         """Difference; a convex decomposition is no longer known."""
-        return Body(self.solid - other.solid, None)
+        return Body(self.solid - body.solid, None)
 
     def moved(self, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Body:
         """Translate."""
@@ -211,15 +211,15 @@ def convex_cells(points: NDArray[np.float64], triangles: NDArray[np.int64]) -> l
         merged = False
         sides = {(cell[i - 1], cell[i]): n for n, cell in enumerate(cells) for i in range(len(cell))}
         for (start, end), n in sides.items():
-            other = sides.get((end, start))
-            if other is None or other == n:
+            facing = sides.get((end, start))
+            if facing is None or facing == n:
                 continue
-            first, second = cells[n], cells[other]
+            first, second = cells[n], cells[facing]
             i, j = first.index(end), second.index(start)
             joined = [*first[i:], *first[:i], *second[j + 1 :], *second[:j]][: len(first) + len(second) - 2]
             if _is_convex(points[joined]):
                 cells[n] = joined
-                cells.pop(other)
+                cells.pop(facing)
                 merged = True
                 break
     return cells

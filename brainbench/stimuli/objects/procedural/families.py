@@ -117,10 +117,10 @@ def _refined(solid: Manifold, detail: int) -> Manifold:
             fine = factor
         elif count < wanted:
             coarse = factor
-            best = max(best, finer, key=lambda item: item.num_tri()) if best.num_tri() < wanted else best
+            best = max(best, finer, key=lambda solid: solid.num_tri()) if best.num_tri() < wanted else best
         else:
             fine = factor
-            best = finer if best.num_tri() < wanted else min(best, finer, key=lambda item: item.num_tri())
+            best = finer if best.num_tri() < wanted else min(best, finer, key=lambda solid: solid.num_tri())
     return best
 
 
