@@ -36,7 +36,7 @@ from brainbench.models.ops import dispatch
 from brainbench.models.ops.layers import packed
 from brainbench.models.registry import describe_model, load_model
 from brainbench.models.streaming import StreamingStep
-from brainbench.models.training.gradients import compiled, fuse
+from brainbench.models.training.optimizers import compiled, fuse
 
 STEPS = 22
 

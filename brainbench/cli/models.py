@@ -98,7 +98,7 @@ def show(
         data["recipe"] = to_plain(recipe)
     twin = (record.trained or {}).get("twin")
     if twin:
-        from brainbench.models.training.twins import draw_twin
+        from brainbench.models.training.card import draw_twin
 
         _, difference = draw_twin(twin, data["trained"]["options"])
         data["twin"] = difference or f"{twin['name']} with seed {twin['seed']}, drawn here to the last bit"

@@ -52,9 +52,8 @@ def train(
 
     Several GPUs: torchrun --nproc-per-node N -m brainbench train …
     """
-    from brainbench.models.training.config import TrainingConfig
+    from brainbench.models.training.config import TrainingConfig, best_run, sweep_runs
     from brainbench.models.training.evaluation import RANDOM, RAW, TWIN
-    from brainbench.models.training.search_space import best_run, sweep_runs
     from brainbench.models.training.trainer import BEST
     from brainbench.models.training.trainer import train as run
 

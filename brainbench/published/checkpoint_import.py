@@ -21,8 +21,7 @@ from brainbench.core.reading.sealed import is_sealed, seal_file
 from brainbench.models.encoders import S4Encoder
 from brainbench.models.graph.temporal_graph import TemporalGraph
 from brainbench.models.heads import AllStepsDecoder
-from brainbench.models.network import EncoderAttenderDecoder
-from brainbench.models.normaliser import PUBLISHED_FORCE_SCALE, Normaliser
+from brainbench.models.network import PUBLISHED_FORCE_SCALE, EncoderAttenderDecoder, Normaliser
 from brainbench.models.ops.parameters import check_named, copy_named
 from brainbench.models.ops.state_space import StateSpace
 from brainbench.models.registry import load_model

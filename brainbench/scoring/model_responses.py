@@ -240,7 +240,7 @@ def _network_input(module: torch.nn.Module, stimuli: Stimuli, normalize: bool) -
     if stimuli.dataset is not None:
         import torch
 
-        from brainbench.models.normaliser import Normaliser
+        from brainbench.models.network import Normaliser
 
         scaled = Normaliser.physical(given.shape[2] // len(CHANNELS))(torch.from_numpy(given)).numpy()
     if takes_si(module):
@@ -252,7 +252,7 @@ def _network_input(module: torch.nn.Module, stimuli: Stimuli, normalize: bool) -
 
 def takes_si(module: torch.nn.Module) -> bool:
     """Return whether a module, or a network of ours inside it, normalises SI values by itself."""
-    from brainbench.models.normaliser import Normaliser
+    from brainbench.models.network import Normaliser
 
     return _has_contract(module) or any(isinstance(part, Normaliser) for part in module.modules())
 

@@ -7,7 +7,7 @@ import h5py
 import pytest
 
 from brainbench.datasets.whisking.dataset import Shard, WhiskingDataset
-from brainbench.models.training import search_space, trainer
+from brainbench.models.training import config, trainer
 from brainbench.models.training.augmentation import Augmentation
 from brainbench.stimuli.sweeps.generation import generate
 from tests.factories.sweep_batches import small_plan
@@ -49,7 +49,7 @@ def test_a_model_is_trained_scored_by_its_folder_and_exported(run, folder, tmp_p
 
 
 def test_of_a_search_the_best_run_is_named_to_be_scored(run, folder, tmp_path, monkeypatch):
-    monkeypatch.setattr(search_space, "best_run", lambda out: (out / "other", {"other": 1.0}))
+    monkeypatch.setattr(config, "best_run", lambda out: (out / "other", {"other": 1.0}))
     found = run("train", "s4-small", *_options(folder, tmp_path), "--sweep", "1/8")
     assert found.status == 0, found.err
     assert f"local-dir:{tmp_path / 'other' / 'best'}" in found.out.replace("\n", "")

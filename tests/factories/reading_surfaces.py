@@ -28,9 +28,9 @@ from brainbench.datasets.whisking.dataset import WhiskingDataset
 from brainbench.geometry.mesh import load_mesh, save_mesh
 from brainbench.models.features import read_features, write_features
 from brainbench.models.graph.tnn_import import read_graph
+from brainbench.models.training.batches import Processes
 from brainbench.models.training.checkpoints import load_weights, read_config
 from brainbench.models.training.config import TrainingConfig
-from brainbench.models.training.processes import Processes
 from brainbench.models.training.trainer import _Run
 from brainbench.published.whiskit import read_runs
 from brainbench.scoring.jobs import parse_seeds, read_batch

@@ -13,7 +13,7 @@ import torch
 from brainbench.core.errors import DataError, UsageError
 from brainbench.models.activations import extract
 from brainbench.models.encoders import S4Encoder
-from brainbench.models.normaliser import Normaliser
+from brainbench.models.network import Normaliser
 from brainbench.models.ops.state_space import StateSpace
 from brainbench.models.registry import describe_model, load_model
 from brainbench.published.checkpoint_files import Settings, recognise

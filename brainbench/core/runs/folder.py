@@ -11,7 +11,7 @@ from brainbench.core.errors import DataError, UsageError, shown
 from brainbench.core.files import read_mapping, to_plain, write_json
 from brainbench.core.writing.temporaries import is_temporary
 
-CONFIG = "config.json"
+RUN, CONFIG = "run.json", "config.json"
 RESTART = "Delete it to start anew."
 EARLIER_STATE = "resume.safetensors"
 """State of a teacher before all runs had one format."""

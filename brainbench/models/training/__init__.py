@@ -1,7 +1,7 @@
 """Training of networks: one run in a folder, resumed exactly after any interruption.
 
 A :mod:`.config` says what is trained; :mod:`.batches` give sweeps, which are augmented, answered by a network with the
-head of its objective, and taken back to :mod:`.gradients` for one of the :mod:`.optimizers`; the best network is
+head of its objective, and taken back to gradients for one of the :mod:`.optimizers`; the best network is
 evaluated and kept as a checkpoint with its card. Importing this package imports no framework.
 """
 

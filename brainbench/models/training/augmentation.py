@@ -24,7 +24,7 @@ from torch.nn import functional
 from brainbench.core.contracts import CHANNELS, GRID_SHAPE
 from brainbench.core.errors import UsageError, check_name
 from brainbench.core.reading.ranges import check_number
-from brainbench.models.normaliser import Normaliser
+from brainbench.models.network import Normaliser
 
 LAST_COLUMNS = (4, 4, 6, 6, 5)
 """Last whisker of rows A–E of the mouse (Bresee et al. 2023); columns count from 0, the other cells are empty."""

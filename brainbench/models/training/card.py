@@ -1,4 +1,9 @@
-"""The configuration and the model card that are written beside a trained model."""
+"""The configuration and the model card that are written beside a trained model, and its untrained twin.
+
+The twin is the network that the training started from, to the last bit. Nothing of it is stored but its name, its seed
+and a hash: ``load_model(name, seed=seed)`` draws it again, and the hash shows where another version of PyTorch draws
+other numbers.
+"""
 
 from __future__ import annotations
 
@@ -6,8 +11,11 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
-from brainbench.core.files import provenance, to_plain
-from brainbench.models.registry import describe_model
+import torch
+from torch import nn
+
+from brainbench.core.files import hash_arrays, provenance, to_plain
+from brainbench.models.registry import describe_model, load_model
 from brainbench.models.training.config import TrainingConfig
 from brainbench.models.training.evaluation import TWIN, Evaluation
 
@@ -26,7 +34,7 @@ def checkpoint_info(
 ) -> dict[str, Any]:
     """Return what a checkpoint's configuration says beside the architecture, in plain values.
 
-    ``twin`` is what :func:`~brainbench.models.training.twins.describe_twin` told of the network before its training,
+    ``twin`` is what :func:`~brainbench.models.training.card.describe_twin` told of the network before its training,
     ``controls`` are evaluations of :data:`~brainbench.models.training.evaluation.CONTROLS`, ``data`` the
     :attr:`~brainbench.models.training.batches.Data.summary` of the sweeps, ``split`` the part of them that the
     evaluation is of.
@@ -107,3 +115,32 @@ def _beside(trained: Mapping[str, Any] | None, twin: Mapping[str, Any] | None) -
 
 def _top1(evaluation: Mapping[str, Any]) -> str:
     return f"top-1 {evaluation['top1']:.3f} [{evaluation['interval']['low']:.3f}, {evaluation['interval']['high']:.3f}]"
+
+
+def describe_twin(name: str, seed: int, model: nn.Module) -> dict[str, Any]:
+    """Return what a configuration says of a network before its training: how to get it, and what it was.
+
+    ``state`` is a SHA-256 (32 digits) over names, types, shapes and bytes of all parameters and buffers, the decoder's
+    included: it belongs to a number of classes.
+    """
+    state = hash_arrays({key: value.detach().cpu().numpy() for key, value in model.state_dict().items()})
+    return {"name": name, "seed": seed, "state": state, "torch": torch.__version__}
+
+
+def difference(twin: Mapping[str, Any], drawn: Mapping[str, Any]) -> str:
+    """Return why a network that was drawn again is not the twin, as :func:`describe_twin` tells of both; else ''."""
+    if twin["state"] == drawn["state"]:
+        return ""
+    return (
+        f"{twin['name']} with seed {twin['seed']} is not the network that training started from: PyTorch "
+        f"{drawn['torch']} here draws other weights than PyTorch {twin['torch']} there"
+    )
+
+
+def draw_twin(twin: Mapping[str, Any], options: Mapping[str, Any]) -> tuple[nn.Module, str]:
+    """Return the twin that a checkpoint's configuration names, and why it is another network after all, or ''.
+
+    ``twin`` and ``options`` are entries of the configuration.
+    """
+    model = load_model(twin["name"], seed=twin["seed"], **options)
+    return model, difference(twin, describe_twin(twin["name"], twin["seed"], model))

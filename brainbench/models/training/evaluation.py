@@ -24,7 +24,7 @@ from brainbench.core.records import Interval
 from brainbench.core.statistics import wilson_interval
 from brainbench.models.activations import evaluating
 from brainbench.models.heads import AllStepsDecoder
-from brainbench.models.normaliser import Normaliser
+from brainbench.models.network import Normaliser
 from brainbench.models.ops.layers import Linear
 from brainbench.models.recipes import BATCH_SIZE, PROBE
 from brainbench.models.training.optimizers import make_optimizer, rate_factor

@@ -25,7 +25,7 @@ from brainbench.core.errors import DataError, UsageError
 from brainbench.core.files import read_mapping, write_json
 from brainbench.core.progress import Progress
 from brainbench.core.reading.regular import readable
-from brainbench.core.runs.folder import RESTART, RunEnd, claim, mark
+from brainbench.core.runs.folder import RESTART, RUN, RunEnd, claim, mark
 from brainbench.core.runs.log import RunLog
 from brainbench.core.runs.state import (
     STATE,
@@ -42,8 +42,8 @@ from brainbench.models.activations import evaluating
 from brainbench.models.ops.parameters import seeded
 from brainbench.models.registry import load_model
 from brainbench.models.training.augmentation import MOUSE, Augmentation
-from brainbench.models.training.batches import Batches, BatchOptions, Data
-from brainbench.models.training.card import checkpoint_info, model_card
+from brainbench.models.training.batches import Batches, BatchOptions, Data, Processes, processes
+from brainbench.models.training.card import checkpoint_info, describe_twin, difference, draw_twin, model_card
 from brainbench.models.training.checkpoints import WEIGHTS, load_weights, save_checkpoint
 from brainbench.models.training.config import TrainingConfig, config_warnings
 from brainbench.models.training.evaluation import (
@@ -55,15 +55,12 @@ from brainbench.models.training.evaluation import (
     fit_probe,
     sweeps_hash,
 )
-from brainbench.models.training.gradients import Gradients, compiled
 from brainbench.models.training.objectives import make_learner
-from brainbench.models.training.optimizers import make_optimizer, rate_factor
-from brainbench.models.training.processes import Processes, processes
-from brainbench.models.training.twins import describe_twin, difference, draw_twin
+from brainbench.models.training.optimizers import Gradients, compiled, make_optimizer, rate_factor
 
 _log = logging.getLogger(__name__)
 
-RUN, BEST, FAILED, CONTROLS_FILE = "run.json", "best", "failed-batch.safetensors", "controls.json"
+BEST, FAILED, CONTROLS_FILE = "best", "failed-batch.safetensors", "controls.json"
 _LOG_STEPS = 50
 
 

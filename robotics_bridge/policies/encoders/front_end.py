@@ -22,8 +22,7 @@ from torch import nn
 from brainbench.core.contracts import CHANNELS, GRID_SHAPE, SUB_STEP_SECONDS
 from brainbench.core.errors import DataError, UsageError, check_name
 from brainbench.core.limits import Positive, limited
-from brainbench.models.network import EncoderAttenderDecoder
-from brainbench.models.normaliser import FORCE_SCALE, MOMENT_SCALE
+from brainbench.models.network import FORCE_SCALE, MOMENT_SCALE, EncoderAttenderDecoder
 from brainbench.models.registry import load_model
 from brainbench.models.streaming import StreamingStep
 from robotics_bridge.policies.encoders.taxel_grid import TaxelGrid
@@ -42,9 +41,9 @@ class HandCalibration:
     """
 
     force: Positive = 0.5
-    """N that count as :data:`~brainbench.models.normaliser.FORCE_SCALE`."""
+    """N that count as :data:`~brainbench.models.network.FORCE_SCALE`."""
     moment: Positive = 5e-3
-    """N·m that count as :data:`~brainbench.models.normaliser.MOMENT_SCALE`."""
+    """N·m that count as :data:`~brainbench.models.network.MOMENT_SCALE`."""
 
     @classmethod
     def fit(cls, grid: torch.Tensor) -> HandCalibration:

@@ -7,7 +7,7 @@ import torch
 
 from brainbench import load_model
 from brainbench.core.errors import DataError, UsageError
-from brainbench.models.normaliser import FORCE_SCALE, MOMENT_SCALE, Normaliser
+from brainbench.models.network import FORCE_SCALE, MOMENT_SCALE, Normaliser
 from robotics_bridge.policies.encoders.arms import EncoderConfig
 from robotics_bridge.policies.encoders.front_end import FrontEnd, HandCalibration, Resampler
 from robotics_bridge.policies.encoders.taxel_grid import TaxelGrid
