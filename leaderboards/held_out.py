@@ -18,6 +18,7 @@ from brainbench.core.errors import DataError
 from brainbench.core.files import file_hash, read_json, write_text
 from brainbench.core.limits import Count
 from brainbench.core.reading.texts import read_text
+from brainbench.core.reading.values import typed_values
 
 DATA, SALT = "held-out.h5", "salt.txt"
 """Files of the secret folder."""
@@ -40,10 +41,8 @@ class Commitment(msgspec.Struct, frozen=True, rename={"public": "kept"}):
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> Commitment:
         """Read a published commitment; raise DataError if the file is missing or is none."""
-        try:
-            return msgspec.convert(read_json(path, "commitment"), cls)
-        except msgspec.ValidationError as error:
-            raise DataError(f"{os.fspath(path)!r} is no commitment to held-out recordings ({error}).") from error
+        name = f"the commitment {os.fspath(path)!r}"
+        return typed_values(cls, read_json(path, "commitment"), name, choices={"kind": ("animals", "stimuli")})
 
     @property
     def plain(self) -> dict[str, Any]:

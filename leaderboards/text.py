@@ -6,7 +6,7 @@ import json
 import math
 import re
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
 from typing import Any
 
@@ -171,20 +171,24 @@ def provenance_rows(provenance: Mapping[str, Any]) -> list[tuple[str, str]]:
         if isinstance(value, Mapping) and key not in ("packages", "pairs"):
             # Each layer's p stands in the table of layers; other statistics are measured, so few digits say all.
             stated = {name: item for name, item in value.items() if (key, name) != ("statistics", "layer_tests")}
-            stated = _rounded(stated) if key == "statistics" else stated
+            stated = with_floats(stated, _three_digits) if key == "statistics" else stated
             rows += [(f"{key}: {name}", item) for name, item in stated.items()]
         elif key != "command":
             rows.append((key, value))
     return [(key.replace("_", " "), _inline(item)) for key, item in rows if item not in (None, "", {}, [])]
 
 
-def _rounded(value: Any) -> Any:
-    """Return a value with its floats at three significant digits."""
+def with_floats(value: Any, change: Callable[[float], Any]) -> Any:
+    """Return a value with each of its floats changed."""
     if isinstance(value, Mapping):
-        return {key: _rounded(item) for key, item in value.items()}
+        return {key: with_floats(entry, change) for key, entry in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_rounded(item) for item in value]
-    return float(f"{value:.3g}") if isinstance(value, float) else value
+        return [with_floats(entry, change) for entry in value]
+    return change(value) if isinstance(value, float) else value
+
+
+def _three_digits(value: float) -> float:
+    return float(f"{value:.3g}")
 
 
 def _inline(value: Any) -> str:

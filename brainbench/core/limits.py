@@ -22,7 +22,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import fields
 from functools import cache, wraps
 from types import NoneType, UnionType
-from typing import Annotated, Any, Literal, Union, get_args, get_origin
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, overload
 
 import msgspec
 
@@ -30,6 +30,7 @@ from brainbench.core.errors import UsageError, check_name, shown
 from brainbench.core.reading.ranges import check_number
 
 Check = Callable[[str, Any], None]
+T = TypeVar("T")
 
 
 def Limit(
@@ -62,6 +63,14 @@ Seed = Annotated[int, Limit(least=0)]
 Share = Annotated[float, Limit(least=0, most=1)]
 Positive = Annotated[float, Limit(above=0)]
 NotNegative = Annotated[float, Limit(least=0)]
+
+
+@overload
+def limited(cls: type[T]) -> type[T]: ...
+
+
+@overload
+def limited(*, of: str = ..., unresolved: Sequence[str] = ...) -> Callable[[type[T]], type[T]]: ...
 
 
 def limited(cls: type | None = None, *, of: str = "{}", unresolved: Sequence[str] = ()) -> Any:

@@ -19,6 +19,7 @@ from brainbench.core.errors import DataError, listing
 from brainbench.core.files import content_hash, to_json, to_plain
 from brainbench.core.provenance import Provenance
 from brainbench.core.reading.texts import parse_json
+from brainbench.core.reading.values import typed_values
 
 Status = Literal["ok", "unreliable", "undefined"]
 """``ok``: can be trusted; ``unreliable``: computed, but the data are too noisy or too few to trust
@@ -428,10 +429,7 @@ def _steady(score: Mapping[str, Any] | None) -> dict[str, Any] | None:
 
 def _convert(kind: type, data: Any) -> Any:
     """Make a dataclass from parsed JSON."""
-    try:
-        built = msgspec.convert(data, kind)
-    except msgspec.ValidationError as error:
-        raise DataError(f"{_in_words(str(error), data)}.") from error
+    built = typed_values(kind, data, "the record", choices={"status": get_args(Status), "schema": (RECORD_SCHEMA,)})
     _check_rest(data, built, "")
     return built
 
@@ -452,28 +450,3 @@ def _check_rest(data: Any, built: Any, place: str) -> None:
     elif isinstance(built, Mapping):
         for name, made in built.items():
             _check_rest(data[name], made, f"{place}.{name}")
-
-
-_WORDS = {"float": "a number", "int": "an integer", "str": "text", "bool": "true or false", "null": "null"}
-_WORDS |= {"object": "an object", "array": "a list"}
-
-
-def _in_words(fault: str, data: Any) -> str:
-    """Say what msgspec found wrong with parsed JSON: the place, what stands there and what is allowed there.
-
-    >>> _in_words("Expected `float | null`, got `str` - at `$.score.p`", {"score": {"p": "high"}})
-    "score.p is 'high'; expected a number or null"
-    """
-    message, _, path = fault.partition(" - at `$")
-    place = path.strip("`.")
-    if missing := re.search(r"missing required field `(\w+)`", message):
-        return f"{place or 'the record'} lacks {missing[1]!r}"
-    allowed = message.partition(", got")[0].replace("Expected", "expected")
-    if message.startswith("Invalid enum value"):
-        allowed = f"expected one of {listing(get_args(Status)) if place.endswith('status') else RECORD_SCHEMA}"
-    allowed = re.sub(r"`([a-z |]+)`", lambda kinds: " or ".join(_WORDS[one] for one in kinds[1].split(" | ")), allowed)
-    if "[...]" in place:  # an entry of a mapping, whose name is not told
-        return f"an entry of {place.replace('[...]', '')} is wrong: {allowed}"
-    for step in re.findall(r"[^.\[\]]+", place):
-        data = data[int(step)] if isinstance(data, list) else data[step]
-    return f"{place or 'the record'} is {repr(data)[:60]}; {allowed}"

@@ -10,10 +10,10 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from brainbench.core.errors import UsageError, check_each, check_name, check_once, shown
-from brainbench.core.reading.ranges import check_fields
+from brainbench.core.errors import UsageError, check_each, check_once, shown
+from brainbench.core.limits import Limit, Positive, Seed, limited
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -23,8 +23,6 @@ if TYPE_CHECKING:
     from brainbench.metrics import Metric
     from brainbench.stimuli import Fidelity, Stimuli
 
-TIME_RULES = ("mean", "concatenate")
-READOUTS = ("default", "published")
 TIME_BIN = 0.05
 """Bin width of scores over time, seconds."""
 
@@ -38,6 +36,7 @@ _ELSEWHERE = ("recordings", "match", "explain", "title", "strict")
 
 
 @dataclass(frozen=True)
+@limited(unresolved=("recordings", "stimuli", "match", "select", "window", "fidelity", "metric", "layers"))
 class ScoreOptions:
     """Options of scoring a model against recordings."""
 
@@ -67,9 +66,9 @@ class ScoreOptions:
     layer: str | None = None
     """The layer committed to before anything is scored; by default the one that the model names, else a held-out
     choice among all."""
-    time: str = "mean"
+    time: Literal["mean", "concatenate"] = "mean"
     """Time axis of both sides: 'mean' averages over it, 'concatenate' keeps every step."""
-    bin: float | None = None
+    bin: Positive | None = None
     """Bin width of the spike counts in seconds."""
     over_time: bool = False
     """Also score each time, in bins of --bin (.05 s), and measure each layer's latency (RSA metrics only)."""
@@ -78,15 +77,15 @@ class ScoreOptions:
     metric: str | Metric = "rsa"
     """rsa, rsa-correlation, rsa-crossnobis, rsa-partial, cka, decoding, ridge, procrustes, or FILE.py:CLASS of your
     own."""
-    units_reliability: float | None = None
+    units_reliability: Annotated[float, Limit(above=-1, below=1)] | None = None
     """Leave out units whose tuning is less reliable than this (published: .5); a choice made on the scored data."""
     normalize: bool = True
     """Give plain modules forces in 1e-4 N and moments in 1e-6 N·m instead of SI; other models take no choice."""
-    seed: int = 0
+    seed: Seed = 0
     """Seed of untrained weights, of split halves and of random features."""
-    weights_seed: int | None = None
+    weights_seed: Seed | None = None
     """Seed of untrained weights alone; --seed then keeps that of the statistics."""
-    readout: str = "default"
+    readout: Literal["default", "published"] = "default"
     """Layers and steps of a network of the study: default (ours), or published (its names, its steps, its averages)."""
     explain: bool = False
     """Also walk from the published estimator to the default one, fault by fault (RSA only); MODEL may then be an .npz
@@ -94,14 +93,9 @@ class ScoreOptions:
 
     def __post_init__(self) -> None:
         """Refuse what no score can be made with, before anything is loaded."""
-        for name in ("over_time", "explain", "normalize", "strict"):
-            if not isinstance(getattr(self, name), bool):
-                raise UsageError(f"{name} must be true or false; received {shown(getattr(self, name))}.")
         for name in _NO_NUMBERS:
             if isinstance(getattr(self, name), (int, float)):
                 raise UsageError(f"{name} must be a text; received {shown(getattr(self, name))}.")
-        check_fields(self, "seed", "weights_seed", least=0, whole=True)
-        check_fields(self, "bin", above=0)
         if self.layers is not None:
             if not (isinstance(self.layers, (list, tuple)) and all(isinstance(name, str) for name in self.layers)):
                 raise UsageError(f"layers must be a list of names; received {shown(self.layers)}.")
@@ -113,11 +107,8 @@ class ScoreOptions:
             for name in ("conditions", "select", "window", "bin"):
                 if getattr(self, name) is not None:
                     raise UsageError(f"Recordings in memory are counted already, so {name} cannot apply; leave it out.")
-        check_name("time rule", self.time, TIME_RULES)
-        check_name("readout", self.readout, READOUTS)
         if self.readout == "published" and (self.time != "mean" or self.over_time):
             raise UsageError("The published readout averages time by its own rule; leave out --time and --over-time.")
-        check_fields(self, "units_reliability", above=-1, below=1)
 
     @classmethod
     def of(cls, values: Mapping[str, Any]) -> ScoreOptions:

@@ -20,10 +20,9 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
 
-import msgspec
-
 from brainbench.core.errors import BrainbenchError, DataError, UsageError
 from brainbench.core.files import atomic_path, file_hash, read_json, to_json, writable, write_json
+from brainbench.core.reading.values import typed_values
 from brainbench.core.records import ResultRecord
 from brainbench.core.writing.locks import lock_folder
 from brainbench.core.writing.temporaries import is_temporary, sweep
@@ -102,10 +101,8 @@ def _read(root: Path) -> _Hashes | None:
     path = root / MANIFEST
     if not os.path.lexists(path):
         return None
-    try:
-        return msgspec.convert(read_json(path, "manifest of a build"), _Hashes)
-    except msgspec.ValidationError as error:
-        raise DataError(f"{str(path)!r} is no manifest of a build ({error}); give a new folder.") from error
+    name = f"the manifest of a build {str(path)!r}"
+    return typed_values(_Hashes, read_json(path, "manifest of a build"), name, advice=" Give a new folder.")
 
 
 def _write_manifest(root: Path, hashes: _Hashes) -> None:

@@ -13,7 +13,7 @@ from leaderboards.boards import Baseline, Board, conclusions
 from leaderboards.entries import Entry
 from leaderboards.figures.svg import interval_ends, score_scale
 from leaderboards.ranking import standing_of
-from leaderboards.text import ways_to_get
+from leaderboards.text import ways_to_get, with_floats
 
 COLUMNS: tuple[dict[str, Any], ...] = (
     {"key": "rank", "label": "rank", "title": "rank", "number": True, "shown": True},
@@ -86,7 +86,7 @@ def page_board(key: str, board: Board) -> dict[str, Any]:
         if entry is not None:
             cells |= {"apart": entry.not_repeatable or None, "seed": entry.card.seed}
             cells |= {"runs": [record.score.scaled for record in entry.records] if entry.seeds > 1 else None}
-        columns.append({name: _rounded(value) for name, value in cells.items()})
+        columns.append({name: with_floats(value, _six_decimals) for name, value in cells.items()})
     trusted = [row for row in columns if row["standing"] != "unreliable"]
     values = [row[name] for row in trusted for name in ("score", "score_low", "score_high") if row[name] is not None]
     axis = score_scale(values, [], 0, 1)
@@ -162,10 +162,8 @@ def _known(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _rounded(value: Any) -> Any:
-    if isinstance(value, list):
-        return [_rounded(item) for item in value]
-    return round(value, 6) if isinstance(value, float) and math.isfinite(value) else _known(value)
+def _six_decimals(value: float) -> float | None:
+    return round(value, 6) if math.isfinite(value) else None
 
 
 def _cell(value: Any) -> Any:

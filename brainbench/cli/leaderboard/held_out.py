@@ -107,12 +107,12 @@ def score_held_out(record: ResultRecord, commitment: Commitment, secret: Path) -
     held_score = score_record(str(settings["model"]), options).score
     return {
         "held_out": f"{commitment.held} {commitment.kind}",
-        "on_public": _rounded(record.score),
-        "on_held_out": _rounded(held_score),
+        "on_public": _two_digits(record.score),
+        "on_held_out": _two_digits(held_score),
     }
 
 
-def _rounded(score: Score) -> dict[str, Any]:
+def _two_digits(score: Score) -> dict[str, Any]:
     from leaderboards.ranking import standing_of
 
     span = score.scaled_interval

@@ -98,7 +98,7 @@ def score_again(record: ResultRecord, *, recordings: str | None = None, trust_co
 
 def _check_kinds(record: ResultRecord, model: Any, source: Any) -> None:
     """Raise DataError for settings of other kinds than the options of a score: anyone may have written the record."""
-    import msgspec
+    from brainbench.core.reading.values import typed_values
 
     origin = record.score.provenance
     stated: dict[str, tuple[Any, Any]] = {
@@ -112,10 +112,7 @@ def _check_kinds(record: ResultRecord, model: Any, source: Any) -> None:
         kind = list[str] if option.several else str if option.kind is Path else option.kind
         stated.setdefault(name, (origin.settings.get(name), kind))
     for name, (value, kind) in stated.items():
-        try:
-            msgspec.convert(value, kind | None)
-        except msgspec.ValidationError as error:
-            raise DataError(f"The settings of {record.score.name[:80]!r} cannot be used: {name}: {error}.") from error
+        typed_values(kind | None, value, f"the setting {name!r} of {record.score.name[:80]!r}")
 
 
 def refuse_foreign_code(record: ResultRecord, *, trusted: bool) -> None:

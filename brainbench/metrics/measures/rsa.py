@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from brainbench.core.errors import UsageError, check_each, check_name
-from brainbench.core.reading.ranges import check_fields
+from brainbench.core.limits import Count, limited
 from brainbench.core.records import Score
 from brainbench.metrics.hooks import usable_features
 from brainbench.metrics.measures.metric import Metric
@@ -28,6 +28,7 @@ _CHUNK_ELEMENTS = 1 << 22
 
 
 @dataclass(frozen=True)
+@limited
 class RSA(Metric):
     """Compare RDMs; corrected by the split-half reliability of each animal's RDM.
 
@@ -45,7 +46,7 @@ class RSA(Metric):
     model_method: str = "sqeuclidean"
     """RDM method of the activations, which have no trial noise."""
     comparison: str = "whitened-cosine"
-    splits: int = 300
+    splits: Count = 300
     """Random halves of the trials of each animal."""
 
     of_rdms = True
@@ -58,7 +59,6 @@ class RSA(Metric):
         check_each("RDM method", (self.brain_method, self.model_method), RDM_METHODS)
         check_name("noise covariance method", self.noise, ("none", *NOISE_METHODS))
         check_comparison(self.comparison)
-        check_fields(self, "splits", least=1, whole=True)
 
     def layer(self, features: ArrayLike) -> Floats:
         """Return the RDM [P] of a layer's features [K, F]."""

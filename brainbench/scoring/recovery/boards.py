@@ -13,15 +13,16 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from itertools import combinations
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.errors import UsageError, repeats, shown, unknown_name
 from brainbench.core.files import content_hash
+from brainbench.core.limits import Count, Limit, Seed, limited
 from brainbench.core.progress import Progress, track
-from brainbench.core.reading.ranges import check_fields, check_number
+from brainbench.core.reading.ranges import check_number
 from brainbench.core.records import Score
 from brainbench.core.statistics import compare_scores
 from brainbench.datasets.synthetic.populations import PopulationDesign, ResponseGeometry, principal_axes
@@ -36,28 +37,25 @@ FEWEST_STIMULI = 4
 
 
 @dataclass(frozen=True)
+@limited(of="{} of a recovery")
 class RecoveryDesign:
     """An experiment that is repeated on the computer with every candidate in turn as the truth."""
 
     population: PopulationDesign = field(default_factory=PopulationDesign)
     """Animals, units, trials and noise."""
-    stimuli: int | None = None
+    stimuli: Annotated[int, Limit(least=FEWEST_STIMULI)] | None = None
     """Stimuli of one board, drawn anew for each from those that the candidates saw; all of them by default."""
     metric: str = "rsa"
     """Metric of the scores."""
     layer: str = "any"
     """Layer whose units the animals mix: any (drawn anew for each board), last, or the name of one."""
-    splits: int = 100
+    splits: Count = 100
     """Split halves that tell the reliability of an animal's RDM."""
-    orders: int = 50
+    orders: Annotated[int, Limit(least=40)] = 50
     """Random orders of the stimuli that tell the score expected by chance; the observed score counts among them, so
     with fewer than about 40 it looks like chance."""
-    seed: int = 0
+    seed: Seed = 0
     """Seed of the animals."""
-
-    def __post_init__(self) -> None:
-        for name, fewest in (("splits", 1), ("orders", 40), ("seed", 0), ("stimuli", FEWEST_STIMULI)):
-            check_fields(self, name, of="{} of a recovery", least=fewest, whole=True)
 
 
 def parse_trials(text: str) -> int | tuple[int, int]:

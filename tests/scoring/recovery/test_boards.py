@@ -83,13 +83,13 @@ def test_the_network_that_made_the_data_scores_highest():
     for true in range(3):
         board = make_board(candidates, DESIGN, true, 0)
         assert board.first == true
-        assert board.told[true] == 0
-        assert min(board.told) >= 0
+        assert board.verdicts[true] == 0
+        assert min(board.verdicts) >= 0
 
 
 def test_few_animals_are_never_told_apart():
     few = replace(DESIGN, population=replace(DESIGN.population, animals=3))
-    assert make_board(make_candidates(20), few, 0, 0).told == (0, 0, 0)
+    assert make_board(make_candidates(20), few, 0, 0).verdicts == (0, 0, 0)
 
 
 def test_a_board_is_the_same_again_and_others_differ():
@@ -97,7 +97,7 @@ def test_a_board_is_the_same_again_and_others_differ():
     once = make_board(candidates, DESIGN, 0, 4)
     assert make_board(make_candidates(), DESIGN, 0, 4) == once
     assert make_board(candidates, DESIGN, 0, 5).scaled != once.scaled
-    assert RecoveryBoard.of({**vars(once), "scaled": [None, *once.scaled[1:]]}).scaled[1:] == once.scaled[1:]
+    assert RecoveryBoard.of({**once.stored, "scaled": [None, *once.scaled[1:]]}).scaled[1:] == once.scaled[1:]
 
 
 def test_some_of_the_stimuli_are_drawn_anew_for_each_board():
