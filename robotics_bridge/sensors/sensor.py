@@ -10,11 +10,11 @@ from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 from brainbench.core.errors import check_kind, check_name
 from brainbench.core.files import read_json
-from brainbench.core.reading.ranges import check_fields
+from brainbench.core.limits import Count, Limit, limited
 from brainbench.core.tradeoffs import TradeoffPoint, cheapest
 from robotics_bridge.sensors.noise.model import BASE_KNOBS, PROBE_KNOBS, Noise
 from robotics_bridge.sensors.probes.placement import Probes
@@ -26,6 +26,7 @@ Convention = Literal["physical", "thesis"]
 
 
 @dataclass(frozen=True, kw_only=True)
+@limited
 class Sensor(abc.ABC):
     """Configuration of a sensor on one link."""
 
@@ -33,7 +34,7 @@ class Sensor(abc.ABC):
     """The link that carries it."""
     noise: Noise = field(default_factory=Noise)
     """Imperfections of the measured reading."""
-    history: int = 0
+    history: Annotated[int, Limit(least=0)] = 0
     """Last readings kept, at the rate of updates; 0 keeps none."""
 
     channels: ClassVar[int] = 0
@@ -50,7 +51,6 @@ class Sensor(abc.ABC):
         check_kind("link of a sensor", self.link, str, "a name")
         check_kind("noise of a sensor", self.noise, Noise, "Noise(...)")
         self.noise.check(self.knobs, type(self).__name__)
-        check_fields(self, "history", least=0, whole=True)
 
     @abc.abstractmethod
     def layout(self) -> tuple[int, ...]:
@@ -72,6 +72,7 @@ class Sensor(abc.ABC):
 
 
 @dataclass(frozen=True, kw_only=True)
+@limited
 class ProbeSensor(Sensor):
     """A sensor made of probes that look at geometries of other links."""
 
@@ -110,6 +111,7 @@ class ProbeSensor(Sensor):
 
 
 @dataclass(frozen=True, kw_only=True)
+@limited
 class QuerySensor(ProbeSensor):
     """A probe sensor that asks for distances, by fields or by triangles."""
 
@@ -121,11 +123,6 @@ class QuerySensor(ProbeSensor):
     geometry within reach, for engines or links without collision."""
 
     shared: ClassVar[tuple[str, ...]] = ("query",)
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_name("query", self.query, ("sdf", "raycast"))
-        check_name("choice of pairs", self.pairs, ("contact", "all"))
 
     @property
     def contact_only(self) -> bool:  # type: ignore[override]
@@ -142,20 +139,16 @@ TABLE = Path(__file__).with_name("fidelity_table.json")
 
 
 @dataclass(frozen=True)
+@limited
 class SensorFidelity:
     """Settings that trade exactness for speed; the rest of a sensor is its own."""
 
     query: Literal["sdf", "raycast"] = "sdf"
     """Way to ask meshes for their distance: sampled fields, or the nearest triangle."""
-    resolution: int = 64
+    resolution: Annotated[int, Limit(least=4, most=512)] = 64
     """Cells of a distance field along the longest edge of its mesh."""
-    points: int = 2000
+    points: Count = 2000
     """Surface points of tracked objects, for proximity and elastomer taxels."""
-
-    def __post_init__(self) -> None:
-        check_name("query", self.query, ("sdf", "raycast"))
-        check_fields(self, "resolution", least=4, most=512, whole=True)
-        check_fields(self, "points", least=1, whole=True)
 
     @classmethod
     def preset(cls, name: str) -> SensorFidelity:

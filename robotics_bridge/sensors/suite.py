@@ -146,7 +146,7 @@ class SensorSuite:
         if fidelity is not None:
             sensors = fidelity.apply(sensors)
         if resolution is None:
-            resolution = fidelity.resolution if fidelity is not None else 64
+            resolution = int(fidelity.resolution) if fidelity is not None else 64
         check_number("resolution", resolution, least=4, most=512, whole=True)
         check_number("seed", seed, whole=True)
         check_number("env_offset", env_offset, least=0, whole=True)

@@ -10,7 +10,8 @@ import torch
 
 from brainbench.core.devices import warp
 from brainbench.core.errors import UsageError, check_kind
-from brainbench.core.reading.ranges import check_fields, check_number
+from brainbench.core.limits import NotNegative, Positive, limited
+from brainbench.core.reading.ranges import check_number
 from robotics_bridge.physics.state import HandState
 from robotics_bridge.sensors.audio.sensors import AudioSensor
 from robotics_bridge.sensors.kernels import sound as k
@@ -18,6 +19,7 @@ from robotics_bridge.sensors.suite import SensorSuite
 
 
 @dataclass(frozen=True)
+@limited
 class Microphone:
     """A place of a listener, and the way sound takes to it."""
 
@@ -27,19 +29,16 @@ class Microphone:
     """The link that carries it; None stands still in the world."""
     sources: tuple[str, ...] = ()
     """Names of the ContactAudio and ActuationAudio that are heard; empty hears all."""
-    speed_of_sound: float = 343.0
+    speed_of_sound: Positive = 343.0
     """c [m/s]."""
-    power: float = 1.0
+    power: NotNegative = 1.0
     """p: 1 is the sound pressure of a free field."""
-    nearest: float = 0.01
+    nearest: Positive = 0.01
     """Sources nearer than this are as loud as at this distance [m]."""
-    reach: float = 3.0
+    reach: Positive = 3.0
     """Longest distance that is rendered with its full delay [m]; sets the memory."""
 
     def __post_init__(self) -> None:
-        check_fields(self, "position", items=3)
-        check_fields(self, "speed_of_sound", "nearest", "reach", above=0)
-        check_fields(self, "power", least=0)
         check_kind("sources", self.sources, (tuple, list), "the names of sensors, such as ('tip',)")
 
     def build(self, suite: SensorSuite) -> Listener:

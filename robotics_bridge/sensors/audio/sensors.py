@@ -9,31 +9,28 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 from brainbench.core.errors import UsageError, unknown_name
-from brainbench.core.reading.ranges import check_fields, check_number
+from brainbench.core.limits import Count, Limit, NotNegative, Positive, limited
+from brainbench.core.reading.ranges import check_number
 from robotics_bridge.sensors.sensor import Sensor
 
 
 @dataclass(frozen=True)
+@limited
 class ElasticMaterial:
     """An isotropic solid with Rayleigh damping C = α M + β K."""
 
-    young_modulus: float
+    young_modulus: Positive
     """E [Pa]."""
-    poisson_ratio: float
-    density: float
+    poisson_ratio: Annotated[float, Limit(above=-1, below=0.49)]
+    density: Positive
     """[kg/m³]."""
-    alpha: float
+    alpha: NotNegative
     """Damping of the mass [1/s]."""
-    beta: float
+    beta: NotNegative
     """Damping of the stiffness [s]."""
-
-    def __post_init__(self) -> None:
-        check_fields(self, "young_modulus", "density", above=0)
-        check_fields(self, "poisson_ratio", above=-1, below=0.49)
-        check_fields(self, "alpha", "beta", least=0)
 
     def decay(self, frequency: float) -> float:
         """Return the decay rate d = (α + β ω²) / 2 [1/s] of a mode [Hz]."""
@@ -107,18 +104,15 @@ def preset_modes(material: str | ElasticMaterial, lowest: float, count: int = 16
 
 
 @dataclass(frozen=True, kw_only=True)
+@limited
 class AudioSensor(Sensor):
     """A sensor that reads a block of samples [N, K] per update."""
 
-    samples: int = 160
+    samples: Count = 160
     """K: the sample rate is K over the time step."""
 
     units: ClassVar[str] = "m/s"
     shared: ClassVar[tuple[str, ...]] = ("samples",)
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_fields(self, "samples", least=1, whole=True)
 
     @property
     def channels(self) -> int:  # type: ignore[override]
@@ -127,6 +121,7 @@ class AudioSensor(Sensor):
 
 
 @dataclass(frozen=True, kw_only=True)
+@limited
 class ContactAudio(AudioSensor):
     """Sound of a link that is struck and rubbed: [1, K] samples.
 
@@ -139,18 +134,14 @@ class ContactAudio(AudioSensor):
 
     modes: Modes
     """Modes of the link, from ``find_modes`` or by hand."""
-    threshold: float = 0.1
+    threshold: NotNegative = 0.1
     """Smallest rise of force that is an impact [N]."""
-    impact: float = 1.0
+    impact: NotNegative = 1.0
     """Factor on impulses."""
-    scrape: float = 0.05
+    scrape: NotNegative = 0.05
     """Density of the force noise of sliding [N·√s per N·m/s]."""
-    contact_time: float = 0.0
+    contact_time: NotNegative = 0.0
     """Duration of an impact's pulse [s]: longer ones excite high modes less. At most the time step; 0 is one sample."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_fields(self, "threshold", "impact", "scrape", "contact_time", least=0)
 
     def layout(self) -> tuple[int, ...]:
         """Return the shape of one emitter."""
@@ -163,6 +154,7 @@ class ContactAudio(AudioSensor):
 
 
 @dataclass(frozen=True, kw_only=True)
+@limited
 class ActuationAudio(AudioSensor):
     """Sound of the drives of a hand: [J, K] samples, one emitter per joint.
 
@@ -172,29 +164,23 @@ class ActuationAudio(AudioSensor):
 
     runtime: ClassVar[str] = "robotics_bridge.sensors.audio.runtime:DriveAudioRuntime"
 
-    joints: int
+    joints: Count
     """J."""
-    load: float = 1e-3
+    load: NotNegative = 1e-3
     """β_load [1/(N·m)], in units of the output."""
-    power: float = 1e-3
+    power: NotNegative = 1e-3
     """β_pow [1/W]."""
-    pitch: float = 80.0
+    pitch: NotNegative = 80.0
     """κ: frequency of the fundamental per speed [Hz per rad/s], i.e. the teeth that mesh per radian."""
-    partials: int = 4
-    rolloff: float = 0.5
+    partials: Annotated[int, Limit(least=0)] = 4
+    rolloff: NotNegative = 0.5
     """Amplitude of a partial relative to the one below."""
-    friction: float = 1e-4
+    friction: NotNegative = 1e-4
     """Noise per speed [1/(rad/s)]."""
-    hum: float = 0.0
+    hum: NotNegative = 0.0
     """Amplitude of the idle hum."""
-    hum_frequency: float = 100.0
+    hum_frequency: NotNegative = 100.0
     """[Hz]."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_fields(self, "joints", least=1, whole=True)
-        check_fields(self, "partials", least=0, whole=True)
-        check_fields(self, "load", "power", "pitch", "rolloff", "friction", "hum", "hum_frequency", least=0)
 
     def layout(self) -> tuple[int, ...]:
         """Return the shape of one emitter per joint."""

@@ -17,7 +17,7 @@ from typing import Any
 from brainbench.core.devices import warp
 from brainbench.core.errors import DataError, UsageError, check_name, listing
 from brainbench.core.files import read_json, to_plain, write_json
-from brainbench.core.reading.ranges import check_fields
+from brainbench.core.limits import NotNegative, Share, limited
 from brainbench.core.reading.regular import readable
 
 BASE_KNOBS = frozenset({"read_delay", "jitter", "white", "bias", "walk", "quantum"})
@@ -32,50 +32,45 @@ _FORMAT = "brainbench-noise-1"
 
 
 @dataclass(frozen=True, kw_only=True)
+@limited
 class Noise:
     """Imperfections of one sensor; every knob is off by default."""
 
-    read_delay: float = 0.0
+    read_delay: NotNegative = 0.0
     """Age of what is read [s]; a zero-order hold between updates."""
-    jitter: float = 0.0
+    jitter: NotNegative = 0.0
     """Half width of the uniform variation of the delay [s], at most the delay."""
-    white: float = 0.0
+    white: NotNegative = 0.0
     """Standard deviation of Gaussian noise, new in every update [unit of the sensor]."""
     bias: float = 0.0
     """Constant offset [unit of the sensor]."""
-    walk: float = 0.0
+    walk: NotNegative = 0.0
     """Standard deviation of the step that a drift makes in every update [unit of the sensor]."""
-    quantum: float = 0.0
+    quantum: NotNegative = 0.0
     """Step of the analogue-to-digital converter [unit of the sensor]; 0 does not round."""
-    radius: float = 0.0
+    radius: NotNegative = 0.0
     """Half width of the uniform error of the sensing radius, new in every update [m] (4.23)."""
-    gain: tuple[float, float] = (1.0, 1.0)
+    gain: tuple[NotNegative, NotNegative] = (1.0, 1.0)
     """Range of each probe's calibration factor, drawn at every reset (4.24). It multiplies the depth."""
-    dead_probability: float = 0.0
+    dead_probability: Share = 0.0
     """Probability that a probe is stuck for an episode (4.25)."""
     dead_range: tuple[float, float] = (0.0, 0.0)
     """Range of the stuck value; one value fills all channels of the probe [unit of the sensor]."""
     hysteresis: float = 0.0
     """Strength β of the viscoelastic overshoot (4.26, 4.27)."""
-    hysteresis_tau: float = 0.05
+    hysteresis_tau: NotNegative = 0.05
     """Its time constant τ [s]."""
-    crosstalk: float = 0.0
+    crosstalk: Share = 0.0
     """Share χ of the signal that spreads over neighbours of a planar grid (4.28)."""
-    crosstalk_sigma: float = 1.0
+    crosstalk_sigma: NotNegative = 1.0
     """Standard deviation of that spread [taxels]."""
 
     def __post_init__(self) -> None:
-        check_fields(self, "gain", items=2, least=0)
-        check_fields(self, "dead_range", items=2)
         for name in ("gain", "dead_range"):
             low, high = map(float, getattr(self, name))
             if low > high:
                 raise UsageError(f"{name} is a range (low, high) with low ≤ high; received ({low}, {high}).")
             object.__setattr__(self, name, (low, high))
-        check_fields(self, "read_delay", "jitter", "white", "walk", "quantum", "radius", least=0)
-        check_fields(self, "hysteresis_tau", "crosstalk_sigma", least=0)
-        check_fields(self, "dead_probability", "crosstalk", least=0, most=1)
-        check_fields(self, "bias", "hysteresis")
         if self.jitter > self.read_delay:
             raise UsageError(
                 f"jitter ({self.jitter:g} s) must not exceed read_delay ({self.read_delay:g} s): "

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
+from brainbench.core.limits import Limit, NotNegative, limited
 from brainbench.core.reading.ranges import check_fields
 from robotics_bridge.sensors.noise.model import PROBE_KNOBS, TAXEL_KNOBS
 from robotics_bridge.sensors.sensor import QuerySensor
 
 
 @dataclass(frozen=True, kw_only=True)
+@limited
 class SurfaceDistanceProbe(QuerySensor):
     """Shortest signed distance [N] from each probe to the surfaces it tracks (m), negative inside.
 
@@ -20,18 +22,13 @@ class SurfaceDistanceProbe(QuerySensor):
 
     nearest: bool = False
     """True if the nearest surface points are kept too (``SensorSuite.read_nearest``)."""
-    max_range: float = math.inf
+    max_range: Annotated[float, Limit(above=0, infinite=True)] = math.inf
     """Distance (m) that is read where nothing is nearer."""
 
     units: ClassVar[str] = "m"
     knobs: ClassVar[frozenset[str]] = PROBE_KNOBS
     shared: ClassVar[tuple[str, ...]] = ("query", "nearest")
     runtime: ClassVar[str] = "robotics_bridge.sensors.probes.runtime:DistanceRuntime"
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.max_range != math.inf:
-            check_fields(self, "max_range", above=0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,12 +41,13 @@ class ContactDepthProbe(QuerySensor):
 
 
 @dataclass(frozen=True, kw_only=True)
+@limited
 class ContactProbe(QuerySensor):
     """Contact [N] as 0 or 1, from the depth by a Schmitt trigger (thesis 4.3); noise acts on the depth."""
 
-    threshold: float = 5e-4
+    threshold: NotNegative = 5e-4
     """Depth η_on (m) beyond which contact begins."""
-    release: float | None = None
+    release: NotNegative | None = None
     """Depth η_off (m) down to which it lasts; by default the threshold (published with noise: 2e-4)."""
 
     units: ClassVar[str] = "1"
@@ -58,5 +56,4 @@ class ContactProbe(QuerySensor):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_fields(self, "threshold", least=0)
         check_fields(self, "release", least=0, most=self.threshold)

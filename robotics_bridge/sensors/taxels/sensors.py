@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
-from brainbench.core.errors import UsageError, check_name
-from brainbench.core.reading.ranges import check_fields, check_number
+from brainbench.core.errors import UsageError
+from brainbench.core.limits import Count, Limit, NotNegative, Positive, limited
+from brainbench.core.reading.ranges import check_number
 from robotics_bridge.sensors.noise.model import GRID_KNOBS, TAXEL_KNOBS
 from robotics_bridge.sensors.sensor import Convention, ProbeSensor, QuerySensor
 
@@ -20,6 +21,7 @@ CONVENTIONS = ("physical", "thesis")
 
 
 @dataclass(frozen=True, kw_only=True)
+@limited
 class KinematicTaxel(QuerySensor):
     """Force (N) and torque (N·m) on the sensor [N, 6], in the link frame, torques about the link's origin.
 
@@ -31,21 +33,21 @@ class KinematicTaxel(QuerySensor):
     minus signs. Defaults are the published parameters (4.10), but for k_ω in the physical convention.
     """
 
-    stiffness: float = 500.0
+    stiffness: NotNegative = 500.0
     """k_n, N/m^α."""
-    damping: float = 1.0
+    damping: NotNegative = 1.0
     """c_n, N·s/m^(1+α)."""
-    exponent: float = 1.2
+    exponent: Positive = 1.2
     """α."""
-    shear: float = 2.0
+    shear: NotNegative = 2.0
     """k_t, N·s/m."""
-    twist: float | None = None
+    twist: NotNegative | None = None
     """k_ω, N·m·s. None is that of a disc of the largest sensing radius R that slips with k_t, k_t R²/2 (1.6e-5 at
     4 mm), and with ``thesis`` :data:`PUBLISHED_TWIST`."""
-    friction: float | None = None
+    friction: NotNegative | None = None
     """μ: with it friction holds at rest. Each taxel holds the point that it touched first by a spring, up to μ times
     its normal force, and lets it slide beyond (Coulomb); k_t and k_ω play no part. None: k_t v_t, nothing at rest."""
-    grip: float = 2 / 3
+    grip: Positive = 2 / 3
     """ρ: tangential over normal stiffness of that spring; 2 (1 − ν) / (2 − ν) of a thick skin (Mindlin 1949), here with
     ν = ½."""
     convention: Convention = "physical"
@@ -63,10 +65,6 @@ class KinematicTaxel(QuerySensor):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_name("force convention", self.convention, CONVENTIONS)
-        check_name("total of a force field", self.total, ("law", "engine"))
-        check_fields(self, "stiffness", "damping", "shear", "twist", "friction", least=0)
-        check_fields(self, "exponent", "grip", above=0)
         if self.sticky and self.convention == "thesis":
             raise UsageError("The published law has no friction at rest; leave out friction or convention='thesis'.")
 
@@ -97,6 +95,7 @@ class KinematicTaxel(QuerySensor):
 
 
 @dataclass(frozen=True, kw_only=True)
+@limited
 class ProximityTaxel(ProbeSensor):
     """Force (N) and torque (N·m) [N, 6] from surface points within the sensing radius, link frame (thesis 4.11–4.16).
 
@@ -107,13 +106,13 @@ class ProximityTaxel(ProbeSensor):
     −a and takes it about the link's origin, so that taxels add up to a wrench. Defaults: published parameters.
     """
 
-    stiffness: float = 300.0
+    stiffness: NotNegative = 300.0
     """k, N/m."""
-    coupling: float = 10.0
+    coupling: NotNegative = 10.0
     """k_s, N·s/m²."""
-    density: float = 100.0
+    density: NotNegative = 100.0
     """Scale of the point density (4.14)."""
-    points: int = 5000
+    points: Count = 5000
     """Surface points spread over all tracked geometries (the published configuration file has 1000)."""
     convention: Convention = "physical"
 
@@ -123,42 +122,30 @@ class ProximityTaxel(ProbeSensor):
     shared: ClassVar[tuple[str, ...]] = ("convention", "points", "followed")
     runtime: ClassVar[str] = "robotics_bridge.sensors.taxels.runtime:ProximityRuntime"
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_name("force convention", self.convention, CONVENTIONS)
-        check_fields(self, "stiffness", "coupling", "density", least=0)
-        check_fields(self, "points", least=1, whole=True)
-
 
 @dataclass(frozen=True, kw_only=True)
+@limited
 class Layer:
     """Terms of a real gel pad that the published equations lack; derived in docs/elastomers.md."""
 
-    poisson: float = 0.45
+    poisson: Annotated[float, Limit(least=0, most=0.5)] = 0.45
     """Poisson ratio ν: how compressible the gel is (0 to 0.5). It shapes the shear field."""
-    softening: float = 1e-3
+    softening: Positive = 1e-3
     """Radius over which a surface point spreads its traction (m)."""
-    thickness: float = 0.0
+    thickness: NotNegative = 0.0
     """Thickness of a layer bonded to a rigid base (m); 0 means a half-space."""
-    recoil: float = 0.0
+    recoil: Annotated[float, Limit(least=0, most=2)] = 0.0
     """κ: how much of the push past its middle turns round, by 1 − κ λ_d r². The net push is 1 − 2κ of the published
     one: at ½ the gel takes all that is displaced up, above it is drawn in, as under any load on a compressible body."""
     expansion: float | tuple[float, float] = 0.0
     """Lateral strain of the pad per metre of its mean indentation (1/m), or along and across: what the gel cannot
     compress, it widens."""
-    frame: tuple[float, float] | None = None
+    frame: tuple[Positive, Positive] | None = None
     """Half widths (m), along and across, of the clamped frame where the widening vanishes; None means free edges."""
-
-    def __post_init__(self) -> None:
-        check_fields(self, "poisson", least=0, most=0.5)
-        check_fields(self, "softening", above=0)
-        check_fields(self, "thickness", least=0)
-        check_fields(self, "recoil", least=0, most=2)
-        check_fields(self, "expansion", items=2 if isinstance(self.expansion, tuple) else 0)
-        check_fields(self, "frame", items=2, above=0)
 
 
 @dataclass(frozen=True, kw_only=True)
+@limited
 class ElastomerTaxel(QuerySensor):
     """Marker displacement [N, 3] in the link frame (m).
 
@@ -167,21 +154,21 @@ class ElastomerTaxel(QuerySensor):
     parameters; ``layer`` replaces the Gaussian shear kernel by that of an elastic layer.
     """
 
-    dilate_scale: float = 100.0
+    dilate_scale: NotNegative = 100.0
     """s_d, 1/m."""
-    dilate_spread: float = 8000.0
+    dilate_spread: NotNegative = 8000.0
     """λ_d, 1/m²."""
-    shear_scale: float = 100.0
+    shear_scale: NotNegative = 100.0
     """s_s, 1/m (the published configuration file has 200)."""
-    shear_spread: float = 2000.0
+    shear_spread: NotNegative = 2000.0
     """λ_s, 1/m²."""
-    exponent: float = 1.2
+    exponent: Positive = 1.2
     """α of the bulge along the normal."""
-    points: int = 1000
+    points: Annotated[int, Limit(least=0)] = 1000
     """Surface points of what is tracked that are followed for shear; 0 leaves shear out."""
-    enter: float = 1e-5
+    enter: NotNegative = 1e-5
     """Depth (m) at which a point anchors."""
-    leave: float = 1e-4
+    leave: NotNegative = 1e-4
     """Height (m) above the pad at which it lets go."""
     layer: Layer | None = None
     dilation: Literal["auto", "separable", "fft", "direct"] = "auto"
@@ -195,8 +182,6 @@ class ElastomerTaxel(QuerySensor):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        ways = ("auto", "separable", "fft", "direct")
-        check_name("way to sum dilation", self.dilation, ways)
         if self.dilation in ("separable", "fft") and not self.planar:
             raise UsageError(
                 f"dilation={self.dilation!r} needs a regular planar grid (Probes.grid); these probes are "
@@ -204,9 +189,6 @@ class ElastomerTaxel(QuerySensor):
             )
         if self.dilation == "separable" and self.layer and self.layer.recoil:
             raise UsageError("A layer with recoil has no separable dilation; use dilation='auto', 'fft' or 'direct'.")
-        check_fields(self, "points", least=0, whole=True)
-        check_fields(self, "dilate_scale", "dilate_spread", "shear_scale", "shear_spread", "enter", "leave", least=0)
-        check_fields(self, "exponent", above=0)
 
     @property
     def planar(self) -> bool:
@@ -236,6 +218,7 @@ class ElastomerTaxel(QuerySensor):
 
 
 @dataclass(frozen=True, kw_only=True)
+@limited
 class Skin:
     """A thin elastic layer bonded to a rigid base, thin beside the contact (Johnson 1985, Contact Mechanics, 5.8).
 
@@ -243,16 +226,12 @@ class Skin:
     M = E (1 − ν) / ((1 + ν) (1 − 2ν)), and shear gives way by G = E / (2 (1 + ν)). Taxels are placed on the base.
     """
 
-    thickness: float
+    thickness: Positive
     """t (m)."""
-    modulus: float
+    modulus: Positive
     """Young's modulus E (Pa)."""
-    poisson: float = 0.45
+    poisson: Annotated[float, Limit(least=0, most=0.49)] = 0.45
     """ν."""
-
-    def __post_init__(self) -> None:
-        check_fields(self, "thickness", "modulus", above=0)
-        check_fields(self, "poisson", least=0, most=0.49)
 
     def law(self, area: float) -> dict[str, float]:
         """Return the settings of ``KinematicTaxel`` for taxels that take up an area (m²) each.

@@ -11,13 +11,14 @@ from __future__ import annotations
 import math
 from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.errors import UsageError, check_kind, check_name
-from brainbench.core.reading.ranges import check_fields, check_number
+from brainbench.core.limits import Count, Limit, NotNegative, Positive, Share, limited
+from brainbench.core.reading.ranges import check_number
 from brainbench.core.rotations import to_matrices
 from robotics_bridge.physics.scene import Geometry, TouchScene
 from robotics_bridge.sensors.sensor import Sensor
@@ -27,20 +28,17 @@ ABSOLUTE_ZERO = -273.15
 
 
 @dataclass(frozen=True)
+@limited
 class ThermalMaterial:
     """Conduction, storage and radiation of heat in a body."""
 
-    conductivity: float
+    conductivity: Positive
     """k [W/(m·K)]."""
-    density: float
+    density: Positive
     """ρ [kg/m³]."""
-    specific_heat: float
+    specific_heat: Positive
     """c_p [J/(kg·K)]."""
-    emissivity: float = 0.9
-
-    def __post_init__(self) -> None:
-        check_fields(self, "conductivity", "density", "specific_heat", above=0)
-        check_fields(self, "emissivity", least=0, most=1)
+    emissivity: Share = 0.9
 
     @property
     def diffusivity(self) -> float:
@@ -77,22 +75,21 @@ def material(name: str | ThermalMaterial) -> ThermalMaterial:
 
 
 @dataclass(frozen=True)
+@limited
 class ThermalBody:
     """Material and temperature of a link that may be touched."""
 
     material: str | ThermalMaterial = "plastic"
-    temperature: float = 22.0
+    temperature: Annotated[float, Limit(least=ABSOLUTE_ZERO)] = 22.0
     """At the start [°C]; later through :func:`robotics_bridge.sensors.temperature.runtime.link_temperature`."""
-
-    def __post_init__(self) -> None:
-        check_fields(self, "temperature", least=ABSOLUTE_ZERO)
 
 
 @dataclass(frozen=True, kw_only=True)
+@limited
 class TemperatureGrid(Sensor):
     """Temperature [nx, ny, nz] of the cells of a link (°C)."""
 
-    cells: tuple[int, int, int] = (2, 2, 2)
+    cells: tuple[Count, Count, Count] = (2, 2, 2)
     """Along the axes of the link; at most a million."""
     low: tuple[float, float, float] | None = None
     """Lower corner of the grid [m, link frame]; None takes the box around the link's geometries."""
@@ -100,11 +97,11 @@ class TemperatureGrid(Sensor):
     """Upper corner [m, link frame]."""
     material: str | ThermalMaterial = "silicone"
     """Material of the link."""
-    base_temperature: float = 22.0
+    base_temperature: Annotated[float, Limit(least=ABSOLUTE_ZERO)] = 22.0
     """Temperature of all cells at a reset [°C]."""
-    ambient_temperature: float = 22.0
+    ambient_temperature: Annotated[float, Limit(least=ABSOLUTE_ZERO)] = 22.0
     """Temperature of the surroundings [°C]."""
-    convection: float = 10.0
+    convection: NotNegative = 10.0
     """Coefficient h [W/(m²·K)] over the outer faces; 0 for none. Radiation follows the material's emissivity."""
     radiates: bool = True
     """True if outer faces radiate."""
@@ -118,17 +115,17 @@ class TemperatureGrid(Sensor):
     """``physical``: the cell (half its depth, and the spreading of a small spot), the interface and the touched body
     (a half-space that gave heat through the spot since the contact began) in series. ``thesis``: 4.38 and 4.39,
     harmonic conductivity over the length V / A."""
-    contact_conductance: float = math.inf
+    contact_conductance: Annotated[float, Limit(least=0, infinite=True)] = math.inf
     """Conductance of the bare interface [W/(m²·K)]; infinite is a perfect one."""
-    contact_radius: float = 0.005
+    contact_radius: Positive = 0.005
     """Radius R of the surfaces at a contact point [m]: the area of a contact of depth δ is π (2 R δ − δ²)."""
-    depth_weight: float = 1.0
+    depth_weight: NotNegative = 1.0
     """d_w of the published floor of the contact area, π d_w δ R with R supplied by ``contact_radius``."""
-    tau: float = 0.0
+    tau: NotNegative = 0.0
     """Time constant of the sensing element [s]; 0 reads the cell itself."""
-    warm_range: float = math.inf
+    warm_range: Annotated[float, Limit(least=0, infinite=True)] = math.inf
     """Range above the base temperature in which the element reads [K]."""
-    cold_range: float = math.inf
+    cold_range: Annotated[float, Limit(least=0, infinite=True)] = math.inf
     """Range below it [K]; skin reads farther down than up."""
 
     units: ClassVar[str] = "degC"
@@ -136,19 +133,11 @@ class TemperatureGrid(Sensor):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_fields(self, "cells", items=3, least=1, whole=True)
         check_number("cells of the grid, all together,", math.prod(map(int, self.cells)), most=10**6)
-        check_fields(self, "low", "high", items=3)
         if (self.low is None) != (self.high is None):
             raise UsageError("Give both corners of the grid, low and high, or neither.")
         if self.low is not None and self.high is not None and not np.less(self.low, self.high).all():
             raise UsageError(f"The corners of the grid differ along every axis; received {self.low}, {self.high}.")
-        limits = ("contact_conductance", "warm_range", "cold_range")
-        check_fields(self, *(name for name in limits if getattr(self, name) != math.inf), least=0)
-        check_fields(self, "convection", "tau", "depth_weight", least=0)
-        check_fields(self, "contact_radius", above=0)
-        check_fields(self, "base_temperature", "ambient_temperature", least=ABSOLUTE_ZERO)
-        check_name("conduction", self.conduction, ("physical", "thesis"))
         if np.shape(self.source) not in ((), tuple(self.cells)):
             raise UsageError(f"source is a number or an array {tuple(self.cells)}; received {np.shape(self.source)}.")
         for value in np.ravel(self.source):

@@ -186,7 +186,7 @@ def test_a_microphone_hears_blocks_of_some_length(dt) -> None:
 def test_bodies_of_a_temperature_grid_are_links_of_the_scene() -> None:
     with pytest.raises(UsageError, match="did you mean 'ball'"):
         _suite(a=TemperatureGrid(link="hand", bodies={"bal": ThermalBody("steel", 60.0)}))
-    for settings in ({"bodies": {"ball": "steel"}}, {"other": None}):
+    for settings in ({"bodies": {"ball": "steel"}}, {"unlisted": None}):
         with pytest.raises(UsageError, match="ThermalBody"):
             TemperatureGrid(link="hand", **settings)
     with pytest.raises(UsageError, match="cells"):
