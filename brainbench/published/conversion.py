@@ -23,7 +23,7 @@ from brainbench.stimuli.objects.solid import Solid
 from brainbench.stimuli.scenes.frames import Frames
 from brainbench.stimuli.stimulus_set import hash_stimulus_set, new_stimulus_set
 from brainbench.stimuli.sweeps.generation import write_data_set
-from brainbench.stimuli.sweeps.plan import USUAL_SHARD, PlannedShard
+from brainbench.stimuli.sweeps.plan import SPLITS, USUAL_SHARD, PlannedShard
 from brainbench.stimuli.sweeps.shards import (
     COUNTS,
     OK,
@@ -34,7 +34,6 @@ from brainbench.stimuli.sweeps.shards import (
     shard_tables,
     write_shard,
 )
-from brainbench.stimuli.sweeps.split import SPLITS
 from brainbench.stimuli.whiskers.array import WhiskerArray
 from brainbench.stimuli.whiskers.selection import ROWS
 
@@ -132,7 +131,7 @@ class SweepTable:
     object: NDArray[np.str_]
     """Name of the object."""
     split: NDArray[np.str_]
-    """One of :data:`~brainbench.stimuli.sweeps.split.SPLITS`."""
+    """One of :data:`~brainbench.stimuli.sweeps.plan.SPLITS`."""
     conditions: Mapping[str, NDArray[np.float64]]
     """Speed, height, rotation, distance and size, as in :class:`~brainbench.stimuli.sweeps.grid.Sweep`."""
     classes: tuple[str, ...]

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,7 +38,7 @@ class BenchTest:
     """[6] force and moment of the closed form or of the elastica."""
     contact_arc: float
     """Arc length of the contact or of the load (m); NaN when the whisker lost the peg."""
-    trace: Trace
+    trace: Trace = field(repr=False)
     """The whole simulation; the last frame is the result."""
 
     @property
@@ -70,7 +70,7 @@ class SlipOff:
     """Measured travel of the peg from first touch to losing the whisker (m)."""
     reference_depth: float
     """Travel at which the elastica has no equilibrium any more (m)."""
-    trace: Trace
+    trace: Trace = field(repr=False)
     """The whole simulation."""
 
     @property

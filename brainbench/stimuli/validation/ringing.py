@@ -6,7 +6,7 @@ Frame and units are those of :mod:`brainbench.stimuli.validation.bench_tests`.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,9 +31,9 @@ class Ringdown:
     """[m] their measured damping ratios; those of all but the first were set to .05."""
     reference_frequencies: NDArray[np.float64]
     """[m] Euler-Bernoulli frequencies (Hz)."""
-    times: NDArray[np.float64]
+    times: NDArray[np.float64] = field(repr=False)
     """[n] time since the release (s)."""
-    wrench: NDArray[np.float64]
+    wrench: NDArray[np.float64] = field(repr=False)
     """[n, 6] base wrench during the ring-down; its last row is at rest."""
 
     @property

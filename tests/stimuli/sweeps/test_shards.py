@@ -9,7 +9,7 @@ import pytest
 from brainbench.core.errors import DataError
 from brainbench.core.files import hash_arrays
 from brainbench.stimuli import simulate
-from brainbench.stimuli.sweeps.manifest import is_complete
+from brainbench.stimuli.sweeps.generation import is_complete
 from brainbench.stimuli.sweeps.shards import (
     ALIGNMENT,
     OK,

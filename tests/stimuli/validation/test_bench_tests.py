@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 from brainbench.core.errors import UsageError
+from brainbench.stimuli.motion.jobs import Trace
 from brainbench.stimuli.validation import bench_tests, references
+from brainbench.stimuli.validation.bench_tests import PointLoad
 from tests.factories.whiskers import C2, GATE_WHISKERS, RAT
 
 POINTS = [(0.3, 0.05), (0.5, 0.1), (0.5, 0.2), (0.7, 0.2)]
@@ -121,3 +123,10 @@ def test_a_long_rat_whisker_bends_as_the_elastica_too():
 def test_impossible_bench_tests_are_refused(call, message):
     with pytest.raises(UsageError, match=message):
         call()
+
+
+def test_a_result_prints_its_figures_and_not_the_trace():
+    trace = Trace(np.zeros((500, 6)), np.zeros(500, dtype=bool), np.zeros(500))
+    text = repr(PointLoad(np.ones(6), np.ones(6), 0.01, trace, 1e-3, 1e-3))
+    assert "deflection=0.001" in text
+    assert "trace" not in text

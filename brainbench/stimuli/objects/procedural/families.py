@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from brainbench.core.errors import check_name
 from brainbench.core.reading.ranges import check_number
 from brainbench.geometry import Mesh, convex_hull
-from brainbench.stimuli.objects.procedural import assembled, extruded, round, swept, turned
+from brainbench.stimuli.objects.procedural import assembled, extruded, turned
 from brainbench.stimuli.objects.procedural.bodies import Body, ShapeSampler
 
 if TYPE_CHECKING:
@@ -32,7 +32,7 @@ DETAIL = (2_000, 20_000)
 
 _FAMILIES: dict[str, Callable[[ShapeSampler, int], Body]] = {
     name: item
-    for module in (round, turned, swept, extruded, assembled)
+    for module in (turned, extruded, assembled)
     for name, item in vars(module).items()
     if isinstance(item, FunctionType) and item.__module__ == module.__name__ and not name.startswith("_")
 }
