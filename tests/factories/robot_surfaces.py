@@ -13,8 +13,8 @@ from robotics_bridge.deploy.links.frames import KEY, read_key
 from robotics_bridge.deploy.links.simulated_hand import Faults
 from robotics_bridge.hands.layouts import read_probes, write_probes
 from robotics_bridge.policies.contract import PolicyContract
+from robotics_bridge.policies.training.distill_config import StudentSweep, read_sweep
 from robotics_bridge.policies.training.student_files import load_student
-from robotics_bridge.policies.training.sweep import StudentSweep, read_sweep
 from robotics_bridge.sensors.calibration.log import read_log
 from robotics_bridge.sensors.noise.model import Noise
 from robotics_bridge.tasks.registry import apply_overrides

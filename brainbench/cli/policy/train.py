@@ -143,8 +143,8 @@ def sweep(
 ) -> Output:
     """Distil every student of a sweep that is not finished yet; what was interrupted goes on."""
     from brainbench.core.files import read_json
+    from robotics_bridge.policies.training.distill_config import PUBLISHED, read_sweep
     from robotics_bridge.policies.training.students import EVALUATION, is_done, success_of, train_student
-    from robotics_bridge.policies.training.sweep import PUBLISHED, read_sweep
 
     read_task_file(task_file)
     plan = read_sweep(file or PUBLISHED)

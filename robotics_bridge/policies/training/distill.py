@@ -44,9 +44,8 @@ from robotics_bridge.policies.encoders.arms import perceptron
 from robotics_bridge.policies.evaluate import Policy
 from robotics_bridge.policies.fit import check_hand, check_version
 from robotics_bridge.policies.student import TACTILE, TactilePolicy
-from robotics_bridge.policies.training.cuda_graph_step import ChunkStep
 from robotics_bridge.policies.training.distill_config import DistillConfig
-from robotics_bridge.policies.training.rollouts import Recorder, Rollout
+from robotics_bridge.policies.training.rollouts import ChunkStep, Recorder, Rollout
 from robotics_bridge.policies.training.student_files import CONFIG, MODEL, begin_with, build_student
 from robotics_bridge.tasks.task import TASK_VERSION, check_measured
 

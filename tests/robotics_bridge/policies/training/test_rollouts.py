@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import nn
 
-from robotics_bridge.policies.training.cuda_graph_step import ChunkStep
+from robotics_bridge.policies.training.rollouts import ChunkStep
 
 
 def _learn(device: str, *, record: bool, steps: int = 8) -> list[torch.Tensor]:
