@@ -44,13 +44,13 @@ def build(words: Sequence[str] | None = None) -> typer.Typer:
     Raises:
         MissingDependencyError: the words name an optional command whose folder was taken off.
     """
-    named = None if words is None else next((word for word in words if not word.startswith("-")), "")
+    first = None if words is None else next((word for word in words if not word.startswith("-")), "")
     second = words[1] if words and len(words) > 1 else ""
     # Looking for entry points takes a twentieth of a second: main commands do without.
-    optional = {} if named in COMMANDS else _optional_commands()
-    single = named in COMMANDS or named in optional
+    optional = {} if first in COMMANDS else _optional_commands()
+    single = first in COMMANDS or first in optional
     # To read options of its own costs typer a tenth of a second: they stand there where they are used or shown.
-    bare = bool(words) and words[0] == named and single
+    bare = bool(words) and words[0] == first and single
     app = typer.Typer(
         name="brainbench",
         help="Which artificial networks process touch the way a brain does?",
@@ -63,20 +63,20 @@ def build(words: Sequence[str] | None = None) -> typer.Typer:
     )
     app.callback()(_set_up if bare else _root)
     for name, summary in COMMANDS.items():
-        if named is None or named == name:
+        if first is None or first == name:
             module = import_module(f"brainbench.cli.{ELSEWHERE.get(name, name)}")
             command = getattr(module, name, None) or _with_optional(module.app, name, second if bare else None)
             _add(app, name, command, summary, second if bare else None)
         elif not single:
             app.command(name, help=summary)(_named_only)
     for name, part in optional.items():
-        if named == name:
+        if first == name:
             _add(app, name, part.load("command"), part.summary, second if bare else None)
-        elif named is None and (command := _loaded(part)) is not None:
+        elif first is None and (command := _loaded(part)) is not None:
             _add(app, name, command, part.summary, None, OPTIONAL_PANEL)
-        elif named is not None and not single and part.present:
+        elif first is not None and not single and part.present:
             app.command(name, help=part.summary, rich_help_panel=OPTIONAL_PANEL)(_named_only)
-    if named is None or single:
+    if first is None or single:
         from brainbench.cli.requirements import guard
 
         guard(app)

@@ -38,8 +38,8 @@ def doctor() -> Output:
         f"processors {data['processors']}, CUDA {', '.join(data['cuda']) or 'none (not needed)'}",
         f"cache {data['cache']} ({data['cache_bytes'] / 1e6:.1f} MB)",
     ]
-    told = f"\n\nAn extra is installed, in the checkout of brainbench, with: {install_command('EXTRA')}"
-    text = "\n".join(head) + "\n\n" + table("", ["part", "version", "extra", "enables"], rows) + told
+    hint = f"\n\nAn extra is installed, in the checkout of brainbench, with: {install_command('EXTRA')}"
+    text = "\n".join(head) + "\n\n" + table("", ["part", "version", "extra", "enables"], rows) + hint
     return Output(data, text)
 
 
@@ -50,9 +50,9 @@ def diagnose() -> dict[str, Any]:
     from brainbench.core.devices import usable_processors
     from brainbench.core.files import cache_dir, provenance
 
-    cache, made = cache_dir(), provenance()
+    cache, facts = cache_dir(), provenance()
     return {
-        **{name: made[name] for name in ("version", "python", "machine")},
+        **{name: facts[name] for name in ("version", "python", "machine")},
         "processors": usable_processors(),
         "cuda": [torch.cuda.get_device_name(index) for index in range(torch.cuda.device_count())],
         "cache": str(cache),

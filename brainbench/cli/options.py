@@ -193,19 +193,19 @@ def with_options(
         given: Hand over a mapping of the values that were given; no flag has a default then.
         help: One help for all of them, in place of their docstrings.
     """
-    known = option_fields(kind)
+    stated = option_fields(kind)
     module, _, wanted = kind.partition(":")
     parameters = []
-    for name in known if names is None else names:
-        field, default = known[name], None if given else known[name].default
+    for name in stated if names is None else names:
+        field, default = stated[name], None if given else stated[name].default
         if help is not None:
             field = replace(field, help=help)
         parameters.append(field.parameter(name, (flags or {}).get(name, ()), default))
 
     def make(values: dict[str, Any]) -> Any:
-        options = {name: known[name].value(name, value) for name, value in values.items()}
+        options = {name: stated[name].value(name, value) for name, value in values.items()}
         # Defaults that are tuples are not read from the source; the dataclass has them.
-        options = {n: value for n, value in options.items() if not (known[n].several and value is None)}
+        options = {n: value for n, value in options.items() if not (stated[n].several and value is None)}
         if given:
             options = {name: value for name, value in options.items() if value is not None}
         return getattr(import_module(module), wanted)(**options) if build and not given else options
@@ -225,13 +225,13 @@ def filled_from(
 
     ``unloaded`` stand for names of its annotations that are not imported.
     """
-    own = inspect.signature(command, locals=unloaded, eval_str=True).parameters.values()
-    every = [item for one in own for item in (options if one.name == parameter else [one])]
+    parameters = inspect.signature(command, locals=unloaded, eval_str=True).parameters.values()
+    every = [item for one in parameters for item in (options if one.name == parameter else [one])]
     every = [item.replace(kind=inspect.Parameter.KEYWORD_ONLY) for item in every]
 
     def run(**values: Any) -> Output:
-        made = make({item.name: values.pop(item.name) for item in options})
-        return command(**{parameter: made}, **values)
+        filled = make({item.name: values.pop(item.name) for item in options})
+        return command(**{parameter: filled}, **values)
 
     run.__doc__, run.__name__ = command.__doc__, command.__name__
     run.__signature__ = inspect.Signature(every)  # pyright: ignore[reportFunctionMemberAccess]
@@ -248,21 +248,21 @@ def as_flags(kind: str, options: Any, flags: Mapping[str, tuple[str, ...]]) -> l
     """Return the words of a command line that give a dataclass: the fields that differ from their defaults."""
     words: list[str] = []
     for field in fields(options):
-        value, told = getattr(options, field.name), option_fields(kind)[field.name]
+        value, stated = getattr(options, field.name), option_fields(kind)[field.name]
         if value == field.default:
             continue
         flag = flags.get(field.name, (f"--{field.name.replace('_', '-')}",))[0]
-        if told.kind is bool:
+        if stated.kind is bool:
             words.append(flag if value else f"--no-{flag.removeprefix('--')}")
         else:
-            words += [flag, ",".join(map(str, value)) if told.several else str(value)]
+            words += [flag, ",".join(map(str, value)) if stated.several else str(value)]
     return words
 
 
 def changed(kind: str, values: Mapping[str, Any]) -> dict[str, bool]:
     """Return by flag which values differ from the defaults of their fields, for :func:`refuse`."""
-    known = option_fields(kind)
-    return {f"--{name.replace('_', '-')}": value != known[name].default for name, value in values.items()}
+    stated = option_fields(kind)
+    return {f"--{name.replace('_', '-')}": value != stated[name].default for name, value in values.items()}
 
 
 def refuse(options: Mapping[str, object], where: str) -> None:

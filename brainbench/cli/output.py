@@ -45,9 +45,9 @@ def printed(command: Callable[..., Output]) -> Callable[..., None]:
         if failure is not None:
             raise failure
 
-    own = inspect.signature(command, eval_str=True).parameters.values()
+    parameters = inspect.signature(command, eval_str=True).parameters.values()
     option = inspect.Parameter("as_json", inspect.Parameter.KEYWORD_ONLY, default=False, annotation=JsonOption)
-    every = [*(item.replace(kind=inspect.Parameter.KEYWORD_ONLY) for item in own), option]
+    every = [*(item.replace(kind=inspect.Parameter.KEYWORD_ONLY) for item in parameters), option]
     run.__signature__ = inspect.Signature(every)  # pyright: ignore[reportAttributeAccessIssue]
     run.__annotations__ = {item.name: item.annotation for item in every}
     return run

@@ -33,9 +33,9 @@ def inspect(
     """Show what a file holds and which --conditions could label its trials."""
     from brainbench.datasets import inspect as inspect_file
 
-    found = _found(path)
+    files = _found(path)
     with progress_bar() as progress:
-        inspection = inspect_file(found, strict=strict, progress=progress)
+        inspection = inspect_file(files, strict=strict, progress=progress)
     return Output(inspection, str(inspection))
 
 
@@ -66,9 +66,9 @@ def rdm(
     brain = replace(brain, dataset=pooled(brain.dataset, pool))
     labels = brain.vocabulary
     animals = brain.animals(labels, measure, ScoreOptions(seed=seed))
-    told = ("subject", "units", "trials", "reliability", "problem", "notes", "rdm")
-    shown = [{name: getattr(item, name) for name in told} for item in animals]
-    data = {"labels": labels, "recordings": brain.origin, "animals": shown}
+    columns = ("subject", "units", "trials", "reliability", "problem", "notes", "rdm")
+    rows = [{name: getattr(item, name) for name in columns} for item in animals]
+    data = {"labels": labels, "recordings": brain.origin, "animals": rows}
     text = table_of(
         f"{brain.dataset.attrs['conditions']}, {brain.dataset.attrs['window']}; RDM: {measure.brain_method} distance",
         animals,
@@ -76,14 +76,14 @@ def rdm(
             "animal": "{0.subject}",
             ">units": "{0.units}",
             ">trials": "{0.trials}",
-            ">reliability": lambda item: "–" if math.isnan(item.reliability) else f"{item.reliability:.3f}",
+            ">reliability": lambda row: "–" if math.isnan(row.reliability) else f"{row.reliability:.3f}",
             "": _verdict,
         },
     )
     text += "".join(f"\n{line}" for line in (*left_out(brain.origin), *(f"Note: {doubt}." for doubt in brain.doubts)))
     if len(labels) <= _LARGEST_SHOWN:
-        for item in animals:
-            text += "\n\n" + _matrix(f"RDM of animal {item.subject}", labels, item.rdm)
+        for animal in animals:
+            text += "\n\n" + _matrix(f"RDM of animal {animal.subject}", labels, animal.rdm)
     return Output(data, text)
 
 
@@ -104,13 +104,13 @@ def check(
     """
     from brainbench.datasets import check as check_files
 
-    found = _found(source)
+    files = _found(source)
     with progress_bar() as progress:
-        checkup = check_files(found, conditions=conditions, progress=progress)
-    told = ("verdict", "source", "sessions", "findings")
+        checkup = check_files(files, conditions=conditions, progress=progress)
+    keys = ("verdict", "source", "sessions", "findings")
     failed = checkup.count("error") or (strict and checkup.count("warning"))
     failure = typer.Exit(1) if failed else None
-    return Output({name: getattr(checkup, name) for name in told}, str(checkup), failure=failure)
+    return Output({name: getattr(checkup, name) for name in keys}, str(checkup), failure=failure)
 
 
 @app.command("export")
@@ -124,9 +124,9 @@ def export(
     """Write a small copy without raw data: spike times and tables. Scores of the copy are identical."""
     from brainbench.datasets import export as export_files
 
-    found = _found(source)
+    sources = _found(source)
     with progress_bar("copying the recordings"):
-        files = export_files(found, target, select=select)
+        files = export_files(sources, target, select=select)
     columns = {"file": "{0}", ">": lambda path: f"{path.stat().st_size / 1e6:.2f} MB"}
     return Output({"files": files}, table_of("", files, columns))
 
@@ -181,7 +181,7 @@ def recipe(
     from brainbench.datasets.layouts.registry import get_layout, list_layouts
 
     if name is None:
-        known = {item: get_layout(item).title for item in list_layouts()}
-        return Output(known, table("", ["layout", ""], [[key, text] for key, text in known.items()]))
-    found = get_layout(name)
-    return Output({"name": found.name, "rules": found.describe().splitlines()}, found.describe())
+        titles = {item: get_layout(item).title for item in list_layouts()}
+        return Output(titles, table("", ["layout", ""], [[key, text] for key, text in titles.items()]))
+    layout = get_layout(name)
+    return Output({"name": layout.name, "rules": layout.describe().splitlines()}, layout.describe())

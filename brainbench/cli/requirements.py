@@ -130,9 +130,9 @@ def check_requirements(needs: Needs, values: Mapping[str, Any]) -> None:
             if isinstance(number, float) and not math.isfinite(number):
                 raise UsageError(f"The option {name!r} takes a finite number; received {number}.")
     lacking = {
-        DISTRIBUTIONS.get(module, module): item
-        for item in needs.packages
-        for module in (item.packages if item.when(values) else ())
+        DISTRIBUTIONS.get(module, module): requirement
+        for requirement in needs.packages
+        for module in (requirement.packages if requirement.when(values) else ())
         if find_spec(module) is None
     }
     if lacking:
@@ -152,8 +152,8 @@ def guard(app: typer.Typer) -> None:
 
 def commands(app: typer.Typer, path: str = "") -> Iterator[tuple[str, Any]]:
     """Yield the name of each command, those of its groups before it, and what typer knows of it."""
-    for item in app.registered_commands:
-        yield f"{path}{item.name}", item
+    for command in app.registered_commands:
+        yield f"{path}{command.name}", command
     for group in app.registered_groups:
         if group.typer_instance is not None:
             yield from commands(group.typer_instance, f"{path}{group.name} ")

@@ -54,8 +54,8 @@ def check_stimulus_set(dataset: xr.Dataset) -> xr.Dataset:
         attributes=("array", "scene", "fidelity", "seed", "backend", "version", "content_hash"),
     )
     if tuple(str(name) for name in dataset["channel"].values) != CHANNELS:
-        found = listing(map(str, dataset["channel"].values))
-        raise DataError(f"The stimulus set has channels {found}; expected {list(CHANNELS)}.")
+        channels = listing(map(str, dataset["channel"].values))
+        raise DataError(f"The stimulus set has channels {channels}; expected {list(CHANNELS)}.")
     for name in ("stimulus", "whisker"):
         labels = [str(label) for label in dataset[name].values]
         if not labels or len(set(labels)) < len(labels) or max(map(len, labels)) > LONGEST_LABEL:
@@ -93,18 +93,20 @@ def check_recordings(dataset: xr.Dataset) -> xr.Dataset:
     vocabulary = [*map(str, dataset.attrs["vocabulary"])]
     if twice := repeats(vocabulary):
         raise DataError(f"The vocabulary of a recordings data set names {listing(twice, limit=4)} twice.")
-    if other := sorted({*map(str, dataset["stimulus"].values.tolist())} - {*vocabulary}):
-        raise DataError(f"Trials have labels that the vocabulary of the recordings lacks: {listing(other, limit=4)}.")
+    if unlisted := sorted({*map(str, dataset["stimulus"].values.tolist())} - {*vocabulary}):
+        raise DataError(
+            f"Trials have labels that the vocabulary of the recordings lacks: {listing(unlisted, limit=4)}."
+        )
     return dataset
 
 
 def check_counts(dataset: xr.Dataset, name: str) -> xr.Dataset:
     """Return recordings from outside, called ``name`` in messages, if they are valid and their numbers can be."""
     check_recordings(dataset)
-    found = [dataset[item].values for item in ("counts", "duration", "time") if item in dataset.variables]
-    if any(values.dtype.kind not in "fiu" for values in found):
+    arrays = [dataset[item].values for item in ("counts", "duration", "time") if item in dataset.variables]
+    if any(values.dtype.kind not in "fiu" for values in arrays):
         raise DataError(f"{name} has counts, durations or times that are no numbers.")
-    counts, duration, *time = found
+    counts, duration, *time = arrays
     # NaN in the counts means that a unit was not recorded; fmin and fmax pass over it without a copy.
     if counts.size and not (np.fmin.reduce(counts, None) >= 0 and np.fmax.reduce(counts, None) < np.inf):
         raise DataError(f"{name} has counts below 0 or without end, or none at all; a count is 0 or more, or NaN.")

@@ -72,7 +72,7 @@ def warp_recorder(device: Any, generators: Sequence[torch.Generator] = ()) -> Re
         where = wp.device_to_torch(device)
         # What Python throws away meanwhile could free device memory, which ends a recording.
         gc.collect()
-        own = torch.cuda.ExternalStream(device.stream.cuda_stream, device=where)
+        external = torch.cuda.ExternalStream(device.stream.cuda_stream, device=where)
         graph, side = torch.cuda.CUDAGraph(), torch.cuda.Stream(where)
         for generator in generators:
             graph.register_generator_state(generator)
@@ -89,7 +89,7 @@ def warp_recorder(device: Any, generators: Sequence[torch.Generator] = ()) -> Re
             # Waiting for Warp's own stream would tie the recording to work outside of it.
             scope.enter_context(wp.ScopedStream(stream, sync_enter=False))
             result = work()
-        return _BetweenStreams(graph, own), result
+        return _BetweenStreams(graph, external), result
 
     return record
 
@@ -121,12 +121,12 @@ class CudaGraphStep:
         warm_up: int = 2,
         aside: bool = False,
         generators: Sequence[torch.Generator] = (),
-        kept: Sequence[torch.Tensor] | None = (),
+        retained: Sequence[torch.Tensor] | None = (),
         required: bool = False,
     ) -> None:
         self.work, self.recorder = work, recorder
         self._subject, self._advice, self._required = subject, advice, required
-        self._left, self._aside, self._generators, self._kept = warm_up, aside, tuple(generators), kept
+        self._left, self._aside, self._generators, self._kept = warm_up, aside, tuple(generators), retained
         self._graph: Graph | None = None
         self._result: Any = None
         self.failed: str = ""
@@ -252,12 +252,12 @@ def _no_collection() -> Iterator[None]:
             gc.enable()
 
 
-def _copied(result: Any, kept: Sequence[torch.Tensor]) -> Any:
+def _copied(result: Any, retained: Sequence[torch.Tensor]) -> Any:
     if isinstance(result, dict):
-        return {name: _copied(value, kept) for name, value in result.items()}
+        return {name: _copied(value, retained) for name, value in result.items()}
     if isinstance(result, tuple):
-        return tuple(_copied(value, kept) for value in result)
-    return result if result is None or any(result is one for one in kept) else result.clone()
+        return tuple(_copied(value, retained) for value in result)
+    return result if result is None or any(result is one for one in retained) else result.clone()
 
 
 def _reason(error: BaseException) -> str:

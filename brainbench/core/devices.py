@@ -56,7 +56,7 @@ def _without_driver_warning() -> Iterator[None]:
     Whoever asks for ``cuda`` there is told by :func:`pick_device`. All else that is written meanwhile follows after.
     """
     try:
-        kept = os.dup(2)
+        stderr = os.dup(2)
     except OSError:  # no stderr at all
         yield
         return
@@ -66,13 +66,13 @@ def _without_driver_warning() -> Iterator[None]:
             try:
                 yield
             finally:
-                os.dup2(kept, 2)
+                os.dup2(stderr, 2)
                 said.seek(0)
                 rest = b"".join(line for line in said if _NO_DRIVER not in line)
                 if rest:
                     os.write(2, rest)
     finally:
-        os.close(kept)
+        os.close(stderr)
 
 
 def usable_processors() -> int:
@@ -119,13 +119,13 @@ def torch_device(name: Any) -> torch.device:
     import torch
 
     try:
-        found = torch.device(name)
+        device = torch.device(name)
     except (RuntimeError, TypeError) as error:
         raise UsageError(f"{name!r} is not a device; name cpu, cuda or cuda:N.") from error
     count = torch.cuda.device_count()
-    if found.type == "cuda" and (found.index or 0) >= count:
-        raise UsageError(f"There is no device {str(found)!r} here ({count} CUDA devices); name cpu instead.")
-    return found
+    if device.type == "cuda" and (device.index or 0) >= count:
+        raise UsageError(f"There is no device {str(device)!r} here ({count} CUDA devices); name cpu instead.")
+    return device
 
 
 def to_struct(kind: Any, values: Mapping[str, np.ndarray], device: Any) -> Any:

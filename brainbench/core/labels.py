@@ -37,10 +37,10 @@ def join_labels(
     unused = [] if explicit else [label for label in labels if label not in pairs.values()]
     if alone or unused:
         lonely = {"without a stimulus": alone, "without recordings": unused}
-        told = "; ".join(f"{what}: {listing(found, limit=40)}" for what, found in lonely.items() if found)
+        words = "; ".join(f"{what}: {listing(found, limit=40)}" for what, found in lonely.items() if found)
         free = next((label for label in labels if label not in pairs.values()), "")
         raise UsageError(
-            f"The labels of recordings and stimuli do not match ({told}; equal on both sides: "
+            f"The labels of recordings and stimuli do not match ({words}; equal on both sides: "
             f"{len(pairs) - len(alone)}). Pair them with --match FILE, a line for each label of the recordings as in "
             f"'{next(iter(alone or vocabulary), 'label')},{free}' (.csv; nothing after the comma drops the label)."
         )

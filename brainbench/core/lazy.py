@@ -29,8 +29,8 @@ def lazy_exports(package: str) -> tuple[Callable[[str], Any], Callable[[], list[
             if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"
         ]
         imports = [node for body in blocks for node in body if isinstance(node, ast.ImportFrom)]
-        found = {alias.name: str(node.module) for node in imports for alias in node.names}
-        return {name: where for name, where in found.items() if name in module.__all__}
+        modules = {alias.name: str(node.module) for node in imports for alias in node.names}
+        return {name: where for name, where in modules.items() if name in module.__all__}
 
     def load(name: str) -> Any:
         if where := exports().get(name):

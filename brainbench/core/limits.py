@@ -108,8 +108,8 @@ def limited(cls: type | None = None, *, of: str = "{}", unresolved: Sequence[str
 def check_limits(options: Any) -> None:
     """Raise a :class:`UsageError` for the first field of a dataclass whose value is outside its limits."""
     cls = type(options)
-    for name, (told, check) in _checks(cls).items():
-        check(told, getattr(options, name))
+    for name, (label, check) in _checks(cls).items():
+        check(label, getattr(options, name))
 
 
 def limits_of(cls: type) -> dict[str, Any]:

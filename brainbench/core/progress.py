@@ -17,10 +17,10 @@ Item = TypeVar("Item")
 
 def track(items: Sequence[Item], what: str, progress: Progress | None) -> Iterator[Item]:
     """Yield items and report how many of them are done."""
-    for done, item in enumerate(items):
+    for done, value in enumerate(items):
         if progress is not None:
             progress(done, len(items), what)
-        yield item
+        yield value
     if progress is not None:
         progress(len(items), len(items), what)
 

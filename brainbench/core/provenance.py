@@ -84,8 +84,8 @@ class Provenance(Mapping[str, Any]):
     @property
     def pairing(self) -> str:
         """Name of the pairing of labels that are not equal on both sides; empty where all are."""
-        other = [f"{label} = {stimulus}" for label, stimulus in self.pairs.items() if stimulus not in (None, label)]
-        return f"{listing(other, limit=1)}; {content_hash(other, length=8)}" if other else ""
+        renamed = [f"{label} = {stimulus}" for label, stimulus in self.pairs.items() if stimulus not in (None, label)]
+        return f"{listing(renamed, limit=1)}; {content_hash(renamed, length=8)}" if renamed else ""
 
     @property
     def time_rule(self) -> str:
@@ -96,13 +96,13 @@ class Provenance(Mapping[str, Any]):
     def layer_p(self) -> dict[str, float]:
         """Each layer's p, corrected for the number of layers where that is stated."""
         tests = self.statistics.get("layer_tests")
-        found = {}
-        for item in tests if isinstance(tests, (list, tuple)) else ():
-            if isinstance(item, Mapping) and isinstance(item.get("layer"), str):
-                p = item.get("p_corrected", item.get("p"))
+        values = {}
+        for test in tests if isinstance(tests, (list, tuple)) else ():
+            if isinstance(test, Mapping) and isinstance(test.get("layer"), str):
+                p = test.get("p_corrected", test.get("p"))
                 if isinstance(p, (int, float)) and not isinstance(p, bool):
-                    found[item["layer"]] = float(p)
-        return found
+                    values[test["layer"]] = float(p)
+        return values
 
     def __getitem__(self, name: str) -> Any:
         """Return a stated entry."""

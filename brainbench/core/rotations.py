@@ -86,8 +86,8 @@ def constant(values: float | Sequence[float], like: torch.Tensor) -> torch.Tenso
 
     It is made once, so that later calls copy nothing to the device.
     """
-    own = tuple(values) if isinstance(values, Sequence) else values
-    return _constant(own, like.device, like.dtype)
+    key = tuple(values) if isinstance(values, Sequence) else values
+    return _constant(key, like.device, like.dtype)
 
 
 @cache

@@ -56,15 +56,15 @@ def two_factor_error(
     Returns:
         Standard errors [...] and degrees of freedom [...]; NaN with fewer than two animals or stimuli.
     """
-    one, other = np.asarray(animals, dtype=np.float64), np.asarray(without_stimulus, dtype=np.float64)
-    count, stimuli = np.isfinite(one).sum(axis=-1), np.isfinite(other).sum(axis=-1)
+    left, right = np.asarray(animals, dtype=np.float64), np.asarray(without_stimulus, dtype=np.float64)
+    count, stimuli = np.isfinite(left).sum(axis=-1), np.isfinite(right).sum(axis=-1)
     with np.errstate(invalid="ignore", divide="ignore"):
-        over_animals = _spread(one) / (count * (count - 1))
-        over_stimuli = _spread(other) * (stimuli - 1) / stimuli
+        over_animals = _spread(left) / (count * (count - 1))
+        over_stimuli = _spread(right) * (stimuli - 1) / stimuli
         total = over_animals + over_stimuli
         freedom = total**2 / (over_animals**2 / (count - 1) + over_stimuli**2 / (stimuli - 1))
-    known = (count > 1) & (stimuli > 1)
-    return np.where(known, np.sqrt(total), np.nan), np.where(known, freedom, np.nan)
+    usable = (count > 1) & (stimuli > 1)
+    return np.where(usable, np.sqrt(total), np.nan), np.where(usable, freedom, np.nan)
 
 
 def two_factor_interval(
@@ -124,11 +124,11 @@ def newcombe_interval(
     successes: float, count: int, other_successes: float, other_count: int, *, over: str = "trials"
 ) -> Interval:
     """Return the interval of the difference of two independent proportions (Newcombe 1998, method 10)."""
-    share, other = successes / max(count, 1), other_successes / max(other_count, 1)
-    one, two = wilson_interval(successes, count), wilson_interval(other_successes, other_count)
-    low = math.hypot(share - one.low, two.high - other)
-    high = math.hypot(one.high - share, other - two.low)
-    return Interval(share - other - low, share - other + high, LEVEL, f"Newcombe over {over}")
+    share, other_share = successes / max(count, 1), other_successes / max(other_count, 1)
+    first, second = wilson_interval(successes, count), wilson_interval(other_successes, other_count)
+    low = math.hypot(share - first.low, second.high - other_share)
+    high = math.hypot(first.high - share, other_share - second.low)
+    return Interval(share - other_share - low, share - other_share + high, LEVEL, f"Newcombe over {over}")
 
 
 def is_finite(interval: Interval | None) -> TypeGuard[Interval]:
@@ -194,12 +194,14 @@ def paired_differences(first: Score, second: Score) -> tuple[NDArray[np.float64]
     """
     pairs = []
     for wanted in (("ok",), ("ok", "unreliable")):
-        one, two = ({s.subject: s.value for s in x.subjects if s.status in wanted} for x in (first, second))
-        pairs = [first.on_scale(one[name]) - second.on_scale(two[name]) for name in sorted(one.keys() & two.keys())]
+        left, right = ({s.subject: s.value for s in x.subjects if s.status in wanted} for x in (first, second))
+        pairs = [
+            first.on_scale(left[name]) - second.on_scale(right[name]) for name in sorted(left.keys() & right.keys())
+        ]
         if pairs := [difference for difference in pairs if math.isfinite(difference)]:
             break
     without = []
     if set(first.stimuli) == set(second.stimuli):
-        one, two = (dict(zip(x.stimuli, x.without_stimulus, strict=False)) for x in (first, second))
-        without = [first.on_scale(one[k]) - second.on_scale(two[k]) for k in one if k in two]
+        left, right = (dict(zip(x.stimuli, x.without_stimulus, strict=False)) for x in (first, second))
+        without = [first.on_scale(left[k]) - second.on_scale(right[k]) for k in left if k in right]
     return np.array(pairs, dtype=np.float64), np.array(without, dtype=np.float64)

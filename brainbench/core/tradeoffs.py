@@ -32,7 +32,7 @@ def pareto_front(points: Iterable[TradeoffPoint]) -> list[TradeoffPoint]:
     """
     usable = [point for point in points if math.isfinite(point.error) and math.isfinite(point.cost)]
     front: list[TradeoffPoint] = []
-    for point in sorted(usable, key=lambda item: (item.cost, item.error)):
+    for point in sorted(usable, key=lambda point: (point.cost, point.error)):
         if not front or point.error < front[-1].error:
             front.append(point)
     return front

@@ -85,7 +85,7 @@ class Env:
             self.apply_action, self.compute_step = (
                 CudaGraphStep(
                     part, recorder, subject="The control step", advice=_ADVICE, generators=generators,
-                    kept=self.lasting, required=bool(options.graphs),
+                    retained=self.lasting, required=bool(options.graphs),
                 )
                 for part in (apply_action, compute_step)
             )  # fmt: skip

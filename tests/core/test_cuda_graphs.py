@@ -61,7 +61,7 @@ def test_a_recording_that_is_asked_for_and_fails_is_an_error_that_tells_what_to_
 @pytest.mark.parametrize(("kept", "same"), [((), False), (None, True)])
 def test_results_of_a_replay_are_copies_unless_nothing_is_to_be_copied(kept: Any, same: bool) -> None:
     x = torch.zeros(2)
-    step = CudaGraphStep(lambda y: y + x, _Fake(), subject="It", warm_up=1, kept=kept)
+    step = CudaGraphStep(lambda y: y + x, _Fake(), subject="It", warm_up=1, retained=kept)
     results = []
     for value in range(4):
         x.fill_(value)

@@ -44,7 +44,7 @@ def list_tasks() -> Output:
         "what to do": "{0[text]}",
         ">episode, s": "{0[seconds]:g}",
         "success": "{0[metric]} ≥ {0[success_from]:.3g}",
-        "student sees": lambda item: ", ".join(item["student"]),
+        "student sees": lambda row: ", ".join(row["student"]),
     }
     policies = [(name, row["task"], row["contacts"][name]) for row in rows for name in row["shipped"]]
     heads = ("trained policy", "task", "contacts")
@@ -161,14 +161,14 @@ def evaluate(
         "agent": "{0[agent]}",
         ">episodes": "{0[episodes]}",
         ">success": "{0[success_rate]:.3f}",
-        ">95 %": lambda item: "{:.3f}–{:.3f}".format(*item["success_interval"]),
+        ">95 %": lambda row: "{:.3f}–{:.3f}".format(*row["success_interval"]),
         f">{env.task.success.metric}": "{0[metric]:.3g} ± {0[metric_half_width]:.2g}",
         ">return": "{0[returns]:.4g} ± {0[returns_half_width]:.2g}",
         ">rad/s": "{0[turn_rate]:.3g} ± {0[turn_rate_half_width]:.2g}",
         ">s": "{0[seconds]:.3g}",
         ">dropped": "{0[dropped]:.3f}",
         ">diverged": "{0[diverged]}",
-        ">by object": lambda item: _by_kind(item["objects"]),
+        ">by object": lambda row: _by_kind(row["objects"]),
     }
     return Output(rows, table_of(f"{env.task.text}; contacts: {contacts}", rows, columns), out=out)
 

@@ -52,8 +52,8 @@ def panels(rows: int, columns: int, inches: tuple[float, float], **options: Any)
     figure = new_figure(*(round(DOTS_PER_INCH * side) for side in inches))
     figure.set_layout_engine("constrained")
     axes = figure.subplots(rows, columns, squeeze=False, **options)
-    for one in axes.flat:
-        style_axes(one)
+    for panel in axes.flat:
+        style_axes(panel)
     return figure, axes
 
 

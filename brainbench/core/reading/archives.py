@@ -25,18 +25,18 @@ def read_npz(path: str | os.PathLike[str], kind: str = ".npz file") -> dict[str,
     """
     import numpy as np
 
-    found = check_file(path, kind)
+    file = check_file(path, kind)
     with readable(path, kind):
-        with found.open("rb") as stream:
+        with file.open("rb") as stream:
             head = stream.read(2)
-        if not zipfile.is_zipfile(found):
+        if not zipfile.is_zipfile(file):
             why = "empty" if not head else "truncated; copy it again" if head == b"PK" else "no zip archive"
             raise DataError(f"{shown(os.fspath(path))} is not an .npz file, which a {kind} is: it is {why}.")
-        with zipfile.ZipFile(found) as archive:
+        with zipfile.ZipFile(file) as archive:
             check_archive(archive, path, kind)
-            for item in archive.infolist():
-                _check_header(archive, item, shown(os.fspath(path)))
-        with np.load(found, allow_pickle=False) as stored:
+            for member in archive.infolist():
+                _check_header(archive, member, shown(os.fspath(path)))
+        with np.load(file, allow_pickle=False) as stored:
             return {key: np.asarray(stored[key]) for key in stored.files}
 
 
@@ -50,12 +50,12 @@ def check_archive(archive: zipfile.ZipFile, path: str | os.PathLike[str], kind: 
         raise DataError(f"{name} unpacks to {unpacked:,} bytes; it is damaged or no {kind}.")
 
 
-def _check_header(archive: zipfile.ZipFile, item: zipfile.ZipInfo, name: str) -> None:
+def _check_header(archive: zipfile.ZipFile, member: zipfile.ZipInfo, name: str) -> None:
     """Compare the shape that an array declares with the bytes behind it, before memory is taken for it."""
     from numpy.lib import format as npy
 
-    place = f"{shown(item.filename)} in {name}"
-    with readable(name, "archive"), archive.open(item) as stream:
+    place = f"{shown(member.filename)} in {name}"
+    with readable(name, "archive"), archive.open(member) as stream:
         try:
             version = npy.read_magic(stream)
             shape, _, dtype = (npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0)(stream)
@@ -63,5 +63,5 @@ def _check_header(archive: zipfile.ZipFile, item: zipfile.ZipInfo, name: str) ->
             raise DataError(f"{place} is no array, or it is damaged ({reason(error)}).") from error
     if dtype.hasobject:
         raise DataError(f"{place} holds Python objects, which are never loaded: they could run code.")
-    if math.prod(shape) * dtype.itemsize > item.file_size:
-        raise DataError(f"{place} declares {list(shape)} of {dtype} and has {item.file_size:,} bytes; it is damaged.")
+    if math.prod(shape) * dtype.itemsize > member.file_size:
+        raise DataError(f"{place} declares {list(shape)} of {dtype} and has {member.file_size:,} bytes; it is damaged.")

@@ -40,11 +40,11 @@ def open_hdf5(path: str | os.PathLike[str], kind: str = "HDF5 file", hint: str =
     """
     import h5py
 
-    found = check_file(path, kind).absolute()
-    state = _state(found)
+    place = check_file(path, kind).absolute()
+    state = _state(place)
     if state not in _TRUSTED and (fault := _fault(*state)):
         raise DataError(f"{shown(os.fspath(path))} {fault}.{hint and ' ' + hint}")
-    with readable(path, kind, hint), h5py.File(found, "r") as file:
+    with readable(path, kind, hint), h5py.File(place, "r") as file:
         yield file
 
 
@@ -54,8 +54,8 @@ def trust_hdf5(path: Path) -> None:
 
 
 def _state(path: Path) -> tuple[str, int, int]:
-    found = path.stat()
-    return str(path), found.st_mtime_ns, found.st_size
+    status = path.stat()
+    return str(path), status.st_mtime_ns, status.st_size
 
 
 _TRUSTED: set[tuple[str, int, int]] = set()

@@ -27,9 +27,9 @@ def fault_of(path: str) -> str:
 
     try:
         with h5py.File(path, "r") as file:
-            found = [_links(file, path), *(_attributes(file, "/"),)]
-            file.visititems(lambda name, item: found.append(_attributes(item, name) or _array(item, name)))
-            return next(filter(None, found), "")
+            faults = [_links(file, path), *(_attributes(file, "/"),)]
+            file.visititems(lambda name, node: faults.append(_attributes(node, name) or _array(node, name)))
+            return next(filter(None, faults), "")
     except OSError as error:
         return _why(path, str(error).strip().splitlines()[0])
     except MemoryError:
@@ -38,44 +38,44 @@ def fault_of(path: str) -> str:
         return f"is damaged ({type(error).__name__}: {str(error)[:120]})"
 
 
-def _attributes(item: Any, name: str) -> str:
-    for key in item.attrs:
+def _attributes(node: Any, name: str) -> str:
+    for key in node.attrs:
         try:
-            item.attrs[key]
-            if not _names_axes(item, key):
+            node.attrs[key]
+            if not _names_axes(node, key):
                 return f"is damaged (attribute {key!r} of {name[:80]!r} does not hold references)"
         except Exception as error:  # noqa: BLE001 - see above
             return f"is damaged (attribute {key[:80]!r} of {name[:80]!r}: {str(error)[:120]})"
     return ""
 
 
-def _names_axes(item: Any, key: str) -> bool:
+def _names_axes(attribute: Any, key: str) -> bool:
     """Return False for a list of axes of another type: the library writes past its memory when it follows one."""
     import h5py
 
-    kind = item.attrs.get_id(key).dtype
+    kind = attribute.attrs.get_id(key).dtype
     if key == "DIMENSION_LIST":
         held = h5py.check_vlen_dtype(kind)
         refers = held is not None and h5py.check_ref_dtype(held) is h5py.Reference
-        return refers and item.attrs[key].shape == (item.ndim,)
+        return refers and attribute.attrs[key].shape == (attribute.ndim,)
     return key != "REFERENCE_LIST" or (kind.names is not None and h5py.check_ref_dtype(kind[0]) is h5py.Reference)
 
 
-def _array(item: Any, name: str) -> str:
+def _array(node: Any, name: str) -> str:
     """Return the fault of an array: unreadable, or far more declared than stored, which would take all memory."""
-    shape = getattr(item, "shape", None)
-    if shape is None or item.is_virtual or item.external:
+    shape = getattr(node, "shape", None)
+    if shape is None or node.is_virtual or node.external:
         return ""
-    declared, stored = math.prod(shape) * item.dtype.itemsize, item.id.get_storage_size()
+    declared, stored = math.prod(shape) * node.dtype.itemsize, node.id.get_storage_size()
     if declared > MOST_MEMORY + MOST_EXPANSION * stored:
         return f"is damaged ({name[:80]!r} declares {list(shape)}, {declared:,} bytes, and stores {stored:,})"
     if declared <= SMALL:
         try:
-            item[()]
+            node[()]
         except Exception as error:  # noqa: BLE001 - see above
             return f"is damaged ({name[:80]!r}: {str(error)[:120]})"
-    elif item.chunks:
-        item.id.get_num_chunks()
+    elif node.chunks:
+        node.id.get_num_chunks()
     return ""
 
 
@@ -83,17 +83,17 @@ def _links(file: Any, path: str) -> str:
     """Return the fault of a link into what is no regular file: to follow it could wait for ever."""
     from h5py import h5l  # pyright: ignore[reportAttributeAccessIssue] - compiled
 
-    found: list[str] = []
+    faults: list[str] = []
 
     def visit(name: bytes, link: Any) -> None:
         if link.type == h5l.TYPE_EXTERNAL:
             target = os.fsdecode(file.id.links.get_val(name)[0])
-            other = Path(path).parent / target
-            if other.exists() and not other.is_file():
-                found.append(f"has a link {os.fsdecode(name)[:80]!r} into {target[:80]!r}, which is no regular file")
+            place = Path(path).parent / target
+            if place.exists() and not place.is_file():
+                faults.append(f"has a link {os.fsdecode(name)[:80]!r} into {target[:80]!r}, which is no regular file")
 
     file.id.links.visit(visit, info=True)
-    return found[0] if found else ""
+    return faults[0] if faults else ""
 
 
 def _why(path: str, text: str) -> str:

@@ -26,9 +26,9 @@ def check_number(
     if kind and -math.inf < value < math.inf and least <= value <= most and above < value < below:
         return
     bounds = {"at least": least, "at most": most, "above": above, "below": below}
-    told = " and ".join(f"{word} {bound:,}" for word, bound in bounds.items() if math.isfinite(bound))
+    words = " and ".join(f"{word} {bound:,}" for word, bound in bounds.items() if math.isfinite(bound))
     raise UsageError(
-        f"{name} must be a {'whole' if whole else 'finite'} number{told and ', '}{told}; received {shown(value)}."
+        f"{name} must be a {'whole' if whole else 'finite'} number{words and ', '}{words}; received {shown(value)}."
     )
 
 
@@ -37,8 +37,8 @@ def check_numbers(name: str, value: Any, count: int, **bounds: Any) -> None:
     values = list(value) if isinstance(value, Iterable) else []
     if len(values) != count:
         raise UsageError(f"{name} holds {count} numbers; received {shown(value)}.")
-    for one in values:
-        check_number(name, one, **bounds)
+    for number in values:
+        check_number(name, number, **bounds)
 
 
 def check_fields(options: Any, *names: str, of: str = "{}", items: int = 0, **bounds: Any) -> None:
@@ -49,10 +49,10 @@ def check_fields(options: Any, *names: str, of: str = "{}", items: int = 0, **bo
     kinds = {field.name: str(field.type) for field in fields(options)}
     for name in names:
         # No format: what a user named may hold braces of its own.
-        value, told = getattr(options, name), of.replace("{}", name)
+        value, label = getattr(options, name), of.replace("{}", name)
         if value is None and "None" in kinds[name]:
             continue
         if items:
-            check_numbers(told, value, items, **bounds)
+            check_numbers(label, value, items, **bounds)
         else:
-            check_number(told, value, **bounds)
+            check_number(label, value, **bounds)

@@ -29,7 +29,7 @@ def check_file(path: str | os.PathLike[str], kind: str = "file", *, most: int | 
     """
     name = shown(os.fspath(path))
     try:
-        found = Path(path).expanduser().stat()
+        status = Path(path).expanduser().stat()
     except (FileNotFoundError, NotADirectoryError) as error:
         wanted, guess = Path(path).expanduser(), None
         with contextlib.suppress(OSError):
@@ -39,13 +39,13 @@ def check_file(path: str | os.PathLike[str], kind: str = "file", *, most: int | 
         raise DataFileNotFoundError(f"There is no {kind} {name}{hint}") from error
     except (OSError, ValueError, RuntimeError) as error:
         raise DataError(f"The {kind} {name} cannot be opened ({reason(error)}).") from error
-    if stat.S_ISDIR(found.st_mode):
+    if stat.S_ISDIR(status.st_mode):
         raise DataError(f"{name} is a folder; a {kind} is needed: name a file in it.")
     # To open a FIFO waits for a writer, and some devices never end.
-    if not stat.S_ISREG(found.st_mode):
+    if not stat.S_ISREG(status.st_mode):
         raise DataError(f"{name} is a pipe or a device; a {kind} is needed: copy its content into a file.")
-    if most is not None and found.st_size > most:
-        raise DataError(f"{name} has {found.st_size:,} bytes; a {kind} of at most {most:,} bytes is read.")
+    if most is not None and status.st_size > most:
+        raise DataError(f"{name} has {status.st_size:,} bytes; a {kind} of at most {most:,} bytes is read.")
     if not os.access(Path(path).expanduser(), os.R_OK):
         raise DataError(f"{name} may not be read by this user; change its permissions.")
     return Path(path).expanduser()
@@ -56,9 +56,9 @@ def reason(error: BaseException) -> str:
     if isinstance(error, OSError) and error.strerror and error.errno:
         return error.strerror
     text = next(iter(str(error).strip().splitlines()), "")
-    own = isinstance(error, (OSError, UnicodeDecodeError)) or type(error).__name__.endswith("DecodeError")
-    told = text if own else f"{type(error).__name__}: {text}"
-    return shown(told.removesuffix(": "), quoted=False, most=160)
+    plain = isinstance(error, (OSError, UnicodeDecodeError)) or type(error).__name__.endswith("DecodeError")
+    words = text if plain else f"{type(error).__name__}: {text}"
+    return shown(words.removesuffix(": "), quoted=False, most=160)
 
 
 @contextlib.contextmanager

@@ -94,10 +94,10 @@ def code_stamp() -> str:
     its own instead (:data:`brainbench.stimuli.engines.PHYSICS_VERSION`).
     """
     root = Path(__file__).parents[2]
-    found = []
+    parts = []
     for folder, _, names in os.walk(root):
         for name in names:
             if not name.endswith(".pyc"):
                 state = os.stat(os.path.join(folder, name))  # noqa: PTH116, PTH118 - twice as fast, on every score
-                found.append((folder, name, state.st_size, state.st_mtime_ns))
-    return content_hash(sorted(found), library_versions(), platform.python_version(), platform.machine())
+                parts.append((folder, name, state.st_size, state.st_mtime_ns))
+    return content_hash(sorted(parts), library_versions(), platform.python_version(), platform.machine())

@@ -26,9 +26,9 @@ def read_tensors(path: str | os.PathLike[str], kind: str = "safetensors file") -
     """
     from safetensors.torch import load_file
 
-    found = check_file(path, kind)
+    file = check_file(path, kind)
     with readable(path, kind, CUT):
-        tensors: dict[str, torch.Tensor] = load_file(found)
+        tensors: dict[str, torch.Tensor] = load_file(file)
     check_finite(tensors, os.fspath(path))
     return tensors
 
@@ -41,14 +41,14 @@ def read_checkpoint(path: str | os.PathLike[str], kind: str = "PyTorch file") ->
     """
     import torch
 
-    found, name = check_file(path, kind), shown(os.fspath(path))
+    file, name = check_file(path, kind), shown(os.fspath(path))
     with readable(path, kind, CUT):
-        sound = zipfile.is_zipfile(found)
+        sound = zipfile.is_zipfile(file)
         if sound:
-            with zipfile.ZipFile(found) as archive:
+            with zipfile.ZipFile(file) as archive:
                 check_archive(archive, path, kind)
         try:
-            content = torch.load(found, map_location="cpu", weights_only=True)
+            content = torch.load(file, map_location="cpu", weights_only=True)
         except pickle.UnpicklingError as error:
             # PyTorch writes zip archives; only in a sound one is an object in the way, and not a torn file.
             if not sound:

@@ -24,18 +24,18 @@ def read_text(path: str | os.PathLike[str], kind: str = "text file", *, most: in
     Raises:
         DataFileNotFoundError: there is no such file.
     """
-    found = check_file(path, kind, most=most)
+    file = check_file(path, kind, most=most)
     with readable(path, kind):
-        return found.read_text(encoding="utf-8-sig")
+        return file.read_text(encoding="utf-8-sig")
 
 
 def parse_json(text: str, name: str) -> Any:
     """Parse JSON text; ``name`` is that of its file in messages."""
 
     def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-        if len(found := dict(pairs)) < len(pairs):
+        if len(values := dict(pairs)) < len(pairs):
             raise DataError(f"{shown(name)} has {listing(repeats(key for key, _ in pairs))} twice in one object.")
-        return found
+        return values
 
     # Python's parser takes NaN and Infinity, which JSON does not know, and 1e400, which is infinite.
     with readable(name, "JSON"):
@@ -102,8 +102,8 @@ def _check_keys(node: Any, name: str) -> None:
     pairs = node.value if node.id == "mapping" else [(None, item) for item in node.value]
     if twice := repeats(key.value for key, _ in pairs if key is not None and key.id == "scalar"):
         raise DataError(f"{shown(name)} has {listing(twice)} twice in one mapping.")
-    for _, item in pairs:
-        _check_keys(item, name)
+    for _, inner in pairs:
+        _check_keys(inner, name)
 
 
 def read_mapping(path: str | os.PathLike[str], kind: str = "file") -> dict[str, Any]:
@@ -141,10 +141,10 @@ def _check(value: Any, name: str, place: tuple[str | int, ...]) -> None:
         if isinstance(value, Mapping):
             for key in value:
                 _encode(str(key), name, place)
-        for key, item in value.items() if isinstance(value, Mapping) else enumerate(value):
+        for key, inner in value.items() if isinstance(value, Mapping) else enumerate(value):
             # Most of a large file are numbers in order.
-            if type(item) is not float or not math.isfinite(item):
-                _check(item, name, (*place, key))
+            if type(inner) is not float or not math.isfinite(inner):
+                _check(inner, name, (*place, key))
 
 
 def _encode(text: str, name: str, place: tuple[str | int, ...]) -> None:

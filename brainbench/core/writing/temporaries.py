@@ -42,15 +42,15 @@ def sweep(folder: Path) -> None:
     if os.name != "posix":
         return
     with contextlib.suppress(OSError):
-        for item in os.scandir(folder):
-            found = _TEMPORARY.fullmatch(item.name)
-            if found is None or found["machine"] != _machine() or _runs(int(found["process"], 16)):
+        for entry in os.scandir(folder):
+            match = _TEMPORARY.fullmatch(entry.name)
+            if match is None or match["machine"] != _machine() or _runs(int(match["process"], 16)):
                 continue
-            if item.is_dir(follow_symlinks=False):
-                shutil.rmtree(item.path, ignore_errors=True)
+            if entry.is_dir(follow_symlinks=False):
+                shutil.rmtree(entry.path, ignore_errors=True)
             else:
                 with contextlib.suppress(OSError):
-                    Path(item.path).unlink()
+                    Path(entry.path).unlink()
 
 
 @lru_cache(maxsize=1)

@@ -172,7 +172,7 @@ def _imitate(env: Env) -> tuple[CudaGraphStep, CudaGraphStep]:
     record, generators = _tape_recorder(env.simulation.uses_warp), [env.state.generator]
     parts = (
         CudaGraphStep(apply_action, record, subject="It", generators=generators),
-        CudaGraphStep(compute_step, record, subject="It", generators=generators, kept=env.lasting),
+        CudaGraphStep(compute_step, record, subject="It", generators=generators, retained=env.lasting),
     )
     env.apply_action, env.compute_step = parts
     return parts
