@@ -45,12 +45,12 @@ class _NullIsNaN:
     """Base of the dataclasses here that hold numbers."""
 
     def __post_init__(self) -> None:
-        for item in fields(self):  # pyright: ignore[reportArgumentType]  # every subclass is a dataclass
-            value = getattr(self, item.name)
-            if item.type in ("Number", "Share") and value is None:
-                object.__setattr__(self, item.name, math.nan)
-            elif item.type == "tuple[Number, ...]" and isinstance(value, tuple) and None in value:
-                object.__setattr__(self, item.name, tuple(math.nan if one is None else one for one in value))
+        for slot in fields(self):  # pyright: ignore[reportArgumentType]  # every subclass is a dataclass
+            value = getattr(self, slot.name)
+            if slot.type in ("Number", "Share") and value is None:
+                object.__setattr__(self, slot.name, math.nan)
+            elif slot.type == "tuple[Number, ...]" and isinstance(value, tuple) and None in value:
+                object.__setattr__(self, slot.name, tuple(math.nan if one is None else one for one in value))
 
 
 @dataclass(frozen=True)
@@ -423,8 +423,8 @@ def _steady(score: Mapping[str, Any] | None) -> dict[str, Any] | None:
     if score is None:
         return None
     volatile = ("time", "machine", "python", "packages", "seconds", "command")
-    kept = {name: value for name, value in (score.get("provenance") or {}).items() if name not in volatile}
-    return {**score, "provenance": kept}
+    provenance = {name: value for name, value in (score.get("provenance") or {}).items() if name not in volatile}
+    return {**score, "provenance": provenance}
 
 
 def _convert(kind: type, data: Any) -> Any:
@@ -437,16 +437,16 @@ def _convert(kind: type, data: Any) -> Any:
 def _check_rest(data: Any, built: Any, place: str) -> None:
     """Refuse fields that a dataclass does not have, which msgspec leaves out without a word, and infinity."""
     if is_dataclass(built) and not isinstance(built, Provenance):
-        known = [item.name for item in fields(built)]
+        names = [item.name for item in fields(built)]
         for name, value in data.items():
-            if name not in known:
-                raise DataError(f"{place or 'the record'} has no field {name!r}; it has {listing(known, limit=40)}.")
+            if name not in names:
+                raise DataError(f"{place or 'the record'} has no field {name!r}; it has {listing(names, limit=40)}.")
             _check_rest(value, getattr(built, name), f"{place}.{name}".lstrip("."))
     elif isinstance(built, tuple):
-        for index, (value, made) in enumerate(zip(data, built, strict=True)):
-            _check_rest(value, made, f"{place}[{index}]")
+        for index, (value, inner) in enumerate(zip(data, built, strict=True)):
+            _check_rest(value, inner, f"{place}[{index}]")
     elif isinstance(built, float) and math.isinf(built):
         raise DataError(f"{place} is {built}; expected a number or null.")
     elif isinstance(built, Mapping):
-        for name, made in built.items():
-            _check_rest(data[name], made, f"{place}.{name}")
+        for name, inner in built.items():
+            _check_rest(data[name], inner, f"{place}.{name}")

@@ -42,7 +42,6 @@ def test_other_commands_refuse_such_an_out_too(run, tmp_path, command):
         (("tradeoff", "whisker"), "--csv"),
         (("tradeoff", "tactile"), "--plot"),
         (("policy", "play", "in_palm_rotate"), "--video"),
-        (("policy", "report", "none"), "--records"),
         (("policy", "sweep"), "--out"),
         (("policy", "export", "none"), "--out"),
         (("leaderboard", "add", "none"), "--to"),
@@ -63,7 +62,7 @@ def test_destinations_without_an_option_are_checked_first(run, tmp_path, command
     assert (outcome.status, str(tmp_path / "file") in outcome.err) == (2, True)
 
 
-@pytest.mark.parametrize("command", [("tradeoff", "tactile", "--plot"), ("policy", "report", "none", "--picture")])
+@pytest.mark.parametrize("command", [("tradeoff", "tactile", "--plot")])
 def test_a_picture_of_an_unknown_format_is_refused_first(run, tmp_path, command):
     outcome = run(*command, str(tmp_path / "x.txt2"))
     assert (outcome.status, "txt2" in outcome.err) == (2, True)
