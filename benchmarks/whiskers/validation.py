@@ -22,7 +22,7 @@ from brainbench.stimuli.engines import list_engines
 from brainbench.stimuli.engines.fidelity import Fidelity, list_presets
 from brainbench.stimuli.motion.trajectories import smooth_step
 from brainbench.stimuli.validation import bench_tests, references
-from brainbench.stimuli.validation.ringing import ringdown
+from brainbench.stimuli.validation.bench_tests import ringdown
 from brainbench.stimuli.whiskers.array import WhiskerArray
 from brainbench.stimuli.whiskers.whisker import Whisker
 from tests.factories.shaken_base import shaken_base

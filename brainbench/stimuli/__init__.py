@@ -17,14 +17,13 @@ if TYPE_CHECKING:
     from brainbench.stimuli.motion.trajectories import Whisking
     from brainbench.stimuli.objects.placed_object import PlacedObject
     from brainbench.stimuli.objects.solid import Solid
-    from brainbench.stimuli.readout import to_grid
     from brainbench.stimuli.scenes.frames import Frames
     from brainbench.stimuli.scenes.recipes import get_recipe, list_recipes
     from brainbench.stimuli.scenes.scene import Head, Scene
     from brainbench.stimuli.scenes.scene_files import load_scene
     from brainbench.stimuli.simulation import simulate
     from brainbench.stimuli.sources import Stimuli, load_stimuli
-    from brainbench.stimuli.stimulus_set import read_stimulus_set, write_stimulus_set
+    from brainbench.stimuli.stimulus_set import read_stimulus_set, to_grid, write_stimulus_set
     from brainbench.stimuli.sweeps.grid import SweepGrid
     from brainbench.stimuli.validation import references
     from brainbench.stimuli.whiskers.array import WhiskerArray

@@ -28,10 +28,16 @@ from brainbench.stimuli.engines.protocol import WhiskerEngine
 from brainbench.stimuli.explain import ATTRIBUTE, SECONDS, explain
 from brainbench.stimuli.kept_sets import find_entry
 from brainbench.stimuli.motion.jobs import Trace
-from brainbench.stimuli.readout import ORIENTATION, turn
 from brainbench.stimuli.scenes.frames import clip_wrenches
 from brainbench.stimuli.scenes.scene import Scene
-from brainbench.stimuli.stimulus_set import hash_stimulus_set, new_stimulus_set, read_stimulus_set, write_stimulus_set
+from brainbench.stimuli.stimulus_set import (
+    ORIENTATION,
+    hash_stimulus_set,
+    new_stimulus_set,
+    read_stimulus_set,
+    turn,
+    write_stimulus_set,
+)
 
 if TYPE_CHECKING:
     import xarray as xr

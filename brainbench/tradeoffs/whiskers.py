@@ -43,8 +43,7 @@ from brainbench.stimuli.objects.obstacle import Obstacle
 from brainbench.stimuli.objects.primitives import rodgers_solid
 from brainbench.stimuli.objects.solid import Solid
 from brainbench.stimuli.validation import contact_scenes
-from brainbench.stimuli.validation.bench_tests import peg
-from brainbench.stimuli.validation.ringing import ringdown
+from brainbench.stimuli.validation.bench_tests import peg, ringdown
 from brainbench.stimuli.whiskers.array import WhiskerArray
 from brainbench.stimuli.whiskers.whisker import Whisker
 from brainbench.tradeoffs.study import Panel, Row, Study, front

@@ -37,7 +37,7 @@ from brainbench.stimuli.engines.fidelity import DEFAULT_ENGINE, Fidelity
 
 Array = NDArray[np.float64]
 SUBSTEPS = 5
-"""Frames of a time step of the input, as in :func:`brainbench.stimuli.readout.to_grid`."""
+"""Frames of a time step of the input, as in :func:`brainbench.stimuli.stimulus_set.to_grid`."""
 FINER = 5
 """Divisor of the time step for a gradient of whiskers that cannot be trusted."""
 BOARDS = 10

@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING
 from brainbench.core.lazy import lazy_exports
 
 if TYPE_CHECKING:
-    from brainbench.stimuli.validation.bench_tests import peg, point_load, slip_off
-    from brainbench.stimuli.validation.ringing import ringdown
+    from brainbench.stimuli.validation.bench_tests import peg, point_load, ringdown, slip_off
 
 __all__ = ["peg", "point_load", "ringdown", "slip_off"]
 

@@ -12,12 +12,12 @@ from brainbench.stimuli.engines.fidelity import DEFAULT_ENGINE
 from brainbench.stimuli.figures import scenes
 from brainbench.stimuli.sweeps.plan import GenerationSettings
 from brainbench.stimuli.sweeps.simulation import simulate_sweeps
-from brainbench.stimuli.validation import bench_tests, ringing
+from brainbench.stimuli.validation import bench_tests
 from tests.factories import out_of_plane
 
 ASKED = (
     simulation.simulate, simulation.prepare, load_stimuli, whisker_shapes.record, scenes.render, simulate_sweeps,
-    bench_tests.peg, bench_tests.point_load, ringing.ringdown, bench_tests.slip_off, out_of_plane.load_aside,
+    bench_tests.peg, bench_tests.point_load, bench_tests.ringdown, bench_tests.slip_off, out_of_plane.load_aside,
     out_of_plane.push_aside, fidelity.measured,
     fidelity.Fidelity.auto, GenerationSettings, draw.render, draw.plot,
     simulate_command.simulate, sweep.sweep,

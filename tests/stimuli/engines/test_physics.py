@@ -14,7 +14,7 @@ from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.motion.jobs import Job, Load, StillFollicle
 from brainbench.stimuli.objects.obstacle import Box, Capsule, ConvexPart, Cylinder, Obstacle, Sphere
 from brainbench.stimuli.validation import bench_tests
-from brainbench.stimuli.validation.ringing import ringdown
+from brainbench.stimuli.validation.bench_tests import ringdown
 from brainbench.stimuli.whiskers.chain import build_chain
 from tests.factories.obstacles import post
 from tests.factories.swing import Swing

@@ -11,10 +11,10 @@ from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.motion.trajectories import Path, Still, Translation, Whisking
 from brainbench.stimuli.objects.placed_object import PlacedObject
 from brainbench.stimuli.objects.primitives import sphere
-from brainbench.stimuli.readout import to_grid
 from brainbench.stimuli.scenes.scene import Animal, Frames, Head, Scene
 from brainbench.stimuli.simulation import simulate
 from brainbench.stimuli.sources import load_stimuli
+from brainbench.stimuli.stimulus_set import to_grid
 from brainbench.stimuli.whiskers.array import WhiskerArray
 from tests.factories.engines import FakeEngine
 

@@ -15,11 +15,10 @@ from brainbench.stimuli.motion.jobs import Trace
 from brainbench.stimuli.motion.trajectories import ArrayFollicle, Path, Still, Whisking
 from brainbench.stimuli.objects.placed_object import PlacedObject
 from brainbench.stimuli.objects.primitives import sphere
-from brainbench.stimuli.readout import to_axes
 from brainbench.stimuli.scenes.frames import Frames, clip_wrenches, low_pass
 from brainbench.stimuli.scenes.scene import Head, Scene
 from brainbench.stimuli.simulation import simulate
-from brainbench.stimuli.stimulus_set import read_stimulus_set, write_stimulus_set
+from brainbench.stimuli.stimulus_set import read_stimulus_set, to_axes, write_stimulus_set
 from brainbench.stimuli.whiskers.array import WhiskerArray
 from tests.factories.engines import FakeEngine
 

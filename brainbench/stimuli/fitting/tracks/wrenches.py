@@ -161,8 +161,7 @@ def _find_series(file: Any) -> tuple[Any, Any] | None:
 
 
 def _read_stimulus_set(path: str | os.PathLike[str], whisker: str | None, stimulus: str | None) -> xr.Dataset:
-    from brainbench.stimuli.readout import to_axes
-    from brainbench.stimuli.stimulus_set import read_stimulus_set
+    from brainbench.stimuli.stimulus_set import read_stimulus_set, to_axes
 
     dataset, chosen = to_axes(read_stimulus_set(path), "world"), {}
     if (readout := dataset.attrs.get("readout", "instantaneous")) != "instantaneous":

@@ -1,11 +1,13 @@
+from __future__ import annotations
+
 import numpy as np
 import pytest
 
 from brainbench.core.errors import DataError, UsageError
 from brainbench.stimuli.engines.fidelity import Fidelity
-from brainbench.stimuli.readout import to_grid
 from brainbench.stimuli.scenes.scene import Frames, Scene
 from brainbench.stimuli.simulation import simulate
+from brainbench.stimuli.stimulus_set import to_grid
 from brainbench.stimuli.whiskers.array import WhiskerArray
 from tests.factories.engines import FakeEngine
 
