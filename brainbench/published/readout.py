@@ -128,12 +128,12 @@ def _through(x: torch.Tensor, layers: Layers) -> tuple[Named, torch.Tensor]:
 
 
 @dataclass(frozen=True)
-class Readout:
+class LayerReadout:
     """How layers are named and read."""
 
     layers: Callable[[nn.Module], tuple[str, ...]]
     activations: Callable[..., Named]
 
 
-READOUT = Readout(published_layers, published_activations)
+READOUT = LayerReadout(published_layers, published_activations)
 """The published readout, as :func:`brainbench.models.activations.find_readout` gives it."""
