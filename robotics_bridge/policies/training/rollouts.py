@@ -92,7 +92,7 @@ class ChunkStep:
         self._record, self._inputs = record, dict[str, torch.Tensor]()
         # On a stream of its own: what backward keeps must not lead to the default one.
         self._step = CudaGraphStep(
-            self._descend, self._recorder, subject="Learning", warm_up=WARM_UP, aside=True, kept=None
+            self._descend, self._recorder, subject="Learning", warm_up=WARM_UP, aside=True, retained=None
         )
 
     def __call__(self, given: Tensors) -> tuple[Tensors, torch.Tensor]:
