@@ -67,15 +67,6 @@ def test_a_suggestion_keeps_the_tag(run):
     assert "'zhuang-intersection-ln-small.simclr'?" in run("models", "show", "zhuang-intersecton-ln-small.simclr").err
 
 
-def test_a_card_says_what_the_weights_are(run):
-    def shown(name):
-        return " ".join(run("models", "show", name).out.split())
-
-    assert "weights trained: simclr" in shown("zhuang-small.simclr")
-    assert "weights untrained" in shown("zhuang-small")
-    assert "brainbench train zhuang-gru --objective simclr" in shown("zhuang-gru.simclr")
-
-
 def test_a_model_of_ones_own_gets_a_name_and_loses_it(run, files, tmp_path, monkeypatch):
     monkeypatch.setenv("BRAINBENCH_CONFIG", str(tmp_path / "settings"))
     monkeypatch.setattr(registry, "_loaded", set())

@@ -7,7 +7,6 @@ import typer.main
 
 import brainbench
 from brainbench.cli import app
-from brainbench.cli.options import SCORE, SCORE_FLAGS, as_flags, option_fields
 from brainbench.core.errors import UsageError
 from brainbench.core.files import to_plain
 from brainbench.scoring import ScoreOptions
@@ -68,14 +67,6 @@ def test_the_published_readout_averages_time_itself():
     for other in ({"time": "concatenate"}, {"over_time": True}):
         with pytest.raises(UsageError, match="--time"):
             ScoreOptions(readout="published", **other)
-
-
-def test_options_are_written_as_flags():
-    assert as_flags(SCORE, ScoreOptions(), SCORE_FLAGS) == []
-    options = replace(ScoreOptions(), layers=("a", "b"), normalize=False, explain=True, weights_seed=1)
-    told = ["--layers", "a,b", "--no-normalize", "--weights-seed", "1", "--explain-estimator"]
-    assert as_flags(SCORE, options, SCORE_FLAGS) == told
-    assert set(option_fields(SCORE)) == set(NAMES)
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,5 @@
 import dataclasses
 import math
-import re
 import sys
 
 import numpy as np
@@ -8,7 +7,6 @@ import pytest
 
 from brainbench.core.errors import MissingDependencyError, UsageError
 from brainbench.stimuli.engines.fidelity import Fidelity
-from brainbench.stimuli.figures import scenes as module
 from brainbench.stimuli.figures.camera import Camera
 from brainbench.stimuli.figures.canvas import Style
 from brainbench.stimuli.figures.pictures import Picture
@@ -18,7 +16,7 @@ from brainbench.stimuli.objects.placed_object import PlacedObject
 from brainbench.stimuli.objects.primitives import box, cylinder
 from brainbench.stimuli.scenes.recipes import get_recipe
 from brainbench.stimuli.scenes.scene import Frames, Scene
-from brainbench.stimuli.whisker_shapes import Recording, record
+from brainbench.stimuli.whisker_shapes import record
 from brainbench.stimuli.whiskers.array import WhiskerArray
 from tests.factories.engines import FakeEngine
 
@@ -82,37 +80,6 @@ def test_thicker_whiskers_cover_more():
     assert covered[1] > 1.5 * covered[0]
 
 
-def test_moments_colour_the_whiskers():
-    recording = record(SCENE, [0.0], fidelity=FAST, cache=False)
-    loaded = tuple(np.linspace(2e-7, 0, item.shape[1])[None] for item in recording.moments)
-    recording = Recording(recording.scene, recording.times, recording.joints, loaded)
-    picture = Picture(recording, ABOVE, dataclasses.replace(SMALL, color="moment"))
-    assert picture.moment_limit == pytest.approx(2e-7)
-    image = picture.frame(0).astype(int)
-    yellow = (image[..., 0] > 180) & (image[..., 1] > 130) & (image[..., 2] < 90)
-    assert yellow.any()
-    fixed = Picture(recording, ABOVE, dataclasses.replace(SMALL, color="moment", moment_limit=1e-5))
-    image = fixed.frame(0).astype(int)
-    assert not ((image[..., 0] > 180) & (image[..., 1] > 130) & (image[..., 2] < 90)).any()
-
-
-def test_whiskers_of_unknown_shape_are_drawn_black_and_unbent_and_said_aloud(caplog, tmp_path, monkeypatch):
-    recording = record(SCENE, [0.0], fidelity=FAST, cache=False)
-    broken = (np.full_like(recording.joints[0], np.nan), recording.joints[1])
-    recording = Recording(recording.scene, recording.times, broken, recording.moments)
-    assert recording.unstable == ("C1",)
-    monkeypatch.setattr(module, "record", lambda *args, **options: recording)
-    render(SCENE, tmp_path / "a.png", times=[0.0], camera=ABOVE, style=SMALL)
-    assert re.search("unstable .*'C1'", caplog.text)
-    # Both still rest at t = 0, so the one whose shape is not known lies where it lay.
-    whole = record(SCENE, [0.0], fidelity=FAST, cache=False)
-    np.testing.assert_allclose(recording.unbent(0, 0), whole.joints[0][0], atol=1e-7)
-    pictures = [Picture(some, ABOVE, SMALL) for some in (whole, recording)]
-    known, unknown = (picture._whiskers(0, picture.lens) for picture in pictures)
-    assert len(known.corners) == len(unknown.corners)
-    assert unknown.colors.reshape(-1, 3).min(axis=1).min() < known.colors.reshape(-1, 3).max(axis=1).min()
-
-
 def test_a_picture_is_written_whole_and_the_same_every_time(tmp_path):
     from PIL import Image
 
@@ -122,16 +89,6 @@ def test_a_picture_is_written_whole_and_the_same_every_time(tmp_path):
     with Image.open(written[0]) as image:
         assert image.size == (320, 240)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.png", "b.png"]
-
-
-def test_a_failed_picture_leaves_the_old_one(tmp_path, monkeypatch):
-    path = tmp_path / "a.png"
-    path.write_bytes(b"old")
-    monkeypatch.setattr(Picture, "frame", lambda self, index: 1 / 0)
-    with pytest.raises(ZeroDivisionError):
-        render(SCENE, path, style=SMALL, fidelity="fast", cache=False)
-    assert path.read_bytes() == b"old"
-    assert len(list(tmp_path.iterdir())) == 1
 
 
 def test_a_gif_has_a_frame_per_instant_and_repeats(tmp_path):
@@ -194,23 +151,6 @@ def test_a_film_runs_from_start_to_stop():
         film_times(SCENE, 0.05, 0.01)
     with pytest.raises(UsageError, match="at most 10,000"):
         film_times(SCENE, 0.0, 1.0, 1e-6)
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"color": "rows"}, "did you mean 'row'"),
-        ({"opacity": 1.5}, "opacity .*at most 1;"),
-        ({"size": (10, 10)}, "64 to 8192"),
-        ({"thickness": 0.0}, "thickness .*above 0"),
-        ({"supersampling": 9}, "1, 2, 3 or 4"),
-        ({"frames_per_second": 0.0}, "frames_per_second .*at most 120"),
-        ({"moment_limit": -1.0}, r"moment_limit .*received -1"),
-    ],
-)
-def test_impossible_styles_are_refused(options, message):
-    with pytest.raises(UsageError, match=message):
-        Style(**options)
 
 
 @pytest.mark.parametrize(

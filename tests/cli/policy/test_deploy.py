@@ -1,8 +1,9 @@
-"""``brainbench policy distill|sweep|export|deploy``."""
+"""``brainbench policy export|deploy``."""
 
 from __future__ import annotations
 
 import json
+from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
@@ -10,8 +11,6 @@ from typer.testing import CliRunner
 from brainbench.cli import app
 from brainbench.core.errors import BrainbenchError, UsageError
 from brainbench.core.files import write_json
-from robotics_bridge import hands
-from robotics_bridge.hands.layouts import write_probes
 from tests.factories.policies import export_small
 
 
@@ -21,16 +20,6 @@ def _run(*arguments: object, code: int = 0) -> str:
         raise result.exception
     assert result.exit_code == code, result.output
     return result.stdout
-
-
-def test_sweep_counts_table_4_10() -> None:
-    counted = json.loads(_run("sweep", "--count", "--json"))
-    assert (counted["students"], counted["published"]) == (244, 214)
-    assert "244 students in table-4.10, all (214 without agg_bool)" in _run("sweep", "--count")
-    parts = [json.loads(_run("sweep", "--list", "--json", "--shard", f"{i}/3", "--subset", "types")) for i in range(3)]
-    assert sum(map(len, parts)) == len({name for part in parts for name in part}) == 44
-    with pytest.raises(UsageError, match="such as 0/4; received '4/4'"):
-        _run("sweep", "--shard", "4/4")
 
 
 TOLD = ("--input", "command=1")
@@ -94,40 +83,18 @@ def test_deploy_asks_for_what_is_missing_before_a_hand_is_started(tmp_path, monk
             _run("deploy", path, *words)
 
 
-@pytest.mark.slow
-def test_a_student_is_distilled_evaluated_and_exported(tmp_path) -> None:
-    teacher = tmp_path / "teacher"
-    _run("train", "in_palm_rotate", "--out", teacher, "--envs", 2, "--iterations", 1, "--steps", 4)
-    common = ("--teacher", teacher, "--envs", 2, "--iterations", 1, "--episodes", 2)
-    run = tmp_path / "students" / "one"
-    found = json.loads(
-        _run(
-            "distill", "in_palm_rotate", *common, "--observe", "agg_bool", "--placement", "tips", "--out", run, "--json"
-        )
-    )
-    assert (found["status"], found["episodes"]) == ("finished", 6)
-    assert json.loads(_run("export", run, "--json"))["difference"] < 1e-4
+def test_a_student_plays_with_its_own_touch_and_is_exported(tmp_path: Path) -> None:
+    from robotics_bridge.deploy.session import read_deployed
+    from robotics_bridge.tasks.settings import CONTACTS
 
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("senses", "encoder"),
-    [
-        (("--observe", "elastomer", "--placement", "tips"), ("--encoder", "tactile_convrnn")),
-        (("--observe", "proximity", "--placement", "tips"), ("--encoder", "rnn", "--units", 9)),
-        (("--resolution", "own.json"), ("--encoder", "reservoir", "--draw", 7)),
-        (("--placement", "fingers"), ("--encoder", "zhuang-small.simclr", "--time", "resampled")),
-    ],
-)
-def test_a_student_of_any_touch_and_encoder_runs_to_the_recorded_episode(
-    tmp_path, monkeypatch, senses: tuple, encoder: tuple
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    write_probes("own.json", hands.load("xhand1").layout("low", "tips"))
-    teacher, task = ("--teacher", "in_palm_rotate.teacher"), "in_palm_rotate"
-    small = ("--envs", 2, "--iterations", 1, "--episodes", 0)
-    _run("distill", task, *teacher, *small, *senses, *encoder, "--out", "run")
-    assert json.loads(_run("play", task, "--agent", "run", "--seconds", 0.1, "--json"))["agent"] == "run"
-    assert json.loads(_run("export", "run", "--json"))["difference"] < 1e-4
-    deployed = _run("deploy", "run/policy.onnx", "--shadow", "--seconds", 1, "--timeout", 1, "--record", "ep", "--json")
-    assert json.loads(deployed)["status"] == "finished"
+    name, file = "in_palm_rotate.student", tmp_path / "policy.onnx"
+    out = json.loads(_run("play", "in_palm_rotate", "--agent", name, "--seconds", "0.2", "--json"))
+    assert (out["agent"], out["contacts"]) == (name, "firm")
+    _run("export", name, "--out", str(file))
+    deployed = read_deployed(file)
+    assert (deployed.contract.observe, deployed.contract.more["contacts"]) == ("force_torque", CONTACTS["firm"])
+    # What a hand measures or is told is all that it reads: nothing but touch is asked for.
+    assert list(deployed.contract.inputs) == ["proprio", "command", "tactile"]
+    assert list(deployed.require({"tactile"})) == ["tactile"]
+    with pytest.raises(UsageError, match=r"no longer shipped; 'in_palm_rotate\.student'"):
+        _run("play", "in_palm_rotate", "--agent", "in_palm_rotate.force-torque-hand")

@@ -1,0 +1,116 @@
+"""Records are taken in, refused, verified and compared from the command line."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+
+from brainbench.core.records import ResultRecord
+from brainbench.datasets import open_recordings, write_recordings
+from leaderboards.store import read_record
+
+PARTS = ("--conditions", "trials:texture")
+
+
+@pytest.fixture
+def scored(run, files) -> tuple[Path, str]:
+    """A record of a user's module on two animals, and where the recordings are."""
+    where = files["recordings"]
+    result = run(
+        "score",
+        files["model"],
+        "--stimuli",
+        files["arrays"],
+        "--recordings",
+        where,
+        *PARTS,
+        "--out",
+        files["out"],
+        "--json",
+    )
+    assert result.status == 0, result.err
+    return Path(json.loads(result.out)["record_path"]), where
+
+
+def _forge(path: Path) -> Path:
+    """Raise the value and give the file the name that fits it, as a careful cheat would."""
+    data = json.loads(path.read_text())
+    data["score"]["value"] += 0.2
+    forged = path.parent / "forged" / ResultRecord.from_json(data).file_name
+    forged.parent.mkdir(exist_ok=True)
+    forged.write_text(json.dumps(data))
+    assert read_record(forged)
+    return forged
+
+
+def test_diff_names_what_changed(run, scored, tmp_path):
+    path, _ = scored
+    for name in ("old", "new"):
+        (tmp_path / name).mkdir()
+    shutil.copy(path, tmp_path / "old")
+    shutil.copy(_forge(path), tmp_path / "new")
+    old, new = str(tmp_path / "old"), str(tmp_path / "new")
+    changes = json.loads(run("leaderboard", "diff", old, new, "--json").out)["changes"]
+    assert [change["kind"] for change in changes] == ["changed"]
+    assert "No difference." in run("leaderboard", "diff", old, old).out
+
+
+def test_models_are_scored_once_and_the_batch_goes_on_where_it_stopped(run, files, tmp_path):
+    batch = tmp_path / "batch.toml"
+    options = f'recordings = "{files["recordings"]}"\nstimuli = "{files["arrays"]}"\nconditions = "trials:texture"\n'
+    batch.write_text(f'[options]\n{options}\n[[entries]]\nmodels = ["{files["model"]}"]\nseeds = [0, 1]\n')
+    to = tmp_path / "board"
+    result = run("leaderboard", "add", "--batch", str(batch), "--to", str(to), "--json")
+    assert result.status == 0, result.err
+    states = [item["state"] for item in json.loads(result.out)["results"]]
+    assert states == ["scored", "scored"]
+    next(to.glob("*.json")).unlink()
+    result = run("leaderboard", "add", "--batch", str(batch), "--to", str(to), "--json")
+    assert sorted(item["state"] for item in json.loads(result.out)["results"]) == ["known", "scored"]
+    assert len(list(to.glob("*.json"))) == 2
+    Path(files["model"].partition(":")[0]).write_text(
+        Path(files["model"].partition(":")[0]).read_text().replace("GRU(8, 6", "GRU(8, 5")
+    )
+    result = run("leaderboard", "add", "--batch", str(batch), "--to", str(to), "--prune", "--workers", "2", "--json")
+    assert result.status == 0, result.err
+    results = json.loads(result.out)["results"]
+    assert [item["state"] for item in results] == ["scored", "scored"]
+    assert all("replaces" in item["note"] for item in results)
+    assert {path.name for path in to.glob("*.json")} == {item["record"] for item in results}
+
+
+def test_recordings_of_other_animals_in_a_folder_of_the_same_name_replace_nothing(run, files, tmp_path):
+    whole = open_recordings(files["recordings"], conditions="trials:texture")
+    to, states = tmp_path / "board", []
+    for animal in sorted(set(whole["subject"].values.tolist())):
+        part = whole.isel(trial=whole["subject"].values == animal, unit=whole["unit_subject"].values == animal)
+        (tmp_path / animal).mkdir()
+        path = write_recordings(tmp_path / animal / "data.h5", part)
+        given = ("--recordings", str(path), "--model", files["features"], "--to", str(to), "--prune")
+        result = run("leaderboard", "add", *given, "--json")
+        states += [item["state"] + item["note"] for item in json.loads(result.out)["results"]]
+    assert states == ["scored", "scored"]
+    assert len(list(to.glob("*.json"))) == 2
+
+
+@pytest.mark.parametrize("option", [("--metric", "cka"), ("--seed", "1")])
+def test_options_of_scores_without_a_model_are_refused(run, tmp_path, option):
+    result = run("leaderboard", "add", str(tmp_path), "--to", str(tmp_path / "board"), *option)
+    assert result.status == 2
+    assert option[0] in result.err
+
+
+def test_a_file_in_place_of_the_folder_is_refused_before_anything_is_scored(run, tmp_path):
+    (tmp_path / "file").write_text("")
+    result = run("leaderboard", "add", "--model", "s4-small", "--to", str(tmp_path / "file"))
+    assert result.status == 2
+    assert "--to" in result.err
+
+
+def test_nothing_to_add_is_an_error(run):
+    result = run("leaderboard", "add")
+    assert result.status == 2
+    assert "Name record files to take in" in result.err

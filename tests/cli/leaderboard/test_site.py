@@ -1,0 +1,91 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from leaderboards.store import read_record
+
+PARTS = ("--conditions", "trials:texture")
+
+
+@pytest.fixture
+def scored(run, files) -> tuple[Path, str]:
+    """A record of a user's module on two animals, and where the recordings are."""
+    where = files["recordings"]
+    result = run(
+        "score",
+        files["model"],
+        "--stimuli",
+        files["arrays"],
+        "--recordings",
+        where,
+        *PARTS,
+        "--out",
+        files["out"],
+        "--json",
+    )
+    assert result.status == 0, result.err
+    return Path(json.loads(result.out)["record_path"]), where
+
+
+def test_a_folder_becomes_a_site_and_a_report_and_a_score_its_own(run, scored, files, tmp_path):
+    path, where = scored
+    site = tmp_path / "site"
+    assert json.loads(run("leaderboard", "build", str(path.parent), "--out", str(site), "--json").out)["records"] == 1
+    assert (site / "index.html").is_file()
+    result = run("leaderboard", "report", str(site), "--out", str(tmp_path / "r.md"), "--json")
+    assert [Path(name).suffix for name in json.loads(result.out)["files"][:2]] == [".md", ".bib"]
+    assert run("leaderboard", "report", str(site), "--format", "docx").status == 2
+    given = ("--stimuli", files["arrays"], "--recordings", where, *PARTS, "--out", files["out"])
+    result = run("score", files["model"], *given, "--report", str(tmp_path / "one.html"))
+    assert result.status == 0, result.err
+    assert "paper" in result.out
+    assert "<svg" in (tmp_path / "one.html").read_text()
+    record = max(path.parent.glob("*.json"), key=lambda item: item.stat().st_mtime)
+    assert "--report" not in read_record(record).score.provenance["command"]
+
+
+def test_a_site_is_opened_in_a_browser_and_its_place_is_said_where_there_is_none(run, scored, monkeypatch, tmp_path):
+    asked = []
+    monkeypatch.setattr("webbrowser.open", lambda address: bool(asked.append(address)))
+    path, _ = scored
+    result = run("leaderboard", "build", str(path.parent), "--out", str(tmp_path / "site"), "--open")
+    assert result.status == 0, result.err
+    assert asked == [(tmp_path / "site" / "index.html").as_uri()]
+    assert "No browser" in result.err
+    assert run("leaderboard", "build", str(path.parent / "none")).status == 2
+
+
+def _score(run, files: dict[str, str], model: str, *more: str):
+    return run(
+        "score",
+        model,
+        "--recordings",
+        files["recordings"],
+        "--conditions",
+        "trials:texture",
+        "--out",
+        files["out"],
+        *more,
+    )
+
+
+def test_the_leaderboard_is_built_from_records(run, files, tmp_path):
+    _score(run, files, files["features"])
+    page = tmp_path / "board"
+    broken = Path(files["out"]) / "broken.json"
+    broken.write_text("{")
+    result = run("leaderboard", "build", files["out"], "--out", str(page), "--json")
+    data = json.loads(result.out)
+    assert data["records"] == 1
+    assert len(data["problems"]) == 1
+    assert "features" in (page / "index.html").read_text()
+
+
+def test_the_leaderboard_of_no_records_says_how_to_get_some(run, tmp_path):
+    result = run("leaderboard", "build", str(tmp_path / "none"), "--out", str(tmp_path / "page"))
+    assert result.status == 2
+    assert not (tmp_path / "page").exists()
+    assert "brainbench score" in result.err

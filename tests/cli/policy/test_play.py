@@ -1,0 +1,126 @@
+"""``brainbench policy`` tasks and play, as a user calls them."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+from brainbench.cli import app
+
+SMALL = """
+from dataclasses import replace
+from robotics_bridge import tasks
+
+@tasks.register("quick")
+def quick() -> tasks.Task:
+    task = tasks.load("in_palm_rotate")
+    return replace(task, name="quick", episode=0.1,
+                   teacher=replace(task.teacher, hidden=(8,), epochs=1, minibatches=1, steps_per_env=4))
+"""
+
+
+@pytest.fixture
+def quick(tmp_path: Path) -> Path:
+    from robotics_bridge import tasks
+
+    file = tmp_path / "quick.py"
+    file.write_text(SMALL)
+    if "quick" in tasks.list_tasks():
+        tasks.forget("quick")
+    return file
+
+
+def _run(*arguments: str) -> str:
+    result = CliRunner().invoke(app, ["policy", *arguments], catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    return result.stdout
+
+
+def test_tasks_are_listed() -> None:
+    found = json.loads(_run("tasks", "--json"))
+    assert {"in_palm_rotate", "in_hand_repose", "screwdriver", "hot_ball"} <= {row["task"] for row in found}
+
+
+def test_what_a_shipped_policy_did_is_told_in_goals_turns_and_drops() -> None:
+    words = ("play", "in_palm_rotate", "--agent", "in_palm_rotate.teacher", "--seconds", "2", "--seed", "2")
+    told = {line.split("  ")[0]: line.split("  ")[-1].strip() for line in _run(*words).splitlines()}
+    found = json.loads(_run(*words, "--json"))
+    assert int(told["goals reached"]) == found["goals"] >= 1
+    assert told["turned"].startswith(f"{found['turned']:.2f} rad")
+    assert told["dropped"].startswith("0")
+
+
+def _student(folder: Path) -> Path:
+    """Return an untrained student of in_palm_rotate, as ``distill`` leaves it."""
+    words = ("--teacher", "in_palm_rotate.teacher", "--observe", "force_torque", "--envs", "1", "--stop-at", "1")
+    _run("distill", "in_palm_rotate", *words, "--iterations", "1", "--episodes", "0", "--out", str(folder / "felt"))
+    return folder / "felt"
+
+
+def test_a_policy_that_plays_forgets_an_episode_that_ended(quick: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import torch
+
+    steps = []
+
+    class Remembering:
+        def __init__(self, _: str, env: Any, **__: Any) -> None:
+            self.action = torch.zeros(1, env.num_actions)
+            steps.append(0)
+
+        def __call__(self, _: object) -> torch.Tensor:
+            steps[-1] += 1
+            return self.action
+
+        def reset(self, mask: torch.Tensor) -> None:
+            assert mask.tolist() == [True]
+            steps.append(0)
+
+    monkeypatch.setattr("brainbench.cli.policy.play.agent_of", Remembering)
+    _run("play", "quick", "--task-file", str(quick), "--seconds", "0.25")
+    assert steps == [4, 4, 2]
+
+
+def test_playing_needs_no_package_for_training_and_checks_names_first() -> None:
+    code = """
+import sys
+
+lacking, *lines = sys.argv[1:]
+sys.modules |= dict.fromkeys(lacking.split())
+from brainbench.cli import main
+
+for line in lines:
+    sys.argv = ["brainbench", "policy", "play", "in_palm_rotate", *line.split()]
+    try:
+        main()
+        ended = 0
+    except SystemExit as stop:
+        ended = stop.code or 0
+    print("ended", ended)
+"""
+
+    def play(lacking: str, *lines: str) -> tuple[list[str], str]:
+        """Play once for each line of arguments in a process that lacks modules: how each ended, and stderr."""
+        command = [sys.executable, "-c", code, lacking, *lines]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        return [line for line in done.stdout.splitlines() if line.startswith("ended")], done.stderr
+
+    training = "rsl_rl tensordict tensorboard gymnasium"
+    agents = [f"--agent in_palm_rotate.{kind} --seconds 0.1" for kind in ("teacher", "student")]
+    ended, told = play(training, *agents)
+    assert ended == ["ended 0"] * 2, told
+    assert "CUDA" not in told
+    ended, told = play(f"{training} torch warp mujoco", "--agent in_palm_rotate.teachr", "--video x.mpx")
+    assert (ended, told.count("\n")) == (["ended 2"] * 2, 2), told
+
+
+def test_shipped_policies_are_listed_with_the_contacts_that_they_were_trained_in() -> None:
+    found = {row["task"]: row["contacts"] for row in json.loads(_run("tasks", "--json"))}["in_palm_rotate"]
+    assert found == {"in_palm_rotate.teacher": "firm", "in_palm_rotate.student": "firm"}
+    told = [line.split() for line in _run("tasks").splitlines() if line.startswith("in_palm_rotate.")]
+    assert {name: model for name, _, model, *_ in told} == found
