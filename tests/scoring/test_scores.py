@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 import xarray as xr
 from torch import nn
 
@@ -17,11 +16,7 @@ from brainbench.datasets import open_recordings, write_recordings
 from brainbench.datasets.sessions import make_session
 from brainbench.datasets.trials.session_trials import pooled
 from brainbench.models.features import write_features
-from brainbench.models.registry import load_model
-from brainbench.scoring.model_responses import resolve_model
-from brainbench.scoring.options import ScoreOptions
 from brainbench.scoring.scores import score_record
-from brainbench.stimuli import Frames, Scene, WhiskerArray, simulate
 from leaderboards.audit import differences
 
 LABELS = ("a", "b", "c", "d", "e", "f")
@@ -322,55 +317,6 @@ def test_the_published_readout_scores_the_layers_of_the_study(recordings: xr.Dat
         score_record({"fc": np.ones((6, 2))}, **given)
 
 
-@pytest.mark.parametrize("normalize", [True, False])
-def test_a_network_of_ours_inside_a_module_of_the_users_sees_si_values(normalize: bool):
-    network, array = load_model("zhuang-small"), WhiskerArray.of("mouse").select("C2")
-    stimuli = simulate([Scene("free", array)], fidelity="fast", cache=False)
-    options = ScoreOptions(stimuli=stimuli, normalize=normalize, layers=("output",))
-    card = resolve_model(nn.Sequential(network)).respond(options).card
-    assert card.input == "SI (N, N·m); normalised inside the model"
-
-
-def test_a_module_with_any_spec_is_plain():
-    class Spectrum(nn.Module):
-        def __init__(self):
-            super().__init__()
-            self.spec = nn.Linear(1050, 3)
-
-        def forward(self, x):
-            return self.spec(x.flatten(2))
-
-    stimuli = simulate([Scene("free", WhiskerArray.of("mouse").select("C2"))], fidelity="fast", cache=False)
-    found = resolve_model(Spectrum()).respond(ScoreOptions(stimuli=stimuli))
-    assert found.card.input == "forces in 1e-4 N, moments in 1e-6 N·m"
-
-
-def test_a_module_in_half_precision_has_a_card():
-    cards = [resolve_model(nn.Linear(3, 2).to(kind)).card for kind in (torch.bfloat16, torch.float16)]
-    assert all(card.weights for card in cards)
-
-
-def test_a_model_whose_input_does_not_fit_says_what_it_was_given(recordings: xr.Dataset, arrays: Path):
-    with pytest.raises(UsageError, match=r"cannot process stimuli of shape \[6, 4, 2, 2, 2\]"):
-        brainbench.score(nn.Linear(3, 2), recordings=recordings, stimuli=str(arrays))
-
-
-def test_a_lazy_layer_without_weights_is_named():
-    with pytest.raises(
-        UsageError, match=r"Sequential has lazy layers without weights yet \(1\.weight, 1\.bias\): run it"
-    ):
-        brainbench.score(nn.Sequential(nn.Flatten(), nn.LazyLinear(3)))
-
-
-def test_other_things_are_no_models():
-    with pytest.raises(UsageError, match="received int"):
-        brainbench.score(3)
-    with pytest.raises(UsageError, match="did you mean 'zhuang'"):
-        brainbench.score("zhuagn")
-    with pytest.raises(UsageError, match="Unknown time rule 'median'"):
-        brainbench.score(_Tiny(), time="median")
-
-
 def test_scores_of_mappings_follow_the_order_of_the_stimuli(recordings: xr.Dataset, arrays: Path, truth: Path):
     by_file = brainbench.score(str(truth), recordings=recordings)
     by_mapping = brainbench.score(
@@ -414,19 +360,3 @@ def test_the_published_estimators_use_correlation_distances(truth: Path, recordi
     assert "correlation RDM, pearson" in brainbench.score(str(truth), recordings=recordings, estimator="thesis").metric
     with pytest.raises(UsageError, match="'ridge'"):
         brainbench.score(str(truth), recordings=recordings, estimator="thesis", metric="ridge")
-
-
-@pytest.mark.parametrize(
-    ("model", "frames", "told"),
-    [
-        ("resnet18-small.supervised", Frames(count=10), ""),
-        ("resnet18-small.supervised", Frames(interval=1e-3, count=10), "200 time steps per second, there 22.22"),
-        ("resnet18-small.supervised", Frames(count=10, axes="follicle"), "follicle axes, there world axes"),
-        ("resnet18-small", Frames(interval=1e-3, count=10), ""),
-    ],
-)
-def test_frames_unlike_those_of_the_training_are_told(model: str, frames: Frames, told: str, caplog):
-    air = simulate(Scene("air", WhiskerArray.mouse(whiskers="C2"), frames=frames), fidelity="fast", cache=False)
-    card = resolve_model(model).respond(ScoreOptions(stimuli=air)).card
-    assert card.input == "SI (N, N·m); normalised inside the model" + f"; unlike its training: {told}" * bool(told)
-    assert (told in caplog.text) if told else "was trained on" not in caplog.text

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from fractions import Fraction
 from itertools import combinations, permutations
 
 import numpy as np
@@ -68,17 +67,6 @@ def test_crossnobis_equals_rsatoolbox_on_balanced_folds(with_precision):
     np.testing.assert_allclose(result, expected, rtol=1e-10, atol=1e-12)
 
 
-@pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("method", ["shrinkage_diag", "shrinkage_eye", "diag", "full"])
-def test_noise_precision_equals_rsatoolbox(method):
-    rsa_data = pytest.importorskip("rsatoolbox.data")
-    from rsatoolbox.data.noise import prec_from_unbalanced
-
-    trials, labels, _ = _make_trials(repeats=20)
-    expected = prec_from_unbalanced(rsa_data.Dataset(trials, obs_descriptors={"s": labels}), "s", method=method)
-    np.testing.assert_allclose(noise_precision(trials, labels, method=method), expected, rtol=1e-8, atol=1e-10)
-
-
 def test_scipy_agrees_on_patterns_without_trials():
     patterns = np.random.default_rng(1).normal(size=(7, 40))
     np.testing.assert_allclose(rdm(patterns), pdist(patterns, "correlation"), atol=1e-13)
@@ -104,13 +92,6 @@ def test_crossnobis_leaves_out_fold_pairs_that_lack_a_stimulus():
     of_two = np.isin(np.arange(15.0) + 1, touches_two)
     np.testing.assert_allclose(result[of_two], complete[of_two], rtol=1e-12)
     assert not np.allclose(result[~of_two], complete[~of_two])
-
-
-def test_the_mean_over_trials_skips_missing_entries():
-    trials, labels, _ = _make_trials(stimuli=3, repeats=3, units=4)
-    trials[0, 1] = np.nan
-    means = np.array([[np.nanmean(trials[labels == k, u]) for u in range(4)] for k in range(3)])
-    np.testing.assert_allclose(rdm(trials, labels), pdist(means, "correlation"), atol=1e-12)
 
 
 def test_a_pair_uses_the_units_recorded_in_both_stimuli():
@@ -143,38 +124,11 @@ def test_a_constant_pattern_has_nan_correlation_distances_and_a_reason(value):
     assert np.isfinite(rdm(patterns, method="sqeuclidean")).all()
 
 
-def test_a_stimulus_without_trials_is_missing_in_its_own_place():
-    trials = np.random.default_rng(6).normal(size=(6, 8))
-    result = square(rdm(trials, [0, 0, 1, 1, 3, 3]))
-    assert result.shape == (4, 4)
-    assert np.isnan(result[2, [0, 1, 3]]).all()
-
-
 def test_infinite_activations_give_nan_pairs():
     patterns = np.random.default_rng(7).normal(size=(3, 5))
     patterns[0, 0] = np.inf
     for method in METHODS_WITHOUT_FOLDS[:3]:
         assert np.isnan(rdm(patterns, method=method)[:2]).all()
-
-
-def _exact_correlation_distance(x, y):
-    """Arithmetic on the floats' exact values; only the last square root rounds."""
-    a, b = [Fraction(float(v)) for v in x], [Fraction(float(v)) for v in y]
-    a, b = [v - sum(a) / len(a) for v in a], [v - sum(b) / len(b) for v in b]
-    cross = sum(p * q for p, q in zip(a, b, strict=True))
-    size = sum(p * p for p in a) * sum(q * q for q in b)
-    return 1 - float(cross) / math.sqrt(float(size))
-
-
-def test_a_huge_offset_costs_no_digits():
-    patterns = 1e8 + 1e-3 * np.random.default_rng(8).normal(size=(3, 50))
-    exact = [_exact_correlation_distance(patterns[i], patterns[j]) for i, j in ((0, 1), (0, 2), (1, 2))]
-    np.testing.assert_allclose(rdm(patterns), exact, atol=1e-12)
-    exact_squares = [float(np.mean((patterns[i] - patterns[j]) ** 2)) for i, j in ((0, 1), (0, 2), (1, 2))]
-    np.testing.assert_allclose(rdm(patterns, method="sqeuclidean"), exact_squares, rtol=1e-9)
-    labels = np.repeat([0, 1, 2], 4)
-    trials = np.repeat(patterns, 4, axis=0)
-    np.testing.assert_allclose(rdm(trials, labels), exact, atol=1e-4)
 
 
 def test_float32_input_is_computed_in_float64():
@@ -187,13 +141,6 @@ def test_patterns_larger_than_one_slice_of_units_agree_with_scipy(monkeypatch):
     patterns = np.random.default_rng(10).normal(size=(5, 333))
     np.testing.assert_allclose(rdm(patterns), pdist(patterns, "correlation"), atol=1e-13)
     np.testing.assert_allclose(rdm(patterns, method="sqeuclidean"), pdist(patterns, "sqeuclidean") / 333, rtol=1e-12)
-
-
-def test_string_labels_are_sorted_and_integer_labels_are_positions():
-    trials, labels, _ = _make_trials(stimuli=3)
-    names = np.array(["c", "a", "b"])[labels]
-    order = permuted_pairs(np.array([[1, 2, 0]]))[0]
-    np.testing.assert_allclose(rdm(trials, names), rdm(trials, labels)[order], rtol=1e-12)
 
 
 @settings(max_examples=40)
@@ -232,49 +179,15 @@ def test_misuse_is_told_in_a_sentence(arguments, message):
         rdm(np.ones((3, 4)), **arguments)
 
 
-def test_responses_must_be_a_matrix_of_numbers():
-    with pytest.raises(UsageError, match="flatten time and space"):
-        rdm(np.ones((3, 4, 5)))
-    with pytest.raises(UsageError, match="real numbers"):
-        rdm([["a", "b"], ["c", "d"]])
-    with pytest.raises(UsageError, match="unequal length"):
-        rdm([[1, 2], [3]])
-
-
 def test_negative_rates_are_refused_by_poisson():
     with pytest.raises(DataError, match="the smallest is -1"):
         rdm([[1.0, -1.0], [2.0, 0.0]], method="poisson")
-
-
-def test_infinite_trials_are_refused():
-    with pytest.raises(DataError, match="1 responses are infinite"):
-        rdm([[1.0, np.inf], [2.0, 0.0]], [0, 1])
-
-
-def test_a_covariance_of_too_few_trials_names_the_way_out():
-    trials, labels, _ = _make_trials(repeats=2, units=30)
-    with pytest.raises(DataError, match="use method='shrinkage_diag'"):
-        noise_precision(trials, labels, method="full")
-    assert np.isfinite(noise_precision(trials, labels)).all()
-    trials[:, 3] = 1.0
-    with pytest.raises(DataError, match="1 of 30 units never vary"):
-        noise_precision(trials, labels)
-    with pytest.raises(DataError, match="more complete trials"):
-        noise_precision(trials[:6], labels[:6])
-    with pytest.raises(UsageError, match="did you mean 'diag'"):
-        noise_precision(trials, labels, method="diagg")
 
 
 def test_a_single_unit_has_distances_but_no_correlations():
     responses = np.array([[1.0], [2.0], [4.0]])
     assert np.isnan(rdm(responses)).all()
     np.testing.assert_array_equal(rdm(responses, method="sqeuclidean"), [1.0, 9.0, 4.0])
-
-
-@pytest.mark.parametrize("wrong", [np.full((2, 2), np.nan), [[1.0, 0.5], [0.1, 1.0]], -np.eye(2), np.zeros((2, 2))])
-def test_a_noise_precision_is_symmetric_and_positive(wrong) -> None:
-    with pytest.raises(UsageError, match="noise precision is a symmetric"):
-        rdm(np.arange(6.0).reshape(3, 2), method="mahalanobis", precision=wrong)
 
 
 @pytest.mark.parametrize("missing", [0.0, 0.1])

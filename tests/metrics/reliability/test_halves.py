@@ -16,7 +16,7 @@ from brainbench.metrics import compare, rdm
 from brainbench.metrics.rdms.pairs import permuted_pairs
 from brainbench.metrics.reliability.halves import SplitRDMs, members
 from brainbench.metrics.reliability.noise_correction import spearman_brown
-from brainbench.metrics.reliability.sessions import content_hashes, draws, key_hashes
+from brainbench.metrics.reliability.sessions import draws, key_hashes
 from brainbench.metrics.reliability.subject_rdm import subject_rdm
 from tests.factories.animals import STIMULI, make_block, make_latent
 
@@ -83,12 +83,6 @@ def test_order_is_irrelevant_for_sparse_counts_whose_trials_hold_the_same_values
     np.testing.assert_allclose(found.split_half_r, expected.split_half_r, atol=1e-12)
 
 
-def test_content_hashes_tell_trials_apart_and_number_the_identical_ones():
-    responses = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, -0.0, np.nan], [2.0, 2.0, 0.0]])
-    hashes = content_hashes(responses, np.array([0, 0, 0, 1, 1]))
-    assert len(set(hashes.tolist())) == 5
-
-
 def test_seeds_give_other_splits_and_the_same_seed_the_same():
     block = make_block(make_latent(), noise=3.0)
     first, again, other = (subject_rdm("a", [block], 6, splits=50, seed=seed) for seed in (1, 1, 2))
@@ -102,15 +96,6 @@ def test_the_first_splits_do_not_depend_on_how_many_follow():
         subject_rdm("a", [block], 6, splits=300).split_half_r[:40],
         subject_rdm("a", [block], 6, splits=40).split_half_r,
         atol=1e-12,
-    )
-
-
-def test_sessions_with_other_units_are_joined_unit_by_unit():
-    latent = make_latent(2)
-    blocks = [make_block(latent, seed=i, units=7, repeats=5) for i in range(2)]
-    means = [np.stack([b.responses[b.labels == k].mean(axis=0) for k in range(6)]) for b in blocks]
-    np.testing.assert_allclose(
-        subject_rdm("a", blocks, 6, splits=5).rdm, rdm(np.concatenate(means, axis=1)), atol=1e-12
     )
 
 
@@ -171,29 +156,6 @@ def test_units_that_cannot_be_split_are_left_out_and_counted():
     assert found.notes == ("1 units or bins left out: recorded in fewer than 2 trials of some stimulus",)
     without = Trials(np.delete(block.responses, 2, axis=1), block.labels, block.keys)
     np.testing.assert_allclose(found.split_half_r, subject_rdm("a", [without], 6, splits=10).split_half_r, atol=1e-12)
-
-
-def test_a_session_with_a_single_trial_of_a_stimulus_is_left_out_in_words():
-    good = make_block(make_latent(6), seed=1)
-    bad = make_block(make_latent(6), seed=2)
-    keep = np.r_[np.flatnonzero(bad.labels != 5), np.flatnonzero(bad.labels == 5)[:1]]
-    bad = Trials(bad.responses[keep], bad.labels[keep])
-    found = subject_rdm("a", [good, bad], 6, stimuli=STIMULI, splits=10)
-    np.testing.assert_allclose(found.rdm, subject_rdm("a", [good], 6, splits=10).rdm, atol=1e-12)
-    assert found.notes == ("1 of 2 sessions left out: fewer than 2 trials of concave-far (1)",)
-    alone = subject_rdm("a", [bad], 6, stimuli=STIMULI, splits=10)
-    assert alone.problem == "no session can be split into halves: fewer than 2 trials of concave-far (1)"
-    assert np.isnan(alone.reliability)
-
-
-def test_an_animal_without_a_stimulus_says_which():
-    found = subject_rdm("a", [make_block(make_latent(7), gap=(2,))], 6, stimuli=STIMULI)
-    assert found.problem == "no trials of 'convex-far'"
-    assert np.isnan(found.rdm).all()
-
-
-def test_an_animal_without_sessions_has_no_trials_of_anything():
-    assert subject_rdm("a", [], 6, stimuli=STIMULI).problem.startswith("no trials of 'convex-close', 'convex-medium'")
 
 
 def test_silent_units_make_the_rdm_undefined_in_words():

@@ -1,4 +1,4 @@
-"""The native environment, on C MuJoCo; what MuJoCo Warp does differently is in test_engines."""
+"""The native environment, on C MuJoCo; what MuJoCo Warp does differently is in physics/test_gpu."""
 
 from __future__ import annotations
 

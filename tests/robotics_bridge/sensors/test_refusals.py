@@ -19,7 +19,6 @@ from robotics_bridge.sensors import (
     ContactProbe,
     ElastomerTaxel,
     KinematicTaxel,
-    Microphone,
     Noise,
     Probes,
     SensorSuite,
@@ -171,16 +170,6 @@ def test_a_source_above_half_the_sample_rate_is_told_and_a_pulse_ends_in_its_blo
         _suite(a=ContactAudio(link="hand", modes=Modes((500.0,), (0.0,), (1.0,)), contact_time=0.5)).update(
             _state(0.014)
         )
-
-
-@pytest.mark.parametrize("dt", [0, -0.01, np.nan, np.inf])
-def test_a_microphone_hears_blocks_of_some_length(dt) -> None:
-    suite = _suite(a=ContactAudio(link="hand", modes=Modes((500.0,), (0.0,), (1.0,))))
-    suite.update(_state(0.014))
-    with pytest.raises(UsageError, match="dt"):
-        Microphone().build(suite).update(_state(0.014), dt)
-    with pytest.raises(UsageError, match="sources"):
-        Microphone(sources="a")
 
 
 def test_bodies_of_a_temperature_grid_are_links_of_the_scene() -> None:

@@ -15,19 +15,15 @@ from robotics_bridge.sensors import (
     ContactAudio,
     ContactDepthProbe,
     ContactProbe,
-    ElastomerTaxel,
     KinematicTaxel,
     Noise,
     Probes,
-    ProximityTaxel,
     SensorSuite,
     SurfaceDistanceProbe,
     TemperatureGrid,
 )
 from robotics_bridge.sensors.audio.sensors import Modes
-from robotics_bridge.sensors.kernels import dilation, kinematic, proximity
-from robotics_bridge.sensors.kernels import probe as _probe_kernels
-from tests.factories.touch_scenes import PAD, move_all, pad_scene, poses_at, random_pose, state_of
+from tests.factories.touch_scenes import move_all, pad_scene, poses_at, random_pose, state_of
 
 BALL = Geometry(name="ball", link="object", kind="sphere", size=(0.01,))
 GRID = Probes.grid(4, 5, size=(0.02, 0.03), center=(0, 0, 0.005), radius=0.003)
@@ -68,24 +64,6 @@ def test_readings_have_the_shapes_of_their_layouts_and_share_memory() -> None:
     assert not torch.equal(view, before)
 
 
-def test_sensors_of_one_class_share_a_launch_and_nothing_else_is_compiled() -> None:
-    for factory in (kinematic.kinematic_kernel, proximity.proximity_kernel, dilation.marker_kernel):
-        factory.cache_clear()
-    _probe_kernels.depth_kernel.cache_clear()
-    mesh = Mesh([[0, 0, 0], [0.01, 0, 0], [0, 0.01, 0], [0, 0, 0.01]], [[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
-    aside = Geometry(name="aside", link="aside", kind="mesh", mesh=mesh)
-    scene = pad_scene(BALL, aside)
-    sensors = {f"tip{i}": ContactProbe(link="hand", probes=GRID, track=("object",)) for i in range(5)}
-    suite = _suite(sensors, scene=scene)
-    suite.update(state_of(scene, poses_at(4, {2: (0, 0, 0.0145), 3: (1, 0, 0)})))
-    assert len(suite.runtimes) == 1
-    assert _fields_and_trees(suite) == (0, 0)
-    assert _probe_kernels.depth_kernel.cache_info().currsize == 1
-    assert kinematic.kinematic_kernel.cache_info().currsize == 0
-    assert proximity.proximity_kernel.cache_info().currsize == 0
-    assert dilation.marker_kernel.cache_info().currsize == 0
-
-
 def test_only_meshes_that_a_sensor_tracks_get_a_field_and_equal_meshes_share_it() -> None:
     mesh = Mesh([[0, 0, 0], [0.01, 0, 0], [0, 0.01, 0], [0, 0, 0.01]], [[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
     twins = [Geometry(name=f"m{i}", link=f"m{i}", kind="mesh", mesh=mesh) for i in range(3)]
@@ -114,18 +92,6 @@ def test_fillers_read_zero_whatever_the_noise() -> None:
     read = suite.read("depth").flatten()
     assert (read[[3, 7]] == 0).all()
     assert (np.delete(read.numpy(), [3, 7]) != 0).all()
-
-
-def test_contact_latches_and_releases_for_truth_and_measurement_apart() -> None:
-    probe = Probes([[0, 0, 0.005]], [[0, 0, 1.0]], 1e-6)
-    noise = Noise(bias=2e-4)
-    sensor = ContactProbe(link="hand", probes=probe, threshold=5e-4, release=2e-4, noise=noise)
-    suite = _suite({"bit": sensor})
-    seen = []
-    for depth in (0.0, 4e-4, 6e-4, 3e-4, 1e-4, 4e-4):
-        suite.update(state_of(suite.scene, poses_at(3, {2: (0, 0, 0.015 + 1e-6 - depth)})))
-        seen.append((int(suite.read_ground_truth("bit")[0, 0]), int(suite.read("bit")[0, 0])))
-    assert seen == [(0, 0), (0, 1), (1, 1), (1, 1), (0, 1), (0, 1)]
 
 
 def test_reset_starts_single_environments_anew() -> None:
@@ -260,36 +226,6 @@ def test_readings_do_not_depend_on_batch_pose_or_order_of_probes() -> None:
     )
 
 
-def test_an_empty_scene_touches_nothing() -> None:
-    scene = TouchScene(("world", "hand"), (PAD,))
-    suite = _suite(
-        {
-            "depth": ContactDepthProbe(link="hand", probes=GRID),
-            "far": SurfaceDistanceProbe(link="hand", probes=GRID),
-            "near": SurfaceDistanceProbe(link="hand", probes=GRID, max_range=0.3),
-        },
-        scene=scene,
-    )
-    suite.update(state_of(scene, poses_at(2, {})))
-    assert (suite.read("depth") == 0).all()
-    assert torch.isinf(suite.read("far")).all()
-    assert (suite.read("near") == np.float32(0.3)).all()
-
-
-def test_depth_needs_a_contact_pair_unless_all_pairs_are_asked_for() -> None:
-    suite = _suite(
-        {
-            "contact": ContactDepthProbe(link="hand", probes=GRID),
-            "all": ContactDepthProbe(link="hand", probes=GRID, pairs="all"),
-        }
-    )
-    suite.update(state_of(suite.scene, _touching(), touch=False))
-    assert (suite.read("contact") == 0).all()
-    assert (suite.read("all") > 0).any()
-    suite.update(state_of(suite.scene, _touching()))
-    assert torch.equal(suite.read("contact"), suite.read("all"))
-
-
 def test_seeds_and_offsets_decide_the_noise_and_nothing_else() -> None:
     noise = Noise(white=1e-3)
     sensors = {"a": ContactDepthProbe(link="hand", probes=GRID, noise=noise)}
@@ -300,33 +236,6 @@ def test_seeds_and_offsets_decide_the_noise_and_nothing_else() -> None:
     assert torch.equal(whole.read("a")[2:], shard.read("a"))
     assert not torch.equal(whole.read("a"), other.read("a"))
     assert torch.equal(whole.read_ground_truth("a"), other.read_ground_truth("a"))
-
-
-NOISY = {
-    "distance": (SurfaceDistanceProbe, "depth", {}),
-    "contact": (ContactProbe, "bool", {}),
-    "depth": (ContactDepthProbe, "depth", {}),
-    "kinematic": (KinematicTaxel, "force", {}),
-    "proximity": (ProximityTaxel, "proximity", {"points": 500}),
-    "elastomer": (ElastomerTaxel, "elastomer", {"points": 500}),
-}
-
-
-@pytest.mark.parametrize("name", list(NOISY))
-def test_a_noisy_taxel_keeps_at_most_130_bytes(name: str) -> None:
-    kind, preset, options = NOISY[name]
-    noise = Noise.preset(f"published-{preset}")
-    noise = replace(noise, **{knob: 0.0 for knob in ("hysteresis", "radius") if knob not in kind.knobs})
-    noise = noise if "gain" in kind.knobs else replace(noise, gain=(1.0, 1.0), dead_probability=0.0)
-    sensor = kind(
-        link="hand",
-        probes=Probes.grid(10, 10, size=(0.02, 0.02), center=(0, 0, 5e-3), radius=0.003),
-        noise=noise,
-        **options,
-    )
-    held = _suite({"taxel": sensor}).state_bytes
-    assert (held["sensors"] + held["shared"]) / 100 <= 130
-    assert held["rings"] == 0
 
 
 @pytest.mark.parametrize(

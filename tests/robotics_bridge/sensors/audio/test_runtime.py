@@ -1,0 +1,135 @@
+"""Sound of contacts and drives over blocks, environments and resets."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from brainbench.core.errors import UsageError
+from robotics_bridge.physics.scene import Geometry, TouchScene
+from robotics_bridge.physics.state import HandState
+from robotics_bridge.sensors.audio.runtime import joint_drive
+from robotics_bridge.sensors.audio.sensors import ActuationAudio, ContactAudio, Modes
+from robotics_bridge.sensors.noise.model import Noise
+from robotics_bridge.sensors.suite import SensorSuite
+
+MODES = Modes((500.0, 1730.0, 4100.0), (8.0, 15.0, 40.0), (1.0, -0.7, 0.4))
+
+
+DT, K = 0.005, 160
+
+
+RATE = K / DT
+
+
+def _scene() -> TouchScene:
+    shapes = (
+        Geometry(name="box", link="box", kind="box", size=(0.1, 0.1, 0.01)),
+        Geometry(name="ball", link="ball", kind="sphere", size=(0.02,)),
+    )
+    return TouchScene(("world", "box", "ball"), shapes)
+
+
+def _make(envs: int = 1, **knobs):
+    sensor = ContactAudio(link="box", modes=MODES, samples=K, **knobs)
+    return SensorSuite(_scene(), {"sound": sensor}, num_envs=envs), HandState.empty(envs, 3, 4 * envs)
+
+
+def _touch(state: HandState, force, envs=(0,)) -> None:
+    count = len(envs)
+    state.set_contacts(
+        list(envs), np.tile([[0, 1]], (count, 1)), force=np.full(count, force),
+        position=np.zeros((count, 3)), normal=np.tile([0.0, 0, 1], (count, 1)),
+    )  # fmt: skip
+
+
+def _strike(suite: SensorSuite, state: HandState, blocks: int, force: float = 10.0, name: str = "sound") -> np.ndarray:
+    suite.update(state, DT)
+    _touch(state, force)
+    heard = []
+    for _ in range(blocks):
+        suite.update(state, DT)
+        heard.append(suite.read_ground_truth(name)[0, 0].numpy().copy())
+        state.contact_count.fill_(0)
+    return np.concatenate(heard)
+
+
+def test_what_is_held_at_a_reset_makes_no_sound_and_what_strikes_afterwards_does():
+    suite, state = _make()
+    _touch(state, 30.0)
+    for _ in range(2):
+        suite.reset()
+        for _ in range(3):
+            suite.update(state, DT)
+            assert np.all(suite.read("sound").numpy() == 0)
+    _touch(state, 40.0)
+    suite.update(state, DT)
+    assert suite.read("sound").abs().max() > 0
+
+
+def test_environments_ring_reset_and_break_alone_and_alike_in_any_batch():
+    alone = _strike(*_make(), 3)
+    suite, state = _make(envs=3)
+    suite.update(state, DT)
+    _touch(state, 10.0, envs=(0, 2))
+    suite.update(state, DT)
+    read = suite.read("sound").numpy()
+    assert np.array_equal(read[0, 0], alone[:K])
+    assert np.all(read[1] == 0)
+    state.contact_count.fill_(0)
+    suite.reset([0])
+    state.pose_torch[1, 1, 0] = math.nan
+    suite.update(state, DT)
+    read = suite.read("sound").numpy()
+    assert np.all(read[0] == 0)
+    assert np.isnan(read[1]).all()
+    assert np.array_equal(read[2, 0], alone[K : 2 * K])
+    assert read.shape == (3, 1, K)
+
+
+def test_drives_whine_at_their_speed_and_grow_louder_with_load():
+    sensor = ActuationAudio(link="box", joints=2, samples=K, friction=0.0, pitch=80.0, hum=0.0)
+    suite, state = SensorSuite(_scene(), {"drives": sensor}, num_envs=1), HandState.empty(1, 3)
+    effort, speed = joint_drive(suite, "drives")
+    effort[0] = effort.new_tensor([1.0, 3.0])
+    speed[0] = speed.new_tensor([10.0, -5.0])
+    heard = []
+    for _ in range(200):
+        suite.update(state, DT)
+        heard.append(suite.read("drives")[0].numpy().copy())
+    sound = np.concatenate(heard, axis=1)
+    frequency = np.fft.rfftfreq(sound.shape[1], 1 / RATE)
+    spectrum = np.abs(np.fft.rfft(sound, axis=1)) / sound.shape[1] * 2
+    loud = [1e-3 * 1 + 1e-3 * 10, 1e-3 * 3 + 1e-3 * 15]
+    for joint, tone in enumerate((800.0, 400.0)):
+        assert frequency[spectrum[joint].argmax()] == pytest.approx(tone, abs=1.5)
+        assert spectrum[joint].max() == pytest.approx(loud[joint], rel=0.02)
+    assert np.abs(np.diff(sound[0])).max() < 4 * loud[0]
+
+
+def test_idle_drives_hum_and_moving_ones_rasp():
+    sensor = ActuationAudio(link="box", joints=1, samples=K, hum=0.01, hum_frequency=120.0, friction=1e-2)
+    suite, state = SensorSuite(_scene(), {"drives": sensor}, num_envs=1), HandState.empty(1, 3)
+    suite.update(state, DT)
+    t = np.arange(1, K + 1) / RATE
+    assert suite.read("drives")[0, 0].numpy() == pytest.approx(0.01 * np.sin(2 * np.pi * 120 * t), abs=1e-5)
+    joint_drive(suite, "drives")[1].fill_(2.0)
+    suite.update(state, DT)
+    suite.update(state, DT)
+    assert suite.read("drives")[0, 0].numpy().std() == pytest.approx(0.02, rel=0.3)
+    with pytest.raises(UsageError, match="'drives'"):
+        joint_drive(suite, "drive")
+
+
+@pytest.mark.parametrize("samples", [160, 960, 3000])
+def test_samples_of_a_block_of_any_length_have_noise_of_their_own(samples):
+    noisy = Noise(white=1.0)
+    sensor = ContactAudio(link="box", modes=MODES, samples=samples, noise=noisy)
+    suite, state, heard = SensorSuite(_scene(), {"sound": sensor}, num_envs=1), HandState.empty(1, 3), []
+    for _ in range(3):
+        suite.reset()
+        suite.update(state, DT)
+        heard.append(suite.read("sound")[0, 0].numpy().copy())
+    assert len(np.unique(heard)) == pytest.approx(3 * samples, rel=0.01)

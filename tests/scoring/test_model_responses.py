@@ -1,0 +1,154 @@
+"""What is taken as a model, and what it is shown."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import xarray as xr
+from torch import nn
+
+import brainbench
+from brainbench.core.errors import UsageError
+from brainbench.datasets import open_recordings, write_recordings
+from brainbench.datasets.sessions import make_session
+from brainbench.models.registry import load_model
+from brainbench.scoring.model_responses import resolve_model
+from brainbench.scoring.options import ScoreOptions
+from brainbench.stimuli import Frames, Scene, WhiskerArray, simulate
+
+LABELS = ("a", "b", "c", "d", "e", "f")
+
+
+TRIALS = 30
+
+
+def _rates(units: int, *, geometry: int = 0, tuning: int) -> np.ndarray:
+    """Rates [K, units] (Hz) of units with random tuning to five dimensions that the stimuli differ in."""
+    dimensions = np.random.default_rng(geometry).normal(size=(len(LABELS), 5))
+    return 12 * np.exp(0.4 * dimensions @ np.random.default_rng([8, tuning]).normal(size=(5, units)))
+
+
+def _make_recordings(
+    folder: Path, *, animals: int = 4, units: int = 80, trials: int = TRIALS, missing: str = ""
+) -> Path:
+    """Animals whose rates are random mixtures of one geometry, with Poisson spikes."""
+    for animal in range(animals):
+        rng = np.random.default_rng([7, animal])
+        rates = _rates(units, tuning=animal)
+        order = rng.permutation(np.repeat(np.arange(len(LABELS)), trials))
+        if animal == 0 and missing:
+            order = order[order != LABELS.index(missing)]
+        starts = 1.0 + 1.5 * np.arange(len(order))
+        spikes = [
+            np.sort(
+                np.concatenate(
+                    [
+                        start + rng.uniform(0, 1, rng.poisson(rates[k, unit]))
+                        for start, k in zip(starts, order, strict=True)
+                    ]
+                )
+            )
+            for unit in range(units)
+        ]
+        table = {"start_time": starts, "stop_time": starts + 1.0, "stimulus": [LABELS[k] for k in order]}
+        span = np.array([[0.0, starts[-1] + 2]])
+        session = make_session(f"m{animal}", "s", spikes, {"trials": table}, observed=[span] * units)
+        write_recordings(folder / f"m{animal}.h5", session)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return _make_recordings(tmp_path_factory.mktemp("recordings"))
+
+
+@pytest.fixture(scope="module")
+def recordings(folder: Path) -> xr.Dataset:
+    return open_recordings(folder, conditions="trials:stimulus")
+
+
+class _Tiny(nn.Module):
+    def __init__(self) -> None:
+        super().__init__()
+        self.fc = nn.Linear(8, 5)
+
+    def forward(self, x):
+        return self.fc(x.flatten(2)).relu().mean(1)
+
+
+@pytest.fixture
+def arrays(tmp_path: Path) -> Path:
+    import h5py
+
+    path = tmp_path / "stimuli.h5"
+    values = np.random.default_rng(2).normal(size=(6, 4, 2, 2, 2)).astype(np.float32)
+    with h5py.File(path, "w") as file:
+        file["stimuli"] = values
+        file["labels"] = np.array(LABELS, dtype=h5py.string_dtype())
+    return path
+
+
+@pytest.mark.parametrize("normalize", [True, False])
+def test_a_network_of_ours_inside_a_module_of_the_users_sees_si_values(normalize: bool):
+    network, array = load_model("zhuang-small"), WhiskerArray.of("mouse").select("C2")
+    stimuli = simulate([Scene("free", array)], fidelity="fast", cache=False)
+    options = ScoreOptions(stimuli=stimuli, normalize=normalize, layers=("output",))
+    card = resolve_model(nn.Sequential(network)).respond(options).card
+    assert card.input == "SI (N, N·m); normalised inside the model"
+
+
+def test_a_module_with_any_spec_is_plain():
+    class Spectrum(nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.spec = nn.Linear(1050, 3)
+
+        def forward(self, x):
+            return self.spec(x.flatten(2))
+
+    stimuli = simulate([Scene("free", WhiskerArray.of("mouse").select("C2"))], fidelity="fast", cache=False)
+    found = resolve_model(Spectrum()).respond(ScoreOptions(stimuli=stimuli))
+    assert found.card.input == "forces in 1e-4 N, moments in 1e-6 N·m"
+
+
+def test_a_module_in_half_precision_has_a_card():
+    cards = [resolve_model(nn.Linear(3, 2).to(kind)).card for kind in (torch.bfloat16, torch.float16)]
+    assert all(card.weights for card in cards)
+
+
+def test_a_model_whose_input_does_not_fit_says_what_it_was_given(recordings: xr.Dataset, arrays: Path):
+    with pytest.raises(UsageError, match=r"cannot process stimuli of shape \[6, 4, 2, 2, 2\]"):
+        brainbench.score(nn.Linear(3, 2), recordings=recordings, stimuli=str(arrays))
+
+
+def test_a_lazy_layer_without_weights_is_named():
+    with pytest.raises(
+        UsageError, match=r"Sequential has lazy layers without weights yet \(1\.weight, 1\.bias\): run it"
+    ):
+        brainbench.score(nn.Sequential(nn.Flatten(), nn.LazyLinear(3)))
+
+
+def test_other_things_are_no_models():
+    with pytest.raises(UsageError, match="received int"):
+        brainbench.score(3)
+    with pytest.raises(UsageError, match="did you mean 'zhuang'"):
+        brainbench.score("zhuagn")
+    with pytest.raises(UsageError, match="Unknown time rule 'median'"):
+        brainbench.score(_Tiny(), time="median")
+
+
+@pytest.mark.parametrize(
+    ("model", "frames", "told"),
+    [
+        ("resnet18-small.supervised", Frames(count=10), ""),
+        ("resnet18-small.supervised", Frames(interval=1e-3, count=10), "200 time steps per second, there 22.22"),
+        ("resnet18-small.supervised", Frames(count=10, axes="follicle"), "follicle axes, there world axes"),
+        ("resnet18-small", Frames(interval=1e-3, count=10), ""),
+    ],
+)
+def test_frames_unlike_those_of_the_training_are_told(model: str, frames: Frames, told: str, caplog):
+    air = simulate(Scene("air", WhiskerArray.mouse(whiskers="C2"), frames=frames), fidelity="fast", cache=False)
+    card = resolve_model(model).respond(ScoreOptions(stimuli=air)).card
+    assert card.input == "SI (N, N·m); normalised inside the model" + f"; unlike its training: {told}" * bool(told)
+    assert (told in caplog.text) if told else "was trained on" not in caplog.text
