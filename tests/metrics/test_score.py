@@ -158,44 +158,6 @@ def test_many_stimuli_use_random_permutations_that_do_not_depend_on_their_order(
     assert "1,999 random orders" in found.p_method
 
 
-def test_unreliable_animals_do_not_vote_and_are_named():
-    latent = make_latent(5)
-    layers, good = _make_layers(latent), _make_animals(latent, 4)
-    rng = np.random.default_rng(0)
-    noisy = make_subject("z", make_rdm(rng), reliability=0.3)
-    score, without = _score(layers, [*good, noisy]), _score(layers, good)
-    assert score.value == pytest.approx(without.value, abs=1e-15)
-    assert score.p == without.p
-    assert score.status == "ok"
-    assert "animal z left out: reliability 0.30 is below 0.5, where no noise correction is trustworthy" in score.reasons
-    last = score.subjects[-1]
-    assert (last.subject, last.status) == ("z", "unreliable")
-    assert math.isfinite(last.value)
-
-
-def test_when_no_animal_is_reliable_the_value_is_reported_as_unreliable():
-    rng = np.random.default_rng(6)
-    animals = [make_subject(f"m{i}", make_rdm(rng), reliability=0.3, seed=i) for i in range(3)]
-    score = _score({"a": make_rdm(rng), "b": make_rdm(rng)}, animals)
-    assert score.status == "unreliable"
-    assert score.reasons[0] == "no animal is reliable"
-    assert math.isfinite(score.value)
-
-
-def test_animals_without_a_stimulus_are_left_out_in_words():
-    latent = make_latent(7)
-    lacking = subject_rdm("a0", [make_block(latent, gap=(2,))], 6, stimuli=STIMULI)
-    score = _score(_make_layers(latent), [lacking, *_make_animals(latent, 3)])
-    assert score.status == "ok"
-    assert "animal a0 left out: no trials of 'convex-far'" in score.reasons
-    assert score.subjects[0].status == "undefined"
-    alone = _score(_make_layers(latent), [lacking])
-    assert alone.status == "undefined"
-    assert alone.reasons == ("no animal can be used", "animal a0 left out: no trials of 'convex-far'")
-    assert math.isnan(alone.value)
-    assert alone.p_smallest == pytest.approx(1 / 720)
-
-
 def test_a_broken_layer_is_never_chosen_and_broken_models_are_undefined():
     latent = make_latent(8)
     layers, animals = _make_layers(latent), _make_animals(latent, 4)
@@ -325,15 +287,6 @@ def test_misuse_is_told_in_a_sentence(change, message):
     arguments = {"layer_rdms": _make_layers(latent), "subjects": _make_animals(latent, 2), "stimuli": STIMULI}
     with pytest.raises(UsageError, match=message):
         score_rdms(name="x", **{**arguments, **change})
-
-
-def test_an_animal_given_twice_or_with_other_stimuli_is_refused():
-    latent = make_latent(16)
-    (animal,) = _make_animals(latent, 1)
-    with pytest.raises(UsageError, match="Subject 'm0' appears twice"):
-        _score(_make_layers(latent), [animal, animal])
-    with pytest.raises(UsageError, match="'m0' has an RDM of 5"):
-        _score(_make_layers(latent), _make_animals(make_latent(16, stimuli=5), 1))
 
 
 @pytest.mark.slow
