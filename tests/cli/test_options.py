@@ -1,6 +1,9 @@
 from dataclasses import fields, replace
 
-from brainbench.cli.options import SCORE, SCORE_FLAGS, as_flags, option_fields
+import pytest
+
+from brainbench.cli.options import SCORE, SCORE_FLAGS, as_flags, numbers, option_fields, part_of, refuse
+from brainbench.core.errors import UsageError
 from brainbench.scoring import ScoreOptions
 
 NAMES = [item.name for item in fields(ScoreOptions)]
@@ -12,3 +15,31 @@ def test_options_are_written_as_flags():
     told = ["--layers", "a,b", "--no-normalize", "--weights-seed", "1", "--explain-estimator"]
     assert as_flags(SCORE, options, SCORE_FLAGS) == told
     assert set(option_fields(SCORE)) == set(NAMES)
+
+
+def test_numbers_are_written_with_commas_or_as_a_size():
+    assert numbers("3, 4,5", "--counts") == (3, 4, 5)
+    assert numbers("640x480", "--size", count=2) == (640, 480)
+    assert numbers("0.5,1", "--view", float, count=2) == (0.5, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("text", "kind", "count", "words"),
+    [("3,x", int, None, "whole numbers"), ("1,2", float, 3, "3 numbers"), ("1,2,inf", float, 3, "3 numbers")],
+)
+def test_what_are_no_such_numbers_is_told(text, kind, count, words):
+    with pytest.raises(UsageError, match=f"--these takes {words} joined by commas; received '{text}'"):
+        numbers(text, "--these", kind, count=count)
+
+
+@pytest.mark.parametrize("text", ["4/4", "1", "-1/4", "a/b", "1/2/3", "0/0"])
+def test_a_part_is_a_number_below_its_count(text):
+    assert part_of("2/3", "--shard takes") == (2, 3)
+    with pytest.raises(UsageError, match=r"--shard takes NUMBER/COUNT"):
+        part_of(text, "--shard takes")
+
+
+def test_options_that_mean_nothing_are_refused_together_and_defaults_are_not():
+    refuse({"--a": None, "--b": False, "--c": ""}, "here")
+    with pytest.raises(UsageError, match="--a and --c cannot be used for a picture"):
+        refuse({"--a": 0, "--b": None, "--c": "x"}, "for a picture")

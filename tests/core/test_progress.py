@@ -1,6 +1,8 @@
 import subprocess
 import sys
 
+from brainbench.core.progress import stages, track
+
 
 def test_ctrl_c_does_not_wait_for_a_compiler_in_a_thread():
     code = """
@@ -19,3 +21,20 @@ cli.main()
     done = subprocess.run(words, capture_output=True, text=True, check=False, timeout=30)
     assert done.returncode == 130
     assert "same command" in done.stderr
+
+
+def test_items_are_told_before_each_and_at_the_end():
+    told = []
+    for item in track("ab", "reading", lambda *said: told.append(said)):
+        told.append(item.upper())
+    assert told == [(0, 2, "reading"), "A", (1, 2, "reading"), "B", (2, 2, "reading")]
+    assert list(track("ab", "reading", None)) == ["a", "b"]
+
+
+def test_stages_are_counted_from_the_beginning():
+    told = []
+    stage_done = stages(2, "fitting", lambda *said: told.append(said))
+    assert told == [(0, 2, "fitting")]
+    stage_done()
+    stage_done()
+    assert told[1:] == [(1, 2, "fitting"), (2, 2, "fitting")]

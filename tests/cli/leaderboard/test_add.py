@@ -1,4 +1,4 @@
-"""Records are taken in, refused, verified and compared from the command line."""
+"""Records are taken in, refused and compared from the command line."""
 
 from __future__ import annotations
 

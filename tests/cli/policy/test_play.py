@@ -56,13 +56,6 @@ def test_what_a_shipped_policy_did_is_told_in_goals_turns_and_drops() -> None:
     assert told["dropped"].startswith("0")
 
 
-def _student(folder: Path) -> Path:
-    """Return an untrained student of in_palm_rotate, as ``distill`` leaves it."""
-    words = ("--teacher", "in_palm_rotate.teacher", "--observe", "force_torque", "--envs", "1", "--stop-at", "1")
-    _run("distill", "in_palm_rotate", *words, "--iterations", "1", "--episodes", "0", "--out", str(folder / "felt"))
-    return folder / "felt"
-
-
 def test_a_policy_that_plays_forgets_an_episode_that_ended(quick: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import torch
 

@@ -25,22 +25,6 @@ def test_a_good_file_is_opened_and_failures_inside_name_it(tmp_path):
         pass
 
 
-def test_a_declared_shape_takes_no_memory(tmp_path):
-    path = tmp_path / "a.h5"
-    with h5py.File(path, "w") as file:
-        file.create_dataset("huge", shape=(2**40,), dtype="f8", chunks=True)
-    with pytest.raises(DataError, match="huge"), hdf5.open_hdf5(path):
-        pass
-
-
-def test_a_link_into_a_device_is_refused(tmp_path):
-    path = _write(tmp_path / "a.h5")
-    with h5py.File(path, "a") as file:
-        file["out"] = h5py.ExternalLink("/dev/zero", "/x")
-    with pytest.raises(DataError, match="/dev/zero"), hdf5.open_hdf5(path):
-        pass
-
-
 def test_a_file_that_the_library_never_returns_from_is_refused_and_the_next_one_is_read(tmp_path, monkeypatch):
     slow, good = _write(tmp_path / "slow.h5"), _write(tmp_path / "good.h5")
     ask = hdf5._Worker.ask

@@ -84,11 +84,6 @@ def test_the_limit_of_time_is_kept_in_words():
         decompose(_angle_bracket("slow"), DecompositionSettings(seconds=0.05, seed=7))
 
 
-def test_the_limit_of_memory_is_kept_in_words():
-    with pytest.raises(DataError, match=r"'big' .*0\.1 GB"):
-        decompose(_angle_bracket("big"), DecompositionSettings(memory=1e8, seed=7))
-
-
 @pytest.mark.slow
 def test_a_mesh_of_too_many_triangles_is_simplified_and_says_by_how_much(monkeypatch):
     ball = trimesh.creation.icosphere(subdivisions=4)
@@ -107,13 +102,6 @@ def test_a_missing_package_names_its_extra(monkeypatch, method, package, extra):
     monkeypatch.setattr(cutting, "find_spec", lambda name: None if name == package else find(name))
     with pytest.raises(MissingDependencyError, match=rf"\[{extra}\]"):
         decompose(_angle_bracket(), DecompositionSettings(method=method, most_faces=4000))
-
-
-@pytest.mark.slow
-def test_v_hacd_gives_convex_pieces_too():
-    result = decompose(_angle_bracket(), DecompositionSettings(method="vhacd"))
-    assert result.deviation.largest < 0.05 * _angle_bracket().diagonal
-    assert "(vhacd)" in result.notes[0]
 
 
 @pytest.mark.slow
