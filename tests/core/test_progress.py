@@ -25,9 +25,9 @@ cli.main()
 
 def test_items_are_told_before_each_and_at_the_end():
     told = []
-    for item in track("ab", "reading", lambda *said: told.append(said)):
-        told.append(item.upper())
-    assert told == [(0, 2, "reading"), "A", (1, 2, "reading"), "B", (2, 2, "reading")]
+    items = track("ab", "reading", lambda *said: told.append(said))
+    assert (next(items), told) == ("a", [(0, 2, "reading")])
+    assert (list(items), told[1:]) == (["b"], [(1, 2, "reading"), (2, 2, "reading")])
     assert list(track("ab", "reading", None)) == ["a", "b"]
 
 

@@ -12,28 +12,6 @@ from brainbench.core.records import ResultRecord
 from brainbench.datasets import open_recordings, write_recordings
 from leaderboards.store import read_record
 
-PARTS = ("--conditions", "trials:texture")
-
-
-@pytest.fixture
-def scored(run, files) -> tuple[Path, str]:
-    """A record of a user's module on two animals, and where the recordings are."""
-    where = files["recordings"]
-    result = run(
-        "score",
-        files["model"],
-        "--stimuli",
-        files["arrays"],
-        "--recordings",
-        where,
-        *PARTS,
-        "--out",
-        files["out"],
-        "--json",
-    )
-    assert result.status == 0, result.err
-    return Path(json.loads(result.out)["record_path"]), where
-
 
 def _forge(path: Path) -> Path:
     """Raise the value and give the file the name that fits it, as a careful cheat would."""

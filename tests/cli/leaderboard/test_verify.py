@@ -4,32 +4,8 @@ import json
 import shutil
 from pathlib import Path
 
-import pytest
-
 from brainbench.core.records import ResultRecord
 from leaderboards.store import read_record
-
-PARTS = ("--conditions", "trials:texture")
-
-
-@pytest.fixture
-def scored(run, files) -> tuple[Path, str]:
-    """A record of a user's module on two animals, and where the recordings are."""
-    where = files["recordings"]
-    result = run(
-        "score",
-        files["model"],
-        "--stimuli",
-        files["arrays"],
-        "--recordings",
-        where,
-        *PARTS,
-        "--out",
-        files["out"],
-        "--json",
-    )
-    assert result.status == 0, result.err
-    return Path(json.loads(result.out)["record_path"]), where
 
 
 def test_a_record_is_added_known_and_confirmed_by_scoring_again(run, scored, tmp_path):

@@ -6,21 +6,11 @@ import json
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
 
-from brainbench.cli import app
 from brainbench.core.errors import BrainbenchError, UsageError
 from brainbench.core.files import write_json
 from tests.factories.policies import export_small
-
-
-def _run(*arguments: object, code: int = 0) -> str:
-    result = CliRunner().invoke(app, ["policy", *map(str, arguments)])
-    if result.exception is not None and not isinstance(result.exception, SystemExit):
-        raise result.exception
-    assert result.exit_code == code, result.output
-    return result.stdout
-
+from tests.factories.policy_commands import run_policy
 
 TOLD = ("--input", "command=1")
 
@@ -31,25 +21,25 @@ SHORT = ("--seconds", 2, *TOLD)
 @pytest.mark.slow
 def test_deploy_runs_on_the_simulated_hand_and_stops_it_when_readings_are_absurd(tmp_path) -> None:
     path = export_small(tmp_path)
-    found = json.loads(_run("deploy", path, *SHORT, "--timeout", 1, "--record", tmp_path / "ep", "--json"))
+    found = json.loads(run_policy("deploy", path, *SHORT, "--timeout", 1, "--record", tmp_path / "ep", "--json"))
     assert found["status"] == "finished", found["reason"]
     assert list(found["unmeasured"]) == ["command"]
     assert found["ticks"] > 40
     info = json.loads((tmp_path / "ep" / "meta" / "info.json").read_text())
     assert info["total_frames"] == found["ticks"]
-    stopped = json.loads(_run("deploy", path, *SHORT, "--fault", "absurd=0.5", "--json", code=1))
+    stopped = json.loads(run_policy("deploy", path, *SHORT, "--fault", "absurd=0.5", "--json", code=1))
     assert "beyond its limits" in stopped["reason"]
 
 
 def test_deploy_refuses_files_without_a_contract_and_unknown_faults(tmp_path) -> None:
     with pytest.raises(FileNotFoundError, match="brainbench policy export writes a policy"):
-        _run("deploy", tmp_path / "policy.onnx")
+        run_policy("deploy", tmp_path / "policy.onnx")
     path = tmp_path / "policy.onnx"
     path.write_bytes(b"")
     contract = {"inputs": [["proprio", [36]]], "format": "onnx", "deployment": {"rate": 40}}
     write_json(tmp_path / "policy.onnx.json", contract)
     with pytest.raises(UsageError, match="does not say 'action_map'"):
-        _run("deploy", path)
+        run_policy("deploy", path)
 
 
 def test_deploy_asks_for_what_is_missing_before_a_hand_is_started(tmp_path, monkeypatch) -> None:
@@ -80,7 +70,7 @@ def test_deploy_asks_for_what_is_missing_before_a_hand_is_started(tmp_path, monk
     ]
     for words, culprit in refused:
         with pytest.raises(BrainbenchError, match=culprit):
-            _run("deploy", path, *words)
+            run_policy("deploy", path, *words)
 
 
 def test_a_student_plays_with_its_own_touch_and_is_exported(tmp_path: Path) -> None:
@@ -88,13 +78,13 @@ def test_a_student_plays_with_its_own_touch_and_is_exported(tmp_path: Path) -> N
     from robotics_bridge.tasks.settings import CONTACTS
 
     name, file = "in_palm_rotate.student", tmp_path / "policy.onnx"
-    out = json.loads(_run("play", "in_palm_rotate", "--agent", name, "--seconds", "0.2", "--json"))
+    out = json.loads(run_policy("play", "in_palm_rotate", "--agent", name, "--seconds", "0.2", "--json"))
     assert (out["agent"], out["contacts"]) == (name, "firm")
-    _run("export", name, "--out", str(file))
+    run_policy("export", name, "--out", str(file))
     deployed = read_deployed(file)
     assert (deployed.contract.observe, deployed.contract.more["contacts"]) == ("force_torque", CONTACTS["firm"])
     # What a hand measures or is told is all that it reads: nothing but touch is asked for.
     assert list(deployed.contract.inputs) == ["proprio", "command", "tactile"]
     assert list(deployed.require({"tactile"})) == ["tactile"]
     with pytest.raises(UsageError, match=r"no longer shipped; 'in_palm_rotate\.student'"):
-        _run("play", "in_palm_rotate", "--agent", "in_palm_rotate.force-torque-hand")
+        run_policy("play", "in_palm_rotate", "--agent", "in_palm_rotate.force-torque-hand")

@@ -9,48 +9,19 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from typer.testing import CliRunner
 
-from brainbench.cli import app
-
-SMALL = """
-from dataclasses import replace
-from robotics_bridge import tasks
-
-@tasks.register("quick")
-def quick() -> tasks.Task:
-    task = tasks.load("in_palm_rotate")
-    return replace(task, name="quick", episode=0.1,
-                   teacher=replace(task.teacher, hidden=(8,), epochs=1, minibatches=1, steps_per_env=4))
-"""
-
-
-@pytest.fixture
-def quick(tmp_path: Path) -> Path:
-    from robotics_bridge import tasks
-
-    file = tmp_path / "quick.py"
-    file.write_text(SMALL)
-    if "quick" in tasks.list_tasks():
-        tasks.forget("quick")
-    return file
-
-
-def _run(*arguments: str) -> str:
-    result = CliRunner().invoke(app, ["policy", *arguments], catch_exceptions=False)
-    assert result.exit_code == 0, result.output
-    return result.stdout
+from tests.factories.policy_commands import run_policy
 
 
 def test_tasks_are_listed() -> None:
-    found = json.loads(_run("tasks", "--json"))
+    found = json.loads(run_policy("tasks", "--json"))
     assert {"in_palm_rotate", "in_hand_repose", "screwdriver", "hot_ball"} <= {row["task"] for row in found}
 
 
 def test_what_a_shipped_policy_did_is_told_in_goals_turns_and_drops() -> None:
     words = ("play", "in_palm_rotate", "--agent", "in_palm_rotate.teacher", "--seconds", "2", "--seed", "2")
-    told = {line.split("  ")[0]: line.split("  ")[-1].strip() for line in _run(*words).splitlines()}
-    found = json.loads(_run(*words, "--json"))
+    told = {line.split("  ")[0]: line.split("  ")[-1].strip() for line in run_policy(*words).splitlines()}
+    found = json.loads(run_policy(*words, "--json"))
     assert int(told["goals reached"]) == found["goals"] >= 1
     assert told["turned"].startswith(f"{found['turned']:.2f} rad")
     assert told["dropped"].startswith("0")
@@ -75,7 +46,7 @@ def test_a_policy_that_plays_forgets_an_episode_that_ended(quick: Path, monkeypa
             steps.append(0)
 
     monkeypatch.setattr("brainbench.cli.policy.play.agent_of", Remembering)
-    _run("play", "quick", "--task-file", str(quick), "--seconds", "0.25")
+    run_policy("play", "quick", "--task-file", str(quick), "--seconds", "0.25")
     assert steps == [4, 4, 2]
 
 
@@ -113,7 +84,7 @@ for line in lines:
 
 
 def test_shipped_policies_are_listed_with_the_contacts_that_they_were_trained_in() -> None:
-    found = {row["task"]: row["contacts"] for row in json.loads(_run("tasks", "--json"))}["in_palm_rotate"]
+    found = {row["task"]: row["contacts"] for row in json.loads(run_policy("tasks", "--json"))}["in_palm_rotate"]
     assert found == {"in_palm_rotate.teacher": "firm", "in_palm_rotate.student": "firm"}
-    told = [line.split() for line in _run("tasks").splitlines() if line.startswith("in_palm_rotate.")]
+    told = [line.split() for line in run_policy("tasks").splitlines() if line.startswith("in_palm_rotate.")]
     assert {name: model for name, _, model, *_ in told} == found

@@ -10,39 +10,12 @@ from brainbench.cli import app
 from brainbench.core.errors import UsageError
 from robotics_bridge import hands
 from robotics_bridge.hands.layouts import write_probes
-
-SMALL = """
-from dataclasses import replace
-from robotics_bridge import tasks
-
-@tasks.register("quick")
-def quick() -> tasks.Task:
-    task = tasks.load("in_palm_rotate")
-    return replace(task, name="quick", episode=0.1,
-                   teacher=replace(task.teacher, hidden=(8,), epochs=1, minibatches=1, steps_per_env=4))
-"""
-
-
-@pytest.fixture
-def quick(tmp_path: Path) -> Path:
-    from robotics_bridge import tasks
-
-    file = tmp_path / "quick.py"
-    file.write_text(SMALL)
-    if "quick" in tasks.list_tasks():
-        tasks.forget("quick")
-    return file
-
-
-def _run(*arguments: str) -> str:
-    result = CliRunner().invoke(app, ["policy", *arguments], catch_exceptions=False)
-    assert result.exit_code == 0, result.output
-    return result.stdout
+from tests.factories.policy_commands import run_policy
 
 
 def test_a_task_of_ones_own_is_trained_and_evaluated(tmp_path: Path, quick: Path) -> None:
     run = tmp_path / "run"
-    out = _run(
+    out = run_policy(
         "train", "quick", "--task-file", str(quick), "--envs", "2", "--iterations", "1", "--out", str(run), "--json"
     )
     assert json.loads(out)["control_steps"] == 8
@@ -50,7 +23,7 @@ def test_a_task_of_ones_own_is_trained_and_evaluated(tmp_path: Path, quick: Path
 
     tasks.forget("quick")
     arguments = ["quick", str(run), "--task-file", str(quick), "--envs", "2", "--episodes", "2", "--seeds", "1"]
-    found = json.loads(_run("evaluate", *arguments, "--json"))
+    found = json.loads(run_policy("evaluate", *arguments, "--json"))
     assert [row["agent"] for row in found] == ["zero", "random", str(run)]
     assert {row["contacts"] for row in found} == {"firm"}
     assert all(row["episodes"] == 2 for row in found)
@@ -58,7 +31,7 @@ def test_a_task_of_ones_own_is_trained_and_evaluated(tmp_path: Path, quick: Path
     student = ("--task-file", str(quick), "--envs", "2", "--iterations", "1", "--episodes", "0", "--json")
     senses = ("--observe", "agg_bool", "--placement", "tips", "--encoder", "mlp")
     words = ("--teacher", str(run), *senses, *student, "--out", str(tmp_path / "student"))
-    assert json.loads(_run("distill", "quick", *words))["iterations"] == 1
+    assert json.loads(run_policy("distill", "quick", *words))["iterations"] == 1
 
 
 @pytest.mark.parametrize(
@@ -82,28 +55,30 @@ def test_settings_that_reach_nothing_are_refused(tmp_path: Path, words: tuple[st
 
 
 def test_sweep_counts_table_4_10() -> None:
-    counted = json.loads(_run("sweep", "--count", "--json"))
+    counted = json.loads(run_policy("sweep", "--count", "--json"))
     assert (counted["students"], counted["published"]) == (244, 214)
-    assert "244 students in table-4.10, all (214 without agg_bool)" in _run("sweep", "--count")
-    parts = [json.loads(_run("sweep", "--list", "--json", "--shard", f"{i}/3", "--subset", "types")) for i in range(3)]
+    assert "244 students in table-4.10, all (214 without agg_bool)" in run_policy("sweep", "--count")
+    parts = [
+        json.loads(run_policy("sweep", "--list", "--json", "--shard", f"{i}/3", "--subset", "types")) for i in range(3)
+    ]
     assert sum(map(len, parts)) == len({name for part in parts for name in part}) == 44
     with pytest.raises(UsageError, match="such as 0/4; received '4/4'"):
-        _run("sweep", "--shard", "4/4")
+        run_policy("sweep", "--shard", "4/4")
 
 
 @pytest.mark.slow
 def test_a_student_is_distilled_evaluated_and_exported(tmp_path) -> None:
     teacher = tmp_path / "teacher"
-    _run("train", "in_palm_rotate", "--out", teacher, "--envs", 2, "--iterations", 1, "--steps", 4)
+    run_policy("train", "in_palm_rotate", "--out", teacher, "--envs", 2, "--iterations", 1, "--steps", 4)
     common = ("--teacher", teacher, "--envs", 2, "--iterations", 1, "--episodes", 2)
     run = tmp_path / "students" / "one"
     found = json.loads(
-        _run(
+        run_policy(
             "distill", "in_palm_rotate", *common, "--observe", "agg_bool", "--placement", "tips", "--out", run, "--json"
         )
     )
     assert (found["status"], found["episodes"]) == ("finished", 6)
-    assert json.loads(_run("export", run, "--json"))["difference"] < 1e-4
+    assert json.loads(run_policy("export", run, "--json"))["difference"] < 1e-4
 
 
 @pytest.mark.slow
@@ -123,8 +98,10 @@ def test_a_student_of_any_touch_and_encoder_runs_to_the_recorded_episode(
     write_probes("own.json", hands.load("xhand1").layout("low", "tips"))
     teacher, task = ("--teacher", "in_palm_rotate.teacher"), "in_palm_rotate"
     small = ("--envs", 2, "--iterations", 1, "--episodes", 0)
-    _run("distill", task, *teacher, *small, *senses, *encoder, "--out", "run")
-    assert json.loads(_run("play", task, "--agent", "run", "--seconds", 0.1, "--json"))["agent"] == "run"
-    assert json.loads(_run("export", "run", "--json"))["difference"] < 1e-4
-    deployed = _run("deploy", "run/policy.onnx", "--shadow", "--seconds", 1, "--timeout", 1, "--record", "ep", "--json")
+    run_policy("distill", task, *teacher, *small, *senses, *encoder, "--out", "run")
+    assert json.loads(run_policy("play", task, "--agent", "run", "--seconds", 0.1, "--json"))["agent"] == "run"
+    assert json.loads(run_policy("export", "run", "--json"))["difference"] < 1e-4
+    deployed = run_policy(
+        "deploy", "run/policy.onnx", "--shadow", "--seconds", 1, "--timeout", 1, "--record", "ep", "--json"
+    )
     assert json.loads(deployed)["status"] == "finished"

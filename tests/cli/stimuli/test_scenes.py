@@ -1,39 +1,10 @@
 import json
+from pathlib import Path
 
 import pytest
 
 from brainbench.stimuli.stimulus_set import hash_stimulus_set, write_stimulus_set
 from tests.factories.recordings import make_stimuli
-
-SCENE = """
-description = "A pole before two whiskers"
-[array]
-whiskers = "C1,C2"
-[frames]
-first_ms = 1
-interval_ms = 5
-count = 10
-[[object]]
-shape = "cylinder"
-radius_mm = 1
-height_mm = 10
-position_mm = [12, 8, 3]
-velocity_mm_s = [0, -30, 0]
-friction = 0.3
-[[scene]]
-label = "whisking"
-[[scene]]
-label = "still"
-[scene.whisking]
-kind = "still"
-"""
-
-
-@pytest.fixture
-def scene(tmp_path):
-    path = tmp_path / "pole.toml"
-    path.write_text(SCENE)
-    return str(path)
 
 
 @pytest.mark.parametrize("command", ["list", "show", "simulate", "render", "plot"])
@@ -51,9 +22,9 @@ def test_show_prints_poses_and_motion_in_millimetres_and_degrees(run, scene):
     assert "10 from 1 ms every 5 ms" in out
 
 
-def test_show_says_how_fast_and_about_what_an_object_turns(run, tmp_path):
+def test_show_says_how_fast_and_about_what_an_object_turns(run, scene, tmp_path):
     path = tmp_path / "turning.toml"
-    path.write_text(SCENE.replace("velocity_mm_s = [0, -30, 0]", "spin_deg_s = [0, 30, -40]"))
+    path.write_text(Path(scene).read_text().replace("velocity_mm_s = [0, -30, 0]", "spin_deg_s = [0, 30, -40]"))
     assert "turns by 50°/s about (0, 30, -40)" in run("stimuli", "show", str(path)).out
 
 
