@@ -69,7 +69,7 @@ _AVERAGED = "split halves averaged before the correction instead of after"
 
 
 @dataclass(frozen=True)
-class Step:
+class WalkStep:
     """One line of the walk."""
 
     change: str
@@ -120,7 +120,7 @@ def add_walk(inputs: Any, *, progress: Progress | None = None) -> dict[str, Any]
     return {"estimator_walk": to_plain(explain_score(rdms, inputs.animals))}
 
 
-def explain_file(path: str | Path) -> tuple[Step, ...]:
+def explain_file(path: str | Path) -> tuple[WalkStep, ...]:
     """Walk through the split halves in an ``.npz`` file: arrays ``r_xy``, ``r_yy`` and maybe ``r_xx``.
 
     Raises:
@@ -140,7 +140,7 @@ def explain_file(path: str | Path) -> tuple[Step, ...]:
     return explain_splits(arrays["r_xy"], arrays["r_yy"], r_xx=arrays.get("r_xx"))
 
 
-def explain_splits(r_xy: ArrayLike, r_yy: ArrayLike, *, r_xx: ArrayLike | None = None) -> tuple[Step, ...]:
+def explain_splits(r_xy: ArrayLike, r_yy: ArrayLike, *, r_xx: ArrayLike | None = None) -> tuple[WalkStep, ...]:
     """Walk through stored split halves of one model and one target, from the published bars to the default.
 
     Arguments are those of :func:`corrected_value`.
@@ -166,7 +166,7 @@ def explain_splits(r_xy: ArrayLike, r_yy: ArrayLike, *, r_xx: ArrayLike | None =
         detail = f"{used:,} of {len(halves):,} splits"
         if switches.ratio_per_split and not switches.drop_splits:
             detail += f"; {negative} with negative reliability have no real ratio and vanish"
-        steps.append(Step(change, value, "ok" if math.isfinite(value) else "undefined", detail, switches))
+        steps.append(WalkStep(change, value, "ok" if math.isfinite(value) else "undefined", detail, switches))
     value, status = steps[-1].value, "ok" if reliability >= RELIABILITY_GATE else "unreliable"
     detail = f"reliability {reliability:.2f}"
     if not reliability > 0:
@@ -175,10 +175,10 @@ def explain_splits(r_xy: ArrayLike, r_yy: ArrayLike, *, r_xx: ArrayLike | None =
         detail += f" is at least {RELIABILITY_GATE}"
     else:
         detail += f" is below {RELIABILITY_GATE}: no correction of these data is trustworthy"
-    return (*steps, Step("gate on reliability: the default", value, status, detail, CORRECTED))
+    return (*steps, WalkStep("gate on reliability: the default", value, status, detail, CORRECTED))
 
 
-def explain_score(layer_rdms: Mapping[str, ArrayLike], subjects: Sequence[SubjectRDM]) -> tuple[Step, ...]:
+def explain_score(layer_rdms: Mapping[str, ArrayLike], subjects: Sequence[SubjectRDM]) -> tuple[WalkStep, ...]:
     """Walk a model's score from the published estimator to the default one, on the same RDMs, by Pearson's r.
 
     The published pool of all animals' units is represented by their mean RDM and halves.
@@ -204,7 +204,7 @@ def explain_score(layer_rdms: Mapping[str, ArrayLike], subjects: Sequence[Subjec
     return tuple(_step(change, switches, rdms, usable) for change, switches in walk)
 
 
-def _step(change: str, switches: Switches, rdms: Floats, subjects: list[SubjectRDM]) -> Step:
+def _step(change: str, switches: Switches, rdms: Floats, subjects: list[SubjectRDM]) -> WalkStep:
     targets = [(subject.subject, subject.rdm, subject.split_half_by("pearson")) for subject in subjects]
     if not switches.no_gate:
         trusted = [float(spearman_brown(r[np.isfinite(r)].mean())) >= RELIABILITY_GATE for _, _, r in targets]
@@ -217,24 +217,26 @@ def _step(change: str, switches: Switches, rdms: Floats, subjects: list[SubjectR
         agreement = compare(halves[:, 0], halves[:, 1])
         targets.append(("the pool", np.mean([subject.rdm for subject in subjects], axis=0), agreement))
     if not targets:
-        return Step(change, math.nan, "undefined", "no animal is reliable", switches)
+        return WalkStep(change, math.nan, "undefined", "no animal is reliable", switches)
     r = compare(rdms[:, None], np.stack([target[1] for target in targets])[None])
     # A correction is a factor of the raw comparison: one per target.
     corrections = [corrected_value(1.0, target[2], switches) for target in targets]
     factors = np.array([item[0] for item in corrections])
     finite = np.isfinite(factors)
     if not finite.any():
-        return Step(change, math.nan, "undefined", "no split half has a positive reliability", switches)
+        return WalkStep(change, math.nan, "undefined", "no split half has a positive reliability", switches)
     names = [target[0] for target, keep in zip(targets, finite, strict=True) if keep]
     used = sum(item[1] for item in corrections)
     values = (r * factors)[:, finite]
     detail = f"{len(names)} of {len(targets)} targets, {used:,} splits"
     if switches.best_target:
         place = int(np.argmax(values.max(axis=0)))
-        return Step(change, float(values.max()), "ok", f"{detail}; the best is {names[place]}", switches)
+        return WalkStep(change, float(values.max()), "ok", f"{detail}; the best is {names[place]}", switches)
     if switches.best_layer or len(rdms) == 1:
-        return Step(change, float(values.mean(axis=1).max()), "ok", detail, switches)
+        return WalkStep(change, float(values.mean(axis=1).max()), "ok", detail, switches)
     if len(names) == 1:
-        return Step(change, math.nan, "undefined", "one animal: the default chooses on halves of its trials", switches)
+        return WalkStep(
+            change, math.nan, "undefined", "one animal: the default chooses on halves of its trials", switches
+        )
     value = float((held_out(r[:, finite]) * factors[finite]).mean())
-    return Step(change, value, "ok", detail, switches)
+    return WalkStep(change, value, "ok", detail, switches)

@@ -13,7 +13,7 @@ from brainbench.core.figures.style import DOTS_PER_INCH, INK, PALE, new_figure, 
 from brainbench.stimuli.figures import canvas
 from brainbench.stimuli.figures.camera import Camera, Lens
 from brainbench.stimuli.figures.canvas import MOMENT_MAP, ROW_COLORS, UNSTABLE_COLOR, Style, round_up
-from brainbench.stimuli.figures.rays import Layer, Triangles, draw, floor, lamp, paint, shade
+from brainbench.stimuli.figures.rays import Triangles, VisibleSurface, draw, floor, lamp, paint, shade
 from brainbench.stimuli.figures.surfaces import DrawnSurface, ball, object_surface, smoothed, tube
 from brainbench.stimuli.whisker_shapes import Recording
 from brainbench.stimuli.whiskers.selection import ROWS
@@ -33,7 +33,7 @@ class Picture:
         self.style = style or Style()
         self._surfaces: list[DrawnSurface] = [object_surface(item) for item in recording.scene.objects]
         self._still = all(surface.motion is None for surface in self._surfaces)
-        self._cached: tuple[Triangles, Layer] | None = None
+        self._cached: tuple[Triangles, VisibleSurface] | None = None
 
     @cached_property
     def lens(self) -> Lens:
@@ -70,7 +70,7 @@ class Picture:
         total = sum(image[row::factor, column::factor] for row in range(factor) for column in range(factor))
         return np.round(255 / factor**2 * np.asarray(total)).astype(np.uint8)
 
-    def _objects(self, index: int, lens: Lens) -> tuple[Triangles, Layer]:
+    def _objects(self, index: int, lens: Lens) -> tuple[Triangles, VisibleSurface]:
         """Return the triangles of the objects and what the camera sees of them; found once when nothing moves."""
         if self._cached is not None and self._still:
             return self._cached

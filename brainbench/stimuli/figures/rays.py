@@ -115,7 +115,7 @@ class RayTree:
 
 
 @dataclass(frozen=True, eq=False)
-class Layer:
+class VisibleSurface:
     """What is visible of some triangles at the pixels of a picture."""
 
     nearness: NDArray[np.float64]
@@ -130,7 +130,7 @@ class Layer:
     """[n, 3] colours."""
 
 
-def draw(triangles: Triangles, lens: Lens) -> Layer:
+def draw(triangles: Triangles, lens: Lens) -> VisibleSurface:
     """Find the nearest triangle at each pixel, and point, normal and colour there."""
     face, weights = RayTree(triangles.corners, lens.target, lens.width).first_hits(lens)
     pixels = np.flatnonzero(face >= 0)
@@ -145,7 +145,7 @@ def draw(triangles: Triangles, lens: Lens) -> Layer:
     length = np.where(np.sum(normals * towards, axis=1) < 0, -length, length)
     normals /= length[:, None].astype(np.float32)
     grid = nearness.reshape(lens.size[1], lens.size[0])
-    return Layer(grid, pixels, points, normals, triangles.colors.astype(np.float32)[face])
+    return VisibleSurface(grid, pixels, points, normals, triangles.colors.astype(np.float32)[face])
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,7 +192,9 @@ def lamp(lens: Lens, samples: int, points: NDArray[np.float64], triangles: Trian
     return Light(RayTree(triangles.corners, lens.target, lens.width), fitted.axes, 1 / fitted.scale, strength)
 
 
-def shade(layer: Layer, lens: Lens, light: Light, *, gloss: float = 0.0, bias: float = 4.0) -> NDArray[np.float64]:
+def shade(
+    layer: VisibleSurface, lens: Lens, light: Light, *, gloss: float = 0.0, bias: float = 4.0
+) -> NDArray[np.float64]:
     """Return the colours [n, 3] of a layer's pixels: diffuse, with shadows and a highlight of strength ``gloss``."""
     facing = layer.normals @ light.direction.astype(np.float32)
     lit = np.zeros(len(facing), dtype=np.float32)
@@ -235,7 +237,7 @@ def floor(lens: Lens, light: Light, height: float) -> NDArray[Any]:
     return bright - shadow.repeat(2, axis=0).repeat(2, axis=1)[:rows, :width]
 
 
-def paint(layer: Layer, colors: NDArray[Any], background: NDArray[Any], opacity: float = 1.0) -> None:
+def paint(layer: VisibleSurface, colors: NDArray[Any], background: NDArray[Any], opacity: float = 1.0) -> None:
     """Lay the colours [n, 3] of a layer over ``background`` [H, W, 3], in place."""
     flat = background.reshape(-1, 3)
     flat[layer.pixels] = opacity * colors + (1 - opacity) * flat[layer.pixels]

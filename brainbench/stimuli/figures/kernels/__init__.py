@@ -1,0 +1,1 @@
+"""Kernels of pictures: rays against the triangles of a scene."""
