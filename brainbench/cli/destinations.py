@@ -8,7 +8,7 @@ from typing import Any
 
 import typer
 
-from brainbench.core.errors import UsageError, check_name, missing_dependency, shown
+from brainbench.core.errors import UsageError, brief, check_name, missing_dependency
 from brainbench.core.figures.style import check_format
 from brainbench.core.files import check_folder
 
@@ -58,7 +58,7 @@ def report_file(path: Path | None) -> Path | None:
     if not kind:
         allowed = ", ".join(f".{name}" for name in FORMATS)
         raise UsageError(
-            f"--report names {shown(str(path))}, which has no ending; give a file that ends in one of {allowed}, or "
+            f"--report names {brief(str(path))}, which has no ending; give a file that ends in one of {allowed}, or "
             "leave --report out for no report."
         )
     check_name("report format", kind, FORMATS, hint="The ending of --report chooses it.")
@@ -69,6 +69,6 @@ def report_file(path: Path | None) -> Path | None:
 
 def _file(path: Path, option: str) -> Path:
     if path.is_dir():
-        raise UsageError(f"{option} names {shown(str(path))}, which is a folder; name a file in it.")
+        raise UsageError(f"{option} names {brief(str(path))}, which is a folder; name a file in it.")
     check_folder(path.parent, option)
     return path

@@ -25,7 +25,7 @@ import typer
 
 from brainbench.cli.output import Output
 from brainbench.core import limits
-from brainbench.core.errors import UsageError, shown
+from brainbench.core.errors import UsageError, brief
 from brainbench.core.limits import bounds_of, check_value
 
 WorkersOption = Annotated[int | None, typer.Option(min=1, help="Processes. [default: as many as there are processors]")]
@@ -285,7 +285,7 @@ def numbers(text: str, what: str, kind: Callable[[str], Any] = int, *, count: in
         values, fault = (), error
     if fault is not None or count not in (None, len(values)) or not all(map(math.isfinite, values)):
         of = f"{count} numbers" if count is not None else "whole numbers" if kind is int else "numbers"
-        raise UsageError(f"{what} takes {of} joined by commas; received {shown(text)}.") from fault
+        raise UsageError(f"{what} takes {of} joined by commas; received {brief(text)}.") from fault
     return values
 
 
@@ -293,7 +293,7 @@ def part_of(text: str, what: str) -> tuple[int, int]:
     """Return the number and the count of ``NUMBER/COUNT``, the number from 0."""
     number, _, count = text.partition("/")
     if not re.fullmatch(r"\d{1,9}/\d{1,9}", text) or int(number) >= int(count):
-        raise UsageError(f"{what} NUMBER/COUNT, the number from 0, such as 0/4; received {shown(text)}.")
+        raise UsageError(f"{what} NUMBER/COUNT, the number from 0, such as 0/4; received {brief(text)}.")
     return int(number), int(count)
 
 

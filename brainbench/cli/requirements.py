@@ -16,7 +16,7 @@ from typing import Any
 import typer
 
 from brainbench.cli.output import Output, printed
-from brainbench.core.errors import FileWriteError, UsageError, missing_dependency, shown
+from brainbench.core.errors import FileWriteError, UsageError, brief, missing_dependency
 from brainbench.core.files import CACHE_VARIABLE, cache_dir
 
 
@@ -114,7 +114,7 @@ def check_cache() -> None:
     folder = cache_dir()
     if not os.access(folder, os.W_OK | os.X_OK):
         raise FileWriteError(
-            f"The cache folder {shown(str(folder))} may not be written by this user; name another with the environment "
+            f"The cache folder {brief(str(folder))} may not be written by this user; name another with the environment "
             f"variable {CACHE_VARIABLE}."
         )
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from brainbench.core.errors import MissingDependencyError, UsageError, shown
+from brainbench.core.errors import MissingDependencyError, UsageError, brief
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -97,7 +97,7 @@ def pick_device(name: Any) -> Any:
     if name == "auto":
         name = "cuda" if not wp.is_cpu_available() and wp.is_cuda_available() else "cpu"
     if not re.fullmatch(r"cpu|cuda(:\d{1,9})?", name):
-        raise UsageError(f"A device is 'cpu', 'cuda' or 'cuda:N'; received {shown(name)}.")
+        raise UsageError(f"A device is 'cpu', 'cuda' or 'cuda:N'; received {brief(name)}.")
     if name != "cpu" and int(name.partition(":")[2] or 0) >= (count := wp.get_cuda_device_count()):
         raise UsageError(f"There are {count} CUDA devices here, so {name!r} cannot be used; use 'cpu' or another one.")
     if name == "cpu" and not wp.is_cpu_available():

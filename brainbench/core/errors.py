@@ -40,10 +40,10 @@ class MissingDependencyError(BrainbenchError, ImportError):
     """An optional package is needed for what was asked."""
 
 
-def shown(value: object, *, quoted: bool = True, most: int = 80) -> str:
+def brief(value: object, *, quoted: bool = True, most: int = 80) -> str:
     """Return a value for a message, cut after ``most`` characters; the end of a path is what tells it apart.
 
-    >>> shown("a" * 100, most=10)
+    >>> brief("a" * 100, most=10)
     "'aaaaaaaaaa…'"
     """
     if getattr(value, "ndim", None) == 0:
@@ -84,7 +84,7 @@ def listing(options: Iterable[str], *, limit: int = 12, quoted: bool = True) -> 
     "'a', 'b' and 1 more"
     """
     choices = list(options)
-    text = ", ".join(shown(choice) if quoted else choice for choice in choices[:limit])
+    text = ", ".join(brief(choice) if quoted else choice for choice in choices[:limit])
     if len(choices) > limit:
         text += f" and {len(choices) - limit} more"
     return text if choices else "none"
@@ -98,8 +98,8 @@ def unknown_name(kind: str, name: object, options: Iterable[str], *, hint: str =
     """
     choices = [str(option) for option in options]
     guess = nearest(name, choices) if isinstance(name, str) and len(name) < 200 else None
-    suggestion = f"; did you mean {shown(guess)}?" if guess else "."
-    text = f"Unknown {kind} {shown(name)}{suggestion} Allowed: {listing(choices)}."
+    suggestion = f"; did you mean {brief(guess)}?" if guess else "."
+    text = f"Unknown {kind} {brief(name)}{suggestion} Allowed: {listing(choices)}."
     return UsageError(f"{text} {hint}".rstrip())
 
 
@@ -128,7 +128,7 @@ def repeats(names: Iterable[Hashable]) -> list[Any]:
 def check_kind(name: str, value: object, kind: type | tuple[type, ...], wanted: str) -> None:
     """Raise a :class:`UsageError` unless a value is of a kind, of which ``wanted`` is an example."""
     if not isinstance(value, kind):
-        raise UsageError(f"The {name} must be {wanted}; received {shown(value)} ({type(value).__name__}).")
+        raise UsageError(f"The {name} must be {wanted}; received {brief(value)} ({type(value).__name__}).")
 
 
 def check_once(where: str, names: Iterable[str]) -> None:

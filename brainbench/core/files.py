@@ -14,7 +14,7 @@ from dataclasses import Field, fields, is_dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from brainbench.core.errors import FileWriteError, UsageError, shown
+from brainbench.core.errors import FileWriteError, UsageError, brief
 from brainbench.core.reading.texts import read_json, read_mapping  # noqa: F401 - also imported from here
 from brainbench.core.writing.temporaries import temporary_path
 
@@ -43,7 +43,7 @@ def cache_dir(*parts: str) -> Path:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise FileWriteError(
-            f"The cache folder {shown(str(path))} cannot be made ({error.strerror}); name a folder that can be written "
+            f"The cache folder {brief(str(path))} cannot be made ({error.strerror}); name a folder that can be written "
             f"with the environment variable {CACHE_VARIABLE}."
         ) from error
     return path
@@ -61,7 +61,7 @@ def check_folder(path: str | os.PathLike[str], option: str) -> None:
         place = place.parent
     fault = "is no folder" if not place.is_dir() else "may not be written by this user"
     if not (place.is_dir() and os.access(place, os.W_OK | os.X_OK)):
-        raise UsageError(f"{option} names {shown(os.fspath(path))}, and {shown(str(place))} {fault}; choose another.")
+        raise UsageError(f"{option} names {brief(os.fspath(path))}, and {brief(str(place))} {fault}; choose another.")
 
 
 @contextlib.contextmanager
@@ -72,7 +72,7 @@ def writable(target: str | os.PathLike[str]) -> Iterator[None]:
     except OSError as error:
         if error.errno not in _UNWRITABLE:
             raise
-        raise FileWriteError(f"{shown(os.fspath(target))} cannot be written ({os.strerror(error.errno)}).") from error
+        raise FileWriteError(f"{brief(os.fspath(target))} cannot be written ({os.strerror(error.errno)}).") from error
 
 
 @contextlib.contextmanager

@@ -26,7 +26,7 @@ from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
 import msgspec
 
-from brainbench.core.errors import UsageError, check_name, shown
+from brainbench.core.errors import UsageError, brief, check_name
 from brainbench.core.reading.ranges import check_number
 
 Check = Callable[[str, Any], None]
@@ -214,7 +214,7 @@ def _number(whole: bool, limit: msgspec.Meta) -> Check:
 
 def _check_truth(name: str, value: Any) -> None:
     if type(value).__name__ not in ("bool", "bool_"):  # NumPy has its own
-        raise UsageError(f"{name} must be True or False; received {shown(value)}.")
+        raise UsageError(f"{name} must be True or False; received {brief(value)}.")
 
 
 def _union(kinds: Sequence[Any]) -> Check | None:
@@ -251,7 +251,7 @@ def _values(fixed: bool, kinds: Sequence[Any], limit: msgspec.Meta) -> Check | N
         several = isinstance(value, Iterable) and not isinstance(value, str | bytes | Mapping | Iterator)
         values = list(value) if several else []
         if not several or (fixed and len(values) != len(checks)):
-            raise UsageError(f"{name} holds {f'{len(checks)} {noun}' if fixed else noun}; received {shown(value)}.")
+            raise UsageError(f"{name} holds {f'{len(checks)} {noun}' if fixed else noun}; received {brief(value)}.")
         _check_length(name, values, limit, "values")
         for inner, limited in zip(values, checks if fixed else checks * len(values), strict=True):
             if limited is not None:
@@ -264,4 +264,4 @@ def _check_length(name: str, value: Any, limit: msgspec.Meta, noun: str) -> None
     shortest, longest = limit.min_length or 0, limit.max_length or math.inf
     if not shortest <= len(value) <= longest:
         words = [f"at least {shortest:,}"] * (shortest > 0) + [f"at most {longest:,}"] * (longest < math.inf)
-        raise UsageError(f"{name} holds {' and '.join(words)} {noun}; received {shown(value)}.")
+        raise UsageError(f"{name} holds {' and '.join(words)} {noun}; received {brief(value)}.")

@@ -11,7 +11,7 @@ from dataclasses import fields, is_dataclass, replace
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
-from brainbench.core.errors import UsageError, check_name, check_once, shown
+from brainbench.core.errors import UsageError, brief, check_name, check_once
 from brainbench.core.limits import annotation_of
 
 T = TypeVar("T")
@@ -27,7 +27,7 @@ def read_pairs(words: Iterable[str], where: str, example: str) -> dict[str, str]
     for word in words:
         name, sign, text = (part.strip() for part in word.partition("="))
         if not (name and sign):
-            raise UsageError(f"{where} takes name=value, such as {example}; received {shown(word)}.")
+            raise UsageError(f"{where} takes name=value, such as {example}; received {brief(word)}.")
         pairs.append((name, text))
     check_once(where, [name for name, _ in pairs])
     return dict(pairs)
@@ -54,8 +54,8 @@ def read_value(name: str, text: str, annotation: Any, present: Any = None) -> An
         except (KeyError, ValueError):
             continue
     words = " or ".join(_words(kind) for kind in readable)
-    now = "" if present is None else f", for instance {shown(present)}"
-    raise UsageError(f"{name!r} takes {words}{now}; received {shown(text)}.")
+    now = "" if present is None else f", for instance {brief(present)}"
+    raise UsageError(f"{name!r} takes {words}{now}; received {brief(text)}.")
 
 
 def kind_of(value: Any) -> Any:
@@ -72,7 +72,7 @@ def _changed(options: Any, path: list[str], text: str) -> Any:
     if not rest:
         return replace(options, **{first: read_value(first, text, annotation_of(type(options), first), present)})
     if not is_dataclass(present):
-        raise UsageError(f"{first!r} has no parts; received {shown('.'.join(path))}.")
+        raise UsageError(f"{first!r} has no parts; received {brief('.'.join(path))}.")
     return replace(options, **{first: _changed(present, rest, text)})
 
 

@@ -37,7 +37,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from brainbench.core.contracts import check_counts
-from brainbench.core.errors import DataError, UsageError, shown
+from brainbench.core.errors import DataError, UsageError, brief
 from brainbench.core.files import atomic_path, to_json
 from brainbench.core.reading.texts import parse_json
 from brainbench.datasets.sessions import SPIKES, Session, SessionTable, decode, text
@@ -84,7 +84,7 @@ def holds_counts(file: h5py.File, path: Path) -> bool:
         later = isinstance(version, (int, np.integer)) and version > VERSION
         newer = " A newer brainbench wrote it: update this one." if later else ""
         raise DataError(
-            f"{path} is {FORMAT} version {shown(version)}, kind {shown(kind)}; this brainbench reads "
+            f"{path} is {FORMAT} version {brief(version)}, kind {brief(kind)}; this brainbench reads "
             f"version {VERSION}, kinds 'spikes' and 'counts'.{newer}"
         )
     return kind == "counts"
@@ -150,7 +150,7 @@ def _write_sessions(file: h5py.File, sessions: list[Session]) -> None:
     root = file.create_group("sessions")
     for session in sessions:
         if not isinstance(session, Session):
-            raise UsageError(f"Recordings are a data set or sessions of make_session; received {shown(session)}.")
+            raise UsageError(f"Recordings are a data set or sessions of make_session; received {brief(session)}.")
         name = f"{session.subject}-{session.session}".replace("/", "_")
         if name in root:
             raise UsageError(f"Two sessions are called {name!r}; give each its own session name.")

@@ -13,7 +13,7 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, nearest, shown, unknown_name
+from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, brief, nearest, unknown_name
 from brainbench.core.plugins import load_optional
 from brainbench.core.reading.hdf5 import open_hdf5
 from brainbench.core.reading.regular import check_file
@@ -53,7 +53,7 @@ def find_recordings(source: Source) -> tuple[RecordingLayout | None, list[Path]]
     DataFileNotFoundError: the source names nothing; UsageError: it names an unknown layout, or a layout and no file.
     """
     if not isinstance(source, (str, os.PathLike, Sequence)):
-        raise UsageError(f"Recordings are a file, a folder, a glob or a list of these; received {shown(source)}.")
+        raise UsageError(f"Recordings are a file, a folder, a glob or a list of these; received {brief(source)}.")
     prefix, colon, rest = source.partition(":") if isinstance(source, str) else ("", "", "")
     in_file = prefix.endswith(".py")
     if not colon or not (in_file or is_name(prefix)) or Path(str(source)).exists():

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.errors import DataError, UsageError, check_name, shown, unknown_name
+from brainbench.core.errors import DataError, UsageError, brief, check_name, unknown_name
 
 SPIKES = "spike_times"
 OBSERVED = "obs_intervals"
@@ -231,7 +231,7 @@ def make_session(
             datetime.fromisoformat(start)
         except ValueError:
             raise UsageError(
-                f"A session starts at a time of ISO 8601, such as 2025-01-31T12:00:00+00:00; received {shown(start)}."
+                f"A session starts at a time of ISO 8601, such as 2025-01-31T12:00:00+00:00; received {brief(start)}."
             ) from None
     data: dict[str, Any] = {"id": np.arange(len(spikes))}
     data |= {name: np.asarray(values) for name, values in (unit_columns or {}).items()}

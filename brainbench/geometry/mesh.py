@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from brainbench.core.errors import DataError, UsageError, check_name, shown, unknown_name
+from brainbench.core.errors import DataError, UsageError, brief, check_name, unknown_name
 from brainbench.core.reading.ranges import check_number
 from brainbench.core.reading.regular import check_file, readable
 
@@ -166,7 +166,7 @@ class Mesh:
         if turn.shape != (3, 3) or not np.allclose(turn @ turn.T, np.eye(3), atol=1e-5) or np.linalg.det(turn) < 0:
             raise UsageError(
                 "A mesh is turned by a rotation matrix [3, 3], orthonormal with determinant 1; "
-                f"received {shown(turn.tolist())}."
+                f"received {brief(turn.tolist())}."
             )
         return Mesh(self.vertices @ turn.T + np.asarray(translation), self.faces, self.name)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass, replace
 
-from brainbench.core.errors import UsageError, shown
+from brainbench.core.errors import UsageError, brief
 
 OBJECTIVES = ("supervised", "simclr", "simsiam", "ae")
 """Tags of trained weights: the objective they were trained with."""
@@ -90,4 +90,4 @@ def is_path(name: str) -> bool:
 def check_new_name(name: str) -> None:
     """Raise UsageError unless a model can be registered under a name."""
     if not _NEW.fullmatch(name):
-        raise UsageError(f"A model name is lower-case letters and digits joined by '-' or '+'; received {shown(name)}.")
+        raise UsageError(f"A model name is lower-case letters and digits joined by '-' or '+'; received {brief(name)}.")

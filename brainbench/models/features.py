@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from brainbench.core.errors import DataError, listing, repeats, shown
+from brainbench.core.errors import DataError, brief, listing, repeats
 from brainbench.core.reading.hdf5 import open_hdf5
 
 if TYPE_CHECKING:
@@ -91,11 +91,11 @@ def _layers(group: h5py.Group, rows: int, path: str) -> dict[str, NDArray[np.flo
         values = node.astype(np.float32 if single else np.float64)[()]
         if whole and (np.abs(values) >= 2**53).any():
             raise DataError(
-                f"Layer {shown(name)} of {shown(path)} has whole numbers of 2**53 or more, which floating point "
+                f"Layer {brief(name)} of {brief(path)} has whole numbers of 2**53 or more, which floating point "
                 "rounds; scale them or write them as floating point."
             )
         if infinite := int(np.isinf(values).sum()):
-            raise DataError(f"Layer {shown(name)} of {shown(path)} has {infinite:,} infinite values; use NaN for none.")
+            raise DataError(f"Layer {brief(name)} of {brief(path)} has {infinite:,} infinite values; use NaN for none.")
         # NaN is a missing value: the layer is scored on the rest, or its score is undefined and says so.
         layers[name.replace("\N{DIVISION SLASH}", "/")] = values[:, None, :] if values.ndim == 2 else values
 

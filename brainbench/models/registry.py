@@ -21,7 +21,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from brainbench.core.errors import UsageError, shown, unknown_name
+from brainbench.core.errors import UsageError, brief, unknown_name
 from brainbench.core.files import read_mapping
 from brainbench.core.plugins import load_entry_points
 from brainbench.models.architecture import OBJECTIVES, Architecture, check_new_name
@@ -184,7 +184,7 @@ class LocatedModel:
 def locate_model(name: str, pretrained: str | os.PathLike[str] | None = None) -> LocatedModel:
     """Find what a name stands for, without building anything; arguments and errors are those of :func:`load_model`."""
     if not isinstance(name, str):
-        raise UsageError(f"A model's name is a text; received {shown(name)}.")
+        raise UsageError(f"A model's name is a text; received {brief(name)}.")
     is_path = name.startswith(PREFIXES)
     if is_path and pretrained is not None:
         raise UsageError(f"{name!r} already names trained weights; pretrained is for registry names with a tag.")

@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 
-from brainbench.core.errors import DataError, UsageError, listing, shown
+from brainbench.core.errors import DataError, UsageError, brief, listing
 from brainbench.core.files import file_hash
 from brainbench.core.reading.tensors import check_stored, read_checkpoint, read_tensors
 from brainbench.core.reading.texts import read_mapping
@@ -57,7 +57,7 @@ def read_weights(path: str | os.PathLike[str]) -> ForeignWeights:
     has_names = isinstance(state, Mapping) and all(isinstance(name, str) for name in state)
     if not has_names or not state or not all(isinstance(value, torch.Tensor) for value in state.values()):
         raise DataError(
-            f"{shown(os.fspath(path))} holds no weights: expected tensors by name, or such a mapping as 'state_dict'; "
+            f"{brief(os.fspath(path))} holds no weights: expected tensors by name, or such a mapping as 'state_dict'; "
             f"found {listing(map(str, content)) if content else 'nothing'}."
         )
     check_stored(state, os.fspath(path))
@@ -83,7 +83,7 @@ def read_settings(path: str | os.PathLike[str]) -> Settings:
             cell = cell_name + ("-ln" if "ln" in words else "")
     if cell is None and objective is None:
         raise DataError(
-            f"{shown(os.fspath(path))} says nothing of a network: expected 'model.encoder.model_config_file', "
+            f"{brief(os.fspath(path))} says nothing of a network: expected 'model.encoder.model_config_file', "
             f"'train.ssl' or a graph's 'nodes'; found {listing(map(str, values)) if values else 'nothing'}."
         )
     return Settings(cell, objective)

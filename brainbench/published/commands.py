@@ -213,14 +213,14 @@ def import_model(
     from brainbench.published.checkpoint_import import import_checkpoint
 
     with progress_bar("importing the weights"):
-        made = import_checkpoint(file, architecture=architecture, config=config, out=out)
-    left = ", ".join(f"{part} ({count} entries)" for part, count in made.not_imported.items())
-    shown = {
-        "architecture": made.architecture,
-        "decoder": made.decoder or "not in the file: drawn from seed 0",
-        "objective": made.objective or "not told by the file",
-        "parameters in the file": f"{made.parameters:,}",
+        imported = import_checkpoint(file, architecture=architecture, config=config, out=out)
+    left = ", ".join(f"{part} ({count} entries)" for part, count in imported.not_imported.items())
+    summary = {
+        "architecture": imported.architecture,
+        "decoder": imported.decoder or "not in the file: drawn from seed 0",
+        "objective": imported.objective or "not told by the file",
+        "parameters in the file": f"{imported.parameters:,}",
         "not part of the network": left or "nothing",
-        "score it with": f"brainbench score {made.name}",
+        "score it with": f"brainbench score {imported.name}",
     }
-    return Output(made, facts(shown))
+    return Output(imported, facts(summary))

@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from brainbench.core.errors import DataError, UsageError, shown
+from brainbench.core.errors import DataError, UsageError, brief
 from brainbench.core.files import to_plain
 from brainbench.core.progress import Progress
 from brainbench.core.reading.archives import read_npz
@@ -134,7 +134,7 @@ def explain_file(path: str | Path) -> tuple[WalkStep, ...]:
         fits = array.ndim == 0 or array.shape == (arrays["r_yy"].size,)
         if array.dtype.kind not in "fiu" or not fits or (np.abs(array) > 1 + 1e-6).any():
             raise DataError(
-                f"{name!r} in {shown(str(path))} is {list(array.shape)} of {array.dtype}; needed are as many "
+                f"{name!r} in {brief(str(path))} is {list(array.shape)} of {array.dtype}; needed are as many "
                 "correlations (-1 to 1, NaN for none) as 'r_yy' has."
             )
     return explain_splits(arrays["r_xy"], arrays["r_yy"], r_xx=arrays.get("r_xx"))

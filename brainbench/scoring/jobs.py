@@ -8,7 +8,7 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from brainbench.core.errors import DataError, UsageError, listing, shown, unknown_name
+from brainbench.core.errors import DataError, UsageError, brief, listing, unknown_name
 from brainbench.core.files import to_plain
 from brainbench.core.identity import ScoreIdentity
 from brainbench.core.provenance import Provenance
@@ -74,7 +74,7 @@ def find_models(patterns: Sequence[str]) -> list[str]:
         if any(mark in pattern for mark in "*?["):
             some = list_models() if Architecture.parse(pattern).tag is None else shipped()
             if not (alike := [name for name in some if fnmatchcase(name, pattern)]):
-                raise UsageError(f"No model matches {shown(pattern)}; see them with: brainbench models list")
+                raise UsageError(f"No model matches {brief(pattern)}; see them with: brainbench models list")
             matches |= dict.fromkeys(alike)
         elif pattern in names or is_path(pattern) or Architecture.parse(pattern).tag is not None:
             matches[pattern] = None
@@ -161,7 +161,7 @@ def parse_seeds(text: str) -> tuple[int, ...]:
                 raise ValueError("a range that ends before it begins")
             seeds += values
     except ValueError as error:
-        raise UsageError(f"Seeds are numbers and ranges such as 0-4 or 0,3; received {shown(text)}.") from error
+        raise UsageError(f"Seeds are numbers and ranges such as 0-4 or 0,3; received {brief(text)}.") from error
     return tuple(dict.fromkeys(seeds))
 
 
@@ -178,12 +178,12 @@ def read_batch(path: Path) -> list[ScoringJob]:
     jobs = []
     for entry in entries:
         if not isinstance(entry, dict) or set(entry) - {"models", "seeds"} or "models" not in entry:
-            raise DataError(f"An entry of {str(path)!r} has 'models' and maybe 'seeds'; received {shown(entry)}.")
+            raise DataError(f"An entry of {str(path)!r} has 'models' and maybe 'seeds'; received {brief(entry)}.")
         models, seeds = entry["models"], entry.get("seeds")
         if not isinstance(models, list) or not models or not all(isinstance(name, str) for name in models):
-            raise DataError(f"'models' of {str(path)!r} is a list of one or more names; received {shown(models)}.")
+            raise DataError(f"'models' of {str(path)!r} is a list of one or more names; received {brief(models)}.")
         if seeds is not None and (not isinstance(seeds, list) or not seeds):
-            raise DataError(f"'seeds' of {str(path)!r} is a list of whole numbers, not empty; received {shown(seeds)}.")
+            raise DataError(f"'seeds' of {str(path)!r} is a list of whole numbers, not empty; received {brief(seeds)}.")
         for seed in seeds or ():
             check_number("A seed of a batch", seed, least=0, whole=True)
         jobs += jobs_of(models, seeds, options)

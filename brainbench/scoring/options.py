@@ -12,7 +12,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from brainbench.core.errors import UsageError, check_each, check_once, shown
+from brainbench.core.errors import UsageError, brief, check_each, check_once
 from brainbench.core.limits import Limit, Positive, Seed, limited
 
 if TYPE_CHECKING:
@@ -95,10 +95,10 @@ class ScoreOptions:
         """Refuse what no score can be made with, before anything is loaded."""
         for name in _NO_NUMBERS:
             if isinstance(getattr(self, name), (int, float)):
-                raise UsageError(f"{name} must be a text; received {shown(getattr(self, name))}.")
+                raise UsageError(f"{name} must be a text; received {brief(getattr(self, name))}.")
         if self.layers is not None:
             if not (isinstance(self.layers, (list, tuple)) and all(isinstance(name, str) for name in self.layers)):
-                raise UsageError(f"layers must be a list of names; received {shown(self.layers)}.")
+                raise UsageError(f"layers must be a list of names; received {brief(self.layers)}.")
             if not self.layers:
                 raise UsageError("layers names none; leave it out for all.")
             check_once("layers", self.layers)

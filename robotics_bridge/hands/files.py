@@ -11,7 +11,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from brainbench.core.devices import mujoco_module
-from brainbench.core.errors import DataError, listing, shown
+from brainbench.core.errors import DataError, brief, listing
 from brainbench.core.reading.regular import check_file, readable
 from brainbench.core.reading.texts import read_text
 
@@ -99,7 +99,7 @@ def _balance_inertias(spec: Any, path: Path) -> None:
         moments = np.sort(body.inertia if np.isnan(full).any() else np.linalg.eigvalsh(full))
         if moments[0] < -1e-9 * abs(moments[2]):
             raise DataError(
-                f"The inertia of link {shown(body.name)} in {shown(str(path))} has the principal moments "
+                f"The inertia of link {brief(body.name)} in {brief(str(path))} has the principal moments "
                 f"{', '.join(f'{moment:.3g}' for moment in moments)} kg·m²; none may be below 0."
             )
         # Of any distribution of mass, two principal moments together reach the third.
@@ -109,7 +109,7 @@ def _balance_inertias(spec: Any, path: Path) -> None:
         spec.compiler.balanceinertia = True
         _log.warning(
             "Hand %s has inertias that no body can have (two principal moments together are less than the third) on %s;"
-            " each is replaced by its mean.", shown(path.stem), listing(unbalanced),
+            " each is replaced by its mean.", brief(path.stem), listing(unbalanced),
         )  # fmt: skip
 
 
@@ -129,7 +129,7 @@ def _checked_xml(path: Path, folder: Path) -> ElementTree.Element:
                 for word in value.split() if key not in _NAMES else ():
                     if _is_absurd(word):
                         raise DataError(
-                            f"{key!r} of <{shown(parent.tag, quoted=False)}> in {shown(str(path))} is {shown(value)}; "
+                            f"{key!r} of <{brief(parent.tag, quoted=False)}> in {brief(str(path))} is {brief(value)}; "
                             f"finite numbers of at most {_LARGEST:g} are needed."
                         )
     return root

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.devices import mujoco_module
-from brainbench.core.errors import DataError, UsageError, check_each, check_kind, listing, shown
+from brainbench.core.errors import DataError, UsageError, brief, check_each, check_kind, listing
 from brainbench.core.files import content_hash
 from brainbench.core.reading.regular import readable
 from robotics_bridge.hands.files import read_mjspec, stated_speeds
@@ -108,7 +108,7 @@ class Hand:
         if assumed := [name for name in names if name not in speeds]:
             slow = f"slides: {UNKNOWN_SPEED * LEVER:g} m/s"
             assumption = f"{UNKNOWN_SPEED:g} rad/s ({slow}) counts as the largest of {listing(assumed)}"
-            _log.warning("Hand %s states no speed for %d joints: %s.", shown(self.name), len(assumed), assumption)
+            _log.warning("Hand %s states no speed for %d joints: %s.", brief(self.name), len(assumed), assumption)
             speeds |= dict(zip(assumed, UNKNOWN_SPEED * self.lever(assumed), strict=True))
         return np.array([speeds[name] for name in names])
 
@@ -194,14 +194,14 @@ def from_file(path: Path) -> Hand:
         model = read_mjspec(path).compile()
         for name in ("geom_friction", "dof_damping", "dof_armature"):
             if (getattr(model, name) < 0).any():
-                raise DataError(f"{shown(str(path))} has a {name} below 0; give 0 or more.")
+                raise DataError(f"{brief(str(path))} has a {name} below 0; give 0 or more.")
     hinges = (model.jnt_type == mujoco_module().mjtJoint.mjJNT_HINGE) & (model.jnt_limited != 0)
     widest = float(np.abs(model.jnt_range[hinges]).max(initial=0.0))
     # Radians that are read as degrees end at π°, degrees that are read as radians turn many times.
     if hinges.any() and not math.radians(math.pi) < widest < 4 * math.pi:
         _log.warning(
             "Limits of the hinges of hand %s end at %.4g rad: is the unit of the angles right (MJCF: degrees "
-            "unless <compiler angle='radian'/>; URDF: rad)?", shown(path.stem), widest,
+            "unless <compiler angle='radian'/>; URDF: rad)?", brief(path.stem), widest,
         )  # fmt: skip
     children: dict[int, list[int]] = {body: [] for body in range(model.nbody)}
     for body in range(1, model.nbody):

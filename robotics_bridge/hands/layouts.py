@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.errors import DataError, UsageError, check_name, shown
+from brainbench.core.errors import DataError, UsageError, brief, check_name
 from brainbench.core.files import file_hash, read_json, write_json
 from brainbench.core.reading.regular import reason
 from robotics_bridge.hands.spec import BoxGeometry, CapsuleGeometry, Grid, Link, Pad
@@ -135,7 +135,7 @@ def read_probes(path: str | os.PathLike[str]) -> Layout:
             cells = [cell for row in rows for cell in row]
             shape = (len(rows), len(rows[0]))
             if not isinstance(link, str) or any(len(row) != shape[1] for row in rows):
-                raise DataError(f"{name}: link {shown(link)} needs a name and rows of equal length.")
+                raise DataError(f"{name}: link {brief(link)} needs a name and rows of equal length.")
             position, normal, radius = ([cell[key] for cell in cells] for key in ("pos", "normal", "radius"))
             probes = Probes(np.array(position, float), np.array(normal, float), np.array(radius, float), shape)
         except DataError:
@@ -143,7 +143,7 @@ def read_probes(path: str | os.PathLike[str]) -> Layout:
         except (LookupError, TypeError, ValueError) as error:
             raise DataError(f"{name} is no probe file (link {len(layout) + 1}: {reason(error)}).") from error
         if link in layout:
-            raise DataError(f"{name}: link {shown(link)} appears twice.")
+            raise DataError(f"{name}: link {brief(link)} appears twice.")
         layout[link] = probes
     return layout
 

@@ -16,7 +16,7 @@ from typing import Annotated, Any, Literal, TypeVar
 import msgspec
 from msgspec import Meta
 
-from brainbench.core.errors import DataError, UsageError, check_each, repeats, shown
+from brainbench.core.errors import DataError, UsageError, brief, check_each, repeats
 from brainbench.core.files import read_mapping, to_json
 from robotics_bridge.hands.observations import OBSERVATIONS
 from robotics_bridge.tasks.settings import CONTACTS, ContactModel
@@ -53,7 +53,7 @@ def from_json(kind: type[T], values: Any, where: str) -> T:
 def wrong(where: str, place: str, received: Any, allowed: str) -> DataError:
     """Return the error for a value at a place of a file."""
     what = f"{place!r} in {where!r}" if place else repr(where)
-    return DataError(f"{what} is {shown(received)}: {allowed.rstrip('.')}.")
+    return DataError(f"{what} is {brief(received)}: {allowed.rstrip('.')}.")
 
 
 def shapes_of(groups: Groups, where: str, place: str) -> dict[str, tuple[int, ...]]:

@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from brainbench.core.errors import DataError, UsageError, shown
+from brainbench.core.errors import DataError, UsageError, brief
 from robotics_bridge.policies.contract import TrainedMap, from_json, trained_contacts
 from robotics_bridge.policies.shipped import stored
 from robotics_bridge.tasks.settings import contacts_name
@@ -79,7 +79,7 @@ def check_actions(described: Mapping[str, Any], env: Env, name: str) -> None:
     rate = given.get("rate", _RATE)
     if not (isinstance(rate, int | float) and math.isclose(rate * env.step_dt, 1, rel_tol=1e-6)):
         raise UsageError(
-            f"The policy {name!r} was trained with {shown(rate)} actions per second, and here are {1 / env.step_dt:g}: "
+            f"The policy {name!r} was trained with {brief(rate)} actions per second, and here are {1 / env.step_dt:g}: "
             "take the solver.timestep and solver.decimation of the task in which it was trained."
         )
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.signal import butter, sosfilt_zi
 
-from brainbench.core.errors import UsageError, check_each, shown
+from brainbench.core.errors import UsageError, brief, check_each
 from brainbench.core.reading.ranges import check_number
 
 if TYPE_CHECKING:
@@ -107,7 +107,7 @@ class AfferentFilter:
 
     def _check(self, x: torch.Tensor) -> None:
         if not (hasattr(x, "is_floating_point") and x.is_floating_point()):
-            raise UsageError(f"A signal is a torch tensor [B, …] of floating-point numbers; received {shown(x)}.")
+            raise UsageError(f"A signal is a torch tensor [B, …] of floating-point numbers; received {brief(x)}.")
         if self._shape is not None and x.shape != self._shape:
             raise UsageError(f"A signal keeps its shape, {tuple(self._shape)}; received {tuple(x.shape)}.")
 

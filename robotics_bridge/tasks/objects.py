@@ -13,7 +13,7 @@ from numbers import Real
 from typing import Any
 
 from brainbench.core.devices import mujoco_module
-from brainbench.core.errors import UsageError, shown
+from brainbench.core.errors import UsageError, brief
 from brainbench.core.limits import Positive, limited
 from brainbench.core.reading.ranges import check_numbers
 from robotics_bridge.tasks.settings import unit_vector
@@ -44,7 +44,7 @@ class ObjectPrimitive:
         if len(sizes) != _SIZES[self.kind] or not all(isinstance(s, Real) and 0 < s <= LARGEST for s in sizes):
             raise UsageError(
                 f"A {self.kind} has {_SIZES[self.kind]} positive size(s) in metres, at most {LARGEST:g}; received "
-                f"{shown(self.size)}."
+                f"{brief(self.size)}."
             )
         check_numbers(f"The position of a {self.kind}", self.position, 3)
         object.__setattr__(self, "quaternion", unit_vector(f"The quaternion of a {self.kind}", self.quaternion, 4))

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.devices import mujoco_module
-from brainbench.core.errors import UsageError, check_each, listing, shown
+from brainbench.core.errors import UsageError, brief, check_each, listing
 from robotics_bridge.hands.hand import LEVER, Hand
 from robotics_bridge.hands.scenes import ARMATURE, WEAK_PUSH, WEAK_SERVO, flexed, palm_surface, place_palm
 from robotics_bridge.physics.scene import excluded_links
@@ -135,7 +135,7 @@ def _warn_inside(task: Task, hand: Hand, built: TaskModel) -> None:
         if name in links and distance < -_INSIDE and (link := links[links[0] == name]) not in built.objects:
             _log.warning(
                 "The object begins %.0f mm inside %s of hand %s: place the hand (Task.hand_poses) or its joints "
-                "(Task.joints) elsewhere in a task of your own.", -1e3 * distance, shown(link), shown(hand.name),
+                "(Task.joints) elsewhere in a task of your own.", -1e3 * distance, brief(link), brief(hand.name),
             )  # fmt: skip
             return
 
@@ -199,7 +199,7 @@ def drives_of(hand: Hand) -> dict[str, tuple[float, float, float]]:
     follow = {leader if follower in servos else follower for follower, leader in pairs}
     if left := [model.actuator(index).name for index in range(model.nu) if index not in servos.values()]:
         message = "are no position servo of one joint and are left out; joints without a servo get a weak one"
-        _log.warning("Of hand %s the drives %s %s.", shown(hand.name), listing(left), message)
+        _log.warning("Of hand %s the drives %s %s.", brief(hand.name), listing(left), message)
     order = [*servos, *(joint for joint in hand.joint_numbers.tolist() if joint not in {*servos, *follow})]
     drives = {}
     for joint in order:

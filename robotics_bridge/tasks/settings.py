@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
-from brainbench.core.errors import UsageError, check_each, shown
+from brainbench.core.errors import UsageError, brief, check_each
 from brainbench.core.limits import Count, Limit, NotNegative, Positive, Share, limited
 from brainbench.core.reading.ranges import check_numbers
 
@@ -26,7 +26,7 @@ def check_order(options: Any, *names: str, of: str = "{}") -> None:
     for name in names:
         value = getattr(options, name)
         if value is not None and value[0] > value[1]:
-            raise UsageError(f"{of.replace('{}', name)} is a range (low, high); received {shown(value)}.")
+            raise UsageError(f"{of.replace('{}', name)} is a range (low, high); received {brief(value)}.")
 
 
 def unit_vector(name: str, value: Any, count: int) -> tuple[float, ...]:
@@ -34,7 +34,7 @@ def unit_vector(name: str, value: Any, count: int) -> tuple[float, ...]:
     check_numbers(name, value, count)
     length = math.hypot(*value)
     if not length > 0:
-        raise UsageError(f"{name} has no length; received {shown(value)}.")
+        raise UsageError(f"{name} has no length; received {brief(value)}.")
     # Numbers that are written with a few digits count as they are written.
     return tuple(value) if abs(length - 1) < 1e-6 else tuple(one / length for one in value)
 
@@ -45,7 +45,7 @@ def check_parameters(of: str, function: Callable[..., Any], given: Iterable[str]
     It takes the context first. Messages call it ``of`` (``reward 'work' of task 'mine'``).
     """
     if not callable(function):
-        raise UsageError(f"The {of} needs a function of a step; received {shown(function)}.")
+        raise UsageError(f"The {of} needs a function of a step; received {brief(function)}.")
     try:
         signature = inspect.signature(function)
     except ValueError:  # Written in C, which tells no parameters.

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 
-from brainbench.core.errors import UsageError, check_each, check_name, shown
+from brainbench.core.errors import UsageError, brief, check_each, check_name
 from brainbench.core.limits import Count, Limit, NotNegative, Positive, limited
 from brainbench.core.reading.ranges import check_number, check_numbers
 from brainbench.core.rotations import TURN
@@ -312,7 +312,7 @@ class Task:
             check_name(f"axis of the carriage {of}", axis, ("x", "y", "z"))
             check_numbers(f"carriage.{axis} {of}", span, 2)
             if span[0] > span[1]:
-                raise UsageError(f"carriage.{axis} {of} is a range (low, high); received {shown(span)}.")
+                raise UsageError(f"carriage.{axis} {of} is a range (low, high); received {brief(span)}.")
             for name, number in zip(("stiffness", "damping", "effort"), numbers, strict=True):
                 check_number(f"{name} of carriage.{axis} {of}", number, least=0)
 

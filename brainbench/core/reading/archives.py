@@ -8,7 +8,7 @@ import zipfile
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from brainbench.core.errors import DataError, listing, shown
+from brainbench.core.errors import DataError, brief, listing
 from brainbench.core.reading.hdf5_worker import MOST_EXPANSION, MOST_MEMORY
 from brainbench.core.reading.regular import check_file, readable, reason
 
@@ -31,18 +31,18 @@ def read_npz(path: str | os.PathLike[str], kind: str = ".npz file") -> dict[str,
             head = stream.read(2)
         if not zipfile.is_zipfile(file):
             why = "empty" if not head else "truncated; copy it again" if head == b"PK" else "no zip archive"
-            raise DataError(f"{shown(os.fspath(path))} is not an .npz file, which a {kind} is: it is {why}.")
+            raise DataError(f"{brief(os.fspath(path))} is not an .npz file, which a {kind} is: it is {why}.")
         with zipfile.ZipFile(file) as archive:
             check_archive(archive, path, kind)
             for member in archive.infolist():
-                _check_header(archive, member, shown(os.fspath(path)))
+                _check_header(archive, member, brief(os.fspath(path)))
         with np.load(file, allow_pickle=False) as stored:
             return {key: np.asarray(stored[key]) for key in stored.files}
 
 
 def check_archive(archive: zipfile.ZipFile, path: str | os.PathLike[str], kind: str) -> None:
     """Refuse what is encrypted, and what unpacks to far more than is stored."""
-    members, name = archive.infolist(), shown(os.fspath(path))
+    members, name = archive.infolist(), brief(os.fspath(path))
     if locked := [item.filename for item in members if item.flag_bits & 1]:
         raise DataError(f"{name} is encrypted ({listing(locked, limit=3)}); save it without a password.")
     unpacked = sum(item.file_size for item in members)
@@ -54,7 +54,7 @@ def _check_header(archive: zipfile.ZipFile, member: zipfile.ZipInfo, name: str) 
     """Compare the shape that an array declares with the bytes behind it, before memory is taken for it."""
     from numpy.lib import format as npy
 
-    place = f"{shown(member.filename)} in {name}"
+    place = f"{brief(member.filename)} in {name}"
     with readable(name, "archive"), archive.open(member) as stream:
         try:
             version = npy.read_magic(stream)

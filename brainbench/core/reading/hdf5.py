@@ -14,7 +14,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from brainbench.core.errors import DataError, shown
+from brainbench.core.errors import DataError, brief
 from brainbench.core.reading.regular import check_file, readable
 
 if TYPE_CHECKING:
@@ -43,7 +43,7 @@ def open_hdf5(path: str | os.PathLike[str], kind: str = "HDF5 file", hint: str =
     place = check_file(path, kind).absolute()
     state = _state(place)
     if state not in _TRUSTED and (fault := _fault(*state)):
-        raise DataError(f"{shown(os.fspath(path))} {fault}.{hint and ' ' + hint}")
+        raise DataError(f"{brief(os.fspath(path))} {fault}.{hint and ' ' + hint}")
     with readable(path, kind, hint), h5py.File(place, "r") as file:
         yield file
 

@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from dataclasses import fields
 from typing import Any
 
-from brainbench.core.errors import UsageError, shown
+from brainbench.core.errors import UsageError, brief
 
 
 def check_number(
@@ -28,7 +28,7 @@ def check_number(
     bounds = {"at least": least, "at most": most, "above": above, "below": below}
     words = " and ".join(f"{word} {bound:,}" for word, bound in bounds.items() if math.isfinite(bound))
     raise UsageError(
-        f"{name} must be a {'whole' if whole else 'finite'} number{words and ', '}{words}; received {shown(value)}."
+        f"{name} must be a {'whole' if whole else 'finite'} number{words and ', '}{words}; received {brief(value)}."
     )
 
 
@@ -36,7 +36,7 @@ def check_numbers(name: str, value: Any, count: int, **bounds: Any) -> None:
     """Raise a :class:`UsageError` unless ``value`` holds so many numbers that :func:`check_number` takes."""
     values = list(value) if isinstance(value, Iterable) else []
     if len(values) != count:
-        raise UsageError(f"{name} holds {count} numbers; received {shown(value)}.")
+        raise UsageError(f"{name} holds {count} numbers; received {brief(value)}.")
     for number in values:
         check_number(name, number, **bounds)
 

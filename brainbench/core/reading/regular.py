@@ -8,7 +8,7 @@ import stat
 from collections.abc import Iterator
 from pathlib import Path
 
-from brainbench.core.errors import BrainbenchError, DataError, DataFileNotFoundError, nearest, shown
+from brainbench.core.errors import BrainbenchError, DataError, DataFileNotFoundError, brief, nearest
 
 MOST_TEXT = 64 << 20
 """Bytes of a text file that is parsed; nested lists take about twenty times as much memory."""
@@ -27,7 +27,7 @@ def check_file(path: str | os.PathLike[str], kind: str = "file", *, most: int | 
     Raises:
         DataFileNotFoundError: there is nothing of this name.
     """
-    name = shown(os.fspath(path))
+    name = brief(os.fspath(path))
     try:
         status = Path(path).expanduser().stat()
     except (FileNotFoundError, NotADirectoryError) as error:
@@ -35,7 +35,7 @@ def check_file(path: str | os.PathLike[str], kind: str = "file", *, most: int | 
         with contextlib.suppress(OSError):
             alike = (item.name for item in wanted.parent.iterdir() if item.suffix == wanted.suffix)
             guess = nearest(wanted.name, alike)
-        hint = f"; did you mean {shown(str(Path(path).with_name(guess)))}?" if guess else "."
+        hint = f"; did you mean {brief(str(Path(path).with_name(guess)))}?" if guess else "."
         raise DataFileNotFoundError(f"There is no {kind} {name}{hint}") from error
     except (OSError, ValueError, RuntimeError) as error:
         raise DataError(f"The {kind} {name} cannot be opened ({reason(error)}).") from error
@@ -58,7 +58,7 @@ def reason(error: BaseException) -> str:
     text = next(iter(str(error).strip().splitlines()), "")
     plain = isinstance(error, (OSError, UnicodeDecodeError)) or type(error).__name__.endswith("DecodeError")
     words = text if plain else f"{type(error).__name__}: {text}"
-    return shown(words.removesuffix(": "), quoted=False, most=160)
+    return brief(words.removesuffix(": "), quoted=False, most=160)
 
 
 @contextlib.contextmanager
@@ -67,7 +67,7 @@ def readable(path: str | os.PathLike[str], kind: str, hint: str = "") -> Iterato
 
     Libraries raise anything at all on damaged input; our own errors pass as they are, and the cause is kept.
     """
-    name = shown(os.fspath(path))
+    name = brief(os.fspath(path))
     try:
         yield
     except BrainbenchError:

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.errors import DataError, listing, repeats, shown
+from brainbench.core.errors import DataError, brief, listing, repeats
 from brainbench.core.reading.regular import MOST_TABLE, readable
 from brainbench.core.reading.texts import read_text
 
@@ -31,12 +31,12 @@ def read_columns(
     """
     header, *rows = (read_rows(path, kind) if gaps else _trimmed(path, kind)) or [[]]
     if twice := repeats(filter(None, header)):
-        raise DataError(f"{shown(os.fspath(path))} has several columns {listing(twice, limit=4)}; a name stands once.")
+        raise DataError(f"{brief(os.fspath(path))} has several columns {listing(twice, limit=4)}; a name stands once.")
     table = to_numbers(rows, path, kind, first=2, columns=len(header), gaps=gaps)
     if not gaps and not np.isfinite(table).all():
         row, column = np.argwhere(~np.isfinite(table))[0]
         raise DataError(
-            f"{shown(os.fspath(path))}: {shown(header[column])} in row {row + 2} is {table[row, column]}; a finite "
+            f"{brief(os.fspath(path))}: {brief(header[column])} in row {row + 2} is {table[row, column]}; a finite "
             "number is needed."
         )
     return header, table
@@ -68,7 +68,7 @@ def to_numbers(
         columns: cells of a line; those of the first when None.
         gaps: True where cells may be empty, as for :func:`read_columns`.
     """
-    name = shown(os.fspath(path))
+    name = brief(os.fspath(path))
     if not rows:
         raise DataError(f"{name} holds no table of numbers.")
     table = np.empty((len(rows), len(rows[0]) if columns is None else columns))
@@ -80,7 +80,7 @@ def to_numbers(
         try:
             table[index] = ["nan" if cell.lower() in ("", "na") else cell for cell in row] if gaps else row
         except ValueError as error:
-            raise DataError(f"{name} is not a {kind}: row {index + first} is {shown(','.join(row))}.") from error
+            raise DataError(f"{name} is not a {kind}: row {index + first} is {brief(','.join(row))}.") from error
     return table
 
 

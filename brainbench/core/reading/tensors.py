@@ -8,7 +8,7 @@ import zipfile
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from brainbench.core.errors import DataError, shown
+from brainbench.core.errors import DataError, brief
 from brainbench.core.reading.archives import check_archive
 from brainbench.core.reading.regular import check_file, readable
 
@@ -41,7 +41,7 @@ def read_checkpoint(path: str | os.PathLike[str], kind: str = "PyTorch file") ->
     """
     import torch
 
-    file, name = check_file(path, kind), shown(os.fspath(path))
+    file, name = check_file(path, kind), brief(os.fspath(path))
     with readable(path, kind, CUT):
         sound = zipfile.is_zipfile(file)
         if sound:
@@ -68,7 +68,7 @@ def check_stored(tensors: Mapping[str, torch.Tensor], name: str) -> None:
         # A view may repeat one stored number without end; only its use would take the memory.
         plain = value.layout == torch.strided and value.device.type == "cpu" and not value.is_complex()
         if not plain or value.numel() * value.element_size() > value.untyped_storage().nbytes():
-            raise DataError(f"{shown(key)} in {shown(name)} is no plain tensor with all of its numbers.")
+            raise DataError(f"{brief(key)} in {brief(name)} is no plain tensor with all of its numbers.")
     check_finite(tensors, name)
 
 
@@ -80,4 +80,4 @@ def check_finite(arrays: Mapping[str, Any], name: str) -> None:
         array = values.detach().float().cpu().numpy() if hasattr(values, "detach") else np.asarray(values)
         if array.dtype.kind in "fc" and not np.isfinite(array).all():
             bad = int((~np.isfinite(array)).sum())
-            raise DataError(f"{shown(key)} in {shown(name)} has {bad:,} of {array.size:,} values that are not finite.")
+            raise DataError(f"{brief(key)} in {brief(name)} has {bad:,} of {array.size:,} values that are not finite.")

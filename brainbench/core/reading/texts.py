@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from brainbench.core.errors import DataError, listing, needing, repeats, shown
+from brainbench.core.errors import DataError, brief, listing, needing, repeats
 from brainbench.core.reading.regular import MOST_TEXT, check_file, readable, reason
 
 MOST_LEVELS = 64
@@ -34,7 +34,7 @@ def parse_json(text: str, name: str) -> Any:
 
     def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
         if len(values := dict(pairs)) < len(pairs):
-            raise DataError(f"{shown(name)} has {listing(repeats(key for key, _ in pairs))} twice in one object.")
+            raise DataError(f"{brief(name)} has {listing(repeats(key for key, _ in pairs))} twice in one object.")
         return values
 
     # Python's parser takes NaN and Infinity, which JSON does not know, and 1e400, which is infinite.
@@ -42,7 +42,7 @@ def parse_json(text: str, name: str) -> Any:
         try:
             return check_values(json.loads(text, object_pairs_hook=unique), name)
         except json.JSONDecodeError as error:
-            raise DataError(f"{shown(name)} is not valid JSON ({reason(error)}).") from error
+            raise DataError(f"{brief(name)} is not valid JSON ({reason(error)}).") from error
 
 
 def parse_toml(text: str, name: str) -> dict[str, Any]:
@@ -53,7 +53,7 @@ def parse_toml(text: str, name: str) -> dict[str, Any]:
         try:
             return check_values(tomllib.loads(text), name)
         except tomllib.TOMLDecodeError as error:
-            raise DataError(f"{shown(name)} is not valid TOML ({reason(error)}).") from error
+            raise DataError(f"{brief(name)} is not valid TOML ({reason(error)}).") from error
 
 
 def read_json(path: str | os.PathLike[str], kind: str = "file") -> Any:
@@ -86,13 +86,13 @@ def read_yaml(path: str | os.PathLike[str], kind: str = "file") -> Any:
             for event in yaml.parse(text, yaml.SafeLoader):
                 level += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
                 if level > MOST_LEVELS:
-                    raise DataError(f"{shown(name)} is nested too deeply: more than {MOST_LEVELS} levels.")
+                    raise DataError(f"{brief(name)} is nested too deeply: more than {MOST_LEVELS} levels.")
                 if isinstance(event, yaml.AliasEvent):
-                    raise DataError(f"{shown(name)} repeats values by alias (*name); write them out instead.")
+                    raise DataError(f"{brief(name)} repeats values by alias (*name); write them out instead.")
             _check_keys(yaml.compose(text, yaml.SafeLoader), name)
             return check_values(yaml.safe_load(text), name)
         except yaml.YAMLError as error:
-            raise DataError(f"{shown(name)} is not valid YAML ({reason(error)}).") from error
+            raise DataError(f"{brief(name)} is not valid YAML ({reason(error)}).") from error
 
 
 def _check_keys(node: Any, name: str) -> None:
@@ -101,7 +101,7 @@ def _check_keys(node: Any, name: str) -> None:
         return
     pairs = node.value if node.id == "mapping" else [(None, item) for item in node.value]
     if twice := repeats(key.value for key, _ in pairs if key is not None and key.id == "scalar"):
-        raise DataError(f"{shown(name)} has {listing(twice)} twice in one mapping.")
+        raise DataError(f"{brief(name)} has {listing(twice)} twice in one mapping.")
     for _, inner in pairs:
         _check_keys(inner, name)
 
@@ -116,7 +116,7 @@ def read_mapping(path: str | os.PathLike[str], kind: str = "file") -> dict[str, 
     read = read_json if suffix == ".json" else read_yaml if suffix in (".yaml", ".yml") else read_toml
     values = read(path, kind)
     if not isinstance(values, dict):
-        raise DataError(f"{shown(os.fspath(path))} holds a {type(values).__name__}, not names and values.")
+        raise DataError(f"{brief(os.fspath(path))} holds a {type(values).__name__}, not names and values.")
     return values
 
 
@@ -137,7 +137,7 @@ def _check(value: Any, name: str, place: tuple[str | int, ...]) -> None:
         _encode(value, name, place)
     elif isinstance(value, (Mapping, list)):
         if len(place) >= MOST_LEVELS:
-            raise DataError(f"{shown(name)} is nested too deeply: more than {MOST_LEVELS} levels.")
+            raise DataError(f"{brief(name)} is nested too deeply: more than {MOST_LEVELS} levels.")
         if isinstance(value, Mapping):
             for key in value:
                 _encode(str(key), name, place)
@@ -157,4 +157,4 @@ def _encode(text: str, name: str, place: tuple[str | int, ...]) -> None:
 
 def _place(name: str, place: tuple[str | int, ...]) -> str:
     inside = "".join(f"[{key}]" if isinstance(key, int) else f".{key}" for key in place).removeprefix(".")
-    return f"{shown(inside)} in {shown(name)}" if inside else shown(name)
+    return f"{brief(inside)} in {brief(name)}" if inside else brief(name)

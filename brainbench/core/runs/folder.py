@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from brainbench.core.errors import DataError, UsageError, shown
+from brainbench.core.errors import DataError, UsageError, brief
 from brainbench.core.files import read_mapping, to_plain, write_json
 from brainbench.core.writing.temporaries import is_temporary
 
@@ -64,7 +64,7 @@ def mark(document: Path, **values: Any) -> None:
 def earlier_state(path: Path) -> DataError:
     """Return the error for a state of another format."""
     return DataError(
-        f"{shown(str(path))} was saved by an earlier brainbench, and this one cannot go on from it: end the run with "
+        f"{brief(str(path))} was saved by an earlier brainbench, and this one cannot go on from it: end the run with "
         "that one, or delete its folder to start anew."
     )
 
@@ -75,7 +75,7 @@ def check_same(folder: Path, stated: object, identity: Mapping[str, Any], what: 
     # Of what identifies a run, no part may have more in it than now.
     names = [*now, *(name for name in before if name not in now and name.partition(".")[0] in identity)]
     if differing := [name for name in names if before.get(name) != now.get(name)]:
-        changes = ", ".join(f"{name} {shown(before.get(name))} (now {shown(now.get(name))})" for name in differing[:4])
+        changes = ", ".join(f"{name} {brief(before.get(name))} (now {brief(now.get(name))})" for name in differing[:4])
         raise UsageError(f"{str(folder)!r} holds another {what}: {changes}. Choose another folder, or delete this one.")
 
 

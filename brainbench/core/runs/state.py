@@ -17,7 +17,7 @@ import torch
 from safetensors import safe_open
 from torch import nn
 
-from brainbench.core.errors import DataError, shown
+from brainbench.core.errors import DataError, brief
 from brainbench.core.reading.regular import check_file, readable, reason
 from brainbench.core.reading.tensors import check_finite
 from brainbench.core.runs.folder import RESTART, earlier_state
@@ -114,14 +114,14 @@ def restore_learner(
     try:
         learner.load_state_dict(weights)
     except RuntimeError as error:
-        raise DataError(f"{shown(os.fspath(path))} belongs to another network ({reason(error)}). {RESTART}") from error
+        raise DataError(f"{brief(os.fspath(path))} belongs to another network ({reason(error)}). {RESTART}") from error
     optimizer.load_state_dict(moments)
     for name in {name for entries in optimizer.state.values() for name in entries}:
         pairs = optimizer.state.items()
         shapes = [(getattr(entries.get(name), "shape", None), weight.shape) for weight, entries in pairs]
         # Moments have the shapes of the weights; counts of steps are alike for all.
         if any(shape != expected for shape, expected in shapes) and len({shape for shape, _ in shapes}) > 1:
-            raise DataError(f"{shown(name)} of the optimiser in {shown(os.fspath(path))} fits no weights. {RESTART}")
+            raise DataError(f"{brief(name)} of the optimiser in {brief(os.fspath(path))} fits no weights. {RESTART}")
 
 
 def odd_shape(

@@ -8,7 +8,7 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
-from brainbench.core.errors import UsageError, shown
+from brainbench.core.errors import UsageError, brief
 
 try:
     import fcntl
@@ -39,7 +39,7 @@ def lock_folder(folder: Path, *, wait: bool = True) -> Iterator[bool]:
             fcntl.flock(handle, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
             held = True
         except BlockingIOError as error:
-            raise UsageError(f"Another process is writing {shown(str(folder))}; wait for it, or end it.") from error
+            raise UsageError(f"Another process is writing {brief(str(folder))}; wait for it, or end it.") from error
         except OSError as error:
             _LOG.warning("%s cannot be locked (%s); start no second run there", folder, error)
         yield held

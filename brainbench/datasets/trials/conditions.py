@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.errors import DataError, UsageError, check_once, repeats, shown
+from brainbench.core.errors import DataError, UsageError, brief, check_once, repeats
 from brainbench.datasets.sessions import SessionTable, as_labels, natural_key
 
 
@@ -30,10 +30,10 @@ class Conditions:
         columns = tuple(item.strip() for item in rest.split(","))
         if not colon or not table.strip() or not all(columns):
             raise UsageError(
-                f"The conditions {shown(source)} cannot be read; write TABLE:COLUMN or TABLE:COLUMN,COLUMN, such as "
+                f"The conditions {brief(source)} cannot be read; write TABLE:COLUMN or TABLE:COLUMN,COLUMN, such as "
                 f"'trials:stimulus'. `brainbench recordings inspect FILE` proposes some."
             )
-        check_once(f"The text {shown(source)} for the conditions", columns)
+        check_once(f"The text {brief(source)} for the conditions", columns)
         return cls(table.strip(), columns)
 
     def __str__(self) -> str:

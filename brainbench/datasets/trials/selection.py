@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.errors import UsageError, check_once, nearest, shown, unknown_name
+from brainbench.core.errors import UsageError, brief, check_once, nearest, unknown_name
 from brainbench.core.reading.ranges import check_fields
 from brainbench.datasets.sessions import SessionTable, as_label, as_labels, as_number, natural_key
 
@@ -23,7 +23,7 @@ _RANGE = re.compile(r"^(?P<low>[-+.\deE]*)\.\.(?P<high>[-+.\deE]*)$")
 def _check_texts(what: str, texts: Any) -> None:
     # A text is a sequence too: of its letters.
     if isinstance(texts, str) or not all(isinstance(text, str) for text in texts):
-        raise UsageError(f"{what} must be a tuple of texts; received {shown(texts)}.")
+        raise UsageError(f"{what} must be a tuple of texts; received {brief(texts)}.")
 
 
 @dataclass(frozen=True)
@@ -130,26 +130,26 @@ class Selection:
         rule_texts: list[str] = []
         selection = cls(name=source.strip())
         if not source.strip(" ;"):
-            raise UsageError(f"The selection {shown(source)} states no rule; leave it out for the usual one.")
+            raise UsageError(f"The selection {brief(source)} states no rule; leave it out for the usual one.")
         for part in filter(None, (item.strip() for item in source.split(";"))):
             match = _RULE.match(part)
             if match is None:
                 raise UsageError(
-                    f"The selection rule {shown(part)} cannot be read; write COLUMN=a|b, COLUMN!=a|b or "
+                    f"The selection rule {brief(part)} cannot be read; write COLUMN=a|b, COLUMN!=a|b or "
                     f"COLUMN=low..high, with units. before columns of the units table, and ';' between rules."
                 )
             column, values = match["column"], match["values"]
             if match["scope"] is None and column in ("min_spikes", "subjects"):
                 rule_texts.append(column)
                 if match["sign"] != "=":
-                    raise UsageError(f"{column} is written {column}=…, and cannot be refused; received {shown(part)}.")
+                    raise UsageError(f"{column} is written {column}=…, and cannot be refused; received {brief(part)}.")
             if column == "min_spikes":
                 if not (values.isdecimal() and len(values) < 16):
-                    raise UsageError(f"min_spikes is a whole number from 0; received {shown(values)}.")
+                    raise UsageError(f"min_spikes is a whole number from 0; received {brief(values)}.")
                 selection = replace(selection, min_spikes=int(values))
             elif column == "subjects":
                 if not all(subjects := _values(values)):
-                    raise UsageError(f"subjects are names with | between them; received {shown(values)}.")
+                    raise UsageError(f"subjects are names with | between them; received {brief(values)}.")
                 selection = replace(selection, subjects=subjects)
             else:
                 rule = _rule(column, match["sign"], values)
@@ -260,4 +260,4 @@ def _number(source: str) -> float | None:
             raise ValueError("not finite")
         return float(source) if source else None
     except ValueError as error:
-        raise UsageError(f"{shown(source)} is not a number; a range is written low..high.") from error
+        raise UsageError(f"{brief(source)} is not a number; a range is written low..high.") from error

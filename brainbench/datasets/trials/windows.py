@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.errors import DataError, UsageError, shown, unknown_name
+from brainbench.core.errors import DataError, UsageError, brief, unknown_name
 from brainbench.core.reading.ranges import check_fields
 from brainbench.datasets.sessions import Session, SessionTable, as_label
 
@@ -74,19 +74,19 @@ class Window:
         if with_unit := _WITH_UNIT.search(first) or _WITH_UNIT.search(last):
             seconds = float(with_unit["number"]) * _UNITS[with_unit["unit"].lower()]
             raise UsageError(
-                f"The window {shown(source)} has a time with a unit, {with_unit[0]!r}; times are seconds without a "
+                f"The window {brief(source)} has a time with a unit, {with_unit[0]!r}; times are seconds without a "
                 f"unit, here {seconds:+g}."
             )
         (anchor, offset), (stop, stop_offset), (most_anchor, length) = map(_edge, (first, last, most))
         if not dots or not anchor or not last or most_anchor or (most and not stop):
             raise UsageError(
-                f"The window {shown(source)} cannot be read; write FROM..TO or FROM..+SECONDS, such as "
+                f"The window {brief(source)} cannot be read; write FROM..TO or FROM..+SECONDS, such as "
                 f"'first-contact..choice' or 'start+0.2..+0.5'."
             )
         for name in (anchor, stop):
             if _NO_NAME.search(name):
                 raise UsageError(
-                    f"The window {shown(source)} has {shown(name)} where an event stands, such as 'choice', or a "
+                    f"The window {brief(source)} has {brief(name)} where an event stands, such as 'choice', or a "
                     f"finite number of seconds after its sign, such as 'choice-0.5' or '+0.5'."
                 )
         if not stop:

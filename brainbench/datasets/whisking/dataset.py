@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 import numpy as np
 
 from brainbench.core.contracts import CHANNELS, GRID_SHAPE, SUB_STEP_SECONDS, SUB_STEPS, SWEEPS_FORMAT, SWEEPS_SCHEMA
-from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, check_name, listing, shown
+from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, brief, check_name, listing
 from brainbench.core.files import cache_dir, content_hash, hash_arrays, read_json, write_text
 from brainbench.core.plugins import load_optional
 from brainbench.core.progress import Progress, track
@@ -117,14 +117,14 @@ def read_manifest(folder: Path) -> Mapping[str, Any]:
     with readable(path, "manifest of a data set", _AGAIN):
         for name, kind in (("classes", list), ("splits", dict), ("shards", list), ("config_hash", str)):
             if not isinstance(manifest[name], kind):
-                raise DataError(f"{name!r} in {str(path)!r} is no {kind.__name__}; received {shown(manifest[name])}.")
+                raise DataError(f"{name!r} in {str(path)!r} is no {kind.__name__}; received {brief(manifest[name])}.")
         for entry in (*manifest["splits"].values(), *manifest["shards"]):
             check_number(f"'sweeps' in {str(path)!r}", entry["sweeps"], least=0, whole=True)
         for entry in manifest["shards"]:
             # A name with a folder in it could lead out of the data set.
             plain = Path(entry["name"]).name == entry["name"] and isinstance(entry["content_hash"], str)
             if not plain or entry["split"] not in manifest["splits"]:
-                raise DataError(f"{str(path)!r} has a shard without a plain name, a split and a hash: {shown(entry)}.")
+                raise DataError(f"{str(path)!r} has a shard without a plain name, a split and a hash: {brief(entry)}.")
     return manifest
 
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Literal
 
-from brainbench.core.errors import UsageError, check_name, listing, shown
+from brainbench.core.errors import UsageError, brief, check_name, listing
 from brainbench.core.reading.ranges import check_fields, check_number
 
 Shape = tuple[int, ...]
@@ -23,7 +23,7 @@ MEMORIES = ("time-decay", "ugrnn", "intersection", "gru", "lstm")
 
 def _check_pair(what: str, pair: Any, *, least: int = 1) -> None:
     if not isinstance(pair, (tuple, list)) or len(pair) != 2:
-        raise UsageError(f"The {what} must be two whole numbers (rows, columns); received {shown(pair)}.")
+        raise UsageError(f"The {what} must be two whole numbers (rows, columns); received {brief(pair)}.")
     for size in pair:
         check_number(f"The {what}", size, least=least, whole=True)
 

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from graphlib import CycleError, TopologicalSorter
 from typing import Any
 
-from brainbench.core.errors import DataError, check_name, listing, shown, unknown_name
+from brainbench.core.errors import DataError, brief, check_name, listing, unknown_name
 from brainbench.core.reading.ranges import check_number
 from brainbench.core.reading.regular import readable
 from brainbench.core.reading.texts import read_json, read_mapping
@@ -35,7 +35,7 @@ class _Section:
 
     def __init__(self, data: Any, where: str) -> None:
         if not isinstance(data, Mapping):
-            raise DataError(f"The graph configuration needs an object for {where}; found {shown(data)}.")
+            raise DataError(f"The graph configuration needs an object for {where}; found {brief(data)}.")
         self.data = dict(data)
         self.where = where
 
@@ -52,7 +52,7 @@ class _Section:
             value = self.data.pop(key, choices[0])
             if value not in choices:
                 raise DataError(
-                    f"The graph configuration has {key!r}: {shown(value)} in {self.where}; only "
+                    f"The graph configuration has {key!r}: {brief(value)} in {self.where}; only "
                     f"{choices[0]!r} is supported."
                 )
 
@@ -60,7 +60,7 @@ class _Section:
         """Take true or false."""
         value = self.take(key, default)
         if not isinstance(value, bool):
-            raise DataError(f"{key!r} in {self.where} must be true or false; found {shown(value)}.")
+            raise DataError(f"{key!r} in {self.where} must be true or false; found {brief(value)}.")
         return value
 
     def number(self, key: str, default: Any = _REQUIRED, **bounds: Any) -> Any:
@@ -82,7 +82,7 @@ class _Section:
         if not isinstance(numbers, (list, tuple)) or len(numbers) != 2 or not all(_is_size(n, least) for n in numbers):
             raise DataError(
                 f"{key!r} in {self.where} must be a whole number from {least} to {_LARGEST:,}, or a pair of them; "
-                f"found {shown(value)}."
+                f"found {brief(value)}."
             )
         return (numbers[0], numbers[1])
 
@@ -122,7 +122,7 @@ def _graph(source: Mapping[str, Any]) -> GraphSpec:
     inputs, output = tuple(config.take("input_nodes")), config.take("output_node")
     shape, order = tuple(config.take("input_shape")), config.take("ff_order", None)
     if not all(map(_is_size, shape)):
-        raise DataError(f"'input_shape' must be whole numbers from 1 to {_LARGEST:,}; found {shown(shape)}.")
+        raise DataError(f"'input_shape' must be whole numbers from 1 to {_LARGEST:,}; found {brief(shape)}.")
     # The number of steps is that of the stimulus; the decoder stands beside the graph.
     config.done("num_timesteps", "sep_num", "addnet")
     if not isinstance(output, str):
@@ -186,7 +186,7 @@ def _operation(part: _Section) -> Convolution | Dense | None:
     common["batch_norm"] = norm is not None and norm is not False
     whole = type(norm) is int and norm == channels
     if common["batch_norm"] and not whole and not (norm is True and kind == "FullyConnected"):
-        raise DataError(f"'batchnorm' in {part.where} must be false or the channels, {channels}; found {shown(norm)}.")
+        raise DataError(f"'batchnorm' in {part.where} must be false or the channels, {channels}; found {brief(norm)}.")
     if kind == "FullyConnected":
         operation: Convolution | Dense = Dense(channels, **common)
     else:

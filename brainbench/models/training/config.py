@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
-from brainbench.core.errors import DataError, UsageError, check_name, shown, unknown_name
+from brainbench.core.errors import DataError, UsageError, brief, check_name, unknown_name
 from brainbench.core.reading.ranges import check_fields, check_number
 from brainbench.models.architecture import OBJECTIVES, Architecture, is_path
 from brainbench.models.recipes import BATCH_SIZE, EPOCHS, OPTIMIZERS, SCHEDULES, recipe_for
@@ -108,7 +108,7 @@ class TrainingConfig:
             check_name("training option", name, names)
             kinds = {"str": str, "int": int, "float": (int, float)}[names[name]]
             if not isinstance(value, kinds) or isinstance(value, bool):
-                raise UsageError(f"The training option {name!r} is a {names[name]}; received {shown(value)}.")
+                raise UsageError(f"The training option {name!r} is a {names[name]}; received {brief(value)}.")
         if "model" not in values:
             raise UsageError("A training configuration needs the option 'model'.")
         return cls(**values)

@@ -18,7 +18,7 @@ from typing import Annotated, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from brainbench.core.errors import UsageError, repeats, shown, unknown_name
+from brainbench.core.errors import UsageError, brief, repeats, unknown_name
 from brainbench.core.files import content_hash
 from brainbench.core.limits import Count, Limit, Seed, limited
 from brainbench.core.progress import Progress, track
@@ -67,7 +67,7 @@ def parse_trials(text: str) -> int | tuple[int, int]:
     match = re.fullmatch(r"\s*(\d{1,9})\s*(?:-\s*(\d{1,9})\s*)?", text)
     first, last = (int(part or 0) for part in match.groups()) if match else (0, 0)
     if first < 1 or (match and match[2] and last < first):
-        raise UsageError(f"Trials are a number above 0 or a range such as 16-20; received {shown(text)}.")
+        raise UsageError(f"Trials are a number above 0 or a range such as 16-20; received {brief(text)}.")
     return (first, last) if last else first
 
 

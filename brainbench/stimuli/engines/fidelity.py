@@ -12,7 +12,7 @@ from functools import cache
 from importlib import resources
 from typing import Annotated, Literal
 
-from brainbench.core.errors import UsageError, check_name, shown
+from brainbench.core.errors import UsageError, brief, check_name
 from brainbench.core.limits import Limit, Positive, limited
 from brainbench.core.overrides import read_pairs, read_value, with_changes
 from brainbench.core.reading.ranges import check_number
@@ -80,7 +80,7 @@ class Fidelity:
         preset is :meth:`auto`.
         """
         preset, *words = (word.strip() for word in text.split(","))
-        changes = read_pairs(words, f"The fidelity {shown(text)}", "links=12")
+        changes = read_pairs(words, f"The fidelity {brief(text)}", "links=12")
         name, _, error = (part.strip() for part in preset.partition("="))
         chosen = cls.auto(error=read_value("error", error, float)) if name == "auto" else cls.preset(preset)
         return with_changes(chosen, changes)
@@ -163,7 +163,7 @@ def measured(backend: str = DEFAULT_ENGINE, share: float = 0.9) -> tuple[Tradeof
     import json
 
     if share not in SHARES:
-        raise UsageError(f"share must be one of {', '.join(map(str, SHARES))}; received {shown(share)}.")
+        raise UsageError(f"share must be one of {', '.join(map(str, SHARES))}; received {brief(share)}.")
     text = resources.files("brainbench.stimuli").joinpath("fidelity_table.json").read_text(encoding="utf-8")
     points: dict[str, list[TradeoffPoint]] = {}
     for point in json.loads(text)["points"]:

@@ -13,7 +13,7 @@ from brainbench.cli.options import changed, items, option, refuse, with_options
 from brainbench.cli.output import Output, progress_bar, table_of
 from brainbench.cli.stimuli import scenes
 from brainbench.cli.stimuli.scenes import BackendOption, StimulusOption, WhiskersOption
-from brainbench.core.errors import UsageError, shown
+from brainbench.core.errors import UsageError, brief
 from brainbench.core.overrides import read_pairs, read_value
 from brainbench.core.plugins import OptionalPart
 from brainbench.stimuli.engines.fidelity import DEFAULT_ENGINE
@@ -101,7 +101,7 @@ def fit(
             measured["noise"] = 1e-6 * noise
     else:
         of_tracks = {"--contacts": contacts, "--noise": noise, **changed(_TRACK, scale)}
-        refuse(of_tracks, f"with wrenches, which {shown(str(file))} holds")
+        refuse(of_tracks, f"with wrenches, which {brief(str(file))} holds")
         measured = read_wrenches(file, whisker=None if scene is None else whisker, stimulus=stimulus)
     if contacts:
         data, text = _contacts(measured, start, noise, frames, first_arc)
@@ -209,7 +209,7 @@ def _span(text: str) -> tuple[float, float]:
     except ValueError:
         ends = (0.0, 0.0)
     if not colon or not ends[0] < ends[1]:
-        raise UsageError(f"--bounds takes LOW:HIGH for each parameter, the lower first; received {shown(text)}.")
+        raise UsageError(f"--bounds takes LOW:HIGH for each parameter, the lower first; received {brief(text)}.")
     return ends
 
 

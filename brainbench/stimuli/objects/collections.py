@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from brainbench.core.errors import DataFileNotFoundError, UsageError, shown, unknown_name
+from brainbench.core.errors import DataFileNotFoundError, UsageError, brief, unknown_name
 from brainbench.core.files import file_hash
 from brainbench.core.reading.regular import readable
 from brainbench.geometry import Mesh
@@ -88,14 +88,14 @@ def _resolve(text: str, unit: str | None, collision: str | None) -> Iterator[Nam
         yield from _shapenet(text.removeprefix("shapenet:"), of_meshes)
         return
     if len(text) > MOST_CHARACTERS:
-        raise UsageError(f"An object is named in at most {MOST_CHARACTERS:,} characters; received {shown(text)}.")
+        raise UsageError(f"An object is named in at most {MOST_CHARACTERS:,} characters; received {brief(text)}.")
     if _is_file(text) or glob.has_magic(text):
         yield from _files(text, unit, of_meshes)
         return
     name, _, number = text.partition(":")
     if number and not (number.isdecimal() and 0 < int(number) <= MOST_MEMBERS):
         raise UsageError(
-            f"The number of members in {shown(text)} is a whole number from 1 to {MOST_MEMBERS:,}, as in torus:20."
+            f"The number of members in {brief(text)} is a whole number from 1 to {MOST_MEMBERS:,}, as in torus:20."
         )
     count = int(number or 1)
     if name in COLLECTIONS:
@@ -150,9 +150,9 @@ def _files(pattern: str, unit: str | None, collision: str) -> Iterator[NamedObje
         matches = [given] if _is_file(pattern) else sorted(Path(given.anchor or ".").glob(below))
         paths = [path for path in matches if path.is_file()]
     if not paths:
-        raise DataFileNotFoundError(f"No mesh file matches {shown(pattern)}.")
+        raise DataFileNotFoundError(f"No mesh file matches {brief(pattern)}.")
     if unit is None:
-        raise UsageError(f"The length unit of {shown(pattern)} is not in the file; say it with --unit (m, cm, mm, …).")
+        raise UsageError(f"The length unit of {brief(pattern)} is not in the file; say it with --unit (m, cm, mm, …).")
     several = len({path.parent for path in paths}) > 1
     for path in paths:
         label = path.parent.name if several else path.stem

@@ -17,7 +17,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, listing, repeats, shown
+from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, brief, listing, repeats
 from brainbench.core.reading.tables import read_rows
 from brainbench.core.reading.texts import read_json, read_text
 from brainbench.stimuli.objects.mesh_solids import mesh_solid
@@ -147,7 +147,7 @@ def read_categories(path: str | os.PathLike[str]) -> dict[str, str]:
     for number, row in enumerate(rows, start=1):
         if len(row) != 2:
             raise DataError(
-                f"Row {number} of {os.fspath(path)!r} must be a name and a label; it is {shown(','.join(row))}."
+                f"Row {number} of {os.fspath(path)!r} must be a name and a label; it is {brief(','.join(row))}."
             )
     return {name: label for name, label in rows if _is_name(name.partition("/")[0])}
 
@@ -163,7 +163,7 @@ def _checked(names: Iterable[str], where: str) -> tuple[str, ...]:
         synset, slash, model = name.partition("/")
         if not (slash and _is_name(synset) and model) or "/" in model or model in (".", ".."):
             raise UsageError(
-                f"A ShapeNet model is named SYNSET/MODEL, such as 02691156/1a04e3; {where} has {shown(name)}."
+                f"A ShapeNet model is named SYNSET/MODEL, such as 02691156/1a04e3; {where} has {brief(name)}."
             )
     if twice := repeats(checked):
         raise UsageError(f"ShapeNet models occur twice in {where}: {listing(twice, limit=4)}.")

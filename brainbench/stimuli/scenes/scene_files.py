@@ -65,7 +65,7 @@ from typing import Annotated, Any, TypeVar
 
 import msgspec
 
-from brainbench.core.errors import BrainbenchError, UsageError, check_name, repeats, shown, unknown_name
+from brainbench.core.errors import BrainbenchError, UsageError, brief, check_name, repeats, unknown_name
 from brainbench.core.limits import Limit, check_value
 from brainbench.core.reading.regular import readable
 from brainbench.core.reading.texts import read_toml
@@ -250,7 +250,7 @@ def load_scene(path: str | os.PathLike[str], *, whiskers: str = "all") -> Recipe
 def read_table(kind: type[Kind], data: Any, name: str) -> Kind:
     """Convert the data of one table; errors say which key of ``name`` is unknown, missing or of another kind."""
     if not isinstance(data, Mapping):
-        raise UsageError(f"{name} must be a table; received {shown(data)}.")
+        raise UsageError(f"{name} must be a table; received {brief(data)}.")
     fields = {field.name: field for field in msgspec.structs.fields(kind)}
     for key in data:
         if key not in fields:
@@ -265,7 +265,7 @@ def read_table(kind: type[Kind], data: Any, name: str) -> Kind:
             values[key] = msgspec.convert(value, fields[key].type)
         except msgspec.ValidationError as error:
             word = next(word for kind, word in _WORDS.items() if kind in str(fields[key].type))
-            raise UsageError(f"{key!r} of {name} must be {word}; received {shown(value)}.") from error
+            raise UsageError(f"{key!r} of {name} must be {word}; received {brief(value)}.") from error
     return kind(**values)
 
 

@@ -16,7 +16,7 @@ import torch
 from torch import nn
 
 from brainbench.core.contracts import GRID_SHAPE
-from brainbench.core.errors import UsageError, check_each, check_kind, shown, unknown_name
+from brainbench.core.errors import UsageError, brief, check_each, check_kind, unknown_name
 from brainbench.core.limits import Limit, Seed, limited
 from brainbench.models.architecture import Architecture
 from brainbench.models.cells import GRU
@@ -82,7 +82,7 @@ class EncoderConfig:
                 default = setting.default_factory()
             if setting.name in owner and value != default:
                 raise UsageError(
-                    f"{setting.name!r} = {shown(value)} is for the tactile encoder {owner[setting.name]}; {self.arm!r} "
+                    f"{setting.name!r} = {brief(value)} is for the tactile encoder {owner[setting.name]}; {self.arm!r} "
                     "has no such setting. Leave it out."
                 )
 

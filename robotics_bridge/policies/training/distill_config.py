@@ -16,7 +16,7 @@ from itertools import product
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from brainbench.core.errors import UsageError, check_each, check_name, listing, repeats, shown
+from brainbench.core.errors import UsageError, brief, check_each, check_name, listing, repeats
 from brainbench.core.limits import Count, Limit, Seed, Share, limited
 from brainbench.core.reading.regular import readable
 from brainbench.core.reading.texts import read_toml
@@ -103,7 +103,7 @@ class DistillConfig:
         kind = observation_type(self.observe)
         check_names(self.resolution, self.placement)
         if not isinstance(self.encoder_settings, Mapping):
-            raise UsageError(f"'encoder_settings' must be names and values; received {shown(self.encoder_settings)}.")
+            raise UsageError(f"'encoder_settings' must be names and values; received {brief(self.encoder_settings)}.")
         defaults = {item.name: item.default for item in fields(self)} | {"encoder_settings": {}}
         if idle := [name for name in FELT if kind.sensor is None and getattr(self, name) != defaults[name]]:
             raise UsageError(f"A student that observes {self.observe!r} has no touch; leave out {listing(idle)}.")
@@ -310,7 +310,7 @@ def _sweep(path: Path, document: Mapping[str, Any]) -> StudentSweep:
             check_names(resolution, placement)
     for arm in sweep.arms:
         if "encoder" not in arm:
-            raise UsageError(f"An arm of the sweep {path.name!r} names no 'encoder': {shown(dict(arm))}.")
+            raise UsageError(f"An arm of the sweep {path.name!r} names no 'encoder': {brief(dict(arm))}.")
     # Every student is made once, so that no value is found wrong in the middle of a sweep.
     for subset in SUBSETS:
         sweep.students(subset)
@@ -321,7 +321,7 @@ def _entry(table: Mapping[str, Any], settings: Mapping[str, Any]) -> SweepEntry:
     check_each("key of a sweep's entry", table, _ENTRY)
     for key in ("task", "hand", "placements"):
         if not table.get(key):
-            raise UsageError(f"An entry of a sweep needs {key!r}; received {shown(dict(table))}.")
+            raise UsageError(f"An entry of a sweep needs {key!r}; received {brief(dict(table))}.")
     combined = {**settings, **table.get("settings", {})}
     if "iterations" in table:
         combined["iterations"] = table["iterations"]

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.sparse.linalg import eigsh
 from scipy.spatial import KDTree
 
-from brainbench.core.errors import UsageError, needing, shown
+from brainbench.core.errors import UsageError, brief, needing
 from brainbench.core.files import cache_dir, content_hash, to_plain
 from brainbench.core.reading.ranges import check_number, check_numbers
 from brainbench.core.reading.sealed import read_sealed, write_sealed
@@ -173,7 +173,7 @@ def find_modes(
         away = np.linalg.norm(place - np.asarray(point, float), axis=1)
         if away.min() > (most := float(np.ptp(place, axis=0).max()) / 2):
             raise UsageError(
-                f"The point {shown(point)} lies {away.min():g} m off the surface of {solid.name!r}, which is "
+                f"The point {brief(point)} lies {away.min():g} m off the surface of {solid.name!r}, which is "
                 f"{2 * most:g} m long; points are in metres, in the frame of the solid."
             )
         weights.append(normal[np.argmin(away)])

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from brainbench.core.errors import UsageError, shown
+from brainbench.core.errors import UsageError, brief
 from brainbench.core.reading.ranges import check_fields, check_number, check_numbers
 from brainbench.geometry import Mesh
 
@@ -157,7 +157,7 @@ def _vectors(name: str, values: ArrayLike) -> NDArray[np.float64]:
     try:
         vectors = np.array(values, dtype=float)
     except (TypeError, ValueError):
-        raise UsageError(f"The {name} of probes is an array [N, 3] of numbers; received {shown(values)}.") from None
+        raise UsageError(f"The {name} of probes is an array [N, 3] of numbers; received {brief(values)}.") from None
     if not vectors.ndim or (vectors.size and vectors.shape[-1] != 3):
         raise UsageError(f"The {name} of probes is an array [N, 3]; received the shape {vectors.shape}.")
     return vectors.reshape(-1, 3)

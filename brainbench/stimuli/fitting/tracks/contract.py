@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.contracts import CHANNELS
-from brainbench.core.errors import DataError, check_each, check_once, shown
+from brainbench.core.errors import DataError, brief, check_each, check_once
 from brainbench.core.reading.ranges import check_number
 
 if TYPE_CHECKING:
@@ -169,7 +169,7 @@ def every_frame(frames: NDArray[np.int_], path: str | os.PathLike[str]) -> NDArr
     first, last, seen = int(frames.min()), int(frames.max()), len(np.unique(frames))
     if (count := last - first + 1) - seen > MOST_GAPS * count:
         raise DataError(
-            f"{shown(os.fspath(path))} has shapes in {seen:,} of the {count:,} frames from {first} to {last}; a track "
+            f"{brief(os.fspath(path))} has shapes in {seen:,} of the {count:,} frames from {first} to {last}; a track "
             f"is used from {100 * (1 - MOST_GAPS):g} % on: give numbers of frames, not times, or cut it to frames in "
             "which it was seen."
         )

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.errors import DataError, UsageError, check_each, choose_name, listing, shown
+from brainbench.core.errors import DataError, UsageError, brief, check_each, choose_name, listing
 from brainbench.core.reading.hdf5 import open_hdf5
 from brainbench.core.reading.regular import MOST_TABLE, check_file, readable
 from brainbench.core.reading.tables import read_columns, read_rows, to_numbers
@@ -30,7 +30,7 @@ Columns = dict[tuple[str, str, str], Array]
 # HDF5 tables of pandas keep their names as a pickle; it is taken apart word by word and never loaded.
 def read_deeplabcut(path: str | os.PathLike[str], options: TrackOptions) -> tuple[NDArray[np.int_], Array]:
     """Return frame numbers [n] and points [n, k, 2 or 3] (pixels) of one whisker."""
-    name = shown(os.fspath(path))
+    name = brief(os.fspath(path))
     frames, columns = _read_hdf5(path) if Path(path).suffix in (".h5", ".hdf5") else _read_csv(path)
     individuals = list(dict.fromkeys(individual for individual, _, _ in columns))
     wanted = choose_name(f"individual of {name}", options.track, individuals, how="as track")
@@ -54,12 +54,12 @@ def _read_csv(path: str | os.PathLike[str]) -> tuple[NDArray[np.int_], Columns]:
     rows = read_rows(path, kind)
     heads = {row[0]: row[1:] for row in rows[:4] if row[0] in ("scorer", "individuals", "bodyparts", "coords")}
     if not {"bodyparts", "coords"} <= set(heads):
-        raise DataError(f"{shown(os.fspath(path))} is no {kind}: its first lines are not scorer, bodyparts and coords.")
+        raise DataError(f"{brief(os.fspath(path))} is no {kind}: its first lines are not scorer, bodyparts and coords.")
     if len({len(row) for row in heads.values()} | {len(rows[0]) - 1}) > 1:
-        raise DataError(f"{shown(os.fspath(path))} is no {kind}: its lines of names differ in length.")
+        raise DataError(f"{brief(os.fspath(path))} is no {kind}: its lines of names differ in length.")
     body = rows[len(heads) :]
     if not body:
-        raise DataError(f"{shown(os.fspath(path))} holds no frame.")
+        raise DataError(f"{brief(os.fspath(path))} holds no frame.")
     table = to_numbers(body, path, kind, first=len(heads) + 1, columns=len(rows[0]), gaps=True)
     individuals = heads.get("individuals", [""] * len(heads["bodyparts"]))
     names = zip(individuals, heads["bodyparts"], heads["coords"], strict=True)
@@ -70,12 +70,12 @@ def _read_hdf5(path: str | os.PathLike[str]) -> tuple[NDArray[np.int_], Columns]
     with open_hdf5(path, "table of DeepLabCut") as file:
         groups = pandas_groups(file)
         if not groups:
-            raise DataError(f"{shown(os.fspath(path))} is no table of DeepLabCut: it holds no pandas table.")
+            raise DataError(f"{brief(os.fspath(path))} is no table of DeepLabCut: it holds no pandas table.")
         group: Any = groups[0]
         if "table" in group:
             table = group["table"]
             rows = table[()]
-            names = pickled_names(bytes(table.attrs["values_block_0_kind"]), shown(os.fspath(path)))
+            names = pickled_names(bytes(table.attrs["values_block_0_kind"]), brief(os.fspath(path)))
             index, values = rows["index"].astype(float), rows["values_block_0"].astype(float)
         else:
             index, values = group["axis1"][()].astype(float), group["block0_values"][()].astype(float)
@@ -86,7 +86,7 @@ def _read_hdf5(path: str | os.PathLike[str]) -> tuple[NDArray[np.int_], Columns]
             ]
             names = list(zip(*words, strict=True))
     if len(names) != values.shape[1]:
-        raise DataError(f"{shown(os.fspath(path))} has {len(names)} names of columns and {values.shape[1]} columns.")
+        raise DataError(f"{brief(os.fspath(path))} has {len(names)} names of columns and {values.shape[1]} columns.")
     # The first level is the scorer; before the last two there may be individuals.
     keys = [(name[1] if len(name) == 4 else "", name[-2], name[-1]) for name in names]
     return frame_numbers(index, path), {key: values[:, column] for column, key in enumerate(keys)}
@@ -100,7 +100,7 @@ def pandas_groups(file: Any) -> list[Any]:
 def frame_numbers(values: Array, path: str | os.PathLike[str]) -> NDArray[np.int_]:
     """Return frame numbers [n] as integers; others are a :class:`DataError`."""
     if not np.isfinite(values).all() or (values % 1).any():
-        raise DataError(f"The frame numbers of {shown(os.fspath(path))} are not whole numbers.")
+        raise DataError(f"The frame numbers of {brief(os.fspath(path))} are not whole numbers.")
     return values.astype(int)
 
 
@@ -139,7 +139,7 @@ _STRUCT_FIELDS = ("r3all", "tracked", "fp3_all")
 
 def read_whiskerman(path: str | os.PathLike[str], options: TrackOptions) -> tuple[NDArray[np.int_], Array]:
     """Return frame numbers [n] and points [n, k, 2 or 3] (pixels) of one whisker."""
-    name = shown(os.fspath(path))
+    name = brief(os.fspath(path))
     whiskers = _read_structs(path)
     if not whiskers:
         raise DataError(f"{name} holds no whisker.")
@@ -184,7 +184,7 @@ def _read_structs(path: str | os.PathLike[str]) -> list[dict[str, Any]]:
     with readable(path, "track of WhiskerMan (MATLAB file)"):
         data = loadmat(file, variable_names=["whisker"], struct_as_record=True, appendmat=False)
     if "whisker" not in data or data["whisker"].dtype.names is None:
-        raise DataError(f"{shown(os.fspath(path))} is no track of WhiskerMan: the struct 'whisker' is missing.")
+        raise DataError(f"{brief(os.fspath(path))} is no track of WhiskerMan: the struct 'whisker' is missing.")
     _need(data["whisker"].dtype.names, path)
     return [{name: one[name] for name in _STRUCT_FIELDS} for one in data["whisker"].ravel()]
 
@@ -195,7 +195,7 @@ def _structs_of_hdf5(path: str | os.PathLike[str]) -> list[dict[str, Any]]:
     with open_hdf5(path, "track of WhiskerMan") as file:
         group = file.get("whisker")
         if not isinstance(group, h5py.Group):
-            raise DataError(f"{shown(os.fspath(path))} is no track of WhiskerMan: the struct 'whisker' is missing.")
+            raise DataError(f"{brief(os.fspath(path))} is no track of WhiskerMan: the struct 'whisker' is missing.")
         _need(tuple(group), path)
         columns: dict[str, list[Any]] = {}
         for name in _STRUCT_FIELDS:
@@ -207,13 +207,13 @@ def _structs_of_hdf5(path: str | os.PathLike[str]) -> list[dict[str, Any]]:
             columns[name] = [np.asarray(cell[()]).T for cell in cells]
     counts = {len(cells) for cells in columns.values()}
     if len(counts) > 1:
-        raise DataError(f"The fields of 'whisker' in {shown(os.fspath(path))} differ in length.")
+        raise DataError(f"The fields of 'whisker' in {brief(os.fspath(path))} differ in length.")
     return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
 
 
 def _need(names: tuple[str, ...], path: str | os.PathLike[str]) -> None:
     if missing := [name for name in _STRUCT_FIELDS if name not in names]:
-        raise DataError(f"'whisker' of {shown(os.fspath(path))} has no field {missing[0]!r}, which WhiskerMan writes.")
+        raise DataError(f"'whisker' of {brief(os.fspath(path))} has no field {missing[0]!r}, which WhiskerMan writes.")
 
 
 _LAYOUTS = {".whiskers": "whisk", **dict.fromkeys((".tr4", ".tr4_2d", ".mat"), "whiskerman")}
@@ -262,7 +262,7 @@ def holds_shapes(path: str | os.PathLike[str]) -> bool:
 
 def detect_layout(path: str | os.PathLike[str]) -> str:
     """Return the kind of table that a file holds; a file that is none is a :class:`DataError`."""
-    suffix, name = Path(path).suffix.lower(), shown(os.fspath(path))
+    suffix, name = Path(path).suffix.lower(), brief(os.fspath(path))
     check_file(path, "track")
     if suffix in _LAYOUTS:
         return _LAYOUTS[suffix]
@@ -296,10 +296,10 @@ def _read_points(path: str | os.PathLike[str], options: TrackOptions) -> tuple[N
     names, table = read_columns(path, "table of points", gaps=True)
     columns = {name: table[:, index] for index, name in enumerate(names)}
     if missing := [name for name in ("frame", "x", "y") if name not in columns]:
-        raise DataError(f"{shown(os.fspath(path))} has no column {missing[0]!r}.")
+        raise DataError(f"{brief(os.fspath(path))} has no column {missing[0]!r}.")
     if "whisker" in columns:
         present = [f"{one:g}" for one in np.unique(columns["whisker"])]
-        wanted = choose_name(f"whisker of {shown(os.fspath(path))}", options.track, present, how="as track")
+        wanted = choose_name(f"whisker of {brief(os.fspath(path))}", options.track, present, how="as track")
         chosen = columns["whisker"] == float(wanted)
         columns = {name: values[chosen] for name, values in columns.items()}
     frames = frame_numbers(columns["frame"], path)

@@ -16,7 +16,7 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.errors import DataError, UsageError, choose_name, listing, shown
+from brainbench.core.errors import DataError, UsageError, brief, choose_name, listing
 from brainbench.core.reading.hdf5 import open_hdf5
 from brainbench.core.reading.regular import MOST_TEXT, check_file, readable
 from brainbench.core.reading.tables import read_columns, read_rows
@@ -32,7 +32,7 @@ _MOST_POINTS = 100_000
 
 def read_whisk(path: str | os.PathLike[str], options: TrackOptions) -> tuple[NDArray[np.int_], Array]:
     """Return frame numbers [n] and points [n, k, 2] (pixels) of one whisker."""
-    name = shown(os.fspath(path))
+    name = brief(os.fspath(path))
     if Path(path).suffix in (".h5", ".hdf5"):
         segments, labels, follicles = _read_whiskiwrap(path)
     else:
@@ -55,7 +55,7 @@ def read_whisk(path: str | os.PathLike[str], options: TrackOptions) -> tuple[NDA
         )
     traces = {key[0]: segments[key] for key in chosen}
     if not traces:
-        raise DataError(f"{name} holds no trace of the whisker {shown(wanted)}.")
+        raise DataError(f"{name} holds no trace of the whisker {brief(wanted)}.")
     frames = every_frame(np.array(sorted(traces)), path)
     return frames, _stack(
         traces, frames, {key[0]: follicles[key] for key in chosen if key in follicles}, options.points
@@ -68,11 +68,11 @@ def _read_segments(path: str | os.PathLike[str]) -> Segments:
         head = stream.read(len(_HEADER))
     if head == _HEADER:
         with readable(path, "binary file of whisk's traces"):
-            return _parse_binary(file.read_bytes(), shown(os.fspath(path)))
+            return _parse_binary(file.read_bytes(), brief(os.fspath(path)))
     if head.startswith(b"whisker1"):
-        return _parse_text(read_rows(path, "text file of whisk's traces"), shown(os.fspath(path)))
+        return _parse_text(read_rows(path, "text file of whisk's traces"), brief(os.fspath(path)))
     raise DataError(
-        f"{shown(os.fspath(path))} is no file of whisk's traces: it begins neither with bwhiskbin1 nor with whisker1."
+        f"{brief(os.fspath(path))} is no file of whisk's traces: it begins neither with bwhiskbin1 nor with whisker1."
     )
 
 
@@ -99,7 +99,7 @@ def _parse_text(rows: list[list[str]], name: str) -> Segments:
             frame, number, _, count = (int(cell) for cell in row[:4])
             values = np.array([float(cell) for cell in row[4 : 4 + 4 * count]]).reshape(count, 4)
         except ValueError as error:
-            raise DataError(f"{name} is damaged: line {index} is no trace ({shown(','.join(row))}).") from error
+            raise DataError(f"{name} is damaged: line {index} is no trace ({brief(','.join(row))}).") from error
         segments[frame, number] = values[:, :2]
     return segments
 
@@ -109,7 +109,7 @@ def _read_identities(path: str) -> tuple[dict[tuple[int, int], int], dict[tuple[
     names, table = read_columns(path, "table of whisk's measurements", gaps=True)
     if missing := [name for name in ("fid", "wid", "label") if name not in names]:
         raise DataError(
-            f"{shown(path)} is no table of whisk's measurements: the column {missing[0]!r} is missing; it has "
+            f"{brief(path)} is no table of whisk's measurements: the column {missing[0]!r} is missing; it has "
             f"{listing(names)}."
         )
     columns = {name: table[:, names.index(name)] for name in names}
@@ -132,14 +132,14 @@ def _read_whiskiwrap(
 ) -> tuple[Segments, dict[tuple[int, int], int], dict[tuple[int, int], Array]]:
     with open_hdf5(path, "HDF5 file of WhiskiWrap") as file:
         if missing := [name for name in ("summary", "pixels_x", "pixels_y") if name not in file]:
-            raise DataError(f"{shown(os.fspath(path))} is no file of WhiskiWrap: {missing[0]!r} is missing.")
+            raise DataError(f"{brief(os.fspath(path))} is no file of WhiskiWrap: {missing[0]!r} is missing.")
         arrays = {name: cast("Any", file[name])[()] for name in ("summary", "pixels_x", "pixels_y")}
         summary = arrays["summary"]
         # Older files call frame, number and follicle otherwise.
         renamed = {"time": "fid", "id": "wid", "fol_x": "follicle_x", "fol_y": "follicle_y"}
         columns = {str(renamed.get(name, name)): summary[name].astype(float) for name in summary.dtype.names or ()}
         if not {"fid", "wid"} <= set(columns):
-            raise DataError(f"The summary of {shown(os.fspath(path))} has no frame and no number of each trace.")
+            raise DataError(f"The summary of {brief(os.fspath(path))} has no frame and no number of each trace.")
         pairs = zip(arrays["pixels_x"], arrays["pixels_y"], strict=True)
         points = [np.stack([np.asarray(x, dtype=float), np.asarray(y, dtype=float)], axis=1) for x, y in pairs]
     keys = [(int(frame), int(number)) for frame, number in zip(columns["fid"], columns["wid"], strict=True)]

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.contracts import CHANNELS
-from brainbench.core.errors import DataError, UsageError, choose_name, listing, shown
+from brainbench.core.errors import DataError, UsageError, brief, choose_name, listing
 from brainbench.core.reading.hdf5 import open_hdf5
 from brainbench.core.reading.tables import read_columns
 from brainbench.stimuli.fitting.tracks.contract import new_wrenches
@@ -49,7 +49,7 @@ def read_wrenches(
     if suffix == ".csv":
         return _read_csv(path)
     if suffix not in (".h5", ".hdf5", ".nwb", ".nc"):
-        raise UsageError(f"{shown(os.fspath(path))} is no file of wrenches; these end in .csv, .h5, .hdf5 or .nwb.")
+        raise UsageError(f"{brief(os.fspath(path))} is no file of wrenches; these end in .csv, .h5, .hdf5 or .nwb.")
     with open_hdf5(path, "file of wrenches") as file:
         ours = "wrench" in file and {"stimulus", "whisker", "channel"} <= set(file)
         if not ours:
@@ -68,19 +68,19 @@ def _read_csv(path: str | os.PathLike[str]) -> xr.Dataset:
         if match := _COLUMN.fullmatch(name):
             unit = re.sub("[.·* ]", "", re.sub("[µμ]", "u", match[2] or ("N" if name[0] == "F" else "Nm")))
             if ("m" in unit.partition("N")[2]) != (name[0] == "M"):
-                raise DataError(f"The column {name!r} of {shown(os.fspath(path))} has the unit of the other kind.")
+                raise DataError(f"The column {name!r} of {brief(os.fspath(path))} has the unit of the other kind.")
             channels.append(match[1])
             columns.append(table[:, index] * _SCALES[unit])
     if not channels:
         raise DataError(
-            f"{shown(os.fspath(path))} has no column of forces or moments; they are called Fx … Mz, or Fy_mN, Mz_uNm. "
+            f"{brief(os.fspath(path))} has no column of forces or moments; they are called Fx … Mz, or Fy_mN, Mz_uNm. "
             f"It has {listing(names)}."
         )
     # Other columns may stand beside a channel that is read, such as Fx_raw beside Fx.
     unread = [name for name in names if re.match(r"[FM][xyz](?![a-z])", name, re.IGNORECASE)]
     if unread := [name for name in unread if name[:2].capitalize() not in channels]:
         raise DataError(
-            f"The columns {listing(unread)} of {shown(os.fspath(path))} have a name or a unit that is not known; "
+            f"The columns {listing(unread)} of {brief(os.fspath(path))} have a name or a unit that is not known; "
             f"forces and moments are called Fx … Mz, with a unit as in Fy_mN or Mz_uNm: {', '.join(_SCALES)}."
         )
     return new_wrenches(times, np.stack(columns, axis=1), channels, source=os.fspath(path))
@@ -90,7 +90,7 @@ def _read_hdf5(file: Any, path: str | os.PathLike[str]) -> xr.Dataset:
     series = _find_series(file)
     if series is None:
         raise DataError(
-            f"{shown(os.fspath(path))} holds no wrenches: neither 'wrench' [n, channel] nor a time series whose "
+            f"{brief(os.fspath(path))} holds no wrenches: neither 'wrench' [n, channel] nor a time series whose "
             "'data' has six columns."
         )
     data, group = series
@@ -100,7 +100,7 @@ def _read_hdf5(file: Any, path: str | os.PathLike[str]) -> xr.Dataset:
     if not channels:
         if values.shape[1] != len(CHANNELS):
             raise DataError(
-                f"The wrenches of {shown(os.fspath(path))} have {values.shape[1]} columns; name them in the attribute "
+                f"The wrenches of {brief(os.fspath(path))} have {values.shape[1]} columns; name them in the attribute "
                 "'channels', or give all six (Fx, Fy, Fz, Mx, My, Mz)."
             )
         channels = list(CHANNELS)
@@ -131,7 +131,7 @@ def _factors(unit: Any, channels: Sequence[str], path: str | os.PathLike[str]) -
         kinds["M"] = 1.0
     if len(kinds) < len(units) or not {name[0] for name in channels} <= set(kinds):
         raise DataError(
-            f"The wrenches of {shown(os.fspath(path))} have the unit {shown(text)}, which does not tell forces and "
+            f"The wrenches of {brief(os.fspath(path))} have the unit {brief(text)}, which does not tell forces and "
             f"moments; write the units of both, as in 'mN, mN·mm': {', '.join(_SCALES)}."
         )
     return np.array([kinds[name[0]] for name in channels])
@@ -153,7 +153,7 @@ def _find_series(file: Any) -> tuple[Any, Any] | None:
     series = [item for item in series if "channels" in item.attrs] or series
     if len(series) > 1:
         raise DataError(
-            f"{shown(file.filename)} has several time series that may be wrenches, "
+            f"{brief(file.filename)} has several time series that may be wrenches, "
             f"{listing(item.parent.name for item in series)}; keep one, or name the channels of one in the attribute "
             "'channels' of its data."
         )
@@ -166,18 +166,18 @@ def _read_stimulus_set(path: str | os.PathLike[str], whisker: str | None, stimul
     dataset, chosen = to_axes(read_stimulus_set(path), "world"), {}
     if (readout := dataset.attrs.get("readout", "instantaneous")) != "instantaneous":
         raise DataError(
-            f"A frame of {shown(os.fspath(path))} is no reading ({readout}), and a fit compares readings; simulate the "
+            f"A frame of {brief(os.fspath(path))} is no reading ({readout}), and a fit compares readings; simulate the "
             "scenes with instantaneous frames (average = 1, no low-pass)."
         )
     for kind, name in (("whisker", whisker), ("stimulus", stimulus)):
         present = [str(one) for one in dataset[kind].values]
-        chosen[kind] = present.index(choose_name(f"{kind} of {shown(os.fspath(path))}", name, present))
+        chosen[kind] = present.index(choose_name(f"{kind} of {brief(os.fspath(path))}", name, present))
     wrench = dataset["wrench"].isel(chosen)
     return new_wrenches(dataset["time"].values, wrench.values, source=os.fspath(path))
 
 
 def _no_times(path: str | os.PathLike[str], names: list[str]) -> DataError:
     return DataError(
-        f"The wrenches of {shown(os.fspath(path))} have no time stamps; add a column or data set 'time' (s), or "
+        f"The wrenches of {brief(os.fspath(path))} have no time stamps; add a column or data set 'time' (s), or "
         f"'time_ms'. There are {listing(names)}."
     )
