@@ -240,7 +240,7 @@ def test_a_notebook_runs_and_gives_what_is_shown(name: str, tmp_path: Path, monk
 def test_the_metric_of_the_statistics_page_scores(tmp_path: Path):
     import numpy as np
 
-    from brainbench.core.trials import Trials
+    from brainbench.core.contracts import Trials
     from brainbench.metrics import get_metric
 
     (block,) = _blocks("docs/statistics.md", "python")

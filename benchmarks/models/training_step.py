@@ -29,7 +29,7 @@ import torch
 
 from benchmarks.models.recorded_optimizer import make_capturable
 from benchmarks.report import publish, script_parser, table
-from brainbench.core.cuda_graphs import record_step
+from brainbench.core.devices import record_step
 from brainbench.models.activations import evaluating
 from brainbench.models.export import export_model, read_onnx
 from brainbench.models.ops import dispatch

@@ -23,10 +23,10 @@ from scipy import stats
 from benchmarks.report import publish, script_parser, table
 from benchmarks.scores import simulated_boards
 from benchmarks.scores.simulated_boards import BIN, BOARDS, RULES, Study
+from brainbench.core.contracts import Trials
 from brainbench.core.figures.style import COLORS, INK, PALE, panels, save_figure
 from brainbench.core.files import write_text
-from brainbench.core.jobs import run_jobs
-from brainbench.core.trials import Trials
+from brainbench.core.runs.jobs import run_jobs
 from brainbench.metrics import compare, get_metric, noise_ceiling, rdm
 from brainbench.metrics.inference.multiple import step_down
 from brainbench.metrics.inference.permutation import label_orders

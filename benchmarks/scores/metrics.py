@@ -21,7 +21,7 @@ from functools import partial
 import numpy as np
 
 from benchmarks.report import publish, script_parser, table
-from brainbench.core.trials import Trials
+from brainbench.core.contracts import Trials
 from brainbench.metrics import compare_models, noise_precision, permutation_test, rdm
 from brainbench.metrics.measures.rsa import RSA, score_rdms
 from brainbench.metrics.reliability.subject_rdm import subject_rdm

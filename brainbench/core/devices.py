@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
+import gc
+import logging
 import os
 import re
 import tempfile
 import threading
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, nullcontext
 from functools import cache
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
@@ -19,7 +23,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
     import torch
-
 
 _STARTING = threading.Lock()
 
@@ -147,3 +150,246 @@ def to_struct(kind: Any, values: Mapping[str, np.ndarray], device: Any) -> Any:
             array = array.astype(record)
         setattr(struct, name, wp.array(array, dtype=dtype, device=device))
     return struct
+
+
+_LOG = logging.getLogger(__name__)
+WARM_UP = 3
+"""Runs before a recording: they choose algorithms, fill caches and allocate."""
+
+
+class Graph(Protocol):
+    """A recorded piece of work."""
+
+    def replay(self) -> Any:
+        """Do it again, on the memory that it was recorded with."""
+        ...
+
+
+Recorder = Callable[[Callable[[], Any]], tuple[Graph, Any]]
+"""Records a piece of work, which does not run, and returns its graph and the tensors that replays fill."""
+
+
+def torch_recorder(generators: Sequence[torch.Generator] = ()) -> Recorder:
+    """Return a recorder of torch's work; ``generators`` are those it draws from, beside torch's own on the device."""
+
+    def record(work: Callable[[], Any]) -> tuple[Graph, Any]:
+        import torch
+
+        graph = torch.cuda.CUDAGraph()
+        for generator in generators:
+            graph.register_generator_state(generator)
+        # Other threads may work on the same device meanwhile.
+        with torch.cuda.graph(graph, capture_error_mode="thread_local"):
+            result = work()
+        return graph, result
+
+    return record
+
+
+def warp_recorder(device: Any, generators: Sequence[torch.Generator] = ()) -> Recorder:
+    """Return a recorder of work of torch and Warp together, without gradients.
+
+    Args:
+        device: Warp's CUDA device.
+        generators: Random numbers that the work draws, beside torch's own on the device.
+    """
+
+    def record(work: Callable[[], Any]) -> tuple[Graph, Any]:
+        import torch
+
+        wp = warp()
+        where = wp.device_to_torch(device)
+        # What Python throws away meanwhile could free device memory, which ends a recording.
+        gc.collect()
+        external = torch.cuda.ExternalStream(device.stream.cuda_stream, device=where)
+        graph, side = torch.cuda.CUDAGraph(), torch.cuda.Stream(where)
+        for generator in generators:
+            graph.register_generator_state(generator)
+        stream = wp.stream_from_torch(side)
+        with contextlib.ExitStack() as scope:
+            scope.enter_context(_no_collection())
+            scope.enter_context(torch.cuda.device(where))
+            # A recording that breaks off leaves torch on its stream.
+            scope.enter_context(torch.cuda.stream(torch.cuda.current_stream(where)))
+            # Results outlive the caller's inference mode, tensors of which no gradient could ever pass.
+            scope.enter_context(torch.inference_mode(False))
+            scope.enter_context(torch.no_grad())
+            scope.enter_context(torch.cuda.graph(graph, stream=side, capture_error_mode="thread_local"))
+            # Waiting for Warp's own stream would tie the recording to work outside of it.
+            scope.enter_context(wp.ScopedStream(stream, sync_enter=False))
+            result = work()
+        return _BetweenStreams(graph, external), result
+
+    return record
+
+
+class CudaGraphStep:
+    """A piece of work that runs as it is at first, is then recorded, and from then on replayed.
+
+    Args:
+        work: Returns tensors in dictionaries and tuples, or None. Random numbers are those that it would draw
+            unrecorded.
+        recorder: :func:`torch_recorder` or :func:`warp_recorder`, made with the same generators.
+        subject: What is recorded, for messages: ``"The control step"``.
+        advice: What to do if it cannot be, for the error where a recording is required.
+        warm_up: Calls before the recording.
+        aside: Make these calls on a stream of their own, as recordings are.
+        generators: Random numbers that the work draws, beside torch's own.
+        kept: Tensors of the result that last anyway and are returned themselves; others are returned as copies. None
+            copies nothing: the next call overwrites what was returned.
+        required: A recording that fails is an error; otherwise a warning, and the work runs launch by launch.
+    """
+
+    def __init__(
+        self,
+        work: Callable[..., Any],
+        recorder: Recorder,
+        *,
+        subject: str,
+        advice: str = "",
+        warm_up: int = 2,
+        aside: bool = False,
+        generators: Sequence[torch.Generator] = (),
+        retained: Sequence[torch.Tensor] | None = (),
+        required: bool = False,
+    ) -> None:
+        self.work, self.recorder = work, recorder
+        self._subject, self._advice, self._required = subject, advice, required
+        self._left, self._aside, self._generators, self._kept = warm_up, aside, tuple(generators), retained
+        self._graph: Graph | None = None
+        self._result: Any = None
+        self.failed: str = ""
+        """Reason why the work could not be recorded; empty if it was, or was not tried yet."""
+
+    @property
+    def recorded(self) -> bool:
+        """True when the work is replayed."""
+        return self._graph is not None
+
+    def __call__(self, *subjects: Any) -> Any:
+        """Do the work and return its result.
+
+        Args:
+            *subjects: What the work takes, the same objects in every call.
+        """
+        warming = self._left > 0
+        self._left -= 1
+        if self._graph is None and not self.failed and not warming:
+            self._record(lambda: self.work(*subjects))
+        if self._graph is None:
+            with side_stream() if self._aside and warming else nullcontext():
+                return self.work(*subjects)
+        self._graph.replay()
+        return self._result if self._kept is None else _copied(self._result, self._kept)
+
+    def _record(self, work: Callable[[], Any]) -> None:
+        states = [generator.get_state() for generator in self._generators]
+        try:
+            self._graph, self._result = self.recorder(work)
+        except (RuntimeError, UsageError) as error:
+            self.failed = _reason(error)
+            self._release_generators(states)
+            failure = f"{self._subject} cannot be recorded as a CUDA graph"
+            if self._required:
+                raise UsageError(f"{failure}: {self.failed}. {self._advice}".rstrip()) from error
+            _LOG.warning("%s and runs launch by launch, which is slower: %s", failure, self.failed)
+
+    def _release_generators(self, states: Sequence[torch.Tensor]) -> None:
+        """Take generators out of the recording that broke off: one that ends well does."""
+        import torch
+
+        if not self._generators:
+            return
+        try:
+            self.recorder(lambda: [torch.rand(1, generator=g, device=g.device) for g in self._generators])
+        except RuntimeError as error:
+            _LOG.warning("Random numbers may not recover from a recording that broke off: %s", _reason(error))
+        for generator, state in zip(self._generators, states, strict=True):
+            generator.set_state(state)
+
+
+def record_step(
+    work: Callable[[], None],
+    device: torch.device,
+    *,
+    generators: Sequence[torch.Generator] = (),
+    warm_up: int = WARM_UP,
+) -> Callable[[], Any]:
+    """Run torch's work a few times and record it; return what repeats it. On the CPU that is ``work`` itself.
+
+    Args:
+        work: Reads and writes tensors that stay where they are.
+        device: Where it works.
+        generators: Random numbers it draws, beside torch's own on the device.
+        warm_up: Runs before the recording; what they change (weights, counters) stays changed.
+    """
+    with side_stream(device) if device.type == "cuda" else nullcontext() as side:
+        for _ in range(warm_up):
+            work()
+    if side is None:
+        return work
+    side.synchronize()
+    graph, _ = torch_recorder(generators)(work)
+    return graph.replay
+
+
+def record_launches(work: Callable[[], None], device: Any) -> Callable[[], None]:
+    """Record launches of Warp on a CUDA device, which do not run, and return what launches them all."""
+    wp = warp()
+    with wp.ScopedCapture(device=device) as capture:
+        work()
+    graph = capture.graph
+    return lambda: wp.capture_launch(graph)
+
+
+@contextlib.contextmanager
+def side_stream(device: torch.device | None = None) -> Iterator[torch.cuda.Stream]:
+    """Work on a new stream of torch, after all that was asked for before and before all that is asked for later."""
+    import torch
+
+    side = torch.cuda.Stream(device)
+    side.wait_stream(torch.cuda.current_stream(device))
+    with torch.cuda.stream(side):
+        yield side
+    torch.cuda.current_stream(device).wait_stream(side)
+
+
+class _BetweenStreams:
+    """A recorded graph that is replayed on torch's stream, between what Warp does on its own."""
+
+    def __init__(self, graph: torch.cuda.CUDAGraph, warp_stream: torch.cuda.Stream) -> None:
+        self._graph, self._warp = graph, warp_stream
+
+    def replay(self) -> None:
+        """Launch the graph on torch's current stream, in order with what Warp is given before and after."""
+        import torch
+
+        current = torch.cuda.current_stream(self._warp.device)
+        current.wait_stream(self._warp)
+        self._graph.replay()
+        self._warp.wait_stream(current)
+
+
+@contextlib.contextmanager
+def _no_collection() -> Iterator[None]:
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
+
+
+def _copied(result: Any, retained: Sequence[torch.Tensor]) -> Any:
+    if isinstance(result, dict):
+        return {name: _copied(value, retained) for name, value in result.items()}
+    if isinstance(result, tuple):
+        return tuple(_copied(value, retained) for value in result)
+    return result if result is None or any(result is one for one in retained) else result.clone()
+
+
+def _reason(error: BaseException) -> str:
+    """Return in one line what broke a recording; the end of the recording, which fails too, hides it."""
+    first = error.__context__ or error
+    return str(first).strip().split("\n")[0] or type(first).__name__

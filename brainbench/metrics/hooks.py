@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from brainbench.core.contracts import Trials
 from brainbench.core.errors import UsageError
-from brainbench.core.trials import Trials
 from brainbench.metrics.arrays import fetch
 from brainbench.metrics.inference.permutation import SMALLEST_STIMULI, canonical_order
 from brainbench.metrics.rdms.pairs import Floats, Ints

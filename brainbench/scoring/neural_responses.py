@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from brainbench.core.contracts import join_labels
 from brainbench.core.errors import UsageError, listing
 from brainbench.core.files import content_hash
-from brainbench.core.labels import join_labels
 from brainbench.core.progress import Progress
 from brainbench.scoring.demo import DEMOS, HIDDEN_NETWORK, demo_identity, demo_recordings
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     import xarray as xr
     from numpy.typing import NDArray
 
-    from brainbench.core.trials import Trials
+    from brainbench.core.contracts import Trials
     from brainbench.metrics import Metric
     from brainbench.scoring.options import ScoreOptions
 

@@ -15,8 +15,8 @@ from typing import Annotated, Any
 
 import numpy as np
 
+from brainbench.core.contracts import Trials
 from brainbench.core.limits import Count, Limit, limited
-from brainbench.core.trials import Trials
 from brainbench.metrics.inference.permutation import label_orders
 from brainbench.metrics.measures.rsa import RSA
 from brainbench.metrics.rdms.comparison import compare

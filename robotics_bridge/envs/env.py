@@ -11,7 +11,7 @@ from typing import Any
 
 import torch
 
-from brainbench.core.cuda_graphs import CudaGraphStep, warp_recorder
+from brainbench.core.devices import CudaGraphStep, warp_recorder
 from brainbench.core.errors import UsageError, check_kind
 from brainbench.core.reading.ranges import check_number
 from robotics_bridge import hands

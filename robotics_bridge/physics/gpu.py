@@ -11,8 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike
 
-from brainbench.core.cuda_graphs import record_launches
-from brainbench.core.devices import mujoco_module, pick_device, warp
+from brainbench.core.devices import mujoco_module, pick_device, record_launches, warp
 from brainbench.core.errors import UsageError, needing, unknown_name
 from brainbench.core.reading.ranges import check_number
 from robotics_bridge.physics.kernels.state import fill_contacts, fill_links

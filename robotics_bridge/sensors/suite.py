@@ -10,8 +10,7 @@ from typing import Any, cast
 import numpy as np
 import torch
 
-from brainbench.core.cuda_graphs import record_launches
-from brainbench.core.devices import pick_device, warp
+from brainbench.core.devices import pick_device, record_launches, warp
 from brainbench.core.errors import UsageError, check_kind, listing, unknown_name
 from brainbench.core.plugins import load_object
 from brainbench.core.reading.ranges import check_number

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from brainbench.core.contracts import Trials
 from brainbench.core.errors import DataError, UsageError
-from brainbench.core.trials import Trials
 from brainbench.datasets import check, inspect, open_recordings, write_recordings
 from brainbench.datasets.sessions import SessionTable, make_session
 from brainbench.datasets.synthetic import ResponseGeometry

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from brainbench.core.trials import Trials
+from brainbench.core.contracts import Trials
 from brainbench.metrics import rdm
 from brainbench.metrics.reliability.noise_correction import spearman_brown
 from brainbench.metrics.reliability.subject_rdm import SubjectRDM

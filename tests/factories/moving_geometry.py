@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from brainbench.core.trials import Trials
+from brainbench.core.contracts import Trials
 from brainbench.metrics import rdm
 from brainbench.scoring.over_time import AnimalMovie
 

@@ -16,9 +16,9 @@ import torch
 from safetensors.torch import save_file
 
 from brainbench.cli.options import numbers as option_numbers
+from brainbench.core.contracts import read_match
 from brainbench.core.errors import DataError
 from brainbench.core.files import read_mapping, write_json
-from brainbench.core.labels import read_match
 from brainbench.core.records import ResultRecord, record_identity
 from brainbench.core.runs.state import STATE
 from brainbench.datasets import export, open_recordings, write_recordings

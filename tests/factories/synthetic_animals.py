@@ -12,7 +12,7 @@ from itertools import groupby
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.trials import Trials
+from brainbench.core.contracts import Trials
 from brainbench.datasets.synthetic import PopulationDesign, ResponseGeometry
 from brainbench.datasets.synthetic.populations import draw_sessions
 from brainbench.datasets.synthetic.truth import correlation_rdm

@@ -9,8 +9,8 @@ import sys
 import numpy as np
 import pytest
 
+from brainbench.core.contracts import Trials
 from brainbench.core.errors import DataError
-from brainbench.core.trials import Trials
 from brainbench.metrics import compare, noise_corrected, rdm
 from brainbench.metrics.measures.rsa import RSA, score_rdms
 from brainbench.metrics.reliability.subject_rdm import subject_rdm

@@ -91,7 +91,7 @@ def score_jobs(
     jobs: list[ScoringJob], to: Path, *, prune: bool, workers: int, scheduler: str | None
 ) -> list[dict[str, Any]]:
     """Score what a folder does not hold yet into it; with ``prune`` remove what a new score replaces."""
-    from brainbench.core.jobs import run_jobs
+    from brainbench.core.runs.jobs import run_jobs
 
     if not jobs:
         return []

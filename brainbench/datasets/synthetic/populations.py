@@ -21,9 +21,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from brainbench.core.contracts import Trials
 from brainbench.core.errors import DataError, UsageError
 from brainbench.core.reading.ranges import check_fields, check_number
-from brainbench.core.trials import Trials
 
 MODULATION = 0.4
 """Largest modulation: beyond it too many rates would be cut off at zero for the truth to hold."""

@@ -16,11 +16,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from brainbench.core.contracts import Trials
 from brainbench.core.errors import DataError, UsageError
 from brainbench.core.files import cache_dir, check_folder, content_hash, file_hash, read_json, write_json
 from brainbench.core.reading.hdf5 import trust_hdf5
 from brainbench.core.reading.ranges import check_number
-from brainbench.core.trials import Trials
 from brainbench.datasets.nwb import write_nwb
 from brainbench.datasets.sessions import Session
 from brainbench.datasets.synthetic.populations import (

@@ -12,10 +12,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.contracts import check_recordings
+from brainbench.core.contracts import Trials, check_recordings
 from brainbench.core.errors import DataError, check_name, listing
 from brainbench.core.files import content_hash, hash_arrays
-from brainbench.core.trials import Trials
 from brainbench.datasets.sessions import natural_key
 from brainbench.datasets.trials.conditions import natural_vocabulary
 from brainbench.datasets.trials.counting import COVARIATES, UNIT_COLUMNS, ReadingOptions, SessionCounts

@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from brainbench.core.contracts import Trials
 from brainbench.core.errors import DataError, UsageError
-from brainbench.core.trials import Trials
 from brainbench.metrics.inference.permutation import SMALLEST_STIMULI, canonical_order, label_orders, tail_p
 from brainbench.metrics.measures.patterns import PatternMetric
 from brainbench.metrics.rdms.dissimilarity import rdm

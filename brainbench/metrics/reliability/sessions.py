@@ -27,8 +27,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from brainbench.core.contracts import Trials
 from brainbench.core.errors import DataError, UsageError, check_name
-from brainbench.core.trials import Trials
 from brainbench.metrics.rdms.noise import NOISE_METHODS, NoiseModel, estimate_noise
 from brainbench.metrics.rdms.pairs import Floats, Ints
 from brainbench.metrics.stimulus_labels import check_finite, labelled_trials, listed, stimulus_means

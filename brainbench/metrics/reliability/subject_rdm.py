@@ -19,10 +19,10 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from brainbench.core.contracts import Trials
 from brainbench.core.errors import DataError, UsageError, check_name
 from brainbench.core.reading.ranges import check_number
 from brainbench.core.records import Interval
-from brainbench.core.trials import Trials
 from brainbench.metrics.rdms.comparison import check_comparison, compare
 from brainbench.metrics.rdms.dissimilarity import RDM_METHODS
 from brainbench.metrics.rdms.noise import NOISE_METHODS

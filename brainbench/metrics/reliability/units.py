@@ -13,8 +13,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from brainbench.core.contracts import Trials
 from brainbench.core.errors import UsageError
-from brainbench.core.trials import Trials
 from brainbench.metrics.arrays import finite_mean
 from brainbench.metrics.rdms.comparison import features
 from brainbench.metrics.rdms.pairs import Floats

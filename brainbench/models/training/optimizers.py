@@ -15,7 +15,7 @@ import torch
 from torch import nn
 from torch.optim import Optimizer
 
-from brainbench.core.cuda_graphs import record_step
+from brainbench.core.devices import record_step
 from brainbench.core.errors import check_name
 from brainbench.core.reading.ranges import check_number
 from brainbench.models.attenders import GPTBlock, MambaBlock

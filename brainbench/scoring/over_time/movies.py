@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from brainbench.core.contracts import Trials
 from brainbench.core.errors import UsageError
-from brainbench.core.trials import Trials
 from brainbench.metrics.rdms.dissimilarity import rdm
 from brainbench.metrics.rdms.pairs import Floats
 from brainbench.metrics.reliability.subject_rdm import subject_rdm

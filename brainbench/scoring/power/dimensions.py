@@ -16,8 +16,8 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import ArrayLike
 
+from brainbench.core.contracts import Trials
 from brainbench.core.errors import DataError, UsageError
-from brainbench.core.trials import Trials
 from brainbench.metrics.rdms.pairs import Floats
 
 MOST = 100.0

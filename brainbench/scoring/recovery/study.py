@@ -16,12 +16,12 @@ import numpy as np
 
 from brainbench.core.errors import UsageError
 from brainbench.core.files import read_json, to_plain, write_json
-from brainbench.core.jobs import run_jobs
 from brainbench.core.progress import Progress, track
 from brainbench.core.reading.ranges import check_number
 from brainbench.core.reading.regular import readable
 from brainbench.core.records import Interval
 from brainbench.core.runs.folder import begin_run
+from brainbench.core.runs.jobs import run_jobs
 from brainbench.metrics.measures.metric import get_metric
 from brainbench.scoring.recovery.boards import Candidate, RecoveryBoard, RecoveryDesign, make_board
 from brainbench.scoring.recovery.confusion import Recovery

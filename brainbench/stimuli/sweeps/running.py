@@ -16,7 +16,15 @@ from pathlib import Path
 
 from brainbench.core.devices import gpus, pick_device, usable_processors
 from brainbench.core.errors import BrainbenchError, DataError
-from brainbench.core.jobs import STOPPING, pool_died, run_jobs, run_on_cluster, start_worker, stop_pool, worker_pool
+from brainbench.core.runs.jobs import (
+    STOPPING,
+    pool_died,
+    run_jobs,
+    run_on_cluster,
+    start_worker,
+    stop_pool,
+    worker_pool,
+)
 from brainbench.stimuli.sweeps.plan import ShardTask
 from brainbench.stimuli.sweeps.shards import (
     BuiltObject,

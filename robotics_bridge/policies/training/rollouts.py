@@ -14,7 +14,7 @@ import torch
 from safetensors.torch import load_file
 from torch import nn
 
-from brainbench.core.cuda_graphs import WARM_UP, CudaGraphStep, Graph, torch_recorder
+from brainbench.core.devices import WARM_UP, CudaGraphStep, Graph, torch_recorder
 from brainbench.core.writing.tensors import write_tensors
 
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from brainbench.core.contracts import Trials
 from brainbench.core.errors import UsageError
-from brainbench.core.trials import Trials
 from brainbench.datasets import open_recordings
 from brainbench.datasets.synthetic import (
     ResponseGeometry,

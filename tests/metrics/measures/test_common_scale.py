@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from brainbench.core.trials import Trials
+from brainbench.core.contracts import Trials
 from brainbench.metrics import get_metric
 from brainbench.metrics.measures.decoding import LabelDecoding
 from brainbench.metrics.reliability.subject_rdm import denoised

@@ -7,9 +7,9 @@ import math
 import numpy as np
 import pytest
 
+from brainbench.core.contracts import Trials
 from brainbench.core.errors import UsageError
 from brainbench.core.statistics import two_factor_interval
-from brainbench.core.trials import Trials
 from brainbench.metrics import get_metric
 from brainbench.metrics.measures.decoding import LabelDecoding, LabelledFeatures, decode, fit_softmax, label_properties
 

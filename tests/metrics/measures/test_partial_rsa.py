@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from brainbench.core.trials import Trials
+from brainbench.core.contracts import Trials
 from brainbench.metrics import get_metric, rdm
 from brainbench.metrics.measures.nuisance import partial_correlations, variance_partition
 

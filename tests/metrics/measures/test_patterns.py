@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.linalg import orthogonal_procrustes
 
+from brainbench.core.contracts import Trials
 from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError
-from brainbench.core.trials import Trials
 from brainbench.metrics import PatternMetric, compare, get_metric, list_metrics, rdm, register_metric
 from brainbench.metrics.measures.patterns import PENALTIES, Procrustes, RidgeEncoding
 from brainbench.metrics.reliability.subject_rdm import subject_rdm

@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from brainbench.core.contracts import Trials
 from brainbench.core.errors import DataError, UsageError
-from brainbench.core.trials import Trials
 from brainbench.metrics import compare, rdm
 from brainbench.metrics.rdms.pairs import permuted_pairs
 from brainbench.metrics.reliability.halves import SplitRDMs, members

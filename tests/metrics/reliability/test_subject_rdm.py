@@ -7,8 +7,8 @@ import warnings
 import numpy as np
 import pytest
 
+from brainbench.core.contracts import Trials
 from brainbench.core.errors import UsageError
-from brainbench.core.trials import Trials
 from brainbench.metrics import noise_precision, rdm
 from brainbench.metrics.reliability.halves import SplitRDMs, half_rdms, split_members
 from brainbench.metrics.reliability.sessions import SortedTrials, key_hashes

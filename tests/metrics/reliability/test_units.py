@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from brainbench.core.contracts import Trials
 from brainbench.core.errors import UsageError
-from brainbench.core.trials import Trials
 from brainbench.metrics.reliability.subject_rdm import subject_rdm
 from brainbench.metrics.reliability.units import reliable_units, unit_reliability
 

@@ -19,8 +19,7 @@ import torch
 from torch.utils import _pytree
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from brainbench.core.cuda_graphs import CudaGraphStep, Recorder
-from brainbench.core.devices import warp
+from brainbench.core.devices import CudaGraphStep, Recorder, warp
 from brainbench.core.errors import UsageError
 from brainbench.core.rotations import constant
 from robotics_bridge import tasks

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from brainbench.core.contracts import Trials
 from brainbench.core.errors import UsageError
-from brainbench.core.trials import Trials
 from brainbench.metrics import rdm
 from brainbench.metrics.reliability.subject_rdm import subject_rdm
 from brainbench.scoring.over_time import animal_movie, in_bins, layer_movie

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from brainbench.core.contracts import Trials
 from brainbench.core.errors import DataError, UsageError
-from brainbench.core.trials import Trials
 from brainbench.scoring.power.dimensions import MOST, pattern_dimensions, signal_dimensions
 
 

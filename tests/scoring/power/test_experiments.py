@@ -7,8 +7,8 @@ import dataclasses
 import numpy as np
 import pytest
 
+from brainbench.core.contracts import Trials
 from brainbench.core.errors import UsageError
-from brainbench.core.trials import Trials
 from brainbench.metrics import compare
 from brainbench.metrics.inference.permutation import label_orders, tail_p
 from brainbench.metrics.measures.rsa import score_rdms

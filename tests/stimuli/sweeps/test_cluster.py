@@ -7,8 +7,8 @@ import time
 
 import pytest
 
-from brainbench.core import jobs
 from brainbench.core.errors import DataError, MissingDependencyError, UsageError
+from brainbench.core.runs import jobs
 from brainbench.stimuli.sweeps import running
 from brainbench.stimuli.sweeps.generation import generate
 from tests.factories.sweep_batches import files_of, killed_plan, small_plan

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.devices import warp
-from brainbench.core.jobs import STOPPING
+from brainbench.core.runs.jobs import STOPPING
 from brainbench.stimuli.engines.rod import limits
 from brainbench.stimuli.engines.rod.limits import AFTER_OTHERS, WARP, contacts_for
 

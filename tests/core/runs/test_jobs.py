@@ -1,3 +1,5 @@
+from __future__ import annotations
+
 import math
 import os
 from functools import partial
@@ -5,7 +7,7 @@ from functools import partial
 import pytest
 
 from brainbench.core.errors import DataError, MissingDependencyError, UsageError
-from brainbench.core.jobs import run_jobs
+from brainbench.core.runs.jobs import run_jobs
 
 
 @pytest.mark.parametrize("workers", [1, 2])
