@@ -383,7 +383,7 @@ SURFACES = (
         _bad_record,
     ),
     Surface("site manifest", _site, lambda path: check_site(path.parent), lambda found: not found[1]),
-    Surface("commitment", _commitment, Commitment.read, lambda found: min(found.held, found.kept) < 1),
+    Surface("commitment", _commitment, Commitment.read, lambda found: min(found.held, found.public) < 1),
     Surface(
         "fidelity text",
         written("fidelity.txt", "fast,links=12,links_per_mm=0.3,time_step=1e-4,solver=quasistatic"),

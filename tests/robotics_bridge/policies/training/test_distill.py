@@ -204,7 +204,7 @@ def test_requests_that_do_not_fit_are_refused(tmp_path) -> None:
         _run(tmp_path, iterations=3)
     with pytest.raises(UsageError, match="did you mean 'mse'"):
         _config(loss="ms")
-    with pytest.raises(UsageError, match=r"share .* received 2"):
+    with pytest.raises(UsageError, match=r"teacher_share.* received 2"):
         _config(teacher_share=2)
     with pytest.raises(UsageError, match="did you mean 'placement'"):
         DistillConfig.of({"task": "x", "placment": "tips"})
