@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 from collections import defaultdict
 from collections.abc import Iterator
 from graphlib import CycleError, TopologicalSorter
@@ -19,41 +20,26 @@ MOST_MODULES = 16
 MOST_LINES = 700
 """Lines of a module, which is cut by idea; 150 to 450 are usual."""
 BUDGETS = {
-    "brainbench/stimuli": 23_000,
-    "robotics_bridge": 21_500,
-    "brainbench/models": 8_500,
-    "brainbench/datasets": 6_700,
-    "brainbench/metrics": 6_000,
-    "brainbench/cli": 4_600,
-    "brainbench/core": 4_100,
-    "leaderboards": 3_400,
-    "brainbench/scoring": 2_500,
-    "brainbench/geometry": 700,
+    "brainbench/stimuli": 26_200,
+    "robotics_bridge": 23_200,
+    "brainbench/models": 8_000,
+    "brainbench/datasets": 6_400,
+    "brainbench/metrics": 5_100,
+    "brainbench/cli": 4_650,
+    "brainbench/core": 4_900,
+    "leaderboards": 3_550,
+    "brainbench/scoring": 3_750,
+    "brainbench/geometry": 1_050,
     "brainbench/published": 2_700,
-    "brainbench/tradeoffs": 900,
+    "brainbench/tradeoffs": 1_100,
     "benchmarks": 7_500,
 }
-"""Folder → lines of Python that it may have. Who adds a capability pays in the same folder, or raises the number in
-the commit that needs it, with the reason."""
-MOST_PRODUCT_LINES, MOST_PRODUCT_MODULES = 84_000, 430
-VAGUE = {
-    *(
-        "found",
-        "told",
-        "own",
-        "kept",
-        "known",
-        "asked",
-        "one",
-        "other",
-        "item",
-        "shown",
-        "made",
-        "named",
-        "taken",
-        "usual",
-    )
-}
+"""Folder → lines of Python that it may have: as the rooms stand, with two per cent to move in. Who adds a capability
+pays in the same folder, or raises the number in the commit that needs it, with the reason."""
+MOST_PRODUCT_LINES, MOST_PRODUCT_MODULES = 89_500, 512
+VAGUE = frozenset(
+    re.findall(r"\w+", "found told own kept known asked one other item shown made named taken usual"),
+)
 """Words that say nothing about a value: a local is the noun of the thing."""
 STORED_FIELDS: set[tuple[str, str]] = set()
 """Module and field of stored files that keep a vague name, since it stands on disk."""

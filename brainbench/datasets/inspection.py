@@ -225,7 +225,7 @@ def _summary(session: Session, usable: bool) -> SessionSummary:
         tables=tables,
         modules=tuple(session.modules.items()),
         acquired=tuple(
-            AcquiredSummary(item.name, item.kind, tuple(item.data.shape), item.gigabytes) for item in series
+            AcquiredSummary(entry.name, entry.kind, tuple(entry.data.shape), entry.gigabytes) for entry in series
         ),
         missing=tuple(missing),
         notes=session.notes,
@@ -292,7 +292,7 @@ def _session_lines(session: SessionSummary) -> Iterator[str]:
             yield f"    {column.name} ({column.kind}) {values}{' …' if column.distinct > EXAMPLES else ''}"
     for name, contents in session.modules:
         yield f"  processing/{name}: {', '.join(contents)}"
-    for (kind, shape), series in groupby(session.acquired, key=lambda item: (item.kind, item.shape)):
+    for (kind, shape), series in groupby(session.acquired, key=lambda entry: (entry.kind, entry.shape)):
         items = list(series)
         gigabytes = sum(item.gigabytes for item in items)
         size = f"{gigabytes:.3g} GB" if gigabytes >= 0.1 else f"{gigabytes * 1e3:.3g} MB"
@@ -335,7 +335,7 @@ def propose(session: Session, layout: RecordingLayout | None = None) -> list[Pro
             declared = layout.vocabulary(layout.conditions) or natural_vocabulary(values)
             labels = ["-".join(row) for row in values]
             ranked.append(((-1.0,), _proposal(str(layout.conditions), labels, declared)))
-    return [proposal for _, proposal in sorted(ranked, key=lambda item: item[0])]
+    return [proposal for _, proposal in sorted(ranked, key=lambda entry: entry[0])]
 
 
 def _selected(table: SessionTable, layout: RecordingLayout) -> NDArray[np.bool_]:

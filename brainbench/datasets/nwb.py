@@ -222,7 +222,7 @@ def write_nwb(
             if series.timestamps is not None:
                 _write_events(_group(file, name, "TimeSeries", f"{origin}Events {name}."), series)
         # Every object has an identifier; the file itself is visited by no walk through it.
-        file.visititems(lambda _, item: _identify(item, identifier))
+        file.visititems(lambda _, node: _identify(node, identifier))
         _identify(file, identifier)
     return Path(path)
 

@@ -95,8 +95,8 @@ def assemble_stimulus_set(
     dataset = new_stimulus_set(
         labels,
         [
-            (one, ROWS.index(name[1]), int(name[2:]), _SIDES[name[0]])
-            for one, name in zip(short_names, names, strict=True)
+            (short, ROWS.index(name[1]), int(name[2:]), _SIDES[name[0]])
+            for short, name in zip(short_names, names, strict=True)
         ],
         frames,
         {

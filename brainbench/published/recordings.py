@@ -242,9 +242,9 @@ def _of_file(
 def _of_animal(array: NDArray[np.float64], sessions: Sequence[ZeroFilledSession]) -> Iterator[Finding]:
     """Yield the trials, borders and silent trials of one animal."""
     listing = "; ".join(
-        f"{item.session}: {item.units} units, {len(item.slots)} trials, "
-        f"{'/'.join(map(str, _trials_of_slots(item)))} per slot"
-        for item in sessions
+        f"{session.session}: {session.units} units, {len(session.slots)} trials, "
+        f"{'/'.join(map(str, _trials_of_slots(session)))} per slot"
+        for session in sessions
     )
     yield Finding("note", "sessions", f"{len(sessions)} session{'s' * (len(sessions) > 1)} found ({listing})")
     if silent := sum(int((item.slots < 0).sum()) for item in sessions):

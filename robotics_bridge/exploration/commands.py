@@ -80,7 +80,7 @@ def hand(
     title = f"{recording.hand}, {placement}, {resolution}; {unit_of}"
     columns = {
         "stimulus": "{0[stimulus]}",
-        ">sites touched": lambda item: f"{item['sites_touched']} of {sites}",
+        ">sites touched": lambda row: f"{row['sites_touched']} of {sites}",
         ">peak force N": "{0[peak_force_N]:.3g}",
     }
     text = table_of(title, data, columns)

@@ -246,11 +246,11 @@ def record_exploration(
         "procedures": list(procedures),
         "objects": [
             {
-                "label": item.label, "quaternion": item.quaternion, "retreat": item.retreat,
-                "mesh": None if (mesh := item.geometry.mesh) is None else content_hash(mesh.vertices, mesh.faces),
-                "geometry": [item.geometry.kind, *item.geometry.size] if mesh is None else None,
+                "label": target.label, "quaternion": target.quaternion, "retreat": target.retreat,
+                "mesh": None if (mesh := target.geometry.mesh) is None else content_hash(mesh.vertices, mesh.faces),
+                "geometry": [target.geometry.kind, *target.geometry.size] if mesh is None else None,
             }
-            for item in objects
+            for target in objects
         ],
     }  # fmt: skip
     return HandRecording(

@@ -103,7 +103,7 @@ def check(source: Source, *, conditions: str | Conditions | None = None, progres
         message = f"{names.count(name)} files hold this session; its trials would count more than once"
         findings.append(Finding("error", "file", message, "Leave all but one of them out.", where=name))
     place = str(source) if not isinstance(source, (list, tuple)) else ", ".join(map(str, source))
-    worst_first = sorted(findings, key=lambda item: SEVERITIES.index(item.severity))
+    worst_first = sorted(findings, key=lambda finding: SEVERITIES.index(finding.severity))
     return Checkup(place, len(paths), tuple(names), tuple(worst_first))
 
 

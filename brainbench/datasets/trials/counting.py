@@ -152,7 +152,7 @@ def count_session(session: Session, options: ReadingOptions) -> SessionCounts:
     # of units (several probes) are told apart by number of spikes and first spike.
     start, ids, unit_ids = table.times("start_time"), as_labels(table.ids()), as_labels(session.units.ids())
     rows = _sorted(keep, lambda row: (start[row], natural_key(ids[row])))
-    units = _sorted(unit_kept, lambda one: (natural_key(unit_ids[one]), len(spikes[one]), spikes[one][:1].tolist()))
+    units = _sorted(unit_kept, lambda unit: (natural_key(unit_ids[unit]), len(spikes[unit]), spikes[unit][:1].tolist()))
     counts, duration = count(
         [spikes[unit] for unit in units], edges[rows], covered[np.ix_(rows, units)], options.bin, options.window.length
     )

@@ -230,7 +230,7 @@ class SteppedJob:
     def end(self, failed: int, reason: str) -> tuple[int, str]:
         """Return the first step that cannot be trusted and why, given what the integration found."""
         missed = passed_unseen(self.job, self.reach, *self.pose, self.times)
-        return min(self.overlap[:2], missed, (failed, reason), key=lambda found: found[0])
+        return min(self.overlap[:2], missed, (failed, reason), key=lambda fault: fault[0])
 
     def frames(self, failed: int) -> FrameSteps:
         """Return the steps around each frame when those from ``failed`` on cannot be trusted."""

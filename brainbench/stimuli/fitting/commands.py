@@ -150,10 +150,10 @@ def _contacts(
         for index in range(contacts.sizes["time"])
     ]
     columns = {
-        ">ms": lambda one: f"{1e3 * one['time']:.2f}",
-        ">force µN": lambda one: f"{1e6 * one['force']:.2f} ± {1e6 * one['force_deviation']:.2f}",
-        ">arc mm": lambda one: f"{1e3 * one['arc']:.2f} ± {1e3 * one['arc_deviation']:.2f}",
-        ">moment nN·m": lambda one: f"{1e9 * one['moment']:.3g}",
+        ">ms": lambda row: f"{1e3 * row['time']:.2f}",
+        ">force µN": lambda row: f"{1e6 * row['force']:.2f} ± {1e6 * row['force_deviation']:.2f}",
+        ">arc mm": lambda row: f"{1e3 * row['arc']:.2f} ± {1e3 * row['arc_deviation']:.2f}",
+        ">moment nN·m": lambda row: f"{1e9 * row['moment']:.3g}",
         "status": "{0[status]}",
         "": "{0[reason]}",
     }
@@ -163,8 +163,8 @@ def _contacts(
 def _text(result: FitResult, measured: xr.Dataset) -> str:
     columns = {
         "parameter": "{0.name}",
-        ">estimate": lambda one: f"{one.value:.4g} {one.unit}",
-        ">interval": lambda one: f"[{one.interval.low:.4g}, {one.interval.high:.4g}]",
+        ">estimate": lambda row: f"{row.value:.4g} {row.unit}",
+        ">interval": lambda row: f"[{row.interval.low:.4g}, {row.interval.high:.4g}]",
         ">start": "{0.start:.4g}",
         "status": "{0.status}",
     }

@@ -197,7 +197,7 @@ def fit(
             "or with a shorter time step."
         )
     check_wrenches(trials, model.run(begin).traces)
-    solutions = sorted((problem.solve(u) for u in find_starts(model)), key=lambda one: one.deviance)
+    solutions = sorted((problem.solve(u) for u in find_starts(model)), key=lambda solution: solution.deviance)
     return _judge(problem, solutions, began)
 
 

@@ -95,8 +95,8 @@ def _shift(name: str, what: str, of_job: str) -> Parameter:
 
 
 PARAMETERS: Mapping[str, Parameter] = {
-    item.name: item
-    for item in (
+    parameter.name: parameter
+    for parameter in (
         _positive("young_modulus", "Pa", "Young's modulus", real=(1e9, 1e10)),
         _positive(
             "density", "kg/m³", "density at the base; the ratio of tip to base is kept", 0.2, 5.0, real=(800.0, 2000.0)
@@ -146,8 +146,8 @@ class FreeParameters:
         """Return the values at coordinates u [p]."""
         whisker = self.start.whisker
         return tuple(
-            PARAMETERS[name].value(self.start[name], float(one), whisker)
-            for name, one in zip(self.names, u, strict=True)
+            PARAMETERS[name].value(self.start[name], float(value), whisker)
+            for name, value in zip(self.names, u, strict=True)
         )
 
     def condition(self, u: Any) -> Condition:

@@ -178,8 +178,8 @@ class FitResult:
             "estimates": [vars(one) for one in self.estimates],
             "noise": dict(self.noise),
             "directions": [
-                {"words": one.words, "deviation": one.deviation, "identified": one.identified}
-                for one in self.directions
+                {"words": direction.words, "deviation": direction.deviation, "identified": direction.identified}
+                for direction in self.directions
             ],
             "residual_tests": [vars(one) for one in self.tests],
             "whisker": self.whisker,

@@ -134,7 +134,7 @@ def _rodgers_recorded(file: str, trajectory: Trajectory | None, species: str, wh
 
         head = Head(far(scene.head.position), scene.head.rotation)
         objects = tuple(
-            PlacedObject(item.solid.scaled(scale), far(item.position), item.rotation) for item in scene.objects
+            PlacedObject(placed.solid.scaled(scale), far(placed.position), placed.rotation) for placed in scene.objects
         )
         return dataclasses.replace(scene, array=array, objects=objects, whisking=whisking, head=head)
 

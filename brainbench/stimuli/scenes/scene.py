@@ -114,8 +114,8 @@ class Scene:
     def split(self) -> tuple[Scene, ...]:
         """Return one scene per animal; together they are this one, because whiskers touch objects only."""
         rest = (
-            replace(self, array=other.array, whisking=other.whisking, head=other.head, animal=other.name, others=())
-            for other in self.others
+            replace(self, array=animal.array, whisking=animal.whisking, head=animal.head, animal=animal.name, others=())
+            for animal in self.others
         )
         return replace(self, others=()), *rest
 
@@ -189,7 +189,7 @@ class Scene:
         if self.others:
             config["animal"] = self.animal
             config["others"] = [
-                {"animal": other.name, "whisking": other.whisking.config(), "head": other.head.config()}
-                for other in self.others
+                {"animal": animal.name, "whisking": animal.whisking.config(), "head": animal.head.config()}
+                for animal in self.others
             ]
         return config

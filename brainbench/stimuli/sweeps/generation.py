@@ -60,8 +60,8 @@ def make_manifest(plan: Plan, folder: str | os.PathLike[str]) -> dict[str, Any]:
     Equal data sets have equal manifests on one machine: there is no time in it.
     """
     objects: dict[str, dict[str, Any]] = {
-        name: {"label": item.label, "source": item.source, "hash": None, "sweeps": {}, "untouched": True}
-        for name, item in plan.objects.items()
+        name: {"label": source.label, "source": source.source, "hash": None, "sweeps": {}, "untouched": True}
+        for name, source in plan.objects.items()
     }
     shards = [_read(Path(folder) / task.name, task, objects) for task in plan.shards]
     for name, entry in objects.items():

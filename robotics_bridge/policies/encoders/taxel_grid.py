@@ -342,7 +342,7 @@ class TaxelGraph(nn.Module):
                 whole[number] = np.sqrt(len(places)) * pattern
                 patterns.append((value, np.concatenate(whole)))
         # Stable: patterns that are equally smooth keep the order of the links.
-        smoothest = sorted(patterns, key=lambda item: item[0])[:SITES]
+        smoothest = sorted(patterns, key=lambda pattern: pattern[0])[:SITES]
         middle = np.concatenate([np.tile(one.mean(0), (len(one), 1)) for one in points if len(one)])
         # Not weights: they follow from the layout, so files of weights need not hold them.
         rows = [pattern for _, pattern in smoothest]

@@ -272,31 +272,31 @@ def _reservoirs(subject: Subject, grid: TaxelGrid | TaxelGraph) -> list[Features
 
 
 def _with_traces(features: Callable[[Subject], Features]) -> Callable[[Subject], list[Features]]:
-    return lambda one: [traces(features(one), one.rollout.begun)]
+    return lambda subject: [traces(features(subject), subject.rollout.begun)]
 
 
 ARMS: Mapping[str, Callable[[Subject], list[Features]]] = {
-    "none": lambda one: [one.rollout.proprio[..., :0]],
-    "none, memory": _with_traces(lambda one: one.rollout.proprio),
-    "bits": lambda one: [bits(one.rollout, one.links)],
-    "bits, memory": _with_traces(lambda one: bits(one.rollout, one.links)),
-    "force": lambda one: [force(one.rollout)],
-    "force, memory": _with_traces(lambda one: force(one.rollout)),
-    "taxels": lambda one: [raw(one.rollout)],
-    "taxels, memory": _with_traces(lambda one: raw(one.rollout)),
-    "grid, memory": _with_traces(lambda one: mapped(one.rollout, one.grid)),
-    "grid, posture, memory": _with_traces(lambda one: mapped(bent(one).rollout, one.grid)),
-    "graph, memory": _with_traces(lambda one: mapped(one.rollout, one.graph)),
-    "reservoir": lambda one: _reservoirs(one, one.grid),
-    "reservoir, posture": lambda one: _reservoirs(bent(one), one.grid),
-    "reservoir, graph": lambda one: _reservoirs(one, one.graph),
-    "untrained": lambda one: networks("native", NETWORK, one, range(one.untrained)),
-    "simclr": lambda one: networks("native", f"{NETWORK}.simclr", one),
-    "simclr, posture": lambda one: networks("native", f"{NETWORK}.simclr", bent(one)),
-    "supervised": lambda one: networks("native", f"{NETWORK}.supervised", one),
-    "untrained, 45 ms": lambda one: networks("resampled", NETWORK, one, range(one.untrained)),
-    "simclr, 45 ms": lambda one: networks("resampled", f"{NETWORK}.simclr", one),
-    "supervised, 45 ms": lambda one: networks("resampled", f"{NETWORK}.supervised", one),
+    "none": lambda subject: [subject.rollout.proprio[..., :0]],
+    "none, memory": _with_traces(lambda subject: subject.rollout.proprio),
+    "bits": lambda subject: [bits(subject.rollout, subject.links)],
+    "bits, memory": _with_traces(lambda subject: bits(subject.rollout, subject.links)),
+    "force": lambda subject: [force(subject.rollout)],
+    "force, memory": _with_traces(lambda subject: force(subject.rollout)),
+    "taxels": lambda subject: [raw(subject.rollout)],
+    "taxels, memory": _with_traces(lambda subject: raw(subject.rollout)),
+    "grid, memory": _with_traces(lambda subject: mapped(subject.rollout, subject.grid)),
+    "grid, posture, memory": _with_traces(lambda subject: mapped(bent(subject).rollout, subject.grid)),
+    "graph, memory": _with_traces(lambda subject: mapped(subject.rollout, subject.graph)),
+    "reservoir": lambda subject: _reservoirs(subject, subject.grid),
+    "reservoir, posture": lambda subject: _reservoirs(bent(subject), subject.grid),
+    "reservoir, graph": lambda subject: _reservoirs(subject, subject.graph),
+    "untrained": lambda subject: networks("native", NETWORK, subject, range(subject.untrained)),
+    "simclr": lambda subject: networks("native", f"{NETWORK}.simclr", subject),
+    "simclr, posture": lambda subject: networks("native", f"{NETWORK}.simclr", bent(subject)),
+    "supervised": lambda subject: networks("native", f"{NETWORK}.supervised", subject),
+    "untrained, 45 ms": lambda subject: networks("resampled", NETWORK, subject, range(subject.untrained)),
+    "simclr, 45 ms": lambda subject: networks("resampled", f"{NETWORK}.simclr", subject),
+    "supervised, 45 ms": lambda subject: networks("resampled", f"{NETWORK}.supervised", subject),
 }
 """Arm → its features, once for each draw; every arm has the joints beside them. ``none`` feels nothing, ``bits`` has
 one bit per link, ``force`` and ``taxels`` every taxel's force, and force with torque; ``memory`` adds two leaky

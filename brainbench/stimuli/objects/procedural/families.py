@@ -31,10 +31,10 @@ DETAIL = (2_000, 20_000)
 """Fewest and most triangles of a shape."""
 
 _FAMILIES: dict[str, Callable[[ShapeSampler, int], Body]] = {
-    name: item
+    name: value
     for module in (turned, extruded, assembled)
-    for name, item in vars(module).items()
-    if isinstance(item, FunctionType) and item.__module__ == module.__name__ and not name.startswith("_")
+    for name, value in vars(module).items()
+    if isinstance(value, FunctionType) and value.__module__ == module.__name__ and not name.startswith("_")
 }
 """Builders by name: every public function of these modules is a family."""
 
