@@ -26,6 +26,8 @@ from brainbench.models.ops.dispatch import DeferredNormGrad
 from brainbench.models.ops.layers import ChannelNorm, Conv2d
 from brainbench.models.ops.parameters import load_named
 
+__all__ = ["GRU", "LSTM", "UGRNN", "IntersectionRNN", "TimeDecay"]
+
 FORGET_BIAS = 1.0
 """Added inside the sigmoid of every gate that keeps the old state."""
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from brainbench.core.trials import Trials
+from brainbench.core.contracts import Trials
 from brainbench.metrics import rdm
 from brainbench.metrics.reliability.sessions import SortedTrials, content_hashes
 from brainbench.metrics.reliability.subject_rdm import subject_rdm
