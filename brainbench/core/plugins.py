@@ -179,6 +179,20 @@ def load_optional(group: str, name: str, kind: str) -> Any | None:
     return None if part is None else part.load(kind)
 
 
+def require_optional(group: str, name: str, kind: str) -> Any:
+    """Return the object of one name of a group that ships with this package.
+
+    Raises:
+        MissingDependencyError: the folder that holds it was taken off, or the installation does not know it.
+    """
+    part = load_optional(group, name, kind)
+    if part is None:
+        raise MissingDependencyError(
+            f"The {kind} {name!r} is not known to this installation; install the project again."
+        )
+    return part
+
+
 def load_entry_points(group: str, take: Callable[[str, Any], None]) -> None:
     """Hand every object of an entry-point group to ``take(name, object)``.
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from brainbench.core.errors import DataError, DataFileNotFoundError, MissingDependencyError, UsageError
-from brainbench.core.plugins import OptionalPart, files_of, load_module, load_object
+from brainbench.core.plugins import OptionalPart, files_of, load_module, load_object, require_optional
 
 
 def test_an_object_of_a_file_may_use_the_files_beside_it(tmp_path):
@@ -58,3 +58,8 @@ def test_a_part_that_is_here_is_described_without_importing_it_and_loaded():
     assert not part.taken_off
     assert part.summary.startswith("Return the object NAME of")
     assert part.load("metric") is load_object
+
+
+def test_a_part_that_the_installation_does_not_know_asks_for_a_new_one():
+    with pytest.raises(MissingDependencyError, match="recorder 'nobody' is not known .* install the project again"):
+        require_optional("robotics_bridge.links", "nobody", "recorder")

@@ -75,7 +75,7 @@ def deploy(
 
     Exit status 1: it was stopped for safety.
     """
-    from brainbench.core.plugins import load_optional
+    from brainbench.core.plugins import require_optional
     from robotics_bridge.deploy import session
     from robotics_bridge.deploy.controller import check_duration, realtime
     from robotics_bridge.deploy.driver import DriverRequest, open_driver
@@ -84,8 +84,8 @@ def deploy(
     deployed = session.read_deployed(policy)
     contract = deployed.contract
     check_duration(seconds)
-    recorder = None if record is None else load_optional(LINKS, "lerobot", "recorder")(contract, record)
-    shadow_touch = load_optional(LINKS, "shadow", "touch") if shadow else None
+    recorder = None if record is None else require_optional(LINKS, "lerobot", "recorder")(contract, record)
+    shadow_touch = require_optional(LINKS, "shadow", "touch") if shadow else None
     given = _inputs(deployed, inputs or [])
     # What is missing is said before a hand is started or greeted.
     opened = open_driver(

@@ -208,11 +208,11 @@ def test_requests_that_do_not_fit_are_refused(tmp_path) -> None:
         _config(teacher_share=2)
     with pytest.raises(UsageError, match="did you mean 'placement'"):
         DistillConfig.of({"task": "x", "placment": "tips"})
-    with pytest.raises(UsageError, match=r"num_envs .*received 0"):
+    with pytest.raises(UsageError, match=r"num_envs.* received 0"):
         _config(num_envs=0)
-    with pytest.raises(UsageError, match=r"width of the hidden layers .*received -4"):
+    with pytest.raises(UsageError, match=r"hidden.* received -4"):
         _config(hidden=(12, -4))
-    with pytest.raises(UsageError, match="received no width"):
+    with pytest.raises(UsageError, match=r"hidden.* holds at least 1 values; received \[\]"):
         _config(hidden=())
     with pytest.raises(UsageError, match=r"stop_after must be a finite number, at least 0; received nan"):
         distill(_config(), tmp_path, env=None, teacher=Follower(), stop_after=math.nan)
