@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from brainbench.core.errors import UsageError, check_name
 from robotics_bridge.policies.student import TACTILE
@@ -47,5 +47,5 @@ def sensing_policy(
         }
     return DistillConfig(
         task=env.task.name, hand=str(env.hand.path or env.hand.name), embedder="lstm", hidden=settings.hidden,
-        num_envs=env.num_envs, seed=seed, contacts=contacts if contacts in CONTACTS else None, **senses,
+        num_envs=env.num_envs, seed=seed, contacts=cast(Any, contacts if contacts in CONTACTS else None), **senses,
     )  # fmt: skip
