@@ -112,7 +112,7 @@ def pickled_names(data: bytes, name: str) -> list[tuple[str, ...]]:
     try:
         for opcode, argument, _ in pickletools.genops(data):
             if opcode.name in ("UNICODE", "BINUNICODE", "SHORT_BINUNICODE"):
-                texts.append(argument)
+                texts.append(argument)  # pyright: ignore[reportArgumentType] # checked above
             elif opcode.name in ("GET", "BINGET", "LONG_BINGET"):
                 texts.append(memo[int(argument or 0)] or "")
             elif opcode.name in ("PUT", "BINPUT", "LONG_BINPUT", "MEMOIZE"):
