@@ -22,6 +22,8 @@ from brainbench.stimuli.whiskers.whisker import Whisker
 
 DEFAULT_ENGINE = "rod"
 """Engine of whatever does not ask for one; it needs no GPU."""
+MOST_LINKS = 100
+"""Links per whisker that are allowed; error is far below 0.1 % before. MuJoCo's cost grows with their square."""
 
 
 @dataclass(frozen=True)
@@ -139,8 +141,6 @@ MARGIN = 0.85
 """Measured over promised error: the sample of scenes must not decide whether a promise holds."""
 RESOLUTION = ("links", "links_per_mm", "time_step", "steps_per_period", "contact_tolerance")
 """Fields that the measured settings differ in."""
-MOST_LINKS = 100
-"""Links per whisker that are allowed; error is far below 0.1 % before. MuJoCo's cost grows with their square."""
 
 _PRESETS = {
     "fast": {"links": 8, "links_per_mm": 0.25, "time_step": 2e-4, "steps_per_period": 10},
