@@ -70,10 +70,18 @@ def limited(cls: type[T]) -> type[T]: ...
 
 
 @overload
-def limited(*, of: str = ..., unresolved: Sequence[str] = ...) -> Callable[[type[T]], type[T]]: ...
+def limited(
+    *, of: str = ..., names: Mapping[str, str] | None = ..., unresolved: Sequence[str] = ...
+) -> Callable[[type[T]], type[T]]: ...
 
 
-def limited(cls: type | None = None, *, of: str = "{}", unresolved: Sequence[str] = ()) -> Any:
+def limited(
+    cls: type | None = None,
+    *,
+    of: str = "{}",
+    names: Mapping[str, str] | None = None,
+    unresolved: Sequence[str] = (),
+) -> Any:
     """Let a dataclass check the limits of its fields when it is made; stands below ``@dataclass``.
 
     What its own ``__post_init__`` checks, relations between fields, comes after.
@@ -81,6 +89,7 @@ def limited(cls: type | None = None, *, of: str = "{}", unresolved: Sequence[str
     Args:
         cls: the class.
         of: text with braces for the field's name in messages, for instance ``"{} of a whisker"``.
+        names: field → what messages call it, where that is not its own name.
         unresolved: fields without limits whose annotation names types that are imported for type checkers alone.
     """
 
@@ -99,6 +108,7 @@ def limited(cls: type | None = None, *, of: str = "{}", unresolved: Sequence[str
         __post_init__.checks_limits = True  # type: ignore[attr-defined]
         cls.__post_init__ = __post_init__  # type: ignore[attr-defined]
         cls.__limits_of__ = of  # type: ignore[attr-defined]
+        cls.__limit_names__ = {**getattr(cls, "__limit_names__", {}), **(names or {})}  # type: ignore[attr-defined]
         cls.__unresolved__ = (*getattr(cls, "__unresolved__", ()), *unresolved)  # type: ignore[attr-defined]
         return cls
 
@@ -163,9 +173,9 @@ def bounds_of(annotation: Any) -> str:
 @cache
 def _checks(cls: type) -> dict[str, tuple[str, Check]]:
     """Return, by field, its name in messages and its check."""
-    of = getattr(cls, "__limits_of__", "{}")
+    of, names = getattr(cls, "__limits_of__", "{}"), getattr(cls, "__limit_names__", {})
     # No format: what a user named may hold braces of its own.
-    checks = {name: (of.replace("{}", name), checker(kind)) for name, kind in limits_of(cls).items()}
+    checks = {name: (of.replace("{}", names.get(name, name)), checker(kind)) for name, kind in limits_of(cls).items()}
     return {name: (told, check) for name, (told, check) in checks.items() if check is not None}
 
 

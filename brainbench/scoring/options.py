@@ -36,7 +36,10 @@ _ELSEWHERE = ("recordings", "match", "explain", "title", "strict")
 
 
 @dataclass(frozen=True)
-@limited(unresolved=("recordings", "stimuli", "match", "select", "window", "fidelity", "metric", "layers"))
+@limited(
+    names={"time": "time rule"},
+    unresolved=("recordings", "stimuli", "match", "select", "window", "fidelity", "metric", "layers"),
+)
 class ScoreOptions:
     """Options of scoring a model against recordings."""
 

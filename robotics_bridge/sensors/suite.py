@@ -188,6 +188,8 @@ class SensorSuite:
         readable += [history.ring.reshape((-1, *history.ring.shape[2:])) for history in self._histories.values()]
         self._readable = [planes for planes in readable if planes.size]
         self._resets = context.array(np.zeros(num_envs, bool), wp.bool)
+        # The view is made once: a control step that resets must not copy from the host, or no graph can record it.
+        self._resets_view = wp.to_torch(self._resets)
         # An update as a CUDA graph, for one state and time step (s).
         self._recorded: tuple[Callable[[], None], HandState, float] | None = None
         self._pose: Any = None
@@ -258,7 +260,7 @@ class SensorSuite:
     def reset(self, env_ids: EnvIds | None = None) -> None:
         """Start a new episode in some environments (all by default): memories are cleared, new errors drawn."""
         c, mask = self.context, self._resets
-        wp.to_torch(mask).copy_(select_envs(env_ids, self.num_envs, wp.device_to_torch(self.device)))
+        self._resets_view.copy_(select_envs(env_ids, self.num_envs, wp.device_to_torch(self.device)))
         c.launch(reset_clock, self.num_envs, mask, c.age, c.episode, self.pairs.status)
         for planes in self._readable:
             c.launch(clear_readings, planes.shape[1:], mask, planes)
