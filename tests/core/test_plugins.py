@@ -61,5 +61,5 @@ def test_a_part_that_is_here_is_described_without_importing_it_and_loaded():
 
 
 def test_a_part_that_the_installation_does_not_know_asks_for_a_new_one():
-    with pytest.raises(MissingDependencyError, match="recorder 'nobody' is not known .* install the project again"):
+    with pytest.raises(MissingDependencyError, match=r"recorder 'nobody' is not known .* install the project again"):
         require_optional("robotics_bridge.links", "nobody", "recorder")

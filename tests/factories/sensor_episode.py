@@ -82,10 +82,11 @@ def readings(kept: dict[str, np.ndarray], device: str) -> dict[str, np.ndarray]:
     for update in range(UPDATES):
         fill(state, kept, update)
         suite.update(state)
-        if update == UPDATES // 2:
-            suite.reset(RESTARTED)
         for name, rows in read.items():
             rows.append(suite.read(name).cpu().numpy().copy())
+        # After the reset nothing could be read but zeros.
+        if update == UPDATES // 2:
+            suite.reset(RESTARTED)
     signal = np.random.default_rng(1).normal(size=(6, 8, 12, 6)).astype(np.float32)
     measured = simulate(replace(FULL, crosstalk=0.3), signal, dt=0.01, layout=(3, 4), device=device)
     return {**{name: np.stack(rows) for name, rows in read.items()}, "noise alone": measured}
