@@ -33,15 +33,15 @@ def test_the_help_of_all_commands_says_what_each_of_them_says():
 
 
 def test_a_command_of_another_package_is_listed_and_a_broken_one_is_announced(run, tmp_path, monkeypatch, caplog):
-    (tmp_path / "elsewhere.py").write_text(
+    (tmp_path / "greeting.py").write_text(
         "from brainbench.cli.output import Output\n"
         "def greet(name: str) -> Output:\n    'Say hello.'\n    return Output({'name': name}, f'hello {name}')\n"
     )
-    (tmp_path / "broken_elsewhere.py").write_text("raise RuntimeError('out of order')\n")
-    info = tmp_path / "elsewhere-1.0.dist-info"
+    (tmp_path / "broken_greeting.py").write_text("raise RuntimeError('out of order')\n")
+    info = tmp_path / "greeting-1.0.dist-info"
     info.mkdir()
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: elsewhere\nVersion: 1.0\n")
-    entries = "[brainbench.commands]\ngreet = elsewhere:greet\nstimuli.broken = broken_elsewhere:command\n"
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: greeting\nVersion: 1.0\n")
+    entries = "[brainbench.commands]\ngreet = greeting:greet\nstimuli.broken = broken_greeting:command\n"
     (info / "entry_points.txt").write_text(entries)
     monkeypatch.syspath_prepend(tmp_path)
     assert "Say hello." in run("--help").out

@@ -13,7 +13,7 @@ from brainbench.core.errors import DataError, UsageError
 from brainbench.published.conversion import SweepTable, convert_sweeps
 from tests.factories.sweep_batches import files_of
 
-ROOT = Path(__file__).parents[3]
+ROOT = Path(__file__).parents[2]
 CONDITIONS = ("speed", "height", "rotation", "distance", "size")
 
 
