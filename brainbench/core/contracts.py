@@ -11,13 +11,17 @@ NaN means "not recorded". :func:`check_stimulus_set` and :func:`check_recordings
 
 from __future__ import annotations
 
+import math
 import os
-from collections.abc import Mapping, Sequence
+import re
+import unicodedata
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brainbench.core.errors import DataError, UsageError, check_once, listing, repeats
 
@@ -159,6 +163,83 @@ class Trials:
         )
 
 
+MISSING_WORDS = ("nan", "nat")
+"""Texts, in lower case, that programs write where a value is missing."""
+DOUBTFUL_WORDS = ("none", "na", "n/a", "null", "<na>")
+"""Texts, in lower case, that may mean a missing value, or a condition."""
+_DECIMAL = re.compile(r"-?(?:0|[1-9]\d{0,11})\.\d{1,12}")
+_DIGITS = {2: 3, 4: 7}
+"""Digits that a number of so many bytes keeps through arithmetic; 12 for all others."""
+
+
+def as_labels(values: Any) -> NDArray[np.str_]:
+    """Settle the label of each value [n]: missing ones become "", and rounding, text numbers and Unicode forms nothing.
+
+    >>> as_labels(np.array([1.0, 2.5, 3 * 0.1, np.nan])).tolist()
+    ['1', '2.5', '0.3', '']
+    """
+    array = np.asarray(values)
+    if not len(array):
+        return np.zeros(0, "U1")
+    unique, inverse = np.unique(array, return_inverse=True)
+    digits = _DIGITS.get(array.dtype.itemsize, 12) if array.dtype.kind == "f" else 12
+    labels = [as_label(value, digits) for value in unique.tolist()]
+    if array.dtype.kind == "U":
+        # Texts of one column that differ were meant to differ, such as the sections 1.1 and 1.10.
+        plain = [unicodedata.normalize("NFC", text.strip()) for text in unique.tolist()]
+        forms: dict[str, set[str]] = {}
+        for label, text in zip(labels, plain, strict=True):
+            forms.setdefault(label, set()).add(text)
+        labels = [text if label and len(forms[label]) > 1 else label for label, text in zip(labels, plain, strict=True)]
+    return np.array(labels, dtype=str)[inverse.reshape(array.shape)]
+
+
+def as_label(value: Any, digits: int = 12) -> str:
+    """Write a value as the text a person would use, a number with so many digits; what is missing becomes ""."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, float):
+        if not np.isfinite(value):
+            return ""
+        text = f"{value:.{digits}g}"
+        return str(int(value)) if value.is_integer() else str(int(float(text))) if float(text).is_integer() else text
+    text = unicodedata.normalize("NFC", str(value).strip())
+    if text.lower() in MISSING_WORDS:
+        return ""
+    return as_label(float(text)) if _DECIMAL.fullmatch(text) else text
+
+
+def near_labels(labels: Iterable[str]) -> list[list[str]]:
+    """Return the groups of labels that differ in case, blanks, leading zeros or the seventh digit alone."""
+    folded: dict[Any, list[str]] = {}
+    for label in sorted({*labels} - {""}):
+        number = as_number(label)
+        rounded = number if number.is_integer() or not math.isfinite(number) else float(f"{number:.6g}")
+        folded.setdefault("".join(label.lower().split()) if math.isnan(number) else rounded, []).append(label)
+    return [twins for twins in folded.values() if len(twins) > 1]
+
+
+def as_number(text: str) -> float:
+    """Return the number that a text states; NaN where it states none."""
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan
+
+
+def natural_key(label: str) -> tuple[Any, ...]:
+    """Return a sort key that puts numbers in numeric order, alone or inside text.
+
+    >>> sorted(["10", "9", "b10", "b2"], key=natural_key)
+    ['9', '10', 'b2', 'b10']
+    """
+    if math.isfinite(number := as_number(label)):
+        return (0, number, (), label)
+    # The odd parts are the digits; the label itself keeps "01" and "1" apart.
+    parts = re.split(r"(\d+)", label)
+    return (1, 0.0, tuple((int(part), "") if index % 2 else (-1, part) for index, part in enumerate(parts)), label)
+
+
 def join_labels(
     vocabulary: tuple[str, ...],
     labels: tuple[str, ...],
@@ -170,10 +251,17 @@ def join_labels(
         vocabulary: condition labels of the recordings.
         labels: stimulus labels of the model side.
         match: recording label → stimulus label (None drops it), or a file of such pairs. Labels it
-            does not name are paired with their equals; without it every label must have an equal.
+            does not name are paired with their equals; every label of the recordings must have a partner, while
+            stimuli that were not recorded are left out.
     """
     explicit = read_match(match) if isinstance(match, (str, os.PathLike)) else dict(match or {})
     sides = f"recordings: {listing(vocabulary, limit=40)}; stimuli: {listing(labels, limit=40)}"
+    # The same number or text in another form is the same label, unless two stimuli share it.
+    forms = [as_label(label) for label in labels]
+    equals = {form: label for form, label in zip(forms, labels, strict=True) if forms.count(form) == 1}
+    equals |= {label: label for label in labels}
+    spelled = {as_label(label): label for label in vocabulary}
+    explicit = {spelled.get(as_label(label), label): partner for label, partner in explicit.items()}
     for label, partner in explicit.items():
         if label not in vocabulary:
             raise UsageError(
@@ -181,18 +269,18 @@ def join_labels(
             )
         if partner is not None and partner not in labels:
             raise UsageError(f"The match pairs {label!r} with {partner!r}, which is no stimulus ({sides}).")
-    pairs = {label: explicit.get(label, label) for label in vocabulary}
+    pairs = {label: explicit.get(label, equals.get(label, equals.get(as_label(label), label))) for label in vocabulary}
     pairs = {label: partner for label, partner in pairs.items() if partner is not None}
-    alone = [label for label, partner in pairs.items() if partner not in labels]
-    unused = [] if explicit else [label for label in labels if label not in pairs.values()]
-    if alone or unused:
+    if alone := [label for label, partner in pairs.items() if partner not in labels]:
+        unused = [label for label in labels if label not in pairs.values()]
         lonely = {"without a stimulus": alone, "without recordings": unused}
-        words = "; ".join(f"{what}: {listing(found, limit=40)}" for what, found in lonely.items() if found)
-        free = next((label for label in labels if label not in pairs.values()), "")
+        words = "; ".join(f"{what}: {listing(names, limit=40)}" for what, names in lonely.items() if names)
+        # What may mean a missing value is dropped, and only a label that has no equal is paired.
+        partner = "" if alone[0].lower() in DOUBTFUL_WORDS else next(iter(unused), "")
         raise UsageError(
             f"The labels of recordings and stimuli do not match ({words}; equal on both sides: "
-            f"{len(pairs) - len(alone)}). Pair them with --match FILE, a line for each label of the recordings as in "
-            f"'{next(iter(alone or vocabulary), 'label')},{free}' (.csv; nothing after the comma drops the label)."
+            f"{len(pairs) - len(alone)}). Pair them with --match FILE, a line for each label without a stimulus "
+            f"as in '{alone[0]},{partner}' (.csv; nothing after the comma drops the label)."
         )
     if twice := repeats(pairs.values()):
         raise UsageError(f"Two recording labels are paired with the stimulus {twice[0]!r}; pairs must be one to one.")

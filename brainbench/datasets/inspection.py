@@ -14,12 +14,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from brainbench.core.contracts import as_labels, natural_key
 from brainbench.core.errors import BrainbenchError, DataError
 from brainbench.core.progress import Progress, track
 from brainbench.datasets import hdf5
 from brainbench.datasets.layouts.registry import RecordingLayout, counted_layout
 from brainbench.datasets.reading import each_session, find_recordings, open_file, suitable_files
-from brainbench.datasets.sessions import SPIKES, Session, SessionTable, as_labels, natural_key
+from brainbench.datasets.sessions import SPIKES, Session, SessionTable
 from brainbench.datasets.trials.conditions import natural_vocabulary
 from brainbench.datasets.trials.counting import has_units, no_units, read_spikes, recorded_span
 from brainbench.datasets.trials.selection import Tally
@@ -371,13 +372,11 @@ def summarise_columns(table: SessionTable) -> Iterator[ColumnSummary]:
         except DataError:
             yield ColumnSummary(name, "other", 0)
             continue
-        unique, number = np.unique(values, return_counts=True)
-        present = np.char.strip(unique) != "" if values.dtype.kind == "U" else np.isfinite(unique)
-        unique, number, kind = unique[present], number[present], _kind(values)
-        labels = as_labels(unique).tolist()
-        labels = (sorted(labels, key=natural_key) if kind == "text" else labels)[:EXAMPLES]
+        counts, kind = Counter(as_labels(values).tolist()), _kind(values)
+        counts.pop("", None)
+        labels = sorted(counts, key=natural_key)[:EXAMPLES]
         examples = tuple(f"{float(item):.6g}" for item in labels) if kind == "number" else tuple(labels)
-        yield ColumnSummary(name, kind, len(unique), examples, int(min(number, default=0)))
+        yield ColumnSummary(name, kind, len(counts), examples, min(counts.values(), default=0))
 
 
 def _kind(values: NDArray[Any]) -> str:

@@ -17,10 +17,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from brainbench.core.contracts import as_labels
 from brainbench.core.errors import DataError
 from brainbench.core.files import atomic_path
 from brainbench.datasets.hdf5 import write_array
-from brainbench.datasets.sessions import SPIKES, Series, Session, SessionTable, as_labels, decode, text
+from brainbench.datasets.sessions import SPIKES, Series, Session, SessionTable, decode, text
 from brainbench.datasets.trials.counting import LICKS
 
 if TYPE_CHECKING:

@@ -7,7 +7,6 @@ a file with gigabytes of raw voltage costs only what is used. Times are seconds 
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import datetime
@@ -283,47 +282,3 @@ def text(value: Any) -> str:
     except UnicodeDecodeError:
         # Latin-1 has a letter for every byte; one sign for all that is not UTF-8 would make two labels one.
         return value.decode("latin-1")
-
-
-def as_labels(values: NDArray[Any]) -> NDArray[np.str_]:
-    """Write each value [n] as the text a person would use; missing ones become "".
-
-    >>> as_labels(np.array([1.0, 2.5, np.nan])).tolist()
-    ['1', '2.5', '']
-    """
-    if not len(values):
-        return np.zeros(0, "U1")
-    unique, inverse = np.unique(values, return_inverse=True)
-    return np.array([as_label(item) for item in unique.tolist()], dtype=str)[inverse]
-
-
-def as_label(value: Any) -> str:
-    """Write a value as the text a person would use; what is missing becomes ""."""
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, float):
-        if not np.isfinite(value):
-            return ""
-        return str(int(value)) if value.is_integer() else repr(value)
-    return str(value).strip()
-
-
-def as_number(text: str) -> float:
-    """Return the number that a text states; NaN where it states none."""
-    try:
-        return float(text)
-    except ValueError:
-        return math.nan
-
-
-def natural_key(label: str) -> tuple[Any, ...]:
-    """Return a sort key that puts numbers in numeric order, alone or inside text.
-
-    >>> sorted(["10", "9", "b10", "b2"], key=natural_key)
-    ['9', '10', 'b2', 'b10']
-    """
-    if math.isfinite(number := as_number(label)):
-        return (0, number, (), label)
-    # The odd parts are the digits; the label itself keeps "01" and "1" apart.
-    parts = re.split(r"(\d+)", label)
-    return (1, 0.0, tuple((int(part), "") if index % 2 else (-1, part) for index, part in enumerate(parts)), label)

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
-from brainbench.core.errors import MissingDependencyError, UsageError, check_name
+from brainbench.core.errors import MissingDependencyError, UsageError, check_name, listing
 from brainbench.core.files import provenance
 from brainbench.core.plugins import load_optional
 from brainbench.core.progress import Progress, stages
@@ -229,8 +229,12 @@ def _compare(inputs: ScoreInputs, *, baselines: bool) -> tuple[list[Score], Scor
     if brain.dependent:
         doubt = "many trials share spikes with another one of their stimulus, which makes noise look reliable"
         scores, between = [_doubted(score, doubt) for score in scores], between and _doubted(between, doubt)
-    scores = [replace(score, reasons=(*score.reasons, *brain.doubts)) for score in scores]
-    return scores, between and replace(between, reasons=(*between.reasons, *brain.doubts))
+    doubts, unfelt = brain.doubts, [label for row, label in enumerate(network.labels) if row not in inputs.rows]
+    if unfelt and options.match is None:
+        names = listing(unfelt, limit=6, quoted=False)
+        doubts += (f"{len(unfelt)} of {len(network.labels)} stimuli have no recordings and are left out: {names}",)
+    scores = [replace(score, reasons=(*score.reasons, *doubts)) for score in scores]
+    return scores, between and replace(between, reasons=(*between.reasons, *doubts))
 
 
 def _optional(name: str) -> Any:

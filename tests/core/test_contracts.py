@@ -7,7 +7,16 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from brainbench.core.contracts import CHANNELS, Trials, check_recordings, check_stimulus_set, join_labels, read_match
+from brainbench.core.contracts import (
+    CHANNELS,
+    Trials,
+    as_labels,
+    check_recordings,
+    check_stimulus_set,
+    join_labels,
+    near_labels,
+    read_match,
+)
 from brainbench.core.errors import DataError, UsageError
 from brainbench.datasets import open_recordings, write_recordings
 from tests.factories.recordings import make_simple_session
@@ -148,3 +157,45 @@ def test_a_wrong_match_file_is_refused(tmp_path: Path, name: str, text: str, mes
         read_match(tmp_path / name)
     with pytest.raises(UsageError, match=r"/none\.json'"):
         read_match(tmp_path / "none.json")
+
+
+@pytest.mark.parametrize(
+    ("values", "labels"),
+    [
+        (np.array([0.1, 0.3], np.float32), ["0.1", "0.3"]),
+        (np.array([0.1, 0.2, 0.3], np.float16), ["0.1", "0.2", "0.3"]),
+        (np.arange(1, 4) * 0.1, ["0.1", "0.2", "0.3"]),
+        (np.cumsum(np.full(3, 0.1)), ["0.1", "0.2", "0.3"]),
+        (np.array([0.301, 0.302]), ["0.301", "0.302"]),
+        (np.array([16777217.0, 16777216.0]), ["16777217", "16777216"]),
+        (np.array(["15.0", "30.50"]), ["15", "30.5"]),
+        (np.array(["1.1", "1.10"]), ["1.1", "1.10"]),
+        (np.array(["001", "002", "1e3", "1.0.0"]), ["001", "002", "1e3", "1.0.0"]),
+        (np.array(["e\u0301", " \u00e9 "]), ["\u00e9", "\u00e9"]),
+        (np.array(["nan", "NaT", "NaN", " ", "None"]), ["", "", "", "", "None"]),
+        (np.array([True, False]), ["true", "false"]),
+    ],
+)
+def test_a_value_has_one_label_whatever_form_it_is_stored_in(values, labels):
+    assert as_labels(values).tolist() == labels
+
+
+def test_stimuli_that_were_not_recorded_are_left_out_and_forms_of_a_number_are_equal():
+    assert join_labels(("15", "a"), ("a", "15.0", "b"), None) == {"15": "15.0", "a": "a"}
+    assert join_labels(("1.1",), ("1.1", "1.10"), None) == {"1.1": "1.1"}
+
+
+@pytest.mark.parametrize(
+    ("vocabulary", "example"), [(("ball", "cat"), "'cat,hook'"), (("ball", "None"), "'None,'"), (("x",), "'x,ball'")]
+)
+def test_the_example_of_a_pair_pairs_no_label_that_has_its_equal(vocabulary, example):
+    with pytest.raises(UsageError, match=example):
+        join_labels(vocabulary, ("ball", "hook"), None)
+
+
+def test_labels_that_nearly_agree_stand_together():
+    assert near_labels(["a", "A ", "b", "001", "1", "0.3", "0.3000001", "16777216", "16777217", "", "1.1"]) == [
+        ["0.3", "0.3000001"],
+        ["001", "1"],
+        ["A ", "a"],
+    ]

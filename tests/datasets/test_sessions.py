@@ -3,10 +3,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from brainbench.core.contracts import as_labels, natural_key
 from brainbench.core.errors import DataError, UsageError
 from brainbench.datasets import write_recordings
 from brainbench.datasets.nwb import write_nwb
-from brainbench.datasets.sessions import SessionTable, as_labels, decode, make_session, natural_key
+from brainbench.datasets.sessions import SessionTable, decode, make_session
 
 
 def test_texts_that_are_not_utf8_stay_different():

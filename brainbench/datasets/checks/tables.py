@@ -9,12 +9,13 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
+from brainbench.core.contracts import as_labels
 from brainbench.core.errors import BrainbenchError, DataError, nearest, repeats
 from brainbench.datasets.checks.findings import LONGEST_SESSION, Finding, Severity, share, some
 from brainbench.datasets.inspection import propose
 from brainbench.datasets.layouts.registry import RecordingLayout
-from brainbench.datasets.sessions import Session, SessionTable, as_labels
-from brainbench.datasets.trials.conditions import Conditions, joined_labels
+from brainbench.datasets.sessions import Session, SessionTable
+from brainbench.datasets.trials.conditions import Conditions, joined_labels, label_doubts
 from brainbench.datasets.trials.counting import inside_observed_spans, recorded_span
 from brainbench.datasets.trials.windows import CONTACTS, WHOLE, Window
 
@@ -42,23 +43,15 @@ def check_labels(session: Session, layout: RecordingLayout | None, conditions: C
         message = f"{share(missing, len(table))} trials have no value of {', '.join(conditions.columns)}"
         yield Finding("warning" if missing < len(table) else "error", "labels", message, "They are left out.")
     vocabulary = layout.vocabulary(conditions) if layout else None
-    if vocabulary is None:
-        yield from _spelling(counts)
-    else:
+    forms = conditions.forms(table) if all(name in table for name in conditions.columns) else {}
+    for doubt in label_doubts(forms, counts if vocabulary is None else ()):
+        yield Finding("warning", "labels", doubt, "Make them one, or refuse them by --select.")
+    if vocabulary is not None:
         yield from _strangers(counts, vocabulary, layout)
         counts = Counter({label: counts[label] for label in vocabulary})
     yield from _balance(counts, vocabulary)
     if {"outcome", "choice", "rewarded_side"} <= set(table.columns):
         yield from _answers(table)
-
-
-def _spelling(counts: Counter[str]) -> Iterator[Finding]:
-    folded: dict[str, list[str]] = {}
-    for label in counts:
-        folded.setdefault("".join(label.lower().split()), []).append(label)
-    for twins in (found for found in folded.values() if len(found) > 1):
-        message = f"labels differ only in case or blanks: {', '.join(map(repr, sorted(twins)))}"
-        yield Finding("warning", "labels", message, "They count as different stimuli: make them one.")
 
 
 def _strangers(counts: Counter[str], vocabulary: tuple[str, ...], layout: RecordingLayout | None) -> Iterator[Finding]:

@@ -13,10 +13,11 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
+from brainbench.core.contracts import as_labels
 from brainbench.core.errors import BrainbenchError, repeats
 from brainbench.datasets.checks.findings import LONGEST_SESSION, Finding, Severity, share, some
 from brainbench.datasets.layouts.registry import RecordingLayout
-from brainbench.datasets.sessions import Session, as_labels
+from brainbench.datasets.sessions import Session
 from brainbench.datasets.trials.counting import recorded_span
 from brainbench.datasets.trials.windows import CONTACTS, FIRST_CONTACT, Window
 

@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from brainbench.core.contracts import as_labels
 from brainbench.datasets.layouts.registry import RecordingLayout
-from brainbench.datasets.sessions import Session, as_labels
+from brainbench.datasets.sessions import Session
 from brainbench.datasets.trials.conditions import Conditions
 from brainbench.datasets.trials.selection import Rule, Selection
 from brainbench.datasets.trials.windows import Window

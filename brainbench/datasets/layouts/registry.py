@@ -11,6 +11,9 @@ from dataclasses import dataclass, replace
 from itertools import product
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
+from brainbench.core.contracts import as_labels
 from brainbench.core.errors import UsageError, check_name
 from brainbench.core.plugins import load_entry_points, load_module
 from brainbench.datasets.sessions import Session
@@ -80,7 +83,8 @@ class RecordingLayout:
         """Return the fixed labels, or None if a column's values are not declared here."""
         if conditions.table != self.conditions.table or any(name not in self.orders for name in conditions.columns):
             return None
-        return tuple("-".join(values) for values in product(*(self.orders[name] for name in conditions.columns)))
+        orders = (as_labels(np.array(self.orders[name], dtype=str)).tolist() for name in conditions.columns)
+        return tuple("-".join(values) for values in product(*orders))
 
     def describe(self) -> str:
         """Return every rule of the layout, one per line."""

@@ -12,9 +12,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from brainbench.core.contracts import as_labels
 from brainbench.core.errors import listing
 from brainbench.datasets.layouts.registry import RecordingLayout
-from brainbench.datasets.sessions import Session, as_labels
+from brainbench.datasets.sessions import Session
 from brainbench.datasets.trials.conditions import Conditions, joined_labels
 from brainbench.datasets.trials.selection import Rule, Selection
 from brainbench.datasets.trials.windows import CONTACTS, FIRST_CONTACT, Window

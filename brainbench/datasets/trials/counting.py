@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from brainbench.core.contracts import as_labels, as_number, natural_key
 from brainbench.core.errors import DataError, UsageError, listing
 from brainbench.core.reading.ranges import check_number
-from brainbench.datasets.sessions import OBSERVED, SPIKES, Session, SessionTable, as_labels, as_number, natural_key
+from brainbench.datasets.sessions import OBSERVED, SPIKES, Session, SessionTable
 from brainbench.datasets.trials.conditions import Conditions, joined_labels
 from brainbench.datasets.trials.selection import Selection, Tally
 from brainbench.datasets.trials.windows import CONTACTS, Window
@@ -116,6 +117,8 @@ class SessionCounts:
     """Recipe of the stimuli, where the file names one."""
     guessed: bool = False
     """True when the file does not name its subject."""
+    forms: dict[tuple[str, str], set[str]] = field(default_factory=dict)
+    """Column and label → how the file writes the value."""
 
 
 def count_session(session: Session, options: ReadingOptions) -> SessionCounts:
@@ -177,6 +180,7 @@ def count_session(session: Session, options: ReadingOptions) -> SessionCounts:
         synthetic=session.synthetic,
         stimuli=session.stimuli,
         guessed=session.guessed,
+        forms=options.conditions.forms(table),
     )
 
 

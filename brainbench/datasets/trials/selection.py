@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from brainbench.core.contracts import MISSING_WORDS, as_label, as_labels, as_number, natural_key
 from brainbench.core.errors import UsageError, brief, check_once, nearest, unknown_name
 from brainbench.core.reading.ranges import check_fields
-from brainbench.datasets.sessions import SessionTable, as_label, as_labels, as_number, natural_key
+from brainbench.datasets.sessions import SessionTable
 
 _TRUTH = (("true", "1"), ("false", "0"))
 _RULE = re.compile(r"^\s*(?:(?P<scope>trials|units)\.)?(?P<column>[^=!<>]+?)\s*(?P<sign>!=|=)\s*(?P<values>.+?)\s*$")
@@ -30,7 +31,7 @@ def _check_texts(what: str, texts: Any) -> None:
 class Rule:
     """One condition on one column; rows that fail it are removed and counted.
 
-    Values are compared as text. In a column of numbers ``1`` and ``1.0`` agree, and in every column ``true`` and ``1``.
+    Values are compared as labels: ``1`` and ``1.0`` agree, and ``true`` and ``1``; texts of one column stay apart.
     A row without a value fails ``allow``, ``low`` and ``high`` and passes ``refuse``, unless the value is ``nan``.
     """
 
@@ -82,7 +83,10 @@ class Rule:
         if seen is not None and (self.allow or self.refuse):
             seen.setdefault(self, set()).update(labels.tolist())
         labels = np.char.lower(labels)
-        has = {value: np.isin(labels, _spellings(value, values.dtype)) for value in (*self.allow, *self.refuse)}
+        present = {*labels.tolist()}
+        has = {
+            value: np.isin(labels, _spellings(value, values.dtype, present)) for value in (*self.allow, *self.refuse)
+        }
         if seen is not None:
             seen.get(self, set()).update(value for value, rows in has.items() if rows.any())
         keep = np.ones(len(labels), dtype=bool)
@@ -228,15 +232,12 @@ def check_values(tallies: Iterable[Tally]) -> list[str]:
     return notes
 
 
-def _spellings(value: str, dtype: np.dtype[Any]) -> list[str]:
-    """Return the texts, in lower case, that rows of a column may have for the value of a rule."""
+def _spellings(value: str, dtype: np.dtype[Any], present: Collection[str]) -> list[str]:
+    """Return the texts, in lower case, that rows of a column may have for the value of a rule; NaN is a missing one."""
     spellings = [value.lower()]
-    if dtype.kind == "f":
-        # Single precision holds .1 as another number, which is what its rows say; NaN is a row without a value.
-        with np.errstate(over="ignore"):
-            number = float(dtype.type(as_number(value)))
-        spellings += [as_label(number)] if math.isfinite(number) or value.lower() == "nan" else []
-    elif dtype.kind != "U" and math.isfinite(number := as_number(value)):
+    if dtype.kind == "U":
+        spellings += [] if value.lower() in present else [as_label(value).lower()]
+    elif math.isfinite(number := as_number(value)) or value.lower() in MISSING_WORDS:
         spellings.append(as_label(number))
     return spellings + [one for pair in _TRUTH for one in pair if {*pair} & {*spellings}]
 

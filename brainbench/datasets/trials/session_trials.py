@@ -12,11 +12,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.contracts import Trials, check_recordings
+from brainbench.core.contracts import Trials, check_recordings, natural_key
 from brainbench.core.errors import DataError, check_name, listing
 from brainbench.core.files import content_hash, hash_arrays
-from brainbench.datasets.sessions import natural_key
-from brainbench.datasets.trials.conditions import natural_vocabulary
+from brainbench.datasets.trials.conditions import label_doubts, natural_vocabulary
 from brainbench.datasets.trials.counting import COVARIATES, UNIT_COLUMNS, ReadingOptions, SessionCounts
 from brainbench.datasets.trials.selection import check_values
 
@@ -226,6 +225,11 @@ def join_sessions(
         )
     vocabulary = options.vocabulary or natural_vocabulary(row for part in parts for row in part.values)
     present = {label for part in parts for label in part.labels}
+    forms: dict[tuple[str, str], set[str]] = {}
+    for part in parts:
+        for key, written in part.forms.items():
+            forms.setdefault(key, set()).update(written)
+    doubts += label_doubts(forms, vocabulary)
     if len(present) < 2:
         raise DataError(
             f"All {trials} trials of {source} that remain have the one condition {next(iter(present))!r} "

@@ -8,9 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from brainbench.core.contracts import as_label
 from brainbench.core.errors import DataError, UsageError, brief, unknown_name
 from brainbench.core.reading.ranges import check_fields
-from brainbench.datasets.sessions import Session, SessionTable, as_label
+from brainbench.datasets.sessions import Session, SessionTable
 
 FIRST_CONTACT = "first-contact"
 CONTACTS = re.compile(r"^(?:.*/)?contacts_by_whisker_(?P<whisker>\w+)$")
