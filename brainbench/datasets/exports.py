@@ -19,7 +19,16 @@ from brainbench.core.errors import DataError, UsageError, check_each
 from brainbench.datasets.hdf5 import write_recordings
 from brainbench.datasets.nwb import write_nwb
 from brainbench.datasets.reading import Source, each_session, find_recordings, open_file, resolve_selection
-from brainbench.datasets.sessions import OBSERVED, SPIKES, Session, SessionTable, decode, ragged
+from brainbench.datasets.sessions import (
+    OBSERVED,
+    SPIKES,
+    LostColumn,
+    Session,
+    SessionTable,
+    decode,
+    neurodata_type,
+    ragged,
+)
 from brainbench.datasets.trials.counting import LICKS, has_units, lick_times, read_spikes, recorded_span
 from brainbench.datasets.trials.selection import EVERYTHING, Selection, Tally, check_values
 
@@ -105,17 +114,22 @@ def _plain(table: SessionTable, rows: NDArray[np.bool_]) -> dict[str, NDArray[An
     columns: dict[str, NDArray[Any]] = {"id": table.ids()[rows]}
     for name in table.columns:
         raw = table.data[name]
-        region = decode(getattr(raw, "attrs", {}).get("neurodata_type", "")).tolist() == "DynamicTableRegion"
-        deeper = (raw.ndim > 1 and name != OBSERVED) or f"{name}_index_index" in table.data
-        if name == SPIKES or name.endswith("_index") or region or deeper:
+        if isinstance(raw, LostColumn) and table.name == "units" and name != OBSERVED:
+            continue
+        if name == SPIKES or neurodata_type(raw) == "DynamicTableRegion" or table.index.get(name) in table.index:
+            continue
+        if name == OBSERVED:
+            columns |= ragged(OBSERVED, [part for part, keep in zip(table.spans(), rows, strict=True) if keep])
+            continue
+        if raw.ndim > 1 and 1 not in raw.shape:
             continue
         values = decode(raw[...])
         if values.dtype.kind not in "biufU":
             continue
-        if f"{name}_index" not in table.data:
+        if name not in table.index:
             columns[name] = table.column(name)[rows]
             continue
-        parts = np.split(values, table.ends(name)[:-1]) if len(table) else []
+        parts = np.split(values.ravel(), table.ends(name)[:-1]) if len(table) else []
         parts = [part for part, keep in zip(parts, rows, strict=True) if keep]
         columns[name] = np.concatenate(parts) if parts else values[:0]
         columns[f"{name}_index"] = np.cumsum([len(part) for part in parts], dtype=np.int64)

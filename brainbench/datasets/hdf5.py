@@ -8,7 +8,8 @@ The root carries the attributes ``format`` = "brainbench-recordings", ``version`
                                 stimuli (optional: recipe of the stimuli)
         units/                  one row per unit
             spike_times         float64 [spikes], s, ascending within a unit; units one after another
-            spike_times_index   int64 [units], end of each unit in spike_times
+            spike_times_index   int64 [units], end of each unit in spike_times; the index of another column
+                                has the attribute neurodata_type = "VectorIndex"
             id                  optional, [units]
             obs_intervals       optional, float64 [spans, 2], s, with obs_intervals_index
             <column>            optional, [units]: depth (µm), layer, inhibitory, …
@@ -29,6 +30,7 @@ Any HDF5 library can write it. Readers refuse versions they do not know.
 
 from __future__ import annotations
 
+import contextlib
 import os
 from collections.abc import Iterable
 from pathlib import Path
@@ -40,7 +42,7 @@ from brainbench.core.contracts import check_counts
 from brainbench.core.errors import DataError, UsageError, brief
 from brainbench.core.files import atomic_path, to_json
 from brainbench.core.reading.texts import parse_json
-from brainbench.datasets.sessions import SPIKES, Session, SessionTable, decode, text
+from brainbench.datasets.sessions import SPIKES, LostColumn, Session, SessionTable, decode, text
 
 if TYPE_CHECKING:
     import h5py
@@ -95,7 +97,7 @@ def read_sessions(file: h5py.File, path: Path) -> list[Session]:
     sessions = []
     for name, group in _need(file, "sessions", path).items():
         source, tables = f"{path}:{name}", _need(group, "tables", path).items()
-        units = SessionTable("units", dict(_need(group, "units", path).items()), source)
+        units = SessionTable("units", columns_of(_need(group, "units", path), path), source)
         # A blank more or less makes no other animal.
         stated = {key: text(group.attrs.get(key, "")).strip() for key in ("subject", "session", "start")}
         sessions.append(
@@ -103,7 +105,7 @@ def read_sessions(file: h5py.File, path: Path) -> list[Session]:
                 subject=stated["subject"] or name,
                 session=stated["session"] or name,
                 units=units if SPIKES in units else None,
-                tables={key: SessionTable(key, dict(table.items()), source) for key, table in tables},
+                tables={key: SessionTable(key, columns_of(table, path), source) for key, table in tables},
                 source=source,
                 start=stated["start"],
                 format=f"{FORMAT} {VERSION}",
@@ -171,7 +173,37 @@ def _write_table(group: h5py.Group, table: SessionTable) -> None:
         array = decode(values[...])
         # References and compound types point into the source file and mean nothing outside it.
         if array.dtype.kind in "biufU":
-            write_array(group, name, array)
+            written = write_array(group, name, array)
+            if name in table.index.values():
+                written.attrs["neurodata_type"] = "VectorIndex"
+    for name, index in table.index.items():
+        if name in group and index in group:
+            group[index].attrs["target"] = group[name].ref
+
+
+def columns_of(group: h5py.Group, path: Path) -> dict[str, Any]:
+    """Return the data sets of a group by name; of a dead link, a column that says so when it is asked for."""
+    import h5py
+
+    columns: dict[str, Any] = {}
+    for name in group:
+        reason = dead_link(group, name, path)
+        node = group[name] if reason is None else LostColumn(reason)
+        if isinstance(node, (h5py.Dataset, LostColumn)):
+            columns[name] = node
+    return columns
+
+
+def dead_link(group: h5py.Group, name: str, path: Path) -> str | None:
+    """Return one sentence about a link to what is not there; None for what is."""
+    import h5py
+
+    with contextlib.suppress(KeyError, OSError):
+        group[name]
+        return None
+    link, place = group.get(name, getlink=True), f"{(group.name or '').rstrip('/')}/{name}"
+    target = f"{link.path!r} of {link.filename!r}" if isinstance(link, h5py.ExternalLink) else repr(link.path)
+    return f"{place} of {path} is a link to {target}, which is not there; put that in its place or remove the link."
 
 
 def write_array(group: h5py.Group, name: str, values: Any) -> h5py.Dataset:

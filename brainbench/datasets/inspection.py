@@ -364,7 +364,7 @@ def _rank(table: str, column: ColumnSummary, rows: int) -> tuple[float, ...]:
 def summarise_columns(table: SessionTable) -> Iterator[ColumnSummary]:
     """Describe every column of an interval table."""
     for name in table.columns:
-        if f"{name}_index" in table:
+        if name in table.index:
             yield ColumnSummary(name, "list", 0)
             continue
         try:

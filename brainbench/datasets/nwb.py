@@ -1,7 +1,7 @@
 """Sessions in Neurodata Without Borders 2.x files, read through h5py: units, interval tables, subject, nothing else.
 
-Needs no NWB schema and touches no raw data. Interval tables are every ``TimeIntervals`` under
-``/intervals`` and in the processing modules.
+Needs no NWB schema and touches no raw data. Tables are known by their type, wherever they stand: intervals, events
+(whose times become those of intervals) and units.
 """
 
 from __future__ import annotations
@@ -20,9 +20,10 @@ import numpy as np
 from brainbench.core.contracts import as_labels
 from brainbench.core.errors import DataError
 from brainbench.core.files import atomic_path
-from brainbench.datasets.hdf5 import write_array
-from brainbench.datasets.sessions import SPIKES, Series, Session, SessionTable, decode, text
+from brainbench.datasets.hdf5 import columns_of, dead_link, write_array
+from brainbench.datasets.sessions import SPIKES, Series, Session, SessionTable, decode, neurodata_type, text
 from brainbench.datasets.trials.counting import LICKS
+from brainbench.datasets.trials.windows import CONTACTS
 
 if TYPE_CHECKING:
     import h5py
@@ -35,7 +36,7 @@ _INTRACELLULAR = ("CurrentClampSeries", "VoltageClampSeries", "IZeroClampSeries"
 
 def is_nwb(file: h5py.File) -> bool:
     """Return whether an open HDF5 file is NWB, of any version."""
-    return _type(file) == "NWBFile" or "nwb_version" in file.attrs or "nwb_version" in file
+    return neurodata_type(file) == "NWBFile" or "nwb_version" in file.attrs or "nwb_version" in file
 
 
 def read_nwb(file: h5py.File, path: Path) -> Session:
@@ -45,7 +46,6 @@ def read_nwb(file: h5py.File, path: Path) -> Session:
     session likewise (``/general/session_id``, ``ses-``, stem). What was guessed is said in ``notes``. Raises DataError:
     the file is NWB 1.x, whose layout differs.
     """
-    import h5py
 
     version = text(file.attrs.get("nwb_version", "")) or _string(file, "nwb_version")
     if version.removeprefix("NWB-").startswith("1"):
@@ -57,17 +57,18 @@ def read_nwb(file: h5py.File, path: Path) -> Session:
         notes.append(f"{path.name}: no subject_id; the subject {subject!r} was taken from the file name")
     session = _string(file, "general/session_id") or _entity(path, "ses")
     description = _string(file, "session_description")
-    keywords, units = file.get("general/keywords"), file.get("units")
+    keywords = file.get("general/keywords")
+    tables, units = _tables(file, path)
     # Licks are processed data with their own times.
     processed = (item for _, module in _groups(file.get("processing")) for item in _series(module))
     licks = [item for item in processed if item[0].rpartition("/")[2] == LICKS]
-    acquired = [_type(group) for _, group in _groups(file.get("acquisition"))]
+    acquired = [neurodata_type(group) for _, group in _groups(file.get("acquisition"))]
     stimuli = _string(file, "general/stimulus")
     return Session(
         subject=subject,
         session=session,
-        units=_table(units, "units", path) if isinstance(units, h5py.Group) else None,
-        tables=_interval_tables(file, path),
+        units=next(iter(units.values())) if len(units) == 1 else None,
+        tables=tables,
         source=str(path),
         identifier=_string(file, "identifier"),
         start=_string(file, "session_start_time"),
@@ -79,24 +80,70 @@ def read_nwb(file: h5py.File, path: Path) -> Session:
         series=dict([*_series(file.get("acquisition")), *licks]),
         stimuli=stimuli.removeprefix(STIMULI) if stimuli.startswith(STIMULI) else "",
         guessed=bool(notes) and subject == path.stem,
+        populations=units,
     )
 
 
-def _interval_tables(file: h5py.File, path: Path) -> dict[str, SessionTable]:
-    tables = {name: _table(group, name, path) for name, group in _groups(file.get("intervals"))}
-    for module_name, module in _groups(file.get("processing")):
-        for name, group in _groups(module):
-            if _type(group) == "TimeIntervals":
-                key = f"{module_name}/{name}" if name in tables else name
-                tables[key] = _table(group, key, path)
-    return tables
+_ROOTS = ("units", "intervals", "processing", "events", "stimulus", "analysis", "scratch", "acquisition")
+"""Where tables may stand; the rest of a file holds devices, electrodes and notes."""
+
+
+def _tables(file: h5py.File, path: Path) -> tuple[dict[str, SessionTable], dict[str, SessionTable]]:
+    """Return the tables of intervals and of units, wherever they stand, by what they are.
+
+    A table is called by its own name, or with the group around it where that is taken. ``/units`` goes before others.
+    """
+    intervals: dict[str, SessionTable] = {}
+    units: dict[str, SessionTable] = {}
+    for place, group in _walk(file, path):
+        if isinstance(group, SessionTable):  # a dead link
+            name = group.name
+            if place == "units":
+                units[place] = group
+            elif place.startswith(("intervals/", "events/")) or CONTACTS.match(name) or name == LICKS:
+                intervals.setdefault(name, group)
+            continue
+        kind, name = neurodata_type(group), place.rpartition("/")[2]
+        if kind == "Units" or place == "units":
+            if "units" not in units:
+                units[place] = _table(group, "units", path)
+            continue
+        if name in intervals:
+            name = place.partition("/")[2] if place.count("/") > 1 else place
+        if kind == "TimeIntervals" or "start_time" in group or place.count("/") == place.startswith("intervals/") == 1:
+            intervals[name] = _table(group, name, path)
+        elif kind == "EventsTable" or "timestamp" in group:
+            table = _table(group, name, path)
+            begin = table.times("timestamp")
+            stop = {"stop_time": begin + table.times("duration")} if "duration" in table else {}
+            intervals[name] = table.with_columns(start_time=begin, **stop)
+    return intervals, units
+
+
+def _walk(parent: h5py.Group, path: Path, place: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield the groups that may be tables by place, and each dead link as a table that says so."""
+    import h5py
+
+    for name in parent if place else [root for root in _ROOTS if root in parent or parent.get(root, getlink=True)]:
+        here = f"{place}/{name}" if place else name
+        if (reason := dead_link(parent, name, path)) is not None:
+            yield here, SessionTable(name, {}, str(path), reason)
+        elif isinstance(group := parent[name], h5py.Group):
+            if "colnames" in group.attrs or "id" in group or place == "intervals" or here == "units":
+                yield here, group
+            elif here.count("/") < _DEEPEST:
+                yield from _walk(group, path, here)
+
+
+_DEEPEST = 5
+"""Levels of groups that are searched for tables: links may run in circles."""
 
 
 def _table(group: h5py.Group, name: str, path: Path) -> SessionTable:
-    import h5py
-
-    columns: dict[str, Any] = {key: item for key, item in group.items() if isinstance(item, h5py.Dataset)}
-    for key in [key for key, item in columns.items() if _type(item) == "EnumData" and f"{key}_elements" in columns]:
+    columns = columns_of(group, path)
+    for key in [key for key, item in columns.items() if neurodata_type(item) == "EnumData"]:
+        if f"{key}_elements" not in columns:
+            continue
         # Numbers follow the first appearance in each file, so only the names mean the same in all files.
         names, numbers = decode(columns.pop(f"{key}_elements")[...]), columns[key][...]
         if len(numbers) and not int(numbers.max()) < len(names):
@@ -120,7 +167,7 @@ def _series(parent: Any) -> Iterator[tuple[str, Series]]:
         start, rate, begin = 0.0, math.nan, group.get("starting_time")
         if isinstance(begin, h5py.Dataset) and begin.shape == ():
             start, rate = float(begin[()]), float(begin.attrs.get("rate", math.nan))
-        yield path, Series(path, _type(group), data, stamps, start, rate)
+        yield path, Series(path, neurodata_type(group), data, stamps, start, rate)
 
 
 def _groups(parent: Any) -> list[tuple[str, h5py.Group]]:
@@ -136,10 +183,6 @@ def _groups(parent: Any) -> list[tuple[str, h5py.Group]]:
             if isinstance(child, h5py.Group):
                 groups.append((name, child))
     return groups
-
-
-def _type(group: h5py.Group | h5py.Dataset) -> str:
-    return text(group.attrs.get("neurodata_type", ""))
 
 
 def _string(file: h5py.File, name: str) -> str:
@@ -232,7 +275,7 @@ def _write_table(group: h5py.Group, table: SessionTable, meanings: Mapping[str, 
     """Write the columns of a table; ragged ones of a table without rows are left out."""
     import h5py
 
-    names = [name for name in table.columns if f"{name}_index" not in table.data or len(table)]
+    names = [name for name in table.columns if name not in table.index or len(table)]
     group.attrs.create("colnames", names, dtype=h5py.string_dtype())
     try:
         ids = as_labels(table.ids()).astype(np.int64)
@@ -242,7 +285,7 @@ def _write_table(group: h5py.Group, table: SessionTable, meanings: Mapping[str, 
     for name in names:
         values = write_array(group, name, np.asarray(table.data[name]))
         _describe(values, "hdmf-common", "VectorData", meanings.get(name, name))
-        if f"{name}_index" in table.data:
+        if name in table.index:
             # The schema asks for unsigned row ends.
             index = group.create_dataset(f"{name}_index", data=table.ends(name).astype(np.uint32))
             _describe(index, "hdmf-common", "VectorIndex", f"Index for VectorData '{name}'")

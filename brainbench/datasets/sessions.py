@@ -10,7 +10,8 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import datetime
-from typing import Any
+from functools import cached_property
+from typing import Any, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,11 +22,31 @@ SPIKES = "spike_times"
 OBSERVED = "obs_intervals"
 
 
+class LostColumn:
+    """A part of a file that is named but not there, such as a dead link: whatever is done with it says so."""
+
+    def __init__(self, reason: str) -> None:
+        self.reason = reason
+
+    def __getattr__(self, name: str) -> NoReturn:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        raise DataError(self.reason)
+
+    def __getitem__(self, key: Any) -> NoReturn:
+        raise DataError(self.reason)
+
+    def __len__(self) -> NoReturn:
+        raise DataError(self.reason)
+
+
 @dataclass(frozen=True)
 class SessionTable:
     """Columns of equal length, in the manner of NWB's DynamicTable.
 
-    A ragged column ``x`` has its values in ``x`` and the end of each row in ``x_index``.
+    A ragged column has its values in one array and the end of each row in another, its index: what the file types as
+    one (``VectorIndex``), whatever its name. Single values in a row or a column of two axes, as MATLAB writes them,
+    are read as well.
     """
 
     name: str
@@ -33,26 +54,53 @@ class SessionTable:
     """Column name → array-like; index columns included."""
     where: str = ""
     """File and path, for messages."""
+    fault: str = ""
+    """Why the table is not there, though the file names it: whatever asks for its content is refused with it."""
+
+    @cached_property
+    def index(self) -> dict[str, str]:
+        """Ragged column → the column of its row ends."""
+        index = {}
+        for name, values in self.data.items():
+            base, kind = name.removesuffix("_index"), neurodata_type(values)
+            if kind == "VectorIndex":
+                base = _target(values) or base
+            elif base == name or not (base in (SPIKES, OBSERVED) or isinstance(values, LostColumn) or not kind):
+                continue
+            elif base in self.data and not (base in (SPIKES, OBSERVED) or isinstance(values, LostColumn)):
+                # Without a type, what has a value for each row is a column of its own.
+                rows = next((self.data[key] for key in ("id", "start_time") if key in self.data), values)
+                if (
+                    _length(self.data[base]) == _length(rows)
+                    or getattr(values, "dtype", np.dtype("f8")).kind not in "iu"
+                ):
+                    continue
+            if base in self.data:
+                index[base] = name
+        return index
 
     @property
     def columns(self) -> tuple[str, ...]:
         """Names of the columns, without ``id`` and the index columns of ragged ones."""
-        return tuple(name for name in self.data if name != "id" and not self._is_index(name))
+        self._check()
+        return tuple(name for name in self.data if name != "id" and name not in self.index.values())
 
     def __len__(self) -> int:
+        self._check()
         if "id" in self.data:
-            return len(self.data["id"])
-        flat = [name for name in self.columns if f"{name}_index" not in self.data]
-        first = flat[0] if flat else next((name for name in self.data if self._is_index(name)), None)
-        return len(self.data[first]) if first else 0
+            return _length(self.data["id"])
+        flat = [name for name in self.columns if name not in self.index]
+        first = flat[0] if flat else next(iter(self.index.values()), None)
+        return _length(self.data[first]) if first else 0
 
     def __contains__(self, column: object) -> bool:
+        self._check()
         return column in self.data
 
     def column(self, name: str) -> NDArray[Any]:
         """Read one column [rows]; text comes as ``str``."""
         self.require(name)
-        if f"{name}_index" in self.data:
+        if name in self.index:
             raise DataError(f"Column {name!r} of {self.label} holds a list per row; choose one with a single value.")
         values = self.data[name][...]
         if (names := (values.dtype.metadata or {}).get("enum")) is not None:
@@ -61,6 +109,8 @@ class SessionTable:
             words = [word_of.get(number, str(number)) for number in values.ravel().tolist()]
             values = np.array(words, dtype=str).reshape(values.shape)
         values = decode(values)
+        if values.ndim == 2 and 1 in values.shape and values.size == len(self):
+            values = values.ravel()
         if values.ndim != 1 or values.dtype.kind not in "biufU":
             raise DataError(
                 f"Column {name!r} of {self.label} has shape {values.shape} and type {values.dtype}; expected one "
@@ -79,39 +129,50 @@ class SessionTable:
 
     def ids(self) -> NDArray[Any]:
         """Return the row identifiers, or the row numbers when the table has none."""
-        return decode(self.data["id"][...]) if "id" in self.data else np.arange(len(self))
+        return decode(self.data["id"][...]).ravel() if "id" in self.data else np.arange(len(self))
 
     def ends(self, name: str) -> NDArray[np.int64]:
         """Return the checked row ends [rows] of a ragged column."""
-        total = len(self.data[name])
-        ends = np.asarray(self.data[f"{name}_index"][...]).astype(np.int64)
+        if name not in self.index:
+            what = name.replace("_", " ")
+            raise DataError(f"{self.label} has {name} without {name}_index; the {what} belong to no row.")
+        index = self.index[name]
+        total = _length(self.data[name], 2 if name == OBSERVED else 1)
+        ends = np.asarray(self.data[index][...]).ravel().astype(np.int64)
         steps = np.diff(ends, prepend=0)
         if len(ends) != len(self) or np.any(steps < 0) or (len(ends) > 0 and ends[-1] != total):
             last = int(ends[-1]) if len(ends) else 0
             order = ", decreasing" if np.any(steps < 0) else ""
             raise DataError(
-                f"The ragged index {name}_index of {self.label} is inconsistent: {len(ends)} ends for {len(self)} "
+                f"The ragged index {index} of {self.label} is inconsistent: {len(ends)} ends for {len(self)} "
                 f"rows, the last at {last} of {total} values{order}; the file is damaged or was written wrongly."
             )
         return ends
 
     def rows(self, name: str) -> list[NDArray[np.float64]]:
         """Read a ragged column of numbers: one array per row."""
-        what = name.replace("_", " ")
-        if f"{name}_index" not in self:
-            raise DataError(f"{self.label} has {name} without {name}_index; the {what} belong to no row.")
         ends = self.ends(name)
         flat = np.asarray(self.data[name][...], dtype=np.float64)
+        flat = flat.ravel() if flat.ndim == 2 and 1 in flat.shape else flat
         bad = ~np.isfinite(flat)
         if bad.any():
             row = int(np.searchsorted(ends, np.flatnonzero(bad)[0], side="right"))
             raise DataError(
-                f"{int(bad.sum())} {what} of {self.label} are not finite (first with id {self.ids()[row]}); the "
-                "data are damaged or were exported wrongly."
+                f"{int(bad.sum())} {name.replace('_', ' ')} of {self.label} are not finite (first with id "
+                f"{self.ids()[row]}); the data are damaged or were exported wrongly."
             )
         # NWB stores a ragged column as all values in one array and the end of each row, so all ends but the last cut
         # it.
         return np.split(flat, ends[:-1]) if len(ends) else []
+
+    def spans(self) -> list[NDArray[np.float64]]:
+        """Read the recorded spans [n, 2] (s) of every unit."""
+        ends, values = self.ends(OBSERVED), np.asarray(self.data[OBSERVED][...], dtype=np.float64)
+        turned = values.ndim == 2 and values.shape[0] == 2 and values.shape != (2, 2)
+        if values.shape == (2, 2):
+            turned = bool((values[:, 0] > values[:, 1]).any() and (values[0] <= values[1]).all())
+        spans = (values.T if turned else values).reshape(-1, 2)
+        return np.split(spans, ends[:-1]) if len(ends) else []
 
     def with_columns(self, **columns: NDArray[Any]) -> SessionTable:
         """Return the table with further columns [rows]."""
@@ -119,6 +180,7 @@ class SessionTable:
 
     def require(self, column: str) -> None:
         """Raise the error for an unknown column, naming the nearest one."""
+        self._check()
         if column not in self.data:
             raise unknown_name("column", column, self.columns, hint=f"(in {self.label})")
 
@@ -127,8 +189,31 @@ class SessionTable:
         """Name and place of the table, for messages."""
         return f"table {self.name!r}{f' of {self.where}' if self.where else ''}"
 
-    def _is_index(self, name: str) -> bool:
-        return name.endswith("_index") and name.removesuffix("_index") in self.data
+    def _check(self) -> None:
+        if self.fault:
+            raise DataError(self.fault)
+
+
+def neurodata_type(node: Any) -> str:
+    """Return the NWB type of an HDF5 group or data set; empty for what has none, such as an array."""
+    return "" if isinstance(node, LostColumn) else text(getattr(node, "attrs", {}).get("neurodata_type", ""))
+
+
+def _target(index: Any) -> str:
+    """Return the name of the column that an NWB index refers to; empty where it refers to none."""
+    reference = index.attrs.get("target")
+    try:
+        return (index.file[reference].name or "").rpartition("/")[2] if reference else ""
+    except (KeyError, ValueError, TypeError):
+        return ""
+
+
+def _length(values: Any, width: int = 1) -> int:
+    """Return the number of rows, each of so many values; a single axis may lie in two, as MATLAB writes it."""
+    shape = tuple(values.shape)
+    if len(shape) == 2 and (width in shape if width > 1 else 1 in shape):
+        return math.prod(shape) // width
+    return shape[0] if shape else 1
 
 
 @dataclass(frozen=True)
@@ -196,6 +281,8 @@ class Session:
     """Recipe of the stimuli that this session's animal felt, where the file names one."""
     guessed: bool = False
     """True when the file does not name its subject, and another name stands for it."""
+    populations: Mapping[str, Any] = field(default_factory=dict)
+    """All tables of units by place, and other responses; ``units`` is the one that is read."""
 
     def table(self, name: str) -> SessionTable:
         """Return one interval table."""
@@ -242,7 +329,7 @@ def make_session(
     units = SessionTable("units", data, session)
     for table in (units, *named_tables.values()):
         for name in table.columns:
-            if f"{name}_index" not in table and len(table.data[name]) != len(table):
+            if name not in table.index and len(table.data[name]) != len(table):
                 raise DataError(f"Column {name!r} of {table.label} has {len(table.data[name])} of {len(table)} rows.")
     units.rows(SPIKES)
     if observed is not None:

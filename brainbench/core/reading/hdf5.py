@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from brainbench.core.errors import DataError, brief
+from brainbench.core.reading.filters import naming_filters
 from brainbench.core.reading.regular import check_file, readable
 
 if TYPE_CHECKING:
@@ -45,7 +46,10 @@ def open_hdf5(path: str | os.PathLike[str], kind: str = "HDF5 file", hint: str =
     if state not in _TRUSTED and (fault := _fault(*state)):
         raise DataError(f"{brief(os.fspath(path))} {fault}.{hint and ' ' + hint}")
     with readable(path, kind, hint), h5py.File(place, "r") as file:
-        yield file
+        with contextlib.suppress(ImportError):
+            import hdf5plugin  # noqa: F401 # pyright: ignore[reportMissingImports] - brings filters along
+        with naming_filters(file, path):
+            yield file
 
 
 def trust_hdf5(path: Path) -> None:

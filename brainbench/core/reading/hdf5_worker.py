@@ -66,6 +66,8 @@ def _array(node: Any, name: str) -> str:
     shape = getattr(node, "shape", None)
     if shape is None or node.is_virtual or node.external:
         return ""
+    if _lacks_filter(node):
+        return ""  # No damage: whoever reads it is told.
     declared, stored = math.prod(shape) * node.dtype.itemsize, node.id.get_storage_size()
     if declared > MOST_MEMORY + MOST_EXPANSION * stored:
         return f"is damaged ({name[:80]!r} declares {list(shape)}, {declared:,} bytes, and stores {stored:,})"
@@ -77,6 +79,13 @@ def _array(node: Any, name: str) -> str:
     elif node.chunks:
         node.id.get_num_chunks()
     return ""
+
+
+def _lacks_filter(node: Any) -> bool:
+    from h5py import h5z
+
+    create = node.id.get_create_plist()
+    return not all(h5z.filter_avail(create.get_filter(place)[0]) for place in range(create.get_nfilters()))
 
 
 def _links(file: Any, path: str) -> str:
@@ -119,7 +128,12 @@ def answer(path: str) -> None:
 
 
 if __name__ == "__main__":
+    import contextlib
+
     import h5py  # noqa: F401 - once, for all processes that are forked below
+
+    with contextlib.suppress(ImportError):
+        import hdf5plugin  # noqa: F401 # pyright: ignore[reportMissingImports] - brings filters along
 
     sys.stdout.write("ready\n")
     sys.stdout.flush()

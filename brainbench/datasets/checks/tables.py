@@ -142,7 +142,7 @@ def check_tables(session: Session) -> Iterator[Finding]:
 def _damaged(table: SessionTable) -> Iterator[Finding]:
     for name in table.columns:
         try:
-            if f"{name}_index" in table.data:
+            if name in table.index:
                 table.ends(name)
             elif len(table.data[name]) != len(table):
                 table.column(name)

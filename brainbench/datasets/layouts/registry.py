@@ -71,7 +71,7 @@ class RecordingLayout:
     def matches(self, session: Session) -> bool:
         """Return whether a session's condition table has the columns of this data set."""
         table = session.tables.get(self.conditions.table)
-        complete = table is not None and all(column in table for column in self.columns)
+        complete = table is not None and not table.fault and all(column in table for column in self.columns)
         return bool(self.columns) and complete and (session.synthetic or not self.synthetic)
 
     def adapted(self, session: Session) -> Session:

@@ -291,14 +291,12 @@ def _coverage(
 
 def inside_observed_spans(units: SessionTable, edges: NDArray[np.float64]) -> NDArray[np.bool_] | None:
     """Return which windows [R, 2] (s) lie in the spans in which each unit was observed [R, U]; None without spans."""
-    if OBSERVED not in units or f"{OBSERVED}_index" not in units:
+    if OBSERVED not in units:
         return None
-    ends = units.ends(OBSERVED)
-    spans = np.asarray(units.data[OBSERVED][...], dtype=np.float64).reshape(-1, 2)
     inside = np.zeros((len(edges), len(units)), dtype=bool)
     # Units of one probe share their spans, so each distinct list is looked at once.
     inside_of: dict[bytes, NDArray[np.bool_]] = {}
-    for unit, unit_spans in enumerate(np.split(spans, ends[:-1]) if len(ends) else []):
+    for unit, unit_spans in enumerate(units.spans()):
         key = unit_spans.tobytes()
         if key not in inside_of:
             fits = [(edges[:, 0] >= low) & (edges[:, 1] <= high) for low, high in _merged(unit_spans)]
