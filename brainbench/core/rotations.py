@@ -9,9 +9,11 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from functools import cache
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
+
+from brainbench.core.limits import Limit
 
 if TYPE_CHECKING:
     import torch
@@ -19,6 +21,13 @@ if TYPE_CHECKING:
 
 TURN = 2 * math.pi
 """A full turn [rad]: poses with larger angles are taken for degrees and refused."""
+
+Length = Annotated[float, Limit(above=0, unit="m")]
+Coordinate = Annotated[float, Limit(unit="m")]
+Angle = Annotated[float, Limit(least=-TURN, most=TURN, unit="rad")]
+Vector = tuple[float, float, float]
+Point = tuple[Coordinate, Coordinate, Coordinate]
+Angles = tuple[Angle, Angle, Angle]
 
 
 def to_matrices(quaternions: ArrayLike) -> NDArray[np.float64]:

@@ -11,7 +11,8 @@ import re
 from collections.abc import Iterator
 from dataclasses import MISSING, dataclass, field, fields
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args, get_origin
+from types import UnionType
+from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 import msgspec
 import numpy as np
@@ -83,6 +84,8 @@ def _good_value(annotation: Any, limit: msgspec.Meta | None = None) -> Any:
         return _good_value(annotation.__origin__, annotation.__metadata__[0])
     if origin is Literal:
         return kinds[0]
+    if origin in (Union, UnionType) and type(None) not in kinds:
+        return _good_value(kinds[0])
     if origin is tuple and kinds[-1] is not Ellipsis:
         return tuple(map(_good_value, kinds))
     if annotation in (int, float):

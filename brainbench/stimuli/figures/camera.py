@@ -9,15 +9,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from brainbench.core.errors import UsageError, check_name, unknown_name
-from brainbench.core.reading.ranges import check_fields
-
-Vector = tuple[float, float, float]
+from brainbench.core.errors import UsageError, unknown_name
+from brainbench.core.limits import Limit, limited
+from brainbench.core.rotations import Length, Point, Vector
 
 VIEWS: dict[str, Vector] = {
     "top": (0.0, 0.0, 1.0),
@@ -31,33 +30,27 @@ VIEWS: dict[str, Vector] = {
 """Directions from the target to the camera, in world axes (x right, y rostral, z dorsal): ``side`` looks
 at the animal's right side, ``front`` into its face."""
 
-PROJECTIONS = ("perspective", "orthographic")
-
 
 @dataclass(frozen=True)
+@limited(of="{} of a camera")
 class Camera:
     """Viewpoint, projection and frame of a picture; what is unknown or out of range is a :class:`UsageError`."""
 
     view: str | Vector = "oblique"
     """A name of :data:`VIEWS`, or the direction from the target to the camera (world)."""
     projection: Literal["perspective", "orthographic"] = "perspective"
-    target: Vector | None = None
+    target: Point | None = None
     """Point in the middle of the picture [m, world]; None frames what is shown."""
-    width: float | None = None
+    width: Length | None = None
     """Width of the picture in the plane of the target [m]; None frames what is shown."""
-    field_of_view: float = math.radians(24)
+    field_of_view: Annotated[float, Limit(above=0, below=math.pi, unit="rad")] = math.radians(24)
     """Horizontal opening angle of the perspective [rad]."""
 
     def __post_init__(self) -> None:
         if isinstance(self.view, str) and self.view not in VIEWS:
             raise unknown_name("view", self.view, VIEWS)
-        check_name("projection", self.projection, PROJECTIONS)
-        vectors = ("target",) if isinstance(self.view, str) else ("view", "target")
-        check_fields(self, *vectors, items=3, of="{} of a camera")
         if not any(self.view):
             raise UsageError("The view of a camera is a direction; (0, 0, 0) is none.")
-        check_fields(self, "width", above=0, of="{} (m)")
-        check_fields(self, "field_of_view", above=0, below=math.pi, of="{} (rad)")
 
     @property
     def axes(self) -> NDArray[np.float64]:

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
-from brainbench.core.errors import UsageError, check_name
-from brainbench.core.reading.ranges import check_fields
+from brainbench.core.limits import Limit, Positive, Share, limited
 
 ROW_COLORS = ("#3466ac", "#1b9aa0", "#d1495b", "#7b4fa3", "#e08e1b")
 """Colours of the whisker rows A to E."""
@@ -15,37 +14,29 @@ UNSTABLE_COLOR = "#111111"
 """Colour of whiskers whose simulation cannot be trusted."""
 MOMENT_MAP = "plasma"
 """Colour map of bending moments, by its name in matplotlib."""
-COLORINGS = ("row", "moment")
+
+_Pixels = Annotated[int, Limit(least=64, most=8192)]
 
 
 @dataclass(frozen=True)
+@limited(of="{} of a picture")
 class Style:
     """Colours, size and quality of a picture of a scene; what is out of range is a :class:`UsageError`."""
 
     color: Literal["row", "moment"] = "row"
     """Whiskers by row, or by their local elastic bending moment."""
-    moment_limit: float | None = None
+    moment_limit: Positive | None = None
     """Moment at the upper end of the colours [N·m]; None takes the largest that is shown."""
-    thickness: float = 2.0
+    thickness: Positive = 2.0
     """Whiskers are drawn so many times as thick as they are, and never thinner than a pixel."""
-    opacity: float = 1.0
+    opacity: Share = 1.0
     """Opacity of the objects, from 0 to 1; whiskers behind them shine through."""
-    size: tuple[int, int] = (1280, 960)
+    size: tuple[_Pixels, _Pixels] = (1280, 960)
     """Width and height in pixels."""
-    supersampling: int = 2
+    supersampling: Annotated[int, Limit(least=1, most=4)] = 2
     """Samples per pixel and direction; smooths edges at its square of the cost."""
-    frames_per_second: float = 25.0
+    frames_per_second: Annotated[float, Limit(above=0, most=120)] = 25.0
     """Frames per second of a film."""
-
-    def __post_init__(self) -> None:
-        check_name("colouring", self.color, COLORINGS)
-        check_fields(self, "moment_limit", "thickness", above=0)
-        check_fields(self, "opacity", least=0, most=1)
-        if len(self.size) != 2 or not all(64 <= value <= 8192 for value in self.size):
-            raise UsageError(f"The size of a picture is 64 to 8192 pixels each way; received {self.size!r}.")
-        if self.supersampling not in (1, 2, 3, 4):
-            raise UsageError(f"supersampling is 1, 2, 3 or 4; received {self.supersampling!r}.")
-        check_fields(self, "frames_per_second", above=0, most=120)
 
 
 def round_up(value: float) -> float:

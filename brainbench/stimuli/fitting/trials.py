@@ -16,6 +16,7 @@ from brainbench.core.contracts import CHANNELS
 from brainbench.core.errors import DataError, UsageError, check_name
 from brainbench.core.limits import Limit, limited
 from brainbench.core.reading.ranges import check_number
+from brainbench.core.rotations import Vector
 from brainbench.stimuli.fitting.curves import normal_offsets
 from brainbench.stimuli.fitting.parameters import Condition
 from brainbench.stimuli.fitting.tracks.contract import AXES, check_length
@@ -29,7 +30,7 @@ if TYPE_CHECKING:
 
     from brainbench.stimuli.scenes.scene import Scene
 
-Vector = tuple[float, float, float]
+
 SETTLING = 4.0
 """Time for which a plucked whisker is held, in decay times 1/(ζ ω) of its first mode; it is held in a way that hardly
 swings."""

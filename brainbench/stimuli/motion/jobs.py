@@ -14,12 +14,15 @@ from numpy.typing import NDArray
 
 from brainbench.core.errors import UsageError
 from brainbench.core.limits import Limit, limited
-from brainbench.core.reading.ranges import check_fields, check_number
+from brainbench.core.reading.ranges import check_number
+from brainbench.core.rotations import Length, Point
 from brainbench.stimuli.objects.obstacle import Obstacle
 from brainbench.stimuli.whiskers.whisker import Whisker
 
-_Metres = Annotated[float, Limit(unit="m")]
 _Radians = Annotated[float, Limit(unit="rad")]
+_Newtons = Annotated[float, Limit(unit="N")]
+_PerSquareSecond = Annotated[float, Limit(unit="m/s²")]
+Acceleration = tuple[_PerSquareSecond, _PerSquareSecond, _PerSquareSecond]
 
 
 class Follicle(Protocol):
@@ -42,7 +45,7 @@ class StillFollicle:
     """A base that stands still."""
 
     finest: ClassVar[float] = math.inf
-    position: tuple[_Metres, _Metres, _Metres] = (0.0, 0.0, 0.0)
+    position: Point = (0.0, 0.0, 0.0)
     """Base point [m, world]."""
     euler: tuple[_Radians, _Radians, _Radians] = (math.pi / 2, 0.0, -math.pi / 2)
     """(θ, φ, ζ) [rad]; the default lays the base frame on the world frame."""
@@ -54,18 +57,20 @@ class StillFollicle:
 
 
 @dataclass(frozen=True)
+@limited(of="{} of a load")
 class Load:
     """A point force on the whisker, as in a bench test; constant in world axes while it acts."""
 
-    arc: float
+    arc: Length
     """Arc length of the point it acts on [m]; the point moves with the whisker."""
-    force: tuple[float, float, float]
+    force: tuple[_Newtons, _Newtons, _Newtons]
     """Force on the whisker [N, world]."""
-    stop: float = math.inf
+    stop: Annotated[float, Limit(unit="s", infinite=True)] = math.inf
     """When the force vanishes [s]; it acts from the start of the job."""
 
 
 @dataclass(frozen=True, eq=False)
+@limited(of="{} of a job")
 class Job:
     """One whisker to simulate from ``start``, at rest relative to its base and unbent, to the last frame."""
 
@@ -74,9 +79,9 @@ class Job:
     obstacles: tuple[Obstacle, ...]
     times: NDArray[np.float64]
     """Output frame times [n] (s), increasing; values are instantaneous, not averaged."""
-    start: float = 0.0
+    start: Annotated[float, Limit(unit="s")] = 0.0
     """When the simulation begins [s]."""
-    gravity: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    gravity: Acceleration = (0.0, 0.0, 0.0)
     """Gravitational acceleration [m/s², world]; off by default: a whisker weighs micrograms."""
     loads: tuple[Load, ...] = ()
     """Point forces on the whisker, beside the contacts."""
@@ -85,15 +90,10 @@ class Job:
         times = np.array(self.times, dtype=float)
         if times.ndim != 1 or not len(times) or not np.isfinite(times).all() or np.any(np.diff(times) <= 0):
             raise UsageError("The frame times of a job must be one increasing list of finite seconds.")
-        check_fields(self, "start", of="{} of a job (s)")
-        check_fields(self, "gravity", items=3, of="{} of a job (m/s²)")
         if times[0] < self.start:
             raise UsageError(f"The first frame ({times[0]:g} s) lies before the start of the job ({self.start:g} s).")
         for load in self.loads:
-            check_number("arc of a load on this whisker (m)", load.arc, above=0, most=self.whisker.arc_length)
-            check_fields(load, "force", items=3, of="{} of a load (N)")
-            if math.isnan(load.stop):
-                raise UsageError("stop of a load (s) must be a number, inf for a load that stays; received nan.")
+            check_number("arc of a load on this whisker (m)", load.arc, most=self.whisker.arc_length)
         times.setflags(write=False)
         object.__setattr__(self, "times", times)
         object.__setattr__(self, "obstacles", tuple(self.obstacles))

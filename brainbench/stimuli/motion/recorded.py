@@ -20,17 +20,18 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.errors import DataError, UsageError, check_name, listing
-from brainbench.core.reading.ranges import check_fields, check_numbers
+from brainbench.core.limits import Limit, Positive, limited
+from brainbench.core.reading.ranges import check_numbers
 from brainbench.core.reading.tables import read_numbers
-from brainbench.core.rotations import TURN, base_rotation
+from brainbench.core.rotations import TURN, Vector, base_rotation
 from brainbench.stimuli.motion.hinge_angles import follow_angles
-from brainbench.stimuli.motion.trajectories import ROTATIONS, Rotations, Vector
+from brainbench.stimuli.motion.trajectories import ROTATIONS, Rotations
 from brainbench.stimuli.whiskers.array import MountedWhisker
 
 _LOG = logging.getLogger(__name__)
@@ -56,6 +57,7 @@ B5) of the published sample; the average arrays have 30, the mouse E0–E5 and t
 
 
 @dataclass(frozen=True, eq=False)
+@limited(of="{} of a trajectory")
 class Trajectory:
     """Angular velocities of whisker bases, evenly sampled from t = 0."""
 
@@ -63,7 +65,7 @@ class Trajectory:
     """[W] side and name, such as ``RC2``."""
     velocity: NDArray[np.float64]
     """[W, n, 3] angular velocity in the axes of the array [rad/s]; sample k is the velocity at t = k/rate."""
-    rate: float = 1000.0
+    rate: Positive = 1000.0
     """Samples per second [Hz]."""
 
     def __post_init__(self) -> None:
@@ -77,7 +79,6 @@ class Trajectory:
             raise DataError("A trajectory has velocities that are not finite numbers.")
         if len(set(self.names)) < len(self.names):
             raise DataError("A trajectory names a whisker twice.")
-        check_fields(self, "rate", above=0)
         velocity.setflags(write=False)
         object.__setattr__(self, "velocity", velocity)
 
@@ -149,11 +150,12 @@ class Trajectory:
 
 
 @dataclass(frozen=True, eq=False)
+@limited(of="{} of recorded whisking")
 class Recorded:
     """Whisking as recorded: each whisker turns from its starting orientation as its line of the file says."""
 
     trajectory: Trajectory
-    start: float = 0.0
+    start: Annotated[float, Limit(least=-math.pi / 2, most=math.pi / 2, unit="rad")] = 0.0
     """Azimuth in front of rest from which play starts [rad], with elevation and torsion coupled by ``rotations``;
     negative behind rest. Unused for whiskers in ``initial``."""
     rotations: Rotations = field(default_factory=lambda: ROTATIONS["knutsen"])
@@ -161,7 +163,6 @@ class Recorded:
     """Starting angles (θ, φ, ζ) [rad] by side and name (``RC2``), as :func:`load_initial_angles` reads them."""
 
     def __post_init__(self) -> None:
-        check_fields(self, "start", least=-math.pi / 2, most=math.pi / 2, of="{} of recorded whisking (rad)")
         for name, angles in self.initial.items():
             check_numbers(f"starting angles of {name} (rad)", angles, 3, least=-TURN, most=TURN)
 

@@ -5,18 +5,19 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Protocol
+from typing import Annotated, Any, ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.errors import UsageError
-from brainbench.core.reading.ranges import check_fields, check_number
-from brainbench.core.rotations import base_rotation
+from brainbench.core.limits import Limit, limited
+from brainbench.core.rotations import Vector, base_rotation
 from brainbench.stimuli.motion.hinge_angles import follow_angles
 from brainbench.stimuli.whiskers.array import MountedWhisker
 
-Vector = tuple[float, float, float]
+_Onset = Annotated[float, Limit(least=0, unit="s")]
+_Excursion = Annotated[float, Limit(least=-math.pi / 2, most=math.pi / 2, unit="rad")]
 
 
 @dataclass(frozen=True)
@@ -78,6 +79,7 @@ class Still(_Motion):
 
 
 @dataclass(frozen=True)
+@limited(of="{} of whisking")
 class Whisking(_Motion):
     """Sinusoidal whisking of the whole array about its rest pose.
 
@@ -88,23 +90,17 @@ class Whisking(_Motion):
     velocity and acceleration start without a jump.
     """
 
-    frequency: float = 20.0
+    frequency: Annotated[float, Limit(above=0, unit="Hz")] = 20.0
     """Whisks per second [Hz]."""
-    protraction: float = math.radians(30)
+    protraction: _Excursion = math.pi / 6
     """Largest azimuth forward of rest [rad]."""
-    retraction: float = math.radians(10)
+    retraction: _Excursion = math.pi / 18
     """Largest azimuth backward of rest [rad]."""
-    onset: float = 0.05
+    onset: _Onset = 0.05
     """Duration of the smooth start [s]."""
     rotations: Rotations = field(default_factory=lambda: ROTATIONS["knutsen"])
 
     def __post_init__(self) -> None:
-        check_fields(self, "frequency", above=0, of="whisking {} (Hz)")
-        check_fields(self, "onset", least=0, of="whisking {} (s)")
-        for name in ("protraction", "retraction"):
-            value = getattr(self, name)
-            if not math.isfinite(value) or abs(value) > math.pi / 2:
-                raise UsageError(f"The {name} of whisking must lie within ±90° (given in rad); received {value!r}.")
         if self.protraction + self.retraction <= 0:
             raise UsageError(
                 "Whisking needs a protraction in front of its retraction (their sum is the peak-to-peak amplitude); "
@@ -136,15 +132,8 @@ class _SteadyMotion(_Motion):
 
     velocity: Vector
     """Final velocity in the world: [m/s] of a translation; [rad/s] of a spin, along the axis by the right-hand rule."""
-    onset: float = 0.01
+    onset: _Onset = 0.01
     """Duration of the smooth start [s]; 0 moves at full speed from the first instant."""
-
-    _unit: ClassVar[str]
-
-    def __post_init__(self) -> None:
-        name = type(self).__name__.lower()
-        check_fields(self, "velocity", items=3, of=f"{{}} of a {name} ({self._unit})")
-        check_number(f"{name} onset (s)", self.onset, least=0)
 
     @property
     def finest(self) -> float:
@@ -162,20 +151,18 @@ class _SteadyMotion(_Motion):
         return way[:, None] * np.array(self.velocity)
 
 
+@limited(of="{} of a translation (SI units)")
 class Translation(_SteadyMotion):
     """Straight motion that reaches its velocity smoothly."""
-
-    _unit = "m/s"
 
     def displacement(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return how far it has moved since t = 0, [n, 3] (m, world)."""
         return self._moved(times)
 
 
+@limited(of="{} of a spin (SI units)")
 class Spin(_SteadyMotion):
     """Turning about an axis through the body's origin that reaches its speed smoothly, as :class:`Translation` does."""
-
-    _unit = "rad/s"
 
     def displacement(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return zeros [n, 3]: the origin stays."""

@@ -12,14 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.errors import UsageError, check_name
-from brainbench.core.reading.ranges import check_fields
-from brainbench.core.rotations import from_matrices, to_matrices
+from brainbench.core.limits import NotNegative, limited
+from brainbench.core.rotations import Length, Point, from_matrices, to_matrices
 from brainbench.geometry import Mesh
 
 RigidMotion = Callable[[NDArray[np.float64]], tuple[NDArray[np.float64], NDArray[np.float64]]]
 """Times [n] (s) → positions [n, 3] (m, world) and unit quaternions [n, 4] (w, x, y, z), body to world."""
-
-Vector = tuple[float, float, float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,12 +62,6 @@ class _Primitive:
     _sizes: ClassVar[tuple[str, ...]] = ("radius",)
     """Names of the fields that only grow with it."""
 
-    def __post_init__(self) -> None:
-        of = f"{{}} of a {type(self).__name__.lower()} (m)"
-        check_fields(self, *self._points, items=3, of=of)
-        for name in self._sizes:
-            check_fields(self, name, items=0 if name == "radius" else 3, above=0, of=of)
-
     def moved(self, rotation: NDArray[np.float64], translation: NDArray[np.float64]) -> Self:
         """Return the body rotated by a matrix [3, 3] about the origin, then translated by [3] (m)."""
         points = {name: rotation @ np.asarray(getattr(self, name)) + translation for name in self._points}
@@ -83,11 +75,12 @@ class _Primitive:
 
 
 @dataclass(frozen=True)
+@limited(of="{} of a sphere")
 class Sphere(_Primitive):
     """A ball."""
 
-    centre: Vector
-    radius: float
+    centre: Point
+    radius: Length
 
     _points = ("centre",)
 
@@ -100,9 +93,9 @@ class Sphere(_Primitive):
 class _Segment(_Primitive):
     """Base of capsules and cylinders: a radius around the segment from ``start`` to ``end``."""
 
-    start: Vector
-    end: Vector
-    radius: float
+    start: Point
+    end: Point
+    radius: Length
 
     _points = ("start", "end")
 
@@ -116,16 +109,17 @@ class _Segment(_Primitive):
         return np.stack([ends.min(axis=0) - reach, ends.max(axis=0) + reach])
 
     def __post_init__(self) -> None:
-        super().__post_init__()
         if tuple(self.start) == tuple(self.end):
             name = type(self).__name__.lower()
             raise UsageError(f"start and end of a {name} are the same point {tuple(self.start)}; use a Sphere.")
 
 
+@limited(of="{} of a capsule")
 class Capsule(_Segment):
     """All points within ``radius`` of the segment from ``start`` to ``end``."""
 
 
+@limited(of="{} of a cylinder")
 class Cylinder(_Segment):
     """A flat-ended cylinder around the segment from ``start`` to ``end``."""
 
@@ -136,20 +130,20 @@ class Cylinder(_Segment):
 
 
 @dataclass(frozen=True)
+@limited(of="{} of a box")
 class Box(_Primitive):
     """A box of half edge lengths ``half_sizes`` turned by ``quaternion`` about its centre."""
 
-    centre: Vector
-    half_sizes: Vector
+    centre: Point
+    half_sizes: tuple[Length, Length, Length]
     quaternion: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
 
     _points = ("centre",)
     _sizes = ("half_sizes",)
 
     def __post_init__(self) -> None:
-        super().__post_init__()
-        length = math.sqrt(sum(value**2 for value in self.quaternion))
-        if len(self.quaternion) != 4 or not math.isclose(length, 1, abs_tol=1e-6):
+        length = math.hypot(*self.quaternion)
+        if not math.isclose(length, 1, abs_tol=1e-6):
             raise UsageError(f"The quaternion of a box must have length 1; {self.quaternion} has length {length:g}.")
 
     def bounds(self) -> NDArray[np.float64]:
@@ -176,6 +170,7 @@ def bounds_of(parts: Iterable[Part], surface: Mesh | None) -> NDArray[np.float64
 
 
 @dataclass(frozen=True)
+@limited(of="{} of an obstacle")
 class Obstacle:
     """A rigid body made of parts that a whisker may touch.
 
@@ -186,7 +181,7 @@ class Obstacle:
     """Geometry in the obstacle frame [m]; the world frame when ``motion`` is None."""
     motion: RigidMotion | None = None
     """Times [n] (s) → position [n, 3] (m) and quaternion [n, 4]; None for an obstacle that stands still."""
-    friction: float | None = None
+    friction: NotNegative | None = None
     """Coulomb coefficient of the contact; None takes the whisker's own."""
     surface: Mesh | None = None
     """The exact surface of the body. Engines that collide meshes (``rod``) touch it instead of ``parts``; those that
@@ -201,7 +196,6 @@ class Obstacle:
         if self.surface is not None and min(len(self.surface.vertices), len(self.surface.faces)) < 4:
             shapes = f"{self.surface.vertices.shape} and {self.surface.faces.shape}"
             raise UsageError(f"A closed surface has at least four vertices and four faces; received shapes {shapes}.")
-        check_fields(self, "friction", least=0, of="{} of an obstacle")
 
     def friction_beside(self, whisker: float) -> float:
         """Return the Coulomb coefficient of a contact with a whisker whose own is given."""

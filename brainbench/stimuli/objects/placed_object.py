@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from brainbench.core.reading.ranges import check_fields
-from brainbench.core.rotations import TURN, euler_matrix, from_matrices
+from brainbench.core.limits import NotNegative, limited
+from brainbench.core.rotations import Angles, Point, euler_matrix, from_matrices
 from brainbench.stimuli.motion.trajectories import Path, Spin, Still, Translation
-from brainbench.stimuli.objects.obstacle import Obstacle, Vector
+from brainbench.stimuli.objects.obstacle import Obstacle
 from brainbench.stimuli.objects.solid import Solid
 
 
@@ -38,23 +38,19 @@ class _PlacedMotion:
 
 
 @dataclass(frozen=True, eq=False)
+@limited(of="{} of an object")
 class PlacedObject:
     """A solid in a scene (world frame); a friction below 0 or a pose that is not finite is a :class:`UsageError`."""
 
     solid: Solid
-    position: Vector = (0.0, 0.0, 0.0)
+    position: Point = (0.0, 0.0, 0.0)
     """Position of the solid's origin [m]."""
-    rotation: Vector = (0.0, 0.0, 0.0)
+    rotation: Angles = (0.0, 0.0, 0.0)
     """Angles [rad] about the world's x, then y, then z axis."""
     motion: Still | Translation | Spin | Path = field(default_factory=Still)
     """Motion from there; the object turns about its solid's origin."""
-    friction: float | None = None
+    friction: NotNegative | None = None
     """Coulomb coefficient of its contacts; None takes each whisker's own."""
-
-    def __post_init__(self) -> None:
-        check_fields(self, "position", items=3, of="{} of an object (m)")
-        check_fields(self, "rotation", items=3, least=-TURN, most=TURN, of="{} of an object (rad)")
-        check_fields(self, "friction", least=0, of="The {} of an object")
 
     def obstacle(self, frame: tuple[ArrayLike, ArrayLike] | None = None) -> Obstacle:
         """Return what the physics sees in a frame, given by its rotation [3, 3] and origin [3] (m), or in the world."""

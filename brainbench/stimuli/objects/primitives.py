@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from brainbench.core.reading.ranges import check_number
+from brainbench.core.rotations import Vector
 from brainbench.geometry import Mesh
-from brainbench.stimuli.objects.obstacle import Box, Capsule, ConvexPart, Cylinder, Sphere, Vector
+from brainbench.stimuli.objects.obstacle import Box, Capsule, ConvexPart, Cylinder, Sphere
 from brainbench.stimuli.objects.solid import Solid
 
 RODGERS_CONTROL = ((-0.720943, 0.195148), (-0.167777, 0.219684), (0.235608, -0.057831), (0.631506, -0.409149))

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.errors import UsageError, check_name
-from brainbench.core.reading.ranges import check_fields
+from brainbench.core.errors import UsageError
+from brainbench.core.limits import Count, Limit, limited
 
 Axes = Literal["world", "follicle"]
 """``world``: axes of the world. ``follicle``: the whisker's base frame, which turns with it: x along the whisker
@@ -27,6 +27,7 @@ _ORDER = 4
 
 
 @dataclass(frozen=True)
+@limited(of="{} of the frames")
 class Frames:
     """Times at which forces are read, and the rule that makes a frame of readings.
 
@@ -36,33 +37,26 @@ class Frames:
     aliases through; ``lowpass`` stops them with a Butterworth filter.
     """
 
-    first: float = 0.001
+    first: Annotated[float, Limit(least=0, unit="s")] = 0.001
     """Time of the first frame [s]; the whiskers start at rest at t = 0."""
-    interval: float = 0.009
+    interval: Annotated[float, Limit(above=0, unit="s")] = 0.009
     """Time between frames [s]."""
-    count: int = 110
-    average: int = 1
+    count: Count = 110
+    average: Count = 1
     """Readings, evenly spread over the interval that begins at the frame's time, whose mean a frame is; the
     readings per frame that a filter works on, when ``lowpass`` is given."""
-    lowpass: float | None = None
+    lowpass: Annotated[float, Limit(above=0, unit="Hz")] | None = None
     """Cut-off [Hz] of a fourth-order Butterworth filter on the readings (−3 dB; −6 dB with phase ``zero``, which
     applies it twice); a frame is then the filtered force at its time. None for no filter."""
     phase: Phase = "zero"
     """Direction of the filter."""
     axes: Axes = "world"
     """Axes of force and moment, turned by the follicle's pose at the time of each frame."""
-    clip: float | None = None
+    clip: Annotated[float, Limit(above=0, unit="N")] | None = None
     """Largest force component [N] that a frame reports; moments are clipped at ``clip`` × 1 mm, which is the same
     number in the published units mN and mN·mm (there 1000: ``clip`` = 1). None for no clipping."""
 
     def __post_init__(self) -> None:
-        check_fields(self, "first", least=0, of="{} of the frames (s)")
-        check_fields(self, "interval", above=0, of="{} of the frames (s)")
-        check_fields(self, "count", "average", least=1, whole=True, of="{} of the frames")
-        for name, allowed in (("phase", ("zero", "causal")), ("axes", ("world", "follicle"))):
-            check_name(f"{name} of the frames", getattr(self, name), allowed)
-        check_fields(self, "clip", above=0, of="{} of the frames (N)")
-        check_fields(self, "lowpass", above=0, of="{} of the frames (Hz)")
         if self.lowpass is not None:
             self._check_filter(self.lowpass)
 

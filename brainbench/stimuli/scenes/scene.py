@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.errors import UsageError
-from brainbench.core.reading.ranges import check_fields
-from brainbench.core.rotations import TURN, base_rotation, euler_matrix
-from brainbench.stimuli.motion.jobs import Job
+from brainbench.core.limits import limited
+from brainbench.core.rotations import Angles, Point, base_rotation, euler_matrix
+from brainbench.stimuli.motion.jobs import Acceleration, Job
 from brainbench.stimuli.motion.recorded import Recorded
-from brainbench.stimuli.motion.trajectories import ArrayFollicle, Path, Still, Translation, Vector, Whisking
+from brainbench.stimuli.motion.trajectories import ArrayFollicle, Path, Still, Translation, Whisking
 from brainbench.stimuli.objects.placed_object import PlacedObject
 from brainbench.stimuli.scenes.frames import Frames
 from brainbench.stimuli.whiskers.array import MountedWhisker, WhiskerArray
@@ -25,18 +25,15 @@ from brainbench.stimuli.whiskers.selection import match_whiskers
 
 
 @dataclass(frozen=True)
+@limited(of="{} of a head")
 class Head:
     """Pose of an array in the world, and its motion; one that is not finite is a :class:`UsageError`."""
 
-    position: Vector = (0.0, 0.0, 0.0)
+    position: Point = (0.0, 0.0, 0.0)
     """World position of the array's origin at t = 0 [m]."""
-    rotation: Vector = (0.0, 0.0, 0.0)
+    rotation: Angles = (0.0, 0.0, 0.0)
     """Angles [rad] about the world's x, then y, then z axis that turn the array frame."""
     motion: Still | Translation | Path = field(default_factory=Still)
-
-    def __post_init__(self) -> None:
-        check_fields(self, "position", items=3, of="{} of a head (m)")
-        check_fields(self, "rotation", items=3, least=-TURN, most=TURN, of="{} of a head (rad)")
 
     @property
     def matrix(self) -> NDArray[np.float64]:
@@ -60,6 +57,7 @@ class Animal:
 
 
 @dataclass(frozen=True, eq=False)
+@limited(of="{} of a scene")
 class Scene:
     """One stimulus to simulate."""
 
@@ -76,7 +74,7 @@ class Scene:
     twist: bool = True
     """Twist of whiskers when :attr:`Fidelity.twist` leaves it open. False in recipes with shipped recordings or
     networks, which were made before whiskers could twist."""
-    gravity: Vector = (0.0, 0.0, 0.0)
+    gravity: Acceleration = (0.0, 0.0, 0.0)
     """Gravitational acceleration [m/s², world axes]; none by default, since a whisker weighs micrograms."""
 
     def __post_init__(self) -> None:
@@ -84,7 +82,6 @@ class Scene:
         object.__setattr__(self, "others", tuple(self.others))
         if not self.label:
             raise UsageError("A scene needs a label: it names the stimulus in every table.")
-        check_fields(self, "gravity", items=3, of="{} of a scene (m/s²)")
         names = [self.animal, *(other.name for other in self.others)]
         if len(set(names)) < len(names) or not all(names) or any(":" in name for name in names):
             raise UsageError(f"The animals of a scene need different names without a colon; received {names}.")

@@ -69,10 +69,11 @@ from brainbench.core.errors import BrainbenchError, UsageError, brief, check_nam
 from brainbench.core.limits import Limit, check_value
 from brainbench.core.reading.regular import readable
 from brainbench.core.reading.texts import read_toml
+from brainbench.core.rotations import Vector
 from brainbench.geometry import DecompositionSettings
 from brainbench.stimuli.motion import trajectories
 from brainbench.stimuli.motion.recorded import Recorded, load_initial_angles, load_trajectory
-from brainbench.stimuli.motion.trajectories import ROTATIONS, Spin, Still, Translation, Vector, Whisking
+from brainbench.stimuli.motion.trajectories import ROTATIONS, Spin, Still, Translation, Whisking
 from brainbench.stimuli.objects import procedural
 from brainbench.stimuli.objects.mesh_solids import mesh_solid, shape_solid
 from brainbench.stimuli.objects.placed_object import PlacedObject

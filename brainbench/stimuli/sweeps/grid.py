@@ -9,16 +9,17 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.errors import UsageError, check_name
+from brainbench.core.errors import UsageError
 from brainbench.core.files import content_hash
-from brainbench.core.reading.ranges import check_fields, check_numbers
-from brainbench.core.rotations import TURN, euler_matrix
+from brainbench.core.limits import Count, Limit, Positive, Seed, check_value, limited
+from brainbench.core.rotations import Angle, euler_matrix
 from brainbench.stimuli.motion.trajectories import Still, Translation
 from brainbench.stimuli.objects.obstacle import Obstacle
 from brainbench.stimuli.objects.placed_object import PlacedObject
@@ -27,24 +28,22 @@ from brainbench.stimuli.scenes.frames import Frames
 from brainbench.stimuli.scenes.scene import Head, Scene
 from brainbench.stimuli.whiskers.array import WhiskerArray
 
-MOVERS = ("object", "head")
-PLACINGS = ("clear", "released")
-
 _HEAD_ONSET = 0.01
 """Smooth start [s] of a travelling head, whose whiskers would feel a jump of velocity as a blow."""
 
 
 @dataclass(frozen=True)
+@limited(of="{} of a span")
 class Span:
     """Values low, low + step, …, high, of which every draw takes one, all equally likely."""
 
     low: float
     high: float
-    step: float
+    step: Positive
 
     def __post_init__(self) -> None:
-        if not (math.isfinite(self.low) and 0 < self.step < math.inf and self.low <= self.high < math.inf):
-            raise UsageError(f"A span ascends from low to high in positive steps; received {self!r}.")
+        if self.low > self.high:
+            raise UsageError(f"A span ascends from low to high; received {self!r}.")
 
     @property
     def count(self) -> int:
@@ -57,7 +56,10 @@ class Span:
         return self.low + self.step * int(generator.integers(self.count))
 
 
-Values = tuple[float, ...] | Span
+_Several = Limit(shortest=1)
+_Numbers = Annotated[tuple[float, ...], _Several]
+_PositiveNumbers = Annotated[tuple[Positive, ...], _Several]
+_Angles = Annotated[tuple[Angle, ...], _Several]
 
 
 @dataclass(frozen=True)
@@ -86,28 +88,29 @@ class Sweep:
 
 
 @dataclass(frozen=True)
+@limited(of="{} of a sweep grid")
 class SweepGrid:
     """A frozen set of sweep conditions; lists are combined, spans are sampled once per draw and object."""
 
-    speed: Values = (0.030,)
+    speed: _PositiveNumbers | Span = (0.030,)
     """[m/s]"""
-    height: Values = (0.0,)
+    height: _Numbers | Span = (0.0,)
     """[m]"""
-    rotation: Values = (0.0,)
+    rotation: _Angles | Span = (0.0,)
     """[rad]"""
-    distance: Values = (0.005,)
+    distance: _Numbers | Span = (0.005,)
     """[m]"""
-    size: Values = (0.040,)
+    size: _PositiveNumbers | Span = (0.040,)
     """[m]"""
-    turns: tuple[float, ...] = (0.0,)
+    turns: _Angles = (0.0,)
     """Angles [rad] added to each rotation."""
-    draws: int = 1
+    draws: Count = 1
     """Number of times that the spans are sampled."""
-    heights_per_draw: int | None = None
+    heights_per_draw: Count | None = None
     """Number of the listed heights that each draw uses, in rotation, so that all are used alike; None for all."""
-    seed: int = 0
+    seed: Seed = 0
     """Seed of the draws; each object has draws of its own, named by seed and object name."""
-    start: float = 0.016
+    start: Annotated[float, Limit(unit="m")] = 0.016
     """Start of the object along y [m]; see ``placing``."""
     placing: Literal["clear", "released"] = "clear"
     """``clear``: the face that leads has y = ``start`` at t = 0, in front of the whiskers. ``released``: the origin
@@ -128,26 +131,15 @@ class SweepGrid:
             values = getattr(self, name)
             if not isinstance(values, Span):
                 object.__setattr__(self, name, tuple(map(float, values)))
-                if not values or not all(map(math.isfinite, values)):
-                    raise UsageError(f"{name} of a sweep grid needs at least one finite value; received {values!r}.")
-        for name in ("rotation", "turns"):
-            values = getattr(self, name)
-            ends = (values.low, values.high) if isinstance(values, Span) else values
-            check_numbers(f"{name} of a sweep grid (rad)", ends, len(ends), least=-TURN, most=TURN)
-        for name in ("speed", "size"):
-            values = getattr(self, name)
-            if (values.low if isinstance(values, Span) else min(values)) <= 0:
-                raise UsageError(f"{name} of a sweep grid must be positive (SI units); received {values!r}.")
-        check_fields(self, "draws", least=1, whole=True, of="{} of a sweep grid")
-        check_fields(self, "start", of="{} of a sweep grid (m)")
+            elif name in ("speed", "size", "rotation"):
+                limit = _Angles if name == "rotation" else _PositiveNumbers
+                check_value(f"{name} of a sweep grid", (values.low, values.high), limit)
         if self.heights_per_draw is not None and (
             isinstance(self.height, Span) or not 1 <= self.heights_per_draw <= len(self.height)
         ):
             raise UsageError(
                 f"heights_per_draw must lie between 1 and the number of listed heights; got {self.heights_per_draw!r}."
             )
-        check_name("mover", self.mover, MOVERS)
-        check_name("placing", self.placing, PLACINGS)
         if not isinstance(self.head.motion, Still):
             raise UsageError("The head of a sweep grid stands still at first; choose mover='head' to let it travel.")
 
@@ -208,11 +200,11 @@ class SweepGrid:
         return tuple(values[(first + i) % len(values)] for i in range(self.heights_per_draw))
 
 
-def _choices(values: Values) -> int:
+def _choices(values: Sequence[float] | Span) -> int:
     return 1 if isinstance(values, Span) else len(values)
 
 
-def _values(values: Values, generator: np.random.Generator) -> tuple[float, ...]:
+def _values(values: tuple[float, ...] | Span, generator: np.random.Generator) -> tuple[float, ...]:
     return (values.draw(generator),) if isinstance(values, Span) else values
 
 

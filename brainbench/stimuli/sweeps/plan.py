@@ -9,15 +9,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
 from importlib import metadata
-from typing import Any, Literal, Protocol
+from typing import Annotated, Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.contracts import SWEEPS_FORMAT, SWEEPS_SCHEMA
-from brainbench.core.errors import UsageError, check_name
+from brainbench.core.errors import UsageError
 from brainbench.core.files import content_hash, portable, to_plain
-from brainbench.core.reading.ranges import check_fields
+from brainbench.core.limits import Count, Limit, Seed, limited
 from brainbench.core.version import __version__
 from brainbench.stimuli.engines import PHYSICS_VERSION, get_engine
 from brainbench.stimuli.engines.fidelity import DEFAULT_ENGINE, Fidelity
@@ -81,6 +81,7 @@ GPU_SHARD = 2048
 
 
 @dataclass(frozen=True)
+@limited
 class GenerationSettings:
     """Options of a data set of sweeps; a value outside its range is a :class:`UsageError`."""
 
@@ -90,23 +91,20 @@ class GenerationSettings:
     """``cpu``, or ``cuda`` with a backend that runs there."""
     split: SplitBy = "object"
     """Train, validation and test (80/10/10) by ``object`` or by ``sweep``."""
-    seed: int = 0
+    seed: Seed = 0
     """Seed of the split, of the order of the objects and of the sample; the grid has a seed of its own."""
-    limit: int | None = None
+    limit: Count | None = None
     """Only the first sweeps of each object; all when None."""
-    sample: float | None = None
+    sample: Annotated[float, Limit(above=0, most=1)] | None = None
     """Only this fraction of all sweeps, drawn at random; all when None."""
-    shard_size: int | None = None
+    shard_size: Count | None = None
     """Sweeps per shard; by backend and device when None."""
-    retry: int = 5
+    retry: Count = 5
     """Whiskers that cannot be trusted are simulated again with steps divided by this, and those left by twice this
     (backend ``rod``); 1 leaves them as they are."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "fidelity", self.fidelity.resolved(get_engine(self.backend).twists))
-        check_name("split", self.split, ("object", "sweep"))
-        check_fields(self, "limit", "shard_size", "retry", least=1, whole=True)
-        check_fields(self, "sample", above=0, most=1)
         if self.limit is not None and self.sample is not None:
             raise UsageError("Give limit (the first sweeps of each object) or sample (a random fraction), not both.")
 

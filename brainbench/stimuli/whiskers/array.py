@@ -16,8 +16,8 @@ from importlib import resources
 from typing import Any, Literal
 
 from brainbench.core.errors import UsageError, check_each, check_name, unknown_name
-from brainbench.core.reading.ranges import check_numbers
-from brainbench.core.rotations import TURN
+from brainbench.core.limits import limited
+from brainbench.core.rotations import Angles, Point
 from brainbench.stimuli.whiskers.selection import match_whiskers
 from brainbench.stimuli.whiskers.whisker import Whisker
 
@@ -31,6 +31,7 @@ _MM = 1e-3
 
 
 @dataclass(frozen=True)
+@limited(of="{} of a whisker")
 class MountedWhisker:
     """One whisker with its place on the face."""
 
@@ -40,9 +41,9 @@ class MountedWhisker:
     row: int
     """0 for row A to 4 for row E."""
     col: int
-    position: tuple[float, float, float]
+    position: Point
     """Base point [m, array frame]."""
-    angles: tuple[float, float, float]
+    angles: Angles
     """(θ, φ, ζ) at rest [rad]: Rz(θ − π/2) · Ry(−φ) · Rx(ζ + π/2) maps the base frame to the array frame."""
     whisker: Whisker
 
@@ -165,7 +166,6 @@ class WhiskerArray:
         allowed = places | {field.name for field in dataclasses.fields(Whisker)}
         check_each("whisker property", changes, sorted(allowed))
         mounted = {key: tuple(map(float, value)) for key, value in changes.items() if key in places}
-        check_numbers("angles of a whisker (rad)", mounted.get("angles", (0, 0, 0)), 3, least=-TURN, most=TURN)
         rod = {key: value for key, value in changes.items() if key not in places}
         chosen = set(self.select(pattern).mounts)
         mounts = tuple(

@@ -7,21 +7,26 @@ plane with its concave side towards +y. Arc length s runs from 0 at the base to 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import numpy as np
 from numpy.polynomial import Polynomial
 from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.errors import UsageError
-from brainbench.core.reading.ranges import check_fields, check_number
+from brainbench.core.limits import Limit, NotNegative, limited
+from brainbench.core.rotations import Length
 
 SOFTEST = 1e3
 """Young's modulus [Pa] below which a number looks like gigapascals."""
 LIGHTEST = 10.0
 """Density [kg/m³] below which a number looks like grams per cubic centimetre."""
 
+_Density = Annotated[float, Limit(least=LIGHTEST, unit="kg/m³")]
+
 
 @dataclass(frozen=True)
+@limited(of="{} of a whisker")
 class Whisker:
     """Geometry and material of one whisker.
 
@@ -29,41 +34,29 @@ class Whisker:
     shape is the parabola y = A x² (A = ``curvature``), measured along its arc.
     """
 
-    arc_length: float
+    arc_length: Length
     """Length along the centre line L [m]."""
-    base_radius: float
+    base_radius: Length
     """Radius at the base [m]."""
-    tip_radius: float
+    tip_radius: Length
     """Radius at the tip [m]; positive, because a real tip is cut or worn and a point has no stiffness."""
-    young_modulus: float
+    young_modulus: Annotated[float, Limit(least=SOFTEST, unit="Pa")]
     """Young's modulus E [Pa]."""
-    density: float | tuple[float, float]
+    density: _Density | tuple[_Density, _Density]
     """Mass density [kg/m³], one number or (base, tip)."""
-    damping_ratio: float
+    damping_ratio: NotNegative
     """Fraction of critical damping of the first bending mode (stiffness-proportional damping)."""
-    curvature: float = 0.0
+    curvature: Annotated[float, Limit(unit="1/m")] = 0.0
     """Coefficient A of the rest shape y = A x² [1/m]; negative bends towards −y."""
-    friction: float = 0.48
+    friction: NotNegative = 0.48
     """Coulomb coefficient against objects that bring none of their own; .48 was measured on steel."""
-    poisson_ratio: float = field(default=0.4, metadata={"later": True})
+    poisson_ratio: Annotated[float, Limit(above=-1, most=0.5)] = field(default=0.4, metadata={"later": True})
     """Poisson's ratio ν, above −1 and at most .5: the shear modulus is G = E/(2 (1 + ν)). Not measured on whiskers; .4
     is usual for polymers. Along its axis human hair twists more easily still: E = 3.9, G = .9 GPa (Robbins 2012)."""
 
     def __post_init__(self) -> None:
-        of = "{} of a whisker (SI units)"
-        check_fields(self, "arc_length", "base_radius", "tip_radius", above=0, of=of)
-        check_fields(self, "young_modulus", least=SOFTEST, of=of)
-        check_fields(self, "damping_ratio", "friction", least=0, of=of)
-        check_fields(self, "curvature", of=of)
-        check_fields(self, "poisson_ratio", above=-1, most=0.5, of=of)
         if isinstance(self.density, (tuple, list)):
-            if len(self.density) != 2:
-                raise UsageError(
-                    f"density of a whisker is one number or (base, tip) in kg/m³; received {len(self.density)} values."
-                )
             object.__setattr__(self, "density", (float(self.density[0]), float(self.density[1])))
-        for value in self.densities:
-            check_number("density of a whisker (kg/m³)", value, least=LIGHTEST)
         thickest = max(self.base_radius, self.tip_radius)
         if thickest > self.arc_length / 5:
             raise UsageError(

@@ -60,10 +60,6 @@ def test_perspective_enlarges_what_is_nearer_by_the_ratio_of_distances():
         ({"view": "abov"}, "Unknown view 'abov'"),
         ({"view": (0.0, 0.0, 0.0)}, "direction"),
         ({"view": (0.0, math.nan, 0.0)}, "view of a camera"),
-        ({"projection": "ortographic"}, "did you mean 'orthographic'"),
-        ({"width": 0.0}, r"width .*received 0"),
-        ({"field_of_view": 4.0}, "field_of_view .*above 0"),
-        ({"target": (0.0, math.inf, 0.0)}, "target of a camera"),
     ],
 )
 def test_impossible_cameras_are_refused(options, message):

@@ -1,4 +1,4 @@
-"""Jobs and bases that stand still: numbers that cannot be are refused."""
+"""Jobs: what their numbers must be beside one another."""
 
 import numpy as np
 import pytest
@@ -8,17 +8,11 @@ from brainbench.stimuli.motion.jobs import Job, Load, StillFollicle
 from tests.factories.whiskers import C2
 
 
-@pytest.mark.parametrize(
-    ("make", "said"),
-    [
-        (lambda: StillFollicle(position=(np.nan, 0.0, 0.0)), "position"),
-        (lambda: StillFollicle(euler=(0.0, np.inf, 0.0)), "euler"),
-        (lambda: Job(C2, StillFollicle(), (), np.array([0.1]), start=np.nan), "start"),
-        (lambda: Job(C2, StillFollicle(), (), np.array([0.1]), gravity=(0.0, 0.0, np.nan)), "gravity"),
-        (lambda: Job(C2, StillFollicle(), (), np.array([0.1]), loads=(Load(0.01, (0.0, np.nan, 0.0)),)), "force"),
-        (lambda: Job(C2, StillFollicle(), (), np.array([0.1]), loads=(Load(0.01, (0, 0, 0), stop=np.nan),)), "stop"),
-    ],
-)
-def test_jobs_of_numbers_that_are_not_finite_are_refused(make, said):
-    with pytest.raises(UsageError, match=f"{said} .*nan|{said} .*inf"):
-        make()
+def test_no_frame_lies_before_the_start():
+    with pytest.raises(UsageError, match=r"first frame \(0.1 s\) lies before .*0.2 s"):
+        Job(C2, StillFollicle(), (), np.array([0.1]), start=0.2)
+
+
+def test_a_load_acts_on_the_whisker():
+    with pytest.raises(UsageError, match=r"arc of a load .*at most 0\.0\d+; received 1"):
+        Job(C2, StillFollicle(), (), np.array([0.1]), loads=(Load(1.0, (0.0, 0.0, 0.0)),))

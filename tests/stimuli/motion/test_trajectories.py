@@ -85,19 +85,9 @@ def test_the_left_side_whisks_as_the_mirror_image():
     np.testing.assert_allclose(left, right * [-1, 1, -1], atol=1e-15)
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"frequency": 0.0}, r"frequency .*received 0\.0"),
-        ({"frequency": float("nan")}, "frequency .*received nan"),
-        ({"protraction": 30.0}, r"protraction .*±90° .*received 30\.0"),
-        ({"protraction": -0.2, "retraction": 0.1}, r"received -0\.2 and 0\.1 rad"),
-        ({"onset": -1.0}, r"onset .*received -1"),
-    ],
-)
-def test_impossible_whisking_is_refused(changes, message):
-    with pytest.raises(UsageError, match=message):
-        Whisking(**changes)
+def test_whisking_backwards_is_refused():
+    with pytest.raises(UsageError, match=r"received -0\.2 and 0\.1 rad"):
+        Whisking(protraction=-0.2, retraction=0.1)
 
 
 def test_translation_reaches_its_velocity_smoothly_and_then_keeps_it():
@@ -132,29 +122,12 @@ def test_a_spin_turns_about_its_axis_by_the_integral_of_its_speed():
     assert (motion.displacement(TIMES) == 0).all()
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (((1.0, 2.0),), r"\(rad/s\) holds 3 numbers"),
-        (((0, 0, 1), -1.0), "spin onset .s. .*at least 0; received -1"),
-    ],
-)
-def test_an_impossible_spin_is_refused(arguments, message):
-    with pytest.raises(UsageError, match=message):
-        Spin(*arguments)
-
-
 def test_a_travelling_head_carries_its_follicles():
     mount = ARRAY["RC2"]
     motion = Translation((0.01, 0.0, 0.0), onset=0.0)
     position, euler = ArrayFollicle(mount, Still(), motion.displacement).pose(np.array([0.0, 0.1]))
     np.testing.assert_allclose(position - mount.position, [[0, 0, 0], [1e-3, 0, 0]], atol=1e-15)
     np.testing.assert_allclose(euler, [mount.angles] * 2)
-
-
-def test_a_velocity_needs_three_numbers():
-    with pytest.raises(UsageError, match=r"m/s\) .*received \(1\.0, 2\.0\)"):
-        Translation((1.0, 2.0))
 
 
 def _turned(*degrees):

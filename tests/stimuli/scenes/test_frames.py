@@ -222,14 +222,6 @@ def test_what_is_not_used_does_not_change_the_name_of_a_stimulus():
     [
         ({"lowpass": 60.0, "average": 20}, r"60 Hz lets aliases through.*nothing above 55.56 Hz"),
         ({"lowpass": 50.0}, r"50 Hz .*average is 1"),
-        ({"lowpass": -1.0}, r"lowpass .*\(Hz\) .*received -1"),
-        ({"phase": "zer"}, "did you mean 'zero'"),
-        ({"axes": "head"}, "'head'. Allowed: 'world'"),
-        ({"clip": 0.0}, "clip .*above 0"),
-        ({"first": -1.0}, "first .*at least 0"),
-        ({"count": 0}, "count .* at least 1"),
-        ({"average": 1.5}, "average .*whole"),
-        ({"interval": 0.0}, "interval .*above 0"),
     ],
 )
 def test_impossible_frames_are_refused(changes, message):

@@ -67,13 +67,6 @@ def test_moving_the_head_is_moving_the_object_the_other_way_as_the_whisker_sees_
     np.testing.assert_allclose(gap_first, gap_second, atol=1e-15)
 
 
-def test_heads_and_objects_stand_somewhere():
-    with pytest.raises(UsageError, match=r"position of a head .*nan"):
-        Head((0.0, np.nan, 0.0))
-    with pytest.raises(UsageError, match=r"rotation of an object .*inf"):
-        PlacedObject(sphere(1e-3), rotation=(np.inf, 0.0, 0.0))
-
-
 def test_the_configuration_holds_everything_but_the_array():
     scene = Scene("one", PAIR)
     assert scene.config() == scene.select("C1").config()

