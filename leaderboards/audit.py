@@ -2,7 +2,8 @@
 
 A record is **stale** when something newer exists than what made it: the default estimator, or the definition behind a
 fidelity's name. A newer package alone makes none: what changes numbers raises the estimator's version. Two records
-**conflict** when they state one identity (:class:`brainbench.core.identity.ScoreIdentity`) and different numbers.
+**conflict** when they state one identity (:class:`brainbench.core.identity.ScoreIdentity`) and different numbers. One
+is **doubtful** when an interval of it misses the number that it is of.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ MOST_NAMED = 3
 def remarks(stored: Iterable[StoredRecord]) -> dict[str, tuple[str, ...]]:
     """Return for each doubtful record, by its identity, one sentence per doubt.
 
-    Every sentence begins with ``stale:`` or ``conflict:``.
+    Every sentence begins with ``stale:``, ``conflict:`` or ``doubtful:``.
     """
     usable = [item.record for item in stored if item.record is not None]
     doubts: dict[str, list[str]] = defaultdict(list)
@@ -39,6 +40,7 @@ def remarks(stored: Iterable[StoredRecord]) -> dict[str, tuple[str, ...]]:
     groups: dict[ScoreIdentity, list[ResultRecord]] = defaultdict(list)
     for record in usable:
         doubts[record.identity] += [f"stale: {reason}" for reason in _stale(record, newest)]
+        doubts[record.identity] += [f"doubtful: {doubt}" for score in record.scores for doubt in score.doubts]
         groups[ScoreIdentity.of(record)].append(record)
     for group in groups.values():
         for record in group:

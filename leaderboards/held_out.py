@@ -15,10 +15,11 @@ from typing import Any, Literal
 import msgspec
 
 from brainbench.core.errors import DataError
-from brainbench.core.files import file_hash, read_json, write_text
+from brainbench.core.files import file_hash, read_json
 from brainbench.core.limits import Count
 from brainbench.core.reading.texts import read_text
 from brainbench.core.reading.values import typed_values
+from brainbench.core.writing.private import write_private
 
 DATA, SALT = "held-out.h5", "salt.txt"
 """Files of the secret folder."""
@@ -65,7 +66,7 @@ def digest(data: Path, salt: str) -> str:
 
 
 def new_salt(secret: str | os.PathLike[str]) -> str:
-    """Write a salt that nobody can guess into a secret folder and return it."""
+    """Write a salt that nobody can guess into a secret folder, which nobody else can enter, and return it."""
     salt = secrets.token_hex(32)
-    write_text(Path(secret) / SALT, salt + "\n")
+    write_private(Path(secret) / SALT, f"{salt}\n".encode())
     return salt

@@ -9,7 +9,6 @@ edits; it is no signature against someone who renames the file as well.
 from __future__ import annotations
 
 import inspect
-import math
 import os
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -22,7 +21,7 @@ import msgspec
 from brainbench.core.errors import DataError, DataFileNotFoundError
 from brainbench.core.files import write_text
 from brainbench.core.reading.texts import parse_json, read_text
-from brainbench.core.records import RECORD_SCHEMA, Interval, ResultRecord, Score, record_identity
+from brainbench.core.records import RECORD_SCHEMA, ResultRecord, record_identity
 
 SCHEMA_PATH = Path(__file__).with_name("record.schema.json")
 """The published schema, shipped with the package."""
@@ -46,9 +45,6 @@ def record_schema() -> dict[str, Any]:
     }
 
 
-_ROUNDING = 1e-6
-_LARGEST = 1e100
-"""Largest absolute number of a score: squares and sums of such are still finite."""
 MAKE_ONE = "make one with: brainbench score MODEL --out FOLDER"
 
 
@@ -142,46 +138,5 @@ def _parse(text: str, path: Path) -> tuple[ResultRecord, dict[str, Any]]:
     try:
         record = ResultRecord.from_json(data)
     except DataError as error:
-        raise DataError(f"{path.name!r} is not a result record: {str(error)[:400]}") from error
-    for score in (record.score, record.animal_to_animal, *record.baselines.values()):
-        contradiction = _contradiction(score) if score else None
-        if score and contradiction:
-            raise DataError(f"{path.name!r} contradicts itself: in the score {score.name[:80]!r}, {contradiction}.")
+        raise DataError(f"{path.name!r} is no result record that can be used: {str(error)[:400]}") from error
     return record, data
-
-
-def _contradiction(score: Score) -> str | None:
-    """Return what cannot be true at once, or None. These rules are beyond what JSON Schema can say."""
-    if math.isnan(score.value) != (score.status == "undefined"):
-        return f"the status is {score.status!r} but the value is {score.value}"
-    count = len(score.stimuli)
-    pairs = count * (count - 1) // 2
-    for name, wanted in (("model_rdm", pairs), ("brain_rdm", pairs), ("without_stimulus", count)):
-        length = len(getattr(score, name))
-        if length not in (0, wanted):
-            what = "values" if name == "without_stimulus" else "pairs"
-            return f"{name} has {length} {what} but {count} stimuli make {wanted}"
-    for name in ("interval", "reliability_interval"):
-        interval: Interval | None = getattr(score, name)
-        if interval and interval.low > interval.high:
-            return f"{name} runs from {interval.low} down to {interval.high}"
-    return _out_of_range(score)
-
-
-def _out_of_range(score: Score) -> str | None:
-    """Return the first number that no score can have, in words, or None; NaN is a number without value."""
-    if score.p < score.p_smallest * (1 - 1e-9):
-        return f"p is {score.p} but the smallest possible is {score.p_smallest}"
-    if score.reliability > 1 + _ROUNDING or any(one.reliability > 1 + _ROUNDING for one in score.subjects):
-        return "a reliability is above 1"
-    if str(score.provenance.settings.get("metric")).startswith("rsa"):  # correlations
-        ends = (score.ceiling.lower, score.ceiling.upper) if score.ceiling else ()
-        compared = (score.r, *ends, *(one.r for one in (*score.subjects, *score.layers)))
-        if any(abs(r) > 1 + _ROUNDING for r in compared):
-            return "a raw comparison (r, or its ceiling) is outside -1 to 1"
-    intervals = [score.interval, score.reliability_interval, *(layer.interval for layer in score.layers)]
-    numbers = [score.value, score.r, score.chance, score.attainable, score.best_layer_value, *score.without_stimulus]
-    numbers += [*score.model_rdm, *score.brain_rdm, *(one.value for one in (*score.subjects, *score.layers))]
-    numbers += [end for one in intervals if one for end in (one.low, one.high)]
-    largest = max((abs(number) for number in numbers if math.isfinite(number)), default=0.0)
-    return f"a number is as large as {largest}" if largest > _LARGEST else None

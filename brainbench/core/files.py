@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
 CACHE_VARIABLE = "BRAINBENCH_CACHE"
 """Environment variable that overrides the platform's cache folder."""
+CONFIG_VARIABLE = "BRAINBENCH_CONFIG"
+"""Environment variable that overrides the platform's folder of settings."""
 LIBRARIES = ("numpy", "scipy", "xarray", "h5py", "torch", "warp-lang", "mujoco-core")
 """Distributions on whose version the last digits of a result depend."""
 _UNWRITABLE = (
@@ -47,6 +49,16 @@ def cache_dir(*parts: str) -> Path:
             f"with the environment variable {CACHE_VARIABLE}."
         ) from error
     return path
+
+
+def settings_dir() -> Path:
+    """Return the folder of the user's settings, ``$BRAINBENCH_CONFIG`` or the platform's own; it may be missing."""
+    folder = os.environ.get(CONFIG_VARIABLE)
+    if not folder:
+        import platformdirs
+
+        folder = platformdirs.user_config_dir("brainbench", appauthor=False)
+    return Path(folder).expanduser()
 
 
 def check_folder(path: str | os.PathLike[str], option: str) -> None:

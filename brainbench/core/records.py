@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, get_args
 
 import msgspec
 
-from brainbench.core.errors import DataError, listing
+from brainbench.core.errors import DataError, brief, listing
 from brainbench.core.files import content_hash, to_json, to_plain
 from brainbench.core.provenance import Provenance
 from brainbench.core.reading.texts import parse_json
@@ -30,6 +30,12 @@ RECORD_SCHEMA: Literal[2] = 2
 
 ESTIMATOR_VERSION = 2
 """Raised whenever the same recordings and activations would get another number from the default estimator."""
+
+_ROUNDING = 1e-6
+_LARGEST = 1e100
+"""Largest absolute number of a score: squares and sums of such are still finite."""
+_ORDERS = re.compile(r"(?P<all>all )?\b(?P<number>\d[\d,]{0,18}) (?:random orders|orders|times)")
+"""Number of orders that a test took, in the words of its method."""
 
 if TYPE_CHECKING:
     Number = Share = float
@@ -139,11 +145,20 @@ class _Document:
         """Rebuild it from :meth:`to_json` or from the mapping inside it."""
         data = parse_json(source, "This text") if isinstance(source, str) else source
         cls._check_version(data)
-        return _convert(cls, data)
+        document = _convert(cls, data)
+        for score in document.scores:
+            if contradiction := _contradiction(score):
+                raise DataError(f"The score {brief(score.name)} contradicts itself: {contradiction}.")
+        return document
 
     @classmethod
     def _check_version(cls, data: Any) -> None:
         """Raise DataError for a layout that is not read here."""
+
+    @property
+    def scores(self) -> tuple[Score, ...]:
+        """All scores that it holds."""
+        raise NotImplementedError
 
 
 if TYPE_CHECKING:
@@ -219,6 +234,31 @@ class Score(_NullIsNaN, _Document):
         super().__post_init__()
         if not isinstance(self.provenance, Provenance):
             object.__setattr__(self, "provenance", Provenance.of(self.provenance))
+
+    @property
+    def scores(self) -> tuple[Score, ...]:
+        """This score."""
+        return (self,)
+
+    @property
+    def intervals(self) -> list[tuple[str, float, Interval]]:
+        """Each interval with its name and the number that it is of."""
+        stated = [
+            ("interval", self.value, self.interval),
+            ("reliability_interval", self.reliability, self.reliability_interval),
+            *((f"the interval of layer {brief(part.layer)}", part.value, part.interval) for part in self.layers),
+        ]
+        return [(name, value, interval) for name, value, interval in stated if interval is not None]
+
+    @property
+    def doubts(self) -> list[str]:
+        """What is hardly true at once, in words: bootstrap intervals may miss their number, but by little."""
+        return [
+            f"{name} of the score {brief(self.name)} runs from {interval.low:.4g} to {interval.high:.4g}, without the "
+            f"number {value:.4g} that it is of"
+            for name, value, interval in self.intervals
+            if value < interval.low - _ROUNDING or value > interval.high + _ROUNDING
+        ]
 
     def on_scale(self, value: float) -> float:
         """Return a value of this score's metric on the scale that all metrics share.
@@ -382,6 +422,11 @@ class ResultRecord(_Document):
                 f"{advice}."
             )
 
+    @property
+    def scores(self) -> tuple[Score, ...]:
+        """The score and those it is judged by."""
+        return (self.score, *([self.animal_to_animal] if self.animal_to_animal else []), *self.baselines.values())
+
     @cached_property
     def identity(self) -> str:
         """Content hash of the result without time and machine: equal inputs give equal names."""
@@ -400,8 +445,7 @@ class ResultRecord(_Document):
 
     def _repr_html_(self) -> str:
         """Show the score and its baselines in a notebook."""
-        parts = [self.score, *([self.animal_to_animal] if self.animal_to_animal else []), *self.baselines.values()]
-        return "".join(part._repr_html_() for part in parts)
+        return "".join(score._repr_html_() for score in self.scores)
 
 
 def record_identity(data: Mapping[str, Any]) -> str:
@@ -450,3 +494,49 @@ def _check_rest(data: Any, built: Any, place: str) -> None:
     elif isinstance(built, Mapping):
         for name, inner in built.items():
             _check_rest(data[name], inner, f"{place}.{name}")
+
+
+def _contradiction(score: Score) -> str | None:
+    """Return what cannot be true at once, or None. These rules are beyond what JSON Schema can say."""
+    if math.isnan(score.value) != (score.status == "undefined"):
+        return f"the status is {score.status!r} but the value is {score.value}"
+    count = len(score.stimuli)
+    pairs = count * (count - 1) // 2
+    for name, wanted in (("model_rdm", pairs), ("brain_rdm", pairs), ("without_stimulus", count)):
+        length = len(getattr(score, name))
+        if length not in (0, wanted):
+            what = "values" if name == "without_stimulus" else "pairs"
+            return f"{name} has {length} {what} but {count} stimuli make {wanted}"
+    for name, _, interval in score.intervals:
+        if interval.low > interval.high:
+            return f"{name} runs from {interval.low} down to {interval.high}"
+    return _impossible_p(score) or _out_of_range(score)
+
+
+def _impossible_p(score: Score) -> str | None:
+    """Return why a test cannot have given the stated p, or None."""
+    smallest = score.p_smallest
+    if counted := _ORDERS.search(score.p_method):
+        # The order that was observed counts among the random ones; all orders hold it.
+        number = int(counted["number"].replace(",", "")) + (counted["all"] is None)
+        smallest = max(1 / max(number, 1), 0.0 if math.isnan(smallest) else smallest)
+    if score.p <= 0 or score.p < smallest * (1 - 1e-9):
+        return f"p is {score.p} but the smallest possible is {smallest}"
+    return None
+
+
+def _out_of_range(score: Score) -> str | None:
+    """Return the first number that no score can have, in words, or None; NaN is a number without value."""
+    if score.reliability > 1 + _ROUNDING or any(one.reliability > 1 + _ROUNDING for one in score.subjects):
+        return "a reliability is above 1"
+    if str(score.provenance.settings.get("metric")).startswith("rsa"):  # correlations
+        ends = (score.ceiling.lower, score.ceiling.upper) if score.ceiling else ()
+        compared = (score.r, *ends, *(one.r for one in (*score.subjects, *score.layers)))
+        if any(abs(r) > 1 + _ROUNDING for r in compared):
+            return "a raw comparison (r, or its ceiling) is outside -1 to 1"
+    intervals = [score.interval, score.reliability_interval, *(layer.interval for layer in score.layers)]
+    numbers = [score.value, score.r, score.chance, score.attainable, score.best_layer_value, *score.without_stimulus]
+    numbers += [*score.model_rdm, *score.brain_rdm, *(one.value for one in (*score.subjects, *score.layers))]
+    numbers += [end for one in intervals if one for end in (one.low, one.high)]
+    largest = max((abs(number) for number in numbers if math.isfinite(number)), default=0.0)
+    return f"a number is as large as {largest}" if largest > _LARGEST else None

@@ -8,14 +8,13 @@ instead (:mod:`~brainbench.models.registry`).
 from __future__ import annotations
 
 import logging
-import os
 from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, check_name
-from brainbench.core.files import check_folder, content_hash, read_json, write_json
+from brainbench.core.files import CONFIG_VARIABLE, check_folder, content_hash, read_json, settings_dir, write_json
 from brainbench.core.plugins import files_of, load_object
 from brainbench.models.architecture import check_new_name
 
@@ -24,8 +23,6 @@ if TYPE_CHECKING:
 
 FAMILY = "user module"
 """Family of models whose code is not in the registry of a package; boards set them apart."""
-CONFIG_VARIABLE = "BRAINBENCH_CONFIG"
-"""Environment variable that overrides the platform's folder of settings."""
 _LOG = logging.getLogger(__name__)
 
 
@@ -104,12 +101,7 @@ def check_module(module: Any, target: str) -> nn.Module:
 
 def settings_file() -> Path:
     """Return the file of the added models, in ``$BRAINBENCH_CONFIG`` or the platform's folder of settings."""
-    folder = os.environ.get(CONFIG_VARIABLE)
-    if not folder:
-        import platformdirs
-
-        folder = platformdirs.user_config_dir("brainbench", appauthor=False)
-    return Path(folder).expanduser() / "models.json"
+    return settings_dir() / "models.json"
 
 
 def read_user_models() -> dict[str, UserModel]:

@@ -6,8 +6,8 @@ import re
 from pathlib import Path
 
 from brainbench.core.errors import UsageError
-from brainbench.core.files import cache_dir, content_hash, read_json, write_text
-from brainbench.core.reading.sealed import code_stamp, keeping, read_entry
+from brainbench.core.files import cache_dir, content_hash, read_json
+from brainbench.core.reading.sealed import code_stamp, keep_entry, read_entry
 from brainbench.core.records import ResultRecord
 from brainbench.scoring.demo import DEMOS
 from brainbench.scoring.options import ScoreOptions
@@ -46,5 +46,4 @@ def read_kept(path: Path | None) -> ResultRecord | None:
 def keep(record: ResultRecord, path: Path | None) -> None:
     """Keep a record in the cache, where it can be written."""
     if path is not None:
-        with keeping("record"):
-            write_text(path, record.to_json())
+        keep_entry(path, "record", lambda file: file.write_text(record.to_json(), encoding="utf-8"))

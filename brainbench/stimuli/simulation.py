@@ -20,7 +20,7 @@ from brainbench.core.errors import BrainbenchError, UsageError
 from brainbench.core.files import cache_dir, content_hash, portable, to_json
 from brainbench.core.progress import PREPARATION, Progress
 from brainbench.core.reading import sealed
-from brainbench.core.reading.sealed import keeping, seal_file, trust_sealed
+from brainbench.core.reading.sealed import keep_entry
 from brainbench.stimuli.engines import PHYSICS_VERSION, get_engine
 from brainbench.stimuli.engines.fidelity import DEFAULT_ENGINE, Fidelity
 from brainbench.stimuli.engines.job_schedule import plan
@@ -82,9 +82,7 @@ def simulate(
     dataset = simulate_uncached(chosen, fidelity, engine, progress=progress)
     _warn_unstable(dataset)
     if path is not None:
-        with keeping("stimuli"):
-            write_stimulus_set(dataset, path)
-            seal_file(path)
+        keep_entry(path, "stimuli", lambda file: write_stimulus_set(dataset, file))
     return dataset
 
 
@@ -106,7 +104,6 @@ def read_entry(path: Path) -> xr.Dataset | None:
 @functools.lru_cache(maxsize=1)
 def _read_entry(path: Path, *state: int) -> xr.Dataset:
     started = time.perf_counter()
-    trust_sealed(path)
     dataset = read_stimulus_set(path)
     dataset.encoding[SECONDS] = {"read": time.perf_counter() - started}
     return dataset

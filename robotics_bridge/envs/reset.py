@@ -56,6 +56,8 @@ class GraspSampling:
     """Candidates per shape before giving up."""
 
 
+_VERSION = 1
+"""Raised whenever the same settings would sample other grasps."""
 SETTINGS = {"xhand1": GraspSampling(), "sharpa": GraspSampling(near=0.01)}
 """By hand; others take those of xhand1."""
 
@@ -73,7 +75,7 @@ def grasps_for(task: Task, hand: Hand, model: TaskModel, *, seed: int = 0) -> di
     # By these a grasp holds too. Usual values are left out, since keys of earlier versions do not have them.
     defaults = ((task.friction, 1.0), (asdict(task.solver), asdict(Solver())), (hand.physics, None))
     numbers += [model.rest.tolist(), *(own for own, other in defaults if own != other)]
-    key = content_hash(asdict(settings), asdict(task.contacts), task.name, seed, *numbers)
+    key = content_hash(_VERSION, asdict(settings), asdict(task.contacts), task.name, seed, *numbers)
     path = cache_dir("grasps") / f"{hand.name}-{key}.npz"
     if (cached := read_sealed(path, "grasps")) is not None:
         return cached

@@ -127,7 +127,7 @@ def draw_board(
         found = make_score(
             name, middle, subjects=subjects, stimuli=labels, chance=chance, attainable=1.0,
             without_stimulus=tuple(map(unscaled, without)), p=0.001 if value > 0.1 else 0.4,
-            p_smallest=0.001, layer="encoder.conv3",
+            p_smallest=0.001, p_method="999 random orders", layer="encoder.conv3",
             interval=Interval(middle - half, middle + half, method=f"t over {animals} animals and {stimuli} stimuli"),
             model_rdm=tuple(rng.random(pairs)), brain_rdm=tuple(rng.random(pairs)),
         )  # fmt: skip

@@ -35,6 +35,24 @@ def test_an_older_estimator_is_stale_and_an_older_package_alone_is_not(make_reco
     assert doubt.startswith("stale: version 0 of the default estimator, now 2")
 
 
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"value": 0.987, "interval": records.Interval(0.1, 0.36)}, "interval of the score 'zhuang' runs from 0.1 to"),
+        ({"value": 0.05, "interval": records.Interval(0.1, 0.36)}, "without the number 0.05"),
+        ({"reliability_interval": records.Interval(0.1, 0.3)}, "reliability_interval of the score"),
+        (
+            {"layers": (records.LayerScore("fc", 0.9, 0.4, interval=records.Interval(0.1, 0.3)),)},
+            "the interval of layer 'fc' of the score",
+        ),
+    ],
+)
+def test_an_interval_that_misses_its_number_is_doubtful(make_record, tmp_path, change, words):
+    ((doubt,),) = remarks([_stored(make_record(**change), tmp_path)]).values()
+    assert doubt.startswith("doubtful: ")
+    assert words in doubt
+
+
 def test_stimuli_of_an_earlier_definition_of_a_fidelity_are_stale(make_record, tmp_path):
     settings = {"fidelity": "balanced", "whiskers": "all"}
     described = {"description": "rodgers, mouse"}

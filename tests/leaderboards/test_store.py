@@ -99,7 +99,9 @@ def test_reading_agrees_with_jsonschema_on_damaged_records(make_record, data):
         del parent[path[-1]]
     else:
         parent[path[-1]] = value
-    assert (_fault(damaged) is None) == VALIDATOR.is_valid(damaged)
+    # What cannot be true at once is beyond a schema.
+    valid = "contradicts itself" in str(fault := _fault(damaged)) or fault is None
+    assert valid == VALIDATOR.is_valid(damaged)
 
 
 def _parent(data: Any, path: tuple[Any, ...]) -> Any:

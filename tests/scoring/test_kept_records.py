@@ -74,3 +74,19 @@ def test_a_kept_record_is_read_and_a_damaged_one_is_not(caplog: pytest.LogCaptur
     path.write_text("{}")
     assert kept_records.read_kept(path) is None
     assert "damaged" in caplog.text
+
+
+def test_an_edited_record_and_one_of_another_model_are_not_read(caplog: pytest.LogCaptureFixture):
+    path, rival = _path(), _path("zhuang-small")
+    assert path is not None
+    assert rival is not None
+    for place, value in ((path, 0.5), (rival, 0.7)):
+        kept_records.keep(ResultRecord(Score("x", value, "ok")), place)
+    rival.replace(path)
+    assert kept_records.read_kept(path) is None
+    text = ResultRecord(Score("x", 0.5, "ok")).to_json()
+    path.write_text(text.replace("0.5", "0.987"))
+    assert kept_records.read_kept(path) is None
+    path.write_text(text)
+    assert kept_records.read_kept(path) is not None
+    assert caplog.text.count("is made again") == 2

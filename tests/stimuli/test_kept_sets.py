@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from brainbench.core.files import read_json
-from brainbench.core.reading.sealed import is_sealed
+from brainbench.core.reading.sealed import is_sealed, seal_file
 from brainbench.stimuli import Fidelity, get_recipe, kept_sets, load_stimuli, simulate, simulation
 from brainbench.stimuli.kept_sets import SHIPPED, SHIPPED_INDEX, find_kept
 from brainbench.stimuli.stimulus_set import read_stimulus_set
@@ -63,6 +63,7 @@ def test_a_damaged_set_of_the_package_gives_way_to_the_cache(
     for folder in (damaged, entry.parent):
         folder.mkdir()
         (folder / name).write_bytes((SHIPPED / name).read_bytes())
+        seal_file(folder / name)
     (damaged / name).write_bytes(b"\x89HDF" + bytes(1000))
     monkeypatch.setattr(kept_sets, "SHIPPED", damaged)
     assert simulate(get_recipe("rodgers").scenes).encoding["source"] == str(entry)

@@ -15,6 +15,7 @@ from brainbench.cli.output import Output, progress_bar
 from brainbench.core.errors import UsageError
 from brainbench.core.files import content_hash, write_json
 from brainbench.core.reading.ranges import check_number
+from brainbench.core.writing.private import private_folder
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -64,7 +65,8 @@ def hold_out(
     check_number(f"{kind} held back", held_count, least=FEWEST[kind], most=len(names) - FEWEST[kind])
     drawn = set(secrets.SystemRandom().sample(names, held_count))
     held, public = (split(whole, kind, [n for n in names if (n in drawn) is kept]) for kept in (True, False))
-    data = write_recordings(secret / DATA, held)
+    data = write_recordings(private_folder(secret) / DATA, held)
+    data.chmod(0o600)
     of, hashed = str(whole.attrs["content_hash"]), digest(data, new_salt(secret))
     commitment = Commitment(kind, held_count, len(names) - held_count, of, hashed)
     files = [

@@ -1,12 +1,21 @@
-"""Entries of the cache: a damaged one is noticed and made again, and a full disk stops no work."""
+"""Entries of the cache, sealed: only what this user's brainbench wrote under a name is read again under that name.
+
+A seal is a keyed hash (HMAC-SHA256) of an entry's place and content; the place holds the version of the code that made
+it. It stands beside the entry, one line for each content that was written there. The key is one user's, in a file that
+nobody else can read. An entry without a seal that fits was damaged, edited, moved or made by somebody else: it is made
+again, with a warning. Entries that come with the package are checked without a secret, since they are part of it.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import functools
+import hmac
 import logging
 import os
 import platform
+import secrets
+import stat
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
@@ -15,24 +24,36 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.errors import DataError
-from brainbench.core.files import atomic_path, content_hash, file_hash, hash_arrays, library_versions, write_text
+from brainbench.core.files import atomic_path, content_hash, file_hash, library_versions, settings_dir
 from brainbench.core.reading.archives import read_npz
 from brainbench.core.reading.hdf5 import trust_hdf5
+from brainbench.core.writing.private import write_private
 
 T = TypeVar("T")
-_HASH = "sha256"
+KEY_VARIABLE = "BRAINBENCH_CACHE_KEY"
+"""Environment variable that holds the key itself, for processes that share a cache and have no folder of settings."""
+KEY_BYTES = 32
+_PACKAGE = Path(__file__).parents[2]
 _LOG = logging.getLogger(__name__)
 
 
 def read_entry(path: Path, what: str, read: Callable[[Path], T]) -> T | None:
-    """Return what ``read`` makes of an entry of the cache; None without one or, with a warning, for a damaged one."""
+    """Return what ``read`` makes of an entry of the cache; None without one.
+
+    One that is not sealed, or cannot be read, is None too, with a warning.
+    """
     if not path.is_file():
         return None
-    try:
-        return read(path)
-    except DataError as error:
-        _LOG.warning("The %s in the cache, %s, is damaged and is made again (%s)", what, path, error)
-        return None
+    fault: object = "its seal does not fit: it was edited, or somebody else wrote it"
+    if is_sealed(path):
+        if path.suffix == ".h5":
+            trust_hdf5(path)  # its bytes were compared: nothing looks through it first
+        try:
+            return read(path)
+        except DataError as error:
+            fault = error
+    _LOG.warning("The %s in the cache, %s, is damaged and is made again (%s)", what, path, fault)
+    return None
 
 
 @contextlib.contextmanager
@@ -44,46 +65,102 @@ def keeping(what: str) -> Iterator[None]:
         _LOG.warning("The %s could not be kept in the cache (%s)", what, error)
 
 
-def read_sealed(path: Path, what: str) -> dict[str, NDArray[Any]] | None:
-    """Return the arrays of an entry of the cache; None, with a warning, if it is damaged, and None without one.
+def keep_entry(path: Path, what: str, write: Callable[[Path], object]) -> None:
+    """Keep in the cache what ``write`` puts into a file, sealed and as a whole.
 
-    Args:
-        path: its file, written by :func:`write_sealed`.
-        what: what it holds, for the warning.
+    Where nothing can be written, a warning says so and work goes on.
     """
+    with keeping(what), atomic_path(path) as temporary:
+        write(temporary)
+        seal_file(temporary, path)
 
-    def read(path: Path) -> dict[str, NDArray[Any]]:
-        arrays: dict[str, NDArray[Any]] = dict(read_npz(path, "entry of the cache"))
-        if str(arrays.pop(_HASH, "none")) != hash_arrays(arrays):
-            raise DataError("its numbers do not match its hash")
-        return arrays
 
-    return read_entry(path, what, read)
+def read_sealed(path: Path, what: str) -> dict[str, NDArray[Any]] | None:
+    """Return the arrays that :func:`write_sealed` kept at ``path``; ``what`` they are, for the warning."""
+    return read_entry(path, what, lambda file: dict(read_npz(file, "entry of the cache")))
 
 
 def write_sealed(path: Path, what: str, arrays: Mapping[str, Any], *, compress: bool = False) -> None:
-    """Keep arrays in the cache, as ``.npz``; where nothing can be written, a warning says so and work goes on."""
-    values = {name: np.asarray(value) for name, value in arrays.items()}
-    with keeping(what), atomic_path(path) as temporary:
-        sealed: dict[str, Any] = {**values, _HASH: hash_arrays(values)}
-        (np.savez_compressed if compress else np.savez)(temporary, **sealed)
+    """Keep arrays in the cache, as ``.npz``."""
+    values: dict[str, Any] = {name: np.asarray(value) for name, value in arrays.items()}
+    keep_entry(path, what, lambda file: (np.savez_compressed if compress else np.savez)(file, **values))
 
 
-def seal_file(path: Path) -> None:
-    """Write the hash of a file of the cache beside it."""
-    write_text(path.with_suffix(".sha256"), file_hash(path, length=64))
+def seal_file(file: Path, place: Path | None = None) -> None:
+    """Note that a file is what belongs at a place, by default where it is."""
+    place = place or file
+    line = _seal(place, file_hash(file, length=64))
+    if line not in _lines(place):
+        # Appended, so that of two processes that write an entry at once neither takes away the other's seal.
+        handle = os.open(_beside(place), os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o600)
+        with os.fdopen(handle, "ab") as stream:
+            stream.write(line + b"\n")
 
 
 def is_sealed(path: Path) -> bool:
-    """Return whether a file of the cache is there with the bytes that :func:`seal_file` saw."""
-    seal = path.with_suffix(".sha256")
-    return path.is_file() and seal.is_file() and seal.read_bytes()[:64] == file_hash(path, length=64).encode()
+    """Return whether a file is there with bytes that :func:`seal_file` saw, under this user's key."""
+    try:
+        state = path.stat()
+        digest = _digest(path, state.st_size, state.st_mtime_ns, state.st_ctime_ns, state.st_ino)
+        return any(hmac.compare_digest(line, _seal(path, digest)) for line in _lines(path))
+    except OSError:
+        return False
 
 
-def trust_sealed(path: Path) -> None:
-    """Open an HDF5 file of the cache without looking through it first, if its bytes fit the hash beside it."""
-    if is_sealed(path):
-        trust_hdf5(path)
+@functools.lru_cache(maxsize=256)
+def _digest(path: Path, *state: int) -> str:
+    """Hash a file once for each state of it."""
+    del state
+    return file_hash(path, length=64)
+
+
+def _beside(place: Path) -> Path:
+    return place.with_name(f"{place.name}.seal")
+
+
+def _lines(place: Path) -> list[bytes]:
+    path = _beside(place)
+    return path.read_bytes().split() if path.is_file() else []
+
+
+def _seal(place: Path, digest: str) -> bytes:
+    key = b"" if place.is_relative_to(_PACKAGE) else _key(settings_dir())
+    return hmac.digest(key, f"{place.parent.name}/{place.name} {digest}".encode(), "sha256").hex().encode()
+
+
+@functools.cache
+def _key(settings: Path) -> bytes:
+    """Return this user's key, made when it is first needed."""
+    if stated := os.environ.get(KEY_VARIABLE):
+        return stated.encode()
+    path = settings / "keys" / "cache.key"
+    try:
+        if (key := _private_bytes(path)) is None:
+            write_private(path, secrets.token_bytes(KEY_BYTES), replace=False)
+            key = _private_bytes(path)
+        if key is not None:
+            return key
+        fault = f"others may read {path}; remove it"
+    except OSError as error:
+        fault = str(error)
+    _LOG.warning(
+        "No key for the cache can be kept (%s): what this run keeps there is made again by the next one. "
+        "Name a folder of settings with BRAINBENCH_CONFIG, or a key with %s.", fault, KEY_VARIABLE,
+    )  # fmt: skip
+    # Processes that this one starts share it.
+    os.environ[KEY_VARIABLE] = secrets.token_hex(KEY_BYTES)
+    return os.environ[KEY_VARIABLE].encode()
+
+
+def _private_bytes(path: Path) -> bytes | None:
+    """Return a key if it is a file of this user that nobody else can read or write; None without such a file."""
+    with contextlib.suppress(FileNotFoundError):
+        state, content = path.lstat(), path.read_bytes()
+        user = os.geteuid() if hasattr(os, "geteuid") else state.st_uid
+        private = os.name != "posix" or not state.st_mode & 0o077
+        if stat.S_ISREG(state.st_mode) and state.st_uid == user and private and len(content) == KEY_BYTES:
+            return content
+    return None
 
 
 @functools.cache
@@ -93,9 +170,8 @@ def code_stamp() -> str:
     An entry named by it never outlives an edit. What is slow to make again, such as a simulation, has a version of
     its own instead (:data:`brainbench.stimuli.engines.PHYSICS_VERSION`).
     """
-    root = Path(__file__).parents[2]
     parts = []
-    for folder, _, names in os.walk(root):
+    for folder, _, names in os.walk(_PACKAGE):
         for name in names:
             if not name.endswith(".pyc"):
                 state = os.stat(os.path.join(folder, name))  # noqa: PTH116, PTH118 - twice as fast, on every score

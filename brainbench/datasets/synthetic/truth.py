@@ -21,6 +21,7 @@ from brainbench.core.errors import DataError, UsageError
 from brainbench.core.files import cache_dir, check_folder, content_hash, file_hash, read_json, write_json
 from brainbench.core.reading.hdf5 import trust_hdf5
 from brainbench.core.reading.ranges import check_number
+from brainbench.core.reading.sealed import is_sealed, keeping, seal_file
 from brainbench.datasets.nwb import write_nwb
 from brainbench.datasets.sessions import Session
 from brainbench.datasets.synthetic.populations import (
@@ -130,10 +131,14 @@ def ensure_recordings(name: str, *key: object, make: Callable[[Path], object]) -
         # Before the stimuli are simulated, which is slow.
         check_folder(target, "The cache")
         make(target)
+        with keeping("recordings"):
+            seal_file(target / TRUTH)
     return target
 
 
 def _complete(folder: Path) -> bool:
+    if not is_sealed(folder / TRUTH):
+        return False
     try:
         for name, stated in read_json(folder / TRUTH)["files"].items():
             path = folder / name

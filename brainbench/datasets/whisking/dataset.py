@@ -22,13 +22,13 @@ import numpy as np
 
 from brainbench.core.contracts import CHANNELS, GRID_SHAPE, SUB_STEP_SECONDS, SUB_STEPS, SWEEPS_FORMAT, SWEEPS_SCHEMA
 from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, brief, check_name, listing
-from brainbench.core.files import cache_dir, content_hash, hash_arrays, read_json, write_text
+from brainbench.core.files import cache_dir, content_hash, hash_arrays, read_json
 from brainbench.core.plugins import load_optional
 from brainbench.core.progress import Progress, track
 from brainbench.core.reading.hdf5 import open_hdf5
 from brainbench.core.reading.ranges import check_number
 from brainbench.core.reading.regular import readable
-from brainbench.core.reading.sealed import read_sealed, write_sealed
+from brainbench.core.reading.sealed import is_sealed, keep_entry, read_sealed, write_sealed
 
 if TYPE_CHECKING:
     import torch
@@ -36,6 +36,8 @@ if TYPE_CHECKING:
 
 FOLDERS = {"train": "train", "validate": "validation", "validation": "validation", "val": "validation", "test": "test"}
 """Folders of the published study's sweeps → split."""
+_STATISTICS = 1
+"""Raised whenever the same sweeps would get other statistics."""
 _UNUSABLE = 2
 _AGAIN = "Remove it and give the command that made the data set again."
 
@@ -85,9 +87,9 @@ class Shard:
         state = self.path.stat()
         stamps = [state.st_size, state.st_mtime_ns, state.st_ctime_ns, state.st_ino]
         mark = cache_dir("verified") / content_hash([str(self.path.absolute()), stamps, self.content_hash], length=24)
-        if not mark.exists():
+        if not is_sealed(mark):
             self.verify()
-            write_text(mark, "")
+            keep_entry(mark, "mark of a whole shard", Path.touch)
 
 
 def is_sweep_tree(folder: Path) -> bool:
@@ -477,7 +479,7 @@ class WhiskingDataset:
 
         All of them are read once; the result is kept in the cache.
         """
-        key = content_hash([self.manifest["content_hash"], self.split, self.unstable], length=24)
+        key = content_hash([_STATISTICS, self.manifest["content_hash"], self.split, self.unstable], length=24)
         path = cache_dir("whisking") / f"{key}.npz"
         if (cached := read_sealed(path, "statistics of channels")) is not None:
             mean, std, largest = (tuple(cached[name].tolist()) for name in ("mean", "std", "largest"))

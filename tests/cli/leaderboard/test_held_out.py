@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 import re
+import stat
 from dataclasses import replace
 from pathlib import Path
 
@@ -41,6 +43,19 @@ def test_both_parts_together_are_the_recordings_and_the_hash_opens(run, study, w
     assert told.open(study["secret"]) == Path(study["secret"]) / DATA
     published = "".join(path.read_text(errors="ignore") for path in Path(study["board"]).glob("*.json"))
     assert (Path(study["secret"]) / SALT).read_text().strip() not in published
+
+
+def test_nobody_else_can_read_what_is_held_back(run, study):
+    before = os.umask(0)
+    try:
+        assert _hold_out(run, study, "--animals", "2").status == 0
+    finally:
+        os.umask(before)
+    secret = Path(study["secret"])
+    assert stat.S_IMODE(secret.stat().st_mode) == 0o700
+    assert {path.name: oct(stat.S_IMODE(path.stat().st_mode)) for path in secret.iterdir()} == {
+        DATA: "0o600", SALT: "0o600"
+    }  # fmt: skip
 
 
 def test_another_file_or_salt_does_not_open_the_commitment(run, study):

@@ -1,4 +1,5 @@
 import time
+from pathlib import Path
 
 import h5py
 import numpy as np
@@ -6,7 +7,7 @@ import pytest
 
 from brainbench.core.errors import DataError, DataFileNotFoundError
 from brainbench.core.reading import hdf5
-from brainbench.core.reading.sealed import seal_file, trust_sealed
+from brainbench.core.reading.sealed import read_entry, seal_file
 
 
 def _write(path):
@@ -41,12 +42,12 @@ def test_a_file_that_the_library_never_returns_from_is_refused_and_the_next_one_
 def test_a_file_of_ours_whose_hash_was_checked_is_opened_at_once(tmp_path, monkeypatch):
     path = _write(tmp_path / "a.h5")
     seal_file(path)
-    trust_sealed(path)
+    read_entry(path, "file", Path.stat)
     monkeypatch.setattr(hdf5._Worker, "ask", lambda *_: "was looked through")
     with hdf5.open_hdf5(path) as file:
         assert list(file) == ["a"]
     # Other bytes, or another file under the name, are looked through again.
     path.write_bytes(path.read_bytes() + b"\0")
-    trust_sealed(path)
+    read_entry(path, "file", Path.stat)
     with pytest.raises(DataError, match="looked through"), hdf5.open_hdf5(path):
         pass
