@@ -6,18 +6,21 @@ One table for all commands; it is asked when the command line is read, before an
 from __future__ import annotations
 
 import functools
+import inspect
 import math
 import os
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
-from typing import Any
+from pathlib import Path
+from typing import Annotated, Any
 
 import typer
 
 from brainbench.cli.output import Output, printed
 from brainbench.core.errors import FileWriteError, UsageError, brief, missing_dependency
 from brainbench.core.files import CACHE_VARIABLE, cache_dir
+from brainbench.core.reading.hdf5 import LINKED_VARIABLE
 
 
 @dataclass(frozen=True)
@@ -83,6 +86,11 @@ CACHED = (
     "leaderboard add", "leaderboard verify",
 )  # fmt: skip
 """Commands that keep what they compute in the cache."""
+FOREIGN = (
+    "score", "recordings inspect", "recordings rdm", "recordings check", "recordings export", "stimuli show",
+    "stimuli plot", "stimuli render", "stimuli separability", "stimuli fit", "power",
+)  # fmt: skip
+"""Commands that read HDF5 files of others."""
 
 
 @dataclass(frozen=True)
@@ -147,7 +155,29 @@ def guard(app: typer.Typer) -> None:
     for name, command in commands(app):
         if command.callback is not None and not hasattr(command, "guarded"):
             command.guarded = True
-            command.callback = printed(_checked(name, command.callback))
+            checked = _checked(name, command.callback)
+            command.callback = printed(_linked(checked) if name in FOREIGN else checked)
+
+
+def _linked(callback: Callable[..., Output]) -> Callable[..., Output]:
+    """Return a command with the option ``--allow-linked``."""
+
+    @functools.wraps(callback)
+    def run(*, allow_linked: Any = None, **values: Any) -> Output:
+        if allow_linked:
+            os.environ[LINKED_VARIABLE] = os.pathsep.join(map(str, allow_linked))
+        return callback(**values)
+
+    help = "HDF5 files may link into this folder too, beside their own; give it again for more."
+    option = typer.Option("--allow-linked", metavar="FOLDER", help=help, exists=True, file_okay=False)
+    added = inspect.Parameter(
+        "allow_linked", inspect.Parameter.KEYWORD_ONLY, default=None, annotation=Annotated[list[Path] | None, option]
+    )
+    signature = inspect.signature(callback, eval_str=True)
+    run.__signature__ = signature.replace(  # pyright: ignore[reportFunctionMemberAccess]
+        parameters=[*(item.replace(kind=added.kind) for item in signature.parameters.values()), added]
+    )
+    return run
 
 
 def commands(app: typer.Typer, path: str = "") -> Iterator[tuple[str, Any]]:

@@ -76,6 +76,8 @@ def check_stimulus_set(dataset: xr.Dataset) -> xr.Dataset:
         raise DataError(f"The times of a stimulus set are numbers in seconds that increase; {time.size} others came.")
     for name, count in zip(("row", "col"), GRID_SHAPE, strict=True):
         cells = dataset[name].values
+        if dataset[name].dims != ("whisker",):
+            raise DataError(f"{name!r} of a stimulus set is one number per whisker; this one has {cells.size} numbers.")
         if cells.dtype.kind not in "iu" or ((cells < 0) | (cells >= count)).any():
             raise DataError(f"{name!r} of a whisker is a whole number from 0 to {count - 1}; this set has others.")
     return dataset

@@ -40,8 +40,9 @@ import numpy as np
 
 from brainbench.core.contracts import check_counts
 from brainbench.core.errors import DataError, UsageError, brief
-from brainbench.core.files import atomic_path, to_json
+from brainbench.core.files import to_json
 from brainbench.core.reading.texts import parse_json
+from brainbench.core.writing.hdf5 import create_hdf5
 from brainbench.datasets.sessions import SPIKES, LostColumn, Session, SessionTable, decode, text
 
 if TYPE_CHECKING:
@@ -60,10 +61,9 @@ def write_recordings(path: str | os.PathLike[str], recordings: xr.Dataset | Sess
         recordings: a recordings data set (kind "counts") or sessions (kind "spikes"; build them with
             :func:`~brainbench.datasets.sessions.make_session`).
     """
-    import h5py
     import xarray as xr
 
-    with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
+    with create_hdf5(path) as file:
         file.attrs.update({"format": FORMAT, "version": VERSION})
         if isinstance(recordings, xr.Dataset):
             _write_counts(file, check_counts(recordings, "The data set"))

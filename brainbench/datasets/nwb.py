@@ -19,7 +19,7 @@ import numpy as np
 
 from brainbench.core.contracts import as_labels
 from brainbench.core.errors import DataError
-from brainbench.core.files import atomic_path
+from brainbench.core.writing.hdf5 import create_hdf5
 from brainbench.datasets.hdf5 import columns_of, dead_link, write_array
 from brainbench.datasets.sessions import SPIKES, Series, Session, SessionTable, decode, neurodata_type, text
 from brainbench.datasets.trials.counting import LICKS
@@ -247,7 +247,7 @@ def write_nwb(
     about = {"subject_id": session.subject, **(subject or {})}
     texts |= {f"general/subject/{name}": value for name, value in about.items()}
     meanings = _DESCRIPTIONS | dict(columns or {})
-    with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
+    with create_hdf5(path) as file:
         _describe(file, "core", "NWBFile")
         file.attrs["nwb_version"] = NWB_VERSION
         for name in ("acquisition", "analysis", "processing", "stimulus/presentation", "stimulus/templates"):

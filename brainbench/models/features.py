@@ -7,7 +7,7 @@ their creation when the file tracks it, else by name.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -35,11 +35,11 @@ def write_features(path: str | Path, labels: Sequence[str], activations: Mapping
     """Write activations ([K, F] or [K, T, F] per layer) in the layout above, atomically."""
     import h5py
 
-    from brainbench.core.files import atomic_path
+    from brainbench.core.writing.hdf5 import create_hdf5
 
     for layer, values in activations.items():
         _check_shape(layer, np.shape(values), len(labels), str(path))
-    with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
+    with create_hdf5(path) as file:
         file.attrs["brainbench_features"] = 1
         file.create_dataset("labels", data=[str(label) for label in labels], dtype=h5py.string_dtype())
         group = file.create_group("activations", track_order=True)
@@ -75,13 +75,10 @@ def read_features(path: str | Path) -> Features:
 
 
 def _layers(group: h5py.Group, rows: int, path: str) -> dict[str, NDArray[np.floating]]:
-    import h5py
-
     layers: dict[str, NDArray[np.floating]] = {}
 
-    def visit(name: str, node: object) -> None:
-        if not isinstance(node, h5py.Dataset):
-            return
+    # Not ``visititems``, which passes over soft links.
+    for name, node in _arrays(group, path):
         _check_shape(name, node.shape, rows, path)
         whole = np.issubdtype(node.dtype, np.integer)
         if not whole and not np.issubdtype(node.dtype, np.floating):
@@ -98,9 +95,20 @@ def _layers(group: h5py.Group, rows: int, path: str) -> dict[str, NDArray[np.flo
             raise DataError(f"Layer {brief(name)} of {brief(path)} has {infinite:,} infinite values; use NaN for none.")
         # NaN is a missing value: the layer is scored on the rest, or its score is undefined and says so.
         layers[name.replace("\N{DIVISION SLASH}", "/")] = values[:, None, :] if values.ndim == 2 else values
-
-    group.visititems(visit)
     return layers
+
+
+def _arrays(group: h5py.Group, path: str, prefix: str = "") -> Iterator[tuple[str, h5py.Dataset]]:
+    """Yield the arrays of a group and of those in it, by their paths in it."""
+    import h5py
+
+    if prefix.count("/") > 32:
+        raise DataError(f"{brief(path)} nests its layers more than 32 deep, or in a circle.")
+    for name, node in group.items():
+        if isinstance(node, h5py.Group):
+            yield from _arrays(node, path, f"{prefix}{name}/")
+        elif isinstance(node, h5py.Dataset):
+            yield prefix + name, node
 
 
 def _check_shape(layer: str, shape: tuple[int, ...], rows: int, path: str) -> None:

@@ -13,14 +13,17 @@ from numpy.typing import NDArray
 
 from brainbench.core.contracts import CHANNELS, GRID_SHAPE, check_stimulus_set
 from brainbench.core.errors import DataError, UsageError, check_name, listing
-from brainbench.core.files import atomic_path, content_hash
+from brainbench.core.files import content_hash, to_json
 from brainbench.core.reading.hdf5 import open_hdf5
 from brainbench.core.version import __version__
+from brainbench.core.writing.hdf5 import create_hdf5
 from brainbench.stimuli.scenes.frames import Axes
 from brainbench.stimuli.whiskers.selection import ROWS
 
 if TYPE_CHECKING:
+    import h5py
     import xarray as xr
+    from xarray.backends import H5NetCDFStore
 
     from brainbench.stimuli.scenes.frames import Frames
 
@@ -81,8 +84,8 @@ def hash_stimulus_set(dataset: xr.Dataset) -> str:
 
 def write_stimulus_set(dataset: xr.Dataset, path: str | os.PathLike[str]) -> Path:
     """Write a stimulus set to an HDF5 file (netCDF4 layout), replacing an older one in one step."""
-    with atomic_path(path) as temporary:
-        check_stimulus_set(dataset).to_netcdf(temporary, engine="h5netcdf")
+    with create_hdf5(path) as file, _netcdf(file, "a") as store:
+        check_stimulus_set(dataset).dump_to_store(store)
     return Path(path)
 
 
@@ -91,15 +94,25 @@ def read_stimulus_set(path: str | os.PathLike[str]) -> xr.Dataset:
     import xarray as xr
 
     name = os.fspath(path)
-    with open_hdf5(path, "stimulus set"), xr.open_dataset(path, engine="h5netcdf") as stored:
+    with open_hdf5(path, "stimulus set") as file, xr.open_dataset(_netcdf(file, "r")) as stored:
         dataset = check_stimulus_set(stored.load())
-    if hash_stimulus_set(dataset) != dataset.attrs["content_hash"]:
+        to_json(dataset.attrs).encode()  # bytes that are no text would end whatever shows them
+        same = hash_stimulus_set(dataset) == dataset.attrs["content_hash"]
+    if not same:
         raise DataError(
             f"The numbers in {name!r} do not match the content hash in the file: it was damaged or edited;"
             " simulate the stimuli again, or set content_hash and config_hash anew, both to"
             " brainbench.stimuli.stimulus_set.hash_stimulus_set."
         )
     return dataset
+
+
+def _netcdf(file: h5py.File, mode: str) -> H5NetCDFStore:
+    """Return an open file as xarray reads and writes it."""
+    import h5netcdf
+    from xarray.backends import H5NetCDFStore
+
+    return H5NetCDFStore(h5netcdf.File(file, mode))
 
 
 ORIENTATION = "orientation"

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import h5py
 import numpy as np
 import pytest
 
@@ -7,7 +8,7 @@ from brainbench.core.errors import DataError, UsageError
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.scenes.scene import Frames, Scene
 from brainbench.stimuli.simulation import simulate
-from brainbench.stimuli.stimulus_set import to_grid
+from brainbench.stimuli.stimulus_set import read_stimulus_set, to_grid, write_stimulus_set
 from brainbench.stimuli.whiskers.array import WhiskerArray
 from tests.factories.engines import FakeEngine
 
@@ -68,3 +69,19 @@ def test_an_unstable_whisker_is_refused_unless_zero_is_asked_for():
     grid = to_grid(dataset, unstable="zero")
     assert np.isfinite(grid).all()
     assert (grid[0, -1, :, 2, 1] == 0).all()
+
+
+@pytest.mark.parametrize("name", ["fidelity", "note"])
+def test_attributes_that_are_no_text_are_refused_in_one_sentence(tmp_path, name):
+    path = write_stimulus_set(_dataset(), tmp_path / "set.h5")
+    with h5py.File(path, "r+") as file:
+        file.attrs.create(name, b"\xff\xfe", dtype=h5py.string_dtype())
+    with pytest.raises(DataError, match=r"set\.h5"):
+        read_stimulus_set(path)
+
+
+def test_columns_that_are_not_one_per_whisker_are_refused_in_one_sentence():
+    dataset = _dataset()
+    longer = dataset.drop_vars("col").assign_coords(col=("column", np.resize(dataset["col"].values, 2 * 30)))
+    with pytest.raises(DataError, match="'col'"):
+        to_grid(longer)

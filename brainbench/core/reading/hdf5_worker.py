@@ -1,14 +1,22 @@
-"""Looks through HDF5 files in a process of its own: damage makes the HDF5 library loop for ever or crash.
+"""Walks HDF5 files in a process of its own: damage makes the HDF5 library loop for ever or crash, and links lead away.
 
-Run by path, without this package: a line with a path comes in, a line of JSON goes out, the fault or ``""``.
+A file is plain when all its bytes are its own. What links to others or is made up of their parts is followed here, hop
+by hop and never by the library: each hop is a regular file in a folder that may be read from, and has the part that is
+asked for. All of it is written, as plain arrays, into a copy that is read in its place.
+
+Run by path, without this package: a line of JSON with path, folders and place of a copy comes in, one with the fault or
+``""`` and whether there is a copy goes out.
 """
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import os
+import shutil
 import signal
+import stat
 import sys
 from pathlib import Path
 from typing import Any
@@ -19,34 +27,84 @@ MOST_EXPANSION = 200
 """Bytes of an array for each stored one; recordings reach about 20, a decompression bomb 1000."""
 SMALL = 1 << 20
 """Bytes of an array that is read as a whole, since its numbers may lead elsewhere (texts of any length)."""
+MOST_HOPS = 32
+"""Links that follow one another."""
+MOST_COPY = 16 << 30
+"""Bytes that a copy may take on disk."""
 
 
-def fault_of(path: str) -> str:
-    """Return what is wrong with a file, in words that follow its name; empty for nothing."""
+class Refused(Exception):
+    """What is wrong with a file, in words that follow its name."""
+
+
+class Missing(Refused):
+    """A hop leads to what is not there."""
+
+
+def fault_of(path: str, folders: list[str] | tuple[str, ...] = (), copy: str = "") -> tuple[str, bool]:
+    """Return what is wrong with a file, in words that follow its name, and whether it was copied.
+
+    Args:
+        path: the file.
+        folders: other folders than its own that its links may lead into.
+        copy: where to write the copy of a file that links to others.
+    """
     import h5py
 
     try:
+        before = os.stat(path)  # noqa: PTH116 - its fields are compared
         with h5py.File(path, "r") as file:
-            faults = [_links(file, path), *(_attributes(file, "/"),)]
-            file.visititems(lambda name, node: faults.append(_attributes(node, name) or _array(node, name)))
-            return next(filter(None, faults), "")
+            linked = _check(file)
+            if linked:
+                _Copy(path, folders).write(file, copy)
+        after = os.stat(path)  # noqa: PTH116
+        if (before.st_ino, before.st_size, before.st_mtime_ns) != (after.st_ino, after.st_size, after.st_mtime_ns):
+            return "changed while it was read; wait until it is complete", False
+        return "", linked
+    except Refused as error:
+        return str(error), False
     except OSError as error:
-        return _why(path, str(error).strip().splitlines()[0])
+        return _why(path, (str(error).strip().splitlines() or [""])[0]), False
     except MemoryError:
-        return "is damaged (it declares more data than there is memory)"
+        return "is damaged (it declares more data than there is memory)", False
+    except RecursionError:
+        return "is nested too deeply", False
     except Exception as error:  # noqa: BLE001 - h5py raises anything on damage, and this process must go on
-        return f"is damaged ({type(error).__name__}: {str(error)[:120]})"
+        return f"is damaged ({type(error).__name__}: {str(error)[:120]})", False
 
 
-def _attributes(node: Any, name: str) -> str:
+def _check(file: Any) -> bool:
+    """Refuse what is damaged in a file itself; return whether anything of it lies in other files."""
+    from h5py import h5l  # pyright: ignore[reportAttributeAccessIssue] - compiled
+
+    linked: list[str] = []
+
+    def visit_link(name: bytes, link: Any) -> None:
+        if link.type not in (h5l.TYPE_HARD, h5l.TYPE_SOFT):
+            linked.append(os.fsdecode(name))
+
+    def visit(name: str, node: Any) -> None:
+        _attributes(node, name)
+        if getattr(node, "shape", None) is not None:
+            _array(node, name)
+            if node.is_virtual or node.external:
+                linked.append(name)
+
+    _attributes(file, "/")
+    file.id.links.visit(visit_link, info=True)
+    file.visititems(visit)
+    return bool(linked)
+
+
+def _attributes(node: Any, name: str) -> None:
     for key in node.attrs:
         try:
             node.attrs[key]
-            if not _names_axes(node, key):
-                return f"is damaged (attribute {key!r} of {name[:80]!r} does not hold references)"
-        except Exception as error:  # noqa: BLE001 - see above
-            return f"is damaged (attribute {key[:80]!r} of {name[:80]!r}: {str(error)[:120]})"
-    return ""
+            axes = _names_axes(node, key)
+        except Exception as error:
+            raise Refused(f"is damaged (attribute {key[:80]!r} of {name[:80]!r}: {str(error)[:120]})") from error
+        if not axes:
+            raise Refused(f"is damaged (attribute {key!r} of {name[:80]!r} does not hold references)")
 
 
 def _names_axes(attribute: Any, key: str) -> bool:
@@ -61,24 +119,23 @@ def _names_axes(attribute: Any, key: str) -> bool:
     return key != "REFERENCE_LIST" or (kind.names is not None and h5py.check_ref_dtype(kind[0]) is h5py.Reference)
 
 
-def _array(node: Any, name: str) -> str:
-    """Return the fault of an array: unreadable, or far more declared than stored, which would take all memory."""
-    shape = getattr(node, "shape", None)
-    if shape is None or node.is_virtual or node.external:
-        return ""
-    if _lacks_filter(node):
-        return ""  # No damage: whoever reads it is told.
-    declared, stored = math.prod(shape) * node.dtype.itemsize, node.id.get_storage_size()
+def _array(node: Any, name: str) -> None:
+    """Refuse an array that is unreadable, or far more declared than stored, which would take all memory."""
+    away = node.is_virtual or bool(node.external)
+    declared, stored = math.prod(node.shape) * node.dtype.itemsize, 0 if away else node.id.get_storage_size()
     if declared > MOST_MEMORY + MOST_EXPANSION * stored:
-        return f"is damaged ({name[:80]!r} declares {list(shape)}, {declared:,} bytes, and stores {stored:,})"
+        raise Refused(
+            f"is damaged ({name[:80]!r} declares {list(node.shape)}, {declared:,} bytes, and stores {stored:,})"
+        )
+    if away or _lacks_filter(node):
+        return  # No damage: whoever reads it is told.
     if declared <= SMALL:
         try:
             node[()]
-        except Exception as error:  # noqa: BLE001 - see above
-            return f"is damaged ({name[:80]!r}: {str(error)[:120]})"
+        except Exception as error:
+            raise Refused(f"is damaged ({name[:80]!r}: {str(error)[:120]})") from error
     elif node.chunks:
         node.id.get_num_chunks()
-    return ""
 
 
 def _lacks_filter(node: Any) -> bool:
@@ -88,21 +145,186 @@ def _lacks_filter(node: Any) -> bool:
     return not all(h5z.filter_avail(create.get_filter(place)[0]) for place in range(create.get_nfilters()))
 
 
-def _links(file: Any, path: str) -> str:
-    """Return the fault of a link into what is no regular file: to follow it could wait for ever."""
-    from h5py import h5l  # pyright: ignore[reportAttributeAccessIssue] - compiled
+class _Copy:
+    """The copy of a file in which plain arrays stand in the place of what lies in others."""
 
-    faults: list[str] = []
+    def __init__(self, path: str, folders: list[str] | tuple[str, ...]) -> None:
+        self.allowed = [Path(folder).resolve() for folder in folders]
+        self.folders = [Path(path).parent.resolve(), *self.allowed]
+        self.files: dict[Path, Any] = {}
+        self.seen: set[tuple[int, int]] = set()
 
-    def visit(name: bytes, link: Any) -> None:
-        if link.type == h5l.TYPE_EXTERNAL:
-            target = os.fsdecode(file.id.links.get_val(name)[0])
-            place = Path(path).parent / target
-            if place.exists() and not place.is_file():
-                faults.append(f"has a link {os.fsdecode(name)[:80]!r} into {target[:80]!r}, which is no regular file")
+    def write(self, file: Any, copy: str) -> None:
+        """Write the copy of an open file."""
+        import h5py
 
-    file.id.links.visit(visit, info=True)
-    return faults[0] if faults else ""
+        shutil.copyfile(file.filename, copy)
+        Path(copy).chmod(0o600)
+        with h5py.File(copy, "r+") as target:
+            self._group(file, target)
+
+    def _group(self, source: Any, target: Any) -> None:
+        import h5py
+
+        self.seen.add(_key(source))
+        for name in source:
+            link, node = source.get(name, getlink=True), None
+            if isinstance(link, h5py.HardLink):
+                node = source[name]
+            elif isinstance(link, h5py.ExternalLink):
+                del target[name]
+                try:
+                    node = self._follow(source, name)
+                except Missing:
+                    # An open end that nobody may need; whoever reads it is told what is missing.
+                    target[name] = h5py.SoftLink(f"{link.path} of {link.filename}")
+                else:
+                    node.file.copy(node, target, name)
+            if isinstance(node, h5py.Group) and _key(node) not in self.seen:
+                self._group(node, target[name])
+            elif isinstance(node, h5py.Dataset) and (node.is_virtual or node.external):
+                values, attributes = self._values(node), [(key, *_typed(node, key)) for key in node.attrs]
+                del target[name]
+                array = target.create_dataset(name, data=values, dtype=node.dtype)
+                for key, value, kind in attributes:
+                    array.attrs.create(key, value, dtype=kind)
+        if source.id.get_create_plist().get_link_creation_order():
+            for name in source:  # anew, in the order in which they were made
+                target.move(name, f"{name}~")
+                target.move(f"{name}~", name)
+
+    def _follow(self, group: Any, path: str, hops: int = 0) -> Any:
+        """Return what a path leads to, through links of all kinds."""
+        import h5py
+
+        if hops > MOST_HOPS:
+            raise Refused(f"has links that lead to themselves or over more than {MOST_HOPS} others ({path[:80]!r})")
+        node = group.file["/"] if path.startswith("/") else group
+        for step in path.split("/"):
+            if step in ("", "."):
+                continue
+            there = isinstance(node, h5py.Group) and node.id.links.exists(step.encode())
+            link = node.get(step, getlink=True) if there else None
+            if isinstance(link, h5py.SoftLink):
+                node = self._follow(node, link.path, hops + 1)
+            elif isinstance(link, h5py.ExternalLink):
+                node = self._follow(self._open(node.file, link.filename), link.path, hops + 1)
+            elif link is None:
+                raise Missing(f"lacks {path[:80]!r}, which is linked to, in {Path(node.file.filename).name[:80]!r}")
+            else:
+                node = node[step]
+        return node
+
+    def _open(self, file: Any, name: str) -> Any:
+        """Open a file that another names."""
+        import h5py
+
+        place = self._place(file, name, self.folders)
+        if place not in self.files:
+            self.files[place] = h5py.File(place, "r")
+            _check(self.files[place])
+        return self.files[place]
+
+    def _place(self, file: Any, name: str, folders: list[Path]) -> Path:
+        """Return where a file is that another names: a regular one in one of the folders."""
+        place = (Path(file.filename).parent / name).resolve() if name != "." else Path(file.filename)
+        if name != "." and not any(place.is_relative_to(folder) for folder in folders):
+            away = "outside its folder" if len(folders) > len(self.allowed) else "which may be any file of yours"
+            raise Refused(f"takes a part from {name[-80:]!r}, {away}; if you trust it, allow it: --allow-linked FOLDER")
+        try:
+            status = place.stat()
+        except OSError:
+            raise Missing(f"takes a part from {name[-80:]!r}, which is missing") from None
+        if not stat.S_ISREG(status.st_mode):
+            raise Refused(f"takes a part from {name[-80:]!r}, which is no regular file")
+        # A second for each part of a large one, as for the file itself.
+        signal.alarm(signal.alarm(0) + status.st_size // (10 << 20)) if hasattr(signal, "alarm") else None
+        return place
+
+    def _values(self, node: Any, route: tuple[Any, ...] = ()) -> Any:
+        """Read an array; one of parts of others is put together here."""
+        import h5py
+        import numpy as np
+
+        if node.shape is None or not (node.is_virtual or node.external):
+            return node[()]
+        if node.external:
+            return self._raw(node)
+        if (key := _key(node)) in route or len(route) > MOST_HOPS:
+            raise Refused(f"has an array, {node.name[-80:]!r}, that is made of itself")
+        values, filled = np.full(node.shape, node.fillvalue, node.dtype), np.zeros(node.shape, bool)
+        for part in node.virtual_sources():
+            if "%" in part.file_name or "%" in part.dset_name:
+                raise Refused(f"names parts of {node.name[-80:]!r} by a pattern, {part.file_name[-80:]!r}; name each")
+            where = f"{node.name[-80:]!r} from {part.dset_name[-80:]!r} of {part.file_name[-80:]!r}"
+            file = node.file if part.file_name == "." else self._open(node.file, part.file_name)
+            source = self._follow(file, "/" + part.dset_name)
+            if not isinstance(source, h5py.Dataset):
+                raise Refused(f"takes a part of {where}, which is no array")
+            to, of = _selected(part.vspace, node.shape), _selected(part.src_space, source.shape)
+            if to is None or of is None or to.sum() != of.sum():
+                raise Refused(f"takes a part of {where}, which is smaller")
+            values[to] = self._values(source, (*route, key))[of]
+            filled |= to
+        if not filled.all() and not (values.dtype.kind in "fc" and np.isnan(values[~filled]).all()):
+            raise Refused(f"has {int((~filled).sum()):,} values of {node.name[-80:]!r} that come from nowhere")
+        return values
+
+    def _raw(self, node: Any) -> Any:
+        """Read an array that lies in the bytes of other files: only in folders that were allowed by name."""
+        import numpy as np
+
+        data = b""
+        for name, offset, size in node.external:
+            place = self._place(node.file, os.fsdecode(name), self.allowed)
+            missing = math.prod(node.shape) * node.dtype.itemsize - len(data)
+            with place.open("rb") as stream:
+                stream.seek(offset)
+                data += stream.read(min(size, missing))
+        if len(data) < math.prod(node.shape) * node.dtype.itemsize:
+            raise Refused(f"lacks bytes of {node.name[-80:]!r} in {os.fsdecode(node.external[0][0])[-80:]!r}")
+        return np.frombuffer(data, node.dtype).reshape(node.shape)
+
+
+def _key(node: Any) -> tuple[int, int]:
+    from h5py import h5o  # pyright: ignore[reportAttributeAccessIssue] - compiled
+
+    status = h5o.get_info(node.id)
+    return status.fileno, status.addr
+
+
+def _typed(node: Any, key: str) -> tuple[Any, Any]:
+    return node.attrs[key], node.attrs.get_id(key).dtype
+
+
+def _selected(space: Any, shape: tuple[int, ...]) -> Any:
+    """Return the values [shape] that a selection holds, true for each; None where it reaches beyond the array."""
+    import numpy as np
+    from h5py import h5s  # pyright: ignore[reportAttributeAccessIssue] - compiled
+
+    kind, mask = space.get_select_type(), np.zeros(shape, bool)
+    if kind == h5s.SEL_ALL and tuple(space.shape) in ((), shape):  # the library writes no extent of all
+        return ~mask
+    if kind != h5s.SEL_HYPERSLABS or len(space.shape) != len(shape):
+        return None
+    if not space.is_regular_hyperslab():
+        blocks = [(low, high + 1) for low, high in space.get_select_hyper_blocklist()]
+    else:
+        sides = []
+        for start, stride, count, block, size in zip(*space.get_regular_hyperslab(), shape, strict=True):
+            # What has no end takes all that there is.
+            count = -(-(size - start) // stride) if count == h5s.UNLIMITED else count
+            block = size - start if block == h5s.UNLIMITED else block
+            if start + stride * (count - 1) + block > size:
+                return None
+            sides.append(np.add.outer(start + stride * np.arange(count), np.arange(block)).ravel())
+        mask[np.ix_(*sides)] = True
+        return mask
+    for low, high in blocks:
+        if (high > shape).any():
+            return None
+        mask[tuple(map(slice, low, high))] = True
+    return mask
 
 
 def _why(path: str, text: str) -> str:
@@ -121,15 +343,27 @@ def _why(path: str, text: str) -> str:
     return f"cannot be read, it seems damaged ({text}); copy it again"
 
 
-def answer(path: str) -> None:
-    """Write the fault of a file as a line of JSON."""
-    sys.stdout.write(json.dumps(fault_of(path)) + "\n")
+def answer(request: str) -> None:
+    """Write what is to be said of a request as a line of JSON."""
+    sys.stdout.write(json.dumps(fault_of(*json.loads(request))) + "\n")
     sys.stdout.flush()
 
 
-if __name__ == "__main__":
-    import contextlib
+def _bound(request: str) -> None:
+    """Set limits to what this process takes: the signal ends it even within a loop of the library."""
+    import resource
 
+    path, folders, _ = json.loads(request)
+    # Who allows a folder by name means large sets too.
+    signal.alarm(5 + Path(path).stat().st_size // (10 << 20) + (600 if folders else 0))
+    resource.setrlimit(resource.RLIMIT_FSIZE, (MOST_COPY, MOST_COPY))
+    files = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
+    resource.setrlimit(resource.RLIMIT_NOFILE, (files, files))
+    with contextlib.suppress(ValueError, OSError):  # systems without
+        resource.setrlimit(resource.RLIMIT_AS, (4 * MOST_MEMORY, 4 * MOST_MEMORY))
+
+
+if __name__ == "__main__":
     import h5py  # noqa: F401 - once, for all processes that are forked below
 
     with contextlib.suppress(ImportError):
@@ -139,14 +373,12 @@ if __name__ == "__main__":
     sys.stdout.flush()
     for line in sys.stdin:
         if not hasattr(os, "fork"):
-            answer(json.loads(line))
+            answer(line)
         elif (child := os.fork()) == 0:
             # Damage can spoil the library's memory: a file has a process to itself, which tells of it when it ends.
-            path = json.loads(line)
-            # The signal ends a process even within a loop of the library.
-            signal.alarm(5 + Path(path).stat().st_size // (10 << 20))
-            answer(path)
+            _bound(line)
+            answer(line)
             sys.exit()
         elif os.waitpid(child, 0)[1]:
-            sys.stdout.write(json.dumps("is damaged: the HDF5 library crashed or did not come back") + "\n")
+            sys.stdout.write(json.dumps(["is damaged: the HDF5 library crashed or did not come back", False]) + "\n")
             sys.stdout.flush()

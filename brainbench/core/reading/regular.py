@@ -14,6 +14,8 @@ MOST_TEXT = 64 << 20
 """Bytes of a text file that is parsed; nested lists take about twenty times as much memory."""
 MOST_TABLE = 256 << 20
 """Bytes of a table of comma-separated numbers."""
+MOST_PART = 512 << 20
+"""Bytes of a file that another names: a mesh, a buffer, a picture."""
 
 
 def check_file(path: str | os.PathLike[str], kind: str = "file", *, most: int | None = None) -> Path:
@@ -49,6 +51,21 @@ def check_file(path: str | os.PathLike[str], kind: str = "file", *, most: int | 
     if not os.access(Path(path).expanduser(), os.R_OK):
         raise DataError(f"{name} may not be read by this user; change its permissions.")
     return Path(path).expanduser()
+
+
+def part_of(folder: Path, name: str, kind: str = "file") -> Path:
+    """Return where a file is that one in ``folder`` names: a regular one of bounded size, in that folder.
+
+    The folder above counts too where the name begins with ``../``: packages of robots keep meshes beside descriptions.
+
+    Raises:
+        DataFileNotFoundError: there is nothing of this name.
+    """
+    place, above = folder / name, Path(name).parts[:1] == ("..",)
+    root = folder.resolve().parent if above else folder.resolve()
+    if not place.resolve().is_relative_to(root):
+        raise DataError(f"{brief(name)} lies outside the folder {brief(str(folder))} of what names it; copy it there.")
+    return check_file(place, kind, most=MOST_PART)
 
 
 def reason(error: BaseException) -> str:

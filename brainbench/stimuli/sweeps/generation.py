@@ -20,7 +20,6 @@ from brainbench.core.files import content_hash, provenance, write_json
 from brainbench.core.progress import Progress
 from brainbench.core.reading.hdf5 import open_hdf5
 from brainbench.core.reading.ranges import check_number
-from brainbench.core.reading.regular import readable
 from brainbench.core.runs.folder import begin_run
 from brainbench.core.writing.locks import lock_folder
 from brainbench.core.writing.temporaries import is_temporary
@@ -37,12 +36,10 @@ _COUNTS = (*COUNTS, "unstable", "unusable")
 
 def is_complete(path: Path, task: PlannedShard) -> bool:
     """Return whether the file of a shard is there and complete; a shard of another data set is a :class:`DataError`."""
-    import h5py
-
     if not path.is_file():
         return False
     try:
-        with readable(path, "shard"), h5py.File(path, "r") as file:
+        with open_hdf5(path, "shard") as file:
             owner = str(file.attrs["config_hash"])
             wrench: Any = file["wrench"]
             end = wrench.id.get_offset() + wrench.size * wrench.dtype.itemsize

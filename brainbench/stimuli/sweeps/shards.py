@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from brainbench.core.contracts import CHANNELS, SWEEPS_FORMAT, SWEEPS_SCHEMA
 from brainbench.core.errors import DataError, UsageError
 from brainbench.core.files import atomic_path, content_hash, hash_arrays, to_json
+from brainbench.core.writing.hdf5 import create_hdf5
 from brainbench.stimuli.engines import get_engine
 from brainbench.stimuli.objects.collections import NamedObject
 from brainbench.stimuli.objects.solid import Solid
@@ -147,12 +148,10 @@ def shard_attributes(
 
 def write_shard(content: ShardContent, folder: str | os.PathLike[str]) -> int:
     """Write the file of a shard so that it is there as a whole or not at all; return the number of its sweeps."""
-    import h5py
-
     arrays, wrench = content.arrays, content.arrays["wrench"]
     digest = hash_arrays(arrays)
     with atomic_path(Path(folder) / content.task.name) as temporary:
-        with h5py.File(temporary, "w", alignment_threshold=ALIGNMENT, alignment_interval=ALIGNMENT) as file:
+        with create_hdf5(temporary, alignment_threshold=ALIGNMENT, alignment_interval=ALIGNMENT) as file:
             file.attrs.update({**content.attributes, "content_hash": digest})
             for name, array in arrays.items():
                 if name != "wrench":

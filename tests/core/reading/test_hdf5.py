@@ -36,14 +36,14 @@ def test_a_file_that_the_library_never_returns_from_is_refused_and_the_next_one_
         pass
     assert time.monotonic() - began < 5
     monkeypatch.undo()
-    assert ask(str(good), 5.0) == ""
+    assert ask([str(good), [], ""], 60.0) == ("", False)
 
 
 def test_a_file_of_ours_whose_hash_was_checked_is_opened_at_once(tmp_path, monkeypatch):
     path = _write(tmp_path / "a.h5")
     seal_file(path)
     read_entry(path, "file", Path.stat)
-    monkeypatch.setattr(hdf5._Worker, "ask", lambda *_: "was looked through")
+    monkeypatch.setattr(hdf5._Worker, "ask", lambda *_: ("was looked through", False))
     with hdf5.open_hdf5(path) as file:
         assert list(file) == ["a"]
     # Other bytes, or another file under the name, are looked through again.
@@ -51,3 +51,34 @@ def test_a_file_of_ours_whose_hash_was_checked_is_opened_at_once(tmp_path, monke
     read_entry(path, "file", Path.stat)
     with pytest.raises(DataError, match="looked through"), hdf5.open_hdf5(path):
         pass
+
+
+def test_a_file_that_is_replaced_between_its_walk_and_its_opening_is_refused(tmp_path, monkeypatch):
+    path, ask = _write(tmp_path / "a.h5"), hdf5._Worker.ask
+
+    def swap(*request):
+        answer = ask(*request)
+        _write(tmp_path / "b.h5").replace(path)
+        return answer
+
+    monkeypatch.setattr(hdf5._Worker, "ask", swap)
+    with pytest.raises(DataError, match="changed while"), hdf5.open_hdf5(path):
+        pass
+
+
+def test_a_linked_file_is_read_from_a_copy_that_is_gone_afterwards(tmp_path):
+    path = _write(tmp_path / "a.h5")
+    with h5py.File(tmp_path / "b.h5", "w") as file:
+        file["b"] = h5py.ExternalLink("a.h5", "/a")
+    for _ in range(2):
+        with hdf5.open_hdf5(tmp_path / "b.h5") as file:
+            copy = Path(file.filename)
+            assert file["b"][2] == 2
+            assert file.get("b", getlink=True).__class__ is h5py.HardLink
+            assert copy.parent != tmp_path
+            assert copy.stat().st_mode & 0o777 == 0o600
+        assert not copy.exists()
+    # What it links to is looked up anew each time.
+    path.unlink()
+    with pytest.raises(DataError, match=r"b\.h5"), hdf5.open_hdf5(tmp_path / "b.h5") as file:
+        file["b"][()]
