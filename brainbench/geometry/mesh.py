@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.errors import DataError, UsageError, brief, check_name, unknown_name
 from brainbench.core.reading.ranges import check_number
-from brainbench.core.reading.regular import check_file, readable
+from brainbench.core.reading.regular import MOST_PART, check_file, part_of, readable
 
 if TYPE_CHECKING:
     import trimesh
@@ -242,7 +242,7 @@ def load_mesh(path: str | os.PathLike[str], *, unit: str, apart: bool = False) -
     import trimesh
 
     check_name("length unit", unit, UNITS)
-    path = check_file(path, "mesh file")
+    path = check_file(path, "mesh file", most=MOST_PART)
     with readable(path, "mesh"):
         loaded: Any = _scene(path).to_mesh()
         if not isinstance(loaded, trimesh.Trimesh) or not len(loaded.faces):
@@ -258,10 +258,28 @@ def load_mesh(path: str | os.PathLike[str], *, unit: str, apart: bool = False) -
         return mesh.scaled(UNITS[unit])
 
 
+class _Beside:
+    """Gives trimesh the buffers and materials that a mesh file names; pictures, which have no shape, are left out."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def get(self, name: str) -> bytes:
+        if Path(name).suffix.lower() not in (".bin", ".glbin", ".mtl", ".ply", ".stl"):
+            raise DataError(f"{brief(name)} holds no part of a mesh's shape.")
+        return part_of(self.folder, name, "part of a mesh").read_bytes()
+
+    __getitem__ = get
+
+    def keys(self) -> tuple[str, ...]:
+        return ()
+
+
 def _scene(path: Path, **options: Any) -> Any:
     """Read a file by trimesh; indices of an OBJ that count back from their line are made absolute first."""
     import trimesh
 
+    options["resolver"] = _Beside(path.parent)
     if path.suffix.lower() == ".obj":
         text = path.read_text(errors="replace")
         if re.search(r"^f\b.*[\s/]-\d", text, re.MULTILINE):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -12,16 +11,12 @@ import numpy as np
 
 from brainbench.core.devices import mujoco_module
 from brainbench.core.errors import DataError, brief, listing
-from brainbench.core.reading.regular import check_file, readable
+from brainbench.core.reading.regular import readable
 from brainbench.core.reading.texts import read_text
+from robotics_bridge.hands.references import KIND, checked_xml
 
 _log = logging.getLogger(__name__)
 
-_KIND = "hand file (URDF or MJCF)"
-_NAMES = {"name", "class", "childclass", "joint", "body", "link", "geom", "site", "mesh", "material", "file"}
-"""Attributes of URDF and MJCF that hold words."""
-_LARGEST = 1e15
-"""Magnitude of numbers in a hand's file that no hand has."""
 _DEFAULTED = ("geom", "joint", "site", "actuator", "tendon", "equality", "pair")
 """Elements that a scene may add to a hand."""
 _IDENTITY = {"classname", "compiler", "default", "frame", "id", "info", "name", "parent", "path", "plugin", "signature"}
@@ -39,7 +34,7 @@ def read_mjspec(path: Path) -> Any:
         DataFileNotFoundError: the file is missing.
     """
     mujoco = mujoco_module()
-    folder, root = path.parent, _checked_xml(path, path.parent)
+    folder, root = path.parent, checked_xml(path)
     with readable(path, "URDF or MJCF file"):
         if path.suffix.lower() == ".mjcf":
             # MuJoCo chooses how to read a file by its ending, and has no reader for this one.
@@ -50,10 +45,6 @@ def read_mjspec(path: Path) -> Any:
         files = [mesh.file for mesh in spec.meshes if mesh.file]
     if any(not (folder / spec.meshdir / name).exists() and (folder / name).exists() for name in files):
         spec.meshdir = ""
-    for name in files:
-        # To open a pipe or a device would wait for ever; compiling names what is not there.
-        if os.path.lexists(place := folder / spec.meshdir / name):
-            check_file(place, "mesh file")
     if path.suffix.lower() == ".urdf":
         spec.compiler.discardvisual = True
         # Fixed links join their parents, as their solids should; a sensor keeps the palm from joining the world.
@@ -113,41 +104,12 @@ def _balance_inertias(spec: Any, path: Path) -> None:
         )  # fmt: skip
 
 
-def _checked_xml(path: Path, folder: Path) -> ElementTree.Element:
-    """Return the root element with included files in place; numbers that are not finite are refused."""
-    text = read_text(path, _KIND)
-    with readable(path, _KIND):
-        root = ElementTree.fromstring(text)
-        for parent in [*root.iter()]:
-            for place, element in reversed([*enumerate(parent)]):
-                if element.tag == "include":
-                    # From the folder of the main file, else from that of the file which includes it.
-                    name = element.get("file", "")
-                    included = folder / name if (folder / name).exists() else path.parent / name
-                    parent[place : place + 1] = list(_checked_xml(included, folder))
-            for key, value in parent.items():
-                for word in value.split() if key not in _NAMES else ():
-                    if _is_absurd(word):
-                        raise DataError(
-                            f"{key!r} of <{brief(parent.tag, quoted=False)}> in {brief(str(path))} is {brief(value)}; "
-                            f"finite numbers of at most {_LARGEST:g} are needed."
-                        )
-    return root
-
-
-def _is_absurd(word: str) -> bool:
-    try:
-        return not abs(float(word)) <= _LARGEST
-    except ValueError:
-        return False
-
-
 def stated_speeds(path: Path | None) -> dict[str, float]:
     """Return joint → largest speed (rad/s or m/s) of a URDF file, which MuJoCo does not keep; 0 states none."""
     if path is None or path.suffix.lower() != ".urdf":
         return {}
     with readable(path, "URDF or MJCF file"):
-        root = ElementTree.fromstring(read_text(path, _KIND))
+        root = ElementTree.fromstring(read_text(path, KIND))
         limits = {joint.get("name", ""): joint.find("limit") for joint in root.iter("joint")}
         speeds = {name: float(limit.get("velocity", 0)) for name, limit in limits.items() if limit is not None}
     return {name: speed for name, speed in speeds.items() if speed > 0}

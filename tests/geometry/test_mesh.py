@@ -1,3 +1,6 @@
+import json
+import os
+
 import numpy as np
 import pytest
 import trimesh
@@ -197,3 +200,35 @@ def test_a_concave_polygon_that_was_cut_into_a_fan_is_diagnosed(tmp_path, first)
     # A fan that is right covers 14 m²; what lies outside the bracket is covered twice.
     assert (mesh.diagnosis.folded_edges > 0) == (area > 14.1)
     assert ("back to back" in str(mesh.diagnosis)) == (area > 14.1)
+
+
+_CORNERS = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\n"
+_FACES = "f 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n"
+
+
+@pytest.mark.parametrize("name", ["pipe.mtl", "/dev/zero", "../outside.mtl", "gone.mtl"])
+def test_materials_that_cannot_be_read_are_left_out(tmp_path, name):
+    os.mkfifo(tmp_path / "pipe.mtl")
+    (tmp_path / "a.obj").write_text(f"mtllib {name}\n{_CORNERS}usemtl x\n{_FACES}")
+    assert load_mesh(tmp_path / "a.obj", unit="mm").volume == pytest.approx(1e-9 / 6)
+
+
+@pytest.mark.parametrize("name", ["pipe.bin", "/dev/zero", "../outside.bin", "gone.bin"])
+def test_buffers_of_a_mesh_are_regular_files_of_its_folder(tmp_path, name):
+    folder = tmp_path / "in"
+    folder.mkdir()
+    os.mkfifo(folder / "pipe.bin")
+    buffers = np.arange(12, dtype="<f4").tobytes() + np.arange(12, dtype="<u2").tobytes()
+    (tmp_path / "outside.bin").write_bytes(buffers)
+    (folder / "good.bin").write_bytes(np.eye(4, 3, dtype="<f4").tobytes() + np.arange(12, dtype="<u2").tobytes())
+    document = {
+        "asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1}]}],
+        "buffers": [{"byteLength": 72, "uri": name}],
+        "bufferViews": [{"buffer": 0, "byteLength": 48}, {"buffer": 0, "byteOffset": 48, "byteLength": 24}],
+        "accessors": [{"bufferView": 0, "componentType": 5126, "count": 4, "type": "VEC3"},
+                      {"bufferView": 1, "componentType": 5123, "count": 12, "type": "SCALAR"}],
+    }  # fmt: skip
+    (folder / "a.gltf").write_text(json.dumps(document))
+    with pytest.raises(DataError):
+        load_mesh(folder / "a.gltf", unit="mm")
