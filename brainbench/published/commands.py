@@ -103,8 +103,7 @@ def _check(what: str, refused: Mapping[str, Any], out: Path, becomes: str, fits:
 
 
 def _data_set(source: Path, out: Path) -> dict[str, Any]:
-    from brainbench.published.conversion import SweepTable, convert_sweeps
-    from brainbench.published.sweep_files import open_sweep_tree
+    from brainbench.published.conversion import SweepTable, convert_sweeps, open_sweep_tree
 
     tree = open_sweep_tree(source)
     table = SweepTable(
@@ -131,8 +130,15 @@ def _sweep_set(paths: list[Path]) -> xr.Dataset:
     import numpy as np
 
     from brainbench.core.contracts import GRID_SHAPE
-    from brainbench.published.conversion import assemble_stimulus_set
-    from brainbench.published.sweep_files import CELLS, CONDITIONS, FAULTS, FRAME_TIMES, FRAMES, read_sweep
+    from brainbench.published.conversion import (
+        CELLS,
+        CONDITIONS,
+        FAULTS,
+        FRAME_TIMES,
+        FRAMES,
+        assemble_stimulus_set,
+        read_sweep,
+    )
     from brainbench.stimuli import Frames
 
     sweeps = [read_sweep(path) for path in paths]

@@ -32,11 +32,9 @@ from brainbench.core.files import write_text
 from brainbench.core.reading.ranges import check_number
 from brainbench.core.reading.tables import read_numbers
 from brainbench.core.reading.texts import read_text
-from brainbench.published.conversion import FRAME_STATUSES, assemble_stimulus_set
-from brainbench.published.sweep_files import LARGEST, SCALE
+from brainbench.published.conversion import FRAME_STATUSES, LARGEST, SCALE, assemble_stimulus_set
 from brainbench.stimuli.scenes.frames import Frames
-from brainbench.stimuli.whiskers.array import MountedWhisker, WhiskerArray, published_whisker
-from brainbench.stimuli.whiskers.selection import ROWS
+from brainbench.stimuli.whiskers.array import ROWS, MountedWhisker, WhiskerArray, published_whisker
 
 if TYPE_CHECKING:
     import xarray as xr

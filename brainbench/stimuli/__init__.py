@@ -15,8 +15,7 @@ from brainbench.core.lazy import lazy_exports
 if TYPE_CHECKING:
     from brainbench.stimuli.engines.fidelity import Fidelity
     from brainbench.stimuli.motion.trajectories import Whisking
-    from brainbench.stimuli.objects.placed_object import PlacedObject
-    from brainbench.stimuli.objects.solid import Solid
+    from brainbench.stimuli.objects.solid import PlacedObject, Solid
     from brainbench.stimuli.scenes.frames import Frames
     from brainbench.stimuli.scenes.recipes import get_recipe, list_recipes
     from brainbench.stimuli.scenes.scene import Head, Scene

@@ -23,7 +23,7 @@ from brainbench.stimuli.engines.fidelity import DEFAULT_ENGINE, Fidelity
 from brainbench.stimuli.kept_sets import find_kept
 from brainbench.stimuli.scenes.recipes import get_recipe, is_packaged, is_recipe, list_recipes, recipe_file
 from brainbench.stimuli.stimulus_set import hash_stimulus_set, read_stimulus_set, to_grid
-from brainbench.stimuli.whiskers.selection import match_whiskers
+from brainbench.stimuli.whiskers.array import match_whiskers
 
 if TYPE_CHECKING:
     import xarray as xr

@@ -18,7 +18,7 @@ from brainbench.core.reading.hdf5 import open_hdf5
 from brainbench.core.version import __version__
 from brainbench.core.writing.hdf5 import create_hdf5
 from brainbench.stimuli.scenes.frames import Axes
-from brainbench.stimuli.whiskers.selection import ROWS
+from brainbench.stimuli.whiskers.array import ROWS
 
 if TYPE_CHECKING:
     import h5py

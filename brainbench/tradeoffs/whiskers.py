@@ -38,10 +38,8 @@ from brainbench.stimuli.engines import get_engine
 from brainbench.stimuli.engines.fidelity import DEFAULT_ENGINE, RESOLUTION, SHARES, Fidelity, list_presets
 from brainbench.stimuli.engines.reach import touched
 from brainbench.stimuli.motion.jobs import Job, Trace
-from brainbench.stimuli.objects.mesh_solids import touchable
 from brainbench.stimuli.objects.obstacle import Obstacle
-from brainbench.stimuli.objects.primitives import rodgers_solid
-from brainbench.stimuli.objects.solid import Solid
+from brainbench.stimuli.objects.solid import Solid, rodgers_solid, touchable
 from brainbench.stimuli.validation import contact_scenes
 from brainbench.stimuli.validation.bench_tests import peg, ringdown
 from brainbench.stimuli.whiskers.array import WhiskerArray

@@ -131,7 +131,7 @@ WAYS = (
         "A mesh, to the shape that a whisker touches",
         (
             f"{_STIMULI}.objects.procedural.families:make",
-            f"{_STIMULI}.objects.placed_object:PlacedObject.obstacle",
+            f"{_STIMULI}.objects.solid:PlacedObject.obstacle",
             f"{_STIMULI}.engines.reach:reachable",
         ),
         _simulate,

@@ -99,7 +99,7 @@ def objects_of(text: str, diagonal: float, unit: str | None = None) -> list[Expl
 
     from brainbench.geometry import Mesh
     from brainbench.stimuli.objects.collections import resolve_objects
-    from brainbench.stimuli.objects.primitives import rodgers_solid
+    from brainbench.stimuli.objects.solid import rodgers_solid
     from brainbench.stimuli.scenes.recipes import get_recipe
     from robotics_bridge.exploration.record import Explored
     from robotics_bridge.physics import Geometry

@@ -13,9 +13,14 @@ from brainbench.core.reading.tensors import read_tensors
 from brainbench.datasets import open_recordings
 from brainbench.models.registry import load_model
 from brainbench.models.training.checkpoints import WEIGHTS
-from brainbench.published.checkpoint_files import read_settings, read_weights, recognise
-from brainbench.published.checkpoint_import import build_published, import_checkpoint
-from brainbench.published.sweep_files import SweepFile, open_sweep_tree, read_sweep
+from brainbench.published.checkpoint_import import (
+    build_published,
+    import_checkpoint,
+    read_settings,
+    read_weights,
+    recognise,
+)
+from brainbench.published.conversion import SweepFile, open_sweep_tree, read_sweep
 from brainbench.published.walk import explain_file
 from tests.factories.published_files import lightning_state
 from tests.factories.published_recordings import make_zero_filled, write_published

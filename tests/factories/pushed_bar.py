@@ -7,8 +7,7 @@ import math
 import numpy as np
 
 from brainbench.stimuli.motion.trajectories import Still, Translation
-from brainbench.stimuli.objects.placed_object import PlacedObject
-from brainbench.stimuli.objects.primitives import capsule
+from brainbench.stimuli.objects.solid import PlacedObject, capsule
 from brainbench.stimuli.scenes.scene import Frames, Head, Scene
 from brainbench.stimuli.whiskers.array import WhiskerArray
 

@@ -38,9 +38,8 @@ from brainbench.scoring.recovery.boards import parse_trials
 from brainbench.stimuli import WhiskerArray, load_stimuli
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.motion.recorded import load_initial_angles, load_trajectory
-from brainbench.stimuli.objects.collections import resolve_objects
-from brainbench.stimuli.objects.primitives import sphere
-from brainbench.stimuli.objects.shapenet import read_categories, read_ids
+from brainbench.stimuli.objects.collections import read_categories, read_ids, resolve_objects
+from brainbench.stimuli.objects.solid import sphere
 from brainbench.stimuli.scenes.scene_files import load_scene
 from brainbench.stimuli.stimulus_set import hash_stimulus_set, write_stimulus_set
 from brainbench.stimuli.sweeps.generation import generate

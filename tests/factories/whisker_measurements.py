@@ -16,8 +16,8 @@ from brainbench.core.errors import DataError
 from brainbench.stimuli.fitting.model import FitModel
 from brainbench.stimuli.fitting.options import FitOptions
 from brainbench.stimuli.fitting.parameters import FreeParameters
-from brainbench.stimuli.fitting.tracks.contract import new_shapes, new_wrenches
 from brainbench.stimuli.fitting.trials import Trial
+from brainbench.stimuli.tracks.contract import new_shapes, new_wrenches
 from brainbench.stimuli.whiskers.chain import build_chain
 from brainbench.stimuli.whiskers.whisker import Whisker
 

@@ -26,8 +26,7 @@ from brainbench.published.whiskit import (
 from brainbench.stimuli import read_stimulus_set, to_grid, write_stimulus_set
 from brainbench.stimuli.engines import get_engine
 from brainbench.stimuli.engines.fidelity import Fidelity
-from brainbench.stimuli.objects.placed_object import PlacedObject
-from brainbench.stimuli.objects.primitives import sphere
+from brainbench.stimuli.objects.solid import PlacedObject, sphere
 from brainbench.stimuli.scenes.scene import Frames, Scene
 from brainbench.stimuli.simulation import simulate
 from brainbench.stimuli.whiskers.array import WhiskerArray

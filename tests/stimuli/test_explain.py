@@ -18,8 +18,7 @@ from brainbench.stimuli.engines.reach import Reach
 from brainbench.stimuli.explain import Explanation
 from brainbench.stimuli.motion.trajectories import Still, Translation
 from brainbench.stimuli.objects.obstacle import Obstacle
-from brainbench.stimuli.objects.placed_object import PlacedObject
-from brainbench.stimuli.objects.primitives import box, rodgers_solid, sphere
+from brainbench.stimuli.objects.solid import PlacedObject, box, rodgers_solid, sphere
 from brainbench.stimuli.scenes.recipes import get_recipe
 from brainbench.stimuli.scenes.scene import Frames, Scene
 from brainbench.stimuli.simulation import simulate

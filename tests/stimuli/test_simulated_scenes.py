@@ -10,9 +10,7 @@ from brainbench.core.rotations import euler_matrix
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.motion.trajectories import Path, Still, Whisking, smooth_step
 from brainbench.stimuli.objects.obstacle import Capsule
-from brainbench.stimuli.objects.placed_object import PlacedObject
-from brainbench.stimuli.objects.primitives import sphere
-from brainbench.stimuli.objects.solid import Solid
+from brainbench.stimuli.objects.solid import PlacedObject, Solid, sphere
 from brainbench.stimuli.scenes.recipes import get_recipe
 from brainbench.stimuli.scenes.scene import Frames, Head, Scene
 from brainbench.stimuli.simulation import simulate

@@ -21,8 +21,7 @@ from brainbench.stimuli import simulation
 from brainbench.stimuli.engines import PHYSICS_VERSION
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.motion.trajectories import ArrayFollicle, Still, Translation, Whisking
-from brainbench.stimuli.objects.placed_object import PlacedObject
-from brainbench.stimuli.objects.primitives import sphere
+from brainbench.stimuli.objects.solid import PlacedObject, sphere
 from brainbench.stimuli.scenes.recipes import get_recipe
 from brainbench.stimuli.scenes.scene import Frames, Head, Scene
 from brainbench.stimuli.simulation import simulate
@@ -205,7 +204,7 @@ def test_an_edited_drawing_module_leaves_simulations_in_their_place_in_the_cache
     names = []
     for copy in ("before", "after"):
         shutil.copytree(Path(brainbench.__file__).parent, tmp_path / copy / "brainbench", ignore=_WEIGHTS)
-        with (tmp_path / copy / "brainbench/stimuli/figures/rays.py").open("a") as module:
+        with (tmp_path / copy / "brainbench/stimuli/figures/surfaces.py").open("a") as module:
             module.write(f"# {copy}\n")
         ended = subprocess.run(
             [sys.executable, "-c", code], env={**os.environ, "PYTHONPATH": str(tmp_path / copy)}, cwd=tmp_path,

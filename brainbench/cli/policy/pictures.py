@@ -11,9 +11,9 @@ import numpy as np
 
 from brainbench.cli.tactile import figures
 from brainbench.stimuli.figures.camera import Camera
-from brainbench.stimuli.figures.canvas import Style
-from brainbench.stimuli.figures.rays import Triangles
+from brainbench.stimuli.figures.pictures import Style
 from brainbench.stimuli.figures.scenes import write_film
+from brainbench.stimuli.figures.surfaces import Triangles
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -47,7 +47,7 @@ def render(
     from brainbench.core.figures.style import check_format
     from brainbench.stimuli.figures import scenes as drawing
     from brainbench.stimuli.figures.camera import Camera
-    from brainbench.stimuli.figures.canvas import Style
+    from brainbench.stimuli.figures.pictures import Style
 
     suffix = check_format(out, drawing.FORMATS)
     scene = scenes.choose_scene(scenes.open_recipe(source, whiskers), stimulus)

@@ -72,7 +72,7 @@ def _families() -> tuple[dict[str, Any], str]:
 
 
 def _folder(source: str, ids: Path | None, categories: Path | None) -> tuple[dict[str, Any], str]:
-    from brainbench.stimuli.objects.shapenet import load_shapenet
+    from brainbench.stimuli.objects.collections import load_shapenet
 
     bodies = load_shapenet(source, ids=ids, categories=categories)
     data = {"models": len(bodies), "labels": bodies.counts, "missing": list(bodies.missing)}
@@ -85,7 +85,7 @@ def _member(
 ) -> tuple[dict[str, Any], Solid]:
     from brainbench.core.errors import check_name
     from brainbench.stimuli.objects import procedural
-    from brainbench.stimuli.objects.mesh_solids import shape_solid
+    from brainbench.stimuli.objects.solid import shape_solid
 
     family = name.removeprefix("family:")
     hint = "Or the path of a mesh file or of a ShapeNet folder."
@@ -103,7 +103,7 @@ def _file(
 ) -> tuple[dict[str, Any], Solid]:
     from brainbench.core.errors import UsageError
     from brainbench.geometry import UNITS, load_mesh
-    from brainbench.stimuli.objects.mesh_solids import mesh_solid
+    from brainbench.stimuli.objects.solid import mesh_solid
 
     if unit is None:
         raise UsageError(f"Mesh files carry no unit; say what the numbers in {source!r} are: --unit {'|'.join(UNITS)}.")

@@ -14,8 +14,7 @@ from scipy.signal import spectrogram
 from brainbench.core.figures.style import COLORS, new_figure, panels, save_figure
 from brainbench.core.rotations import to_matrices
 from brainbench.stimuli.figures.camera import Camera, Lens
-from brainbench.stimuli.figures.rays import Triangles, draw, lamp, paint, shade
-from brainbench.stimuli.figures.surfaces import ball, corner_normals, tube
+from brainbench.stimuli.figures.surfaces import Triangles, ball, corner_normals, draw, lamp, paint, shade, tube
 from robotics_bridge.sensors.queries.solids import tessellate
 
 SIZE = (1100, 900)

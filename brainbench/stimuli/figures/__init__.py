@@ -1,6 +1,6 @@
 """Figures: force traces, and pictures and films of scenes, without a display or OpenGL.
 
-``camera`` frames the world, ``surfaces`` makes triangles of objects and whiskers, ``rays`` finds and lights the visible
-ones, ``pictures`` joins these and writes around them, and ``scenes`` makes files of them, films too. ``traces`` are
-charts; ``canvas`` holds what pictures of whiskers share, and ``brainbench.core.figures.style`` the look of all charts.
+``camera`` frames the world, ``surfaces`` makes triangles of objects and whiskers and lights the visible ones,
+``pictures`` joins these and writes around them, and ``scenes`` makes files of them, films too. ``traces`` are charts;
+``brainbench.core.figures.style`` holds the look of all charts.
 """

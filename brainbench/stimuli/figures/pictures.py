@@ -2,21 +2,86 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.figures.style import DOTS_PER_INCH, INK, PALE, new_figure, save_figure
-from brainbench.stimuli.figures import canvas
+from brainbench.core.limits import Limit, Positive, Share, limited
 from brainbench.stimuli.figures.camera import Camera, Lens
-from brainbench.stimuli.figures.canvas import MOMENT_MAP, ROW_COLORS, UNSTABLE_COLOR, Style, round_up
-from brainbench.stimuli.figures.rays import Triangles, VisibleSurface, draw, floor, lamp, paint, shade
-from brainbench.stimuli.figures.surfaces import DrawnSurface, ball, object_surface, smoothed, tube
+from brainbench.stimuli.figures.surfaces import (
+    DrawnSurface,
+    Triangles,
+    VisibleSurface,
+    ball,
+    draw,
+    floor,
+    lamp,
+    object_surface,
+    paint,
+    shade,
+    smoothed,
+    tube,
+)
 from brainbench.stimuli.whisker_shapes import Recording
-from brainbench.stimuli.whiskers.selection import ROWS
+from brainbench.stimuli.whiskers.array import ROWS
+
+ROW_COLORS = ("#3466ac", "#1b9aa0", "#d1495b", "#7b4fa3", "#e08e1b")
+"""Colours of the whisker rows A to E."""
+UNSTABLE_COLOR = "#111111"
+"""Colour of whiskers whose simulation cannot be trusted."""
+MOMENT_MAP = "plasma"
+"""Colour map of bending moments, by its name in matplotlib."""
+
+_Pixels = Annotated[int, Limit(least=64, most=8192)]
+
+
+@dataclass(frozen=True)
+@limited(of="{} of a picture")
+class Style:
+    """Colours, size and quality of a picture of a scene; what is out of range is a :class:`UsageError`."""
+
+    color: Literal["row", "moment"] = "row"
+    """Whiskers by row, or by their local elastic bending moment."""
+    moment_limit: Positive | None = None
+    """Moment at the upper end of the colours [N·m]; None takes the largest that is shown."""
+    thickness: Positive = 2.0
+    """Whiskers are drawn so many times as thick as they are, and never thinner than a pixel."""
+    opacity: Share = 1.0
+    """Opacity of the objects, from 0 to 1; whiskers behind them shine through."""
+    size: tuple[_Pixels, _Pixels] = (1280, 960)
+    """Width and height in pixels."""
+    supersampling: Annotated[int, Limit(least=1, most=4)] = 2
+    """Samples per pixel and direction; smooths edges at its square of the cost."""
+    frames_per_second: Annotated[float, Limit(above=0, most=120)] = 25.0
+    """Frames per second of a film."""
+
+
+def round_up(value: float) -> float:
+    """Return the least of a few round numbers that is not below ``value``, for the end of a scale.
+
+    >>> round_up(0.308)
+    0.4
+    """
+    power = 10.0 ** math.floor(math.log10(value))
+    steps = (1, 1.2, 1.6, 2, 2.4, 3, 4, 5, 6, 8, 10)
+    return float(f"{next(step for step in steps if step * power >= value * (1 - 1e-9)) * power:.3g}")
+
+
+def round_length(length: float) -> float:
+    """Return the longest of 1, 2, 5 times a power of ten that is not above ``length``.
+
+    >>> round_length(0.0073)
+    0.005
+    """
+    power = 10.0 ** math.floor(math.log10(length) + 1e-9)
+    return max(step * power for step in (1, 2, 5) if step * power <= length * (1 + 1e-9))
+
 
 OBJECT_COLOR = (0.76, 0.80, 0.85)
 _PER_LINK = 6
@@ -203,7 +268,7 @@ class Annotation:
 
     def _scale_bar(self) -> None:
         lens = self.picture.lens
-        length = canvas.round_length(0.2 * lens.width)
+        length = round_length(0.2 * lens.width)
         left, low = self._edge, self.height - self._edge
         self._line([left, left + length * lens.scale], [low, low], width=5)
         label = f"{length * 1e3:g} mm" + ("" if lens.distance is None else " at the centre")
@@ -228,9 +293,9 @@ class Annotation:
     def _row_key(self) -> None:
         rows = sorted({mount.row for mount in self.picture.recording.scene.mounts})
         top = self._edge + 84 * self._unit
-        key = [(f"row {ROWS[row]}", canvas.ROW_COLORS[row]) for row in rows]
+        key = [(f"row {ROWS[row]}", ROW_COLORS[row]) for row in rows]
         if self.picture.recording.unstable:
-            key.append(("unstable, drawn unbent", canvas.UNSTABLE_COLOR))
+            key.append(("unstable, drawn unbent", UNSTABLE_COLOR))
         for place, (words, color) in enumerate(key):
             y = top + 26 * self._unit * place
             self._line([self._edge, self._edge + 30 * self._unit], [y, y], color, 4)
@@ -239,7 +304,7 @@ class Annotation:
     def _moment_bar(self) -> None:
         left, top, long, wide = self._edge, self._edge + 84 * self._unit, 220 * self._unit, 16 * self._unit
         ramp = np.linspace(0, 1, 256)[None]
-        self.axes.imshow(ramp, cmap=canvas.MOMENT_MAP, extent=(left, left + long, top + wide, top), aspect="auto")
+        self.axes.imshow(ramp, cmap=MOMENT_MAP, extent=(left, left + long, top + wide, top), aspect="auto")
         limit = self.picture.moment_limit * 1e6
         for share in (0.0, 0.5, 1.0):
             side = ("left", "center", "right")[round(2 * share)]

@@ -21,8 +21,7 @@ from brainbench.stimuli.engines.fidelity import DEFAULT_ENGINE, Fidelity
 from brainbench.stimuli.engines.protocol import WhiskerEngine
 from brainbench.stimuli.engines.units import MILLI
 from brainbench.stimuli.figures.camera import Camera
-from brainbench.stimuli.figures.canvas import Style
-from brainbench.stimuli.figures.pictures import Annotation, Picture
+from brainbench.stimuli.figures.pictures import Annotation, Picture, Style
 from brainbench.stimuli.motion.trajectories import Whisking
 from brainbench.stimuli.scenes.scene import Scene
 from brainbench.stimuli.whisker_shapes import record

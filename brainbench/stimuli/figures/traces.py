@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from brainbench.core.contracts import CHANNELS, GRID_SHAPE, check_stimulus_set
 from brainbench.core.errors import UsageError, check_name, choose_name
 from brainbench.core.figures.style import INK, PALE, check_format, new_figure, save_figure
-from brainbench.stimuli.figures.canvas import round_up
-from brainbench.stimuli.whiskers.selection import ROWS
+from brainbench.stimuli.figures.pictures import round_up
+from brainbench.stimuli.whiskers.array import ROWS
 
 if TYPE_CHECKING:
     import xarray as xr

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 _FIT = "brainbench.stimuli.fitting.options:FitOptions"
 _CONTACTS = "brainbench.stimuli.fitting.contacts:ContactOptions"
-_TRACK = "brainbench.stimuli.fitting.options:TrackOptions"
+_TRACK = "brainbench.stimuli.tracks.readers:TrackOptions"
 _OFFERED = (
     "metres_per_pixel", "frame_rate", "track", "layout", "zero_frame", "identities", "parts", "least_likelihood",
 )  # fmt: skip
@@ -82,9 +82,8 @@ def fit(
     ] = None,
 ) -> Output:
     """Estimate parameters of a whisker, with intervals, from traced shapes or base wrenches."""
-    from brainbench.stimuli.fitting.options import TrackOptions
-    from brainbench.stimuli.fitting.tracks.readers import holds_shapes, read_shapes
-    from brainbench.stimuli.fitting.tracks.wrenches import read_wrenches
+    from brainbench.stimuli.fitting.wrenches import read_wrenches
+    from brainbench.stimuli.tracks.readers import TrackOptions, holds_shapes, read_shapes
 
     if contacts:
         of_fits = {"--parameters": parameters != _PARAMETERS, "--bounds": bounds, "--picture": picture}
@@ -108,7 +107,7 @@ def fit(
     else:
         from brainbench.stimuli.fitting import Trial
         from brainbench.stimuli.fitting import fit as run
-        from brainbench.stimuli.fitting.figure import draw_fit
+        from brainbench.stimuli.fitting.result import draw_fit
 
         trial = (
             Trial.ringdown(start, measured, 1e-3 * (1.0 if deflection is None else deflection))

@@ -21,7 +21,7 @@ from brainbench.core.errors import DataError, UsageError
 from brainbench.core.limits import Count, Limit, limited
 from brainbench.core.reading.ranges import check_number
 from brainbench.stimuli.fitting.curves import STEPS, LoadedShapes, LoadedWhisker, offsets_of_samples
-from brainbench.stimuli.fitting.tracks.contract import check_length, check_track, traced_lengths
+from brainbench.stimuli.tracks.contract import check_length, check_track, traced_lengths
 from brainbench.stimuli.whiskers.whisker import Whisker
 
 if TYPE_CHECKING:

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
 from brainbench.core.errors import UsageError
-from brainbench.core.limits import Count, Limit, Positive, Share, limited
+from brainbench.core.limits import Count, Limit, limited
 from brainbench.core.statistics import check_level
 from brainbench.stimuli.engines.fidelity import MOST_LINKS
 
@@ -46,49 +45,3 @@ class FitOptions:
                 "use intervals = 'laplace', or the loss 'linear'."
             )
         check_level(self.level)
-
-
-@dataclass(frozen=True)
-@limited
-class TrackOptions:
-    """Scale, frame rate and identity of a track; a value that cannot be is a :class:`UsageError`."""
-
-    metres_per_pixel: Positive | None = None
-    """Length of a pixel (or of the unit of the file) in m."""
-    frame_rate: Positive | None = None
-    """Frames per second of the video (Hz)."""
-    track: str | None = None
-    """Which whisker of the file: a label of whisk, a number of WhiskerMan (from 1), or an individual of DeepLabCut."""
-    layout: Literal["auto", "deeplabcut", "points", "whisk", "whiskerman"] = "auto"
-    """Kind of table: auto, deeplabcut, points, whisk or whiskerman."""
-    zero_frame: int = 0
-    """Frame at which time is 0: the start of the scene, or the release of a plucked whisker."""
-    identities: str | None = None
-    """Table of whisk's measurements (CSV) that says which trace is which whisker and where its follicle is."""
-    parts: tuple[str, ...] = ()
-    """Body parts of DeepLabCut from the base to the tip; in the order of the file when empty."""
-    least_likelihood: Share = 0.6
-    """Likelihood of DeepLabCut from which a point is used."""
-    points: Annotated[int, Limit(least=2)] = 30
-    """Most points of a frame that are kept of whisk's traces."""
-    rows_down: bool = True
-    """True for image coordinates, whose y runs down; it is turned, so that left stays left."""
-
-    def __post_init__(self) -> None:
-        for name, what in (
-            ("metres_per_pixel", "the scale: metres per pixel (5e-5 for 50 µm)"),
-            ("frame_rate", "the frames per second of the video"),
-        ):
-            value = getattr(self, name)
-            if value is None:
-                raise UsageError(f"A track holds pixels and frame numbers; give {what} as {name}.")
-        if not 1e-8 <= float(self.metres_per_pixel or math.nan) <= 1e-2:
-            raise UsageError(
-                f"metres_per_pixel is {self.metres_per_pixel:g} m; a pixel of a whisker video is between 1e-8 and "
-                "1e-2 m (50 µm = 5e-5)."
-            )
-        if not 10 <= float(self.frame_rate or math.nan) <= 1e6:
-            raise UsageError(
-                f"frame_rate is {self.frame_rate:g} Hz; videos of whiskers have 10 to 1e6 frames per second: give "
-                "frames per second, not the time of a frame."
-            )

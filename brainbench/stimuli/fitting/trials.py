@@ -19,8 +19,8 @@ from brainbench.core.reading.ranges import check_number
 from brainbench.core.rotations import Vector
 from brainbench.stimuli.fitting.curves import normal_offsets
 from brainbench.stimuli.fitting.parameters import Condition
-from brainbench.stimuli.fitting.tracks.contract import AXES, check_length
 from brainbench.stimuli.motion.jobs import Job, Load, StillFollicle, Trace
+from brainbench.stimuli.tracks.contract import AXES, check_length
 from brainbench.stimuli.validation import references
 from brainbench.stimuli.whiskers.chain import build_chain
 from brainbench.stimuli.whiskers.whisker import Whisker
@@ -87,7 +87,7 @@ class Trial:
     job: Job
     """Whisker, motion of its base, objects; it is read at the times of the measurement."""
     measured: xr.Dataset
-    """``wrench`` [time, channel] or ``shape`` [time, point, axis], see :mod:`brainbench.stimuli.fitting.tracks`."""
+    """``wrench`` [time, channel] or ``shape`` [time, point, axis], see :mod:`brainbench.stimuli.tracks`."""
     pluck: Pluck | None = None
 
     def __post_init__(self) -> None:

@@ -30,8 +30,7 @@ from brainbench.core.limits import Limit, Positive, limited
 from brainbench.core.reading.ranges import check_numbers
 from brainbench.core.reading.tables import read_numbers
 from brainbench.core.rotations import TURN, Vector, base_rotation
-from brainbench.stimuli.motion.hinge_angles import follow_angles
-from brainbench.stimuli.motion.trajectories import ROTATIONS, Rotations
+from brainbench.stimuli.motion.trajectories import ROTATIONS, Rotations, follow_angles
 from brainbench.stimuli.whiskers.array import MountedWhisker
 
 _LOG = logging.getLogger(__name__)

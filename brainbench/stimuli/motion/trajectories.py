@@ -1,4 +1,7 @@
-"""Motions of whiskers, heads and objects: whisking, translation, spin, keyframes, rest. In rad, m and s."""
+"""Motions of whiskers, heads and objects, and the hinge angles that they give a follicle. In rad, m and s.
+
+Letters: n time.
+"""
 
 from __future__ import annotations
 
@@ -8,13 +11,64 @@ from dataclasses import dataclass, field
 from typing import Annotated, Any, ClassVar, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.errors import UsageError
 from brainbench.core.limits import Limit, limited
 from brainbench.core.rotations import Vector, base_rotation
-from brainbench.stimuli.motion.hinge_angles import follow_angles
 from brainbench.stimuli.whiskers.array import MountedWhisker
+
+STEEPEST = math.radians(87)
+"""Elevation up to which a follicle is driven by its Euler angles."""
+_RATE = 1000.0
+"""Instants per second at which angles are followed from the start; between two of them nothing turns by 180°."""
+
+
+def principal_angles(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return (θ, φ, ζ) [..., 3] (rad) of base frames [..., 3, 3], the inverse of ``base_rotation``.
+
+    φ lies within ±90°, θ − 90° and ζ + 90° within ±180°.
+    """
+    # Rz(θ − 90°) Ry(−φ) Rx(ζ + 90°) has the first column (cos φ cos θ′, cos φ sin θ′, sin φ) and the last row (sin φ,
+    # cos φ sin ζ′, cos φ cos ζ′), with θ′ = θ − 90° and ζ′ = ζ + 90°.
+    theta = np.arctan2(rotation[..., 1, 0], rotation[..., 0, 0]) + np.pi / 2
+    phi = np.arcsin(np.clip(rotation[..., 2, 0], -1.0, 1.0))
+    zeta = np.arctan2(rotation[..., 2, 1], rotation[..., 2, 2]) - np.pi / 2
+    return np.stack([theta, phi, zeta], axis=-1)
+
+
+def follow_angles(
+    rotation: Callable[[NDArray[np.float64]], NDArray[np.float64]],
+    times: NDArray[np.float64],
+    first: ArrayLike,
+    name: str,
+) -> NDArray[np.float64]:
+    """Return the angles (θ, φ, ζ) [n, 3] (rad) of a moving base frame at ``times`` [n] (s), without jumps by turns.
+
+    ``rotation`` gives base frames [m, 3, 3] at times [m]; ``first`` are the angles at t = 0, which tell the turn to
+    start in. Times may have any order: the angles do not depend on which others are asked for.
+    """
+    times = np.asarray(times, dtype=float)
+    grid = np.arange(math.floor(max(times.max(initial=0.0), 0.0) * _RATE) + 2) / _RATE
+    # The last instant may lie beyond what is known of the motion.
+    grid = np.minimum(grid, max(times.max(initial=0.0), 0.0))
+    coarse, fine = principal_angles(rotation(grid)), principal_angles(rotation(times))
+    for angles, when in ((coarse, grid), (fine, times)):
+        steep = np.abs(angles[:, 1]) > STEEPEST
+        if steep.any():
+            raise UsageError(
+                f"The whisker {name} points along the vertical axis of its array (elevation "
+                f"{math.degrees(angles[steep][0, 1]):.0f}°) at {when[steep][0]:.4g} s; the follicle is driven by "
+                f"azimuth, elevation and torsion, which lose their meaning beyond "
+                f"{math.degrees(STEEPEST):.0f}° (gimbal lock). Leave this whisker out, or let it move less."
+            )
+    # The number of whole turns follows from the way since t = 0; the even grid makes it independent of ``times``.
+    track = np.unwrap(coarse, axis=0)
+    track += 2 * np.pi * np.round((np.asarray(first, dtype=float) - track[0]) / (2 * np.pi))
+    # Exact principal angles, each with the whole turns that bring it nearest to the followed ones.
+    expected = np.stack([np.interp(times, grid, track[:, axis]) for axis in range(3)], axis=1)
+    return fine + 2 * np.pi * np.round((expected - fine) / (2 * np.pi))
+
 
 _Onset = Annotated[float, Limit(least=0, unit="s")]
 _Excursion = Annotated[float, Limit(least=-math.pi / 2, most=math.pi / 2, unit="rad")]
@@ -269,6 +323,8 @@ class ArrayFollicle:
     """Rotation of the head [n, 3, 3] about the origin of the array at times [n]; None when it does not turn."""
     finest: float | None = None
     """Shortest period of anything in all of these (s); None when unknown."""
+    shift: Callable[[NDArray[np.float64]], NDArray[np.float64]] | None = None
+    """Displacement of the base in the array [n, 3] (m) at times [n]; None when it stays."""
 
     def pose(self, times: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return positions [n, 3] (m) and Euler angles (θ, φ, ζ) [n, 3] (rad).
@@ -276,13 +332,14 @@ class ArrayFollicle:
         A head that turns a whisker upright, where these angles lose their meaning, is a :class:`UsageError`.
         """
         times = np.asarray(times, dtype=float)
-        position = np.tile(np.array(self.mount.position), (len(times), 1))
+        place = np.array(self.mount.position) + (0.0 if self.shift is None else self.shift(times))
+        position = np.broadcast_to(place, (len(times), 3))
         angles = self.whisking.angles(self.mount, times)
         if self.turn is not None:
             turn, whisking = self.turn, self.whisking
             # The head carries the base point and the frame in which the whisker whisks; only hinge angles drive a
             # follicle, so the product of both rotations is taken apart again.
-            position = turn(times) @ np.array(self.mount.position)
+            position = turn(times) @ place if self.shift is None else np.einsum("nij,nj->ni", turn(times), place)
             first = whisking.angles(self.mount, np.zeros(1))[0]
             angles = follow_angles(
                 lambda t: turn(t) @ base_rotation(whisking.angles(self.mount, t)), times, first, self.mount.name

@@ -110,7 +110,7 @@ def describe_recipe(name: str) -> str:
 
 def _rodgers_recorded(file: str, trajectory: Trajectory | None, species: str, whiskers: str) -> Recipe:
     from brainbench.stimuli.motion.recorded import Recorded, load_trajectory
-    from brainbench.stimuli.objects.placed_object import PlacedObject
+    from brainbench.stimuli.objects.solid import PlacedObject
     from brainbench.stimuli.scenes.scene import Head, Scene
     from brainbench.stimuli.scenes.scene_files import Recipe
     from brainbench.stimuli.whiskers.array import WhiskerArray

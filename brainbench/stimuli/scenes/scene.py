@@ -6,7 +6,9 @@ the mean base point, x right, y rostral, z dorsal), placed in the world by :clas
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -17,11 +19,14 @@ from brainbench.core.limits import limited
 from brainbench.core.rotations import Angles, Point, base_rotation, euler_matrix
 from brainbench.stimuli.motion.jobs import Acceleration, Job
 from brainbench.stimuli.motion.recorded import Recorded
+from brainbench.stimuli.motion.tracked import Tracked
 from brainbench.stimuli.motion.trajectories import ArrayFollicle, Path, Still, Translation, Whisking
-from brainbench.stimuli.objects.placed_object import PlacedObject
+from brainbench.stimuli.objects.solid import PlacedObject
 from brainbench.stimuli.scenes.frames import Frames
-from brainbench.stimuli.whiskers.array import MountedWhisker, WhiskerArray
-from brainbench.stimuli.whiskers.selection import match_whiskers
+from brainbench.stimuli.whiskers.array import MountedWhisker, WhiskerArray, match_whiskers
+
+WhiskerMotion = Still | Whisking | Recorded | Tracked
+"""Motion of whiskers relative to the head."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +57,7 @@ class Animal:
     name: str
     """Prefix of its whiskers' names: ``b:C2``."""
     array: WhiskerArray
-    whisking: Still | Whisking | Recorded = field(default_factory=Whisking)
+    whisking: WhiskerMotion = field(default_factory=Whisking)
     head: Head = field(default_factory=Head)
 
 
@@ -64,7 +69,7 @@ class Scene:
     label: str
     array: WhiskerArray
     objects: tuple[PlacedObject, ...] = ()
-    whisking: Still | Whisking | Recorded = field(default_factory=Whisking)
+    whisking: WhiskerMotion = field(default_factory=Whisking)
     head: Head = field(default_factory=Head)
     frames: Frames = field(default_factory=Frames)
     others: tuple[Animal, ...] = ()
@@ -157,13 +162,19 @@ class Scene:
         return [
             Job(
                 mount.whisker,
-                ArrayFollicle(mount, self.whisking, travel, turn, finest),
+                ArrayFollicle(mount, self.whisking, travel, turn, finest, self._shift(mount)),
                 obstacles,
                 self.frames.readings,
                 gravity=(x, y, z),
             )
             for mount in self.array
         ]
+
+    def _shift(self, mount: MountedWhisker) -> Callable[[NDArray[np.float64]], NDArray[np.float64]] | None:
+        """Return how a base moves in its array; None where it stays."""
+        whisking = self.whisking
+        moves = isinstance(whisking, Tracked) and whisking.shifts is not None
+        return partial(whisking.displacement, mount) if moves else None
 
     def orientations(self) -> NDArray[np.float64]:
         """Return rotations [time, whisker, 3, 3] from each whisker's base frame to the world at the frame times."""

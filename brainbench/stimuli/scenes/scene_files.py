@@ -23,6 +23,7 @@
     onset_ms = 50
     rotations = "knutsen"
     # recorded: path = "whisking.csv", rate_hz = 1000, layout = "rat-60", start_deg = -10, initial_path = "angles.csv"
+    # track: path = "tracks/{trial}.csv", whiskers = { C2 = "0" }, frame_rate_hz = 500, mm_per_pixel = 0.05; see below
 
     [frames]
     first_ms = 1
@@ -46,6 +47,14 @@
     friction = 0.3               # optional
     velocity_mm_s = [0, -30, 0]  # optional; or spin_deg_s = [0, 0, 90] about its position; or keyframes as for the head
 
+``kind = "track"`` plays what a video showed (:mod:`brainbench.stimuli.motion.tracked`): ``whiskers`` names the whiskers
+of the array that were tracked, each with its label in the file (empty where the file holds one). ``layout``,
+``zero_frame``, ``parts``, ``least_likelihood`` and ``identities_path`` are those of ``stimuli fit``, ``rest_deg``,
+``view``, ``rostral_deg``, ``longest_gap_ms`` and ``lowpass_hz`` those of
+:class:`~brainbench.stimuli.motion.tracked.PlayOptions`; ``lowpass_hz = 0`` filters nothing. A file of ``layout =
+"angles"`` is a table of angles. A scene whose label holds ``{trial}`` stands for as many scenes as there are files at
+``path``, where ``{trial}`` is any text; it may also stand in other texts of the scene.
+
 ``[[object]]`` at the top level stands in every scene. Other shapes: ``sphere`` (``radius_mm``), ``box``
 (``size_mm``), ``capsule`` (``radius_mm``, ``length_mm``), ``rodgers`` (``diagonal_mm``, ``segments``) and
 ``mesh`` (``path`` relative to the file, ``unit``, ``diagonal_mm``, ``collision`` = "hull" | "exact" | "pieces" |
@@ -56,9 +65,10 @@ names: ``brainbench stimuli objects``). A decomposition takes ``method`` = "coac
 
 from __future__ import annotations
 
+import glob
 import math
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
@@ -73,15 +83,24 @@ from brainbench.core.rotations import Vector
 from brainbench.geometry import DecompositionSettings
 from brainbench.stimuli.motion import trajectories
 from brainbench.stimuli.motion.recorded import Recorded, load_initial_angles, load_trajectory
-from brainbench.stimuli.motion.trajectories import ROTATIONS, Spin, Still, Translation, Whisking
+from brainbench.stimuli.motion.tracked import PlayOptions, Tracked, load_angles, load_tracks
+from brainbench.stimuli.motion.trajectories import ROTATIONS, Rotations, Spin, Still, Translation, Whisking
 from brainbench.stimuli.objects import procedural
-from brainbench.stimuli.objects.mesh_solids import mesh_solid, shape_solid
-from brainbench.stimuli.objects.placed_object import PlacedObject
-from brainbench.stimuli.objects.primitives import box, capsule, cylinder, rodgers_solid, sphere
-from brainbench.stimuli.objects.solid import Solid
+from brainbench.stimuli.objects.solid import (
+    PlacedObject,
+    Solid,
+    box,
+    capsule,
+    cylinder,
+    mesh_solid,
+    rodgers_solid,
+    shape_solid,
+    sphere,
+)
 from brainbench.stimuli.scenes.frames import Frames
-from brainbench.stimuli.scenes.scene import Animal, Head, Scene
+from brainbench.stimuli.scenes.scene import Animal, Head, Scene, WhiskerMotion
 from brainbench.stimuli.sweeps.sweep_scenes import SweepScenes
+from brainbench.stimuli.tracks.readers import TrackOptions
 from brainbench.stimuli.whiskers.array import WhiskerArray
 
 MILLI = 1e-3
@@ -92,6 +111,7 @@ _UNITS = {
 }  # fmt: skip
 """Ends of keys → what their numbers are multiplied by to be in SI units."""
 _FAMILY = "family:"
+_TRIAL = "{trial}"
 
 
 class Table(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
@@ -156,6 +176,23 @@ class _Recorded(_Whisking, kw_only=True):
     start_deg: float | None = None
 
 
+class _Track(_Whisking, kw_only=True):
+    path: str
+    whiskers: dict[str, str] = {}
+    frame_rate_hz: float | None = None
+    mm_per_pixel: float | None = None
+    layout: str | None = None
+    zero_frame: int | None = None
+    parts: list[str] | None = None
+    least_likelihood: float | None = None
+    identities_path: str | None = None
+    rest_deg: float | None = None
+    view: str | None = None
+    rostral_deg: float | None = None
+    longest_gap_ms: float | None = None
+    lowpass_hz: float | None = None
+
+
 class _Frames(Table):
     first_ms: float | None = None
     interval_ms: float | None = None
@@ -203,7 +240,9 @@ class _File(Table):
     scene: list[dict[str, Any]] = []
 
 
-_WHISKINGS: dict[str, type[_Whisking]] = {"sinusoid": _Whisking, "still": _Whisking, "recorded": _Recorded}
+_WHISKINGS: dict[str, type[_Whisking]] = {
+    "sinusoid": _Whisking, "still": _Whisking, "recorded": _Recorded, "track": _Track,
+}  # fmt: skip
 _PRIMITIVES: dict[str, tuple[Callable[..., Solid], list[Any]]] = {
     "sphere": (sphere, [("radius_mm", float)]),
     "box": (box, [("size_mm", Vector)]),
@@ -286,17 +325,17 @@ def _recipe(path: Path, data: dict[str, Any], whiskers: str) -> Recipe:
     file = read_table(_File, data, "the scene file")
     array = _array(file.array)
     others = tuple(_animal(read_table(_Animal, animal, "[[animal]]"), path.parent) for animal in file.animal)
+    side = array.mounts[0].full_name[0]
     if not file.scene:
         raise UsageError("the file has no [[scene]].")
     scenes = []
-    for entry in file.scene:
-        table = read_table(_Scene, entry, "[[scene]]")
+    for table in _trials(file, path.parent):
         name = f"[[object]] of scene {table.label!r}"
         scene = Scene(
             label=table.label,
             array=array,
             objects=tuple(_object(entry, name, path.parent) for entry in (*file.object, *table.object)),
-            whisking=_whisking({**file.whisking, **table.whisking}, path.parent),
+            whisking=_whisking(table.whisking, path.parent, side),
             head=_head({**file.head, **table.head}),
             frames=_frames(file.frames),
             others=others,
@@ -310,7 +349,36 @@ def _recipe(path: Path, data: dict[str, Any], whiskers: str) -> Recipe:
 
 
 def _animal(table: _Animal, folder: Path) -> Animal:
-    return Animal(table.name, _array(table.array), _whisking(table.whisking, folder), _head(table.head))
+    array = _array(table.array)
+    whisking = _whisking(table.whisking, folder, array.mounts[0].full_name[0])
+    return Animal(table.name, array, whisking, _head(table.head))
+
+
+def _trials(file: _File, folder: Path) -> Iterator[_Scene]:
+    """Yield the scenes of a file with their whisking, one for each trial where a label asks for trials."""
+    for entry in file.scene:
+        table = read_table(_Scene, entry, "[[scene]]")
+        whisking = {**file.whisking, **table.whisking}
+        where = str(whisking.get("path", ""))
+        if _TRIAL not in table.label:
+            yield msgspec.structs.replace(table, whisking=whisking)
+            continue
+        if whisking.get("kind") != "track" or where.count(_TRIAL) != 1:
+            raise UsageError(
+                f"the label {table.label!r} asks for trials; they are the files of tracked whisking, whose path holds "
+                f"{_TRIAL} once, as in tracks/{_TRIAL}.csv: received {brief(where)}."
+            )
+        before, after = where.split(_TRIAL)
+        files = sorted(folder.glob(f"{glob.escape(before)}*{glob.escape(after)}"))
+        if not files:
+            raise UsageError(f"there is no file {where!r} in {brief(os.fspath(folder))}, whatever {_TRIAL} is.")
+        for track in files:
+            trial = track.relative_to(folder).as_posix().removeprefix(before).removesuffix(after)
+            # The keys of a trial may name its own files, so that every text of the scene is filled in.
+            data = msgspec.json.encode({**entry, "whisking": whisking}).replace(
+                _TRIAL.encode(), msgspec.json.encode(trial)[1:-1]
+            )
+            yield read_table(_Scene, msgspec.json.decode(data), "[[scene]]")
 
 
 def _array(data: Mapping[str, Any]) -> WhiskerArray:
@@ -331,8 +399,8 @@ def _frames(data: Mapping[str, Any]) -> Frames:
     return Frames(**given)
 
 
-def _whisking(data: Mapping[str, Any], folder: Path) -> Still | Whisking | Recorded:
-    """Return what ``[whisking]`` says; paths are relative to ``folder``."""
+def _whisking(data: Mapping[str, Any], folder: Path, side: str) -> WhiskerMotion:
+    """Return what ``[whisking]`` says; paths are relative to ``folder``, names without a side are of ``side``."""
     kind = str(data.get("kind", "sinusoid"))
     check_name("kind of whisking", kind, _WHISKINGS)
     table = read_table(_WHISKINGS[kind], data, "[whisking]")
@@ -341,11 +409,34 @@ def _whisking(data: Mapping[str, Any], folder: Path) -> Still | Whisking | Recor
         check_name("set of rotations", table.rotations, ROTATIONS)
         given["rotations"] = ROTATIONS[table.rotations]
     whisking = Whisking(**given)
+    if isinstance(table, _Track):
+        return _tracked(table, folder, side, whisking.rotations)
     if not isinstance(table, _Recorded):
         return whisking if kind == "sinusoid" else Still()
     angles = table.initial_path and load_initial_angles(folder / table.initial_path, layout=table.layout)
     played = load_trajectory(folder / table.path, layout=table.layout, **table.si(rate="rate_hz"))
     return Recorded(played, rotations=whisking.rotations, initial=angles or {}, **table.si("start_deg"))
+
+
+def _tracked(table: _Track, folder: Path, side: str, rotations: Rotations) -> Tracked:
+    given: dict[str, Any] = {name: getattr(table, name) for name in ("rest_deg", "rostral_deg")}
+    given |= table.si("view", "longest_gap_ms", "lowpass_hz")
+    if given.get("lowpass") == 0:
+        given["lowpass"] = None
+    options = PlayOptions(**given)
+    if table.layout == "angles":
+        return load_angles(folder / table.path, options, rotations=rotations)
+    if table.mm_per_pixel is None and table.rostral_deg is not None:
+        raise UsageError("[whisking] needs the key 'mm_per_pixel' beside 'rostral_deg': bases move by lengths.")
+    track = TrackOptions(
+        # Directions have no scale; without displacements any will do.
+        metres_per_pixel=MILLI * (table.mm_per_pixel or 0.1),
+        identities=table.identities_path and os.fspath(folder / table.identities_path),
+        parts=tuple(table.parts or ()),
+        **table.si("layout", "zero_frame", "least_likelihood", frame_rate="frame_rate_hz"),
+    )
+    whiskers = {name if name[:1] in ("L", "R") else side + name: label for name, label in table.whiskers.items()}
+    return load_tracks(folder / table.path, whiskers, track, options, rotations=rotations)
 
 
 def _head(data: Mapping[str, Any]) -> Head:

@@ -22,8 +22,7 @@ from brainbench.core.limits import Count, Limit, Positive, Seed, check_value, li
 from brainbench.core.rotations import Angle, euler_matrix
 from brainbench.stimuli.motion.trajectories import Still, Translation
 from brainbench.stimuli.objects.obstacle import Obstacle
-from brainbench.stimuli.objects.placed_object import PlacedObject
-from brainbench.stimuli.objects.solid import Solid
+from brainbench.stimuli.objects.solid import PlacedObject, Solid
 from brainbench.stimuli.scenes.frames import Frames
 from brainbench.stimuli.scenes.scene import Head, Scene
 from brainbench.stimuli.whiskers.array import WhiskerArray

@@ -14,8 +14,7 @@ from brainbench.core.rotations import base_rotation, euler_matrix
 from brainbench.stimuli.motion.jobs import Job, Trace
 from brainbench.stimuli.motion.trajectories import ArrayFollicle, Whisking
 from brainbench.stimuli.objects.obstacle import Obstacle
-from brainbench.stimuli.objects.primitives import box, capsule, rodgers_solid, sphere
-from brainbench.stimuli.objects.solid import Solid
+from brainbench.stimuli.objects.solid import Solid, box, capsule, rodgers_solid, sphere
 from brainbench.stimuli.whiskers.array import SPECIES, MountedWhisker, WhiskerArray
 
 OBJECTS = ("post", "ball", "edge", "hollow")

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from brainbench.cli.tactile import figures
-from brainbench.stimuli.figures.rays import Triangles
+from brainbench.stimuli.figures.surfaces import Triangles
 
 
 def test_triangles_of_a_link_are_carried_with_it():

@@ -16,7 +16,7 @@ from brainbench.scoring.recovery import RecoveryDesign, design_for_networks
 from brainbench.scoring.recovery.motion import _Evaluator, _judge, _Network
 from brainbench.stimuli import PlacedObject, Scene, WhiskerArray, Whisking, simulate, to_grid
 from brainbench.stimuli.fitting.design import DesignOptions
-from brainbench.stimuli.objects.primitives import cylinder
+from brainbench.stimuli.objects.solid import cylinder
 from brainbench.stimuli.scenes.frames import Frames
 
 pytest.importorskip("warp")

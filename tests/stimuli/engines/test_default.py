@@ -11,7 +11,7 @@ from brainbench.stimuli.engines import fidelity, get_engine, list_engines
 from brainbench.stimuli.engines.fidelity import DEFAULT_ENGINE
 from brainbench.stimuli.figures import scenes
 from brainbench.stimuli.sweeps.plan import GenerationSettings
-from brainbench.stimuli.sweeps.simulation import simulate_sweeps
+from brainbench.stimuli.sweeps.shards import simulate_sweeps
 from brainbench.stimuli.validation import bench_tests
 from tests.factories import out_of_plane
 

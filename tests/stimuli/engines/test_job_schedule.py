@@ -8,8 +8,7 @@ from brainbench.stimuli import WhiskerArray
 from brainbench.stimuli.engines.job_schedule import plan
 from brainbench.stimuli.motion.trajectories import Whisking
 from brainbench.stimuli.objects.obstacle import Sphere
-from brainbench.stimuli.objects.placed_object import PlacedObject
-from brainbench.stimuli.objects.solid import Solid
+from brainbench.stimuli.objects.solid import PlacedObject, Solid
 from brainbench.stimuli.scenes.scene import Scene
 
 

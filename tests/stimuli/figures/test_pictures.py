@@ -7,12 +7,10 @@ import pytest
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.figures import scenes as module
 from brainbench.stimuli.figures.camera import Camera
-from brainbench.stimuli.figures.canvas import Style
-from brainbench.stimuli.figures.pictures import Picture
+from brainbench.stimuli.figures.pictures import Picture, Style
 from brainbench.stimuli.figures.scenes import render
 from brainbench.stimuli.motion.trajectories import Still
-from brainbench.stimuli.objects.placed_object import PlacedObject
-from brainbench.stimuli.objects.primitives import cylinder
+from brainbench.stimuli.objects.solid import PlacedObject, cylinder
 from brainbench.stimuli.scenes.scene import Frames, Scene
 from brainbench.stimuli.whisker_shapes import Recording, record
 from brainbench.stimuli.whiskers.array import WhiskerArray

@@ -8,12 +8,10 @@ import pytest
 from brainbench.core.errors import MissingDependencyError, UsageError
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.figures.camera import Camera
-from brainbench.stimuli.figures.canvas import Style
-from brainbench.stimuli.figures.pictures import Picture
+from brainbench.stimuli.figures.pictures import Picture, Style
 from brainbench.stimuli.figures.scenes import film_times, render, still_time
 from brainbench.stimuli.motion.trajectories import Still, Translation, Whisking
-from brainbench.stimuli.objects.placed_object import PlacedObject
-from brainbench.stimuli.objects.primitives import box, cylinder
+from brainbench.stimuli.objects.solid import PlacedObject, box, cylinder
 from brainbench.stimuli.scenes.recipes import get_recipe
 from brainbench.stimuli.scenes.scene import Frames, Scene
 from brainbench.stimuli.whisker_shapes import record

@@ -10,7 +10,7 @@ import pytest
 from brainbench.core.errors import UsageError
 from brainbench.stimuli import PlacedObject, Scene, WhiskerArray, Whisking
 from brainbench.stimuli.fitting.design import DesignOptions, _Evaluator, _soft_least, design
-from brainbench.stimuli.objects.primitives import cylinder
+from brainbench.stimuli.objects.solid import cylinder
 
 QUICK = DesignOptions(iterations=2, starts=2, check="fast")
 

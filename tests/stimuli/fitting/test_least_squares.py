@@ -186,7 +186,7 @@ def test_two_trials_are_more_certain_than_one(rung, pulled):
 def _pole():
     """Return a scene of a whisker that whisks against a pole, and the trial of it that is still to be simulated."""
     from brainbench.stimuli import Frames, PlacedObject, Scene, Whisking
-    from brainbench.stimuli.objects.primitives import cylinder
+    from brainbench.stimuli.objects.solid import cylinder
 
     array = WhiskerArray.of("mouse", whiskers="C2")
     pole = PlacedObject(cylinder(0.0005, 0.02), position=(0.0115, -0.0005, 0.003))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import pytest
 
 from brainbench.stimuli.fitting.result import directions, unknown_parameters
 
@@ -35,3 +36,16 @@ def test_the_summary_is_plain(traced):
     assert data["status"] == "undefined"
     assert data["directions"][0]["deviation"] is None or data["directions"][0]["deviation"] > 1
     assert data["provenance"]["simulated_whiskers"] > 5
+
+
+@pytest.mark.parametrize("kind", ["pulled", "traced"])
+def test_a_fit_is_drawn(request, tmp_path, kind):
+    from PIL import Image
+
+    from brainbench.stimuli.fitting.result import draw_fit
+
+    path = draw_fit(*request.getfixturevalue(kind), tmp_path / "fit.png")
+    pixels = np.asarray(Image.open(path).convert("RGB")).reshape(-1, 3)
+    # The colour of the first series is on it, and most of it is white.
+    assert (np.abs(pixels.astype(int) - [0, 114, 178]).sum(axis=1) < 40).sum() > 50
+    assert 0.5 < np.mean(pixels.min(axis=1) > 250) < 0.99

@@ -9,8 +9,7 @@ from brainbench.core.errors import UsageError
 from brainbench.core.rotations import base_rotation, euler_matrix
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.motion.trajectories import Path, Still, Translation, Whisking
-from brainbench.stimuli.objects.placed_object import PlacedObject
-from brainbench.stimuli.objects.primitives import sphere
+from brainbench.stimuli.objects.solid import PlacedObject, sphere
 from brainbench.stimuli.scenes.scene import Animal, Frames, Head, Scene
 from brainbench.stimuli.simulation import simulate
 from brainbench.stimuli.sources import load_stimuli

@@ -7,9 +7,8 @@ from scipy.spatial.transform import Rotation
 from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError
 from brainbench.core.rotations import base_rotation
 from brainbench.stimuli.engines.fidelity import Fidelity
-from brainbench.stimuli.motion.hinge_angles import follow_angles
 from brainbench.stimuli.motion.recorded import LAYOUTS, Recorded, Trajectory, load_initial_angles, load_trajectory
-from brainbench.stimuli.motion.trajectories import Whisking
+from brainbench.stimuli.motion.trajectories import Whisking, follow_angles
 from brainbench.stimuli.scenes.recipes import describe_recipe, get_recipe, is_recipe
 from brainbench.stimuli.scenes.scene import Frames, Scene
 from brainbench.stimuli.scenes.scene_files import load_scene

@@ -13,8 +13,7 @@ from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.protocol import WhiskerEngine
 from brainbench.stimuli.motion.jobs import Trace
 from brainbench.stimuli.motion.trajectories import ArrayFollicle, Path, Still, Whisking
-from brainbench.stimuli.objects.placed_object import PlacedObject
-from brainbench.stimuli.objects.primitives import sphere
+from brainbench.stimuli.objects.solid import PlacedObject, sphere
 from brainbench.stimuli.scenes.frames import Frames, clip_wrenches, low_pass
 from brainbench.stimuli.scenes.scene import Head, Scene
 from brainbench.stimuli.simulation import simulate

@@ -6,7 +6,7 @@ import pytest
 from brainbench.core.errors import UsageError
 from brainbench.core.rotations import base_rotation, euler_matrix
 from brainbench.stimuli.motion.recorded import Trajectory
-from brainbench.stimuli.objects.primitives import box, rodgers_solid
+from brainbench.stimuli.objects.solid import box, rodgers_solid
 from brainbench.stimuli.scenes.recipes import describe_recipe, get_recipe, list_recipes
 from brainbench.stimuli.sweeps.sweep_scenes import GRIDS
 

@@ -5,8 +5,7 @@ from brainbench.core.errors import UsageError
 from brainbench.core.rotations import euler_matrix
 from brainbench.stimuli.motion.recorded import Recorded, Trajectory
 from brainbench.stimuli.motion.trajectories import Still, Translation
-from brainbench.stimuli.objects.placed_object import PlacedObject
-from brainbench.stimuli.objects.primitives import sphere
+from brainbench.stimuli.objects.solid import PlacedObject, sphere
 from brainbench.stimuli.scenes.scene import Frames, Head, Scene
 from brainbench.stimuli.sweeps.grid import Span, SweepGrid
 from brainbench.stimuli.whiskers.array import WhiskerArray

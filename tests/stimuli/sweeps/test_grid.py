@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from brainbench.core.errors import UsageError
 from brainbench.stimuli.motion.trajectories import Translation
-from brainbench.stimuli.objects.primitives import box, capsule, cylinder, rodgers_solid, sphere
+from brainbench.stimuli.objects.solid import box, capsule, cylinder, rodgers_solid, sphere
 from brainbench.stimuli.scenes.scene import Head
 from brainbench.stimuli.sweeps.grid import Span, SweepGrid
 from brainbench.stimuli.sweeps.sweep_scenes import GRIDS

@@ -7,7 +7,7 @@ from brainbench.core.errors import UsageError
 from brainbench.core.rotations import base_rotation
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.motion.trajectories import Still, Translation
-from brainbench.stimuli.objects.primitives import box, capsule, cylinder, rodgers_solid, sphere
+from brainbench.stimuli.objects.solid import box, capsule, cylinder, rodgers_solid, sphere
 from brainbench.stimuli.scenes.recipes import describe_recipe, get_recipe
 from brainbench.stimuli.scenes.scene import Frames
 from brainbench.stimuli.simulation import simulate

@@ -124,7 +124,7 @@ class RecordingSolver(WhiskerSolver):
 
     @property
     def packed_shapes(self) -> dict[str, tuple[int, ...]]:
-        """Shapes of the packed arrays that changes are of, see ``kernels.adjoint.tangent.PackedTangents``."""
+        """Shapes of the packed arrays that changes are of, see ``kernels.tangent.PackedTangents``."""
         scene = self.scene
         loads, solids = int(scene.jobs.load_force.shape[0]), int(scene.shapes.kind.shape[0])
         return {

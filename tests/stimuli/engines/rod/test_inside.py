@@ -12,11 +12,11 @@ from brainbench.stimuli.engines import get_engine
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.rod.engine import RodEngine
 from brainbench.stimuli.motion.jobs import Job, StillFollicle
-from brainbench.stimuli.objects.mesh_solids import shape_solid
 from brainbench.stimuli.objects.obstacle import Box, Capsule, ConvexPart, Cylinder, Obstacle, Sphere
 from brainbench.stimuli.objects.procedural import make
+from brainbench.stimuli.objects.solid import shape_solid
 from brainbench.stimuli.sweeps.grid import SweepGrid
-from brainbench.stimuli.sweeps.simulation import simulate_sweeps
+from brainbench.stimuli.sweeps.shards import simulate_sweeps
 from brainbench.stimuli.sweeps.sweep_scenes import SweepScenes
 from tests.factories.whiskers import C2
 

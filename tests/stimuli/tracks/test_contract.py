@@ -7,7 +7,7 @@ import pytest
 
 from brainbench.core.errors import DataError
 from brainbench.stimuli.fitting import new_shapes
-from brainbench.stimuli.fitting.tracks.contract import check_length, check_track, inspect_track
+from brainbench.stimuli.tracks.contract import check_length, check_track, inspect_track
 from tests.factories.whisker_tracks import bent_shapes
 
 SHAPES = bent_shapes(frames=40)

@@ -15,7 +15,7 @@ from brainbench.core.contracts import CHANNELS
 from brainbench.core.errors import DataError, UsageError, brief, choose_name, listing
 from brainbench.core.reading.hdf5 import open_hdf5
 from brainbench.core.reading.tables import read_columns
-from brainbench.stimuli.fitting.tracks.contract import new_wrenches
+from brainbench.stimuli.tracks.contract import new_wrenches
 
 if TYPE_CHECKING:
     import xarray as xr
