@@ -31,14 +31,25 @@ def test_the_recordings_page_writes_a_file_that_can_be_scored(tmp_path: Path, mo
     assert dataset.sizes["unit"] == 20
 
 
-def test_the_scene_file_of_the_stimuli_page_is_valid(tmp_path: Path):
-    from brainbench.stimuli import load_scene
+def test_the_scene_files_of_the_stimuli_page_are_valid(tmp_path: Path):
+    import numpy as np
 
-    (block,) = _blocks("docs/stimuli.md", "toml")
-    path = tmp_path / "pole.toml"
-    path.write_text(block)
-    recipe = load_scene(path)
-    assert [scene.label for scene in recipe.scenes] == ["near", "far"]
+    from brainbench.stimuli import load_scene
+    from tests.factories.whisker_tracks import bent_shapes, write_points
+
+    poles, trials = (tmp_path / name for name in ("pole.toml", "trials.toml"))
+    for path, block in zip((poles, trials), _blocks("docs/stimuli.md", "toml"), strict=True):
+        path.write_text(block)
+    assert [scene.label for scene in load_scene(poles).scenes] == ["near", "far"]
+    (tmp_path / "tracks").mkdir()
+    for trial in ("1", "2"):
+        table = write_points(tmp_path / "tracks" / f"{trial}.csv", bent_shapes(frames=500))
+        head, *rows = table.read_text().splitlines()
+        both = [f"{row},{whisker}" for whisker in (0, 1) for row in rows]
+        table.write_text("\n".join([f"{head},whisker", *both]))
+    scenes = load_scene(trials).scenes
+    assert [scene.label for scene in scenes] == ["1", "2"]
+    assert np.ptp(scenes[0].jobs()[1].follicle.pose(scenes[0].frames.times)[1][:, 0]) == pytest.approx(0.6, abs=0.02)
 
 
 def test_the_data_set_of_the_datasets_page_can_be_made_and_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -170,7 +181,7 @@ def test_what_a_page_prints_is_printed(page: str, tmp_path: Path):
         _blocks(page, "bash")[0],
         re.findall(r"```(?:text)?\n(.*?)```", text.split("prints", 1)[1], re.S),
     )
-    (tmp_path / "poles.toml").write_text("".join(_blocks(page, "toml")))
+    (tmp_path / "poles.toml").write_text("".join(_blocks(page, "toml")[:1]))
     line = next(
         line
         for line in command.splitlines()
