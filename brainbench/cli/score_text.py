@@ -121,7 +121,12 @@ def _notes(record: ResultRecord) -> Iterator[str]:
 
 
 def left_out(recordings: Mapping[str, Any]) -> Iterator[str]:
-    """Yield what was not used of recordings, by their provenance: trials and units by rule, files by reason."""
+    """Yield what was not used of recordings, by their provenance: one line of their balance, or of an older record."""
+    if ledger := recordings.get("ledger"):
+        from brainbench.datasets.ledger import balance_line
+
+        yield from (f"Left out: {line}." for line in (balance_line(ledger),) if line)
+        return
     removed = recordings.get("removed") or {}
     if removals := [f"{rule} ({number:,})" for rule, number in removed.items() if number]:
         yield f"Left out: {'; '.join(removals)}."

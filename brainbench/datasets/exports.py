@@ -6,6 +6,7 @@ times their digits, and what coverage was taken from units that are left out is 
 
 from __future__ import annotations
 
+import logging
 import os
 import re
 from dataclasses import replace
@@ -17,8 +18,16 @@ from numpy.typing import NDArray
 
 from brainbench.core.errors import DataError, UsageError, check_each
 from brainbench.datasets.hdf5 import write_recordings
+from brainbench.datasets.ledger import Ledger
 from brainbench.datasets.nwb import write_nwb
-from brainbench.datasets.reading import Source, each_session, find_recordings, open_file, resolve_selection
+from brainbench.datasets.reading import (
+    Source,
+    each_session,
+    find_recordings,
+    open_file,
+    resolve_selection,
+    suitable_files,
+)
 from brainbench.datasets.sessions import (
     OBSERVED,
     SPIKES,
@@ -29,8 +38,10 @@ from brainbench.datasets.sessions import (
     neurodata_type,
     ragged,
 )
-from brainbench.datasets.trials.counting import LICKS, has_units, lick_times, read_spikes, recorded_span
+from brainbench.datasets.trials.counting import LICKS, has_units, lick_times, no_units, read_spikes, recorded_span
 from brainbench.datasets.trials.selection import EVERYTHING, Selection, Tally, check_values
+
+_LOG = logging.getLogger(__name__)
 
 
 def export(source: Source, target: str | os.PathLike[str], *, select: Selection | str | None = None) -> list[Path]:
@@ -46,19 +57,25 @@ def export(source: Source, target: str | os.PathLike[str], *, select: Selection 
     Returns:
         The files that were written.
     """
-    layout, paths = find_recordings(source)
+    ledger = Ledger()
+    layout, paths = find_recordings(source, ledger)
+    paths = suitable_files(paths, ledger)
     chosen = EVERYTHING if select is None else resolve_selection(select)
     sessions, subjects, tallies = [], set(), []
     for path in paths:
         with open_file(path) as file:
             for session, session_layout in each_session(file, path, layout):
                 subjects.add(session.subject)
-                if has_units(session) and session.subject in (chosen.subjects or subjects):
+                if not has_units(session):
+                    ledger.leave("sessions", no_units(session), lost=True)
+                elif session.subject in (chosen.subjects or subjects):
                     tallies.append(Tally())
                     table = session_layout.conditions.table if session_layout else "trials"
                     sessions.append(subset(session, chosen, table, tallies[-1]))
     check_each("subject", chosen.subjects, sorted(subjects))
     check_values(tallies)
+    for reason in ledger.skipped:
+        _LOG.warning("Not copied: %s", reason)
     if not sessions:
         raise DataError(f"None of the {len(paths)} files of {source} holds units with spike times; nothing to copy.")
     target = Path(target)
@@ -67,9 +84,7 @@ def export(source: Source, target: str | os.PathLike[str], *, select: Selection 
         raise UsageError(f"An NWB file holds one session, these are {len(sessions)}; name a folder or an .h5 file.")
     if target.suffix and not together and target.suffix != ".nwb":
         raise UsageError(f"Recordings are written to .nwb, .h5 or a folder; received {target.name!r}.")
-    places = [target if target.suffix else target / _file_name(session) for session in sessions]
-    if len(set(places)) < len(places) and not together:
-        raise UsageError("Two sessions would get the same file name; export to one .h5 file instead.")
+    places = [target if target.suffix else target / name for name in _file_names(sessions)]
     if lost := {place.resolve() for place in places} & {path.resolve() for path in paths}:
         raise UsageError(f"The copy would take the place of its source {str(min(lost))!r}; name another target.")
     if together:
@@ -136,6 +151,13 @@ def _plain(table: SessionTable, rows: NDArray[np.bool_]) -> dict[str, NDArray[An
     return columns
 
 
-def _file_name(session: Session) -> str:
-    subject, name = (re.sub(r"[^A-Za-z0-9]+", "-", part) for part in (session.subject, session.session))
-    return f"sub-{subject}_ses-{name}.nwb"
+def _file_names(sessions: list[Session]) -> list[str]:
+    """Return a name for each file; equal ones, as of the probes of one session, are numbered."""
+    names: list[str] = []
+    for session in sessions:
+        subject, name = (re.sub(r"[^A-Za-z0-9]+", "-", part) for part in (session.subject, session.session))
+        stem, number = f"sub-{subject}_ses-{name}", 1
+        while (name := f"{stem}{f'_probe-{number}' * (number > 1)}.nwb") in names:
+            number += 1
+        names.append(name)
+    return names

@@ -154,8 +154,8 @@ def _write_sessions(file: h5py.File, sessions: list[Session]) -> None:
         if not isinstance(session, Session):
             raise UsageError(f"Recordings are a data set or sessions of make_session; received {brief(session)}.")
         name = f"{session.subject}-{session.session}".replace("/", "_")
-        if name in root:
-            raise UsageError(f"Two sessions are called {name!r}; give each its own session name.")
+        if name in root:  # such as the probes of one session; their trials tell whether they are
+            name += f" {sum(key.partition(' ')[0] == name for key in root) + 1}"
         if session.units is None:
             raise DataError(f"Session {name!r} has no units table; there are no spikes to write.")
         session.units.rows(SPIKES)  # what no reader takes is not written

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 from collections import Counter
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
 from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,12 +18,14 @@ from numpy.typing import NDArray
 from brainbench.core.contracts import as_labels, natural_key
 from brainbench.core.errors import BrainbenchError, DataError
 from brainbench.core.progress import Progress, track
+from brainbench.core.reading.filters import MissingFilterError
 from brainbench.datasets import hdf5
 from brainbench.datasets.layouts.registry import RecordingLayout, counted_layout
+from brainbench.datasets.ledger import Ledger, balance_line
 from brainbench.datasets.reading import each_session, find_recordings, open_file, suitable_files
 from brainbench.datasets.sessions import SPIKES, Session, SessionTable
 from brainbench.datasets.trials.conditions import natural_vocabulary
-from brainbench.datasets.trials.counting import has_units, no_units, read_spikes, recorded_span
+from brainbench.datasets.trials.counting import has_units, no_units, read_spikes, recorded_span, time_fault
 from brainbench.datasets.trials.selection import Tally
 
 if TYPE_CHECKING:
@@ -132,6 +135,8 @@ class Inspection:
     """Conditions that can be scored, the likeliest first."""
     skipped: tuple[str, ...] = ()
     """Reason for each file that holds no recordings and is not described."""
+    ledger: Mapping[str, Any] = field(default_factory=dict)
+    """Balance: kind → found, read, and what was left out."""
 
     def __str__(self) -> str:
         return "\n".join(self._lines())
@@ -142,7 +147,8 @@ class Inspection:
             yield f"layout: {self.layout} (detected from its columns)"
         for session in self.sessions:
             yield from _session_lines(session)
-        yield from (f"! skipped: {reason}" for reason in self.skipped)
+        if line := balance_line(self.ledger):
+            yield f"! left out: {line}"
         if self.proposals:
             yield "conditions that can be scored, the likeliest marked with →:"
             for place, proposal in enumerate(self.proposals):
@@ -174,24 +180,44 @@ def inspect(path: str | os.PathLike[str], *, strict: bool = False, progress: Pro
     proposals: list[Proposal] = []
     formats: dict[str, None] = {}
     layouts: set[str | None] = set()
-    layout_named, files = find_recordings(path)
-    paths, skipped = suitable_files(files, strict=strict)
+    ledger = Ledger(strict=strict)
+    layout_named, files = find_recordings(path, ledger)
+    paths = suitable_files(files, ledger)
     for file_path in track(paths, "reading recordings", progress):
         if (counted := counted_layout(file_path, layout_named)) is not None and counted.open_counted is not None:
             kind = f"{file_path.suffix.lower()}, counted responses, layout {counted.name}"
             return _counted(counted.open_counted(file_path), file_path, kind)
-        with open_file(file_path) as file:
-            if hdf5.holds_counts(file, file_path):
-                return _counted(hdf5.read_counts(file, file_path), file_path)
-            for session, session_layout in each_session(file, file_path, layout_named):
-                layouts.add(session_layout.name if session_layout else None)
-                formats[session.format] = None
-                session_proposals = propose(session, session_layout)
-                summaries.append(_summary(session, bool(session_proposals)))
-                proposals += session_proposals
+        try:
+            with open_file(file_path) as file:
+                if hdf5.holds_counts(file, file_path):
+                    return _counted(hdf5.read_counts(file, file_path), file_path)
+                for session, session_layout in each_session(file, file_path, layout_named):
+                    session_proposals = propose(session, session_layout)
+                    summaries.append(_summary(session, bool(session_proposals), ledger))
+                    layouts.add(session_layout.name if session_layout else None)
+                    formats[session.format] = None
+                    proposals += session_proposals
+        except MissingFilterError as error:
+            if len(paths) == 1:
+                raise
+            ledger.leave("files", str(error), lost=True)
     layout = layouts.pop() if len(layouts) == 1 else None
     format_names = ", ".join(formats)
-    return Inspection(os.fspath(path), format_names, layout, tuple(summaries), _merged(proposals), tuple(skipped))
+    subjects = {summary.subject for summary in summaries}
+    read = ledger.totals["files"] - len([entry for entry in ledger.left if entry.kind == "files"])
+    for kind, number in (("files", read), ("sessions", len(summaries)), ("animals", len(subjects))):
+        ledger.take(kind, number)
+        ledger.find(kind, number if kind != "files" else 0)
+    ledger.close()
+    return Inspection(
+        os.fspath(path),
+        format_names,
+        layout,
+        tuple(summaries),
+        _merged(proposals),
+        tuple(ledger.skipped),
+        ledger.stated(),
+    )
 
 
 def _merged(proposals: list[Proposal]) -> tuple[Proposal, ...]:
@@ -206,12 +232,24 @@ def _merged(proposals: list[Proposal]) -> tuple[Proposal, ...]:
     return tuple(merged.values())
 
 
-def _summary(session: Session, usable: bool) -> SessionSummary:
+def _summary(session: Session, usable: bool, ledger: Ledger) -> SessionSummary:
     units = _units(session)
     tables = tuple(_table(table) for table in session.tables.values())
     missing = [no_units(session)] if units is None else []
     missing += [units.problem] if units is not None and units.problem else []
     missing += [f"table {table.name}: {table.problem}" for table in tables if table.problem]
+    for table in tables:
+        ledger.find("tables")
+        if lost := session.tables[table.name].fault:
+            ledger.leave("tables", lost, lost=True)
+        else:
+            ledger.take("tables")
+    if units is not None:
+        ledger.find("units", units.units)
+        ledger.leave("units", units.problem, units.units, lost=True) if units.problem else ledger.take(
+            "units", units.units
+        )
+    missing += _time_faults(session)
     if not session.tables:
         missing.append("no interval tables: nothing says when which stimulus was presented")
     elif not usable:
@@ -254,7 +292,19 @@ def _units(session: Session) -> UnitsSummary | None:
     )
 
 
+def _time_faults(session: Session) -> list[str]:
+    """Return what speaks against seconds of one clock, once for all tables."""
+    with contextlib.suppress(BrainbenchError):  # of spikes, which is told already
+        if session.units is not None and has_units(session):
+            spikes = read_spikes(session.units, [])
+            tables = (table for table in session.tables.values() if not table.fault)
+            return [fault for table in tables if (fault := time_fault(spikes, table))][:1]
+    return []
+
+
 def _table(table: SessionTable) -> TableSummary:
+    if table.fault:
+        return TableSummary(table.name, 0, (), table.fault)
     problem = "" if "start_time" in table else "it has no start_time"
     try:
         return TableSummary(table.name, len(table), tuple(summarise_columns(table)), problem)
@@ -313,6 +363,8 @@ def propose(session: Session, layout: RecordingLayout | None = None) -> list[Pro
     """
     ranked: list[tuple[tuple[float, ...], Proposal]] = []
     for name, table in session.tables.items():
+        if table.fault:
+            continue
         ours = layout if layout is not None and name == layout.conditions.table else None
         chosen = slice(None) if ours is None else _selected(table, ours)
         for column in summarise_columns(table):

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import glob
 import os
+import re
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -26,6 +27,7 @@ from brainbench.datasets.layouts.registry import (
     list_layouts,
     load_layout,
 )
+from brainbench.datasets.ledger import Ledger
 from brainbench.datasets.trials.selection import DEFAULT, EVERYTHING, Selection
 
 if TYPE_CHECKING:
@@ -37,16 +39,16 @@ if TYPE_CHECKING:
 Source = str | os.PathLike[str] | Sequence[str | os.PathLike[str]]
 """A file, a folder, a glob, a list of these, or ``LAYOUT:PATH``."""
 
-SUFFIXES = ((".nwb",), (".h5", ".hdf5"))
-"""Endings searched for in a folder, in this order; other tools also leave ``.h5`` files beside NWB."""
+ENDINGS = (".nwb", ".h5", ".hdf5")
+"""Endings searched for in a folder; other tools also leave ``.h5`` files beside NWB."""
 
 _DEMOS = ("demo", "demo-rodgers")
 """Names of recordings that are made on first use, above this package."""
 _SELECTIONS = {"none": EVERYTHING, "default": DEFAULT}
 
 
-def find_recordings(source: Source) -> tuple[RecordingLayout | None, list[Path]]:
-    """Return the layout that a source names, if any, and its files.
+def find_recordings(source: Source, ledger: Ledger | None = None) -> tuple[RecordingLayout | None, list[Path]]:
+    """Return the layout that a source names, if any, and its files; the ledger takes what looks like one and is not.
 
     ``LAYOUT:PATH`` names one, or ``FILE.py:PATH`` for a Python file that defines one. A prefix counts as a layout when
     it is a bare word of at least two letters (so drive letters stay paths) and no file of the whole name exists. Raises
@@ -54,29 +56,33 @@ def find_recordings(source: Source) -> tuple[RecordingLayout | None, list[Path]]
     """
     if not isinstance(source, (str, os.PathLike, Sequence)):
         raise UsageError(f"Recordings are a file, a folder, a glob or a list of these; received {brief(source)}.")
+    if isinstance(source, str):
+        _refuse_address(source)
     prefix, colon, rest = source.partition(":") if isinstance(source, str) else ("", "", "")
     in_file = prefix.endswith(".py")
     if not colon or not (in_file or is_name(prefix)) or Path(str(source)).exists():
-        return None, find_files(source)
+        return None, find_files(source, ledger)
     layout = load_layout(prefix) if in_file else None
     if not rest:
         raise UsageError(f"The source {source!r} names a layout but no file; write {prefix}:PATH.")
     if rest in _DEMOS:
         raise UsageError(f"The demo recordings have a layout of their own; write {rest!r} without {prefix}:.")
-    return layout or get_layout(prefix), find_files(rest)
+    return layout or get_layout(prefix), find_files(rest, ledger)
 
 
-def find_files(source: Source) -> list[Path]:
+def find_files(source: Source, ledger: Ledger | None = None) -> list[Path]:
     """Return the recording files a source names, sorted and without repetition.
 
-    A folder is searched at every depth for ``.nwb`` and, if it has none, for ``.h5`` and ``.hdf5``; hidden files are
-    skipped.
+    A folder is searched at every depth for ``.nwb``, ``.h5`` and ``.hdf5``; hidden files are skipped.
 
     Raises:
         DataFileNotFoundError: a path does not exist, or a folder or glob holds no recording file.
     """
     items = [source] if isinstance(source, (str, os.PathLike)) else source
-    return sorted({path for item in items for path in _expand(os.fspath(item))}, key=str)
+    ledger = Ledger() if ledger is None else ledger
+    paths = sorted({path for item in items for path in _expand(os.fspath(item), ledger)}, key=str)
+    ledger.find("files", len(paths))
+    return paths
 
 
 def resolve_selection(select: Selection | str) -> Selection:
@@ -104,26 +110,27 @@ def open_file(path: Path) -> AbstractContextManager[h5py.File]:
     return open_hdf5(path, "recording", "brainbench reads NWB 2.x and its own HDF5 layout.")
 
 
-def suitable_files(paths: Sequence[Path], *, strict: bool = False) -> tuple[list[Path], list[str]]:
-    """Return the files that hold sessions of spike times, and for each other file a sentence that says why not.
+def suitable_files(paths: Sequence[Path], ledger: Ledger) -> list[Path]:
+    """Return the files that hold sessions of spike times; the ledger takes each other one with a sentence.
 
     One file alone was meant, so it is kept whatever it holds: reading it says what is wrong.
     """
     if len(paths) < 2:
-        return list(paths), []
-    readable, skipped = [], []
+        return list(paths)
+    suitable, reasons = [], []
     for path in paths:
         try:
             with open_file(path) as file:
                 _check_kind(file, path)
-            readable.append(path)
+            suitable.append(path)
         except DataError as error:
-            if strict:
-                raise
-            skipped.append(str(error))
-    if not readable:
-        raise DataError(f"None of {len(paths)} files holds recordings; the first: {skipped[0]}")
-    return readable, skipped
+            # Other tools leave .h5 files beside NWB, which were no recordings to begin with.
+            beside = path.suffix.lower() != ".nwb" and any(neighbour.suffix.lower() == ".nwb" for neighbour in paths)
+            ledger.leave("files", str(error), lost=not (beside and path in ledger.incidental))
+            reasons.append(str(error))
+    if not suitable:
+        raise DataError(f"None of {len(paths)} files holds recordings; the first: {reasons[0]}")
+    return suitable
 
 
 def each_session(
@@ -153,21 +160,91 @@ def _check_kind(file: h5py.File, path: Path) -> None:
     )
 
 
-def _expand(source: str) -> list[Path]:
+_ADDRESS = re.compile(r"([a-z][a-z0-9+.-]+)://", re.IGNORECASE)
+_ARRAYS = (
+    "arrays of a sorter (.npy); make sessions of them with brainbench.datasets.sessions.make_session and write these "
+    "with brainbench.datasets.write_recordings (docs/recordings.md)"
+)
+
+
+def _refuse_address(source: str) -> None:
+    if match := _ADDRESS.match(source):
+        fetch = "`brainbench recordings fetch` takes data sets of the DANDI archive; else download it first"
+        raise UsageError(
+            f"{brief(source)} is an address of {match[1]}://, and recordings are read from files of this machine only: "
+            f"{fetch}."
+        )
+
+
+def unread(path: Path) -> str:
+    """Return one sentence on what looks like a recording and is none that can be read; empty for all else."""
+    suffixes = {suffix.lower() for suffix in path.suffixes}
+    if path.is_symlink() and not path.exists():
+        if suffixes & {*ENDINGS, ".zarr"} or "annex" in os.fspath(path.readlink()):
+            target = brief(os.fspath(path.readlink()))
+            get = f"as git-annex and DataLad leave it: get the content first (datalad get {path.name})"
+            return f"{path} is a link to {target}, which is not there, {get}."
+    elif path.is_dir():
+        if ".zarr" in suffixes or any((path / name).exists() for name in (".zgroup", ".zattrs", "zarr.json")):
+            return f"{path} is a Zarr store; brainbench reads NWB in HDF5: convert it (pynwb: NWBHDF5IO.export)."
+        if path.suffix.lower() == ".nwb":
+            return f"{path} is a folder called .nwb, and no HDF5 file."
+        if path.is_symlink() and any(item.suffix.lower() in ENDINGS for item in path.rglob("*")):
+            return f"{path} is a link to a folder, which is not searched; name that folder too."
+    elif suffixes & _LIKE and path.suffix.lower() not in ENDINGS:
+        return f"{path} ends in {path.suffix}, which is not read; brainbench reads .nwb, .h5 and .hdf5."
+    return ""
+
+
+_LIKE = {".nwb", ".hdf", ".he5", ".h5", ".hdf5", ".nix", ".plx", ".pl2", ".nev", ".abf", ".smr", ".smrx", ".mat"}
+"""Endings, also inside a name such as ``a.nwb.gz``, of files that may hold recordings."""
+
+
+def _search(folder: Path, ledger: Ledger) -> list[Path]:
+    """Return the files of a folder that may be recordings, at every depth; the ledger takes what cannot be read."""
+    files: list[Path] = []
+    for entry in sorted(folder.iterdir()):
+        if entry.name.startswith("."):
+            continue
+        if reason := unread(entry):
+            ledger.find("files")
+            ledger.leave("files", reason, lost=entry.suffix.lower() != ".mat")
+        elif entry.is_dir():
+            files += [] if entry.is_symlink() else _search(entry, ledger)
+        elif entry.is_file() and entry.suffix.lower() in ENDINGS:
+            files.append(entry)
+    return files
+
+
+def _expand(source: str, ledger: Ledger) -> list[Path]:
     path = Path(source).expanduser()
+    if path.suffix == ".npy":
+        raise DataError(f"{path} is one of the {_ARRAYS}.")
     if path.is_file():
         return [path]
+    if reason := unread(path):
+        raise DataError(reason)
     if path.is_dir():
-        inside = [item for item in path.rglob("*") if item.is_file()]
-        visible = [item for item in inside if not any(part.startswith(".") for part in item.relative_to(path).parts)]
-        for endings in SUFFIXES:
-            if files := [item for item in visible if item.suffix.lower() in endings]:
-                return files
-        raise DataFileNotFoundError(f"The folder {source!r} holds no recordings (*.nwb, *.h5, *.hdf5).")
+        files = _search(path, ledger)
+        ledger.incidental.update(files)
+        if not files:
+            why = f" {ledger.skipped[0]}" if ledger.skipped else ""
+            why = f" It holds {_ARRAYS}." if any(path.rglob("*.npy")) else why
+            raise DataFileNotFoundError(f"The folder {source!r} holds no recordings (*.nwb, *.h5, *.hdf5).{why}")
+        return files
     if glob.has_magic(source):
-        matches = map(Path, glob.glob(str(path), recursive=True))  # noqa: PTH207 (absolute patterns)
-        if not (files := [item for item in matches if item.is_file()]):
-            raise DataFileNotFoundError(f"The pattern {source!r} matches no file.")
+        matches = [Path(name) for name in sorted(glob.glob(str(path), recursive=True))]  # noqa: PTH207
+        files = [match for match in matches if match.is_file()]
+        for match in matches:
+            reason = "" if match in files else unread(match)
+            if not reason and match.is_dir() and "**" not in source and _search(match, Ledger()):
+                reason = f"{match} is a folder with recordings, which the pattern does not reach; write {source!r}/**."
+            if reason:
+                ledger.find("files")
+                ledger.leave("files", reason, lost=True)
+        if not files:
+            why = f" {ledger.skipped[0]}" if ledger.skipped else ""
+            raise DataFileNotFoundError(f"The pattern {source!r} matches no file.{why}")
         return files
     if source in _DEMOS:
         raise UsageError(

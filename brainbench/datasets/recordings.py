@@ -14,9 +14,11 @@ from typing import TYPE_CHECKING, Any, NoReturn
 from brainbench.core.contracts import check_recordings
 from brainbench.core.errors import DataError, UsageError, check_each, listing, unknown_name
 from brainbench.core.progress import Progress, track
+from brainbench.core.reading.filters import MissingFilterError
 from brainbench.datasets import hdf5
 from brainbench.datasets.inspection import propose
 from brainbench.datasets.layouts.registry import RecordingLayout, counted_layout, list_layouts
+from brainbench.datasets.ledger import Ledger
 from brainbench.datasets.reading import (
     Source,
     each_session,
@@ -27,6 +29,7 @@ from brainbench.datasets.reading import (
 )
 from brainbench.datasets.sessions import Session
 from brainbench.datasets.trials.conditions import Conditions
+from brainbench.datasets.trials.copies import Copies, joined_probes
 from brainbench.datasets.trials.counting import ReadingOptions, SessionCounts, count_session, has_units, no_units
 from brainbench.datasets.trials.selection import DEFAULT, Selection
 from brainbench.datasets.trials.session_trials import join_sessions
@@ -78,7 +81,8 @@ def open_recordings(
     Raises:
         DataFileNotFoundError: the source names nothing.
     """
-    layout, paths = find_recordings(source)
+    ledger = Ledger(strict=strict)
+    layout, paths = find_recordings(source, ledger)
     wanted = Conditions.parse(conditions) if isinstance(conditions, str) else conditions
     given = {"conditions": wanted, "select": select, "window": window, "bin": bin}
     if len(paths) == 1 and (ready := _already_counted(paths[0], layout, given)) is not None:
@@ -90,13 +94,14 @@ def open_recordings(
         bin=bin,
         layout=layout,
         layout_given=layout is not None,
-        strict=strict,
+        ledger=ledger,
     )
-    suitable, reader.skipped = suitable_files(paths, strict=strict)
+    suitable = suitable_files(paths, ledger)
     reader.lenient = len(suitable) > 1 and not strict
     for path in track(suitable, "reading recordings", progress):
         reader.read(path)
-    return reader.dataset(", ".join(map(str, paths)) if len(paths) < 4 else f"{len(paths)} files, {paths[0]} …")
+    name = ", ".join(map(str, suitable)) if len(suitable) < 4 else f"{len(suitable)} files, {suitable[0]} …"
+    return reader.dataset(name)
 
 
 @dataclass
@@ -110,55 +115,64 @@ class _Reader:
     layout: RecordingLayout | None
     """The layout that the source named; else the one by which the first session was recognised."""
     layout_given: bool
-    strict: bool = False
+    ledger: Ledger
     lenient: bool = False
-    """Skip sessions without the table of the conditions, because others may have it."""
+    """Skip what cannot be used of one file, because others may have it."""
     options: ReadingOptions | None = None
     """Made for the first session and kept for all others."""
     counted: list[SessionCounts] = field(default_factory=list)
-    seen: dict[tuple[str, ...], str] = field(default_factory=dict)
-    """Names of the sessions that were read, each with its source."""
+    copies: Copies = field(default_factory=Copies)
     notes: list[str] = field(default_factory=list)
-    skipped: list[str] = field(default_factory=list)
-    """Why each file that holds no recordings is left out."""
-    without_units: list[str] = field(default_factory=list)
+    doubts: list[str] = field(default_factory=list)
+    first: str = ""
+    """Source of the session for which the options were made."""
     other_tables: dict[str, str] = field(default_factory=dict)
     """Why each session without the table of the conditions is left out, by one of the tables that it has."""
-    subjects: set[str] = field(default_factory=set)
-    """Names of all animals of the files, also of those that are not chosen."""
+    subjects: dict[str, str] = field(default_factory=dict)
+    """Every animal of the files → why it is left out; empty for one that is read."""
 
     def read(self, path: Path) -> None:
         """Count the sessions of one file."""
-        with open_file(path) as file:
-            for session, session_layout in each_session(file, path, self.layout if self.layout_given else None):
-                self.subjects.add(session.subject)
-                if not has_units(session):
-                    if self.strict:
-                        raise DataError(no_units(session))
-                    self.without_units.append(no_units(session))
-                    continue
-                table = None if self.conditions is None else self.conditions.table
-                if self.lenient and table is not None and table not in session.tables:
-                    why = f"{session.source} has no table {table!r}; its tables: {listing(session.tables)}"
-                    self.other_tables |= dict.fromkeys(session.tables or ("none",), why)
-                    continue
-                self._refuse_twins(session)
-                options = self._options_for(session, session_layout)
-                if options.selection.subjects and session.subject not in options.selection.subjects:
-                    continue
-                self.notes += session.notes
-                self.counted.append(count_session(session, options))
+        number, why = len(self.counted), (f"{path} holds no session", True)
+        try:
+            with open_file(path) as file:
+                for session, session_layout in each_session(file, path, self.layout if self.layout_given else None):
+                    self.ledger.find("sessions")
+                    reason, lost = self._count(session, session_layout)
+                    if reason:
+                        self.ledger.leave("sessions", reason, lost=lost)
+                        why = reason, lost
+                        self.subjects.setdefault(session.subject, reason)
+                    else:
+                        self.ledger.take("sessions")
+                        self.subjects[session.subject] = ""
+        except MissingFilterError as error:
+            if not self.lenient:
+                raise
+            self.ledger.leave("files", str(error), lost=True)
+            self.ledger.leave("sessions", str(error), lost=True)
+            return
+        if len(self.counted) > number:
+            self.ledger.take("files")
+        else:
+            self.ledger.leave("files", why[0], lost=why[1])
 
-    def _refuse_twins(self, session: Session) -> None:
-        keys = [("subject and session", session.subject, session.session)]
-        keys += [("identifier", session.identifier)] if session.identifier else []
-        for key in keys:
-            if key in self.seen:
-                raise DataError(
-                    f"{self.seen[key]} and {session.source} are the same session (equal {key[0]}: "
-                    f"{' / '.join(key[1:])}); its trials would count twice, so leave one of the files out."
-                )
-            self.seen[key] = session.source
+    def _count(self, session: Session, session_layout: RecordingLayout | None) -> tuple[str, bool]:
+        """Count a session; else return why not, and whether nobody asked for that."""
+        if not has_units(session):
+            return no_units(session), True
+        table = None if self.conditions is None else self.conditions.table
+        if self.lenient and table is not None and table not in session.tables:
+            why = f"{session.source} has no table {table!r}; its tables: {listing(session.tables)}"
+            self.other_tables |= dict.fromkeys(session.tables or ("none",), why)
+            return why, True
+        options = self._options_for(session, session_layout)
+        if options.selection.subjects and session.subject not in options.selection.subjects:
+            return f"{session.subject} is not among the chosen animals", False
+        part = count_session(session, options, self.copies.compare)
+        self.notes += session.notes
+        self.counted.append(part)
+        return "", False
 
     def _options_for(self, session: Session, session_layout: RecordingLayout | None) -> ReadingOptions:
         """Return the options of all sessions, made for the first one; a later one must have its layout."""
@@ -172,11 +186,12 @@ class _Reader:
             if self.options is not None and session_layout is not self.layout:
                 # Going on with the first file's layout would make the result depend on the order of files.
                 raise UsageError(
-                    f"{session.source} has another layout than {next(iter(self.seen.values()))}; open them apart, or "
+                    f"{session.source} has another layout than {self.first}; open them apart, or "
                     f"name the layout for both: {listing(f'{name}:PATH' for name in list_layouts())}."
                 )
             self.layout = session_layout
         if self.options is None:
+            self.first = session.source
             layout = self.layout
             conditions = self.conditions or (layout.conditions if layout else _no_conditions(session))
             self.options = ReadingOptions(
@@ -190,25 +205,53 @@ class _Reader:
 
     def dataset(self, source: str) -> xr.Dataset:
         """Join what was counted; see :func:`open_recordings`."""
+        skipped = self.ledger.skipped
         if self.options is None and self.other_tables and self.conditions is not None:
             raise unknown_name("table", self.conditions.table, self.other_tables)
         if self.options is None:
-            more = f" ({len(self.without_units) - 1} more files likewise)" if len(self.without_units) > 1 else ""
-            raise DataError(f"{self.without_units[0]}{more}" if self.without_units else "The file holds no session.")
+            more = f" ({len(skipped) - 1} more likewise)" if len(skipped) > 1 else ""
+            raise DataError(f"{skipped[0]}{more}" if skipped else "The file holds no session.")
         check_each("subject", self.options.selection.subjects, sorted(self.subjects))
-        skipped = self.skipped + self.without_units + [*dict.fromkeys(self.other_tables.values())]
         if not self.counted:
             raise DataError(f"No session of the chosen subjects can be counted. {skipped[0]}")
         name = self.layout.name if self.layout else ""
         name += "" if self.layout_given or not name else " (detected from its columns)"
-        joined = join_sessions(self.counted, self.options, source=source, layout=name, notes=self.notes + skipped)
+        parts = joined_probes(self.counted, self.doubts)
+        joined = join_sessions(
+            parts, self.options, source=source, layout=name, notes=self.notes + skipped, doubts=self.doubts
+        )
         if self.bin is not None and (longest := float(joined["duration"].max())) < (1 - 1e-6) * self.bin:
             raise UsageError(
                 f"A bin of {self.bin:g} s is longer than every window (up to {longest:g} s), so it cuts nothing; leave "
                 "it out, or give it in seconds."
             )
-        joined.attrs["skipped"] = skipped
+        self._balance(parts, joined)
         return check_recordings(joined)
+
+    def _balance(self, parts: list[SessionCounts], joined: xr.Dataset) -> None:
+        """Close the ledger over the sessions that were counted, and write it into the data set."""
+        ledger, read = self.ledger, {*joined["subject"].values.tolist()}
+        ledger.find("animals", len(self.subjects))
+        ledger.take("animals", len(read))
+        for name, reason in self.subjects.items():
+            if name not in read:
+                chosen = not reason or reason.endswith("chosen animals")
+                ledger.leave("animals", reason or f"{name}: no trial is left", lost=not chosen)
+        labels = frozenset[str]().union(*(part.found_labels for part in parts))
+        ledger.find("labels", len(labels))
+        ledger.take("labels", len(present := labels & {*joined["stimulus"].values.tolist()}))
+        for label in sorted(labels - present):
+            ledger.leave("labels", f"{label}: no trial is left")
+        for part in parts:
+            ledger.add(part.ledger)
+            ledger.find("trials", part.trials)
+            ledger.take("trials", len(part.labels))
+            ledger.find("units", part.units)
+            ledger.take("units", len(part.unit_ids))
+            ledger.remove(part.tally.removed)
+        for entry in ledger.close():
+            joined.attrs["doubts"] = [*joined.attrs["doubts"], f"the balance does not close: {entry}"]
+        joined.attrs |= {"skipped": ledger.skipped, "ledger": ledger.stated()}
 
 
 def _no_conditions(session: Session) -> NoReturn:

@@ -84,6 +84,7 @@ class NeuralResponses:
         truth = {"truth": HIDDEN_NETWORK} if self.source == "demo" and self.synthetic else {}
         truth |= {"config_hash": self.definition} if self.definition else {}
         truth |= {"title": self.title} if self.title else {}
+        truth |= {"ledger": ledger} if (ledger := self.dataset.attrs.get("ledger")) else {}
         truth |= {"skipped": skipped} if (skipped := self.dataset.attrs.get("skipped")) else {}
         stated = {name: self.dataset.attrs[name] for name in names}
         return {"source": self.source, "content_hash": self.content_hash, **stated, **truth}

@@ -61,7 +61,7 @@ def test_sessions_and_animals_are_pooled_on_request(run, folder, pool, names):
 def test_a_session_that_an_rdm_leaves_out_is_named(run, tmp_path):
     for name, labels in (("1", "abc"), ("2", "ab")):
         table = {"start_time": np.arange(1.0, 31), "stop_time": np.arange(1.5, 31), "stimulus": [*labels * 15][:30]}
-        spikes = [np.sort(np.random.default_rng(unit).uniform(0, 32, 900)) for unit in range(9)]
+        spikes = [np.sort(np.random.default_rng([unit, *name.encode()]).uniform(0, 32, 900)) for unit in range(9)]
         write_recordings(tmp_path / f"{name}.h5", make_session("m", name, spikes, {"trials": table}))
     given = ("recordings", "rdm", str(tmp_path), "--conditions", "trials:stimulus")
     assert "1 of 2 sessions left out: fewer than 2 trials of c (0)" in " ".join(run(*given).out.split())

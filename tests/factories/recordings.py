@@ -54,8 +54,10 @@ def make_stimuli(seed: int = 0, whiskers: int = 30):
 def make_simple_session(
     *, subject: str = "mouse", session: str = "1", trials: int = 12, units: int = 3, seed: int = 0, **options
 ) -> Session:
-    """Regular trials of 1 s every 2 s, stimulus by turns, Poisson spikes over the whole session."""
-    random = np.random.default_rng(seed)
+    """Regular trials of 1 s every 2 s, stimulus by turns, Poisson spikes of its own over the whole session."""
+    random = np.random.default_rng(
+        [seed, *f"{subject}/{session}".encode()] if (subject, session) != ("mouse", "1") else seed
+    )
     start = 1.0 + 2.0 * np.arange(trials)
     table = {
         "start_time": start,

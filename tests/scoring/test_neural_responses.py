@@ -108,7 +108,9 @@ def test_recordings_that_hold_too_little_get_a_status_with_its_reason(features, 
 @pytest.mark.parametrize("time", ["mean", "concatenate"])
 def test_a_session_of_dropped_labels_alone_is_left_out(features, tmp_path, time):
     for session, labels in (("1", [f"s{1 + index % 13}" for index in range(120)]), ("2", ["s13"] * 120)):
-        spikes = [np.sort(np.random.default_rng(unit).uniform(0, 122, 900)) for unit in range(20)]
+        spikes = [
+            np.sort(np.random.default_rng(unit + 100 * (session == "2")).uniform(0, 122, 900)) for unit in range(20)
+        ]
         table = {"start_time": 1.0 + np.arange(120), "stop_time": 1.5 + np.arange(120), "stimulus": labels}
         write_recordings(tmp_path / "two" / f"{session}.h5", make_session("m1", session, spikes, {"trials": table}))
     how = {"conditions": "trials:stimulus", "match": {"s13": None}, "bin": 0.25, "time": time}

@@ -7,22 +7,25 @@ a *note* when it only has to be known.
 
 from __future__ import annotations
 
+import contextlib
 import re
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from brainbench.core.errors import DataError, repeats
+from brainbench.core.errors import BrainbenchError, DataError
 from brainbench.core.progress import Progress, track
 from brainbench.datasets import hdf5
-from brainbench.datasets.checks.findings import SEVERITIES, Finding, some
+from brainbench.datasets.checks.findings import SEVERITIES, Finding, Severity, some
 from brainbench.datasets.checks.tables import check_coverage, check_labels, check_tables
 from brainbench.datasets.checks.timing import check_clock, check_spikes
 from brainbench.datasets.layouts.registry import RecordingLayout, counted_layout
+from brainbench.datasets.ledger import Ledger
 from brainbench.datasets.reading import Source, each_session, find_recordings, open_file
 from brainbench.datasets.sessions import Session
-from brainbench.datasets.trials.conditions import Conditions
-from brainbench.datasets.trials.counting import has_units, no_units, read_spikes
+from brainbench.datasets.trials.conditions import Conditions, joined_labels, label_doubts
+from brainbench.datasets.trials.copies import Copies
+from brainbench.datasets.trials.counting import has_units, no_units, read_spikes, time_fault
 
 _NUMBER = re.compile(r"\d+(?:,\d{3})*(?:\.\d+)?")
 
@@ -90,25 +93,41 @@ def check(source: Source, *, conditions: str | Conditions | None = None, progres
     Raises:
         DataFileNotFoundError: the source names nothing.
     """
-    layout, paths = find_recordings(source)
+    ledger = Ledger()
+    layout, paths = find_recordings(source, ledger)
     wanted = Conditions.parse(conditions) if isinstance(conditions, str) else conditions
-    findings: list[Finding] = []
+    findings = [Finding("warning", "file", reason, where=str(source)) for reason in ledger.skipped]
     names: list[str] = []
+    every = _Everything()
     for path in track(paths, "checking recordings", progress):
         try:
-            findings += _check_file(path, layout, wanted, names)
+            findings += _check_file(path, layout, wanted, names, every)
         except DataError as error:
-            findings.append(Finding("error", "file", str(error), where=path.name))
-    for name in repeats(names):
-        message = f"{names.count(name)} files hold this session; its trials would count more than once"
-        findings.append(Finding("error", "file", message, "Leave all but one of them out.", where=name))
+            beside = path in ledger.incidental and any(neighbour.suffix == ".nwb" for neighbour in paths)
+            severity: Severity = "note" if beside and path.suffix != ".nwb" else "error"
+            findings.append(Finding(severity, "file", str(error), where=path.name))
+    singly = {finding.message for finding in findings}
+    across = (doubt for doubt in label_doubts(every.forms, every.labels) if doubt not in singly)
+    findings += [Finding("warning", "labels", doubt, _LABELS, where="all sessions") for doubt in across]
     place = str(source) if not isinstance(source, (list, tuple)) else ", ".join(map(str, source))
     worst_first = sorted(findings, key=lambda finding: SEVERITIES.index(finding.severity))
     return Checkup(place, len(paths), tuple(names), tuple(worst_first))
 
 
+_LABELS = "Make them one, or refuse them by --select."
+
+
+@dataclass
+class _Everything:
+    """What is compared across sessions: spikes, and the values that label trials."""
+
+    copies: Copies = field(default_factory=Copies)
+    forms: dict[tuple[str, str], set[str]] = field(default_factory=dict)
+    labels: set[str] = field(default_factory=set)
+
+
 def _check_file(
-    path: Path, layout: RecordingLayout | None, conditions: Conditions | None, names: list[str]
+    path: Path, layout: RecordingLayout | None, conditions: Conditions | None, names: list[str], every: _Everything
 ) -> Iterator[Finding]:
     if (counted := counted_layout(path, layout)) is not None and counted.check_counted is not None:
         yield from counted.check_counted(path, names)
@@ -121,14 +140,18 @@ def _check_file(
             return
         for session, session_layout in each_session(file, path, layout):
             names.append(session.subject + f" / {session.session}" * (session.session != session.subject))
-            for finding in check_session(session, session_layout, conditions):
+            for finding in check_session(session, session_layout, conditions, every):
                 yield replace(finding, where=names[-1])
 
 
 def check_session(
-    session: Session, layout: RecordingLayout | None = None, conditions: Conditions | None = None
+    session: Session,
+    layout: RecordingLayout | None = None,
+    conditions: Conditions | None = None,
+    every: _Everything | None = None,
 ) -> Iterator[Finding]:
     """Yield the findings about one session, which must still be open."""
+    every = every or _Everything()
     if not has_units(session) or session.units is None:
         # Nothing else matters of a file that scores skip.
         yield Finding("error", "units", no_units(session))
@@ -136,6 +159,13 @@ def check_session(
     conditions = conditions or (layout.conditions if layout else None)
     yield from check_tables(session)
     yield from check_labels(session, layout, conditions)
+    table = session.tables.get(conditions.table if conditions else "trials")
+    with contextlib.suppress(BrainbenchError):
+        if table is not None and conditions is not None:
+            for key, written in conditions.forms(table).items():
+                every.forms.setdefault(key, set()).update(written)
+            fixed = layout is not None and layout.vocabulary(conditions) is not None
+            every.labels |= set() if fixed else {*joined_labels(conditions.values(table))}
     notes: list[str] = []
     try:
         spikes = read_spikes(session.units, notes)
@@ -144,6 +174,14 @@ def check_session(
         return
     for note in notes:
         yield Finding("warning", "spikes", note, "Whoever wrote the file may have joined trials or probes.")
+    with contextlib.suppress(BrainbenchError):  # of the table, which is told already
+        if table is not None and (fault := time_fault(spikes, table)):
+            yield Finding("error", "times", fault)
+    try:
+        if doubt := every.copies.compare(session, spikes):
+            yield Finding("warning", "duplicates", doubt)
+    except DataError as error:
+        yield Finding("error", "duplicates", str(error))
     yield from check_spikes(session, spikes)
     yield from check_coverage(session, spikes, layout, conditions)
     yield from check_clock(session, spikes, layout)

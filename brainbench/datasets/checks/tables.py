@@ -127,11 +127,14 @@ def check_tables(session: Session) -> Iterator[Finding]:
         message = "there are no interval tables: nothing says when which stimulus was presented"
         yield Finding("error", "tables", message)
     for table in session.tables.values():
+        if table.fault:
+            yield Finding("error", "tables", table.fault)
+            continue
         yield from _damaged(table)
         if "start_time" in table and len(table):
             yield from _times(table)
     trials = session.tables.get("trials")
-    if trials is not None and "start_time" in trials and "stop_time" in trials and len(trials):
+    if trials is not None and not trials.fault and "start_time" in trials and "stop_time" in trials and len(trials):
         try:
             yield from _events(trials)
             yield from _contacts(session, trials)
@@ -250,7 +253,7 @@ def check_coverage(
     """
     table = session.tables.get(conditions.table if conditions else "trials")
     span = recorded_span(spikes)
-    if table is None or span is None or "start_time" not in table or not len(table):
+    if table is None or span is None or table.fault or "start_time" not in table or not len(table):
         return
     # Without ends of trials only their beginnings can be held against the recorded span.
     window = layout.window if layout else WHOLE if "stop_time" in table else Window("start", length=1e-3)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from brainbench.core.contracts import as_labels, as_number, natural_key
 from brainbench.core.errors import DataError, UsageError, listing
 from brainbench.core.reading.ranges import check_number
+from brainbench.datasets.ledger import Ledger
 from brainbench.datasets.sessions import OBSERVED, SPIKES, Session, SessionTable
 from brainbench.datasets.trials.conditions import Conditions, joined_labels
 from brainbench.datasets.trials.selection import Selection, Tally
@@ -119,10 +120,18 @@ class SessionCounts:
     """True when the file does not name its subject."""
     forms: dict[tuple[str, str], set[str]] = field(default_factory=dict)
     """Column and label → how the file writes the value."""
+    ledger: Ledger = field(default_factory=Ledger)
+    """Balance of the tables and spikes of the file."""
+    found_labels: frozenset[str] = frozenset()
+    """Labels of all rows of the table, before any rule."""
 
 
-def count_session(session: Session, options: ReadingOptions) -> SessionCounts:
-    """Count the trials of one session."""
+def count_session(
+    session: Session,
+    options: ReadingOptions,
+    look: Callable[[Session, Sequence[NDArray[np.float64]]], str] | None = None,
+) -> SessionCounts:
+    """Count the trials of one session; ``look`` sees it with the spikes of all units, and may return a doubt."""
     if session.units is None or not has_units(session):
         raise DataError(no_units(session))
     tally = Tally()
@@ -145,7 +154,11 @@ def count_session(session: Session, options: ReadingOptions) -> SessionCounts:
         overlap = ((edges[:, :1] < end) & (edges[:, 1:] > begin)).any(axis=1)
         keep = tally.apply(keep, ~overlap, "trials: overlap with invalid_times")
 
-    spikes = read_spikes(session.units, tally.notes)
+    spikes = read_spikes(session.units, tally.doubts)
+    if fault := time_fault(spikes, table):
+        raise DataError(f"{session.source}: {fault}.")
+    if look is not None and (doubt := look(session, spikes)):
+        tally.doubts.append(doubt)
     # A window outside the recorded span is missing data, not silence: zero counts there would lower every mean.
     covered, unit_kept = _coverage(session.units, spikes, edges, options.selection, tally)
     keep = tally.apply(keep, covered.any(axis=1), "trials: outside the recorded span")
@@ -159,6 +172,10 @@ def count_session(session: Session, options: ReadingOptions) -> SessionCounts:
     counts, duration = count(
         [spikes[unit] for unit in units], edges[rows], covered[np.ix_(rows, units)], options.bin, options.window.length
     )
+    ledger = Ledger()
+    _enter_tables(ledger, session, options.conditions.table)
+    used = [spikes[unit] for unit in units]
+    _enter_spikes(ledger, spikes, used, edges[rows], covered[np.ix_(rows, units)], counts)
     return SessionCounts(
         subject=session.subject,
         session=session.session,
@@ -181,7 +198,45 @@ def count_session(session: Session, options: ReadingOptions) -> SessionCounts:
         stimuli=session.stimuli,
         guessed=session.guessed,
         forms=options.conditions.forms(table),
+        ledger=ledger,
+        found_labels=frozenset(labels.tolist()) - {""},
     )
+
+
+def _enter_tables(ledger: Ledger, session: Session, conditions: str) -> None:
+    used = {name for name in session.tables if name in (conditions, "invalid_times", LICKS) or CONTACTS.match(name)}
+    ledger.find("tables", len(session.tables))
+    ledger.take("tables", len(used))
+    for name, table in session.tables.items():
+        if name not in used:
+            ledger.leave("tables", table.fault or "not asked for", lost=bool(table.fault))
+
+
+def _enter_spikes(
+    ledger: Ledger,
+    spikes: list[NDArray[np.float64]],
+    used: list[NDArray[np.float64]],
+    edges: NDArray[np.float64],
+    covered: NDArray[np.bool_],
+    counts: NDArray[np.float32],
+) -> None:
+    """Enter all spikes, those of the units that are used [U] in their windows [R, 2] (s), and those between these."""
+    ledger.find("spikes", sum(map(len, spikes)))
+    ledger.leave("spikes", "of units that are left out", sum(map(len, spikes)) - sum(map(len, used)))
+    inside, outside = 0, 0
+    bounds_of: dict[bytes, NDArray[np.float64]] = {}
+    for unit, times in enumerate(used):
+        key = covered[:, unit].tobytes()
+        if key not in bounds_of:
+            bounds_of[key] = np.array(_merged(edges[covered[:, unit]])).reshape(-1)
+        place = np.searchsorted(bounds_of[key], times, side="right")
+        inside += int((place % 2 == 1).sum())
+        outside += int((place % 2 == 0).sum())
+    ledger.leave("spikes", "between the windows", outside)
+    begin, end = edges[np.argsort(edges[:, 0])].T
+    # A spike in two windows is counted in both; else the counts themselves must add up.
+    apart = bool((begin[1:] >= end[:-1]).all())
+    ledger.take("spikes", int(np.nansum(counts, dtype=np.float64)) if apart else inside)
 
 
 def has_units(session: Session) -> bool:
@@ -202,15 +257,67 @@ def no_units(session: Session) -> str:
     return f"{session.source} has no units table with spike_times (it holds {holds}); there is nothing to score."
 
 
-def read_spikes(units: SessionTable, notes: list[str]) -> list[NDArray[np.float64]]:
-    """Read the spike times (s, ascending) of every unit."""
+def read_spikes(units: SessionTable, doubts: list[str]) -> list[NDArray[np.float64]]:
+    """Read the spike times (s, ascending) of every unit.
+
+    Raises DataError where the times of most units start anew: their files were joined, or each trial has its own zero.
+    """
     spikes = units.rows(SPIKES)
     unsorted = [index for index, times in enumerate(spikes) if np.any(np.diff(times) < 0)]
     if unsorted:
-        notes.append(f"{units.label}: spike times of {len(unsorted)} units were not in order and have been sorted")
+        # Times in any order step back at every second spike; times that start anew do so seldom, and far.
+        again = [index for index in unsorted if _starts_anew(spikes[index])]
+        if 2 * len(again) > sum(len(times) > 1 for times in spikes):
+            raise DataError(
+                f"{units.label}: the spike times of {len(again)} units start anew within the session, as where files "
+                "were joined or times count from each trial; write them on one clock first."
+            )
+        doubts.append(f"{units.label}: spike times of {len(unsorted)} units were not in order and have been sorted")
         for index in unsorted:
             spikes[index] = np.sort(spikes[index])
     return spikes
+
+
+def _starts_anew(times: NDArray[np.float64]) -> bool:
+    """Return whether ascending runs of times (s), of four or more on average, begin near the start again."""
+    back = np.flatnonzero(np.diff(times) < 0)
+    steps, whole = times[back] - times[back + 1], np.ptp(times)
+    near = np.median(times[back + 1] - times.min()) < 0.5 * whole and np.median(steps) > 0.25 * whole
+    return bool(len(times) >= 4 * (len(back) + 1) and near)
+
+
+_UNITS_OF_TIME = {
+    "milliseconds: divide them by 1000": 1e3,
+    "samples: divide them by the sampling rate": 2.5e4,
+    "microseconds: divide them by 1,000,000": 1e6,
+}
+"""What times that are no seconds may be → about how many of it are in a second."""
+
+
+def time_fault(spikes: list[NDArray[np.float64]], table: SessionTable) -> str:
+    """Return why spikes and trials seem not to be both in seconds of one clock; empty where nothing speaks for it."""
+    span = recorded_span(spikes)
+    if span is None or "start_time" not in table or len(table) < 5:
+        return ""
+    start = table.times("start_time")
+    stop = table.times("stop_time") if "stop_time" in table else start
+    end = float(np.nanmax([*start, *stop], initial=-np.inf))
+    starts = np.sort(start[np.isfinite(start)])
+    if len(starts) < 5 or not (end > starts[0] and span[1] > span[0] and span[1] > 0 and end > 0):
+        return ""
+    number, last = sum(map(len, spikes)), span[1]
+    where = f"spikes run to {last:g} and trials to {end:g}"
+    for unit, factor in _UNITS_OF_TIME.items():
+        # Neurons fire more than once in ten seconds, and a recording lasts no longer than some times its trials.
+        least = 0.35 if factor == 2.5e4 else 0.9
+        if number / len(spikes) / (last - span[0]) < 0.1 and least <= last / end / factor <= 5:
+            return f"{where} s, so the spike times look like {unit}"
+        if 0.2 <= end / last / factor <= 1.2 / (least if least < 0.5 else 1.0):
+            return f"spikes run to {last:g} s and trials to {end:g}, so the times of the trials look like {unit}"
+    longest = 1.5 * float(np.median(np.diff(starts)))
+    if number > 20 and span[0] >= -longest and last <= longest and end > 5 * last:
+        return f"{where} s, so the spike times seem to count from the start of each trial: add its start_time"
+    return ""
 
 
 def recorded_span(spikes: list[NDArray[np.float64]]) -> tuple[float, float] | None:

@@ -191,6 +191,8 @@ class Tally:
     notes: list[str] = field(default_factory=list)
     seen: dict[Rule, set[str]] = field(default_factory=dict)
     """Values that the columns of the rules have."""
+    doubts: list[str] = field(default_factory=list)
+    """Notes that every result must state."""
 
     def apply(self, keep: NDArray[np.bool_], passes: Any, rule: str) -> NDArray[np.bool_]:
         """Return the rows that remain and count those that only now fell out."""
@@ -203,7 +205,7 @@ class Tally:
         for rule in rules:
             passes = rule.keep(table, self.seen)
             if passes is None:
-                self.notes.append(f"{table.label}: no column {rule.column!r}, so the rule {rule} did not apply")
+                self.doubts.append(f"{table.label}: no column {rule.column!r}, so the rule {rule} did not apply")
             else:
                 keep = self.apply(keep, passes, f"{scope}: {rule}")
         return keep

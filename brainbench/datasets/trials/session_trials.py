@@ -193,7 +193,13 @@ def _unique(keys: list[str]) -> tuple[str, ...]:
 
 
 def join_sessions(
-    parts: list[SessionCounts], options: ReadingOptions, *, source: str, layout: str, notes: list[str]
+    parts: list[SessionCounts],
+    options: ReadingOptions,
+    *,
+    source: str,
+    layout: str,
+    notes: list[str],
+    doubts: Sequence[str] = (),
 ) -> xr.Dataset:
     """Join the sessions' trials and units, block by block, in canonical order.
 
@@ -203,7 +209,8 @@ def join_sessions(
 
     # The order must not depend on that of the files: equal data then have equal content hashes.
     parts = sorted(parts, key=lambda part: (natural_key(part.subject), natural_key(part.session)))
-    doubts = [*check_values(part.tally for part in parts), *_doubtful_names(parts)]
+    doubts = [*doubts, *check_values(part.tally for part in parts), *_doubtful_names(parts)]
+    doubts += [doubt for part in parts for doubt in part.tally.doubts]
     removed: Counter[str] = Counter()
     for part in parts:
         removed.update(part.tally.removed)

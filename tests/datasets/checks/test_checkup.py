@@ -34,7 +34,7 @@ def test_a_folder_is_judged_as_a_whole_worst_first(tmp_path):
     assert checkup.files == 3
     assert [item.severity for item in checkup.findings[:2]] == ["error", "error"]
     assert re.search(r"broken\.h5.*HDF5", str(checkup))
-    assert "2 files hold this session" in str(checkup)
+    assert "hold the same spikes (5 of 5 units)" in str(checkup)
     with pytest.raises(DataFileNotFoundError):
         check(tmp_path / "nothing.h5")
     with pytest.raises(UsageError, match=r"'stimulus' .*TABLE:COLUMN"):

@@ -61,7 +61,7 @@ def test_a_missing_value_fails_what_is_asked_for_and_passes_what_is_refused():
 def test_an_optional_rule_without_its_column_says_so():
     tally = Tally()
     assert tally.select(make_table(a=[1, 2]), (Rule("b", refuse=("x",), required=False),), "trials").all()
-    assert "rule b!=x" in tally.notes[0]
+    assert "rule b!=x" in tally.doubts[0]
     assert tally.removed == {}
 
 

@@ -1,0 +1,136 @@
+"""What became of everything that a source holds: found = read + left out, and why, by kind."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from brainbench.core.errors import DataError, listing
+
+KINDS = ("files", "animals", "sessions", "tables", "units", "trials", "spikes", "labels")
+"""What is counted, from the largest to the smallest."""
+QUIET = ("tables", "spikes")
+"""Kinds of which most is left out by the very question: what a line of text tells of them is what was lost."""
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """Some of one kind that was found and not read."""
+
+    kind: str
+    reason: str
+    number: int = 1
+    lost: bool = False
+    """True for what nobody asked to leave out: no selection, no window, no mark in the file itself."""
+
+
+@dataclass
+class Ledger:
+    """The balance of one reading."""
+
+    strict: bool = False
+    """Refuse the first thing that is lost."""
+    totals: Counter[str] = field(default_factory=Counter)
+    read: Counter[str] = field(default_factory=Counter)
+    left: list[LeftOut] = field(default_factory=list)
+    incidental: set[Path] = field(default_factory=set)
+    """Files that a search came upon, and nobody named."""
+
+    def find(self, kind: str, number: int = 1) -> None:
+        """Note that so many were found."""
+        self.totals[kind] += number
+
+    def take(self, kind: str, number: int = 1) -> None:
+        """Note that so many were read."""
+        self.read[kind] += number
+
+    def leave(self, kind: str, reason: str, number: int = 1, *, lost: bool = False) -> None:
+        """Note that so many were not read, and why. Raises DataError for a lost one if the ledger is strict."""
+        if lost and self.strict:
+            raise DataError(reason)
+        if number:
+            self.left.append(LeftOut(kind, reason, number, lost))
+
+    def remove(self, removed: Mapping[str, int]) -> None:
+        """Take over the rows that rules removed, each under ``KIND: RULE``."""
+        for rule, number in removed.items():
+            kind, _, reason = rule.partition(": ")
+            self.leave(kind, reason, number)
+
+    def add(self, part: Ledger) -> Ledger:
+        """Take over all numbers of another balance; returns this one."""
+        self.totals += part.totals
+        self.read += part.read
+        for entry in part.left:
+            self.leave(entry.kind, entry.reason, entry.number, lost=entry.lost)
+        return self
+
+    def unbalanced(self) -> list[str]:
+        """Return a sentence for each kind whose numbers do not add up."""
+        out = Counter[str]()
+        for entry in self.left:
+            out[entry.kind] += entry.number
+        return [
+            f"{self.totals[kind]:,} {kind} were found, {self.read[kind]:,} read and {out[kind]:,} left out"
+            for kind in KINDS
+            if self.totals[kind] != self.read[kind] + out[kind]
+        ]
+
+    def close(self) -> list[str]:
+        """Return what does not add up; a strict ledger raises DataError for it."""
+        if (faults := self.unbalanced()) and self.strict:
+            raise DataError(f"The balance of the recordings does not close: {'; '.join(faults)}.")
+        return faults
+
+    @property
+    def skipped(self) -> list[str]:
+        """Reasons why whole files and sessions are left out."""
+        return [*dict.fromkeys(entry.reason for entry in self.left if entry.kind in ("files", "sessions"))]
+
+    def stated(self) -> dict[str, Any]:
+        """Return the balance as a record states it: kind → found, read, and what was left out."""
+        return {
+            kind: {
+                "found": self.totals[kind],
+                "read": self.read[kind],
+                "left_out": [
+                    {"reason": reason, "number": number, "lost": lost}
+                    for (reason, lost), number in _joined(entry for entry in self.left if entry.kind == kind).items()
+                ],
+            }
+            for kind in KINDS
+            if self.totals[kind]
+        }
+
+
+def _joined(entries: Iterable[LeftOut]) -> dict[tuple[str, bool], int]:
+    numbers: dict[tuple[str, bool], int] = {}
+    for entry in entries:
+        key = (entry.reason, entry.lost)
+        numbers[key] = numbers.get(key, 0) + entry.number
+    return numbers
+
+
+def balance_line(stated: Mapping[str, Any]) -> str:
+    """Return a stated balance in one line: what was left out of what, and why; empty if nothing was."""
+    return "; ".join(_parts(stated))
+
+
+def _parts(stated: Mapping[str, Any]) -> Iterator[str]:
+    before: set[str] = set()
+    for kind, numbers in stated.items():
+        entries = [entry for entry in numbers["left_out"] if entry["lost"] or kind not in QUIET]
+        if entries:
+            total = sum(entry["number"] for entry in entries)
+            numbered = len(entries) > 1 and total > len(entries)
+            counts = (f" ({entry['number']:,})" if numbered else "" for entry in entries)
+            reasons = (entry["reason"].rstrip(".") + count for entry, count in zip(entries, counts, strict=True))
+            # What a file held is left out with it, which is said once.
+            texts = [text for text, entry in zip(reasons, entries, strict=True) if entry["reason"] not in before]
+            before.update(entry["reason"] for entry in entries)
+            yield f"{total:,} of {numbers['found']:,} {kind}" + (
+                f": {listing(texts, limit=4, quoted=False)}" if texts else ""
+            )

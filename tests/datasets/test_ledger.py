@@ -1,0 +1,68 @@
+import h5py
+import pytest
+
+from brainbench.core.errors import DataError
+from brainbench.datasets import inspect, open_recordings, write_recordings
+from brainbench.datasets.ledger import Ledger, balance_line
+from tests.factories.recording_files import write_nwb
+from tests.factories.recordings import make_simple_session
+
+
+def test_a_balance_that_does_not_close_is_said_and_refused_when_strict():
+    ledger = Ledger()
+    ledger.find("units", 5)
+    ledger.take("units", 3)
+    ledger.remove({"units: too deep": 1, "trials: spoiled": 0})
+    assert ledger.close() == ["5 units were found, 3 read and 1 left out"]
+    with pytest.raises(DataError, match="5 units were found"):
+        Ledger(strict=True).add(ledger).close()
+    ledger.leave("units", "no spikes")
+    assert ledger.close() == []
+    assert balance_line(ledger.stated()) == "2 of 5 units: too deep, no spikes"
+
+
+def test_what_is_lost_is_refused_at_once_when_strict_and_what_was_asked_for_is_not():
+    ledger = Ledger(strict=True)
+    ledger.leave("trials", "outcome=correct", 3)
+    with pytest.raises(DataError, match="a Zarr store"):
+        ledger.leave("files", "b.nwb is a Zarr store.", lost=True)
+
+
+def test_every_kind_of_a_reading_adds_up(tmp_path):
+    for name in ("m1", "m2"):
+        write_recordings(tmp_path / f"{name}.h5", make_simple_session(subject=name))
+    opened = open_recordings(tmp_path, conditions="trials:stimulus", select="stimulus=a|b; units.id=0|1")
+    ledger = opened.attrs["ledger"]
+    assert list(ledger) == ["files", "animals", "sessions", "tables", "units", "trials", "spikes", "labels"]
+    for kind, numbers in ledger.items():
+        assert numbers["found"] == numbers["read"] + sum(entry["number"] for entry in numbers["left_out"]), kind
+    assert (ledger["units"]["read"], ledger["trials"]["read"], ledger["labels"]["found"]) == (4, 16, 3)
+    assert ledger["spikes"]["read"] == int(opened["counts"].sum(skipna=True))
+    assert "8 of 24 trials: stimulus=a|b" in balance_line(ledger)
+
+
+def test_an_animal_that_is_not_read_is_named_by_every_command(tmp_path):
+    write_nwb(tmp_path / "a.nwb", subject="m1")
+    (tmp_path / "b.nwb.zarr").mkdir()
+    (tmp_path / "c.nwb").symlink_to(tmp_path / ".git" / "annex" / "c.nwb")
+    (tmp_path / "d.nwb.gz").write_bytes(b"")
+    (tmp_path / "pose.h5").write_bytes(b"of another tool")
+    stated = {
+        "inspect": inspect(tmp_path).ledger,
+        "open": open_recordings(tmp_path, conditions="trials:texture").attrs["ledger"],
+    }
+    for ledger in stated.values():
+        assert (ledger["files"]["found"], ledger["files"]["read"]) == (5, 1)
+        reasons = " ".join(entry["reason"] for entry in ledger["files"]["left_out"])
+        for words in ("b.nwb.zarr is a Zarr store", "c.nwb is a link", "datalad get c.nwb", "ends in .gz", "pose.h5"):
+            assert words in reasons
+    with pytest.raises(DataError, match=r"b\.nwb\.zarr"):
+        open_recordings(tmp_path, conditions="trials:texture", strict=True)
+
+
+def test_files_of_another_tool_beside_nwb_are_no_loss(tmp_path):
+    write_nwb(tmp_path / "a.nwb")
+    with h5py.File(tmp_path / "pose.h5", "w") as file:
+        file["x"] = [1]
+    opened = open_recordings(tmp_path, conditions="trials:texture", strict=True)
+    assert "pose.h5 is HDF5 but neither" in balance_line(opened.attrs["ledger"])
