@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass, replace
+from typing import Literal, get_args
 
 from brainbench.core.errors import UsageError, brief
 
-OBJECTIVES = ("supervised", "simclr", "simsiam", "ae")
+Objective = Literal["supervised", "simclr", "simsiam", "ae"]
+OBJECTIVES: tuple[Objective, ...] = get_args(Objective)
 """Tags of trained weights: the objective they were trained with."""
 
 _NEW = re.compile(r"[a-z0-9]+([-+][a-z0-9]+)*")

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from functools import cache
 from itertools import product
+from typing import Literal, get_args
 
 from brainbench.core.errors import check_name
 from brainbench.models.architecture import Architecture
@@ -21,8 +22,10 @@ SOURCE = "thesis, tables 3.2-3.5"
 EPOCHS = 100
 BATCH_SIZE = 256
 SIMSIAM_BATCH_SIZE = 1024
-OPTIMIZERS = ("sgd", "adam", "adamw", "lars")
-SCHEDULES = ("step", "constant", "cosine")
+Optimizer = Literal["sgd", "adam", "adamw", "lars"]
+Schedule = Literal["step", "constant", "cosine"]
+OPTIMIZERS: tuple[Optimizer, ...] = get_args(Optimizer)
+SCHEDULES: tuple[Schedule, ...] = get_args(Schedule)
 """``step``: a tenth every 30 epochs; ``constant``; ``cosine``: to zero, after a linear rise if there is a warm-up."""
 _RATES = (1e-1, 1e-2, 1e-3, 1e-4)
 

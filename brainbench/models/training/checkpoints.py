@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, check_name, listing, needing
 from brainbench.core.plugins import load_optional
@@ -23,7 +23,8 @@ WEIGHTS, CONFIG, CARD = "model.safetensors", "config.json", "README.md"
 LOCAL, HUB = "local-dir:", "hf-hub:"
 PREFIXES = (LOCAL, HUB)
 """Beginnings of a model's name that is a folder or a repository instead of a registry name."""
-DTYPES = ("float32", "float16", "bfloat16")
+DType = Literal["float32", "float16", "bfloat16"]
+DTYPES: tuple[DType, ...] = get_args(DType)
 FOREIGN, SCORED, SETTINGS = "*.ckpt", "val_best.ckpt", "config.yaml"
 IMPORTERS = "brainbench.checkpoints"
 """Entry points of functions that make a model's folder of a foreign file and its settings (None without any)."""

@@ -9,81 +9,61 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
-from brainbench.core.errors import DataError, UsageError, brief, check_name, unknown_name
-from brainbench.core.reading.ranges import check_fields, check_number
-from brainbench.models.architecture import OBJECTIVES, Architecture, is_path
-from brainbench.models.recipes import BATCH_SIZE, EPOCHS, OPTIMIZERS, SCHEDULES, recipe_for
-from brainbench.models.training.checkpoints import DTYPES
+from brainbench.core.errors import DataError, UsageError, check_each, check_kind, unknown_name
+from brainbench.core.limits import Limit, NotNegative, Positive, limited
+from brainbench.models.architecture import OBJECTIVES, Architecture, Objective, is_path
+from brainbench.models.recipes import BATCH_SIZE, EPOCHS, Optimizer, Schedule, recipe_for
+from brainbench.models.training.checkpoints import DType
 
-PRECISIONS = ("auto", "float32", "bf16")
-COMPILE = ("off", "parts", "default", "graphs")
-AUGMENTATIONS = ("none", "physical", "thesis", "image")
+_Times = Annotated[int, Limit(least=0, most=2**31 - 1)]
 
 
 @dataclass(frozen=True)
+@limited
 class TrainingConfig:
     """One training run. :meth:`published` fills in the published recipe."""
 
     model: str
     """Registry name without a tag."""
-    objective: str = "supervised"
+    objective: Objective = "supervised"
     """``supervised``, ``simclr``, ``simsiam`` or ``ae``; ``simsiam-warmup`` names a recipe of its own."""
-    optimizer: str = "sgd"
+    optimizer: Optimizer = "sgd"
     """``sgd``, ``adam``, ``adamw`` or ``lars``."""
-    schedule: str = "step"
+    schedule: Schedule = "step"
     """``step``, ``constant`` or ``cosine``."""
-    learning_rate: float = 1e-2
+    learning_rate: Positive = 1e-2
     """Highest learning rate."""
-    warmup_epochs: int = 0
+    warmup_epochs: _Times = 0
     """Epochs in which the rate of the ``cosine`` schedule rises from 1e-4 of its highest."""
-    epochs: int = EPOCHS
+    epochs: Annotated[int, Limit(least=1, most=2**31 - 1)] = EPOCHS
     """Passes through the training sweeps (published: 100)."""
-    batch_size: int = BATCH_SIZE
+    batch_size: Annotated[int, Limit(least=2, most=2**31 - 1)] = BATCH_SIZE
     """Sweeps per optimiser step, over all processes."""
     decoder: str = "linear"
     """One of :data:`~brainbench.models.heads.DECODERS`."""
-    augmentation: str = "physical"
+    augmentation: Literal["none", "physical", "thesis", "image"] = "physical"
     """``none``, ``physical``, ``thesis`` or ``image`` (:mod:`brainbench.models.training.augmentation`)."""
-    masking: float = 0.0
+    masking: Annotated[float, Limit(least=0, below=1)] = 0.0
     """Share of masked time steps (published with 0.75)."""
-    precision: str = "auto"
+    precision: Literal["auto", "float32", "bf16"] = "auto"
     """``float32``, ``bf16`` (mixed precision with float32 weights), or ``auto``: bf16 on CUDA and float32 on the CPU,
     where PyTorch's half-precision gradients of small convolutions are slower and now and then not finite."""
-    compile: str = "off"
+    compile: Literal["off", "parts", "default", "graphs"] = "off"
     """``off``, ``parts`` (torch.compile of cells and blocks, each once: quick to compile), ``default`` (of the whole
     unrolled step) or ``graphs`` (cells fused, and on CUDA the whole step recorded as a CUDA graph: the fastest)."""
-    clip: float = 1.0
+    clip: NotNegative = 1.0
     """Largest norm of the gradient; 0 leaves it alone."""
-    probe_epochs: int = 100
+    probe_epochs: _Times = 100
     """Epochs of the linear probe after a self-supervised objective; 0 for none."""
-    seed: int = 0
+    seed: _Times = 0
     """Seed of weights, order, augmentation and dropout."""
-    checkpoint_seconds: float = 60.0
+    checkpoint_seconds: NotNegative = 60.0
     """Time between saved states within an epoch; the end of every epoch saves too."""
-    weights_dtype: str = "auto"
+    weights_dtype: Literal["auto", DType] = "auto"
     """Precision of the published weights: ``float32``, ``float16``, ``bfloat16``, or ``auto``: bfloat16 where the run
     trains in bf16 (half the size), else float32."""
-
-    def __post_init__(self) -> None:
-        for kind, value, allowed in (
-            ("objective", self.objective, OBJECTIVES),
-            ("optimizer", self.optimizer, OPTIMIZERS),
-            ("schedule", self.schedule, SCHEDULES),
-            ("precision", self.precision, PRECISIONS),
-            ("way to compile", self.compile, COMPILE),
-            ("precision of weights", self.weights_dtype, ("auto", *DTYPES)),
-            ("augmentation", self.augmentation, AUGMENTATIONS),
-        ):
-            check_name(kind, value, allowed)
-        whole = (("epochs", 1), ("batch_size", 2), ("probe_epochs", 0), ("warmup_epochs", 0), ("seed", 0))
-        for name, smallest in whole:
-            check_number(name, getattr(self, name), least=smallest, most=2**31 - 1, whole=True)
-        check_fields(self, "learning_rate", above=0)
-        check_fields(self, "clip", least=0)
-        check_fields(self, "masking", least=0, below=1)
-        check_fields(self, "checkpoint_seconds", least=0)
 
     @classmethod
     def published(cls, model: str, objective: str = "supervised", **changes: Any) -> TrainingConfig:
@@ -103,14 +83,10 @@ class TrainingConfig:
     @classmethod
     def from_mapping(cls, values: Mapping[str, Any]) -> TrainingConfig:
         """Build a configuration from names and values."""
-        names = {field.name: str(field.type) for field in fields(cls)}
-        for name, value in values.items():
-            check_name("training option", name, names)
-            kinds = {"str": str, "int": int, "float": (int, float)}[names[name]]
-            if not isinstance(value, kinds) or isinstance(value, bool):
-                raise UsageError(f"The training option {name!r} is a {names[name]}; received {brief(value)}.")
+        check_each("training option", values, [field.name for field in fields(cls)])
         if "model" not in values:
             raise UsageError("A training configuration needs the option 'model'.")
+        check_kind("model of a training", values["model"], str, "a name")
         return cls(**values)
 
     @property

@@ -107,7 +107,7 @@ PARTS = (Cell, GPTBlock, MambaBlock, S4Block, BasicBlock)
 
 
 def compiled(module: torch.nn.Module, how: str) -> Any:
-    """Return a module compiled in one of the ways of :data:`~brainbench.models.training.config.COMPILE`."""
+    """Return a module compiled in one of the ways of ``TrainingConfig.compile``."""
     if how == "off":
         return module
     if how == "parts":

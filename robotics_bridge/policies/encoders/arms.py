@@ -125,7 +125,7 @@ class EncoderConfig:
         return _Network(self)
 
 
-def perceptron(inputs: int, hidden: Sequence[int], outputs: int) -> nn.Sequential:
+def elu_perceptron(inputs: int, hidden: Sequence[int], outputs: int) -> nn.Sequential:
     """Return a multilayer perceptron with ELU between its layers."""
     sizes = (inputs, *hidden)
     layers = [part for a, b in zip(sizes, hidden, strict=False) for part in (nn.Linear(a, b), nn.ELU())]
@@ -226,7 +226,7 @@ class _Flat(_Learned):
     def __init__(self, config: EncoderConfig) -> None:
         super().__init__(config)
         slots, items, channels = self.shape
-        self.net = perceptron(slots * items * channels, (_HIDDEN, _HIDDEN), self.features)
+        self.net = elu_perceptron(slots * items * channels, (_HIDDEN, _HIDDEN), self.features)
 
     def forward(self, taxels: torch.Tensor, h_in: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         return self.net(self.scale(taxels).flatten(1)), h_in

@@ -12,17 +12,17 @@ import json
 import logging
 import math
 import time
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import torch
 
-from brainbench.core.errors import BrainbenchError, DataError, DataFileNotFoundError, UsageError, needing
+from brainbench.core.errors import BrainbenchError, DataError, DataFileNotFoundError, UsageError, check_name, needing
 from brainbench.core.files import file_hash, provenance, read_mapping, to_plain, write_json
+from brainbench.core.limits import Count, Positive, Seed, limited
 from brainbench.core.progress import Progress
-from brainbench.core.reading.ranges import check_fields
 from brainbench.core.reading.regular import readable
 from brainbench.core.reading.tensors import check_finite
 from brainbench.core.runs.folder import RESTART, RunEnd, claim
@@ -31,19 +31,56 @@ from brainbench.core.runs.state import STATE, load_state, odd_shape, random_stat
 from brainbench.core.runs.stopping import Stop, occupied
 from brainbench.core.writing.tensors import write_tensors
 from robotics_bridge.envs.rsl_rl import RslRlEnv
-from robotics_bridge.policies.acting import ActingModel
 from robotics_bridge.policies.contract import from_json
 from robotics_bridge.policies.evaluate import Policy
 from robotics_bridge.policies.fit import check_fit, check_version
 from robotics_bridge.policies.shipped import SENSING, policy_path
+from robotics_bridge.policies.student import TACTILE, ActingModel
 from robotics_bridge.policies.training.distill import describe_run
-from robotics_bridge.policies.training.sensing import sensed_groups, sensing_policy
+from robotics_bridge.policies.training.distill_config import DistillConfig
 from robotics_bridge.policies.training.student_files import CONFIG, MODEL
-from robotics_bridge.tasks.settings import TeacherSettings
-from robotics_bridge.tasks.task import TASK_VERSION, Task
+from robotics_bridge.tasks.settings import CONTACTS, TeacherSettings, contacts_name
+from robotics_bridge.tasks.task import GROUPS, TASK_VERSION, Task, check_measured
 
 if TYPE_CHECKING:
     from robotics_bridge.envs.env import Env
+
+SENSES = {
+    "proprio": "proprio", "touch": TACTILE, "command": "command", "link_pose": "link_pose", "thermal": "thermal"
+}  # fmt: skip
+"""Name of an observation → its group."""
+
+
+def sensed_groups(observe: Iterable[str]) -> tuple[str, ...]:
+    """Return the groups of observations of :data:`SENSES`; UsageError for another, or one that is privileged."""
+    groups = []
+    for name in observe:
+        if name in GROUPS and name != TACTILE:
+            check_measured((name,), "A policy without a teacher")
+        check_name("observation", name, SENSES)
+        groups.append(SENSES[name])
+    return tuple(groups)
+
+
+def sensing_policy(
+    env: Env, settings: TeacherSettings, seed: int, observe: tuple[str, ...], encoder: str
+) -> DistillConfig:
+    """Return what a policy that reads some observations is as a student: its touch and network, and its memory."""
+    for name in sensed_groups(observe):
+        if name not in env.observation_shapes:
+            given = "make the environment with an observation type" if name == TACTILE else "leave it out"
+            raise UsageError(f"Task {env.task.name!r} gives no {name!r} here: {given}.")
+    o, contacts = env.options, contacts_name(env.task.contacts)
+    senses: dict[str, Any] = {"observe": "none"}
+    if "touch" in observe:
+        senses = {name: getattr(o, name) for name in ("observe", "placement", "resolution", "noisy")} | {
+            "encoder": encoder
+        }
+    return DistillConfig(
+        task=env.task.name, hand=str(env.hand.path or env.hand.name), embedder="lstm", hidden=settings.hidden,
+        num_envs=env.num_envs, seed=seed, contacts=cast(Any, contacts if contacts in CONTACTS else None), **senses,
+    )  # fmt: skip
+
 
 _LOG = logging.getLogger(__name__)
 _IDENTITY = (
@@ -222,20 +259,21 @@ class Trainer:
 
 
 @dataclass(frozen=True, kw_only=True)
+@limited(of="'{}' of a teacher's run")
 class TeacherRun:
     """Extent of a training run, and what it begins with."""
 
-    iterations: int | None = None
+    iterations: Count | None = None
     """In total, earlier ones of the run included; the settings' by default."""
-    minutes: float | None = None
+    minutes: Positive | None = None
     """Stop after this time and save."""
-    seed: int = 0
+    seed: Seed = 0
     """Seed of weights and actions."""
-    save_every: int = 50
+    save_every: Count = 50
     """Iterations between checkpoints."""
     start: Path | None = None
     """Another run, one of its models, or a shipped teacher, whose actor and critic a new run begins with."""
-    start_std: float | None = None
+    start_std: Positive | None = None
     """Standard deviation of actions that it begins with, to explore anew; by default that of the other run."""
     observe: tuple[str, ...] = ()
     """What the policy reads, with memory, in place of a teacher's groups: proprio, touch, command, …; the critic, which
@@ -247,9 +285,6 @@ class TeacherRun:
     """Loggers beside log.jsonl: tensorboard, csv (log.csv), wandb (offline)."""
 
     def __post_init__(self) -> None:
-        check_fields(self, "iterations", "save_every", least=1, whole=True)
-        check_fields(self, "seed", least=0, whole=True)
-        check_fields(self, "minutes", "start_std", above=0)
         if self.start_std is not None and self.start is None:
             raise UsageError(f"start_std goes with a run to start from; received {self.start_std!r} alone.")
         sensed_groups(self.observe)

@@ -29,26 +29,12 @@ def test_changes_win():
     assert TrainingConfig.published("zhuang", "ae", epochs=3, learning_rate=None).epochs == 3
 
 
-@pytest.mark.parametrize(
-    ("values", "message"),
-    [
-        ({"epoch": 3}, "Unknown training option 'epoch'; did you mean 'epochs'"),
-        ({"epochs": 0}, "epochs .*at least 1 .*received 0"),
-        ({"epochs": 1.5}, r"'epochs' is a int; received 1\.5"),
-        ({"learning_rate": -1.0}, "learning_rate .*-1"),
-        ({"optimizer": "sgdd"}, "Unknown optimizer 'sgdd'; did you mean 'sgd'"),
-        ({"schedule": "stepp"}, "Unknown schedule 'stepp'; did you mean 'step'"),
-        ({"precision": "fp16"}, "Unknown precision 'fp16'"),
-        ({"augmentation": "tactile"}, "Unknown augmentation 'tactile'"),
-        ({"objective": "simclr"}, ""),
-    ],
-)
-def test_values_are_checked(values, message):
-    if not message:
-        assert TrainingConfig.from_mapping({"model": "zhuang", **values}).objective == "simclr"
-        return
-    with pytest.raises(UsageError, match=message):
-        TrainingConfig.from_mapping({"model": "zhuang", **values})
+def test_options_of_a_mapping_are_checked_by_name_and_kind():
+    assert TrainingConfig.from_mapping({"model": "zhuang", "objective": "simclr"}).objective == "simclr"
+    with pytest.raises(UsageError, match="Unknown training option 'epoch'; did you mean 'epochs'"):
+        TrainingConfig.from_mapping({"model": "zhuang", "epoch": 3})
+    with pytest.raises(UsageError, match="model of a training must be a name; received 3"):
+        TrainingConfig.from_mapping({"model": 3})
 
 
 def test_a_configuration_names_its_model():

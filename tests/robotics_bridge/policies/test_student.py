@@ -13,8 +13,22 @@ from brainbench import load_model
 from brainbench.core.errors import UsageError
 from robotics_bridge.policies.encoders.arms import ARMS
 from robotics_bridge.policies.export import export_policy
-from robotics_bridge.policies.student import TactilePolicy
+from robotics_bridge.policies.student import ActingModel, TactilePolicy
 from robotics_bridge.policies.training.distill_config import DistillConfig
+
+
+def test_weights_of_rsl_rl_give_the_same_actions_without_it():
+    models = pytest.importorskip("rsl_rl.models")
+    observations = {"proprio": torch.randn(7, 5), "goal": torch.randn(7, 2)}
+    groups = {"actor": ["proprio", "goal"]}
+    spread = {"class_name": "GaussianDistribution", "init_std": 1.0}
+    theirs = models.MLPModel(observations, groups, "actor", 3, (16, 8), "elu", True, spread)
+    theirs.update_normalization({name: 3 * value + 1 for name, value in observations.items()})
+    ours = ActingModel(observations, groups, "actor", 3, (16, 8))
+    ours.load_state_dict({name: v for name, v in theirs.state_dict().items() if not name.startswith("distribution.")})
+    assert torch.equal(ours(observations), theirs(observations))
+    assert ours(observations).shape == (7, 3)
+
 
 NETWORK = "zhuang-intersection-ln-small"
 
