@@ -17,6 +17,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Any, Literal
 
+from brainbench.core.errors import look_alike
 from brainbench.core.files import to_plain
 from brainbench.core.identity import ScoreIdentity
 from brainbench.core.records import ESTIMATOR_VERSION, ResultRecord, Score
@@ -32,7 +33,7 @@ MOST_NAMED = 3
 def remarks(stored: Iterable[StoredRecord]) -> dict[str, tuple[str, ...]]:
     """Return for each doubtful record, by its identity, one sentence per doubt.
 
-    Every sentence begins with ``stale:``, ``conflict:`` or ``doubtful:``.
+    Every sentence begins with ``stale:``, ``conflict:``, ``doubtful:`` or ``look-alike:``.
     """
     usable = [item.record for item in stored if item.record is not None]
     doubts: dict[str, list[str]] = defaultdict(list)
@@ -42,6 +43,12 @@ def remarks(stored: Iterable[StoredRecord]) -> dict[str, tuple[str, ...]]:
         doubts[record.identity] += [f"stale: {reason}" for reason in _stale(record, newest)]
         doubts[record.identity] += [f"doubtful: {doubt}" for score in record.scores for doubt in score.doubts]
         groups[ScoreIdentity.of(record)].append(record)
+    names: dict[str, set[str]] = defaultdict(set)
+    for name in {record.score.name for record in usable}:
+        names[look_alike(name)].add(name)
+    for record in usable:
+        rivals = sorted(names[look_alike(record.score.name)] - {record.score.name})
+        doubts[record.identity] += [f"look-alike: its name reads like {rival!a}" for rival in rivals[:MOST_NAMED]]
     for group in groups.values():
         for record in group:
             # A few are enough to find out, and a set of many contradicting records stays readable.

@@ -15,6 +15,7 @@ from functools import cached_property
 
 import numpy as np
 
+from brainbench.core.errors import visible_name
 from brainbench.core.files import content_hash
 from brainbench.core.identity import unusual_settings
 from brainbench.core.records import Interval, ModelCard, ResultRecord, Score
@@ -72,7 +73,7 @@ class Entry:
     @property
     def name(self) -> str:
         """Name of the model."""
-        return self.score.name
+        return visible_name(self.score.name)
 
     @property
     def seeds(self) -> int:

@@ -8,43 +8,19 @@ edits; it is no signature against someone who renames the file as well.
 
 from __future__ import annotations
 
-import inspect
 import os
 from collections.abc import Iterable
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 from typing import Any
-
-import msgspec
 
 from brainbench.core.errors import DataError, DataFileNotFoundError
 from brainbench.core.files import write_text
 from brainbench.core.reading.texts import parse_json, read_text
-from brainbench.core.records import RECORD_SCHEMA, ResultRecord, record_identity
+from brainbench.core.records import ResultRecord, record_identity
 
 SCHEMA_PATH = Path(__file__).with_name("record.schema.json")
-"""The published schema, shipped with the package."""
-
-
-@cache
-def record_schema() -> dict[str, Any]:
-    """Return the JSON Schema (draft 2020-12) of one record file. The result is shared: do not change it."""
-    schema = msgspec.json.schema(ResultRecord)
-    for definition in schema["$defs"].values():
-        definition["description"] = inspect.cleandoc(definition["description"]).split("\n\n")[0].replace("\n", " ")
-        definition["additionalProperties"] = False
-        for described in definition["properties"].values():
-            described.pop("default", None)  # NaN among them, which JSON does not have
-    schema["$defs"]["ResultRecord"]["required"].append("schema")
-    return {
-        "$schema": "https://json-schema.org/draft/2020-12/schema",
-        "$id": f"urn:brainbench:result-record:{RECORD_SCHEMA}",
-        "title": "brainbench result record",
-        **schema,
-    }
-
-
+"""The published JSON Schema (draft 2020-12) of one record file, shipped with the package."""
 MAKE_ONE = "make one with: brainbench score MODEL --out FOLDER"
 
 

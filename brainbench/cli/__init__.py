@@ -6,6 +6,9 @@ Exit status: 0 done; 1 the request was fine but the job failed (unusable data);
 
 from __future__ import annotations
 
+import contextlib
+import errno
+import io
 import os
 import sys
 from typing import Any
@@ -34,6 +37,9 @@ def main() -> None:
     # (six times the processor time for --metric cka, where other work keeps the processors busy). Torch has its own.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")  # characters that a terminal lacks
     try:
         _run()
     except KeyboardInterrupt:
@@ -52,15 +58,26 @@ def main() -> None:
 
 def _run() -> None:
     from brainbench.cli.application import build
-    from brainbench.core.errors import BrainbenchError
+    from brainbench.core.errors import BrainbenchError, visible_lines
 
     # A shell that completes words asks for all of them.
     completing = "_BRAINBENCH_COMPLETE" in os.environ
     try:
-        build(None if completing else sys.argv[1:])()
+        try:
+            build(None if completing else sys.argv[1:])()
+        finally:
+            sys.stdout.flush()  # what cannot be written fails here, where it can be said
     except BrainbenchError as error:
-        print(f"brainbench: {error}", file=sys.stderr)
+        print(f"brainbench: {visible_lines(str(error))}", file=sys.stderr)
         sys.exit(error.exit_code)
+    except OSError as error:
+        if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EIO):
+            raise
+        # It would be tried again, and fail again, when Python ends.
+        with contextlib.suppress(OSError, ValueError):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        print(f"brainbench: The output cannot be written ({error.strerror}).", file=sys.stderr)
+        sys.exit(1)
 
 
 def _leave() -> None:

@@ -11,7 +11,7 @@ from typing import Annotated, Any
 
 import typer
 
-from brainbench.core.errors import MissingDependencyError
+from brainbench.core.errors import MissingDependencyError, visible_lines
 from brainbench.core.plugins import OptionalPart, optional_parts
 from brainbench.core.version import __version__
 
@@ -147,4 +147,13 @@ def _root(
 
 
 def _log(level: int) -> None:
-    logging.basicConfig(stream=sys.stderr, level=level, format="%(levelname)s %(name)s: %(message)s")
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(_Lines("%(levelname)s %(name)s: %(message)s"))
+    logging.basicConfig(level=level, handlers=[handler])
+
+
+class _Lines(logging.Formatter):
+    """Lines of the log, in which texts of others are data."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        return visible_lines(super().format(record))

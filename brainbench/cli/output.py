@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import inspect
+import json
 import sys
 import threading
 import time as clock
@@ -14,6 +15,7 @@ from typing import Annotated, Any, NamedTuple
 
 import typer
 
+from brainbench.core.errors import visible, visible_lines
 from brainbench.core.files import to_json, write_json
 from brainbench.core.progress import Item, Progress, track
 
@@ -41,7 +43,7 @@ def printed(command: Callable[..., Output]) -> Callable[..., None]:
         data, text, out, failure = command(**values)
         if out is not None:
             write_json(out, data)
-        print(to_json(data) if as_json else text)
+        print(_encodable_json(data) if as_json else visible_lines(text, styled=sys.stdout.isatty()))
         if failure is not None:
             raise failure
 
@@ -53,13 +55,23 @@ def printed(command: Callable[..., Output]) -> Callable[..., None]:
     return run
 
 
+def _encodable_json(data: Any) -> str:
+    """Return data as JSON that the stream can hold: characters that it lacks are written as escapes."""
+    text = to_json(data)
+    try:
+        text.encode(sys.stdout.encoding or "utf-8")
+    except UnicodeEncodeError:
+        return json.dumps(json.loads(text), indent=2, sort_keys=True)
+    return text
+
+
 def list_without_command(app: typer.Typer, command: Callable[[], Output]) -> None:
     """Let a group of commands run its listing when no command is named."""
 
     @app.callback(invoke_without_command=True)
     def run(context: typer.Context) -> None:
         if context.invoked_subcommand is None:
-            print(command().text)
+            print(visible_lines(command().text, styled=sys.stdout.isatty()))
 
 
 def table_of(title: str, items: Iterable[Any], columns: Mapping[str, str | Callable[[Any], object]]) -> str:
@@ -90,6 +102,7 @@ def table(title: str, columns: list[str], rows: list[list[str]], *, right: tuple
     from rich.console import Console
     from rich.table import Table
 
+    rows = [[visible(cell) for cell in row] for row in rows]
     grid = Table(show_header=any(columns), box=None, pad_edge=False, header_style="bold")
     terminal = sys.stdout.isatty()
     lengths = [max(map(len, column)) for column in zip(columns, *rows, strict=True)]

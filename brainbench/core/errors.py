@@ -3,10 +3,22 @@
 from __future__ import annotations
 
 import difflib
+import re
+import unicodedata
 from collections import Counter
 from collections.abc import Hashable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any
+
+MOST_OF_A_MESSAGE = 400
+"""Characters of the longest message: a longer one is cut in its middle, since its end says what to do."""
+_CONTROL = (
+    # C0 and C1; marks of direction and what has no width; ends of lines and paragraphs; tags; halves of pairs
+    "[\\x00-\\x1f\\x7f-\\x9f\\u061c\\u200b-\\u200f\\u2028-\\u202e\\u2060-\\u206f\\ufeff\\ufff9-\\ufffb"
+    "\\U000e0000-\\U000e007f\\ud800-\\udfff]"
+)
+_UNSAFE = re.compile(rf"{_CONTROL}|^\s+|\s+$|^\s*(?:::|##\[)")
+_UNSAFE_IN_LINES = re.compile(rf"(?P<style>\x1b\[[\d;]{{0,16}}m)|(?![\n\t]){_CONTROL}")
 
 
 class BrainbenchError(Exception):
@@ -14,6 +26,12 @@ class BrainbenchError(Exception):
 
     exit_code = 1
     """Exit status of the command line when this error ends it."""
+
+    def __str__(self) -> str:
+        """Return the message, of bounded length."""
+        text = super().__str__()
+        head, tail = MOST_OF_A_MESSAGE * 5 // 8, MOST_OF_A_MESSAGE * 3 // 8 - 3
+        return text if len(text) <= MOST_OF_A_MESSAGE else f"{text[:head]} … {text[-tail:]}"
 
 
 class UsageError(BrainbenchError, ValueError):
@@ -56,6 +74,55 @@ def brief(value: object, *, quoted: bool = True, most: int = 80) -> str:
     elif len(value) > most:
         value = f"{value[:most]}…"
     return repr(value) if quoted else value
+
+
+def visible(text: object) -> str:
+    """Return a text of others as one line of data: it can neither steer what shows it nor begin a command there.
+
+    Control characters, marks of direction, what has no width and blanks at the edges are written as escapes, and so is
+    the beginning of a command of a workflow. The one filter for terminals, Markdown, HTML and names of files.
+
+    >>> visible("x\\n::error::y"), visible("::error::y"), visible("s4-small ")
+    ('x\\\\n::error::y', '\\\\x3a\\\\x3aerror::y', 's4-small\\\\x20')
+    """
+    return _UNSAFE.sub(lambda match: "".join(map(_escaped, match[0])), str(text))
+
+
+def visible_lines(text: str, *, styled: bool = False) -> str:
+    """Return a text of several lines without control characters; those of style stay where the terminal has some."""
+    return _UNSAFE_IN_LINES.sub(
+        lambda match: match[0] if styled and match["style"] else "".join(map(_escaped, match[0])), text
+    )
+
+
+def visible_name(name: str) -> str:
+    """Return a name such that two which differ look different: what looks like a plain character is an escape.
+
+    >>> visible_name("s4\\u2010small"), visible_name("s4-small")
+    ('s4\\\\u2010small', 's4-small')
+    """
+    return visible("".join(mark if _is_plain(mark) else _escaped(mark) for mark in name))
+
+
+def look_alike(name: str) -> str:
+    """Return what a name looks like: equal for names that a reader cannot tell apart.
+
+    >>> look_alike("S4\\u2010small ") == look_alike("s4-small")
+    True
+    """
+    folded = unicodedata.normalize("NFKC", name).casefold()
+    marks = ("-" if unicodedata.category(mark) == "Pd" or mark in "_\u2212" else mark for mark in folded)
+    return "".join(mark for mark in marks if unicodedata.category(mark)[0] not in "ZC")
+
+
+def _is_plain(mark: str) -> bool:
+    if mark.isascii():
+        return True
+    return unicodedata.normalize("NFKC", mark) == mark and unicodedata.category(mark)[0] not in "ZCPS"
+
+
+def _escaped(mark: str) -> str:
+    return f"\\x{ord(mark):02x}" if " " <= mark <= "~" else mark.encode("unicode_escape").decode()
 
 
 def nearest(name: str, options: Iterable[str]) -> str | None:

@@ -11,6 +11,7 @@ from html import escape
 
 import numpy as np
 
+from brainbench.core.errors import visible_lines
 from leaderboards.boards import RAW_INPUT, Board
 from leaderboards.figures.svg import WIDTH, Drawing, Figure, Scale, cut, left_axis, legend, scale_of
 from leaderboards.ranking import DOUBTFUL
@@ -161,7 +162,7 @@ def draw_rdm(drawing: Drawing, x: float, y: float, side: float, picture: RdmPict
     drawing.rect(x, y, side, side, "box")
     drawing.parts.append(
         f'<image {place} image-rendering="pixelated" href="{picture.source}">'
-        f"<title>{escape(picture.description)}</title></image>"
+        f"<title>{escape(visible_lines(picture.description))}</title></image>"
     )
 
 

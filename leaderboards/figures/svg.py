@@ -12,6 +12,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from html import escape
 
+from brainbench.core.errors import visible_lines
 from brainbench.core.records import Interval
 from brainbench.core.statistics import is_finite
 
@@ -48,7 +49,7 @@ class Drawing:
 
     def text(self, x: float, y: float, text: str, kind: str = "") -> None:
         """Write one line; ``kind`` holds classes such as ``end quiet small``."""
-        self.parts.append(f'<text x="{_n(x)}" y="{_n(y)}"{_class(kind)}>{escape(text)}</text>')
+        self.parts.append(f'<text x="{_n(x)}" y="{_n(y)}"{_class(kind)}>{escape(visible_lines(text))}</text>')
 
     def line(self, x1: float, y1: float, x2: float, y2: float, kind: str = "line") -> None:
         """Draw a straight line."""
@@ -81,9 +82,10 @@ class Drawing:
 
     def render(self, *, style: str = "") -> str:
         """Return the SVG element."""
+        label = escape(visible_lines(self.title))
         return (
             f'<svg class="figure" xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {_n(self.width)} {_n(self.height)}" '
-            f'width="{_n(self.width)}" height="{_n(self.height)}" role="img" aria-label="{escape(self.title)}">'
+            f'width="{_n(self.width)}" height="{_n(self.height)}" role="img" aria-label="{label}">'
             f"{f'<style>{style}</style>' if style else ''}{''.join(self.parts)}</svg>"
         )
 
@@ -172,7 +174,7 @@ def _class(kind: str) -> str:
 
 def _end(element: str, tip: str) -> str:
     """Close an element, with the text that is shown on hovering."""
-    return f"><title>{escape(tip)}</title></{element}>" if tip else "/>"
+    return f"><title>{escape(visible_lines(tip))}</title></{element}>" if tip else "/>"
 
 
 WIDTH = 760.0

@@ -14,7 +14,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from brainbench.core.errors import DataError, check_name, missing_dependency
+from brainbench.core.errors import DataError, check_name, missing_dependency, visible
 from brainbench.core.files import write_together
 from brainbench.core.records import ResultRecord
 from brainbench.core.version import __version__
@@ -107,7 +107,7 @@ def _toolkit() -> Reference:
 
 def _other(text: str) -> Reference:
     key = re.sub(r"[^a-z0-9]+", "", text.lower())[:24] or "other"
-    safe = re.sub(r"[{}\\\n]", " ", text)
+    safe = re.sub(r"[{}\\]", " ", visible(text))
     return Reference(key, text, f"@misc{{{key},\n  note = {{{safe}}}\n}}")
 
 
@@ -157,7 +157,9 @@ def write_paper(
         "synthetic": any(board.synthetic for board in boards),
         "sections": [_section(board, place, path) for place, board in enumerate(boards, start=1)],
         "references": cited,
-        "commands": list(dict.fromkeys(text for record in usable if (text := record.score.provenance.command))),
+        "commands": list(
+            dict.fromkeys(visible(text) for record in usable if (text := record.score.provenance.command))
+        ),
         "bib": path.with_suffix(".bib").name,
     }
     if kind == "md":

@@ -32,7 +32,7 @@ from leaderboards.boards import Board, conclusions, rank
 from leaderboards.figures.charts import board_figures
 from leaderboards.site.score_page import model_page, render, script_json
 from leaderboards.site.table import COLUMNS, board_label, page_board, table_csv, table_rows
-from leaderboards.store import MAKE_ONE, StoredRecord, record_schema, record_text
+from leaderboards.store import MAKE_ONE, SCHEMA_PATH, StoredRecord, record_text
 
 MANIFEST = "build-manifest.json"
 _Hashes = dict[str, list[str]]
@@ -210,7 +210,7 @@ def _pages(stored: Sequence[StoredRecord], title: str) -> Iterator[tuple[str, st
     texts = {record.file_name: record_text(record) for record in records}
     yield from ((f"records/{name}", text) for name, text in texts.items())
     rows = [row for board in boards for row in table_rows(board)]
-    data = (table_csv(rows), to_json(rows) + "\n", _records_zip(texts), to_json(record_schema()) + "\n")
+    data = (table_csv(rows), to_json(rows) + "\n", _records_zip(texts), SCHEMA_PATH.read_bytes())
     yield from zip(DOWNLOADS, data, strict=True)
 
 

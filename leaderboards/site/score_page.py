@@ -20,6 +20,7 @@ from typing import Any
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
+from brainbench.core.errors import visible, visible_lines
 from brainbench.core.files import to_plain, write_text
 from brainbench.core.records import ResultRecord
 from brainbench.core.statistics import compare_scores
@@ -61,22 +62,31 @@ _MARKDOWN = str.maketrans({mark: f"\\{mark}" for mark in "\\`*_{}[]|#!"} | {"<":
 
 def escape_markdown(value: Any) -> Any:
     """Return a value as text of one line that Markdown, and the HTML in it, take literally; markup stays as it is."""
-    return value if isinstance(value, Markup) else " ".join(str(value).translate(_MARKDOWN).split())
+    return value if isinstance(value, Markup) else " ".join(visible_lines(str(value)).translate(_MARKDOWN).split())
 
 
 def script_json(value: Any) -> Any:
     """Return ``value`` as JSON that can stand inside a script element: nothing in it can end the element."""
-    text = json.dumps(to_plain(value), ensure_ascii=False, allow_nan=False, separators=(",", ":"))
+    text = json.dumps(_visible_texts(to_plain(value)), ensure_ascii=False, allow_nan=False, separators=(",", ":"))
     for mark, escaped in (("<", "\\u003c"), (">", "\\u003e"), ("&", "\\u0026")):
         text = text.replace(mark, escaped)
     return Markup(text)
+
+
+def _visible_texts(value: Any) -> Any:
+    """Return plain values, or what a template shows, with control characters as escapes; markup stays as it is."""
+    if isinstance(value, dict):
+        return {visible(key): _visible_texts(inner) for key, inner in value.items()}
+    if isinstance(value, list):
+        return [_visible_texts(inner) for inner in value]
+    return visible_lines(value) if type(value) is str else value
 
 
 @cache
 def _environment() -> Environment:
     environment = Environment(
         loader=FileSystemLoader(_TEMPLATES), autoescape=True, undefined=StrictUndefined, trim_blocks=True,
-        lstrip_blocks=True,
+        lstrip_blocks=True, finalize=_visible_texts,
     )  # fmt: skip
     helpers = (words.number, words.probability, words.count, words.span, words.level)
     environment.filters |= {helper.__name__: helper for helper in helpers}

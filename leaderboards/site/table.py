@@ -8,6 +8,7 @@ import math
 from collections.abc import Iterable
 from typing import Any
 
+from brainbench.core.errors import visible
 from brainbench.core.records import Score
 from leaderboards.boards import Baseline, Board, conclusions
 from leaderboards.entries import Entry
@@ -169,6 +170,7 @@ def _six_decimals(value: float) -> float | None:
 def _cell(value: Any) -> Any:
     if value is None:
         return ""
+    value = visible(value) if isinstance(value, str) else value
     # A spreadsheet would run text that starts like a formula.
     if isinstance(value, str) and value.startswith(("=", "+", "-", "@", "\t", "\r")):
         return f"'{value}"

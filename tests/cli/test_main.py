@@ -9,6 +9,8 @@ from pathlib import Path
 import pytest
 
 import brainbench
+from leaderboards.store import write_record
+from tests.factories.records import make_record
 
 HEAVY = {"torch", "xarray", "h5py", "mujoco", "scipy", "trimesh", "pandas", "matplotlib", "plotly"}
 COMMANDS = ["score", "models", "recordings", "stimuli", "leaderboard", "doctor"]
@@ -90,3 +92,56 @@ def test_ctrl_c_is_answered_in_one_sentence_that_says_how_to_go_on(tmp_path):
     assert running.returncode == 130
     assert len(err.strip().splitlines()) == 1
     assert "same command" in err
+
+
+@pytest.fixture
+def boards(tmp_path) -> tuple[str, str]:
+    """Two folders of records, the second with one more model."""
+    for folder, names in {"before": ("zhuang",), "after": ("zhuang", "ünet")}.items():
+        for name in names:
+            write_record(make_record(name), tmp_path / folder)
+    return str(tmp_path / "before"), str(tmp_path / "after")
+
+
+def _command(*words: str, stdout=subprocess.PIPE, **environment: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "brainbench", *words], stdout=stdout, stderr=subprocess.PIPE, check=False,
+        encoding=environment.get("PYTHONIOENCODING", "utf-8"),
+        env={**os.environ, **environment},
+    )  # fmt: skip
+
+
+def test_a_board_is_built_without_docstrings_and_has_the_same_schema(boards, tmp_path):
+    for level in ("", "2"):
+        done = _command(
+            "leaderboard", "build", boards[1], "--out", str(tmp_path / f"site{level}"), PYTHONOPTIMIZE=level
+        )
+        assert done.returncode == 0, done.stderr
+    schemas = {(tmp_path / name / "data" / "record.schema.json").read_bytes() for name in ("site", "site2")}
+    assert len(schemas) == 1
+
+
+@pytest.mark.parametrize("words", [("models", "list"), ("stimuli", "objects"), ("--help",), ("doctor",)])
+def test_commands_need_no_docstrings(words):
+    done = _command(*words, PYTHONOPTIMIZE="2")
+    assert (done.returncode, "Traceback" in done.stderr) == (0, False)
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "latin-1"])
+def test_characters_that_a_terminal_lacks_are_replaced(boards, encoding):
+    done = _command("leaderboard", "diff", *boards, PYTHONIOENCODING=encoding)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "added" in done.stdout
+    data = _command("leaderboard", "diff", *boards, "--json", PYTHONIOENCODING="ascii")
+    assert json.loads(data.stdout)["changes"][0]["name"] == "ünet (seed 3)"
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device that is always full")
+@pytest.mark.parametrize(
+    "words", [("leaderboard", "diff"), ("leaderboard", "diff", "--json"), ("--help",), ("--version",)]
+)
+def test_a_full_output_is_one_sentence(boards, words):
+    with Path("/dev/full").open("w") as full:
+        done = _command(*words[:2], *(boards if "diff" in words else ()), *words[2:], stdout=full)
+    assert done.returncode == 1
+    assert done.stderr == "brainbench: The output cannot be written (No space left on device).\n"

@@ -3,6 +3,7 @@ import doctest
 import pytest
 
 from brainbench.core import errors
+from brainbench.core.errors import DataError, FileWriteError, look_alike, visible, visible_lines, visible_name
 
 
 def test_examples_in_the_docstrings_hold():
@@ -37,3 +38,52 @@ def test_a_missing_package_names_the_extra_that_installs_it():
 )
 def test_exit_status_tells_a_wrong_request_from_a_failed_job(kind: type[errors.BrainbenchError], status: int):
     assert kind.exit_code == status
+
+
+@pytest.mark.parametrize(
+    "mark",
+    ["\x00", "\n", "\r", "\x1b", "\x7f", "\x85", "\x9b", "\u061c", "\u200b", "\u2028", "\u202e", "\u2066", "\ufeff",
+     "\U000e0041", "\udcff"],
+)  # fmt: skip
+def test_no_control_character_of_others_is_shown(mark):
+    text = visible(f"a{mark}b")
+    assert mark not in text
+    assert text.startswith("a\\")
+    assert text.encode().endswith(b"b")
+    assert (mark in visible_lines(f"a{mark}b")) == (mark == "\n")
+
+
+@pytest.mark.parametrize("text", ["::error::x", "  ::set-output name=x::y", "##[error]x", " edge", "edge "])
+def test_text_of_others_begins_no_command_and_has_no_blanks_at_its_edges(text):
+    shown = visible(text)
+    assert not shown.startswith(("::", "##[", " "))
+    assert not shown.endswith(" ")
+
+
+def test_plain_text_is_shown_as_it_is():
+    for text in ("zhuang-intersection-ln+gpt.simclr", "Zürich, 0.5 – 0.7 µN → 東京", "a::b", ""):
+        assert visible(text) == visible_lines(text) == text
+
+
+def test_styles_stay_where_a_terminal_has_some():
+    text = "\x1b[1mhead\x1b[0m\x1b]0;title\x07"
+    assert visible_lines(text, styled=True) == "\x1b[1mhead\x1b[0m\\x1b]0;title\\x07"
+    assert "\x1b" not in visible_lines(text)
+
+
+@pytest.mark.parametrize(
+    "rival", ["s4\u2010small", "s4\u2212small", "s4-small ", "s4-\u200bsmall", "\uff534-small", "S4_small"]
+)
+def test_names_that_read_alike_are_equal_when_compared_and_differ_when_shown(rival):
+    assert look_alike(rival) == look_alike("s4-small")
+    assert visible_name(rival) != visible_name("s4-small") == "s4-small"
+    assert visible_name(rival).isascii()
+
+
+def test_a_long_message_keeps_its_beginning_and_what_to_do():
+    error = DataError(f"The file {'x' * 900} is damaged; copy it again.")
+    assert len(str(error)) <= 400
+    assert str(error).startswith("The file xxx")
+    assert str(error).endswith("copy it again.")
+    missing = FileWriteError("y" * 900)
+    assert len(str(missing)) <= 400

@@ -21,8 +21,8 @@ from jsonschema import Draft202012Validator
 
 from brainbench.core.errors import DataError, DataFileNotFoundError
 from brainbench.core.records import ResultRecord, Score, record_identity
-from leaderboards.store import SCHEMA_PATH, read_record, read_records, record_schema, write_record
-from tests.factories.records import VALIDATOR
+from leaderboards.store import SCHEMA_PATH, read_record, read_records, write_record
+from tests.factories.records import VALIDATOR, record_schema
 
 
 def _fault(data: Any) -> str | None:

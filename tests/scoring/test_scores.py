@@ -10,7 +10,7 @@ import xarray as xr
 from torch import nn
 
 import brainbench
-from brainbench.cli.leaderboard.verify import score_again
+from brainbench.cli.leaderboard.verify import Repetition, score_again
 from brainbench.core.errors import UsageError
 from brainbench.datasets import open_recordings, write_recordings
 from brainbench.datasets.sessions import make_session
@@ -209,7 +209,7 @@ def test_dropped_labels_leave_the_comparison(truth: Path, recordings: xr.Dataset
 def test_a_record_with_a_dropped_label_is_repeated_without_it(truth: Path, folder: Path):
     how = {"recordings": str(folder), "conditions": "trials:stimulus"}
     record = score_record(str(truth), match={"f": None}, **how)
-    again = score_again(record, recordings=str(folder), trust_code=True)
+    again = score_again(record, Repetition(str(folder), trust_code=True))
     assert differences(record, again) == []
 
 

@@ -2,8 +2,16 @@
 
 import typer
 
-from brainbench.cli.leaderboard import add, held_out, site, verify
+from brainbench.cli.leaderboard import add, held_out, site, submission, verify
 
 app = typer.Typer(no_args_is_help=True, help="Collect result records, check them, and show them as a leaderboard.")
-for _command in (add.add, verify.verify, held_out.hold_out, site.diff, site.build, site.report):
+for _command in (
+    add.add,
+    verify.verify,
+    submission.check_submission,
+    held_out.hold_out,
+    site.diff,
+    site.build,
+    site.report,
+):
     app.command(_command.__name__.replace("_", "-"))(_command)

@@ -10,7 +10,7 @@ import typer
 from brainbench.cli.destinations import out_folder
 from brainbench.cli.options import SCORE, SCORE_FLAGS, SchedulerOption, with_options
 from brainbench.cli.output import Output
-from brainbench.core.errors import UsageError
+from brainbench.core.errors import UsageError, visible
 
 OFFERED = (
     "recordings", "conditions", "select", "window", "stimuli", "fidelity", "whiskers", "metric", "estimator", "time"
@@ -70,6 +70,6 @@ def add(
     done += score_jobs(jobs, to, prune=prune, workers=workers, scheduler=scheduler)
     states = [item["state"] for item in done]
     summary = ", ".join(f"{states.count(state)} {state}" for state in dict.fromkeys(states)) or "nothing to do"
-    lines = [f"{item['state']:9} {item['record'] or item['model']}{item['note']}" for item in done]
+    lines = [f"{item['state']:9} {visible(item['record'] or item['model'])}{item['note']}" for item in done]
     failure = typer.Exit(1) if "refused" in states else None
     return Output({"folder": to, "results": done}, "\n".join([*lines, f"{to}: {summary}"]), failure=failure)

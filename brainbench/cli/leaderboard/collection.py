@@ -9,7 +9,7 @@ from typing import Any
 
 from brainbench.cli.options import SCORE, SCORE_FLAGS, as_flags
 from brainbench.cli.output import progress_bar
-from brainbench.core.errors import DataFileNotFoundError
+from brainbench.core.errors import DataFileNotFoundError, look_alike
 from brainbench.core.files import to_json
 from brainbench.core.identity import ScoreIdentity
 from brainbench.core.records import ResultRecord
@@ -31,12 +31,21 @@ def given_files(sources: list[Path]) -> list[Path]:
 def take_in(paths: list[Path], to: Path, *, keep_both: bool) -> list[dict[str, Any]]:
     """Take in files one after the other; what one brought counts for the next."""
     present: dict[ScoreIdentity, dict[str, ResultRecord]] = defaultdict(dict)
+    names: dict[str, str] = {}
     for record in (record for _, record in (_present(to) if paths else [])):
         present[ScoreIdentity.of(record)][record.identity] = record
+        names.setdefault(look_alike(record.score.name), record.score.name)
     done = []
     for path in paths:
         (stored,) = read_records(path)
-        done.append({"record": path.name} | _take_in_one(stored, to, present, keep_both=keep_both))
+        record, state = stored.record, {}
+        if record is not None and not keep_both:
+            rival = names.setdefault(look_alike(record.score.name), record.score.name)
+            if rival != record.score.name:
+                note = f": its name {record.score.name!a} reads like {rival!a}, which is there"
+                state = {"state": "refused", "model": record.score.name, "note": note}
+        state = state or _take_in_one(stored, to, present, keep_both=keep_both)
+        done.append({"record": path.name} | state)
     return done
 
 

@@ -10,6 +10,7 @@ import typer
 
 from brainbench.cli.destinations import out_file_option, out_folder_option
 from brainbench.cli.output import Output, progress_bar, table_of
+from brainbench.core.errors import visible
 
 if TYPE_CHECKING:
     from leaderboards.store import StoredRecord
@@ -92,4 +93,4 @@ def _problems(stored: list[StoredRecord]) -> list[dict[str, Any]]:
 
 
 def _left_out(problems: list[dict[str, Any]]) -> str:
-    return "".join(f"\n  left out: {item['path']}: {item['problem']}" for item in problems)
+    return "".join(f"\n  left out: {visible(item['path'])}: {visible(item['problem'])}" for item in problems)

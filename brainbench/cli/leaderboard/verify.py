@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -9,16 +11,21 @@ import typer
 
 from brainbench.cli.options import SCORE, option_fields
 from brainbench.cli.output import Output, table_of, tracked
-from brainbench.core.errors import BrainbenchError, DataError, UsageError
+from brainbench.core.errors import BrainbenchError, DataError, UsageError, brief, visible
 
 if TYPE_CHECKING:
     from brainbench.core.records import ResultRecord
+    from leaderboards.held_out import Commitment
+    from leaderboards.store import StoredRecord
 
 
 def verify(
     records: Annotated[list[Path], typer.Argument(help="Record files or folders of them.")],
     recordings: Annotated[
         str | None, typer.Option("--recordings", "-r", help="Where the recordings are, if not 'demo'.")
+    ] = None,
+    stimuli: Annotated[
+        str | None, typer.Option("--stimuli", "-s", help="Stimuli, if not a recipe of the package.")
     ] = None,
     score: Annotated[
         bool, typer.Option("--score/--no-score", help="Score the model again and compare; else only read the files.")
@@ -34,12 +41,10 @@ def verify(
 ) -> Output:
     """Check records: the file against its hash, the records against one another, the numbers against a repetition.
 
-    Only models of the registry and weights that come with the package are repeated: code that a record names could do
-    anything, and could read the answer. Exit status 1 if a file was edited, a repetition gives something else or
-    cannot be made; what differs is printed.
+    Only models of the registry, weights and stimuli that come with the package are repeated: code that a record names
+    could do anything, and could read the answer, and a path in it could be that of any file. Exit status 1 if a file
+    was edited, a repetition gives something else or cannot be made; what differs is printed.
     """
-    from brainbench.cli.leaderboard.held_out import score_held_out
-    from leaderboards.audit import differences, remarks
     from leaderboards.held_out import Commitment
     from leaderboards.store import read_records
 
@@ -47,7 +52,36 @@ def verify(
     commitment = None if held_out is None else Commitment.read(held_out)
     if commitment is not None:
         commitment.open(secret)
-    stored = read_records(records)
+    return verdicts(
+        read_records(records), Repetition(recordings, stimuli, trust_code, score, tolerance), commitment, secret
+    )
+
+
+@dataclass(frozen=True)
+class Repetition:
+    """How records are scored again."""
+
+    recordings: str | None = None
+    """Where they are, if not those of the demo."""
+    stimuli: str | None = None
+    """Stimuli in place of those that the record names."""
+    trust_code: bool = False
+    """Run code, and open files, that do not come with this package."""
+    score: bool = True
+    """Score at all, rather than read the files alone."""
+    tolerance: float = 1e-3
+
+
+def verdicts(
+    stored: Sequence[StoredRecord],
+    how: Repetition,
+    commitment: Commitment | None = None,
+    secret: Path | None = None,
+) -> Output:
+    """Return what is found about records, with exit status 1 where one is refused, differs or is not repeated."""
+    from brainbench.cli.leaderboard.held_out import score_held_out
+    from leaderboards.audit import differences, remarks
+
     doubts = remarks(stored)
     results: list[dict[str, Any]] = []
     for entry in tracked(stored, "records verified"):
@@ -55,13 +89,13 @@ def verify(
         if entry.record is not None:
             result |= {"verdict": "intact", "doubts": doubts.get(entry.record.identity, ())}
             try:
-                if score:
-                    again = score_again(entry.record, recordings=recordings, trust_code=trust_code)
-                    changes = differences(entry.record, again, tolerance=tolerance)
+                if how.score:
+                    again = score_again(entry.record, how)
+                    changes = differences(entry.record, again, tolerance=how.tolerance)
                     result |= {"verdict": "differs" if changes else "confirmed", "differences": changes}
                     result |= {"value": again.score.value}
-                if commitment is not None and result["verdict"] in ("intact", "confirmed"):
-                    refuse_foreign_code(entry.record, trusted=trust_code)
+                if commitment is not None and secret is not None and result["verdict"] in ("intact", "confirmed"):
+                    refuse_foreign_code(entry.record, trusted=how.trust_code)
                     result |= score_held_out(entry.record, commitment, secret)
             except BrainbenchError as error:
                 result |= {"verdict": "not repeated", "problem": str(error)}
@@ -71,11 +105,10 @@ def verify(
     return Output(results, text, failure=typer.Exit(1) if failed else None)
 
 
-def score_again(record: ResultRecord, *, recordings: str | None = None, trust_code: bool = False) -> ResultRecord:
-    """Repeat a record's computation from its provenance.
+def score_again(record: ResultRecord, how: Repetition) -> ResultRecord:
+    """Repeat a record's computation from its provenance, of which only names that this package knows are taken.
 
-    Only demo recordings are found without ``recordings``, since records keep no folders. ``trust_code`` also runs code
-    and weights that do not come with this package.
+    Only demo recordings are found without ``how.recordings``, since records keep no folders.
     """
     from brainbench.scoring.demo import DEMOS
     from brainbench.scoring.options import ScoreOptions
@@ -89,10 +122,11 @@ def score_again(record: ResultRecord, *, recordings: str | None = None, trust_co
             f"The record of {record.score.name!r} does not name a model that can be loaded (a module in memory or a "
             "record of an earlier layout); score the model again."
         )
-    refuse_foreign_code(record, trusted=trust_code)
-    if recordings is None and (not isinstance(source, str) or source not in DEMOS):
+    refuse_foreign_code(record, trusted=how.trust_code, stimuli=how.stimuli)
+    if how.recordings is None and (not isinstance(source, str) or source not in DEMOS):
         raise UsageError(f"The record was made with recordings {str(source)[:80]!r}; give them with --recordings PATH.")
-    options = ScoreOptions.stated_in(origin.settings, recordings=recordings or source, match=origin.pairs or None)
+    others = {"recordings": how.recordings or source, "match": origin.pairs or None}
+    options = ScoreOptions.stated_in(origin.settings, **others, **({"stimuli": how.stimuli} if how.stimuli else {}))
     return score_record(model, options)
 
 
@@ -115,13 +149,22 @@ def _check_kinds(record: ResultRecord, model: Any, source: Any) -> None:
         typed_values(kind | None, value, f"the setting {name!r} of {record.score.name[:80]!r}")
 
 
-def refuse_foreign_code(record: ResultRecord, *, trusted: bool) -> None:
-    """Refuse to run what a record names unless it is in the registry or comes with the package."""
+def refuse_foreign_code(record: ResultRecord, *, trusted: bool, stimuli: str | None = None) -> None:
+    """Refuse to run or open what a record names unless it is in the registry or comes with the package.
+
+    ``stimuli`` given by whoever asks stand in place of the record's.
+    """
     from brainbench.metrics import list_metrics
     from brainbench.models.registry import list_models
     from brainbench.models.training.checkpoints import shipped
+    from brainbench.stimuli.scenes.recipes import is_packaged
 
     settings = record.score.provenance.settings
+    if not (trusted or stimuli or settings.get("stimuli") is None or is_packaged(settings["stimuli"])):
+        raise UsageError(
+            f"The stimuli {brief(settings['stimuli'])} of the record do not come with this package, and what a record "
+            "names is not opened; give yours with --stimuli, or trust the record with --trust-code."
+        )
     ours = {"model": [*list_models(), *shipped()], "metric": list_metrics()}
     for what, names in ours.items():
         if not trusted and settings.get(what) not in names:
@@ -141,8 +184,8 @@ def _verdict(result: dict[str, Any]) -> str:
         "not repeated": f"not repeated: {result['problem']}",
         "refused": f"refused: {result['problem']}",
     }
-    lines = [f"{result['record']}\n  {words[result['verdict']]}"]
-    lines += [f"  {doubt}" for doubt in result.get("doubts", ())]
+    lines = [visible(result["record"]), f"  {visible(words[result['verdict']])}"]
+    lines += [f"  {visible(doubt)}" for doubt in result.get("doubts", ())]
     if held := result.get("held_out"):
         columns = {name: f"{{0[{name}]}}" for name in ("on", "score", "low", "high", "standing")}
         rows = [{"on": "public part", **result["on_public"]}, {"on": f"held-out {held}", **result["on_held_out"]}]

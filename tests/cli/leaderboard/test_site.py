@@ -3,7 +3,8 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from leaderboards.store import read_record
+from leaderboards.store import read_record, write_record
+from tests.factories.records import make_record
 
 PARTS = ("--conditions", "trials:texture")
 
@@ -67,3 +68,39 @@ def test_the_leaderboard_of_no_records_says_how_to_get_some(run, tmp_path):
     assert result.status == 2
     assert not (tmp_path / "page").exists()
     assert "brainbench score" in result.err
+
+
+ACTS = "\x1b[31mred\x1b[0m\x1b]0;title\x07\u202ex\n::error::y"
+
+
+def test_text_of_others_is_data_wherever_it_is_shown(run, tmp_path):
+    for folder, name in {"before": "zhuang", "after": ACTS}.items():
+        write_record(make_record(name), tmp_path / folder)
+    acting = next((tmp_path / "after").iterdir())
+    renamed = acting.rename(acting.with_name(f"x\n::error::x--{acting.stem.rpartition('--')[2]}.json"))
+    after, site = str(tmp_path / "after"), tmp_path / "site"
+    outputs = [
+        run("leaderboard", "verify", "--no-score", after).out,
+        run("leaderboard", "diff", str(tmp_path / "before"), after).out,
+        run("leaderboard", "add", str(renamed), "--to", str(tmp_path / "board")).out,
+    ]
+    assert run("leaderboard", "build", after, "--out", str(site)).status == 0
+    assert run("leaderboard", "report", after, "--out", str(tmp_path / "report.md")).status == 0
+    files = [*site.rglob("*.html"), *site.rglob("*.csv"), *tmp_path.rglob("*.svg"), *tmp_path.glob("report.*")]
+    assert not [line for text in outputs for line in text.splitlines() if line.startswith("::")]
+    outputs += [path.read_text() for path in files]
+    for text in outputs:
+        assert not set(text) & set("\x1b\x07\u202e")
+
+
+def test_names_that_read_alike_are_refused_or_marked(run, tmp_path):
+    for name in ("zhuang-small", "zhuang-small ", "zhuang\u2010small"):
+        write_record(make_record(name), tmp_path / "alike")
+    added = run("leaderboard", "add", str(tmp_path / "alike"), "--to", str(tmp_path / "board"))
+    assert (added.status, added.out.count("reads like")) == (1, 2)
+    assert len(list((tmp_path / "board").iterdir())) == 1
+    assert "look-alike: its name reads like" in run("leaderboard", "verify", "--no-score", str(tmp_path / "alike")).out
+    run("leaderboard", "build", str(tmp_path / "alike"), "--out", str(tmp_path / "site"))
+    table = (tmp_path / "site" / "data" / "leaderboard.csv").read_text()
+    assert "zhuang-small\\x20" in table
+    assert "zhuang\\u2010small" in table

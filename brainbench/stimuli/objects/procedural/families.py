@@ -65,7 +65,7 @@ def list_families() -> tuple[str, ...]:
 
 def describe_family(family: str) -> str:
     """Return one sentence about a family; an unknown one is a :class:`UsageError`."""
-    return (_family(family).__doc__ or "").strip().splitlines()[0]
+    return (_family(family).__doc__ or "").strip().partition("\n")[0]
 
 
 def make(family: str, seed: int = 0, *, detail: int = 4_000) -> Shape:
