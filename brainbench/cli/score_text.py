@@ -9,6 +9,7 @@ from typing import Any
 from brainbench.cli.output import table, table_of
 from brainbench.core.records import ResultRecord, Score, spanned
 from brainbench.core.statistics import compare_scores
+from brainbench.models.activations import ReadReport
 
 RAW_INPUT = "raw input"
 
@@ -49,6 +50,8 @@ def _headline(record: ResultRecord) -> Iterator[str]:
     if record.synthetic:
         yield "Synthetic recordings: ranks on them say nothing about brains."
     yield from left_out(score.provenance.recordings)
+    if reading := score.provenance.get("reading"):
+        yield f"Network: {ReadReport.of(reading)}."
 
 
 def _weights(record: ResultRecord) -> str:

@@ -1,21 +1,28 @@
 """Activations of a model's layers for a set of stimuli.
 
-Letters: K stimulus, T time step, F feature.
+A network of ours names its layers and their axes. Any other is read by hooks, and what a hook captures counts only as
+far as :mod:`~brainbench.models.proof` shows it to be a response.
+
+Letters: K stimulus, B batch, T time step, F feature.
 """
 
 from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Collection, Iterator
-from contextlib import ExitStack, contextmanager
+import shutil
+import tempfile
+import weakref
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from brainbench.core.errors import BrainbenchError, UsageError, check_each, unknown_name
+from brainbench.core.errors import BrainbenchError, UsageError, check_each, listing, unknown_name
 from brainbench.core.plugins import load_optional, optional_parts
 from brainbench.core.reading.ranges import check_number
 
@@ -23,14 +30,53 @@ if TYPE_CHECKING:
     import torch
     from torch import nn
 
+    from brainbench.models.proof import Layout
+
 _log = logging.getLogger(__name__)
 
 READOUTS = "brainbench.readouts"
 """Entry points of ways to read layers other than the default."""
 OUTPUT = "output"
 """Layer name of a user model's own output."""
-_REPEATED = 0.05
-"""Difference of repeated activations, as a share of their size, that neither rounding nor half precision makes."""
+MEMORY = 2.0
+"""Memory for activations [GiB], by default."""
+_SAMPLED = 7
+"""Stimuli in a batch of the second run, unlike the 16 of the first."""
+
+
+@dataclass(frozen=True)
+class ReadReport:
+    """What was read of a model, and what was not."""
+
+    called: int
+    """Modules that ran and count as layers."""
+    not_read: Mapping[str, str] = field(default_factory=dict)
+    """Layer → why it is no response to the stimuli."""
+    notes: tuple[str, ...] = ()
+    """What else a reader of the layers should know."""
+
+    @property
+    def read(self) -> int:
+        """Number of modules that were read in all their calls."""
+        return self.called - len({name.partition("[")[0] for name in self.not_read})
+
+    @classmethod
+    def of(cls, stated: Mapping[str, Any]) -> ReadReport:
+        """Return the report that a record states."""
+        return cls(stated["called"], stated["not_read"], tuple(stated["notes"]))
+
+    @property
+    def stated(self) -> dict[str, Any]:
+        """The report as a record states it."""
+        return {"called": self.called, "read": self.read, "not_read": dict(self.not_read), "notes": list(self.notes)}
+
+    def __str__(self) -> str:
+        """Return the report as a sentence."""
+        text = f"{self.read} of {self.called} called modules read"
+        if self.not_read:
+            parts = [f"{name} ({reason})" for name, reason in self.not_read.items()]
+            text += f"; not read: {listing(parts, limit=5, quoted=False)}"
+        return "; ".join((text, *self.notes))
 
 
 class Activations(dict[str, np.ndarray]):
@@ -40,6 +86,8 @@ class Activations(dict[str, np.ndarray]):
         super().__init__()
         self.nonfinite: dict[str, int] = {}
         """Number of NaN and infinite values of each layer that has any."""
+        self.report = ReadReport(0)
+        """What was read, and what was not and why."""
 
 
 def extract(
@@ -50,79 +98,69 @@ def extract(
     chunk: int = 16,
     folder: str | os.PathLike[str] | None = None,
     readout: str = "default",
+    reduce: Callable[[np.ndarray], np.ndarray] | None = None,
+    memory: float = MEMORY,
 ) -> Activations:
     """Return the activations of a model's layers.
 
-    A model with ``layers`` and ``activations`` (all of ours) gives its named layers. Any other module is
-    read by hooks at its leaf modules, and at its output under the name ``output``. A hooked layer that is
-    called once has the time axis of the stimuli if its tensor is [B, T, ...], [T, B, ...], [B·T, ...] or
-    [T·B, ...], else T = 1; one called several times per sweep is stacked over calls as time (calls of unequal shape, or
-    calls that have the time axis and are not T: ``name[0]``, ``name[1]``, …). Of a tuple or mapping the first tensor
-    counts.
+    A model with ``layers`` and ``activations`` (all of ours) gives its named layers. Any other module is read by hooks
+    at its parts that have no parts or have weights of their own, and at its output under the name ``output``. A tensor
+    counts as a layer if its rows are proven to follow the stimuli, wherever they lie in it; its time axis is the one
+    that is proven to follow time, else T = 1. Calls of one module are ``name[0]``, ``name[1]``, …, or the time steps of
+    one layer if they are proven to be. Of a tuple or mapping the first tensor counts. The result's ``report`` names
+    what was not read, and why.
 
-    The model runs in evaluation mode without gradients; modes are put back and no hook stays. Memory
-    beyond the result is that of ``chunk`` stimuli; with ``folder`` the result lies on disk, and so may the
-    stimuli (``numpy.load(…, mmap_mode="r")``).
+    The model runs in evaluation mode without gradients on copies of the stimuli; modes are put back and no hook stays.
+    The proof runs a copy of it on 8 probes and a quarter of the stimuli. Memory beyond the result is that copy and
+    half of ``memory``, or one stimulus and the probes where these need more.
 
     Args:
         model: Maps [B, T, C, H, W] to anything.
         stimuli: Array or tensor [K, T, C, H, W], or an object whose ``input`` is one.
         layers: Layers wanted; for a module without named layers any of its submodules. None: all.
-        chunk: Stimuli processed at once.
+        chunk: Stimuli processed at once, at most.
         folder: Keep every layer as ``<folder>/<layer>.npy``, which replaces an earlier one, and return them mapped
             into memory.
         readout: ``published`` reads a network of the study by its layer names and steps there; the mean of axis 1 is
             then what was scored (``brainbench/published``).
+        reduce: Makes of the activations [B, T, F] of a batch what is kept of them, [B, T', F'], such as a mean over
+            time.
+        memory: Layers beyond this many GiB lie in temporary files, which go with the result.
     """
     import torch
+
+    from brainbench.models import proof
+    from brainbench.models.ops.parameters import check_weights
 
     given = getattr(stimuli, "input", stimuli)
     values: Any = given if isinstance(given, torch.Tensor) else np.asanyarray(given)
     check_number("The chunk of an extraction", chunk, least=1, whole=True)
+    check_number("The memory of an extraction (GiB)", memory, above=0)
     if values.ndim < 2 or len(values) < 1:
         raise UsageError(f"Extraction needs stimuli [stimulus, time, ...]; received shape {list(values.shape)}.")
     if not isinstance(values, torch.Tensor) and values.dtype.kind not in "fiub":
         raise UsageError(f"Stimuli are real numbers; received {values.dtype}.")
-    like = next((p for p in model.parameters() if p.is_floating_point()), torch.zeros(()))
-    if readout != "default":
-        own_reader = reader = partial(find_readout(readout).activations, model, layers=layers)
-    else:
-        own_reader = named_reader(model, layers)
-        reader = own_reader or partial(_hooked_run, model, _hooked(model, layers), layers is not None, {})
-    result = Activations()
-    with evaluating(model), torch.no_grad():
-
-        def read(start: int, stop: int) -> Iterator[tuple[str, np.ndarray]]:
-            part = torch.as_tensor(_writable(values[start:stop])).to(device=like.device, dtype=like.dtype)
-            for name, activity in _run(reader, part, model, values).items():
-                # Real and imaginary parts are features of their own.
-                real = torch.view_as_real(activity.resolve_conj()) if activity.is_complex() else activity
-                yield name, real.detach().to("cpu", dtype=torch.float32).reshape(*real.shape[:2], -1).numpy()
-
-        for start, stop in _chunks(len(values), chunk, avoid=values.shape[1]):
-            for name, rows in read(start, stop):
-                if name not in result:
-                    result[name] = _room(name, (len(values), *rows.shape[1:]), folder)
-                elif result[name].shape[1:] != rows.shape[1:]:
-                    raise UsageError(
-                        f"Layer {name!r} changed its shape between stimuli, from {list(result[name].shape[1:])} to "
-                        f"{list(rows.shape[1:])}; give stimuli of one length or leave this layer out."
-                    )
-                result[name][start:stop] = rows
-        # In another batch, after others: what depends on these is no answer to a stimulus. Ours do not.
-        first = 3 if values.shape[1] == 2 else 2
-        _check_repeated(result, read(0, min(len(values), first)) if own_reader is None else iter(()), model)
+    model = proof.unwrapped(model)
+    check_weights(model, type(model).__name__)
+    rooms = _Rooms(len(values), folder, int(memory * 2**30), reduce)
+    with evaluating(model), torch.no_grad(), proof.uncompiled(model):
+        run = _Run(model, values)
+        if readout != "default":
+            named = partial(find_readout(readout).activations, model, layers=layers)
+        else:
+            named = named_reader(model, layers)
+        if named is not None:
+            _read_named(run, named, rooms, chunk, proven=readout != "default" or _is_ours(model))
+        else:
+            _HookedReader(run, layers, rooms).read(chunk)
+    result = rooms.close(run.notes)
     if not result:
         raise UsageError(
-            f"Nothing in {type(model).__name__} gives an activation per stimulus: no output of it or of its parts has "
-            f"the {len(values)} stimuli as its first axis. Return [B, ...] for stimuli [B, T, C, H, W]."
+            f"Nothing in {type(model).__name__} gives an activation per stimulus ({result.report}). Return [B, ...] "
+            "for stimuli [B, T, C, H, W]."
         )
-    for name, activity in result.items():
-        if isinstance(activity, np.memmap):
-            activity.flush()
-        if count := sum(int((~np.isfinite(row)).sum()) for row in activity):
-            result.nonfinite[name] = count
-            _log.warning("%d of %d activations of layer %r are not finite.", count, activity.size, name)
+    for name, count in result.nonfinite.items():
+        _log.warning("%d of %d activations of layer %r are not finite.", count, rooms.sizes[name], name)
     return result
 
 
@@ -133,38 +171,14 @@ def find_readout(name: str) -> Any:
     return readout
 
 
-def _check_repeated(result: Activations, again: Iterator[tuple[str, np.ndarray]], model: nn.Module) -> None:
-    """Raise UsageError if the first stimuli give other activations than before."""
-    try:
-        repeated = dict(again)
-    except UsageError:  # a model may be made for batches of one size
-        return
-    for name, rows in repeated.items():
-        before = result[name][: len(rows)]
-        finite = np.isfinite(before) & np.isfinite(rows)
-        first, two = before[finite].astype(np.float64), rows[finite].astype(np.float64)
-        if np.linalg.norm(two - first) > _REPEATED * np.linalg.norm(first):
-            raise UsageError(
-                f"{type(model).__name__} answers the same stimuli otherwise when it is run again (layer {name!r}): it "
-                "keeps a state between calls, draws random numbers or normalises over the batch. Begin anew in "
-                "forward, and give functional.dropout and functional.batch_norm training=self.training."
-            )
-
-
-def _writable(values: Any) -> Any:
-    """Return stimuli that PyTorch may read in place: its tensors cannot be read-only."""
-    if isinstance(values, np.ndarray):
-        return np.array(values) if not values.flags.writeable else np.ascontiguousarray(values)
-    return values
-
-
-def _room(name: str, shape: tuple[int, ...], folder: str | os.PathLike[str] | None) -> np.ndarray:
-    """Return where a layer's activations go: memory, or a file."""
-    if folder is None:
-        return np.empty(shape, np.float32)
-    path = Path(folder) / f"{name.replace('/', '-')}.npy"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    return np.lib.format.open_memmap(path, mode="w+", dtype=np.float32, shape=shape)
+def named_reader(model: nn.Module, layers: Collection[str] | None) -> Any:
+    """Return a function from stimuli to activations if the model names its layers itself."""
+    names, read = getattr(model, "layers", None), getattr(model, "activations", None)
+    if not isinstance(names, tuple) or not all(isinstance(name, str) for name in names) or not callable(read):
+        return None
+    check_each("layer", layers or (), names)
+    wanted = names if layers is None else tuple(name for name in names if name in layers)
+    return lambda part: read(part, wanted)
 
 
 @contextmanager
@@ -179,144 +193,462 @@ def evaluating(model: nn.Module) -> Iterator[None]:
             module.training = mode
 
 
-def _chunks(count: int, chunk: int, *, avoid: int) -> Iterator[tuple[int, int]]:
-    """Yield ranges, none as long as the time axis: such a batch could not be told from time."""
-    start = 0
-    while start < count:
-        stop = min(start + chunk, count)
-        if stop - start == avoid and avoid > 1:
-            stop -= 1
-        yield start, stop
-        start = stop
+def _is_ours(model: nn.Module) -> bool:
+    """Return whether a network is one of this package, whose tests prove its layers."""
+    return type(model).__module__.startswith("brainbench.")
 
 
-def _run(reader: Any, part: torch.Tensor, model: nn.Module, stimuli: torch.Tensor) -> dict[str, torch.Tensor]:
-    import torch
+class _Run:
+    """A model and its stimuli, of which it gets copies."""
 
-    try:
-        return reader(part)
-    except torch.OutOfMemoryError:
-        raise
-    except (RuntimeError, ValueError, TypeError, IndexError, AssertionError, NotImplementedError) as error:
-        if isinstance(error, _LayerError) or (isinstance(error, BrainbenchError) and not isinstance(error, UsageError)):
+    def __init__(self, model: nn.Module, values: Any) -> None:
+        import torch
+
+        from brainbench.models import proof
+
+        self.model, self.values = model, values
+        self.count, self.steps = values.shape[:2]
+        self.like = next((p for p in model.parameters() if p.is_floating_point()), torch.zeros(()))
+        self.sample = proof.draw_sample(self.count)
+        self.notes: list[str] = []
+
+    def stimuli(self, rows: slice | np.ndarray) -> torch.Tensor:
+        """Return a copy of stimuli, which a model may write to."""
+        import torch
+
+        if isinstance(self.values, torch.Tensor):
+            part = self.values[torch.as_tensor(rows) if isinstance(rows, np.ndarray) else rows].detach().clone()
+        else:
+            part = torch.from_numpy(np.array(self.values[rows], order="C"))
+        return part.to(device=self.like.device, dtype=self.like.dtype)
+
+    def __call__(self, reader: Callable[[torch.Tensor], Any], part: torch.Tensor) -> Any:
+        """Run a model or a reader of it on stimuli; what fails is told in one sentence."""
+        import torch
+
+        version = part._version
+        try:
+            result = reader(part)
+        except torch.OutOfMemoryError:
             raise
-        reason = str(error).strip().partition("\n")[0]
-        if not isinstance(error, UsageError):
-            reason = f"{type(error).__name__}: {reason}"
-        raise UsageError(
-            f"{type(model).__name__} cannot process stimuli of shape {list(stimuli.shape)} "
-            f"[stimulus, time, channel, row, column]: {reason}"
-        ) from error
+        except Exception as error:
+            if isinstance(error, BrainbenchError) and not isinstance(error, UsageError):
+                raise
+            reason = str(error).strip().partition("\n")[0]
+            if not isinstance(error, UsageError):
+                reason = f"{type(error).__name__}: {reason}"
+            raise UsageError(
+                f"{type(self.model).__name__} cannot process stimuli of shape {list(self.values.shape)} "
+                f"[stimulus, time, channel, row, column]: {reason}"
+            ) from error
+        if part._version != version and not self.notes:
+            self.notes.append("the model changes its input in place, and was given copies")
+        return result
+
+    def chunks(self, chunk: int) -> Iterator[slice]:
+        """Yield the ranges of all stimuli."""
+        for start in range(0, self.count, chunk):
+            yield slice(start, min(start + chunk, self.count))
+
+    def refusal(self, layer: str) -> UsageError:
+        """Return the error for a model that does not answer a stimulus alone."""
+        return UsageError(
+            f"{type(self.model).__name__} answers the same stimuli otherwise when it is run again in another batch "
+            f"(layer {layer!r}): it keeps a state between calls, draws random numbers or mixes the stimuli of a batch. "
+            "Begin anew in forward, and give functional.dropout and functional.batch_norm training=self.training."
+        )
 
 
-class _LayerError(UsageError):
-    """A layer, not the stimulus, is what does not fit."""
+class _Sketches:
+    """What stands for the rows of the sampled stimuli, in the first and in the second run."""
+
+    def __init__(self, sample: np.ndarray) -> None:
+        self.sample, self.places = sample, {}
+        for place, stimulus in enumerate(sample):
+            self.places.setdefault(int(stimulus), []).append(place)
+        self.runs: tuple[dict[Any, np.ndarray], dict[Any, np.ndarray]] = {}, {}
+        self.kinds: dict[Any, Any] = {}
+
+    def add(self, run: int, key: tuple[str, int | None], rows: torch.Tensor, stimuli: Iterable[int]) -> None:
+        """Keep the sketches of the rows that are of sampled stimuli."""
+        from brainbench.models import proof
+
+        pairs = [(row, place) for row, stimulus in enumerate(stimuli) for place in self.places.get(int(stimulus), ())]
+        if pairs:
+            source, target = (list(part) for part in zip(*pairs, strict=True))
+            numbers = proof.sketch(rows[source])
+            store = self.runs[run].setdefault(key, np.full((len(self.sample), numbers.shape[1]), np.nan))
+            if store.shape[1] == numbers.shape[1]:
+                store[target] = numbers
+            self.kinds[key] = rows.dtype
+
+    def unequal(self) -> dict[str, str]:
+        """Return the layers that the runs do not agree on, with the reason."""
+        from brainbench.models import proof
+
+        reasons: dict[str, str] = {}
+        for key, before in self.runs[0].items():
+            after = self.runs[1].get(key)
+            if after is None or np.isnan(after).any():
+                reasons[key[0]] = "does not run in every batch"
+            elif not np.isnan(before).any() and (
+                before.shape != after.shape or not proof.agree(before, after, self.kinds[key])
+            ):
+                reasons[key[0]] = proof.DEPENDENT
+        return reasons
 
 
-def named_reader(model: nn.Module, layers: Collection[str] | None) -> Any:
-    """Return a function from stimuli to activations if the model names its layers itself."""
-    names, read = getattr(model, "layers", None), getattr(model, "activations", None)
-    if not isinstance(names, tuple) or not all(isinstance(name, str) for name in names) or not callable(read):
-        return None
-    check_each("layer", layers or (), names)
-    wanted = names if layers is None else tuple(name for name in names if name in layers)
-    return lambda part: read(part, wanted)
+class _Rooms:
+    """Where layers go: memory up to a bound, files beyond it; each row has to be written."""
+
+    def __init__(self, count: int, folder: Any, memory: int, reduce: Callable[[np.ndarray], np.ndarray] | None) -> None:
+        self.count, self.folder, self.memory, self.reduce = count, folder, memory, reduce
+        self.result, self.used = Activations(), 0
+        self.sizes: dict[str, int] = {}
+        """Number of activations of each layer, before they are reduced."""
+        self.written: dict[str, np.ndarray] = {}
+        self.not_read: dict[str, str] = {}
+        self.called: set[str] = set()
+        self.order: dict[str, int] = {}
+        """Place of each layer's module among the modules."""
+
+    def write(self, name: str, rows: np.ndarray, place: slice) -> None:
+        """Write the activations [B, T, F] of some stimuli."""
+        lost = int(rows.size - np.isfinite(rows).sum())
+        self.sizes[name] = self.sizes.get(name, 0) + rows.size
+        rows = rows if self.reduce is None else self.reduce(rows)
+        if name not in self.result:
+            self.result[name] = self._room(name, (self.count, *rows.shape[1:]), rows.dtype)
+            self.written[name] = np.zeros(self.count, bool)
+        if self.result[name].shape[1:] != rows.shape[1:]:
+            shapes = f"from {list(self.result[name].shape[1:])} to {list(rows.shape[1:])}"
+            self.not_read[name] = f"changes its shape between stimuli, {shapes}"
+            return
+        self.result[name][place] = rows
+        self.written[name][place] = True
+        if lost:
+            self.result.nonfinite[name] = self.result.nonfinite.get(name, 0) + lost
+
+    def close(self, notes: Iterable[str]) -> Activations:
+        """Return the layers whose every row was written, and the report."""
+        for name, rows in self.written.items():
+            if not rows.all():
+                gaps = np.flatnonzero(~rows)
+                self.not_read.setdefault(name, f"gives no row for {len(gaps)} stimuli, {gaps[0]}–{gaps[-1]}")
+        for name in self.not_read:
+            if (room := self.result.pop(name, None)) is not None and isinstance(room, np.memmap):
+                filename, room = room.filename, None
+                Path(str(filename)).unlink(missing_ok=True)
+            self.result.nonfinite.pop(name, None)
+        layers = sorted(self.result, key=self._place)
+        for name in layers:
+            self.result[name] = room = self.result.pop(name)
+            if isinstance(room, np.memmap):
+                room.flush()
+        not_read = {name: self.not_read[name] for name in sorted(self.not_read, key=self._place)}
+        self.result.report = ReadReport(len(self.called), not_read, tuple(notes))
+        return self.result
+
+    def _place(self, name: str) -> tuple[int, int]:
+        base, _, call = name.partition("[")
+        return self.order.get(name, self.order.get(base, len(self.order))), int(call.rstrip("]") or 0) if call else 0
+
+    def _room(self, name: str, shape: tuple[int, ...], kind: Any) -> np.ndarray:
+        size = int(np.prod(shape)) * np.dtype(kind).itemsize
+        if self.folder is None and self.used + size > self.memory:
+            self.folder = tempfile.mkdtemp(prefix="brainbench-layers-")
+            weakref.finalize(self.result, shutil.rmtree, self.folder, ignore_errors=True)
+        if self.folder is None:
+            self.used += size
+            return np.full(shape, np.nan, kind)
+        path = Path(self.folder) / f"{name.replace('/', '-')}.npy"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        room = np.lib.format.open_memmap(path, mode="w+", dtype=kind, shape=shape)
+        room.fill(np.nan)
+        return room
 
 
-def _hooked(model: nn.Module, layers: Collection[str] | None) -> dict[str, nn.Module]:
-    every = {name: module for name, module in model.named_modules() if name}
-    if layers is None:
-        leaves = {name: module for name, module in every.items() if not any(True for _ in module.children())}
-        return leaves | {OUTPUT: model}
-    choices = every if OUTPUT in every else {**every, OUTPUT: model}
-    check_each("layer", layers, choices)
-    return {name: choices[name] for name in choices if name in layers}
-
-
-def _hooked_run(
-    model: nn.Module, modules: dict[str, nn.Module], strict: bool, time_first: dict[str, bool], part: torch.Tensor
-) -> dict[str, torch.Tensor]:
-    """Run any module and return what submodules gave, read by forward hooks; if strict, each must give something.
-
-    ``time_first`` keeps, for layers that join stimuli and steps in one axis, whether steps come first in it.
-    """
-    calls = _recorded(model, modules, part)
-    batch, steps = part.shape[:2]
-    joined = [name for name, outputs in calls.items() for item in outputs[:1] if item.shape[:1] == (batch * steps,)]
-    if min(batch, steps) > 1 and (undecided := [name for name in joined if name not in time_first]):
-        # Both orders have one shape. Stimuli in another order tell which one it is: a layer's rows move with them.
-        moved = _recorded(model, {name: modules[name] for name in undecided}, part.roll(1, 0))
-        for name in undecided:
-            before, two = calls[name][0].float(), moved[name][0].float()
-            ours = (before.unflatten(0, (batch, steps)).roll(1, 0).flatten(0, 1) - two).abs().nan_to_num().sum()
-            theirs = (before.unflatten(0, (steps, batch)).roll(1, 1).flatten(0, 1) - two).abs().nan_to_num().sum()
-            # Where rows are equal, later stimuli tell.
-            if max(ours, theirs) > 1e-3 * before.abs().nan_to_num().sum():
-                time_first[name] = bool(theirs < ours)
-    activities = {}
-    for name, outputs in calls.items():
-        if time_first.get(name):
-            outputs = [
-                value.unflatten(0, (steps, batch)).transpose(0, 1) if value.shape[:1] == (batch * steps,) else value
-                for value in outputs
-            ]
-        activity = _over_calls(name, outputs, batch, steps)
-        if not activity and strict:
-            seen = [list(output.shape) for output in outputs] or "nothing"
-            raise _LayerError(f"Layer {name!r} gave {seen} for {batch} stimuli of {steps} steps, not one each.")
-        activities |= activity
-    return activities
-
-
-def _recorded(model: nn.Module, modules: dict[str, nn.Module], part: torch.Tensor) -> dict[str, list[torch.Tensor]]:
-    """Run a module and return what each submodule gave, call by call."""
-    calls: dict[str, list[torch.Tensor]] = {name: [] for name in modules}
-
-    def record(name: str, output: Any) -> None:
-        if (tensor := _first_tensor(output)) is not None:
-            # A later in-place operation must not change what was recorded.
-            calls[name].append(tensor.detach().clone())
-
-    with ExitStack() as handles:
-        for name, module in modules.items():
-            handle = module.register_forward_hook(lambda _, inputs, output, name=name: record(name, output))
-            handles.callback(handle.remove)
-        model(part)
-    return calls
-
-
-def _first_tensor(value: Any) -> torch.Tensor | None:
+def _plain(rows: torch.Tensor) -> np.ndarray:
+    """Return rows as single precision in memory."""
     import torch
 
-    if isinstance(value, torch.Tensor):
-        return value
-    if isinstance(value, dict):
-        value = tuple(value.values())
-    if isinstance(value, (tuple, list)):
-        return next((tensor for item in value if (tensor := _first_tensor(item)) is not None), None)
-    return None
+    return rows.detach().to("cpu", dtype=torch.float32).numpy()
 
 
-def _over_calls(name: str, outputs: list[torch.Tensor], batch: int, steps: int) -> dict[str, torch.Tensor]:
-    """Return named activations [B, T, ...]; none if the outputs do not belong to the stimuli."""
+def _read_named(run: _Run, read: Any, rooms: _Rooms, chunk: int, *, proven: bool) -> None:
+    """Read a model that names its layers [B, T, …]; one that is not ours has to give the same rows in other batches."""
     import torch
 
-    timed = [_with_time(output, batch, steps) for output in outputs]
-    if len(outputs) == 1:
-        return {} if timed[0] is None else {name: timed[0]}
-    # A part that stands in several places of a network gives all steps each time; only a loop's calls are steps.
-    whole = len(outputs) != steps and all(item is not None and item.shape[1] == steps > 1 for item in timed)
-    if len({output.shape for output in outputs}) == 1 and not whole:
-        return {name: torch.stack(outputs, 1)} if outputs[0].shape[:1] == (batch,) else {}
-    return {f"{name}[{index}]": activity for index, activity in enumerate(timed) if activity is not None}
+    from brainbench.models import proof
+
+    def layers(part: torch.Tensor, reader: Any) -> Iterator[tuple[str, torch.Tensor]]:
+        for name, activity in run(reader, part).items():
+            rooms.order.setdefault(name, len(rooms.order))
+            values = torch.view_as_real(activity.resolve_conj()) if activity.is_complex() else activity
+            yield name, values.reshape(*values.shape[:2], -1)
+
+    sketches = None if proven else _Sketches(run.sample)
+    fresh = None if proven else proof.fresh_copy(run.model)
+    for place in run.chunks(chunk):
+        for name, rows in layers(run.stimuli(place), read):
+            rooms.called.add(name)
+            rooms.write(name, _plain(rows), place)
+            if sketches is not None:
+                sketches.add(0, (name, None), rows, range(place.start, place.stop))
+    if sketches is None:
+        return
+    again = read if fresh is None else named_reader(fresh, tuple(rooms.order))
+    for start in range(0, len(run.sample), _SAMPLED):
+        picks = run.sample[start : start + _SAMPLED]
+        for name, rows in layers(run.stimuli(picks), again):
+            sketches.add(1, (name, None), rows, picks)
+    for name in sketches.unequal():
+        raise run.refusal(name)
 
 
-def _with_time(output: torch.Tensor, batch: int, steps: int) -> torch.Tensor | None:
-    shape = tuple(output.shape)
-    if len(shape) >= 3 and shape[:2] == (batch, steps):
-        return output
-    if len(shape) >= 3 and shape[:2] == (steps, batch):
-        return output.transpose(0, 1)
-    if shape[:1] == (batch * steps,) and steps > 1:
-        return output.unflatten(0, (batch, steps))
-    return output.unsqueeze(1) if shape[:1] == (batch,) else None
+@dataclass(frozen=True)
+class _Place:
+    """Layer, and step of it, that one call of a module gives."""
+
+    layer: str
+    layout: Layout
+    step: int | None = None
+    moved: bool = True
+    """Whether rows of unequal probes differed; if not, those of the stimuli have to."""
+
+
+class _HookedReader:
+    """Reads a network of others: proves what its parts return on a copy of it, then runs it once."""
+
+    def __init__(self, run: _Run, layers: Collection[str] | None, rooms: _Rooms) -> None:
+        from brainbench.models import proof
+
+        self.run, self.rooms, self.layers = run, rooms, layers
+        self.modules = self._modules(run.model)
+        rooms.order = {name: place for place, name in enumerate(self.modules)}
+        self.fresh = proof.fresh_copy(run.model)
+        if self.fresh is None:
+            run.notes.append("the model cannot be copied, so a state that its first batch leaves is not noticed")
+        self.places: dict[tuple[str, int], _Place] = {}
+        self.calls: dict[str, int] = {}
+        self.size = 1
+        """Bytes of all layers for a stimulus."""
+        self.fill = 1
+        """Stimuli that a batch has at least; more where a model takes no others."""
+
+    def _modules(self, model: nn.Module) -> dict[str, nn.Module]:
+        from brainbench.models import proof
+
+        if self.layers is None:
+            return {**proof.layer_modules(model), OUTPUT: model}
+        every = {name.replace("_orig_mod.", ""): module for name, module in model.named_modules() if name}
+        choices = {OUTPUT: model} | every
+        wanted = {name.partition("[")[0] if name not in choices else name for name in self.layers}
+        check_each("layer", sorted(wanted), choices)
+        return {name: choices[name] for name in (*every, OUTPUT) if name in wanted}
+
+    def read(self, chunk: int) -> None:
+        """Prove and read all layers."""
+        rooms, run = self.rooms, self.run
+        try:
+            self._prove()
+        except UsageError:  # a model may be made for batches of one size
+            self.fill = min(chunk, run.count)
+            self._prove()
+        sketches = _Sketches(run.sample)
+        self._run_sample(sketches)
+        chunk = max(1, min(chunk, rooms.memory // 2 // self.size))
+        self._run_all(chunk, sketches)
+        for name, reason in sketches.unequal().items():
+            rooms.not_read.setdefault(name, reason)
+        self._check(rooms.not_read)
+
+    def _check(self, not_read: Mapping[str, str]) -> None:
+        """Refuse a model whose output is no answer to a stimulus, and layers asked for that are none."""
+        from brainbench.models.proof import DEPENDENT
+
+        if not_read.get(OUTPUT) == DEPENDENT and self.modules.get(OUTPUT) is self.run.model:
+            raise self.run.refusal(OUTPUT)
+        for name in self.layers or ():
+            base, run = name.partition("[")[0], {layer.partition("[")[0] for layer in self.rooms.written}
+            if base not in self.rooms.called:
+                raise UsageError(f"Layer {name!r} of {type(self.run.model).__name__} gave nothing: it did not run.")
+            reason = not_read.get(name) or (not_read.get(base) if base not in run or name == base else None)
+            if reason == DEPENDENT:
+                raise self.run.refusal(name)
+            if reason is not None:
+                raise UsageError(f"Layer {name!r} of {type(self.run.model).__name__} cannot be read: {reason}.")
+
+    def _forward(self, model: nn.Module, part: torch.Tensor, take: Callable[[str, int, Any], None]) -> dict[str, int]:
+        """Run a model, give each call's first tensor away, and return how often each module was called."""
+        from brainbench.models import proof
+
+        counts: dict[str, int] = {}
+
+        def count(name: str, output: Any) -> None:
+            index = counts[name] = counts.get(name, -1) + 1
+            take(name, index, proof.first_tensor(output))
+
+        modules = self._modules(model)
+        # A root's hook does not run for every kind of module, its result is here anyway.
+        with proof.hooks({name: module for name, module in modules.items() if module is not model}, count):
+            output = self.run(model, part)
+        if modules.get(OUTPUT) is model:
+            count(OUTPUT, output)
+        return {name: last + 1 for name, last in counts.items()}
+
+    def _prove(self) -> None:
+        """Find the places of stimuli and time in what each module returns."""
+        import torch
+
+        from brainbench.models import proof
+
+        run, model = self.run, self.fresh or self.run.model
+        stimuli = run.stimuli(run.sample[:16])
+        rows = proof.probes(stimuli.cpu(), run.steps)
+        batches = []
+        for batch in (proof.FIRST, proof.SECOND):
+            filling = [stimuli[place % len(stimuli)] for place in range(self.fill - len(batch))]
+            probes = [stimuli[0] if row is None else rows[row].to(stimuli) for row in batch]
+            batches.append(torch.stack([*probes, *filling]))
+        sizes = (len(batches[0]), len(batches[1]))
+        calls: dict[str, list[Any]] = {}
+        proven: dict[str, list[Any]] = {}
+
+        def capture(name: str, index: int, tensor: Any) -> None:
+            # A later operation in place must not change what was captured.
+            calls.setdefault(name, []).append(None if tensor is None else tensor.cpu().clone())
+
+        def compare(name: str, index: int, tensor: Any) -> None:
+            first = calls[name][index] if index < len(calls.get(name, ())) else None
+            if first is None or tensor is None:
+                result = [], "gives no tensor of numbers"
+            else:
+                result = proof.stimulus_layouts(first, tensor.cpu(), sizes)
+            proven.setdefault(name, []).append(result)
+
+        self._forward(model, batches[0], capture)
+        self._forward(model, batches[1], compare)
+        self.places, self.rooms.not_read, self.size = {}, {}, 1
+        for name in self.modules:
+            if (name not in calls) and (name not in proven):
+                continue
+            self.rooms.called.add(name)
+            tensors = calls.pop(name, [])
+            if len(tensors) != len(proven.get(name, ())):
+                self.rooms.not_read[name] = "does not run alike in every batch"
+                continue
+            self._place(name, tensors, proven[name], sizes[0])
+
+    def _place(self, name: str, tensors: list[Any], proven: list[Any], batch: int) -> None:
+        """Decide which layers, and which steps of them, the calls of a module are."""
+        from brainbench.models import proof
+
+        if len(tensors) > 1 and (loop := self._loop(tensors, proven, batch)) is not None:
+            layout, before, after = loop
+            for index, tensor in enumerate(tensors):
+                outer, step, inner = np.unravel_index(index, (before, self.run.steps, after))
+                layer = name if before * after == 1 else f"{name}[{outer * after + inner}]"
+                self.places[name, index] = _Place(layer, layout, int(step))
+                self.size += tensor.numel() * 4 // batch
+            return
+        for index, (tensor, (layouts, reason)) in enumerate(zip(tensors, proven, strict=True)):
+            layer = name if len(tensors) == 1 else f"{name}[{index}]"
+            moved = [layout for layout, moves in layouts if moves]
+            still = [layout for layout, moves in layouts if not moves and layout.outer == layout.inner == 1]
+            if not moved and not still:
+                self.rooms.not_read[layer] = reason
+                continue
+            layout = (moved or still)[0]
+            if moved:
+                layout = proof.with_time(layout, layout.split(tensor, batch), self.run.steps)
+            self.places[name, index] = _Place(layer, layout, moved=bool(moved))
+            self.size += tensor.numel() * 4 // batch
+
+    def _loop(self, tensors: list[Any], proven: list[Any], batch: int) -> tuple[Layout, int, int] | None:
+        """Return the layout of calls that are the steps of a loop, and how many calls stand around its steps."""
+        import torch
+
+        from brainbench.models import proof
+
+        steps, count = self.run.steps, len(tensors)
+        if steps < 2 or count % steps or len({getattr(tensor, "shape", None) for tensor in tensors}) != 1:
+            return None
+        common = set.intersection(*({layout for layout, _ in layouts} for layouts, _ in proven))
+        moved = [layout for layouts, _ in proven for layout, moves in layouts if moves and layout in common]
+        if not moved:
+            return None
+        layout = moved[0]
+        split = [layout.split(tensor, batch)[: len(proof.FIRST)] for tensor in tensors]
+        if proof.with_time(layout, split[-1], steps).time is not None:
+            return None
+        stacked = torch.stack(split, 1)
+        choices = [
+            (proof.time_misfit(stacked.unflatten(1, (before, steps, -1)).movedim(2, 1)), before)
+            for before in range(1, count // steps + 1)
+            if (count // steps) % before == 0
+        ]
+        misfit, before = min(choices)
+        return (layout, before, count // steps // before) if misfit < proof.SHIFT else None
+
+    def _run_sample(self, sketches: _Sketches) -> None:
+        """Run the sampled stimuli in their own order and batches."""
+        run = self.run
+        for part in np.array_split(run.sample, -(-len(run.sample) // _SAMPLED)):
+            picks = np.resize(part, max(len(part), self.fill))
+
+            def take(name: str, index: int, tensor: Any, picks: Any = picks) -> None:
+                place = self.places.get((name, index))
+                if place is not None and tensor is not None and place.layout.fits(tuple(tensor.shape), len(picks)):
+                    rows = place.layout.rows(tensor, len(picks), run.steps)
+                    sketches.add(1, (place.layer, place.step), rows, picks)
+
+            self._forward(self.fresh or run.model, run.stimuli(picks), take)
+
+    def _run_all(self, chunk: int, sketches: _Sketches) -> None:
+        """Run all stimuli once, and write what is a response."""
+        from brainbench.models import proof
+
+        rooms, run = self.rooms, self.run
+        firsts: dict[tuple[str, int], torch.Tensor] = {}
+        moved: set[tuple[str, int]] = set()
+        for part in run.chunks(chunk):
+            batch = part.stop - part.start
+            loops: dict[str, np.ndarray] = {}
+            missing: dict[str, int] = {}
+
+            def take(name: str, index: int, tensor: Any, part: Any = part, batch: Any = batch, loops: Any = loops,
+                     missing: Any = missing) -> None:  # fmt: skip
+                place = self.places.get((name, index))
+                if place is None:
+                    rooms.called.add(name)
+                    if name not in rooms.not_read and f"{name}[{index}]" not in rooms.not_read:
+                        rooms.not_read[name] = "does not run alike in every batch"
+                    return
+                if tensor is None or not place.layout.fits(tuple(tensor.shape), batch):
+                    shape = "no tensor" if tensor is None else list(tensor.shape)
+                    rooms.not_read[place.layer] = f"gives {shape} for {batch} stimuli, unlike in other batches"
+                    return
+                rows = place.layout.rows(tensor, batch, run.steps)
+                sketches.add(0, (place.layer, place.step), rows, range(part.start, part.stop))
+                if not place.moved and (name, index) not in moved:
+                    first = firsts.setdefault((name, index), rows[:1].cpu().clone())
+                    if not proof.same(first.expand_as(rows), rows.cpu(), 0.0):
+                        moved.add((name, index))
+                if place.step is None:
+                    rooms.write(place.layer, _plain(rows), part)
+                    return
+                if place.layer not in loops:
+                    loops[place.layer] = np.full((batch, run.steps, rows.shape[-1]), np.nan, np.float32)
+                    missing[place.layer] = run.steps
+                loops[place.layer][:, place.step] = _plain(rows)[:, 0]
+                missing[place.layer] -= 1
+                if not missing[place.layer]:
+                    rooms.write(place.layer, loops.pop(place.layer), part)
+
+            self._forward(run.model, run.stimuli(part), take)
+            for layer in loops:
+                rooms.not_read[layer] = "does not run alike in every batch"
+        for key, place in self.places.items():
+            if not place.moved and key not in moved:
+                rooms.not_read[place.layer] = proof.UNMOVED

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -33,6 +33,24 @@ RANDOM_FEATURES = 512
 _ELSEWHERE = "features computed elsewhere"
 
 
+@dataclass(frozen=True, eq=False)
+class _Features(Mapping[str, Any]):
+    """Features [K, F] by layer: all layers at once would take the memory of the activations once more."""
+
+    activations: Mapping[str, NDArray[np.floating]]
+    rows: list[int]
+    time: str
+
+    def __getitem__(self, layer: str) -> NDArray[np.floating]:
+        return reduce_time(self.activations[layer][self.rows], self.time)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.activations)
+
+    def __len__(self) -> int:
+        return len(self.activations)
+
+
 @dataclass(frozen=True)
 class ModelResponses:
     """Activations of one model, with the labels of their rows."""
@@ -40,7 +58,7 @@ class ModelResponses:
     card: ModelCard
     labels: tuple[str, ...]
     activations: Mapping[str, NDArray[np.floating]]
-    """Layer → [K, T, F]."""
+    """Layer → [K, T, F], or [K, 1, F] where only the mean over time is needed."""
     time: str
     model_input: NDArray[np.floating] | None = None
     """[K, T, F] what the model received; None for features computed elsewhere."""
@@ -49,9 +67,9 @@ class ModelResponses:
     seconds: float | None = None
     """Duration of the stimuli, over which the steps of every layer are spread evenly; None where unknown."""
 
-    def features(self, rows: list[int]) -> dict[str, NDArray[np.floating]]:
-        """Return every layer's features [K, F] of the stimuli ``rows``."""
-        return {layer: reduce_time(values[rows], self.time) for layer, values in self.activations.items()}
+    def features(self, rows: list[int]) -> Mapping[str, NDArray[np.floating]]:
+        """Return every layer's features [K, F] of the stimuli ``rows``, made when they are asked for."""
+        return _Features(self.activations, rows, self.time)
 
     def baseline_features(self, rows: list[int], seed: int) -> dict[str, dict[str, NDArray[np.floating]]]:
         """Return the raw input and random features of it; nothing without an input."""
@@ -107,13 +125,22 @@ class ResolvedModel:
                 layer: _as_steps(layer, computed[layer], len(labels)) for layer in options.layers or computed
             }
         else:
-            from brainbench.models.activations import extract
+            from brainbench.models.activations import extract, named_reader
 
             values, comparable, note = _network_input(self.module, simulated, options.normalize)
             if card.objective not in (None, "untrained") and (difference := _unlike_training(self.module, simulated)):
                 _LOG.warning("%s was trained on other stimuli: here %s.", card.name, difference)
                 note += f"; unlike its training: {difference}"
-            activations = extract(self.module, values, layers=options.layers, readout=options.readout)
+            activations = extract(
+                self.module,
+                values,
+                layers=options.layers,
+                readout=options.readout,
+                reduce=mean_over_time if options.time == "mean" and not options.over_time else None,
+                memory=options.memory,
+            )
+            if options.readout == "default" and named_reader(self.module, None) is None:
+                origin = {**origin, "reading": activations.report.stated}
             card = replace(card, input=note)
             steps = comparable if comparable.ndim > 2 else comparable[:, None, :]
             model_input = steps.reshape(*steps.shape[:2], -1)
@@ -148,11 +175,13 @@ def resolve_model(model: Any, *, seed: int = 0) -> ResolvedModel:
     import torch
 
     from brainbench.models.diagram import graph_of
-    from brainbench.models.ops.parameters import weights_hash
+    from brainbench.models.ops.parameters import check_weights, weights_hash
+    from brainbench.models.proof import unwrapped
     from brainbench.models.registry import locate_model
     from brainbench.models.training.checkpoints import CONFIG, PREFIXES
     from brainbench.models.user_models import load_user_model
 
+    model = unwrapped(model)
     if isinstance(model, torch.nn.Module):
         module, card = model, ModelCard(type(model).__name__, family="user module")
     elif not isinstance(model, str):
@@ -161,7 +190,8 @@ def resolve_model(model: Any, *, seed: int = 0) -> ResolvedModel:
             f"torch.nn.Module; received {type(model).__name__}."
         )
     elif (":" in model and not model.startswith(PREFIXES)) or model.endswith(".py"):
-        module, card = load_user_model(model, seed=seed), ModelCard(model, family="user module", seed=seed)
+        module = unwrapped(load_user_model(model, seed=seed))
+        card = ModelCard(model, family="user module", seed=seed)
     else:
         entry = locate_model(model)
         module = entry.build(seed)
@@ -178,12 +208,7 @@ def resolve_model(model: Any, *, seed: int = 0) -> ResolvedModel:
         )
         with readable(f"{model}/{CONFIG}", "configuration of a trained model"):
             card = replace(card, **_trained(entry.trained))
-    lazy = [name for name, value in module.named_parameters() if isinstance(value, torch.nn.UninitializedParameter)]
-    if lazy:
-        raise UsageError(
-            f"{card.name} has lazy layers without weights yet ({', '.join(lazy[:3])}): run it once, on zeros of shape "
-            "[1, 22, 30, 5, 7] for instance, before you return it."
-        )
+    check_weights(module, card.name)
     count = sum(parameter.numel() for parameter in module.parameters())
     layer = card.layer or getattr(module, "committed_layer", None)
     facts = {"parameters": count, "weights": weights_hash(module), "graph": graph_of(module), "layer": layer}
@@ -275,6 +300,11 @@ def _unlike_training(module: Any, stimuli: Stimuli) -> str:
     if not spec.frame.startswith(axes):
         differences.append(f"{axes} axes, there {spec.frame.partition(' ')[0]} axes")
     return " and ".join(differences)
+
+
+def mean_over_time(values: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Return the mean [K, 1, F] of activations [K, T, F]."""
+    return values.mean(axis=1, keepdims=True, dtype=np.float64)
 
 
 def reduce_time(values: NDArray[np.floating], time: str) -> NDArray[np.floating]:

@@ -31,8 +31,9 @@ _NO_NUMBERS = (
     "estimator",
 )  # fmt: skip
 """Fields that take much in Python, and a number nowhere; a batch file can hold one."""
-_ELSEWHERE = ("recordings", "match", "explain", "title", "strict")
-"""Fields whose effect stands in other entries of the provenance: ``recordings``, ``pairs`` and ``statistics``."""
+_ELSEWHERE = ("recordings", "match", "explain", "title", "strict", "memory")
+"""Fields whose effect stands in other entries of the provenance (``recordings``, ``pairs``, ``statistics``), or in
+none."""
 
 
 @dataclass(frozen=True)
@@ -90,6 +91,8 @@ class ScoreOptions:
     """Seed of untrained weights alone; --seed then keeps that of the statistics."""
     readout: Literal["default", "published"] = "default"
     """Layers and steps of a network of the study: default (ours), or published (its names, its steps, its averages)."""
+    memory: Positive = 2.0
+    """Memory for the activations of a model, GiB; layers beyond it lie in temporary files."""
     explain: bool = False
     """Also walk from the published estimator to the default one, fault by fault (RSA only); MODEL may then be an .npz
     of stored splits (arrays r_xy, r_yy and r_xx)."""

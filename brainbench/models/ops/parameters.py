@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import nn
 
-from brainbench.core.errors import DataError, listing, nearest
+from brainbench.core.errors import DataError, UsageError, listing, nearest
 from brainbench.core.files import content_hash
 from brainbench.core.reading.ranges import check_number
 
@@ -51,6 +51,21 @@ def check_named(shapes: Mapping[str, tuple[int, ...]], state: Mapping[str, Any],
         problems.append(f"shapes that do not fit: {described}")
     if problems:
         raise DataError(f"The parameters do not fit {what}: {'; '.join(problems)}.")
+
+
+def check_weights(module: nn.Module, name: str) -> None:
+    """Raise UsageError for a module whose weights do not exist yet."""
+    values = [*module.named_parameters(), *module.named_buffers()]
+    if lazy := [label for label, value in values if nn.parameter.is_lazy(value)]:
+        raise UsageError(
+            f"{name} has lazy layers without weights yet ({', '.join(lazy[:3])}): run it once, on zeros of shape "
+            "[1, 22, 30, 5, 7] for instance, before you return it."
+        )
+    if empty := [label for label, value in values if value.is_meta]:
+        raise UsageError(
+            f"{name} has weights that were never loaded ({', '.join(empty[:3])} on the device 'meta'): load them, or "
+            "build it on a device that holds numbers."
+        )
 
 
 def weights_hash(module: nn.Module) -> str:

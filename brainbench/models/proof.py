@@ -1,0 +1,322 @@
+"""Proof of what a captured tensor is: which of its axes holds the stimuli, and which their time steps.
+
+Networks of others return tensors of any layout, and a shape alone says little: 16 slots, 16 tokens and a batch of 16
+look alike. So a copy of the network that has never run gets probes, in two small batches of unequal size and another
+order. The stimulus axis is the one whose rows follow their probes from place to place; the time axis is the one that
+moves when probes are changed late, or are shifted, in time. Later a random sample of the stimuli has to give the rows
+that it gave among all others. What fails here is not a response, whatever its shape.
+
+Letters: B batch, T time step, F feature.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import torch
+from torch import nn
+from torch.nn.utils.parametrize import is_parametrized
+
+BASE, LATE, SHIFTED, PAIR, PAIR_SHIFTED = range(5)
+"""Rows of the first batch of probes: two probes, both of them shifted by one step, and the first one changed late."""
+FIRST, SECOND = (BASE, LATE, SHIFTED, PAIR, PAIR_SHIFTED), (PAIR, None, BASE)
+"""Both batches of probes; None is a stimulus as it is."""
+NO_AXIS = "no axis of it follows the stimuli"
+UNMOVED = "does not move with the stimuli"
+DEPENDENT = "its rows depend on the batch: on other stimuli, their place, chance or what ran before"
+SHIFT = 0.7
+"""Change by a shift that the shift explains leaves less than this of what it is without it."""
+_BLOCKS = 256
+"""Numbers that stand for a row where two runs are compared."""
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Place of the stimuli and of their time steps in a tensor."""
+
+    axis: int
+    """Axis of the stimuli."""
+    outer: int = 1
+    """Length of what is joined with the stimuli before them, [outer · B, …]."""
+    inner: int = 1
+    """Length of what is joined with them behind them, [B · inner, …]."""
+    rest: tuple[int, ...] = ()
+    """Lengths of the other axes."""
+    time: tuple[int, int] | None = None
+    """Axis of the time steps, counted after the stimuli were put first and split from what they are joined with, and
+    the length of what is joined with time before it; None for no time."""
+
+    @property
+    def lengths(self) -> tuple[int, ...]:
+        """Lengths of the axes of each stimulus."""
+        return (*self.rest[: self.axis], self.outer, self.inner, *self.rest[self.axis :])
+
+    def fits(self, shape: tuple[int, ...], batch: int) -> bool:
+        """Return whether a tensor of a batch has this layout."""
+        return shape == (*self.rest[: self.axis], self.outer * batch * self.inner, *self.rest[self.axis :])
+
+    def split(self, tensor: torch.Tensor, batch: int) -> torch.Tensor:
+        """Return [B, …] with what is joined with the stimuli as axes of their own."""
+        return tensor.unflatten(self.axis, (self.outer, batch, self.inner)).movedim(self.axis + 1, 0)
+
+    def rows(self, tensor: torch.Tensor, batch: int, steps: int) -> torch.Tensor:
+        """Return [B, T, F]; T = 1 without time."""
+        rows = self.split(tensor, batch)
+        if self.time is None:
+            return rows.reshape(batch, 1, -1)
+        axis, before = self.time
+        return rows.unflatten(axis, (before, steps, -1)).movedim(axis + 1, 1).reshape(batch, steps, -1)
+
+
+def layouts(first: tuple[int, ...], second: tuple[int, ...], batches: tuple[int, int]) -> Iterator[Layout]:
+    """Yield the layouts that the shapes of one tensor in two batches allow."""
+    if len(first) != len(second):
+        return
+    for axis, (length, again) in enumerate(zip(first, second, strict=True)):
+        rest = (*first[:axis], *first[axis + 1 :])
+        count, uneven = divmod(length, batches[0])
+        if uneven or not count or again != count * batches[1] or rest != (*second[:axis], *second[axis + 1 :]):
+            continue
+        for outer in range(1, count + 1):
+            if count % outer == 0:
+                yield Layout(axis, outer, count // outer, rest)
+
+
+def probes(stimuli: torch.Tensor, steps: int) -> dict[int, torch.Tensor]:
+    """Return the probes [T, …] by their row, from stimuli [B, T, …]: two of them with noise of their size in all steps.
+
+    Noise tells steps and stimuli apart even where the stimuli are alike, such as at rest.
+    """
+    generator = torch.Generator().manual_seed(0)
+    values = stimuli.double()
+    values = torch.where(values.isfinite(), values, 0.0)
+    size = values.square().mean((0, 1)).sqrt()
+    size = size if bool(size.any()) else torch.ones_like(size)
+
+    def noise(length: int) -> torch.Tensor:
+        return torch.randn((length, *size.shape), generator=generator, dtype=torch.float64) * size
+
+    base, pair = values[0] + noise(steps), values[-1] + noise(steps)
+    late, half = base.clone(), steps // 2
+    late[half:] += noise(steps - half)
+    head = noise(1)
+    shifted, pair_shifted = (torch.cat([head, row[:-1]]) for row in (base, pair))
+    return {BASE: base, LATE: late, SHIFTED: shifted, PAIR: pair, PAIR_SHIFTED: pair_shifted}
+
+
+def same(left: torch.Tensor, right: torch.Tensor, spread: float) -> bool:
+    """Return whether tensors are equal but for rounding; ``spread`` is how far rows of unequal stimuli lie apart."""
+    if not torch.equal(left.isfinite(), right.isfinite()):
+        return False
+    limit = tolerance(left.dtype) * spread + rounding(left)
+    return largest(left - right) <= limit
+
+
+def largest(values: torch.Tensor) -> float:
+    """Return the largest absolute value that is finite; 0 for none."""
+    if not values.numel():
+        return 0.0
+    return float(values.abs().nan_to_num(0.0, 0.0, 0.0).max())
+
+
+def tolerance(kind: torch.dtype) -> float:
+    """Return which share of the differences between stimuli rounding may make."""
+    return min(1e5 * torch.finfo(kind).eps, 0.05) if kind.is_floating_point else 0.01
+
+
+def rounding(values: torch.Tensor) -> float:
+    """Return the difference that rounding alone makes in values of this size."""
+    eps = torch.finfo(values.dtype).eps if values.dtype.is_floating_point else 0.0
+    return 50 * eps * largest(values)
+
+
+def stimulus_layouts(
+    first: torch.Tensor, second: torch.Tensor, batches: tuple[int, int]
+) -> tuple[list[tuple[Layout, bool]], str]:
+    """Return the layouts under which probes give the same rows in both batches, and whether these move; else why not.
+
+    The batches begin with :data:`FIRST` and :data:`SECOND`.
+    """
+    proven, reason = [], UNMOVED if first.shape == second.shape and same(first, second, 0.0) else NO_AXIS
+    places = [(place, SECOND.index(row)) for place, row in enumerate(FIRST) if row in SECOND]
+    for layout in layouts(tuple(first.shape), tuple(second.shape), batches):
+        before, after = layout.split(first, batches[0]), layout.split(second, batches[1])
+        spread = largest(before[: len(FIRST)] - before[:1])
+        if all(same(before[left], after[right], spread) for left, right in places):
+            proven.append((layout, spread > rounding(before)))
+        elif reason == NO_AXIS:
+            reason = DEPENDENT
+    return proven, reason
+
+
+def with_time(layout: Layout, values: torch.Tensor, steps: int) -> Layout:
+    """Return the layout with its time axis, if the probes [B, …], which :meth:`Layout.split` gave, show one."""
+    joined = (layout.axis, layout.axis + 1)
+    choices = []
+    for axis, length in enumerate(layout.lengths):
+        if steps < 2 or length % steps or (length != steps and axis not in joined):
+            continue
+        for before in range(1, length // steps + 1):
+            if (length // steps) % before == 0:
+                split = values.unflatten(axis + 1, (before, steps, -1)).movedim(axis + 2, 1)
+                choices.append((time_misfit(split), (axis + 1, before)))
+    misfit, time = min(choices, default=(math.inf, None))
+    return Layout(layout.axis, layout.outer, layout.inner, layout.rest, time if misfit < SHIFT else None)
+
+
+def time_misfit(values: torch.Tensor) -> float:
+    """Return how badly axis 1 of the probes [B, T, …] moves with time: 0 for exactly, from 1 on for not at all.
+
+    Exactly: a late change leaves the early entries as they were, and moves later ones; early entries do move with an
+    early change. Entries that know the future too move with a shift: it explains what the shift changed.
+    """
+    rows = values[: len(FIRST)].reshape(len(FIRST), values.shape[1], -1)
+    rows = (rows if rows.dtype == torch.float64 else rows.float()).nan_to_num(0.0, 0.0, 0.0)
+    half, floor = values.shape[1] // 2, rounding(rows)
+
+    def moved(row: int) -> torch.Tensor:
+        return (rows[row] - rows[BASE]).abs().amax(-1)
+
+    late, early = moved(LATE), moved(SHIFTED)[:half]
+    if late[:half].max() <= max(1e-3 * float(late.max()), floor) < late[half:].max() and early.max() > floor:
+        return 0.0
+    # Of the difference between two probes, so that a code of the place in time, which does not shift, drops out.
+    before, after = rows[BASE] - rows[PAIR], rows[SHIFTED] - rows[PAIR_SHIFTED]
+    unexplained, change = (float((after[1:] - part).norm()) for part in (before[:-1], before[1:]))
+    return unexplained / change if change > floor else math.inf
+
+
+def sketch(rows: torch.Tensor) -> np.ndarray:
+    """Return [B, ≤ 257] numbers that stand for rows [B, …]: sums of signed blocks, and how many are not finite."""
+    flat = rows.reshape(len(rows), -1)
+    flat = flat.float() if flat.dtype != torch.float64 else flat
+    lost = (~flat.isfinite()).sum(1, keepdim=True)
+    flat = flat.nan_to_num(0.0, 0.0, 0.0)
+    if (length := flat.shape[1]) > _BLOCKS:
+        width = -(-length // _BLOCKS)
+        flat = nn.functional.pad(flat * _signs(length).to(flat.device), (0, width * _BLOCKS - length))
+        flat = flat.unflatten(1, (_BLOCKS, width)).sum(-1)
+    return torch.cat([flat, lost], 1).cpu().numpy()
+
+
+@lru_cache(maxsize=16)
+def _signs(length: int) -> torch.Tensor:
+    """Return signs drawn for rows of a length, so that entries that changed places do not cancel in a sum."""
+    generator = torch.Generator().manual_seed(length)
+    return torch.randint(0, 2, (length,), generator=generator, dtype=torch.int8).mul_(2).sub_(1)
+
+
+def agree(left: np.ndarray, right: np.ndarray, kind: torch.dtype) -> bool:
+    """Return whether two runs over the same stimuli gave the same sketches [S, N], but for rounding."""
+    if not np.array_equal(left[:, -1], right[:, -1]):
+        return False
+    left, right = (part[:, :-1].astype(np.float64) for part in (left, right))
+    if not left.size:
+        return True
+    both = np.concatenate([left, right])
+    eps = torch.finfo(kind).eps if kind.is_floating_point else 1e-7
+    limit = tolerance(kind) * np.abs(both - both.mean(axis=0)).max() + 50 * eps * np.abs(both).max()
+    return bool(np.abs(left - right).max() <= limit)
+
+
+def draw_sample(count: int) -> np.ndarray:
+    """Return the stimuli of the second run in its order: a quarter, from everywhere, 3 to 128."""
+    generator = np.random.default_rng(0)
+    size = min(max(3, count // 4), 128)
+    edges = np.linspace(0, count, size + 1).astype(int)
+    picks = [int(generator.integers(low, max(high, low + 1))) for low, high in pairwise(edges)]
+    return generator.permutation(np.minimum(picks, count - 1))
+
+
+def fresh_copy(model: nn.Module) -> nn.Module | None:
+    """Return a copy of a model as it is before it runs, for a state that the first batch leaves behind; None: no copy.
+
+    Old kinds of weight norm keep a weight that was computed, which Python cannot copy but PyTorch can.
+    """
+    memo: dict[int, Any] = {
+        id(value): value.detach().clone()
+        for module in model.modules()
+        for value in vars(module).values()
+        if isinstance(value, torch.Tensor) and not value.is_leaf
+    }
+    try:
+        return copy.deepcopy(model, memo)
+    except torch.OutOfMemoryError:
+        raise
+    except Exception:  # noqa: BLE001 - anything that a user's attribute raises when it is copied
+        return None
+
+
+def unwrapped(model: Any) -> Any:
+    """Return the module inside a compiled one."""
+    return getattr(model, "_orig_mod", model)
+
+
+def uncompiled(model: nn.Module) -> Any:
+    """Return a context in which parts that were compiled run as written, since only those call hooks."""
+    if any("_orig_mod" in part._modules or getattr(part, "_compiled_call_impl", None) for part in model.modules()):
+        return torch.compiler.set_stance("force_eager")
+    return nullcontext()
+
+
+def layer_modules(model: nn.Module) -> dict[str, nn.Module]:
+    """Return the parts that count as layers: those without parts, and those with weights of their own.
+
+    Parametrisations are weights of the part that they stand in.
+    """
+    layers: dict[str, nn.Module] = {}
+    passed = {model}
+
+    def walk(module: nn.Module, prefix: str) -> None:
+        for label, part in module.named_children():
+            if part in passed or (label == "parametrizations" and is_parametrized(module)):
+                continue
+            passed.add(part)
+            name = prefix if label == "_orig_mod" else f"{prefix}.{label}".strip(".")
+            leaf = not any(True for _ in part.children())
+            if leaf or is_parametrized(part) or any(True for _ in part.parameters(recurse=False)):
+                layers[name] = part
+            walk(part, name)
+
+    walk(model, "")
+    return layers
+
+
+def first_tensor(value: Any) -> torch.Tensor | None:
+    """Return the first tensor in what a module returned, as numbers that lie densely."""
+    if isinstance(value, torch.Tensor):
+        if value.is_meta or value.is_nested:
+            return None
+        if value.is_quantized:
+            return value.dequantize()
+        dense = value if value.layout == torch.strided else value.to_dense()
+        # Real and imaginary parts are features of their own.
+        return torch.view_as_real(dense.resolve_conj()) if dense.is_complex() else dense
+    if isinstance(value, dict):
+        value = tuple(value.values())
+    elif hasattr(value, "__dataclass_fields__"):
+        value = tuple(vars(value).values())
+    if isinstance(value, (tuple, list)):
+        return next((tensor for part in value if (tensor := first_tensor(part)) is not None), None)
+    return None
+
+
+@contextmanager
+def hooks(modules: dict[str, nn.Module], take: Callable[[str, Any], None]) -> Iterator[None]:
+    """Call ``take`` with the name and the output of each module when it was called."""
+    handles = []
+    try:
+        for name, module in modules.items():
+            handles.append(module.register_forward_hook(lambda _, inputs, output, name=name: take(name, output)))
+        yield
+    finally:
+        for handle in handles:
+            handle.remove()
