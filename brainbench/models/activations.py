@@ -146,11 +146,11 @@ def extract(
     with evaluating(model), torch.no_grad(), proof.uncompiled(model):
         run = _Run(model, values)
         if readout != "default":
-            named = partial(find_readout(readout).activations, model, layers=layers)
+            reader = partial(find_readout(readout).activations, model, layers=layers)
         else:
-            named = named_reader(model, layers)
-        if named is not None:
-            _read_named(run, named, rooms, chunk, proven=readout != "default" or _is_ours(model))
+            reader = named_reader(model, layers)
+        if reader is not None:
+            _read_named(run, reader, rooms, chunk, proven=readout != "default" or _is_ours(model))
         else:
             _HookedReader(run, layers, rooms).read(chunk)
     result = rooms.close(run.notes)
@@ -241,8 +241,9 @@ class _Run:
                 f"{type(self.model).__name__} cannot process stimuli of shape {list(self.values.shape)} "
                 f"[stimulus, time, channel, row, column]: {reason}"
             ) from error
-        if part._version != version and not self.notes:
-            self.notes.append("the model changes its input in place, and was given copies")
+        note = "the model changes its input in place, and was given copies"
+        if part._version != version and note not in self.notes:
+            self.notes.append(note)
         return result
 
     def chunks(self, chunk: int) -> Iterator[slice]:
@@ -303,7 +304,7 @@ class _Rooms:
 
     def __init__(self, count: int, folder: Any, memory: int, reduce: Callable[[np.ndarray], np.ndarray] | None) -> None:
         self.count, self.folder, self.memory, self.reduce = count, folder, memory, reduce
-        self.result, self.used = Activations(), 0
+        self.result, self.used, self.spill = Activations(), 0, None
         self.sizes: dict[str, int] = {}
         """Number of activations of each layer, before they are reduced."""
         self.written: dict[str, np.ndarray] = {}
@@ -355,13 +356,16 @@ class _Rooms:
 
     def _room(self, name: str, shape: tuple[int, ...], kind: Any) -> np.ndarray:
         size = int(np.prod(shape)) * np.dtype(kind).itemsize
-        if self.folder is None and self.used + size > self.memory:
-            self.folder = tempfile.mkdtemp(prefix="brainbench-layers-")
-            weakref.finalize(self.result, shutil.rmtree, self.folder, ignore_errors=True)
-        if self.folder is None:
+        folder = self.folder
+        if folder is None and self.used + size > self.memory:
+            if self.spill is None:
+                self.spill = tempfile.mkdtemp(prefix="brainbench-layers-")
+                weakref.finalize(self.result, shutil.rmtree, self.spill, ignore_errors=True)
+            folder = self.spill
+        if folder is None:
             self.used += size
             return np.full(shape, np.nan, kind)
-        path = Path(self.folder) / f"{name.replace('/', '-')}.npy"
+        path = Path(folder) / f"{name.replace('/', '-')}.npy"
         path.parent.mkdir(parents=True, exist_ok=True)
         room = np.lib.format.open_memmap(path, mode="w+", dtype=kind, shape=shape)
         room.fill(np.nan)
@@ -421,6 +425,8 @@ class _HookedReader:
     """Reads a network of others: proves what its parts return on a copy of it, then runs it once."""
 
     def __init__(self, run: _Run, layers: Collection[str] | None, rooms: _Rooms) -> None:
+        import torch
+
         from brainbench.models import proof
 
         self.run, self.rooms, self.layers = run, rooms, layers
@@ -429,6 +435,8 @@ class _HookedReader:
         self.fresh = proof.fresh_copy(run.model)
         if self.fresh is None:
             run.notes.append("the model cannot be copied, so a state that its first batch leaves is not noticed")
+        if any(isinstance(part, torch.jit.ScriptModule) for part in run.model.modules()):
+            run.notes.append("parts that run in TorchScript cannot be read: give the module that was scripted")
         self.places: dict[tuple[str, int], _Place] = {}
         self.calls: dict[str, int] = {}
         self.size = 1
@@ -589,7 +597,7 @@ class _HookedReader:
             if (count // steps) % before == 0
         ]
         misfit, before = min(choices)
-        return (layout, before, count // steps // before) if misfit < proof.SHIFT else None
+        return (layout, before, count // steps // before) if misfit < 1 else None
 
     def _run_sample(self, sketches: _Sketches) -> None:
         """Run the sampled stimuli in their own order and batches."""

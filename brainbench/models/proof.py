@@ -169,7 +169,7 @@ def with_time(layout: Layout, values: torch.Tensor, steps: int) -> Layout:
                 split = values.unflatten(axis + 1, (before, steps, -1)).movedim(axis + 2, 1)
                 choices.append((time_misfit(split), (axis + 1, before)))
     misfit, time = min(choices, default=(math.inf, None))
-    return Layout(layout.axis, layout.outer, layout.inner, layout.rest, time if misfit < SHIFT else None)
+    return Layout(layout.axis, layout.outer, layout.inner, layout.rest, time if misfit < 1 else None)
 
 
 def time_misfit(values: torch.Tensor) -> float:
@@ -188,30 +188,35 @@ def time_misfit(values: torch.Tensor) -> float:
     late, early = moved(LATE), moved(SHIFTED)[:half]
     if late[:half].max() <= max(1e-3 * float(late.max()), floor) < late[half:].max() and early.max() > floor:
         return 0.0
-    # Of the difference between two probes, so that a code of the place in time, which does not shift, drops out.
+    # Of the difference between two probes, so that a code of the place in time, which does not shift, drops out, and
+    # without what all entries share, since it tells nothing of time.
     before, after = rows[BASE] - rows[PAIR], rows[SHIFTED] - rows[PAIR_SHIFTED]
+    before, after = before - before.mean(0), after - after.mean(0)
     unexplained, change = (float((after[1:] - part).norm()) for part in (before[:-1], before[1:]))
-    return unexplained / change if change > floor else math.inf
+    # By chance the share scatters about 1, the more the fewer numbers there are.
+    limit = min(SHIFT, 1 - 3 / math.sqrt(before[1:].numel()))
+    return unexplained / change / limit if change > floor and limit > 0 else math.inf
 
 
 def sketch(rows: torch.Tensor) -> np.ndarray:
-    """Return [B, ≤ 257] numbers that stand for rows [B, …]: sums of signed blocks, and how many are not finite."""
+    """Return [B, ≤ 257] numbers that stand for rows [B, …]: weighted sums of blocks, and how many are not finite."""
     flat = rows.reshape(len(rows), -1)
     flat = flat.float() if flat.dtype != torch.float64 else flat
     lost = (~flat.isfinite()).sum(1, keepdim=True)
     flat = flat.nan_to_num(0.0, 0.0, 0.0)
     if (length := flat.shape[1]) > _BLOCKS:
         width = -(-length // _BLOCKS)
-        flat = nn.functional.pad(flat * _signs(length).to(flat.device), (0, width * _BLOCKS - length))
+        flat = nn.functional.pad(flat * _weights(length).to(flat.device), (0, width * _BLOCKS - length))
         flat = flat.unflatten(1, (_BLOCKS, width)).sum(-1)
     return torch.cat([flat, lost], 1).cpu().numpy()
 
 
 @lru_cache(maxsize=16)
-def _signs(length: int) -> torch.Tensor:
-    """Return signs drawn for rows of a length, so that entries that changed places do not cancel in a sum."""
+def _weights(length: int) -> torch.Tensor:
+    """Return weights of either sign for rows of a length, so that entries that changed places do not cancel."""
     generator = torch.Generator().manual_seed(length)
-    return torch.randint(0, 2, (length,), generator=generator, dtype=torch.int8).mul_(2).sub_(1)
+    signs = torch.randint(0, 2, (length,), generator=generator, dtype=torch.int8).mul_(2).sub_(1)
+    return torch.randint(32, 128, (length,), generator=generator, dtype=torch.int8).mul_(signs)
 
 
 def agree(left: np.ndarray, right: np.ndarray, kind: torch.dtype) -> bool:
@@ -315,6 +320,8 @@ def hooks(modules: dict[str, nn.Module], take: Callable[[str, Any], None]) -> It
     handles = []
     try:
         for name, module in modules.items():
+            if isinstance(module, torch.jit.ScriptModule):  # it takes no hooks, and its parts would not call them
+                continue
             handles.append(module.register_forward_hook(lambda _, inputs, output, name=name: take(name, output)))
         yield
     finally:

@@ -174,12 +174,12 @@ def resolve_model(model: Any, *, seed: int = 0) -> ResolvedModel:
         return ResolvedModel(card, None, features.activations, features.labels, {"features": path.name})
     import torch
 
-    from brainbench.models.diagram import graph_of
     from brainbench.models.ops.parameters import check_weights, weights_hash
     from brainbench.models.proof import unwrapped
     from brainbench.models.registry import locate_model
     from brainbench.models.training.checkpoints import CONFIG, PREFIXES
     from brainbench.models.user_models import load_user_model
+    from brainbench.models.zoo import graph_of
 
     model = unwrapped(model)
     if isinstance(model, torch.nn.Module):

@@ -1,6 +1,9 @@
+import gc
 import logging
 import re
 import tracemalloc
+import warnings
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -78,7 +81,7 @@ def test_a_loops_calls_become_time(stimuli):
     activations = extract(model, stimuli)
     assert {name: value.shape for name, value in activations.items()} == {
         "flatten": (K, T, 1050),
-        "norm": (K, 1, 1050 * T),
+        "norm": (K, T, 1050),
         "cell": (K, T, 6),
         "drop": (K, 1, 6),
         "head": (K, 1, 3),
@@ -184,9 +187,10 @@ def test_complex_activations_keep_both_parts(stimuli):
         def forward(self, x):
             return torch.fft.fft(x.flatten(2), dim=1)
 
-    found = extract(Phases(), stimuli)["output"]
+    spectra = extract(Phases(), stimuli)["output"]
     expected = np.fft.fft(stimuli.reshape(K, T, -1), axis=1)
-    np.testing.assert_allclose(found[..., ::2] + 1j * found[..., 1::2], expected, atol=1e-8)
+    assert spectra.shape == (K, 1, expected[0].size * 2), "frequencies are no time steps"
+    np.testing.assert_allclose(spectra[:, 0, ::2] + 1j * spectra[:, 0, 1::2], expected.reshape(K, -1), atol=1e-8)
 
 
 def test_calls_of_unequal_shape_are_kept_apart(stimuli):
@@ -223,9 +227,9 @@ def test_a_layer_that_knows_no_stimuli_is_an_error_only_when_asked_for(stimuli):
             return self.head(x.flatten(2)) + self.bias(torch.tensor([1]))
 
     assert list(extract(Biased(), stimuli)) == ["head", "output"]
-    with pytest.raises(UsageError, match=r"'bias' .*\[\[1, 3\]\]"):
+    with pytest.raises(UsageError, match=r"'bias' .* cannot be read: does not move with the stimuli"):
         extract(Biased(), stimuli, layers=["bias"])
-    with pytest.raises(UsageError, match=r"'unused' .*nothing"):
+    with pytest.raises(UsageError, match=r"'unused' .* gave nothing: it did not run"):
         extract(Biased(), stimuli, layers=["unused"])
 
 
@@ -362,3 +366,213 @@ def test_a_part_in_two_places_gives_time_in_each(join):
         name: (5, 4, 8) for name in ("one", "two", "act[0]", "act[1]", "output")
     }
     np.testing.assert_array_equal(found["act[1]"], found["output"])
+
+
+def test_the_report_names_what_was_not_read(stimuli):
+    class Tabled(nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.read, self.table, self.unused = nn.Linear(1050, 4), nn.Embedding(K, 4), nn.Linear(1, 1)
+
+        def forward(self, x):
+            return self.read(x.flatten(2)).mean(1) @ self.table(torch.arange(K)).T
+
+    report = extract(Tabled(), stimuli).report
+    assert str(report) == "2 of 3 called modules read; not read: table (does not move with the stimuli)"
+    assert (report.called, report.read, dict(report.not_read)) == (3, 2, {"table": "does not move with the stimuli"})
+    assert type(report).of(report.stated) == report
+
+
+class InPlace(nn.Module):
+    def __init__(self):
+        super().__init__()
+        self.act, self.read = nn.ReLU(inplace=True), nn.Linear(1050, 3)
+
+    def forward(self, x):
+        return self.read(self.act(x.mul_(2)).flatten(2))
+
+
+@pytest.mark.parametrize("wrap", [np.array, torch.tensor])
+def test_a_model_that_works_in_place_changes_no_stimuli_and_is_named_so(stimuli, wrap):
+    values = wrap(stimuli)
+    layers = extract(InPlace(), values)
+    np.testing.assert_array_equal(values, stimuli)
+    np.testing.assert_allclose(layers["act"], np.maximum(2 * stimuli.reshape(K, T, -1), 0))
+    assert "the model changes its input in place, and was given copies" in str(layers.report)
+    assert layers.report.notes == extract(InPlace(), values, chunk=2).report.notes
+    assert not extract(nn.Flatten(2), values).report.notes
+
+
+def test_a_memory_map_is_never_written(stimuli, tmp_path):
+    np.save(tmp_path / "stimuli.npy", stimuli)
+    before = (tmp_path / "stimuli.npy").read_bytes()
+    for mode in ("r+", "r", "c"):
+        mapped = np.load(tmp_path / "stimuli.npy", mmap_mode=mode)
+        extract(InPlace(), mapped)
+        np.testing.assert_array_equal(mapped, stimuli)
+    assert (tmp_path / "stimuli.npy").read_bytes() == before
+
+
+class _Calibrated(nn.Module):
+    """Sets its scale to the first batch that it sees, in a buffer, a weight or an attribute."""
+
+    def __init__(self, kind):
+        super().__init__()
+        self.kind, self.read, self.scale = kind, nn.Linear(1050, 6), nn.Parameter(torch.zeros(6))
+        self.register_buffer("ready", torch.zeros(()))
+        self.first = None
+
+    def forward(self, x):
+        y = self.read(x.flatten(2))
+        fresh = {"buffer": self.ready == 0, "weight": not self.scale.any(), "attribute": self.first is None}[self.kind]
+        if fresh:
+            self.scale.data.copy_(1 / y.flatten(0, 1).std(0))
+            self.first = self.ready.fill_(1)
+        return y * self.scale
+
+
+@pytest.mark.parametrize("kind", ["buffer", "weight", "attribute"])
+def test_a_normaliser_that_calibrates_itself_on_its_first_batch_is_refused(kind):
+    x = torch.randn(21, 4, 30, 5, 7, generator=torch.Generator().manual_seed(0))
+    with pytest.raises(UsageError, match="_Calibrated answers the same stimuli otherwise"):
+        extract(_Calibrated(kind), x)
+
+
+def test_a_state_that_only_another_batch_size_resets_is_refused():
+    class Leaky(nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.read, self.trace = nn.Linear(210, 6), torch.zeros(0, 6)
+
+        def forward(self, x):
+            self.trace = self.trace if len(self.trace) == len(x) else x.new_zeros(len(x), 6)
+            for step in self.read(x.flatten(2)).unbind(1):
+                self.trace = 0.95 * self.trace + step
+            return self.trace
+
+    with pytest.raises(UsageError, match="Leaky answers the same stimuli otherwise"):
+        extract(Leaky(), torch.randn(32, 4, 6, 5, 7))
+
+
+def test_compiled_parts_and_models_are_read_as_written(stimuli):
+    plain = nn.Sequential(nn.Flatten(2), nn.Sequential(nn.Linear(1050, 3), nn.ReLU()))
+    expected = extract(plain, stimuli)
+    whole = torch.compile(plain, backend="eager")
+    inside = nn.Sequential(plain[0], torch.compile(plain[1], backend="eager"))
+    with torch.no_grad():
+        whole(torch.from_numpy(stimuli))
+    for model in (whole, inside):
+        layers = extract(model, stimuli)
+        assert list(layers) == list(expected)
+        assert all(np.array_equal(layers[name], values) for name, values in expected.items())
+
+
+@pytest.mark.filterwarnings("ignore:.*torch.jit:DeprecationWarning")
+def test_the_parts_of_a_scripted_model_are_named_as_not_readable(stimuli):
+    plain = nn.Sequential(nn.Flatten(2), nn.Linear(1050, 3))
+    layers = extract(torch.jit.script(plain), stimuli)
+    np.testing.assert_allclose(layers["output"], extract(plain, stimuli)["output"], atol=1e-9)
+    assert "TorchScript" in str(layers.report)
+
+
+def test_sparse_and_quantised_tensors_give_their_numbers(stimuli):
+    class Kinds(nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.sparse, self.quantised = nn.Identity(), nn.Identity()
+
+        def forward(self, x):
+            y = x.flatten(2).mean(1)
+            self.sparse(y.to_sparse())
+            return self.quantised(torch.quantize_per_tensor(y, 1e-7, 0, torch.qint32))
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # PyTorch deprecates its quantised tensors
+        layers = extract(Kinds(), stimuli)
+    expected = stimuli.reshape(K, T, -1).mean(1, keepdims=True)
+    np.testing.assert_allclose(layers["sparse"], expected, atol=1e-10)
+    np.testing.assert_allclose(layers["quantised"], expected, atol=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("model", "words"),
+    [
+        (nn.Sequential(nn.Flatten(2), nn.Linear(1050, 2, device="meta")), "never loaded.*1.weight"),
+        (nn.Sequential(nn.Flatten(2), nn.LazyLinear(2)), "lazy layers.*1.weight"),
+    ],
+)
+def test_weights_that_do_not_exist_are_told(stimuli, model, words):
+    with pytest.raises(UsageError, match=words):
+        extract(model, stimuli)
+
+
+def test_layers_are_reduced_while_they_are_produced(stimuli):
+    model = Recurrent().eval()
+    whole = extract(model, stimuli)
+    means = extract(model, stimuli, chunk=2, reduce=lambda rows: rows.mean(axis=1, keepdims=True))
+    assert {name: values.shape[1] for name, values in means.items()} == dict.fromkeys(whole, 1)
+    for name, values in whole.items():
+        np.testing.assert_allclose(means[name][:, 0], values.mean(axis=1), rtol=1e-3, atol=1e-5)
+
+
+def test_layers_beyond_the_memory_lie_in_files_that_go_with_them(stimuli):
+    model = nn.Sequential(nn.Flatten(2), nn.Linear(1050, 500), nn.ReLU())
+    whole = extract(model, stimuli)
+    size = whole["1"].nbytes / 2**30
+    layers = extract(model, stimuli, memory=1.5 * size)
+    mapped = {name: values.filename for name, values in layers.items() if isinstance(values, np.memmap)}
+    assert mapped
+    assert len(mapped) < len(layers)
+    for name, values in whole.items():
+        np.testing.assert_allclose(layers[name], values, atol=1e-6)
+    paths = [Path(name) for name in mapped.values()]
+    assert all(path.is_file() for path in paths)
+    del layers
+    gc.collect()
+    assert not any(path.exists() for path in paths)
+
+
+def test_stimuli_run_once_beyond_the_proof():
+    class Counted(nn.Module):
+        rows = 0
+
+        def forward(self, x):
+            type(self).rows += len(x)
+            return x.flatten(2)
+
+    extract(Counted(), torch.randn(40, 4, 6, 5, 7))
+    assert Counted.rows == 40 + 8 + 10
+
+
+def test_a_model_of_one_batch_size_is_read_in_it():
+    class Fixed(nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.read = nn.Linear(210, 3)
+
+        def forward(self, x):
+            return self.read(x.reshape(8, 4, 210))
+
+    x = torch.randn(16, 4, 6, 5, 7)
+    model = Fixed()
+    with torch.no_grad():
+        expected = model.read(x.flatten(2))
+    np.testing.assert_allclose(extract(model, x, chunk=8)["read"], expected, atol=1e-5)
+
+
+def test_a_model_of_others_that_names_its_layers_is_proven_too():
+    class Named(nn.Module):
+        layers = ("mean",)
+
+        def __init__(self, mixes):
+            super().__init__()
+            self.mixes = mixes
+
+        def activations(self, x, layers):
+            y = x.flatten(2)
+            return {"mean": y - y.mean(0) if self.mixes else y}
+
+    x = torch.randn(9, 4, 6, 5, 7)
+    np.testing.assert_array_equal(extract(Named(False), x)["mean"], x.flatten(2))
+    with pytest.raises(UsageError, match="Named answers the same stimuli otherwise"):
+        extract(Named(True), x)

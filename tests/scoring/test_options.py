@@ -19,8 +19,9 @@ ELSEWHERE = {
     "explain": "statistics",
     "title": "recordings",
     "strict": "recordings",
+    "memory": "",
 }
-"""Options whose effect stands in another entry of the provenance than its settings."""
+"""Options whose effect stands in another entry of the provenance than its settings, or in none."""
 
 
 @pytest.mark.parametrize("name", NAMES)
