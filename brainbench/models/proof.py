@@ -114,17 +114,19 @@ def probes(stimuli: torch.Tensor, steps: int) -> dict[int, torch.Tensor]:
 
 def same(left: torch.Tensor, right: torch.Tensor, spread: float) -> bool:
     """Return whether tensors are equal but for rounding; ``spread`` is how far rows of unequal stimuli lie apart."""
-    if not torch.equal(left.isfinite(), right.isfinite()):
-        return False
     limit = tolerance(left.dtype) * spread + rounding(left)
-    return largest(left - right) <= limit
+    change = float((left - right).abs().max()) if left.numel() else 0.0
+    if math.isfinite(change):
+        return change <= limit
+    return torch.equal(left.isfinite(), right.isfinite()) and largest(left - right) <= limit
 
 
 def largest(values: torch.Tensor) -> float:
     """Return the largest absolute value that is finite; 0 for none."""
     if not values.numel():
         return 0.0
-    return float(values.abs().nan_to_num(0.0, 0.0, 0.0).max())
+    size = float(values.abs().max())
+    return size if math.isfinite(size) else float(values.abs().nan_to_num(0.0, 0.0, 0.0).max())
 
 
 def tolerance(kind: torch.dtype) -> float:
@@ -201,14 +203,22 @@ def time_misfit(values: torch.Tensor) -> float:
 def sketch(rows: torch.Tensor) -> np.ndarray:
     """Return [B, ≤ 257] numbers that stand for rows [B, …]: weighted sums of blocks, and how many are not finite."""
     flat = rows.reshape(len(rows), -1)
-    flat = flat.float() if flat.dtype != torch.float64 else flat
-    lost = (~flat.isfinite()).sum(1, keepdim=True)
-    flat = flat.nan_to_num(0.0, 0.0, 0.0)
-    if (length := flat.shape[1]) > _BLOCKS:
-        width = -(-length // _BLOCKS)
-        flat = nn.functional.pad(flat * _weights(length).to(flat.device), (0, width * _BLOCKS - length))
-        flat = flat.unflatten(1, (_BLOCKS, width)).sum(-1)
-    return torch.cat([flat, lost], 1).cpu().numpy()
+    flat = flat if flat.dtype == torch.float64 else flat.float()
+    numbers, lost = _block_sums(flat), torch.zeros(len(flat), 1, device=flat.device)
+    if not bool(numbers.isfinite().all()):  # rarely, so that most rows are passed over once
+        lost = (~flat.isfinite()).sum(1, keepdim=True)
+        numbers = _block_sums(flat.nan_to_num(0.0, 0.0, 0.0))
+    return torch.cat([numbers, lost], 1).cpu().numpy()
+
+
+def _block_sums(flat: torch.Tensor) -> torch.Tensor:
+    if (length := flat.shape[1]) <= _BLOCKS:
+        return flat
+    width = -(-length // _BLOCKS)
+    weighted = flat * _weights(length).to(flat.device)
+    if width * _BLOCKS != length:
+        weighted = nn.functional.pad(weighted, (0, width * _BLOCKS - length))
+    return weighted.unflatten(1, (_BLOCKS, width)).sum(-1)
 
 
 @lru_cache(maxsize=16)
@@ -304,7 +314,8 @@ def first_tensor(value: Any) -> torch.Tensor | None:
             return value.dequantize()
         dense = value if value.layout == torch.strided else value.to_dense()
         # Real and imaginary parts are features of their own.
-        return torch.view_as_real(dense.resolve_conj()) if dense.is_complex() else dense
+        dense = torch.view_as_real(dense.resolve_conj()) if dense.is_complex() else dense
+        return dense if dense.is_floating_point() else dense.double()
     if isinstance(value, dict):
         value = tuple(value.values())
     elif hasattr(value, "__dataclass_fields__"):

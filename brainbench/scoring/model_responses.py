@@ -309,4 +309,7 @@ def mean_over_time(values: NDArray[np.floating]) -> NDArray[np.floating]:
 
 def reduce_time(values: NDArray[np.floating], time: str) -> NDArray[np.floating]:
     """Return [K, T, F] as [K, F'] by the time rule; NaN activations stay NaN, since here nothing is "not recorded"."""
-    return values.reshape(len(values), -1) if time == "concatenate" else values.mean(axis=1, dtype=np.float64)
+    if time == "mean" and values.shape[1] > 1:
+        return values.mean(axis=1, dtype=np.float64)
+    flat = values.reshape(len(values), -1)
+    return flat.astype(np.float64, copy=False) if time == "mean" else flat

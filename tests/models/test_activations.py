@@ -576,3 +576,18 @@ def test_a_model_of_others_that_names_its_layers_is_proven_too():
     np.testing.assert_array_equal(extract(Named(False), x)["mean"], x.flatten(2))
     with pytest.raises(UsageError, match="Named answers the same stimuli otherwise"):
         extract(Named(True), x)
+
+
+def test_decisions_and_counts_are_numbers_too(stimuli):
+    class Decided(nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.above, self.count = nn.Identity(), nn.Identity()
+
+        def forward(self, x):
+            return self.count(self.above(x.flatten(2) > 0).sum(2))
+
+    layers = extract(Decided(), stimuli)
+    above = stimuli.reshape(K, T, -1) > 0
+    np.testing.assert_array_equal(layers["above"], above)
+    np.testing.assert_array_equal(layers["count"], above.sum(2)[..., None])
