@@ -16,7 +16,13 @@ from brainbench.core.rotations import conjugate, from_xyzw, rotate
 from robotics_bridge.envs.kernels.contact_forces import add_contact_forces
 from robotics_bridge.envs.simulation import EnvOptions, Simulation
 from robotics_bridge.hands import Hand
-from robotics_bridge.hands.observations import PATCH_FORCE_SCALE, TAXELS_IN_CONTACT, observation_type, sensors_for
+from robotics_bridge.hands.observations import (
+    PATCH_FORCE_SCALE,
+    TAXELS_IN_CONTACT,
+    center_of_pressure,
+    observation_type,
+    sensors_for,
+)
 from robotics_bridge.physics.state import HandState
 from robotics_bridge.sensors import Probes, SensorSuite, SurfaceDistanceProbe
 from robotics_bridge.tasks.scenes import TaskModel
@@ -124,8 +130,15 @@ class TactileObservation:
         width: int = 3 if observe == "force" else int(self._parts[0][0].shape[0])
         self._taxels = torch.zeros(num_envs, len(links), width, device=where)
         self._pool = None
+        self._patches: list[tuple[torch.Tensor, ...]] = []
         columns = len(links)
-        if kind.per_link:
+        if observe == "center_of_pressure":
+            columns = len(taxels)
+            for number, (link, probes) in enumerate(taxels.items()):
+                arrays = (probes.position[active[link]], probes.normal[active[link]])
+                patch = [torch.as_tensor(array, dtype=torch.float32, device=where) for array in arrays]
+                self._patches.append((torch.as_tensor(np.flatnonzero(links == number), device=where), *patch))
+        elif kind.per_link:
             columns = len(taxels)
             pool = np.zeros((len(links), columns, kind.channels))
             # Sum over the taxels of a link as one matrix product: counts of contacts, or 10⁴ Σ d n with axes z, y, x
@@ -145,6 +158,14 @@ class TactileObservation:
                 self._taxels = part
             else:
                 self._taxels.index_copy_(1, target, part)
+        if self._patches:
+            # The index tensors lie on the device, so that a graph can record the step.
+            parts = [
+                center_of_pressure(self._taxels.index_select(1, members), place, normal)
+                for members, place, normal in self._patches
+            ]
+            self.reading[:, substep] = torch.stack(parts, dim=1)
+            return
         if self._pool is None:
             self.reading[:, substep] = self._taxels
             return

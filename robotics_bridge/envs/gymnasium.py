@@ -134,7 +134,7 @@ def make_vec(
     task: str,
     num_envs: int = 1,
     *,
-    touch: str = "none",
+    touch: str = "center_of_pressure",
     groups: tuple[str, ...] = (),
     privileged: bool = False,
     **options: Any,
@@ -144,7 +144,7 @@ def make_vec(
     Args:
         task: Name of a task.
         num_envs: Environments.
-        touch: Type of the observation ``tactile``, such as ``force_torque``; by default the hand feels nothing.
+        touch: Type of the observation ``tactile``, such as ``force_torque``; ``none``: the hand feels nothing.
         groups: Observation groups, by default all that a hand has.
         privileged: Give groups that only the simulation knows, too.
         **options: Those of :func:`robotics_bridge.tasks.make`.

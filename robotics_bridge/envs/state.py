@@ -18,7 +18,8 @@ from brainbench.core.rotations import angle_of, conjugate, from_xyzw, multiply, 
 from robotics_bridge.envs.contacts import Contacts, TactileObservation
 from robotics_bridge.envs.simulation import Actuators, EnvOptions, Simulation
 from robotics_bridge.hands import Hand
-from robotics_bridge.tasks.scenes import TaskModel, build, coupled
+from robotics_bridge.hands.tree import coupled
+from robotics_bridge.tasks.scenes import TaskModel, build
 from robotics_bridge.tasks.task import Task
 from robotics_bridge.tasks.terms import TaskState
 

@@ -12,10 +12,10 @@ from pathlib import Path
 
 from brainbench.core.errors import unknown_name
 from brainbench.core.lazy import lazy_exports
-from robotics_bridge.hands.hand import Hand, from_file
+from robotics_bridge.hands.hand import Hand, all_from_file, from_file
 from robotics_bridge.hands.spec import read_spec
 
-__all__ = ["Hand", "list_hands", "load"]
+__all__ = ["Hand", "list_hands", "load", "load_all"]
 
 _OWN = {path.stem: path for path in sorted(Path(__file__).parent.glob("*.toml"))}
 
@@ -25,14 +25,26 @@ def list_hands() -> tuple[str, ...]:
     return tuple(_OWN)
 
 
-def load(name_or_path: str | os.PathLike[str]) -> Hand:
-    """Return a hand of ours by name (:func:`list_hands`), or that of a URDF or MJCF file."""
+def load(name_or_path: str | os.PathLike[str], *, palm: str | None = None) -> Hand:
+    """Return a hand of ours by name (:func:`list_hands`), or that of a URDF or MJCF file.
+
+    Of several hands in a file it is that with the link ``palm``, or the first, with a warning.
+    """
     name = os.fspath(name_or_path)
     if name in _OWN:
         spec = read_spec(_OWN[name])
         return Hand(spec.name, spec.palm, spec.fingers, spec=spec)
+    return from_file(_hand_file(name), palm)
+
+
+def load_all(path: str | os.PathLike[str]) -> tuple[Hand, ...]:
+    """Return every hand of a URDF or MJCF file, that with most fingers first; all share the file's model."""
+    return all_from_file(_hand_file(os.fspath(path)))
+
+
+def _hand_file(name: str) -> Path:
     if Path(name).suffix.lower() in (".urdf", ".xml", ".mjcf"):
-        return from_file(Path(name))
+        return Path(name)
     raise unknown_name("hand", name, _OWN, hint="Or give the path of a URDF or MJCF file.")
 
 

@@ -16,13 +16,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.devices import mujoco_module
-from brainbench.core.errors import DataError, UsageError, brief, check_each, check_kind, listing
+from brainbench.core.errors import DataError, UsageError, brief, check_each, check_kind, check_name, listing
 from brainbench.core.files import content_hash
 from brainbench.core.reading.regular import readable
 from robotics_bridge.hands.files import read_mjspec, stated_speeds
 from robotics_bridge.hands.layouts import Layout, check_names, is_probe_file, pad_probes, read_probes, select
 from robotics_bridge.hands.spec import HandSpec, build
 from robotics_bridge.hands.surface import palmar_directions
+from robotics_bridge.hands.tree import Tree
 from robotics_bridge.sensors.probes.placement import Probes
 
 _log = logging.getLogger(__name__)
@@ -60,6 +61,8 @@ class Hand:
     """The file of any other."""
     custom: Layout | None = None
     """Probes of :meth:`with_probes`, the resolution ``custom``."""
+    couplers: frozenset[str] = frozenset()
+    """Links of fingers that only move others, such as the rods of a linkage; they get no taxels."""
 
     def mjspec(self) -> Any:
         """Return a new ``mujoco.MjSpec`` of the hand, for scenes to attach; the palm is fixed to the world."""
@@ -162,7 +165,7 @@ class Hand:
         layout: Layout = {}
         reasons: list[str] = []
         facing = palmar_directions(self.model, self.palm, self.fingers)
-        for link in links:
+        for link in (link for link in links if link not in self.couplers):
             place = "palm" if link == self.palm else "tips" if link in self.tips else "fingers"
             rows, columns, radius = _AUTO_GRIDS[resolution][place]
             if not geoms_of(self.model, self.model.body(link).id):
@@ -182,13 +185,16 @@ class Hand:
                 f"Hand {self.name!r} gets no taxels on {', '.join(links)}: {'; '.join(reasons)}. Place them with "
                 "Hand.with_probes (a probe file, or link → Probes)."
             )
+        if reasons:
+            _log.warning("Hand %s gets no taxels on some links: %s.", brief(self.name), "; ".join(reasons))
         return layout
 
 
-def from_file(path: Path) -> Hand:
-    """Return the hand of a file; palm and fingers follow from its tree.
+def all_from_file(path: Path) -> tuple[Hand, ...]:
+    """Return the hands of a file, that with most fingers first; palms and fingers follow from its tree.
 
-    The palm is the body from which most branches of joints part; a finger is a branch, named by its tip.
+    The palm is the body from which most branches of joints part; a finger is a branch, or what a closed loop makes of
+    several, named by its tip.
     """
     with readable(path, "URDF or MJCF file"):
         model = read_mjspec(path).compile()
@@ -203,33 +209,36 @@ def from_file(path: Path) -> Hand:
             "Limits of the hinges of hand %s end at %.4g rad: is the unit of the angles right (MJCF: degrees "
             "unless <compiler angle='radian'/>; URDF: rad)?", brief(path.stem), widest,
         )  # fmt: skip
-    children: dict[int, list[int]] = {body: [] for body in range(model.nbody)}
-    for body in range(1, model.nbody):
-        children[int(model.body_parentid[body])].append(body)
-    jointed = {body: _joints_below(model, body, children) for body in range(model.nbody)}
-    branches = {body: [child for child in children[body] if jointed[child]] for body in range(model.nbody)}
-    # The palm is the body with most branches that have joints; of equals the one with the lowest number. Without any
-    # fork it is the body before the last joint: a fixed jaw, with whatever arm below it.
-    most = max(len(branches[body]) for body in branches)
-    palm = max(branches, key=lambda body: (len(branches[body]), body if most == 1 else -body))
-    if not branches[palm]:
+    branches = Tree(model).hands()
+    if not branches:
         raise DataError(f"{str(path)!r} holds no hand: it has no joints.")
-    fingers: dict[str, tuple[str, ...]] = {}
-    for start in branches[palm]:
-        chain, body = [start], start
-        while following := [child for child in children[body] if jointed[child] or model.body_geomnum[child]]:
-            body = max(following, key=lambda child: (jointed[child], model.body_geomnum[child]))
-            chain.append(body)
-        # Pads that are fixed beside the chain belong to it too, each after its parent.
-        every = [chain[0]]
-        for body, parent in zip(chain[1:], chain, strict=False):
-            every += [child for child in children[parent] if child not in chain and not jointed[child]] + [body]
-        chain = [body for body in every if model.body_geomnum[body]] or chain[-1:]
-        names = tuple(model.body(body).name for body in chain)
-        fingers[names[-1]] = names
-    return Hand(path.stem, model.body(palm).name, fingers, path=path)
+
+    def names(bodies: Iterable[int]) -> tuple[str, ...]:
+        return tuple(model.body(body).name for body in bodies)
+
+    hands = []
+    for hand in branches:
+        fingers = {model.body(tip).name: names(chain) for tip, chain in hand.fingers.items()}
+        couplers = frozenset(names(hand.couplers))
+        name = path.stem if len(branches) == 1 else f"{path.stem}-{model.body(hand.palm).name}"
+        hands.append(Hand(name, model.body(hand.palm).name, fingers, path=path, couplers=couplers))
+    return tuple(hands)
 
 
-def _joints_below(model: Any, body: int, children: dict[int, list[int]]) -> int:
-    count = sum(int(model.jnt_type[index]) in (2, 3) for index in range(model.njnt) if model.jnt_bodyid[index] == body)
-    return count + sum(_joints_below(model, child, children) for child in children[body])
+def from_file(path: Path, palm: str | None = None) -> Hand:
+    """Return the hand of a file, or of several the one with that palm; what gets no taxels is named."""
+    hands = all_from_file(path)
+    if palm is not None:
+        check_name("palm", palm, [hand.palm for hand in hands])
+        return next(hand for hand in hands if hand.palm == palm)
+    if len(hands) > 1:
+        others = listing([hand.palm for hand in hands[1:]])
+        _log.warning(
+            "%s holds %d hands: that of palm %s is taken, and links of %s get no taxels. hands.load_all reads all, "
+            "hands.load(path, palm=...) another.", brief(path.name), len(hands), brief(hands[0].palm), others,
+        )  # fmt: skip
+    if hands[0].couplers:
+        _log.warning("Hand %s: %s only move other links and get no taxels.", brief(path.stem),
+                     listing(sorted(hands[0].couplers)))  # fmt: skip
+    # The name of a file's hand is that of the file, whatever else the file holds.
+    return replace(hands[0], name=path.stem)

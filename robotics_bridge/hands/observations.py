@@ -1,4 +1,5 @@
-"""Observations of a policy from the sensors of a hand: the tactile types of the thesis (tables 4.3, 4.6).
+"""Observations of a policy from the sensors of a hand: the tactile types of the thesis (tables 4.3, 4.6), and the
+centre of pressure of each link.
 
 Readings are those of one sensor per link, in the layout's order. Letters: B environment, N probe of a link, L link.
 """
@@ -52,6 +53,8 @@ OBSERVATIONS: dict[str, ObservationType] = {
     # Displacement of each marker (m); force and torque from nearby surface.
     "elastomer": ObservationType("ElastomerTaxel", False, 3),
     "proximity": ObservationType("ProximityTaxel", False, 6),
+    # Force of each link (N), the point at which it acts (m) and the torque about its normal there (N·m).
+    "center_of_pressure": ObservationType("KinematicTaxel", True, 7),
 }
 """Name → type."""
 
@@ -86,11 +89,14 @@ def sensors_for(
     settings: dict[str, Any] = {"track": track, **knobs}
     if kind.sensor == "KinematicTaxel" and all(knobs.get(name) is None for name in _LAW):
         settings |= HOLDING
+    elif kind.sensor == "KinematicTaxel" and settings.get("total") is None:
+        settings["total"] = "law"
     if kind.sensor != "KinematicTaxel":
         # Only a force law has it; tasks and stored students state theirs for any type.
         settings.pop("twist", None)
     if noisy:
-        settings["noise"] = sensors.Noise.preset(f"published-{name}")
+        preset = "force" if name == "center_of_pressure" else name
+        settings["noise"] = sensors.Noise.preset(f"published-{preset}")
         if kind.sensor == "ContactProbe":
             settings.setdefault("release", 2e-4)
     if kind.sensor == "ElastomerTaxel" and any(not probes.active.all() for probes in layout.values()):
@@ -146,6 +152,25 @@ def _part(name: str, values: torch.Tensor, probes: Any) -> torch.Tensor:
         normal = torch.as_tensor(probes.normal[probes.active].copy(), dtype=values.dtype, device=values.device)
         # 10⁴ P Σ d n with P the order z, y, x of the axes (4.29).
         return PATCH_FORCE_SCALE * (values[..., :1] * normal).sum(dim=1).flip(-1)
+    if name == "center_of_pressure":
+        place = torch.as_tensor(probes.position[probes.active].copy(), dtype=values.dtype, device=values.device)
+        normal = torch.as_tensor(probes.normal[probes.active].copy(), dtype=values.dtype, device=values.device)
+        return center_of_pressure(values, place, normal)
     if name == "force":
         values = values[..., :3]
     return values.flatten(1)
+
+
+def center_of_pressure(values: torch.Tensor, place: torch.Tensor, normal: torch.Tensor) -> torch.Tensor:
+    """Return force, point and torsion [B, 7] of wrenches [B, N, 6] of a link, in its frame; zeros without a touch.
+
+    ``place`` and ``normal`` [N, 3] are those of its taxels. The point is their mean by normal force; the torsion is the
+    torque about it, along their mean normal by force.
+    """
+    weight = (values[..., :3] * normal).sum(dim=-1).abs()
+    total = weight.sum(dim=1, keepdim=True)
+    share = weight / total.clamp_min(1e-12)
+    force, point = values[..., :3].sum(dim=1), share @ place
+    axis = torch.nn.functional.normalize(share @ normal, dim=1)
+    moment = values[..., 3:].sum(dim=1) - torch.linalg.cross(point, force)
+    return torch.cat([force, point, (moment * axis).sum(dim=1, keepdim=True)], dim=1) * (total > 0)

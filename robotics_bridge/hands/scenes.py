@@ -16,6 +16,7 @@ from brainbench.core.rotations import from_matrices, from_z_axis, to_matrices
 from robotics_bridge.hands.hand import Hand
 from robotics_bridge.hands.spec import add_servo
 from robotics_bridge.hands.surface import half_open, link_middle, opens, palmar_directions, slide_of
+from robotics_bridge.hands.tree import Tree, coupled
 
 mujoco = mujoco_module()
 
@@ -145,7 +146,7 @@ def _between(hand: Hand, spec: Any, jaws: dict[int, tuple[float, float]]) -> Any
 def closing(hand: Hand, share: float) -> NDArray[np.float64]:
     """Return targets (rad, m) of the servos of :func:`holding`, in their order: :func:`flexed` of their joints."""
     target, joints = flexed(hand, share), _servoed(hand)
-    return target[hand.joint_numbers if joints is None else joints]
+    return target[leading_joints(hand.model) if joints is None else joints]
 
 
 def flexed(hand: Hand, share: float) -> NDArray[np.float64]:
@@ -177,11 +178,19 @@ def replace_drives(spec: Any) -> None:
     """Give every hinge and slide of a hand a weak position servo of its name, in place of the drives of its file."""
     while spec.actuators:
         spec.delete(spec.actuators[0])
+    model = spec.copy().compile()
+    names = {model.joint(joint).name for joint in leading_joints(model).tolist()}
     for joint in spec.joints:
-        slides = joint.type == mujoco.mjtJoint.mjJNT_SLIDE
-        if slides or joint.type == mujoco.mjtJoint.mjJNT_HINGE:
+        if joint.name in names:
+            slides = joint.type == mujoco.mjtJoint.mjJNT_SLIDE
             joint.armature = max(joint.armature, ARMATURE)
             add_servo(spec, joint.name, *(WEAK_PUSH if slides else WEAK_SERVO))
+
+
+def leading_joints(model: Any) -> NDArray[np.intp]:
+    """Return the hinges and slides that do not follow from others through loops."""
+    joints = np.flatnonzero(np.isin(model.jnt_type, (2, 3)))
+    return joints[~np.isin(joints, list(Tree(model).followers - {each[0] for each in coupled(model)}))]
 
 
 def palm_surface(hand: Hand) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:

@@ -41,6 +41,27 @@ def geoms_of(model: Any, body: int) -> list[int]:
     return solid or mine
 
 
+def looped_bodies(model: Any) -> list[frozenset[int]]:
+    """Return the closed loops of a model: the bodies on both ways from what is tied together to where these part."""
+    loops: list[frozenset[int]] = []
+    ties = (model.eq_type == mujoco.mjtEq.mjEQ_CONNECT) | (model.eq_type == mujoco.mjtEq.mjEQ_WELD)
+    for row in np.flatnonzero(ties & (model.eq_active0 != 0)).tolist():
+        ends = [int(model.eq_obj1id[row]), int(model.eq_obj2id[row])]
+        if int(model.eq_objtype[row]) == int(mujoco.mjtObj.mjOBJ_SITE):
+            ends = [int(model.site_bodyid[end]) for end in ends]
+        ways = []
+        for body in ends:
+            way = {body}
+            while body:
+                body = int(model.body_parentid[body])
+                way.add(body)
+            ways.append(way)
+        loop = frozenset(ways[0] ^ ways[1])
+        if len(loop) > 1 and loop not in loops:
+            loops.append(loop)
+    return loops
+
+
 def cast_grid(
     model: Any, link: str, rows: int, columns: int, *, facing: ArrayLike, radius: float, extent: float = 0.8
 ) -> Probes:
@@ -135,6 +156,8 @@ def palmar_directions(model: Any, palm: str, fingers: Mapping[str, tuple[str, ..
     """
     data = half_open(model)
     sign = -1.0 if opens(model, fingers) else 1.0
+    # Which way a link of a closed loop turns is told by the loop, not by its own joint.
+    looped = {int(model.body_weldid[body]) for loop in looped_bodies(model) for body in loop}
     towards: dict[str, np.ndarray] = {}
     tips = []
     for name, chain in fingers.items():
@@ -142,12 +165,15 @@ def palmar_directions(model: Any, palm: str, fingers: Mapping[str, tuple[str, ..
         for place in reversed(range(len(chain))):
             body = model.body(chain[place]).id
             following = data.xpos[model.body(chain[place + 1]).id] if place + 1 < len(chain) else None
-            world = _flexed(model, data, body, following)
+            in_loop = int(model.body_weldid[body]) in looped
+            world = None if in_loop else _flexed(model, data, body, following)
             if world is None and facing is None and place + 1 == len(chain):
                 others = [other[-1] for key, other in fingers.items() if key != name] or [palm]
                 world = _opposite(model, data, body, [model.body(other).id for other in others])
                 if world is None:
                     world = _flexed(model, data, body, following, symmetric=True)
+                elif in_loop:
+                    world = sign * world
             facing = facing if world is None else sign * world
             if facing is not None:
                 towards[chain[place]] = data.xmat[body].reshape(3, 3).T @ facing

@@ -97,6 +97,10 @@ class TouchScene:
     """Pairs of geometry numbers (low, high) that collide whatever their bits say."""
     variants: Mapping[int, tuple[Geometry, ...]] = field(default_factory=dict)
     """By geometry number, where environments differ: its shapes in environments 0, 1, …, then from the first again."""
+    flexes: tuple[str, ...] = ()
+    """Names of soft bodies that collide; contacts of the engine have the number −1 in place of their geometry."""
+    reports_forces: bool = False
+    """True if an engine tells the forces of contacts."""
 
     def __post_init__(self) -> None:
         for what, names in (("link", self.links), ("geometry", [g.name for g in self.geometries])):
@@ -195,7 +199,7 @@ class TouchScene:
         }
         pairs = zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True)
         always = frozenset((min(pair), max(pair)) for pair in pairs)
-        return cls(links, geometries, _never(model), always, variants)
+        return cls(links, geometries, _never(model), always, variants, _flexes(model), reports_forces=True)
 
 
 def _name(model: Any, what: int, index: int) -> str:
@@ -221,6 +225,13 @@ def _geometries(model: Any, links: tuple[str, ...]) -> tuple[Geometry, ...]:
             )
         )  # fmt: skip
     return tuple(geometries)
+
+
+def _flexes(model: Any) -> tuple[str, ...]:
+    collides = (model.flex_contype | model.flex_conaffinity) != 0
+    kind = mujoco.mjtObj.mjOBJ_FLEX
+    names = (mujoco.mj_id2name(model, kind, index) or f"flex{index}" for index in np.flatnonzero(collides).tolist())
+    return tuple(names)
 
 
 def _mesh(model: Any, index: int) -> Mesh:

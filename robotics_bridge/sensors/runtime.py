@@ -134,7 +134,8 @@ class Runtime(abc.ABC):
 class ProbeRuntime(Runtime):
     """Probes of all sensors of a group, one after another, with their slots.
 
-    A probe looks ``reach`` beyond its radius (m); None is unlimited, and geometries need not be in contact.
+    A probe looks ``reach`` beyond its radius (m); None is unlimited, and geometries need not be in contact. ``others``:
+    what it looks at may be of kinds without a distance.
     """
 
     def __init__(
@@ -145,11 +146,13 @@ class ProbeRuntime(Runtime):
         *,
         reach: float | None = 0.0,
         fusable: bool = True,
+        others: bool = False,
     ) -> None:
         active = np.concatenate([sensor.probes.active for sensor in sensors.values()])
         super().__init__(sensors, channels, context, fusable=fusable, active=active)
         tracked = {name: sensor.tracked(context.scene) for name, sensor in sensors.items()}
-        self.kinds = context.solids.kinds_of(sorted({g for members in tracked.values() for g in members}))
+        members = sorted({g for members in tracked.values() for g in members})
+        self.kinds = context.solids.kinds_of(members, others=others)
         """Kinds of the geometries that they may meet."""
         self.slots: list[int] = []
         """Slot of each sensor in the pair table."""

@@ -12,7 +12,7 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
-from brainbench.core.errors import check_kind, check_name
+from brainbench.core.errors import UsageError, check_kind, check_name
 from brainbench.core.files import read_json
 from brainbench.core.limits import Count, Limit, limited
 from brainbench.core.tradeoffs import TradeoffPoint, cheapest
@@ -61,6 +61,11 @@ class Sensor(abc.ABC):
         """True if it reads forces that do not follow the forces of the engine, which users are told of once."""
         return False
 
+    def for_scene(self, scene: TouchScene) -> Sensor:
+        """Return the sensor with what it leaves open settled for a scene; what it cannot feel there is refused."""
+        del scene
+        return self
+
     def group(self) -> Hashable:
         """Return the values of :attr:`shared`."""
         return tuple(getattr(self, name) for name in self.shared)
@@ -96,6 +101,16 @@ class ProbeSensor(Sensor):
     def layout(self) -> tuple[int, ...]:
         """Return the shape (N,) or (rows, columns) of the reading of one environment, without channels."""
         return self.probes.shape
+
+    def for_scene(self, scene: TouchScene) -> Sensor:
+        """Return the sensor; raise UsageError if it would look at flexes, which have no distance."""
+        if scene.flexes and not self.track:
+            raise UsageError(
+                f"{type(self).__name__} on link {self.link!r} asks for distances, which the flex {scene.flexes[0]!r} "
+                f"does not have: name the links it looks at with track=(...), or use KinematicTaxel(total='engine'), "
+                "which feels flexes by the engine's contacts."
+            )
+        return self
 
     @property
     def followed(self) -> tuple[object, ...]:

@@ -22,7 +22,7 @@ from robotics_bridge.sensors.kernels.pairs import clear_readings, count_update, 
 from robotics_bridge.sensors.probes.placement import Probes, enclosing_sphere
 from robotics_bridge.sensors.probes.runtime import DistanceRuntime
 from robotics_bridge.sensors.probes.sensors import ContactProbe, SurfaceDistanceProbe
-from robotics_bridge.sensors.queries.pairs import DIVERGED, OVERFULL, UNFELT, PairTable
+from robotics_bridge.sensors.queries.pairs import DIVERGED, OVERFULL, PairTable
 from robotics_bridge.sensors.queries.solids import Solids
 from robotics_bridge.sensors.runtime import History, Runtime, SuiteContext
 from robotics_bridge.sensors.sensor import ProbeSensor, Sensor, SensorFidelity
@@ -153,15 +153,16 @@ class SensorSuite:
             check_number("listed", listed, least=1, whole=True)
         check_number("environments of a suite", num_envs, least=1, most=MOST_ENVS, whole=True)
         check_kind("sensors of a suite", sensors, Mapping, "a dictionary of name to sensor")
-        self.scene, self.sensors = scene, dict(sensors)
+        self.scene, self.sensors = scene, dict[str, Sensor]()
         self.num_envs, self.device = num_envs, pick_device(device)
         groups: dict[Any, dict[str, Sensor]] = {}
-        for name, sensor in self.sensors.items():
+        for name, sensor in sensors.items():
             if not isinstance(sensor, Sensor):
                 raise UsageError(
                     f"{name!r} must be a sensor such as ContactProbe(...); received {type(sensor).__name__}."
                 )
             scene.link_index(sensor.link)
+            self.sensors[name] = sensor = sensor.for_scene(scene)
             groups.setdefault((type(sensor), sensor.group()), {})[name] = sensor
         warn_of(scene, self.sensors)
         queries = frozenset().union(*(sensor.queries(scene) for sensor in self.sensors.values()))
@@ -194,7 +195,7 @@ class SensorSuite:
         self._recorded: tuple[Callable[[], None], HandState, float] | None = None
         self._pose: Any = None
         """Poses of the last update; None before the first."""
-        self._warned = False
+        self._warned = self._lacked = False
         self._by_depth = [name for name, sensor in self.sensors.items() if sensor.ignores_load]
 
     def update(self, state: HandState, dt: float = 0.01) -> None:
@@ -224,6 +225,8 @@ class SensorSuite:
             self._tell_of_depth(state)
         self._pose = state.pose
         self._updates += 1
+        if not self.device.is_cuda:
+            self._tell_of_missing()
 
     def read(self, name: str) -> torch.Tensor:
         """Return the measured reading of a sensor, [B, N] or [B, rows, columns], and channels last; a view.
@@ -279,10 +282,26 @@ class SensorSuite:
         return self._flagged(DIVERGED)
 
     @property
+    def missing(self) -> torch.Tensor:
+        """Force [B, L] (N) of the engine's contacts on each link of the scene at the last update, less what its taxels
+        of ``total="engine"`` feel of it; 0 on links without such taxels.
+
+        It counts contacts with what they track. NaN where nobody knows: in environments that diverged, and in all where
+        the engine had no room for every contact.
+        """
+        self._flagged(0)
+        if self.pairs.loads is None:
+            return torch.zeros(self.num_envs, len(self.scene.links), device=wp.device_to_torch(self.device))
+        lost = self._flagged(DIVERGED | OVERFULL)[:, None]
+        return wp.to_torch(self.pairs.loads)[1].masked_fill(lost, torch.nan)
+
+    @property
     def unfelt(self) -> torch.Tensor:
-        """Mask [B] of environments in which, at the last update, a contact on a link with taxels of ``total="engine"``
-        lay near none of them that feels it: their sum lacks its force."""
-        return self._flagged(UNFELT)
+        """Mask [B] of environments in which more than a hundredth of the load of a link was :attr:`missing`."""
+        missing = self.missing
+        if self.pairs.loads is None:
+            return missing.isnan().any(dim=1)
+        return ~(missing <= 0.01 * wp.to_torch(self.pairs.loads)[0]).all(dim=1)
 
     def _flagged(self, bit: int) -> torch.Tensor:
         if self._pose is None:
@@ -305,6 +324,20 @@ class SensorSuite:
                 RuntimeWarning,
                 stacklevel=3,
             )
+
+    def _tell_of_missing(self) -> None:
+        """Say once where taxels that add up to the engine's forces lack some of them, and why."""
+        if self._lacked or not self.pairs.told.numpy()[0]:
+            return
+        self._lacked = True
+        missing, load = self.missing.nan_to_num(0.0), wp.to_torch(self.pairs.loads)[0]
+        env, link = divmod(int((missing / load.clamp_min(1e-30)).argmax()), missing.shape[1])
+        if missing[env, link] > 0:
+            _log.warning(
+                "%.3g N of %.3g N on link %r are felt by no taxel: where the engine touches it, none of its taxels "
+                "faces the contact within its sensing radius. suite.missing has the force of every link.",
+                missing[env, link], load[env, link], self.scene.links[link],
+            )  # fmt: skip
 
     def _tell_of_depth(self, state: HandState) -> None:
         """Say once which taxels read the depth of a contact although the engine knows its force."""

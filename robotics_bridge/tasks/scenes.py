@@ -15,6 +15,7 @@ from brainbench.core.devices import mujoco_module
 from brainbench.core.errors import UsageError, brief, check_each, listing
 from robotics_bridge.hands.hand import LEVER, Hand
 from robotics_bridge.hands.scenes import ARMATURE, WEAK_PUSH, WEAK_SERVO, flexed, palm_surface, place_palm
+from robotics_bridge.hands.tree import Tree, driven, pulled
 from robotics_bridge.physics.scene import excluded_links
 from robotics_bridge.tasks.objects import ObjectShape, add_object, slots, with_sizes
 from robotics_bridge.tasks.settings import ContactModel, set_contacts
@@ -171,11 +172,18 @@ def _hand_spec(task: Task, hand: Hand) -> tuple[Any, dict[str, tuple[float, floa
         for each in spec.bodies:
             each.gravcomp = 1.0
     drives |= slides
+    tendons = {hand.model.joint(joint).name: drive for joint, drive in driven(hand.model).items() if drive.tendon >= 0}
     for name, (_, _, effort) in drives.items():
+        target, kind, gain = name, mujoco.mjtTrn.mjTRN_JOINT, 1.0
+        if name in tendons:
+            # One action for all that a tendon pulls: the torque of its leading joint is the tendon's force times that
+            # joint's coefficient.
+            target, kind = hand.model.tendon(tendons[name].tendon).name, mujoco.mjtTrn.mjTRN_TENDON
+            gain = 1.0 / tendons[name].coefficient
         spec.add_actuator(
-            name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT, gaintype=mujoco.mjtGain.mjGAIN_FIXED,
-            biastype=mujoco.mjtBias.mjBIAS_NONE, gainprm=[1.0] + [0.0] * 9, forcelimited=True,
-            forcerange=(-effort, effort),
+            name=name, target=target, trntype=kind, gaintype=mujoco.mjtGain.mjGAIN_FIXED,
+            biastype=mujoco.mjtBias.mjBIAS_NONE, gainprm=[gain] + [0.0] * 9, forcelimited=True,
+            forcerange=(-effort * abs(gain), effort * abs(gain)),
         )  # fmt: skip
     for first, second in _apart(spec):
         spec.add_exclude(bodyname1=first, bodyname2=second)
@@ -187,49 +195,39 @@ def _hand_spec(task: Task, hand: Hand) -> tuple[Any, dict[str, tuple[float, floa
 def drives_of(hand: Hand) -> dict[str, tuple[float, float, float]]:
     """Return joint → stiffness, damping and effort: those of its position servo, or a weak drive of ours.
 
-    A joint that mimics another is not driven.
+    A tendon's servo is that of its first joint. Joints that mimic another, or follow from a closed loop, are not
+    driven.
     """
-    model = hand.model
-    servos: dict[int, int] = {}
-    for index in range(model.nu):
-        if int(model.actuator_trntype[index]) == 0 and model.actuator_biasprm[index, 1] < 0:
-            servos.setdefault(int(model.actuator_trnid[index, 0]), index)
-    # Of two coupled joints one is driven: a mimic joint of a robot takes no commands.
-    pairs = [(follower, leader) for follower, leader, _ in coupled(model) if not {follower, leader} <= set(servos)]
-    follow = {leader if follower in servos else follower for follower, leader in pairs}
-    if left := [model.actuator(index).name for index in range(model.nu) if index not in servos.values()]:
-        message = "are no position servo of one joint and are left out; joints without a servo get a weak one"
+    model, tree = hand.model, Tree(hand.model)
+    servos = driven(model)
+    moved = {*servos, *pulled(model), *tree.followers}
+    used = {drive.actuator for drive in servos.values()}
+    if left := [model.actuator(index).name for index in range(model.nu) if index not in used]:
+        message = "are no position servo of a joint or a tendon and are left out; joints without a servo get a weak one"
         _log.warning("Of hand %s the drives %s %s.", brief(hand.name), listing(left), message)
-    order = [*servos, *(joint for joint in hand.joint_numbers.tolist() if joint not in {*servos, *follow})]
+    order = [*servos, *(joint for joint in hand.joint_numbers.tolist() if joint not in moved)]
     drives = {}
     for joint in order:
         slides = model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE
         (stiffness, damping), effort = (WEAK_PUSH, _EFFORT / LEVER) if slides else (WEAK_SERVO, _EFFORT)
         if joint in servos:
-            index = servos[joint]
-            # Behind a gear, the servo's length and force are those of the motor.
+            drive = servos[joint]
+            index = drive.actuator
+            # Behind a gear, the servo's length and force are those of the motor; a tendon's length is what all its
+            # joints make of it, its force reaches each by its own coefficient.
             gear = abs(float(model.actuator_gear[index, 0]))
-            stiffness = float(-model.actuator_biasprm[index, 1]) * gear**2
-            damping = float(-model.actuator_biasprm[index, 2]) * gear**2
+            share = abs(drive.coefficient)
+            stiffness = float(-model.actuator_biasprm[index, 1]) * gear**2 * share * drive.total
+            damping = float(-model.actuator_biasprm[index, 2]) * gear**2 * share * drive.total
             # Without a limit, what the largest error of a target calls for; noise is stated in units of it.
             span = float(np.ptp(model.jnt_range[joint])) if model.jnt_limited[joint] else 2 * np.pi
             limited = bool(model.actuator_forcelimited[index])
-            effort = float(model.actuator_forcerange[index, 1]) * gear if limited else stiffness * span
+            effort = float(model.actuator_forcerange[index, 1]) * gear * share if limited else stiffness * span
         if model.jnt_actfrclimited[joint]:
             stated = float(model.jnt_actfrcrange[joint, 1])
             effort = min(effort, stated) if joint in servos else stated
         drives[model.joint(joint).name] = (stiffness, damping, effort)
     return drives
-
-
-def coupled(model: Any) -> list[tuple[int, int, NDArray[np.float64]]]:
-    """Return (joint, the one that it follows, coefficients [5] of its law) of the equality constraints of two joints.
-
-    The law is MuJoCo's: y − y₀ = a₀ + a₁ (x − x₀) + … + a₄ (x − x₀)⁴.
-    """
-    joints = (model.eq_type == mujoco.mjtEq.mjEQ_JOINT) & (model.eq_obj2id >= 0) & (model.eq_active0 != 0)
-    rows = np.flatnonzero(joints).tolist()
-    return [(int(model.eq_obj1id[row]), int(model.eq_obj2id[row]), model.eq_data[row, :5]) for row in rows]
 
 
 def _moved(task: Task, hand: Hand, joints: Sequence[str]) -> tuple[str, ...]:

@@ -42,7 +42,7 @@ def sensors() -> dict[str, Any]:
     """Return sensors of every class, clean and noisy."""
     grid = Probes.grid(7, 8, size=(0.24, 0.24), center=(0, 0, 0.125), radius=0.01)
     common: dict[str, Any] = {"link": "box0", "probes": grid, "track": ("box1",)}
-    force = KinematicTaxel(**common)
+    force = KinematicTaxel(**common, total="law")
     found: dict[str, Any] = {
         "distance": SurfaceDistanceProbe(**common),
         "bit": ContactProbe(**common),

@@ -10,6 +10,9 @@ import typer
 from brainbench.cli.destinations import out_folder_option
 from brainbench.cli.output import Output, table, table_of, tracked
 from brainbench.cli.policy.options import HandOption
+from brainbench.core.errors import UsageError
+
+_HAND_FILES = (".urdf", ".xml", ".mjcf")
 
 
 def demo(
@@ -118,8 +121,17 @@ def bench(
     return Output({"results": results, "envs": envs, "device": device}, text)
 
 
-def check(device: Annotated[str, typer.Option(help="cpu or cuda.")] = "cpu") -> Output:
-    """Compare sensors with closed forms on this machine; exit status 1 if one is off."""
+def check(
+    folder: Annotated[Path | None, typer.Argument(help="Folder of hand files (URDF, MJCF), or one; searched.")] = None,
+    device: Annotated[str, typer.Option(help="cpu or cuda.")] = "cpu",
+    out: Annotated[Path, out_folder_option("Folder for the pictures of hands.")] = Path("tactile-check"),
+) -> Output:
+    """Compare sensors with closed forms, or the hands of a folder with the engine; exit status 1 if one is off.
+
+    Of each hand: whether it loads, its finger tips, its pads, and whether a ball pressed on each pad is felt.
+    """
+    if folder is not None:
+        return _check_hands(folder, out)
     from robotics_bridge.sensors.checks import CHECKS
 
     results = []
@@ -137,3 +149,30 @@ def check(device: Annotated[str, typer.Option(help="cpu or cuda.")] = "cpu") -> 
     failure = None if all(result["passed"] for result in results) else typer.Exit(1)
     text = table_of(f"Checks on {device}", results, columns)
     return Output({"device": device, "checks": results}, text, failure=failure)
+
+
+def _check_hands(folder: Path, out: Path) -> Output:
+    """Check every hand of a folder's files."""
+    from dataclasses import asdict
+
+    from robotics_bridge.hands.gallery import check_file
+
+    paths = [folder] if folder.is_file() else sorted(p for p in folder.rglob("*") if p.suffix in _HAND_FILES)
+    if not paths:
+        raise UsageError(f"{str(folder)!r} holds no hand file ({', '.join(_HAND_FILES)}).")
+    out.mkdir(parents=True, exist_ok=True)
+    checks = [check for path in tracked(paths, "checking hands") for check in check_file(path, out)]
+    columns = {
+        "hand": "{0.name}",
+        "palm": "{0.palm}",
+        ">tips": lambda check: str(len(check.tips)),
+        ">pads": "{0.pads}",
+        ">taxels": "{0.taxels}",
+        ">pressed": "{0.pressed}",
+        ">most missing": "{0.worst:.2%}",
+        "": lambda check: "ok" if check.passed else "; ".join(check.errors),
+    }
+    failed = sum(not check.passed for check in checks)
+    text = table_of(f"Hands of {folder}", checks, columns) + f"\n\n{len(checks) - failed} of {len(checks)} are sound."
+    data = [{**asdict(check), "passed": check.passed} for check in checks]
+    return Output({"hands": data, "pictures": out}, text, failure=typer.Exit(1) if failed else None)

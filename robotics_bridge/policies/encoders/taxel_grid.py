@@ -310,6 +310,11 @@ _WRENCHES: Mapping[str, Any] = {
     **dict.fromkeys(("bool", "depth", "agg_bool"), lambda points, normals: _of_force(points, -normals[:, :, None])),
     # Undoes equation 4.29: axes z, y, x, and outward; its scale is left to the calibration.
     "agg_force": lambda points, normals: _vector(points, -np.eye(3)[::-1]),
+    # A linear map has no use for the point: the force acts in the middle of the link's taxels.
+    "center_of_pressure": lambda points, normals: np.concatenate(
+        [_vector(points, np.eye(3)), np.zeros((len(points), 6, 3)), np.pad(normals, ((0, 0), (3, 0)))[:, :, None]],
+        axis=2,
+    ),
 }
 """Observation type → the maps [N, 6, C] from its values to wrenches about the link's origin, in its axes."""
 

@@ -1,25 +1,36 @@
-"""Kernels that spread every contact force of the engine over the taxels that feel it.
+"""Kernels that spread every contact force of the engine over the taxels that feel it, and count what none feels.
 
-A contact c pushes with F_c at p_c. A taxel n with weight d_n^α belongs to the contacts of the body that gives it its
-depth, on the side that faces it, by inverse distance: r_nc = g_nc / Σ_c g_nc (Shepard 1968). With y_nc = d_n^α r_nc and
-the outward normal m_n of what is touched::
+A contact c pushes with F_c at p_c, wherever the engine puts that point: it reports a flat face at its corners. A taxel
+n with weight d_n^α belongs to the contacts of the body that gives it its depth, on the side that faces it, by inverse
+distance: r_nc = g_nc / Σ_c g_nc (Shepard 1968). With y_nc = d_n^α r_nc and the outward normal m_n of what is touched::
 
     f_n = Σ_c y_nc (s_c q_n + (F_c − s_c Σ_n y_nc q_n) / Σ_n y_nc),    s_c = normal force / Σ_n y_nc (m_n · n_c)
 
 so that Σ_n f_n = Σ_c F_c whatever the weights are. q_n is m_n, and m_n + σ_n for taxels that hold what they touch
-(``stick``). A node is one side of a contact: 2c of the first geometry, 2c + 1 of
-the second. Vectors are in the frame of the sensor link (m, N).
+(``stick``). A node is one side of a contact: 2c of the first geometry, 2c + 1 of the second. Vectors are in the frame
+of the sensor link (m, N).
+
+:func:`settle_kernel` gives the contacts that have no such taxel (a block on a card, a flex, a height field) to taxels
+that overlap the body behind the nearest one, else to those near the contact that face it; what is left is missing.
+Before, it tilts the forces under each face so that their moment is that of its contacts as well.
 Letters: B environment, L link, S sensor, C contact, N taxel, K sensor of one link.
 """
 
 from __future__ import annotations
 
+from functools import cache
+from typing import Any
+
 from brainbench.core.devices import warp
-from robotics_bridge.physics.kernels.state import StateArrays, in_scene
-from robotics_bridge.sensors.kernels.pairs import SlotArrays
+from robotics_bridge.physics.kernels.state import StateArrays
+from robotics_bridge.sensors.kernels.distance import SIDED, SolidArrays, shape_functions
+from robotics_bridge.sensors.kernels.pairs import PairArrays, SlotArrays
 from robotics_bridge.sensors.kernels.readout import ProbeArrays, ReadoutArrays
 
 wp = warp()
+
+TILTS = 6
+"""Times that forces are tilted at most."""
 
 
 @wp.struct
@@ -40,8 +51,16 @@ class SpreadPlan:
     """[N] a contact this near is felt (m); negative for fillers."""
     slip: wp.float32
     """Sign of friction: 1 as it acts on the sensor, −1 as published."""
-    status: wp.array(dtype=wp.int32)
-    """[B] bits of the suite; 4 is a force that no taxel carries."""
+    whole: wp.array(dtype=wp.int32)
+    """[S] 1 where a sensor feels everything, with what is no geometry (a flex, number −1)."""
+    links: wp.array(dtype=wp.int32)
+    """[M] links that carry these sensors."""
+    loads: wp.array3d(dtype=wp.float32)
+    """[2, B, L] sum of the forces that push a link, and what its taxels lack of them (N)."""
+    fresh: wp.int32
+    """1 for the first group of sensors of a suite, which overwrites the loads of the update before."""
+    told: wp.array(dtype=wp.int32)
+    """[1] 1 once anything was missing."""
 
 
 @wp.struct
@@ -52,10 +71,18 @@ class ContactNodes:
     """[B, L] first node of a link, −1 for none."""
     follower: wp.array(dtype=wp.int32)
     """[2 C] next node of the same link."""
+    watched: wp.array(dtype=wp.int32)
+    """[2 C] bit k: sensor k of the link looks at what pushes."""
     felt: wp.array(dtype=wp.int32)
-    """[2 C] bit k: a taxel of sensor k of the link lies near."""
+    """[2 C] bit k: a taxel of it lies near or between the points at which that body pushes from that side."""
+    carried: wp.array2d(dtype=wp.int32)
+    """[2 C, K] 1 where a taxel of sensor k overlaps the body from that side."""
     other: wp.array(dtype=wp.int32)
-    """[2 C] link on the other side."""
+    """[2 C] link on the other side, −1 for what is no geometry."""
+    geometry: wp.array(dtype=wp.int32)
+    """[2 C] geometry on the other side, −1 for none."""
+    overlap: wp.array(dtype=wp.float32)
+    """[2 C] (m)."""
     point: wp.array(dtype=wp.vec3f)
     """[2 C]."""
     normal: wp.array(dtype=wp.vec3f)
@@ -94,7 +121,6 @@ def list_contacts(
     plan: SpreadPlan,
     slots: SlotArrays,
     link_of: wp.array(dtype=wp.int32),
-    probes: ProbeArrays,
     state: StateArrays,
     friction: wp.array(dtype=wp.vec3f),
     nodes: ContactNodes,
@@ -104,42 +130,44 @@ def list_contacts(
     c = node // 2
     if c >= state.contact_count[0]:
         return
+    nodes.watched[node] = 0
     nodes.felt[node] = 0
     pair = state.contact_geom[c]
-    if not in_scene(pair, link_of.shape[0]):
+    mine = pair[node % 2]
+    other = pair[1 - node % 2]
+    # A state made by hand may hold numbers of no geometry; −1 stands for a flex.
+    if mine < 0 or wp.max(pair) >= link_of.shape[0] or other < -1:
+        return
+    load = state.contact_force[c]
+    link = link_of[mine]
+    # What the engine does not tell (NaN) is read as such.
+    if plan.sensors[link, 0] < 0 or load <= 0.0:
         return
     env = state.contact_env[c]
-    # The normal leads from the first to the second, which it pushes away.
-    sign = wp.where(node % 2 == 0, -1.0, 1.0)
-    other = pair[1 - node % 2]
-    link = link_of[pair[node % 2]]
-    if plan.sensors[link, 0] < 0:
-        return
-    here = state.pose[env, link]
-    turn = wp.transform_get_rotation(here)
-    point = wp.quat_rotate_inv(turn, state.contact_position[c] - wp.transform_get_translation(here))
-    overlap = wp.max(-state.contact_distance[c], 0.0)
     felt = int(0)
-    tracked = int(0)
     for k in range(plan.sensors.shape[1]):
         sensor = plan.sensors[link, k]
         if sensor >= 0:
-            span = plan.spans[sensor]
-            if slots.place[span[2], other] >= 0:
-                bit = 1 << k
-                tracked = tracked | bit
-                for n in range(span[0], span[1]):
-                    if wp.length(probes.position[n] - point) <= plan.reach[n] + overlap:
-                        felt = felt | bit
-                        break
-    load = state.contact_force[c]
-    if felt != tracked and load > 0.0:
-        wp.atomic_or(plan.status, env, 4)
+            nodes.carried[node, k] = 0
+            watched = plan.whole[sensor] == 1
+            if other >= 0:
+                watched = slots.place[plan.spans[sensor][2], other] >= 0
+            if watched:
+                felt = felt | (1 << k)
     if felt == 0:
         return
+    # The normal leads from the first to the second, which it pushes away.
+    sign = wp.where(node % 2 == 0, -1.0, 1.0)
+    here = state.pose[env, link]
+    turn = wp.transform_get_rotation(here)
+    point = wp.quat_rotate_inv(turn, state.contact_position[c] - wp.transform_get_translation(here))
     normal = wp.quat_rotate_inv(turn, sign * state.contact_normal[c])
-    nodes.felt[node] = felt
-    nodes.other[node] = link_of[other]
+    nodes.watched[node] = felt
+    nodes.geometry[node] = other
+    nodes.overlap[node] = wp.max(-state.contact_distance[c], 0.0)
+    nodes.other[node] = -1
+    if other >= 0:
+        nodes.other[node] = link_of[other]
     nodes.point[node] = point
     nodes.normal[node] = normal
     nodes.load[node] = load
@@ -170,6 +198,50 @@ def sort_contacts(nodes: ContactNodes):
 
 
 @wp.func
+def alike(nodes: ContactNodes, first: int, second: int) -> bool:
+    """Return whether one body pushes at two contacts from one side, within 60°."""
+    same = nodes.other[first] == nodes.other[second]
+    return same and wp.dot(nodes.normal[first], nodes.normal[second]) > 0.5
+
+
+@wp.kernel
+def find_taxels(
+    plan: SpreadPlan,
+    link_of: wp.array(dtype=wp.int32),
+    probes: ProbeArrays,
+    state: StateArrays,
+    nodes: ContactNodes,
+):
+    """Note which sensors have taxels near a contact, or between it and others of the same face. Thread: node [2 C]."""
+    node = wp.tid()
+    c = node // 2
+    if c >= state.contact_count[0] or nodes.watched[node] == 0:
+        return
+    env = state.contact_env[c]
+    link = link_of[state.contact_geom[c][node % 2]]
+    # A sphere around all points of the face: a flat one is reported at its corners.
+    low = nodes.point[node]
+    high = nodes.point[node]
+    other = nodes.head[env, link]
+    while other >= 0:
+        if alike(nodes, node, other):
+            low = wp.min(low, nodes.point[other])
+            high = wp.max(high, nodes.point[other])
+        other = nodes.follower[other]
+    center = 0.5 * (low + high)
+    extent = 0.5 * wp.length(high - low) + nodes.overlap[node]
+    felt = int(0)
+    for k in range(plan.sensors.shape[1]):
+        if ((nodes.watched[node] >> k) & 1) == 1:
+            span = plan.spans[plan.sensors[link, k]]
+            for n in range(span[0], span[1]):
+                if wp.length(probes.position[n] - center) <= plan.reach[n] + extent:
+                    felt = felt | (1 << k)
+                    break
+    nodes.felt[node] = felt
+
+
+@wp.func
 def nearness(alone: bool, point: wp.vec3f, push: wp.vec3f, x: wp.vec3f, normal: wp.vec3f, reach: float) -> float:
     """Return g_nc of a contact and a taxel at ``x``; 0 where they lie on different sides of the link.
 
@@ -186,7 +258,6 @@ def nearness(alone: bool, point: wp.vec3f, push: wp.vec3f, x: wp.vec3f, normal: 
 @wp.kernel
 def share_contacts(
     plan: SpreadPlan,
-    slots: SlotArrays,
     link_of: wp.array(dtype=wp.int32),
     probes: ProbeArrays,
     state: StateArrays,
@@ -243,8 +314,7 @@ def share_contacts(
         scale = load / wp.max(straight, 0.5 * whole)
         rest = (nodes.force[node] - scale * field) / whole
         share = wp.vec4f(scale, rest[0], rest[1], rest[2])
-    elif load > 0.0:
-        wp.atomic_or(plan.status, env, 4)
+        nodes.carried[node, k] = 1
     nodes.share[node, k] = share
 
 
@@ -257,8 +327,8 @@ def write_wrench(out: wp.array3d(dtype=wp.float32), env: int, n: int, x: wp.vec3
         out[axis + 3, env, n] = turn[axis]
 
 
-@wp.kernel
-def spread_contacts(
+@wp.func
+def spread_row(
     plan: SpreadPlan,
     probes: ProbeArrays,
     rows: wp.array(dtype=wp.vec4i),
@@ -267,12 +337,10 @@ def spread_contacts(
     noisy: int,
     written: wp.array2d(dtype=wp.uint8),
     io: ReadoutArrays,
+    env: int,
+    at_row: int,
 ):
-    """Write the readings. Thread: environment and row of taxels [B, R].
-
-    ``written`` [B, R] is 1 where a row may hold anything but zeros; most touch nothing, now and before.
-    """
-    env, at_row = wp.tid()
+    """Write the readings of a row of taxels."""
     span = rows[at_row]
     part = span[3]
     k = plan.order[part]
@@ -322,3 +390,310 @@ def spread_contacts(
         if noisy == 1:
             write_wrench(io.measured, env, n, x, measured * f)
         n += span[2]
+
+
+@wp.kernel
+def spread_contacts(
+    plan: SpreadPlan,
+    probes: ProbeArrays,
+    rows: wp.array(dtype=wp.vec4i),
+    press: PressArrays,
+    nodes: ContactNodes,
+    noisy: int,
+    written: wp.array2d(dtype=wp.uint8),
+    io: ReadoutArrays,
+):
+    """Write the readings. Thread: environment and row of taxels [B, R].
+
+    ``written`` [B, R] is 1 where a row may hold anything but zeros; most touch nothing, now and before.
+    """
+    env, at_row = wp.tid()
+    spread_row(plan, probes, rows, press, nodes, noisy, written, io, env, at_row)
+
+
+@wp.func
+def force_of(planes: wp.array3d(dtype=wp.float32), env: int, n: int) -> wp.vec3f:
+    """Return the force of a reading."""
+    return wp.vec3f(planes[0, env, n], planes[1, env, n], planes[2, env, n])
+
+
+@wp.func
+def tilted(f: wp.vec3f, x: wp.vec3f, center: wp.vec3f, tilt: wp.vec3f) -> wp.vec3f:
+    """Return a force with the part of a tilt about the centre that its size bears."""
+    return f + wp.length(f) * wp.cross(tilt, x - center)
+
+
+@wp.func
+def shares(press: PressArrays, env: int, n: int, body: int, push: wp.vec3f) -> bool:
+    """Return whether a taxel carries contacts of a body on a side."""
+    if press.total[env, n] <= 0.0 or press.body[env, n] != body:
+        return False
+    return wp.dot(press.normal[env, n], push) > 0.0
+
+
+@wp.func
+def tilt_group(
+    plan: SpreadPlan,
+    probes: ProbeArrays,
+    nodes: ContactNodes,
+    press: PressArrays,
+    noisy: int,
+    io: ReadoutArrays,
+    env: int,
+    sensor: int,
+    k: int,
+    head: int,
+    leader: int,
+) -> bool:
+    """Tilt the forces under one face of a body so that their moment is that of its contacts, their sum the same.
+
+    False where the taxels under it carry other faces as well, or not all of it: these are left as they are.
+    """
+    # The first contact of a face leads it.
+    force = wp.vec3f()
+    moment = wp.vec3f()
+    node = head
+    leads = bool(True)
+    before = bool(True)
+    while node >= 0:
+        if node == leader:
+            before = False
+        if nodes.carried[node, k] == 1 and alike(nodes, node, leader):
+            if before:
+                leads = False
+            force += nodes.force[node]
+            moment += wp.cross(nodes.point[node], nodes.force[node])
+        node = nodes.follower[node]
+    if not leads:
+        return True
+    body = nodes.other[leader]
+    push = nodes.normal[leader]
+    span = plan.spans[sensor]
+    steepest = float(2.0)
+    last = float(1.0e30)
+    # One tilt is enough unless the moment takes more than some taxels bear; then the rest is tilted again.
+    for _ in range(wp.static(TILTS)):
+        if steepest > 1.0:
+            total = wp.vec3f()
+            weight = float(0.0)
+            turning = wp.vec3f()
+            center = wp.vec3f()
+            spread = wp.mat33f()
+            for n in range(span[0], span[1]):
+                if shares(press, env, n, body, push):
+                    f = force_of(io.truth, env, n)
+                    size = wp.length(f)
+                    x = probes.position[n]
+                    total += f
+                    turning += wp.cross(x, f)
+                    weight += size
+                    center += size * x
+                    spread += size * wp.outer(x, x)
+            if not (wp.length(total - force) <= 1.0e-4 * weight):
+                return False
+            # As exact as a hundredth of a millimetre, or nothing won by the last tilt: done.
+            rest = wp.length(moment - turning)
+            if rest <= 1.0e-5 * weight or rest > 0.9 * last:
+                return True
+            last = rest
+            center = center / weight
+            # Tensor of inertia of the forces' sizes about their centre: the forces |f| θ × r have the moment J θ and
+            # the sum 0.
+            spread -= weight * wp.outer(center, center)
+            trace = spread[0, 0] + spread[1, 1] + spread[2, 2]
+            # A little more on its diagonal lets a row of taxels, which bears no moment along it, be solved.
+            inertia = 1.0001 * trace * wp.identity(n=3, dtype=wp.float32) - spread
+            tilt = wp.vec3f()
+            if trace > 1.0e-12 * weight:
+                tilt = wp.inverse(inertia) @ (moment - turning)
+            steepest = float(0.0)
+            for n in range(span[0], span[1]):
+                if shares(press, env, n, body, push):
+                    steepest = wp.max(steepest, wp.length(wp.cross(tilt, probes.position[n] - center)))
+            # No taxel is turned round: where the patch is too small for the moment, as much as it bears.
+            tilt = tilt / wp.max(steepest, 1.0)
+            for n in range(span[0], span[1]):
+                if shares(press, env, n, body, push):
+                    x = probes.position[n]
+                    write_wrench(io.truth, env, n, x, tilted(force_of(io.truth, env, n), x, center, tilt))
+                    if noisy == 1:
+                        write_wrench(io.measured, env, n, x, tilted(force_of(io.measured, env, n), x, center, tilt))
+    return True
+
+
+@cache
+def settle_kernel(kinds: frozenset[int], raycast: bool, in_turn: bool) -> Any:
+    """Return the kernel ``settle``: contacts without a taxel of their body, missing forces, and moments. Dim [B, M].
+
+    One thread goes through the contacts of a link in their order, so that sums do not depend on the device. A processor
+    writes the readings ``in_turn`` in the same launch (:func:`spread_contacts`).
+    """
+    distance = shape_functions(kinds, raycast).distance
+
+    @wp.func
+    def overlap_of(
+        solids: SolidArrays, pairs: PairArrays, probes: ProbeArrays, env: int, n: int, place: int
+    ) -> wp.vec4f:
+        """Return outward normal and depth of a taxel in what its list names at ``place``."""
+        row = env % solids.kind.shape[0]
+        geometry = pairs.geometry[env, place]
+        rotation = pairs.rotation[env, place]
+        radius = probes.radius[n]
+        facing = wp.vec3f()
+        limit = float(0.0)
+        if wp.static(bool(kinds & SIDED)):
+            facing = rotation @ (radius * probes.normal[n])
+        if wp.static(raycast or bool(kinds & SIDED)):
+            limit = 2.0 * solids.bound[row, geometry][3] + radius
+        x = rotation @ probes.position[n] + pairs.offset[env, place]
+        found = distance(solids, row, geometry, x, facing, limit)
+        m = wp.transpose(rotation) @ wp.vec3f(found[0], found[1], found[2])
+        return wp.vec4f(m[0], m[1], m[2], radius - found[3])
+
+    @wp.func
+    def weigh(
+        plan: SpreadPlan,
+        solids: SolidArrays,
+        pairs: PairArrays,
+        probes: ProbeArrays,
+        nodes: ContactNodes,
+        node: int,
+        env: int,
+        n: int,
+        place: int,
+    ) -> float:
+        """Return what a taxel takes of a contact: by overlap with the geometry at ``place``, or −1: by nearness."""
+        radius = probes.radius[n]
+        if radius <= 0.0:
+            return 0.0
+        push = nodes.normal[node]
+        point = nodes.point[node]
+        x = probes.position[n]
+        if place >= 0:
+            depth = overlap_of(solids, pairs, probes, env, n, place)
+            m = wp.vec3f(depth[0], depth[1], depth[2])
+            return wp.max(depth[3], 0.0) * nearness(False, point, push, x, m, plan.reach[n])
+        # Without a distance the taxel's own normal tells its side.
+        away = wp.length(x - point) / (plan.reach[n] + nodes.overlap[node])
+        if away > 1.0 or wp.dot(probes.normal[n], push) > 0.1:
+            return 0.0
+        return 1.001 - away * away
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def settle(
+        plan: SpreadPlan,
+        probes: ProbeArrays,
+        rows: wp.array(dtype=wp.vec4i),
+        solids: SolidArrays,
+        pairs: PairArrays,
+        nodes: ContactNodes,
+        press: PressArrays,
+        noisy: int,
+        written: wp.array2d(dtype=wp.uint8),
+        io: ReadoutArrays,
+    ):
+        env, number = wp.tid()
+        link = plan.links[number]
+        if wp.static(in_turn):
+            for k in range(plan.sensors.shape[1]):
+                sensor = plan.sensors[link, k]
+                if sensor >= 0:
+                    for row in range(plan.row_first[sensor], plan.row_first[sensor + 1]):
+                        spread_row(plan, probes, rows, press, nodes, noisy, written, io, env, row)
+        if (io.status[env] & 1) != 0:
+            plan.loads[1, env, link] = wp.nan
+            return
+        head = nodes.head[env, link]
+        if plan.fresh == 1:
+            plan.loads[0, env, link] = 0.0
+            plan.loads[1, env, link] = 0.0
+        if head < 0:
+            return
+        pushed = float(0.0)
+        lost = float(0.0)
+        error = float(0.0)
+        for k in range(plan.sensors.shape[1]):
+            sensor = plan.sensors[link, k]
+            if sensor < 0:
+                continue
+            span = plan.spans[sensor]
+            # What a tilt has added up needs no second sum.
+            verified = bool(True)
+            head_of = head
+            while head_of >= 0:
+                if nodes.carried[head_of, k] == 1:
+                    if not tilt_group(plan, probes, nodes, press, noisy, io, env, sensor, k, head, head_of):
+                        verified = False
+                head_of = nodes.follower[head_of]
+            force = wp.vec3f()
+            node = head
+            while node >= 0:
+                if ((nodes.watched[node] >> k) & 1) == 1:
+                    if nodes.carried[node, k] == 0:
+                        first = pairs.first[span[2]]
+                        place = int(-1)
+                        if ((nodes.felt[node] >> k) & 1) == 1:
+                            for index in range(pairs.count[env, span[2]]):
+                                if pairs.geometry[env, first + index] == nodes.geometry[node]:
+                                    place = first + index
+                        whole = float(0.0)
+                        # Overlap with the body comes first, then taxels near the contact that face it.
+                        for way in range(2):
+                            if way == 1:
+                                place = -1
+                            if whole == 0.0 and (way == 1 or place >= 0):
+                                for n in range(span[0], span[1]):
+                                    whole += weigh(plan, solids, pairs, probes, nodes, node, env, n, place)
+                                if whole > 0.0:
+                                    nodes.carried[node, k] = 1
+                                    verified = False
+                                    for row in range(plan.row_first[sensor], plan.row_first[sensor + 1]):
+                                        part = rows[row]
+                                        n = part[0]
+                                        while n < part[1]:
+                                            y = weigh(plan, solids, pairs, probes, nodes, node, env, n, place)
+                                            if y > 0.0:
+                                                x = probes.position[n]
+                                                f = y / whole * nodes.force[node]
+                                                write_wrench(io.truth, env, n, x, force_of(io.truth, env, n) + f)
+                                                if noisy == 1:
+                                                    write_wrench(
+                                                        io.measured, env, n, x, force_of(io.measured, env, n) + f
+                                                    )
+                                                written[env, row] = wp.uint8(1)
+                                            n += part[2]
+                    if nodes.carried[node, k] == 1:
+                        force += nodes.force[node]
+                node = nodes.follower[node]
+            total = wp.vec3f()
+            weight = float(0.0)
+            for n in range(span[0], span[1]):
+                if not verified:
+                    f = force_of(io.truth, env, n)
+                    total += f
+                    weight += wp.length(f)
+            gap = wp.length(force - total)
+            # Rounding of the sums is no loss.
+            if not verified and not (gap <= 1.0e-4 * (weight + wp.length(force))):
+                error = wp.max(error, gap)
+                if wp.isnan(gap):
+                    error = wp.nan
+        node = head
+        while node >= 0:
+            size = wp.length(nodes.force[node])
+            carried = int(0)
+            for k in range(plan.sensors.shape[1]):
+                if plan.sensors[link, k] >= 0:
+                    carried += nodes.carried[node, k]
+            pushed += size
+            if carried == 0:
+                lost += size
+            node = nodes.follower[node]
+        lost += error
+        # Sensors of several groups may sit on a link: the most that one of them lacks counts.
+        plan.loads[0, env, link] = wp.max(plan.loads[0, env, link], pushed)
+        plan.loads[1, env, link] = wp.where(wp.isnan(lost), lost, wp.max(plan.loads[1, env, link], lost))
+        if not (lost <= 0.01 * pushed):
+            plan.told[0] = 1
+
+    return settle

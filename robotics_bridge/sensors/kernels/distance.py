@@ -13,8 +13,11 @@ from brainbench.core.devices import warp
 
 wp = warp()
 
-PLANE, SPHERE, CAPSULE, ELLIPSOID, CYLINDER, BOX, MESH, OTHER, WALL = range(9)
-"""Numbers of the kinds, in the order of :data:`robotics_bridge.physics.scene.KINDS`; then meshes with thin walls."""
+PLANE, SPHERE, CAPSULE, ELLIPSOID, CYLINDER, BOX, MESH, OTHER, WALL, THIN = range(10)
+"""Numbers of the kinds, in the order of :data:`robotics_bridge.physics.scene.KINDS`; then meshes with thin walls, and a
+mark, no kind, of thin solids among the others."""
+SIDED = frozenset({WALL, THIN})
+"""Those that are asked from the side of the sensor."""
 
 FAR = 1.0e6
 """Distance that stands for "out of reach" (m)."""
@@ -27,7 +30,8 @@ class SolidArrays:
     kind: wp.array2d(dtype=wp.int32)
     """[R, G] number of the kind."""
     size: wp.array2d(dtype=wp.vec3f)
-    """[R, G] (m), as in ``Geometry.size``; of a thin wall the rounding of its edges and its thickness."""
+    """[R, G] (m), as in ``Geometry.size``; of a thin wall the rounding of its edges and its least
+    and largest thickness."""
     frame: wp.array2d(dtype=wp.transformf)
     """[R, G] pose in the frame of the link."""
     bound: wp.array2d(dtype=wp.vec4f)
@@ -38,6 +42,8 @@ class SolidArrays:
     """[R, G] number of the distance field, −1 for none."""
     mesh: wp.array2d(dtype=wp.uint64)
     """[R, G] id of the triangle tree."""
+    thickness: wp.array2d(dtype=wp.float32)
+    """[R, G] least width of a thin solid that is no wall (m), 0 for others."""
     first: wp.array(dtype=wp.int32)
     """[F] first sample of a field in ``values``."""
     counts: wp.array(dtype=wp.vec3i)
@@ -57,6 +63,7 @@ class SolidShape:
     kind: wp.int32
     size: wp.vec3f
     mesh: wp.uint64
+    thickness: wp.float32
     first: wp.int32
     counts: wp.vec3i
     origin: wp.vec3f
@@ -232,18 +239,29 @@ def triangles(mesh: wp.uint64, x: wp.vec3f, reach: float, rounding: float) -> wp
 
 
 @wp.func
+def outer(found: wp.vec4f, facing: wp.vec3f) -> wp.vec4f:
+    """Turn a normal that points out of the sensor to its mirror image: what touches it lies on its outer side."""
+    normal = wp.vec3f(found[0], found[1], found[2])
+    normal -= 2.0 * wp.max(wp.dot(normal, facing), 0.0) / wp.max(wp.length_sq(facing), 1.0e-20) * facing
+    return wp.vec4f(normal[0], normal[1], normal[2], found[3])
+
+
+@wp.func
 def wall(shape: SolidShape, x: wp.vec3f, facing: wp.vec3f, reach: float) -> wp.vec4f:
     """Ask a thin wall from the side of the sensor: past its middle, and through it, the side touched stays the same."""
     found = triangles(shape.mesh, x, reach, shape.size[0])
     radius = wp.length(facing)
     slope = wp.dot(wp.vec3f(found[0], found[1], found[2]), facing)
-    if found[3] >= radius or slope <= 0.2 * radius:
+    if slope <= 0.2 * radius:
+        return outer(found, facing)
+    # A surface farther behind the sensor than the wall is thick was not passed: it lies at the back of a thin link.
+    if found[3] >= wp.min(radius, shape.size[2]):
         return found
     # The nearest side faces away from the sensor, so the point lies past the middle. Going back along the sensor's
     # normal, the first face that is left, and not entered, is the one that the sensor came through.
     back = -facing / radius
     gone = float(0.0)
-    most = (wp.max(found[3], 0.0) + 2.0 * shape.size[1]) * radius / slope
+    most = (wp.max(found[3], 0.0) + 2.0 * shape.size[2]) * radius / slope
     for _ in range(2):
         hit = wp.mesh_query_ray(shape.mesh, x + gone * back, back, most - gone)
         if hit.result:
@@ -253,7 +271,7 @@ def wall(shape: SolidShape, x: wp.vec3f, facing: wp.vec3f, reach: float) -> wp.v
             if across > 0.0:
                 return wp.vec4f(normal[0], normal[1], normal[2], -gone * across)
             gone += 0.01 * shape.size[1]
-    return found
+    return outer(found, facing)
 
 
 @wp.kernel(module="unique", enable_backward=False)
@@ -301,8 +319,9 @@ def shape_functions(kinds: frozenset[int], raycast: bool) -> SimpleNamespace:
         raycast: ask triangles instead of closed forms and fields; planes stay planes.
     """
     curved = not raycast
-    has_triangles = raycast and bool(kinds - {PLANE, WALL})
-    sized = WALL in kinds or (curved and bool(kinds - {PLANE, MESH}))
+    has_triangles = raycast and bool(kinds - {PLANE, WALL, THIN})
+    sized = WALL in kinds or (curved and bool(kinds - {PLANE, MESH, THIN}))
+    thin = curved and THIN in kinds
 
     @wp.func
     def shape_of(solids: SolidArrays, row: int, geometry: int) -> SolidShape:
@@ -312,6 +331,8 @@ def shape_functions(kinds: frozenset[int], raycast: bool) -> SimpleNamespace:
             shape.size = solids.size[row, geometry]
         if wp.static(has_triangles or WALL in kinds):
             shape.mesh = solids.mesh[row, geometry]
+        if wp.static(thin):
+            shape.thickness = solids.thickness[row, geometry]
         if wp.static(curved and MESH in kinds):
             number = wp.max(solids.field[row, geometry], 0)
             shape.first = solids.first[number]
@@ -321,15 +342,10 @@ def shape_functions(kinds: frozenset[int], raycast: bool) -> SimpleNamespace:
         return shape
 
     @wp.func
-    def distance_to(
-        values: wp.array(dtype=wp.float32), shape: SolidShape, x: wp.vec3f, facing: wp.vec3f, reach: float
-    ) -> wp.vec4f:
+    def nearest(values: wp.array(dtype=wp.float32), shape: SolidShape, x: wp.vec3f, reach: float) -> wp.vec4f:
         if wp.static(PLANE in kinds):
             if shape.kind == wp.static(PLANE):
                 return plane(shape.size, x)
-        if wp.static(WALL in kinds):
-            if shape.kind == wp.static(WALL):
-                return wall(shape, x, facing, reach)
         if wp.static(has_triangles):
             return triangles(shape.mesh, x, reach, 1.0e-3)
         if wp.static(curved and BOX in kinds):
@@ -351,6 +367,50 @@ def shape_functions(kinds: frozenset[int], raycast: bool) -> SimpleNamespace:
             if shape.kind == wp.static(MESH):
                 return field(values, shape, x)
         return wp.vec4f(0.0, 0.0, 1.0, wp.static(FAR))
+
+    @wp.func
+    def beyond(
+        values: wp.array(dtype=wp.float32), shape: SolidShape, x: wp.vec3f, facing: wp.vec3f, found: wp.vec4f
+    ) -> wp.vec4f:
+        # As for walls: past the middle of a thin solid the side touched stays the same. Steps of the distance itself
+        # lead from the point back along the sensor's normal to the side that it came through.
+        radius = wp.length(facing)
+        slope = wp.dot(wp.vec3f(found[0], found[1], found[2]), facing)
+        if slope <= 0.2 * radius:
+            return outer(found, facing)
+        if found[3] >= wp.min(radius, shape.thickness):
+            return found
+        back = -facing / radius
+        most = (wp.max(found[3], 0.0) + 2.0 * shape.thickness) * radius / slope
+        at = found
+        entered = found[3] < 0.0
+        gone = float(0.0)
+        for _ in range(48):
+            gone += wp.max(wp.abs(at[3]), 0.02 * shape.thickness)
+            if gone > most:
+                return outer(found, facing)
+            at = nearest(values, shape, x + gone * back, most)
+            if entered and at[3] > -0.002 * shape.thickness:
+                across = wp.dot(wp.vec3f(at[0], at[1], at[2]), back)
+                if across > 0.2:
+                    return wp.vec4f(at[0], at[1], at[2], at[3] - gone * across)
+                return outer(found, facing)
+            if at[3] < 0.0:
+                entered = True
+        return outer(found, facing)
+
+    @wp.func
+    def distance_to(
+        values: wp.array(dtype=wp.float32), shape: SolidShape, x: wp.vec3f, facing: wp.vec3f, reach: float
+    ) -> wp.vec4f:
+        if wp.static(WALL in kinds):
+            if shape.kind == wp.static(WALL):
+                return wall(shape, x, facing, reach)
+        found = nearest(values, shape, x, reach)
+        if wp.static(thin):
+            if shape.thickness > 0.0:
+                return beyond(values, shape, x, facing, found)
+        return found
 
     @wp.func
     def distance(solids: SolidArrays, row: int, geometry: int, x: wp.vec3f, facing: wp.vec3f, reach: float) -> wp.vec4f:

@@ -13,7 +13,7 @@ from typing import Any
 
 from brainbench.core.devices import warp
 from robotics_bridge.sensors.kernels.contact_load import ContactNodes, PressArrays, SpreadPlan, nearness
-from robotics_bridge.sensors.kernels.distance import FAR, WALL, SolidArrays, SolidShape, shape_functions
+from robotics_bridge.sensors.kernels.distance import FAR, SIDED, SolidArrays, SolidShape, shape_functions
 from robotics_bridge.sensors.kernels.noise import NoiseParams, episode_draw, radius_noise
 from robotics_bridge.sensors.kernels.pairs import PairArrays
 from robotics_bridge.sensors.kernels.readout import (
@@ -272,10 +272,10 @@ def kinematic_kernel(
                         shape = shape_of(solids, variant, geometry)
                         rotation = pairs.rotation[env, held]
                         offset = pairs.offset[env, held]
-                        if wp.static(raycast or WALL in kinds):
+                        if wp.static(raycast or bool(kinds & SIDED)):
                             limit = 2.0 * solids.bound[variant, geometry][3]
                     facing = wp.vec3f()
-                    if wp.static(WALL in kinds):
+                    if wp.static(bool(kinds & SIDED)):
                         facing = rotation @ (radius * probes.normal[n])
                     found = distance_to(solids.values, shape, rotation @ x + offset, facing, limit + radius)
                     if found[3] < best:

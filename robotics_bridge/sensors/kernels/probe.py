@@ -10,7 +10,7 @@ from functools import cache
 from typing import Any
 
 from brainbench.core.devices import warp
-from robotics_bridge.sensors.kernels.distance import FAR, WALL, SolidArrays, shape_functions
+from robotics_bridge.sensors.kernels.distance import FAR, SIDED, SolidArrays, shape_functions
 from robotics_bridge.sensors.kernels.noise import episode_draw, radius_noise
 from robotics_bridge.sensors.kernels.pairs import PairArrays
 from robotics_bridge.sensors.kernels.readout import CLEAN, ProbeArrays, ReadoutArrays, readout_functions, silenced
@@ -42,11 +42,11 @@ def deepest_function(kinds: frozenset[int], raycast: bool) -> Any:
             rotation = pairs.rotation[env, at]
             limit = reach
             facing = wp.vec3f()
-            if wp.static(WALL in kinds):
+            if wp.static(bool(kinds & SIDED)):
                 # A probe without a limit asks for the distance, whichever side is the nearest.
                 if reach <= 0.0:
                     facing = rotation @ (probes.radius[n] * probes.normal[n])
-            if wp.static(raycast or WALL in kinds):
+            if wp.static(raycast or bool(kinds & SIDED)):
                 # A query of triangles searches within a limit: from inside, the surface is at most a bounding diameter
                 # away.
                 if reach <= 0.0:

@@ -18,8 +18,6 @@ DIVERGED = 1
 """Status of an environment: since its reset, a pose or velocity was not finite, or a quaternion not of unit length."""
 OVERFULL = 2
 """Status of an environment: the state had no room for some contacts."""
-UNFELT = 4
-"""Status of an environment: a contact pushed a link with taxels of ``total="engine"`` where none of them lies."""
 _LISTED = 16
 """Geometries in contact with one link that are listed where lists of all would be too long."""
 _LIST_BYTES = 2**28
@@ -49,7 +47,12 @@ class PairTable:
         self.crowded: Any = None
         """Warp array [B]: the most geometries that ever met a sensor whose list holds fewer; 0 where none was lost."""
         self.status: Any = context.zeros(context.num_envs, int)
-        """Warp array [B] of :data:`DIVERGED`, :data:`OVERFULL` and :data:`UNFELT`, as of the last update."""
+        """Warp array [B] of :data:`DIVERGED` and :data:`OVERFULL`, as of the last update."""
+        self.loads: Any = None
+        """Warp array [2, B, L] of links with taxels of ``total="engine"``: sum of the engine's forces, and what their
+        taxels lack of them (N); None where there are none (:meth:`count_loads`)."""
+        self.told: Any = context.zeros(1, int)
+        """Warp array [1]: 1 once more than a hundredth of a load was missing."""
 
     def slot(
         self,
@@ -75,6 +78,12 @@ class PairTable:
                 return number
         self._slots.append({**wanted, "center": np.asarray(center, np.float32), "reach": float(reach)})
         return len(self._slots) - 1
+
+    def count_loads(self) -> Any:
+        """Return :attr:`loads`, made by the first call."""
+        if self.loads is None:
+            self.loads = self._context.zeros((2, self._context.num_envs, len(self._solids.scene.links)))
+        return self.loads
 
     @property
     def state_bytes(self) -> int:

@@ -20,7 +20,7 @@ from brainbench.geometry.distance import sample_surface
 from brainbench.geometry.mesh_repair import repair
 from robotics_bridge.physics.scene import KINDS, Geometry, TouchScene
 from robotics_bridge.sensors.kernels import distance
-from robotics_bridge.sensors.kernels.distance import OTHER, WALL, SolidArrays, measure_walls
+from robotics_bridge.sensors.kernels.distance import OTHER, THIN, WALL, SolidArrays, measure_walls
 from robotics_bridge.sensors.probes.placement import face_areas
 
 _FORMAT = 3
@@ -79,6 +79,9 @@ def mesh_tree(mesh: Mesh, device: Any, *, winding: bool = False) -> Any:
 
 RESOLVED = 4.0
 """Cells across a wall from which a distance field tells its two sides apart."""
+THINNEST = 3e-3
+"""Least width of a solid (m) below which it is thin: engines let bodies overlap by up to about half of it, so that what
+touches it may lie past its middle, where the nearest side is the wrong one."""
 _FLAT = 1e-6
 """Mean thickness, as a part of the diagonal, below which a mesh encloses nothing."""
 _SAMPLES = 2000
@@ -106,8 +109,8 @@ def as_solid(mesh: Mesh) -> Mesh:
     return mended.mesh
 
 
-def wall_thickness(mesh: Mesh, cell: float, device: Any) -> float:
-    """Return the thickness (m) of walls of a closed mesh that cells of a distance field (m) cannot resolve, or 0."""
+def wall_thickness(mesh: Mesh, below: float, device: Any) -> tuple[float, float]:
+    """Return the least and largest thickness (m) of walls of a closed mesh that are thinner than that, or zeros."""
     wp, tree = warp(), mesh_tree(mesh, device)
     points, faces = sample_surface(mesh, _SAMPLES, np.random.default_rng(0))
     normal = face_areas(mesh.vertices[mesh.faces[faces]])[1]
@@ -116,14 +119,22 @@ def wall_thickness(mesh: Mesh, cell: float, device: Any) -> float:
     inputs = [tree.id, *arrays, 1e-6 * mesh.diagonal, out]
     wp.launch(measure_walls, dim=len(points), inputs=inputs, device=device)
     thickness = out.numpy()
-    thin = thickness[(thickness > 0) & (thickness < RESOLVED * cell)]
-    return float(np.quantile(thin, 0.1)) if len(thin) > _SHARE * len(points) else 0.0
+    thin = thickness[(thickness > 0) & (thickness < below)]
+    if len(thin) <= _SHARE * len(points):
+        return 0.0, 0.0
+    return float(np.quantile(thin, 0.1)), float(thin.max())
 
 
 _UNBOUNDED = 1.0e6
 _LARGER = 1024.0
 """Factor at which round solids are made: trimesh leaves out triangles below 1e-8 m², such as those at the poles of a
 finger's capsule. A power of two loses no digit."""
+
+
+def least_width(geometry: Geometry) -> float:
+    """Return the least width (m) of a solid without a mesh, or 0 for what has none."""
+    size = geometry.size[:1] if geometry.kind in ("sphere", "capsule") else geometry.size
+    return 2 * min(size) if size else 0.0
 
 
 def bounding_sphere(geometry: Geometry) -> NDArray[np.float32]:
@@ -200,6 +211,7 @@ class Solids:
         frame = np.zeros((*shape, 7), np.float32)
         frame[..., 6] = 1
         field, mesh = np.full(shape, -1, np.int32), np.zeros(shape, np.uint64)
+        self._thickness = np.zeros(shape, np.float32)
         self._sound: dict[str, Mesh] = {}
         self._fields: dict[str, Field] = {}
         self._trees: dict[str, Any] = {}
@@ -213,7 +225,8 @@ class Solids:
                 rows = row if index in scene.variants else slice(None)
                 described = seen[id(geometry)]
                 self.kinds[rows, index], size[rows, index], bound[rows, index] = described[:3]
-                frame[rows, index], field[rows, index], mesh[rows, index] = described[3:]
+                frame[rows, index], field[rows, index], mesh[rows, index] = described[3:6]
+                self._thickness[rows, index] = described[6]
         volumes = list(self._fields.values()) or [Field(np.zeros((2, 2, 2), np.float32), np.zeros(3, np.float32), 1.0)]
         starts = np.cumsum([0, *(v.values.size for v in volumes)])
         if starts[-1] >= 2**31:
@@ -226,6 +239,7 @@ class Solids:
             "link": scene.link_of,
             "field": field,
             "mesh": mesh,
+            "thickness": self._thickness,
             "first": starts[:-1],
             "counts": [v.values.shape for v in volumes],
             "origin": [v.origin for v in volumes],
@@ -235,29 +249,37 @@ class Solids:
         self.struct: Any = to_struct(SolidArrays, {k: np.asarray(v) for k, v in arrays.items()}, device)
         """The Warp structure that kernels take."""
 
-    def kinds_of(self, geometries: Iterable[int]) -> frozenset[int]:
-        """Return the kinds (numbers) that some geometries take in any environment."""
+    def kinds_of(self, geometries: Iterable[int], *, others: bool = False) -> frozenset[int]:
+        """Return the kinds (numbers) that some geometries take in any environment, and the mark of thin ones.
+
+        What has no distance is refused by name, or with ``others`` left out.
+        """
         chosen = list(geometries)
         kinds = frozenset(self.kinds[:, chosen].ravel().tolist()) if chosen else frozenset()
-        if OTHER in kinds:
+        if OTHER in kinds and not others:
             culprit = next(g for g in chosen if (self.kinds[:, g] == OTHER).any())
             raise UsageError(
-                f"The geometry {self.scene.geometries[culprit].name!r} is of a kind that no sensor can query (height "
-                "fields and engine-made surfaces); turn it into a mesh or leave it out of what the sensor tracks."
+                f"The geometry {self.scene.geometries[culprit].name!r} is of a kind that has no distance to ask for "
+                "(height fields and engine-made surfaces); turn it into a mesh, leave it out of what the sensor "
+                "tracks, or feel it by KinematicTaxel(total='engine')."
             )
-        return kinds
+        thin = chosen and bool((self._thickness[:, chosen] > 0).any())
+        return (kinds - {OTHER}) | ({THIN} if thin else set())
 
     def _describe(self, geometry: Geometry, field: bool, tree: bool, resolution: int) -> tuple:
-        """Return kind, size, bounding sphere, frame, number of the distance field and id of the tree."""
+        """Return kind, size, bounding sphere, frame, number of the distance field, id of the tree and thickness."""
         number, mesh, kind, size = -1, 0, KINDS.index(geometry.kind), [*geometry.size, 0.0, 0.0, 0.0][:3]
-        if geometry.mesh is not None and (field or tree):
-            surface = self._solid(geometry.mesh)
+        thin = width if (width := least_width(geometry)) < THINNEST else 0.0
+        if (geometry.mesh is not None and (field or tree)) or (thin and tree):
+            surface = self._solid(geometry.mesh) if geometry.mesh is not None else tessellate(geometry)
             cell = float(np.ptp(surface.bounds, axis=0).max()) / resolution
-            if thickness := wall_thickness(surface, cell, self.device):
+            below = max(RESOLVED * cell, THINNEST)
+            least, thin = (thin, thin) if thin else wall_thickness(surface, below, self.device)
+            if thin and (tree or least < RESOLVED * cell):
                 # Triangles nearer to one another than a hundredth of the wall are one place, in mean edges for Warp.
                 edges = np.diff(surface.vertices[surface.faces[:, [0, 1, 2, 0]]], axis=1)
-                size = [0.01 * thickness / float(np.linalg.norm(edges, axis=2).mean()), thickness, 0.0]
-                kind, field, tree = WALL, False, True
+                size = [0.01 * least / float(np.linalg.norm(edges, axis=2).mean()), least, thin]
+                kind, field, tree, thin = WALL, False, True, 0.0
             if field:
                 key = surface.content_hash
                 if key not in self._fields:
@@ -272,7 +294,7 @@ class Solids:
         w, x, y, z = geometry.quaternion
         # Ours are (w, x, y, z), Warp's (x, y, z, w).
         frame = (*geometry.position, x, y, z, w)
-        return kind, size, bounding_sphere(geometry), frame, number, mesh
+        return kind, size, bounding_sphere(geometry), frame, number, mesh, thin
 
     def _solid(self, mesh: Mesh) -> Mesh:
         """Return a mesh mended, once for all that share it."""

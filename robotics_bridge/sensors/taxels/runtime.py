@@ -12,7 +12,7 @@ from brainbench.core.devices import warp
 from robotics_bridge.physics.state import HandState
 from robotics_bridge.sensors.context import fill
 from robotics_bridge.sensors.kernels import contact_load as kernels
-from robotics_bridge.sensors.kernels.contact_load import ContactNodes, PressArrays, SpreadPlan
+from robotics_bridge.sensors.kernels.contact_load import ContactNodes, PressArrays, SpreadPlan, settle_kernel
 from robotics_bridge.sensors.kernels.kinematic import KinematicParams, StickArrays, kinematic_kernel
 from robotics_bridge.sensors.kernels.proximity import ProximityArrays, ProximityParams, proximity_kernel
 from robotics_bridge.sensors.kernels.readout import FUSED
@@ -33,7 +33,7 @@ class KinematicRuntime(ProbeRuntime):
     def __init__(self, sensors: Mapping[str, KinematicTaxel], context: SuiteContext) -> None:
         first = next(iter(sensors.values()))
         # Readings of a taxel whose forces are summed depend on others, so that none can be finished, noise included.
-        super().__init__(sensors, 6, context, fusable=not self.summed)
+        super().__init__(sensors, 6, context, fusable=not self.summed, others=self.summed)
         rows = probe_rows(self.slices.values(), context, self.mode)
         self._kernel = kinematic_kernel(
             self.kinds, first.query == "raycast", first.convention == "physical", first.sticky, self.summed, self.mode,
@@ -108,7 +108,11 @@ class ContactLoadRuntime(KinematicRuntime):
         plan.order, plan.spans = context.array(order, int), context.array(spans, wp.vec3i)
         plan.reach = context.array(np.concatenate([contact_reach(sensor.probes) for sensor in configs]), float)
         plan.row_first = context.array(np.searchsorted(self.rows.numpy()[:, 3], np.arange(len(spans) + 1)), int)
-        plan.status = context.pairs.status
+        plan.whole = context.array([int(not sensor.track) for sensor in configs], int)
+        plan.links = context.array(sorted(set(links)), int)
+        plan.fresh = int(context.pairs.loads is None)
+        plan.loads, plan.told = context.pairs.count_loads(), context.pairs.told
+        self._settle = settle_kernel(self.kinds, configs[0].query == "raycast", in_turn=not context.device.is_cuda)
         plan.slip = 1.0 if configs[0].convention == "physical" else -1.0
         shape, press = (context.num_envs, self.count), self.press
         press.weight, press.total = context.zeros(shape), context.zeros(shape)
@@ -131,20 +135,27 @@ class ContactLoadRuntime(KinematicRuntime):
         # A processor can look how many contacts there are; on a GPU that would wait for it.
         contacts = room if c.device.is_cuda else min(room, int(state.contact_count.numpy()[0]))
         nodes.head.fill_(-1)
-        scene_arrays = [plan, c.pairs.plan, c.solids.struct.link, self.probes, state.arrays]
-        c.launch(kernels.list_contacts, 2 * contacts, *scene_arrays, state.contact_friction, nodes)
+        arrays = [plan, c.pairs.plan, c.solids.struct.link]
+        c.launch(kernels.list_contacts, 2 * contacts, *arrays, state.arrays, state.contact_friction, nodes)
         if c.device.is_cuda:
             c.launch(kernels.sort_contacts, nodes.head.shape, nodes)
+        seen = [plan, c.solids.struct.link, self.probes, state.arrays]
+        c.launch(kernels.find_taxels, 2 * contacts, *seen, nodes)
         super().run_kernels(state, dt)
-        c.launch(kernels.share_contacts, (2 * contacts, self._most), *scene_arrays, press, nodes)
-        inputs = [plan, self.probes, self.rows, press, nodes, int(self.noisy), self._written, self.io]
-        c.launch(kernels.spread_contacts, (c.num_envs, self.rows.shape[0]), *inputs)
+        c.launch(kernels.share_contacts, (2 * contacts, self._most), *seen, press, nodes)
+        inputs = [int(self.noisy), self._written, self.io]
+        if c.device.is_cuda:
+            spread = [plan, self.probes, self.rows, press, nodes, *inputs]
+            c.launch(kernels.spread_contacts, (c.num_envs, self.rows.shape[0]), *spread)
+        c.launch(self._settle, (c.num_envs, plan.links.shape[0]), plan, self.probes, self.rows, c.solids.struct,
+                 c.pairs.struct, nodes, press, *inputs)  # fmt: skip
 
     def _make_nodes(self, room: int) -> Any:
         c, nodes = self.context, kernels.ContactNodes()
         nodes.head = c.zeros((c.num_envs, len(c.scene.links)), int)
-        for name in ("follower", "felt", "other"):
+        for name in ("follower", "watched", "felt", "other", "geometry"):
             setattr(nodes, name, c.zeros(2 * room, int))
+        nodes.carried, nodes.overlap = c.zeros((2 * room, self._most), int), c.zeros(2 * room)
         for name in ("point", "normal", "force"):
             setattr(nodes, name, c.zeros(2 * room, wp.vec3f))
         nodes.load, nodes.share = c.zeros(2 * room), c.zeros((2 * room, self._most), wp.vec4f)

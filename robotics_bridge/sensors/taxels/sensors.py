@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, cast
 
 from brainbench.core.errors import UsageError
 from brainbench.core.limits import Count, Limit, NotNegative, Positive, limited
 from brainbench.core.reading.ranges import check_number
 from robotics_bridge.sensors.noise.model import GRID_KNOBS, TAXEL_KNOBS
-from robotics_bridge.sensors.sensor import Convention, ProbeSensor, QuerySensor
+from robotics_bridge.sensors.sensor import Convention, ProbeSensor, QuerySensor, Sensor
 
 if TYPE_CHECKING:
     from robotics_bridge.physics.scene import TouchScene
@@ -18,6 +18,8 @@ PUBLISHED_TWIST = 2.0
 """k_ω of the published parameters (N·m·s): that of a disc of 1.4 m, which drowns every other moment when an object
 turns."""
 CONVENTIONS = ("physical", "thesis")
+_LAW = ("stiffness", "damping", "shear", "twist", "convention", "pairs")
+"""Settings of the law alone."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,12 +53,15 @@ class KinematicTaxel(QuerySensor):
     """ρ: tangential over normal stiffness of that spring; 2 (1 − ν) / (2 − ν) of a thick skin (Mindlin 1949), here with
     ν = ½."""
     convention: Convention = "physical"
-    total: Literal["law", "engine"] = "law"
-    """``law``: each taxel by itself, as published. ``engine``: the taxels of a sensor add up to the forces, friction at
-    rest included, of the engine's contacts between its link and what it tracks. Each contact is spread over the taxels
-    that feel that body from that side, by d^α and, with ``friction``, by their springs; stiffness, damping, shear and
-    twist play no part. A taxel without such
-    a contact reads 0; the force of a contact beside all taxels is missing (``SensorSuite.unfelt``)."""
+    total: Literal["auto", "engine", "law"] = "auto"
+    """``engine``: the taxels of a sensor add up to the forces, friction at rest included, of the engine's contacts
+    between its link and what it tracks, and to their moment as far as they push. Each contact is spread over the taxels
+    that overlap that body from that side, by d^α and, with ``friction``, by their springs, wherever the engine puts its
+    points; that of a flex or a height field over the taxels near it. Stiffness, damping, shear and twist play no part.
+    A taxel without such a contact reads 0; the force that no taxel feels is ``SensorSuite.missing``.
+    ``law``: each taxel by itself, by its depth, as published, which does not follow the load.
+    ``auto``: ``engine`` in scenes of an engine, unless ``stiffness``, ``damping``, ``shear``, ``twist``, the published
+    ``convention`` or ``pairs="all"`` is stated, which belong to the law."""
 
     channels: ClassVar[int] = 6
     units: ClassVar[str] = "N, N m"
@@ -68,6 +73,14 @@ class KinematicTaxel(QuerySensor):
         if self.sticky and self.convention == "thesis":
             raise UsageError("The published law has no friction at rest; leave out friction or convention='thesis'.")
 
+    def for_scene(self, scene: TouchScene) -> Sensor:
+        """Return the sensor with ``total`` settled; the law refuses flexes, which have no distance."""
+        total = self.total
+        if total == "auto":
+            stated = any(getattr(self, name) != getattr(KinematicTaxel, name) for name in _LAW)
+            total = "engine" if scene.reports_forces and not stated else "law"
+        return replace(self if total == "engine" else cast(KinematicTaxel, super().for_scene(scene)), total=total)
+
     @property
     def runtime(self) -> str:  # type: ignore[override]
         """``package.module:Class`` of the runtime that serves it."""
@@ -77,7 +90,7 @@ class KinematicTaxel(QuerySensor):
     @property
     def ignores_load(self) -> bool:
         """True if it reads a law of depths in newtons, published signs aside."""
-        return self.total == "law" and self.convention == "physical"
+        return self.total != "engine" and self.convention == "physical"
 
     @property
     def torsion(self) -> float:

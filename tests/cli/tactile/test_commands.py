@@ -1,5 +1,7 @@
 import json
 
+from tests.factories.hand_gallery import GALLERY
+
 
 def test_layouts_prints_the_counts_of_the_published_table(run):
     found = json.loads(run("tactile", "layouts", "--hand", "sharpa", "--json").out)
@@ -29,6 +31,21 @@ def test_check_compares_this_machine_with_closed_forms(run):
     checks = json.loads(found.out)["checks"]
     assert len(checks) == 9
     assert all(item["passed"] for item in checks)
+
+
+def test_check_of_a_folder_presses_every_pad_and_draws_every_hand(run, tmp_path):
+    for name in ("jaws-slide", "four-bar-tendon"):
+        GALLERY[name].write(tmp_path, name)
+    found = run("tactile", "check", str(tmp_path), "--out", str(tmp_path / "pictures"), "--json")
+    hands = json.loads(found.out)["hands"]
+    assert [(hand["name"], len(hand["tips"]), hand["passed"]) for hand in hands] == [
+        ("four-bar-tendon", 2, True), ("jaws-slide", 2, True),
+    ]  # fmt: skip
+    assert len(list((tmp_path / "pictures").glob("*.png"))) == 2
+    (tmp_path / "broken.xml").write_text("<mujoco/>")
+    found = run("tactile", "check", str(tmp_path / "broken.xml"), "--out", str(tmp_path / "pictures"))
+    assert found.status == 1
+    assert "no joints" in found.out
 
 
 def test_check_fails_where_a_truth_is_missed(run, monkeypatch):

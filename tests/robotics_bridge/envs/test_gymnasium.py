@@ -125,7 +125,10 @@ def test_touch_is_a_keyword_of_make() -> None:
         "brainbench/InPalmRotate-v0", touch="force_torque", placement="tips", resolution="low", threads=1
     )
     assert env.observation_space["tactile"].shape == (5, 45, 6)
-    assert "tactile" not in gymnasium.make("brainbench/InPalmRotate-v0", threads=1).observation_space.spaces
+    felt = gymnasium.make("brainbench/InPalmRotate-v0", placement="tips", resolution="low", threads=1)
+    assert felt.observation_space["tactile"].shape == (5, 5, 7)
+    numb = gymnasium.make("brainbench/InPalmRotate-v0", touch="none", threads=1)
+    assert "tactile" not in numb.observation_space.spaces
 
 
 def test_an_option_that_a_reset_in_gymnasium_lacks_is_refused() -> None:

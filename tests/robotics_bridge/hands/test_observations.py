@@ -52,7 +52,21 @@ def test_sizes_of_a_hand_follow_from_counts_of_taxels_and_links():
     assert observe("agg_force", scalar, layout).shape == (2, 15)
     assert observe("agg_bool", scalar, layout).shape == (2, 5)
     assert observe("none", scalar, layout).shape == (2, 0)
-    assert len(OBSERVATIONS) == 9
+    assert len(OBSERVATIONS) == 10
+
+
+def test_the_centre_of_pressure_is_where_a_force_acts_and_how_it_twists():
+    """Forces of 1 and 3 N at 0 and 4 mm, and a torque of 2 mN·m about the normal, have one wrench in closed form."""
+    layout = {"tip": Probes(np.array([[0, 0, 0], [4e-3, 0, 0]]), np.tile([0, 0, 1.0], (2, 1)), np.full(2, 1e-3))}
+    reading = torch.zeros(2, 2, 6)
+    for taxel, (x, force) in enumerate(((0.0, 1.0), (4e-3, 3.0))):
+        reading[0, taxel, :3] = torch.tensor([0.0, 0.5, -force])
+        reading[0, taxel, 3:] = torch.linalg.cross(torch.tensor([x, 0, 0]), reading[0, taxel, :3])
+    reading[0, 0, 5] += 2e-3
+    seen = observe("center_of_pressure", {"tip": reading}, layout)
+    # About the point, the sideways forces of .5 N each twist by .5 · (-3 + 1) mm.
+    np.testing.assert_allclose(seen[0], [0, 1, -4, 3e-3, 0, 0, 2e-3 - 1e-3], atol=1e-9)
+    assert not seen[1].any()
 
 
 def test_wrong_names_and_shapes_are_explained():

@@ -1,0 +1,166 @@
+"""What a hand file becomes, checked: palm, tips and pads, and a ball pressed into every pad, against the engine."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from brainbench.core.devices import mujoco_module
+from brainbench.core.errors import BrainbenchError
+from robotics_bridge.hands import load_all
+from robotics_bridge.hands.hand import Hand
+from robotics_bridge.hands.layouts import Layout, active_count
+
+mujoco = mujoco_module()
+
+_RADIUS = 6e-3
+"""Radius of the balls that press (m)."""
+_DEPTH = 3e-4
+"""Depth to which they press (m)."""
+_AWAY = 10.0
+"""Where a ball waits (m)."""
+WRONG = 0.01
+"""Part of a load that taxels may lack without a word."""
+
+
+@dataclass(frozen=True)
+class HandCheck:
+    """What became of one hand."""
+
+    name: str
+    palm: str = ""
+    tips: tuple[str, ...] = ()
+    pads: int = 0
+    """Links with taxels."""
+    taxels: int = 0
+    bare: tuple[str, ...] = ()
+    """Links of the hand without taxels."""
+    pressed: int = 0
+    """Pads that a ball could touch."""
+    worst: float = 0.0
+    """Largest part of a press that the taxels of a pad lack."""
+    errors: tuple[str, ...] = field(default=())
+    """What stopped the check, or is wrong."""
+
+    @property
+    def passed(self) -> bool:
+        """True if every tip has taxels and these feel what presses them."""
+        return not self.errors
+
+
+def check_file(path: Path, pictures: Path | None = None, resolution: str = "low") -> list[HandCheck]:
+    """Check every hand of a URDF or MJCF file; a picture of each goes to a folder."""
+    try:
+        hands = load_all(path)
+    except BrainbenchError as error:
+        return [HandCheck(path.name, errors=(str(error),))]
+    return [check_hand(hand, pictures, resolution) for hand in hands]
+
+
+def check_hand(hand: Hand, pictures: Path | None = None, resolution: str = "low") -> HandCheck:
+    """Place taxels on a hand, press a ball on every pad, and compare their sums with the engine's forces."""
+    try:
+        layout = hand.layout(resolution)
+        loads = press(hand, layout)
+    except BrainbenchError as error:
+        return HandCheck(hand.name, hand.palm, hand.tips, errors=(str(error),))
+    bare = tuple(link for link in hand.links() if link not in layout and link not in hand.couplers)
+    errors = [f"no taxels on the tip {tip!r}" for tip in hand.tips if tip not in layout]
+    parts = {}
+    for link, (load, felt, missing) in loads.items():
+        lack, whole = float(np.linalg.norm(felt - load)), float(np.linalg.norm(load))
+        parts[link] = lack / whole
+        # What the suite says is missing is not wrong: the ball also touches where no taxel lies.
+        if lack - missing > WRONG * whole:
+            errors.append(f"taxels of {link!r} lack {lack / whole:.0%} of a press, of which nothing tells")
+    if pictures is not None:
+        draw(hand, layout, pictures / f"{hand.name}.png")
+    return HandCheck(
+        hand.name, hand.palm, hand.tips, len(layout), active_count(layout), bare, len(loads),
+        max(parts.values(), default=0.0), tuple(errors),
+    )  # fmt: skip
+
+
+def press(hand: Hand, layout: Layout) -> dict[str, tuple[np.ndarray, np.ndarray, float]]:
+    """Return link → force [3] (N, link frame) of the engine, sum of its taxels, and what the suite misses (N).
+
+    A ball is pressed into each pad in turn.
+
+    Links that the ball cannot touch, such as those behind another, are left out.
+    """
+    from robotics_bridge.physics.cpu import MujocoEngine
+    from robotics_bridge.sensors import KinematicTaxel, SensorSuite
+
+    spec, data = hand.mjspec(), mujoco.MjData(hand.model)
+    mujoco.mj_kinematics(hand.model, data)
+    spec.option.gravity = (0, 0, 0)
+    names = {}
+    for number, (link, probes) in enumerate(layout.items()):
+        body = data.body(link)
+        turn, active = body.xmat.reshape(3, 3), np.flatnonzero(probes.active)
+        middle = probes.position[active].mean(axis=0)
+        nearest = active[np.linalg.norm(probes.position[active] - middle, axis=1).argmin()]
+        outward = turn @ probes.normal[nearest]
+        place = body.xpos + turn @ probes.position[nearest] + outward * (_RADIUS - _DEPTH)
+        ball = spec.worldbody.add_body(name=f"press{number}", pos=place)
+        ball.add_joint(name=f"press{number}", type=mujoco.mjtJoint.mjJNT_SLIDE, axis=outward)
+        size = (_RADIUS, 0, 0)
+        ball.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=size, mass=0.1, contype=0xFFFF, conaffinity=0xFFFF)
+        names[link] = f"press{number}"
+    model = spec.compile()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)
+        engine = MujocoEngine(model, 1, contacts=400)
+        sensors = {
+            link: KinematicTaxel(link=link, probes=probes, track=tuple(names.values()), total="engine")
+            for link, probes in layout.items()
+        }
+        suite = SensorSuite(engine.scene, sensors, num_envs=1)
+        loads = {}
+        for link, name in names.items():
+            data = engine.data[0]
+            mujoco.mj_resetData(model, data)
+            for ball_name in names.values():
+                data.joint(ball_name).qpos[0] = 0.0 if ball_name == name else _AWAY
+            engine.forward()
+            suite.update(engine.state, engine.timestep)
+            force, six, body = np.zeros(3), np.zeros(6), model.body(link).id
+            for index, contact in enumerate(data.contact):
+                mujoco.mj_contactForce(model, data, index, six)
+                links = [int(model.geom_bodyid[geom]) for geom in contact.geom]
+                if sorted(links) == sorted((body, model.body(name).id)):
+                    sign = 1.0 if links[1] == body else -1.0
+                    force += sign * contact.frame.reshape(3, 3).T @ six[:3]
+            if np.linalg.norm(force) > 1e-9:
+                felt = suite.read(link)[0].reshape(-1, 6)[:, :3].sum(dim=0).numpy()
+                loads[link] = (data.body(link).xmat.reshape(3, 3).T @ force, felt, float(suite.missing[0, body]))
+    return loads
+
+
+def draw(hand: Hand, layout: Layout, path: Path) -> None:
+    """Draw the taxels of a hand at rest over the corners of its links, from the side of the palm and from beside."""
+    from brainbench.core.figures.style import panels, save_figure
+    from robotics_bridge.hands.surface import link_points
+
+    model, data = hand.model, mujoco.MjData(hand.model)
+    mujoco.mj_kinematics(model, data)
+
+    def world(link: str, points: Any) -> np.ndarray:
+        body = data.body(link)
+        return 1e3 * (body.xpos + np.asarray(points) @ body.xmat.reshape(3, 3).T)
+
+    figure, axes = panels(1, 2, (6.4, 3.2))
+    for axis, (across, up) in zip(axes[0], ((0, 1), (0, 2)), strict=True):
+        for number in range(1, model.nbody):
+            if len(points := link_points(model, number)):
+                corners = world(model.body(number).name, points)
+                axis.scatter(corners[:, across], corners[:, up], s=1, color="0.8", rasterized=True)
+        for link, probes in layout.items():
+            places = world(link, probes.position[probes.active])
+            axis.scatter(places[:, across], places[:, up], s=4)
+        axis.set(xlabel=f"{'xyz'[across]} (mm)", ylabel=f"{'xyz'[up]} (mm)", aspect="equal")
+    save_figure(figure, path)

@@ -1,0 +1,50 @@
+"""Several hands of a file, and which joints of linkages and tendons lead."""
+
+from __future__ import annotations
+
+import logging
+
+import pytest
+
+from brainbench.core.errors import UsageError
+from robotics_bridge import hands
+from robotics_bridge.hands.scenes import closing, holding
+from robotics_bridge.hands.tree import Tree, driven, pulled
+from robotics_bridge.tasks.scenes import drives_of
+from tests.factories.hand_gallery import GALLERY
+
+
+@pytest.mark.parametrize("name", [name for name, model in GALLERY.items() if model.drives])
+def test_what_follows_is_not_driven(name: str, tmp_path) -> None:
+    hand = hands.load(GALLERY[name].write(tmp_path, name))
+    assert len(drives_of(hand)) == GALLERY[name].drives
+
+
+def test_a_tendon_drive_is_the_servo_of_its_first_joint(tmp_path) -> None:
+    """Coefficients ½ and a gain of 16: 16 · ½ · 1 N·m/rad at the crank, as the tendon makes when both cranks turn."""
+    hand = hands.load(GALLERY["four-bar-tendon"].write(tmp_path, "hand"))
+    assert {joint: values[:2] for joint, values in drives_of(hand).items()} == {"left_crank": (8.0, pytest.approx(0.3))}
+    assert [hand.model.joint(joint).name for joint in pulled(hand.model)] == ["right_crank"]
+    assert [hand.model.joint(joint).name for joint in driven(hand.model)] == ["left_crank"]
+
+
+def test_a_hand_that_holds_a_ball_has_a_servo_on_each_leading_joint_alone(tmp_path) -> None:
+    for name, count in (("four-bar-servos", 2), ("four-bar-passive", 2), ("three-fingers-box", 6)):
+        hand = hands.load(GALLERY[name].write(tmp_path, name))
+        assert holding(hand).nu == len(closing(hand, 0.5)) == count
+
+
+def test_the_other_hand_of_a_file_is_named_and_can_be_chosen(tmp_path, caplog) -> None:
+    path = GALLERY["two-hands"].write(tmp_path, "pair")
+    with caplog.at_level(logging.WARNING):
+        assert hands.load(path).palm == "left_palm"
+    assert "'right_palm' get no taxels" in caplog.text
+    assert hands.load(path, palm="right_palm").tips == ("rf0_tip", "rf1_tip", "rf2_tip")
+    with pytest.raises(UsageError, match="right_palm"):
+        hands.load(path, palm="right_plam")
+    assert len(hands.load_all(path)) == 2
+
+
+def test_followers_of_a_model_without_loops_are_those_that_mimic(tmp_path) -> None:
+    hand = hands.load(GALLERY["mimic-hand"].write(tmp_path, "hand"))
+    assert {hand.model.joint(joint).name for joint in Tree(hand.model).followers} == set(hand.tips)

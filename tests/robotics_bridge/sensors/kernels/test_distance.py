@@ -1,0 +1,88 @@
+"""Thin solids are felt from the side of the sensor, like thick ones whose touching face is the same."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from brainbench.geometry import Mesh
+from robotics_bridge.physics.scene import Geometry, TouchScene
+from robotics_bridge.sensors import ContactDepthProbe, ElastomerTaxel, KinematicTaxel, Probes, SensorSuite
+from robotics_bridge.sensors.queries.solids import THINNEST, least_width
+from tests.factories.touch_scenes import poses_at, state_of
+
+HALF, PRESSED = 0.15e-3, 0.24e-3
+PAD = Geometry(name="pad", link="pad", kind="box", size=(0.04, 0.04, 0.01))
+GRID = Probes.grid(16, 16, size=(0.08, 0.08), center=(0, 0, 0.01), radius=0.004)
+FLAT = (2**-0.5, 0.0, 2**-0.5, 0.0)
+
+
+def _ball(*scale: float) -> Mesh:
+    solid = trimesh.creation.icosphere(3, 1.0)
+    return Mesh(solid.vertices * scale, solid.faces, "ball")
+
+
+def _wire(radius: float, half: float) -> Mesh:
+    solid = trimesh.creation.cylinder(1e3 * radius, 2e3 * half, sections=24)
+    return Mesh(1e-3 * solid.vertices, solid.faces, "wire")
+
+
+def _press(half: float, pressed: float, sensors: dict, turn: tuple = (1.0, 0, 0, 0), **shape: object) -> SensorSuite:
+    """Return a suite that read an object whose lower side lies ``pressed`` below the top of a pad."""
+    body = Geometry(name="o", link="o", quaternion=turn, **shape)
+    scene = TouchScene(("world", "pad", "o"), (PAD, body))
+    suite = SensorSuite(scene, sensors, num_envs=1)
+    state = state_of(scene, poses_at(3, {2: (0, 0, 0.01 - pressed + half)}))
+    for _ in range(2):
+        suite.update(state, 0.002)
+    return suite
+
+
+def _read(half: float, pressed: float = PRESSED, turn: tuple = (1.0, 0, 0, 0), **shape: object) -> tuple:
+    sensors = {"law": KinematicTaxel(link="pad", probes=GRID), "gel": ElastomerTaxel(link="pad", probes=GRID, points=0)}
+    suite = _press(half, pressed, sensors, turn, **shape)
+    return suite.read("law")[..., 2].sum().item(), suite.read("gel").abs().max().item()
+
+
+@pytest.mark.parametrize("half", [0.15e-3, 0.45e-3])
+def test_a_sheet_reads_like_a_thick_block(half: float) -> None:
+    thin = _read(half, 1.6 * half, kind="box", size=(0.02, 0.02, half))
+    np.testing.assert_allclose(thin, _read(0.01, 1.6 * half, kind="box", size=(0.02, 0.02, 0.01)), rtol=1e-4)
+    assert thin[0] < -40
+
+
+def test_a_disc_reads_like_a_thick_cylinder_and_a_lens_like_its_mesh() -> None:
+    thick = _read(0.01, kind="cylinder", size=(0.02, 0.01))
+    np.testing.assert_allclose(_read(HALF, kind="cylinder", size=(0.02, HALF)), thick, rtol=1e-4)
+    lens = _read(HALF, kind="ellipsoid", size=(0.02, 0.02, HALF))
+    assert lens[0] < -25
+    assert _read(HALF, kind="mesh", mesh=_ball(0.02, 0.02, HALF))[0] == pytest.approx(lens[0], rel=0.03)
+
+
+@pytest.mark.parametrize("radius", [0.15e-3, 0.4e-3, 1e-3])
+def test_wires_and_beads_push_whatever_they_are_made_of(radius: float) -> None:
+    """Taxels 2.7 mm beside what is pressed past its middle, and taxels under it."""
+    for turn, shape in (
+        ((1, 0, 0, 0), {"kind": "sphere", "size": (radius,)}),
+        ((1, 0, 0, 0), {"kind": "mesh", "mesh": _ball(radius, radius, radius)}),
+        (FLAT, {"kind": "capsule", "size": (radius, 0.02)}),
+        (FLAT, {"kind": "mesh", "mesh": _wire(radius, 0.02)}),
+    ):
+        assert _read(radius, 1.6 * radius, turn, **shape)[0] < 0
+    under = Probes.grid(1, 5, size=(0, 0.004), center=(0, 0, 0.01), radius=0.002)
+    suite = _press(
+        radius, 1.6 * radius, {"d": ContactDepthProbe(link="pad", probes=under)}, kind="sphere", size=(radius,)
+    )
+    assert suite.read("d").max().item() == pytest.approx(0.002 + 1.6 * radius, rel=0.01)
+
+
+def test_the_back_of_a_thin_link_does_not_read_what_lies_on_its_front_as_passed() -> None:
+    """A sheet on a plate of 3 mm: probes on its other side are 3 mm away, not 3 mm deep."""
+    back = Probes.grid(3, 3, size=(0.01, 0.01), center=(0, 0, 0.007), normal=(0, 0, -1), radius=0.004)
+    sensors = {"d": ContactDepthProbe(link="pad", probes=back)}
+    suite = _press(HALF, 0.0, sensors, kind="box", size=(0.02, 0.02, HALF))
+    np.testing.assert_allclose(suite.read("d").numpy(), 0.001, atol=1e-6)
+
+
+def test_a_solid_is_thin_by_its_least_width() -> None:
+    assert least_width(Geometry(name="a", link="a", kind="cylinder", size=(0.02, 0.001))) == 0.002 < THINNEST
+    assert least_width(Geometry(name="a", link="a", kind="capsule", size=(0.002, 0.0001))) == 0.004
