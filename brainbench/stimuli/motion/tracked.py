@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from brainbench.core.errors import DataError, UsageError, brief, listing
 from brainbench.core.limits import Limit, NotNegative, Positive, limited
 from brainbench.core.reading.tables import read_columns
+from brainbench.core.rotations import Angle
 from brainbench.stimuli.motion.trajectories import ROTATIONS, Rotations
 from brainbench.stimuli.tracks.readers import TrackOptions, read_shapes
 from brainbench.stimuli.whiskers.array import ROWS, MountedWhisker
@@ -39,7 +40,6 @@ _ORDER = 4
 _TAIL = 0.01
 """Time [s] for which the last pose is held beyond the end, for the last steps of a simulation."""
 _AXES = ("theta", "phi", "zeta")
-_Degrees = Annotated[float, Limit(least=-360, most=360, unit="°")]
 
 
 @dataclass(frozen=True)
@@ -47,14 +47,14 @@ _Degrees = Annotated[float, Limit(least=-360, most=360, unit="°")]
 class PlayOptions:
     """How tracks become motion."""
 
-    rest_deg: _Degrees | None = None
-    """Direction in the image, counter-clockwise from its x axis, in which a whisker is at rest; the median of each
-    track when None."""
+    rest: Angle | None = None
+    """Direction of a whisker at rest in the image, counter-clockwise from its x axis [rad]; the median of each track
+    when None."""
     view: Literal["top", "bottom"] = "top"
     """Side from which the camera looks at the animal; from the bottom turns are mirrored."""
-    rostral_deg: _Degrees | None = None
-    """Direction of rostral in the image, counter-clockwise from its x axis. With it bases move as they did; without it
-    they stay where the array has them."""
+    rostral: Angle | None = None
+    """Direction of rostral in the image, counter-clockwise from its x axis [rad]. With it bases move as they did;
+    without it they stay where the array has them."""
     longest_gap: Annotated[float, Limit(least=0, unit="s")] = 0.02
     """Longest gap of a track that is filled, evenly from its last value before to the first behind it [s]."""
     lowpass: Annotated[float, Limit(above=0, unit="Hz")] | None = 50.0
@@ -252,18 +252,18 @@ def _motion_of(points: Array, options: PlayOptions) -> Array:
     if not seen.any():
         raise DataError("No frame of the track has the base of the whisker and a point next to it.")
     azimuth = np.unwrap(np.arctan2(directions[seen, 1], directions[seen, 0]))
-    if options.rest_deg is None:
+    if options.rest is None:
         rest = float(np.median(azimuth))
     else:
-        rest = math.radians(options.rest_deg if options.view == "top" else 180 - options.rest_deg)
+        rest = options.rest if options.view == "top" else math.pi - options.rest
         azimuth = azimuth - 2 * math.pi * round((float(np.median(azimuth)) - rest) / (2 * math.pi))
     motion[seen, 0] = azimuth - rest
     if points.shape[2] == 3:
         rise = np.arcsin(directions[seen, 2] / np.linalg.norm(directions[seen], axis=1))
         motion[seen, 1] = rise - np.median(rise)
-    if options.rostral_deg is not None:
-        rostral = options.rostral_deg if options.view == "top" else 180 - options.rostral_deg
-        angle = math.radians(90 - rostral)  # rostral is the y axis of the array
+    if options.rostral is not None:
+        rostral = options.rostral if options.view == "top" else math.pi - options.rostral
+        angle = math.pi / 2 - rostral  # rostral is the y axis of the array
         base = points[:, 0] * mirror
         base = base - np.nanmedian(base, axis=0)
         motion[:, 3] = math.cos(angle) * base[:, 0] - math.sin(angle) * base[:, 1]

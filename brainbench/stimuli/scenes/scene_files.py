@@ -419,8 +419,7 @@ def _whisking(data: Mapping[str, Any], folder: Path, side: str) -> WhiskerMotion
 
 
 def _tracked(table: _Track, folder: Path, side: str, rotations: Rotations) -> Tracked:
-    given: dict[str, Any] = {name: getattr(table, name) for name in ("rest_deg", "rostral_deg")}
-    given |= table.si("view", "longest_gap_ms", "lowpass_hz")
+    given = table.si("rest_deg", "rostral_deg", "view", "longest_gap_ms", "lowpass_hz")
     if given.get("lowpass") == 0:
         given["lowpass"] = None
     options = PlayOptions(**given)

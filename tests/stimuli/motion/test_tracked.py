@@ -13,7 +13,7 @@ from brainbench.stimuli.motion.tracked import PlayOptions, Tracked, load_angles,
 from brainbench.stimuli.motion.trajectories import ROTATIONS
 from brainbench.stimuli.tracks.readers import TrackOptions
 from brainbench.stimuli.whiskers.array import WhiskerArray
-from tests.factories.whisker_tracks import write_points
+from tests.factories.whisker_tracks import write_deeplabcut_csv, write_points, write_whiskerman, write_whiskers
 
 RATE, SCALE = 500.0, 5e-5
 TIMES = np.arange(200) / RATE
@@ -54,6 +54,26 @@ def test_a_tracked_whisker_turns_as_it_was_filmed_however_the_camera_was_turned(
     np.testing.assert_allclose(angles[:, 1:], sense * angles[:, :1] * np.array(row), atol=1e-12)
 
 
+def _write_deeplabcut(path, pixels):
+    return write_deeplabcut_csv(path.with_suffix(".csv"), pixels, np.ones(pixels.shape[:2]))
+
+
+def _write_whisk(path, pixels):
+    return write_whiskers(path.with_suffix(".whiskers"), {(frame, 0): trace for frame, trace in enumerate(pixels)})
+
+
+def _write_whiskerman(path, pixels):
+    ends = np.concatenate([pixels[:, [0, 6, -1]], np.zeros((len(pixels), 3, 1))], axis=2).swapaxes(1, 2)
+    return write_whiskerman(path.with_suffix(".tr4"), ends, ends[:, :, 0], np.ones(len(pixels)))
+
+
+@pytest.mark.parametrize(("write", "label"), [(_write_deeplabcut, ""), (_write_whisk, ""), (_write_whiskerman, "1")])
+def test_files_of_every_tracker_are_played(tmp_path, write, label):
+    pixels = _filmed(turn=0.3) / SCALE * [1, -1] + [300, 400]
+    tracked = load_tracks(write(tmp_path / "a", pixels), {"RC2": label}, TRACK, EXACT)
+    np.testing.assert_allclose(tracked.turns[0, :, 0], SWING - np.median(SWING), atol=1e-4)
+
+
 def test_a_view_from_below_is_mirrored(tmp_path):
     below = PlayOptions(view="bottom", lowpass=None)
     tracked = _played(tmp_path / "a.csv", _filmed(turn=0.7, mirrored=True), below)
@@ -61,7 +81,7 @@ def test_a_view_from_below_is_mirrored(tmp_path):
 
 
 def test_the_direction_of_rest_may_be_given(tmp_path):
-    tracked = _played(tmp_path / "a.csv", _filmed(turn=0.5), PlayOptions(rest_deg=math.degrees(0.4), lowpass=None))
+    tracked = _played(tmp_path / "a.csv", _filmed(turn=0.5), PlayOptions(rest=0.4, lowpass=None))
     np.testing.assert_allclose(tracked.turns[0, :, 0], SWING + 0.1, atol=1e-5)
 
 
@@ -75,7 +95,7 @@ def test_three_axes_tell_the_elevation_too(tmp_path):
 
 def test_bases_move_as_they_did_when_rostral_is_known(tmp_path):
     # The animal faces the right of the image, so that what goes up there goes to its left.
-    tracked = _played(tmp_path / "a.csv", _filmed(sway=4e-4), PlayOptions(rostral_deg=0, lowpass=None))
+    tracked = _played(tmp_path / "a.csv", _filmed(sway=4e-4), PlayOptions(rostral=0.0, lowpass=None))
     moved = tracked.displacement(ARRAY["RC2"], TIMES)
     way = -4e-4 * np.sin(2 * np.pi * 6 * TIMES)
     np.testing.assert_allclose(moved[:, 0], way - np.median(way), atol=2e-8)

@@ -134,6 +134,61 @@ def quaternion_rate(q: vec4, w: vec3) -> vec4:
     )
 
 
+@wp.struct
+class TrackPiece:
+    """Cubic piece of a track at one time: its first knot, and the weights of value and slope at both of its ends."""
+
+    first: wp.int32
+    v0: real
+    s0: real
+    v1: real
+    s1: real
+    dv: real
+    """Derivative of the weight of the first value; that of the second is its negative."""
+    ds0: real
+    ds1: real
+
+
+@wp.func
+def piece_at(motions: MotionArrays, first: int, count: int, when: Instant) -> TrackPiece:
+    """Return the piece of a track of more than one knot."""
+    one = real(1.0)
+    two = real(2.0)
+    three = real(3.0)
+    cell = cell_at(when, count - 1)
+    start = motions.cell[first + cell]
+    pieces = motions.cell[first + cell + 1] - start
+    spacing = one / real(pieces)
+    place = (real(when.tick - cell) + when.part) * real(pieces)
+    # Outside the knots the first or the last piece goes on.
+    i = wp.clamp(int(wp.floor(place)), 0, pieces - 1)
+    u = place - real(i)
+    piece = TrackPiece()
+    piece.first = start + i
+    # Cubic Hermite basis; the slopes are per ms, hence the spacing.
+    piece.v0 = (one + two * u) * (one - u) * (one - u)
+    piece.s0 = u * (one - u) * (one - u) * spacing
+    piece.v1 = u * u * (three - two * u)
+    piece.s1 = u * u * (u - one) * spacing
+    piece.dv = real(6.0) * u * (u - one) / spacing
+    piece.ds0 = (one - u) * (one - three * u)
+    piece.ds1 = u * (three * u - two)
+    return piece
+
+
+@wp.func
+def raw_turn(motions: MotionArrays, piece: TrackPiece) -> vec4:
+    """Return the quaternion of a piece before it is normalised."""
+    a = piece.first
+    b = a + 1
+    return (
+        motions.quaternion[a] * piece.v0
+        + quaternion_rate(motions.quaternion[a], motions.spin[a]) * piece.s0
+        + motions.quaternion[b] * piece.v1
+        + quaternion_rate(motions.quaternion[b], motions.spin[b]) * piece.s1
+    )
+
+
 @wp.func
 def pose_at(motions: MotionArrays, index: int, when: Instant) -> BodyMotion:
     """Return the motion of a track at a time."""
@@ -147,43 +202,24 @@ def pose_at(motions: MotionArrays, index: int, when: Instant) -> BodyMotion:
         pose.quaternion = motions.quaternion[first]
         pose.spin = vec3(real(0.0), real(0.0), real(0.0))
         return pose
-    cell = cell_at(when, count - 1)
-    a = motions.cell[first + cell]
-    pieces = motions.cell[first + cell + 1] - a
-    spacing = real(1.0) / real(pieces)
-    place = (real(when.tick - cell) + when.part) * real(pieces)
-    # Outside the knots the first or the last piece goes on.
-    i = wp.clamp(int(wp.floor(place)), 0, pieces - 1)
-    u = place - real(i)
-    a = a + i
+    piece = piece_at(motions, first, count, when)
+    a = piece.first
     b = a + 1
-    one = real(1.0)
-    two = real(2.0)
-    three = real(3.0)
-    # Weights of value and slope at both ends, and their derivatives.
-    # Cubic Hermite basis; the slopes are per ms, hence the spacing.
-    v0 = (one + two * u) * (one - u) * (one - u)
-    s0 = u * (one - u) * (one - u) * spacing
-    v1 = u * u * (three - two * u)
-    s1 = u * u * (u - one) * spacing
-    dv = real(6.0) * u * (u - one) / spacing
-    ds0 = (one - u) * (one - three * u)
-    ds1 = u * (three * u - two)
     # From the first knot on: differences keep the digits that the places themselves would lose.
     way = (motions.coarse[b] - motions.coarse[a]) + (motions.place[b] - motions.place[a])
     pose.coarse = motions.coarse[a]
-    pose.place = motions.place[a] + way * v1 + motions.velocity[a] * s0 + motions.velocity[b] * s1
+    pose.place = motions.place[a] + way * piece.v1 + motions.velocity[a] * piece.s0 + motions.velocity[b] * piece.s1
     # The derivatives of both value weights differ in sign only.
-    pose.velocity = motions.velocity[a] * ds0 + motions.velocity[b] * ds1 - way * dv
-    quaternion = (
-        motions.quaternion[a] * v0
-        + quaternion_rate(motions.quaternion[a], motions.spin[a]) * s0
-        + motions.quaternion[b] * v1
-        + quaternion_rate(motions.quaternion[b], motions.spin[b]) * s1
-    )
+    pose.velocity = motions.velocity[a] * piece.ds0 + motions.velocity[b] * piece.ds1 - way * piece.dv
+    quaternion = raw_turn(motions, piece)
     # A cubic between quaternions is nearly one; normalised.
     pose.quaternion = quaternion / wp.length(quaternion)
-    pose.spin = motions.spin[a] * v0 + motions.surge[a] * s0 + motions.spin[b] * v1 + motions.surge[b] * s1
+    pose.spin = (
+        motions.spin[a] * piece.v0
+        + motions.surge[a] * piece.s0
+        + motions.spin[b] * piece.v1
+        + motions.surge[b] * piece.s1
+    )
     return pose
 
 

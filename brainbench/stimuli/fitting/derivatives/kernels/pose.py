@@ -3,60 +3,8 @@
 import warp as wp
 
 from ..algebra import vec3, vec4
-from ..motion import Instant, MotionArrays, cell_at, elapsed, quaternion_rate
+from ..motion import Instant, MotionArrays, elapsed, piece_at, quaternion_rate, raw_turn
 from ..parameters import real
-
-
-@wp.struct
-class TrackPiece:
-    """Cubic piece of a track at one time: its first knot, and the weights of ``motion.pose_at``."""
-
-    first: wp.int32
-    v0: real
-    s0: real
-    v1: real
-    s1: real
-    dv: real
-    ds0: real
-    ds1: real
-
-
-@wp.func
-def piece_at(motions: MotionArrays, first: int, count: int, when: Instant) -> TrackPiece:
-    """Return the piece of a track of more than one knot."""
-    one = real(1.0)
-    two = real(2.0)
-    three = real(3.0)
-    cell = cell_at(when, count - 1)
-    start = motions.cell[first + cell]
-    pieces = motions.cell[first + cell + 1] - start
-    spacing = one / real(pieces)
-    place = (real(when.tick - cell) + when.part) * real(pieces)
-    i = wp.clamp(int(wp.floor(place)), 0, pieces - 1)
-    u = place - real(i)
-    piece = TrackPiece()
-    piece.first = start + i
-    piece.v0 = (one + two * u) * (one - u) * (one - u)
-    piece.s0 = u * (one - u) * (one - u) * spacing
-    piece.v1 = u * u * (three - two * u)
-    piece.s1 = u * u * (u - one) * spacing
-    piece.dv = real(6.0) * u * (u - one) / spacing
-    piece.ds0 = (one - u) * (one - three * u)
-    piece.ds1 = u * (three * u - two)
-    return piece
-
-
-@wp.func
-def raw_turn(motions: MotionArrays, piece: TrackPiece) -> vec4:
-    """Return the quaternion of a piece before it is normalised."""
-    a = piece.first
-    b = a + 1
-    return (
-        motions.quaternion[a] * piece.v0
-        + quaternion_rate(motions.quaternion[a], motions.spin[a]) * piece.s0
-        + motions.quaternion[b] * piece.v1
-        + quaternion_rate(motions.quaternion[b], motions.spin[b]) * piece.s1
-    )
 
 
 @wp.struct
