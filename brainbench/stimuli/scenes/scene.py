@@ -173,8 +173,9 @@ class Scene:
     def _shift(self, mount: MountedWhisker) -> Callable[[NDArray[np.float64]], NDArray[np.float64]] | None:
         """Return how a base moves in its array; None where it stays."""
         whisking = self.whisking
-        moves = isinstance(whisking, Tracked) and whisking.shifts is not None
-        return partial(whisking.displacement, mount) if moves else None
+        if not isinstance(whisking, Tracked) or whisking.shifts is None:
+            return None
+        return partial(whisking.displacement, mount)
 
     def orientations(self) -> NDArray[np.float64]:
         """Return rotations [time, whisker, 3, 3] from each whisker's base frame to the world at the frame times."""
