@@ -23,7 +23,7 @@ BUDGETS = {
     "brainbench/stimuli": 26_200,
     "robotics_bridge": 23_200,
     "brainbench/models": 8_500,
-    "brainbench/datasets": 7_150,
+    "brainbench/datasets": 7_300,
     "brainbench/metrics": 5_100,
     "brainbench/cli": 4_850,  # check-submission
     "brainbench/core": 5_300,  # the sealed door for files of others, seals of the cache, the filter of foreign text

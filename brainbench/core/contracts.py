@@ -118,7 +118,8 @@ def check_counts(dataset: xr.Dataset, name: str) -> xr.Dataset:
         raise DataError(f"{name} has counts, durations or times that are no numbers.")
     counts, duration, *time = arrays
     # NaN in the counts means that a unit was not recorded; fmin and fmax pass over it without a copy.
-    if counts.size and not (np.fmin.reduce(counts, None) >= 0 and np.fmax.reduce(counts, None) < np.inf):
+    least = 0 if dataset.attrs.get("measure", "spikes") == "spikes" else -np.inf
+    if counts.size and not (np.fmin.reduce(counts, None) >= least and np.fmax.reduce(counts, None) < np.inf):
         raise DataError(f"{name} has counts below 0 or without end, or none at all; a count is 0 or more, or NaN.")
     if not all(np.isfinite(values).all() for values in (duration, *time)) or (duration < 0).any():
         raise DataError(f"{name} has times that are not finite or durations below 0.")

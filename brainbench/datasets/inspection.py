@@ -27,6 +27,7 @@ from brainbench.datasets.sessions import SPIKES, Session, SessionTable
 from brainbench.datasets.trials.conditions import natural_vocabulary
 from brainbench.datasets.trials.counting import has_units, no_units, read_spikes, recorded_span, time_fault
 from brainbench.datasets.trials.selection import Tally
+from brainbench.datasets.trials.signals import response_series
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -235,7 +236,10 @@ def _merged(proposals: list[Proposal]) -> tuple[Proposal, ...]:
 def _summary(session: Session, usable: bool, ledger: Ledger) -> SessionSummary:
     units = _units(session)
     tables = tuple(_table(table) for table in session.tables.values())
-    missing = [no_units(session)] if units is None else []
+    signal = response_series(session) if units is None else None
+    missing = [no_units(session)] if units is None and signal is None else []
+    if signal is not None:
+        missing.append(f"no spikes: the responses of trials are means of {signal.name}, {signal.data.shape} samples")
     missing += [units.problem] if units is not None and units.problem else []
     missing += [f"table {table.name}: {table.problem}" for table in tables if table.problem]
     for table in tables:

@@ -12,6 +12,7 @@ import os
 import re
 import uuid
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -58,7 +59,7 @@ def read_nwb(file: h5py.File, path: Path) -> Session:
     session = _string(file, "general/session_id") or _entity(path, "ses")
     description = _string(file, "session_description")
     keywords = file.get("general/keywords")
-    tables, units = _tables(file, path)
+    tables, units, signals = _tables(file, path)
     # Licks are processed data with their own times.
     processed = (item for _, module in _groups(file.get("processing")) for item in _series(module))
     licks = [item for item in processed if item[0].rpartition("/")[2] == LICKS]
@@ -80,7 +81,7 @@ def read_nwb(file: h5py.File, path: Path) -> Session:
         series=dict([*_series(file.get("acquisition")), *licks]),
         stimuli=stimuli.removeprefix(STIMULI) if stimuli.startswith(STIMULI) else "",
         guessed=bool(notes) and subject == path.stem,
-        populations=units,
+        populations={**units, **signals},
     )
 
 
@@ -88,13 +89,14 @@ _ROOTS = ("units", "intervals", "processing", "events", "stimulus", "analysis", 
 """Where tables may stand; the rest of a file holds devices, electrodes and notes."""
 
 
-def _tables(file: h5py.File, path: Path) -> tuple[dict[str, SessionTable], dict[str, SessionTable]]:
-    """Return the tables of intervals and of units, wherever they stand, by what they are.
+def _tables(file: h5py.File, path: Path) -> tuple[dict[str, SessionTable], dict[str, SessionTable], dict[str, Series]]:
+    """Return the tables of intervals and of units, and the signals of cells, wherever they stand, by what they are.
 
     A table is called by its own name, or with the group around it where that is taken. ``/units`` goes before others.
     """
     intervals: dict[str, SessionTable] = {}
     units: dict[str, SessionTable] = {}
+    signals: dict[str, Series] = {}
     for place, group in _walk(file, path):
         if isinstance(group, SessionTable):  # a dead link
             name = group.name
@@ -108,6 +110,9 @@ def _tables(file: h5py.File, path: Path) -> tuple[dict[str, SessionTable], dict[
             if "units" not in units:
                 units[place] = _table(group, "units", path)
             continue
+        if kind == _SIGNAL:
+            signals |= {place: replace(_one_series(group), name=place)}
+            continue
         if name in intervals:
             name = place.partition("/")[2] if place.count("/") > 1 else place
         if kind == "TimeIntervals" or "start_time" in group or place.count("/") == place.startswith("intervals/") == 1:
@@ -117,7 +122,11 @@ def _tables(file: h5py.File, path: Path) -> tuple[dict[str, SessionTable], dict[
             begin = table.times("timestamp")
             stop = {"stop_time": begin + table.times("duration")} if "duration" in table else {}
             intervals[name] = table.with_columns(start_time=begin, **stop)
-    return intervals, units
+    return intervals, units, signals
+
+
+_SIGNAL = "RoiResponseSeries"
+"""Type of the responses of imaged cells."""
 
 
 def _walk(parent: h5py.Group, path: Path, place: str = "") -> Iterator[tuple[str, Any]]:
@@ -129,7 +138,13 @@ def _walk(parent: h5py.Group, path: Path, place: str = "") -> Iterator[tuple[str
         if (reason := dead_link(parent, name, path)) is not None:
             yield here, SessionTable(name, {}, str(path), reason)
         elif isinstance(group := parent[name], h5py.Group):
-            if "colnames" in group.attrs or "id" in group or place == "intervals" or here == "units":
+            if (
+                neurodata_type(group) == _SIGNAL
+                or "colnames" in group.attrs
+                or "id" in group
+                or place == "intervals"
+                or here == "units"
+            ):
                 yield here, group
             elif here.count("/") < _DEEPEST:
                 yield from _walk(group, path, here)
@@ -159,15 +174,20 @@ def _series(parent: Any) -> Iterator[tuple[str, Series]]:
     import h5py
 
     for _, group in _groups(parent):
-        data, stamps = group.get("data"), group.get("timestamps")
-        if not isinstance(data, h5py.Dataset):
+        if not isinstance(group.get("data"), h5py.Dataset):
             yield from _series(group)
             continue
-        path = (group.name or "").strip("/")
-        start, rate, begin = 0.0, math.nan, group.get("starting_time")
-        if isinstance(begin, h5py.Dataset) and begin.shape == ():
-            start, rate = float(begin[()]), float(begin.attrs.get("rate", math.nan))
-        yield path, Series(path, neurodata_type(group), data, stamps, start, rate)
+        series = _one_series(group)
+        yield series.name, series
+
+
+def _one_series(group: h5py.Group) -> Series:
+    import h5py
+
+    path, start, rate, begin = (group.name or "").strip("/"), 0.0, math.nan, group.get("starting_time")
+    if isinstance(begin, h5py.Dataset) and begin.shape == ():
+        start, rate = float(begin[()]), float(begin.attrs.get("rate", math.nan))
+    return Series(path, neurodata_type(group), group["data"], group.get("timestamps"), start, rate)
 
 
 def _groups(parent: Any) -> list[tuple[str, h5py.Group]]:

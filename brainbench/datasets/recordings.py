@@ -33,6 +33,7 @@ from brainbench.datasets.trials.copies import Copies, joined_probes
 from brainbench.datasets.trials.counting import ReadingOptions, SessionCounts, count_session, has_units, no_units
 from brainbench.datasets.trials.selection import DEFAULT, Selection
 from brainbench.datasets.trials.session_trials import join_sessions
+from brainbench.datasets.trials.signals import response_series
 from brainbench.datasets.trials.windows import WHOLE, Window
 
 if TYPE_CHECKING:
@@ -159,7 +160,7 @@ class _Reader:
 
     def _count(self, session: Session, session_layout: RecordingLayout | None) -> tuple[str, bool]:
         """Count a session; else return why not, and whether nobody asked for that."""
-        if not has_units(session):
+        if not has_units(session) and response_series(session) is None:
             return no_units(session), True
         table = None if self.conditions is None else self.conditions.table
         if self.lenient and table is not None and table not in session.tables:

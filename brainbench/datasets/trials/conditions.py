@@ -50,7 +50,7 @@ class Conditions:
         for name in self.columns:
             values = np.unique(table.column(name))
             for value, label in zip(values.tolist(), as_labels(values).tolist(), strict=True):
-                written = ascii(value.strip()) if isinstance(value, str) else repr(value)
+                written = ascii(value) if isinstance(value, str) else repr(value)
                 if isinstance(value, (int, float)) and abs(value) < 2**53:
                     written = repr(float(value))
                 forms.setdefault((name, label), set()).add(written)

@@ -14,9 +14,10 @@ from brainbench.core.contracts import as_labels, as_number, natural_key
 from brainbench.core.errors import DataError, UsageError, listing
 from brainbench.core.reading.ranges import check_number
 from brainbench.datasets.ledger import Ledger
-from brainbench.datasets.sessions import OBSERVED, SPIKES, Session, SessionTable
+from brainbench.datasets.sessions import OBSERVED, SPIKES, Series, Session, SessionTable
 from brainbench.datasets.trials.conditions import Conditions, joined_labels
 from brainbench.datasets.trials.selection import Selection, Tally
+from brainbench.datasets.trials.signals import frame_times, response_series, window_means
 from brainbench.datasets.trials.windows import CONTACTS, Window
 
 COVARIATES = ("contacts", "licks", "choice")
@@ -122,6 +123,8 @@ class SessionCounts:
     """Column and label → how the file writes the value."""
     ledger: Ledger = field(default_factory=Ledger)
     """Balance of the tables and spikes of the file."""
+    measure: str = "spikes"
+    """What the responses are: spikes, or name and NWB type of a signal."""
     found_labels: frozenset[str] = frozenset()
     """Labels of all rows of the table, before any rule."""
 
@@ -132,7 +135,8 @@ def count_session(
     look: Callable[[Session, Sequence[NDArray[np.float64]]], str] | None = None,
 ) -> SessionCounts:
     """Count the trials of one session; ``look`` sees it with the spikes of all units, and may return a doubt."""
-    if session.units is None or not has_units(session):
+    series = None if has_units(session) else response_series(session)
+    if series is None and not has_units(session):
         raise DataError(no_units(session))
     tally = Tally()
     table = session.table(options.conditions.table)
@@ -154,6 +158,9 @@ def count_session(
         overlap = ((edges[:, :1] < end) & (edges[:, 1:] > begin)).any(axis=1)
         keep = tally.apply(keep, ~overlap, "trials: overlap with invalid_times")
 
+    if series is not None:
+        return _count_signal(session, series, options, table, values, labels, keep, edges, tally)
+    assert session.units is not None
     spikes = read_spikes(session.units, tally.doubts)
     if fault := time_fault(spikes, table):
         raise DataError(f"{session.source}: {fault}.")
@@ -200,6 +207,69 @@ def count_session(
         forms=options.conditions.forms(table),
         ledger=ledger,
         found_labels=frozenset(labels.tolist()) - {""},
+    )
+
+
+def _count_signal(
+    session: Session,
+    series: Series,
+    options: ReadingOptions,
+    table: SessionTable,
+    values: NDArray[np.str_],
+    labels: NDArray[np.str_],
+    keep: NDArray[np.bool_],
+    edges: NDArray[np.float64],
+    tally: Tally,
+) -> SessionCounts:
+    """Average a sampled signal over the windows of the trials that rules keep [rows]; negative values are values.
+
+    Responses stand in the counts as mean × s, so that whoever divides by the duration gets the mean.
+    """
+    times = frame_times(series)
+    step = float(np.median(np.diff(times))) if len(times) > 1 else math.nan
+    number = 1 if series.data.ndim == 1 else series.data.shape[1]
+    cells = SessionTable("cells", {"id": np.arange(number)}, session.source)
+    inside = (edges[:, 0] >= times[0] - step) & (edges[:, 1] <= times[-1] + step)
+    keep = tally.apply(keep, inside, "trials: outside the recorded span")
+    start, ids = table.times("start_time"), as_labels(table.ids())
+    rows = _sorted(keep, lambda row: (start[row], natural_key(ids[row])))
+    _, duration = count([], edges[rows], np.zeros((len(rows), 0), dtype=bool), options.bin, options.window.length)
+    shortest = float(duration[duration > 0].min(initial=math.inf))
+    if shortest < step:
+        raise DataError(
+            f"{series.name} of {session.source} has a frame every {step:.3g} s, and windows or bins are as short as "
+            f"{shortest:.3g} s; take longer ones."
+        )
+    bounds = edges[rows][:, :1] + np.concatenate([np.zeros((len(rows), 1)), np.cumsum(duration, axis=1)], axis=1)
+    means = window_means(series, times, bounds)
+    unit_kept = tally.select(cells, options.selection.units, "units")
+    unit_kept = tally.apply(unit_kept, np.isfinite(means).any(axis=(0, 1)), "units: no finite frame in any window")
+    units = np.flatnonzero(unit_kept)
+    ledger = Ledger()
+    _enter_tables(ledger, session, options.conditions.table)
+    return SessionCounts(
+        subject=session.subject,
+        session=session.session,
+        source=session.source,
+        values=tuple(tuple(values[row].tolist()) for row in rows),
+        labels=tuple(labels[rows].tolist()),
+        trial_ids=tuple(ids[rows].tolist()),
+        unit_ids=tuple(map(str, units.tolist())),
+        edges=edges[rows],
+        counts=(means[:, :, units] * duration[:, :, None]).astype(np.float32),
+        duration=duration,
+        columns={name: missing_column(kind, len(units)) for name, kind in UNIT_COLUMNS.items()},
+        covariates=trial_covariates(session, table, rows, edges[rows]),
+        tally=tally,
+        trials=len(table),
+        units=len(cells),
+        synthetic=session.synthetic,
+        stimuli=session.stimuli,
+        guessed=session.guessed,
+        forms=options.conditions.forms(table),
+        ledger=ledger,
+        found_labels=frozenset(labels.tolist()) - {""},
+        measure=f"{series.name} ({series.kind})",
     )
 
 
@@ -252,6 +322,12 @@ def no_units(session: Session) -> str:
         return (
             f"{session.source} has no units table: it holds {total} intracellular series ({series}), which are "
             f"voltages or currents of single cells, while brainbench needs spike times of units per trial."
+        )
+    tables = [place for place, item in session.populations.items() if isinstance(item, SessionTable)]
+    if len(tables) > 1:
+        return (
+            f"{session.source} has {len(tables)} tables of units ({listing(tables)}) and none at /units, where the one "
+            "to read stands; copy one of them there."
         )
     holds = f"interval tables {', '.join(session.tables)}" if session.tables else "no interval tables either"
     return f"{session.source} has no units table with spike_times (it holds {holds}); there is nothing to score."

@@ -211,6 +211,9 @@ def join_sessions(
     parts = sorted(parts, key=lambda part: (natural_key(part.subject), natural_key(part.session)))
     doubts = [*doubts, *check_values(part.tally for part in parts), *_doubtful_names(parts)]
     doubts += [doubt for part in parts for doubt in part.tally.doubts]
+    measure = listing(sorted({part.measure for part in parts}), quoted=False)
+    if measure != "spikes":
+        doubts.append(f"responses are means over the window of {measure}, not spike counts")
     removed: Counter[str] = Counter()
     for part in parts:
         removed.update(part.tally.removed)
@@ -277,6 +280,7 @@ def join_sessions(
     dataset.attrs = {
         "vocabulary": list(vocabulary),
         "conditions": str(options.conditions),
+        "measure": measure,
         "layout": layout,
         "window": str(options.window),
         "bin": options.bin,

@@ -1,0 +1,219 @@
+"""The same recordings in the forms in which laboratories write files: what comes out of each, in one table."""
+
+from __future__ import annotations
+
+import re
+import unicodedata
+
+import h5py
+import numpy as np
+import pytest
+
+from brainbench.core.errors import BrainbenchError
+from brainbench.datasets import open_recordings, write_recordings
+from brainbench.datasets.ledger import balance_line
+from brainbench.datasets.nwb import write_nwb
+from brainbench.datasets.sessions import make_session
+
+NAMES = np.array(["ball", "comb", "disk"])
+TRIALS = "intervals/trials"
+
+
+def animal(number, labels=NAMES, change=None):
+    """Twelve trials of half a second, four units of about 6 Hz."""
+    random = np.random.default_rng(number)
+    start = 2 + np.cumsum(random.uniform(1.2, 1.6, 12))
+    spikes = [np.sort(np.append(random.uniform(1, start[-1] + 2, 120), [0.5, start[-1] + 3])) for _ in range(4)]
+    table = {"start_time": start, "stop_time": start + 0.5, "stimulus": np.asarray(labels)[np.arange(12) % 3]}
+    return make_session(f"m{number}", "1", [change(times) for times in spikes] if change else spikes, {"trials": table})
+
+
+def put(file, place, values, kind=None, **attributes):
+    kind = kind or (file[place].attrs["neurodata_type"] if place in file else "VectorData")
+    if place in file:
+        del file[place]
+    values = np.asarray(values)
+    text = values.dtype.kind == "U"
+    made = file.create_dataset(
+        place, data=values.astype(object) if text else values, dtype=h5py.string_dtype() if text else None
+    )
+    made.attrs.update({"neurodata_type": kind, **attributes})
+
+
+def shaped(place, turn):
+    return lambda file: put(file, place, turn(file[place][...]))
+
+
+def linked(place):
+    def edit(file):
+        if "obs_intervals" in place:
+            spans(file)
+        if place in file:
+            del file[place]
+        file[place] = h5py.ExternalLink("elsewhere.h5", f"/{place}")
+
+    return edit
+
+
+def moved(place, target):
+    return lambda file: file.move(place, target)
+
+
+def spans(file, turn=lambda values: values, index=True):
+    put(file, "units/obs_intervals", turn(np.tile([[0.0, 1e3]], (4, 1))))
+    if index:
+        put(file, "units/obs_intervals_index", np.arange(1, 5), "VectorIndex")
+
+
+def as_events(file):
+    begin, stop, labels = (file[f"{TRIALS}/{name}"][...] for name in ("start_time", "stop_time", "stimulus"))
+    del file[TRIALS]
+    group = file.create_group("events/trials")
+    group.attrs.update({"neurodata_type": "EventsTable", "colnames": ["timestamp", "duration", "stimulus"]})
+    put(file, "events/trials/timestamp", begin)
+    put(file, "events/trials/duration", stop - begin)
+    file["events/trials/stimulus"] = labels
+
+
+def second_units(file):
+    file.copy("units", "processing/one/units")
+    file.move("units", "processing/two/units")
+
+
+def packed(code):
+    def edit(file):
+        values = file["units/spike_times"][...]
+        del file["units/spike_times"]
+        create = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+        create.set_chunk((len(values),))
+        create.set_filter(code, h5py.h5z.FLAG_OPTIONAL, (2, 2, 8, 8 * len(values)))
+        space = h5py.h5s.create_simple(values.shape)
+        made = h5py.h5d.create(file["units"].id, b"spike_times", h5py.h5t.IEEE_F64LE, space, create)
+        made.write_direct_chunk((0,), values.tobytes(), 0)
+
+    return edit
+
+
+SHAPES = {"n1": lambda values: values[:, None], "1n": lambda values: values[None]}
+SHAPED = [f"{TRIALS}/{name}" for name in ("start_time", "stop_time", "stimulus", "id")]
+SHAPED += [f"units/{name}" for name in ("spike_times", "spike_times_index", "id")]
+PLACES = ("processing/behavior", "stimulus/presentation", "analysis", "scratch", "acquisition", "processing/a/b")
+NEEDED = [f"{TRIALS}/stimulus", f"{TRIALS}/start_time", f"{TRIALS}/id", TRIALS, "units", "intervals/invalid_times"]
+NEEDED += ["units/spike_times", "units/spike_times_index", "units/obs_intervals", "units/obs_intervals_index"]
+UNNEEDED = ("units/electrodes", "acquisition/raw", "general/extracellular_ephys", "units/waveform_mean")
+
+
+def number_beside(file):
+    put(file, f"{TRIALS}/stimulus_index", np.arange(12) % 3)
+    put(file, "units/quality", np.ones(4))
+    put(file, "units/quality_index", np.arange(4))
+
+
+def index_of_any_name(file):
+    put(file, f"{TRIALS}/tags", np.arange(24))
+    put(file, f"{TRIALS}/ends", 2 * np.arange(1, 13), "VectorIndex", target=file[f"{TRIALS}/tags"].ref)
+
+
+def fixed_text(file):
+    del file[f"{TRIALS}/stimulus"]
+    file[f"{TRIALS}/stimulus"] = NAMES[np.arange(12) % 3].astype("S")
+
+
+def template(file):
+    file["identifier"][()] = "template"
+
+
+FILE = {
+    "plain": (lambda file: None, "same"),
+    **{f"{place} {form}": (shaped(place, turn), "same") for place in SHAPED for form, turn in SHAPES.items()},
+    "spans": (spans, "same"),
+    "spans 2n": (lambda file: spans(file, np.transpose), "same"),
+    "spans without index": (lambda file: spans(file, index=False), r"obs_intervals without obs_intervals_index"),
+    "number beside": (number_beside, "same"),
+    "index of any name": (index_of_any_name, "same"),
+    "big-endian": (shaped(f"{TRIALS}/start_time", lambda values: values.astype(">f8")), "same"),
+    "fixed text": (fixed_text, "same"),
+    "short index": (shaped("units/spike_times_index", lambda values: values.astype(np.uint16)), "same"),
+    "units in ecephys": (moved("units", "processing/ecephys/units"), "same"),
+    "units by type": (moved("units", "processing/ecephys/sorted"), "same"),
+    "two tables of units": (second_units, r"2 tables of units.*processing/one/units"),
+    **{f"trials in {place}": (moved(TRIALS, f"{place}/trials"), "same") for place in PLACES},
+    "events": (as_events, "same"),
+    **{f"dead {place}": (linked(place), r"elsewhere\.h5") for place in NEEDED},
+    **{f"dead {place}, not needed": (linked(place), "same") for place in UNNEEDED},
+    **{f"filter {code}": (packed(code), rf"filter {code}.*hdf5plugin") for code in (32001, 32004, 32013, 32015)},
+    "template identifier": (template, "same"),
+}
+LABELS = {
+    "float32": (np.array([0.1, 0.2, 0.3], np.float32), "count as one"),
+    "products": (np.arange(1, 4) * 0.1, "count as one"),
+    "texts": (np.array(["0.1", "0.20", "0.3"]), "count as one"),
+    "nearly": (np.array([0.1, 0.2, 0.3000001]), "count as different stimuli"),
+    "NFD": (np.array([unicodedata.normalize("NFD", "\u00e9"), "b", "c"]), "count as one"),
+    "blanks": (np.array(["\u00e9 ", "b", "c"]), "count as one"),
+    "case": (np.array(["\u00e9", "B", "c"]), "count as different stimuli"),
+    **{word: (np.array(["a", "b", word]), "no value of stimulus") for word in ("nan", "NaN", "NaT", "")},
+    **{word: (np.array(["a", "b", word]), "may mean a missing value") for word in ("None", "NA", "n/a", "<NA>")},
+}
+TIMES = {
+    "milliseconds": (lambda times: 1000 * times, "look like milliseconds"),
+    "milliseconds early": (lambda times: np.sort(1000 * np.append(1e-6, times)), "look like milliseconds"),
+    "microseconds": (lambda times: 1e6 * times, "look like microseconds"),
+    "samples": (lambda times: np.round(30000 * times), "look like samples"),
+    "restart": (lambda times: np.concatenate([times[:60], times[:60]]), "start anew"),
+    "of trials": (lambda times: np.concatenate([np.linspace(0, 0.4, 12)] * 10), "start anew"),
+    "of trials, sorted": (lambda times: np.sort(times % 0.5), "count from the start of each trial"),
+    "unsorted": (np.random.default_rng(0).permutation, "have been sorted"),
+}
+
+
+def outcome(folder):
+    """Return the data set, and everything that was said of it; or the words of the refusal."""
+    try:
+        opened = open_recordings(folder, conditions="trials:stimulus")
+    except BrainbenchError as error:
+        return None, str(error)
+    return opened, "; ".join([*opened.attrs["doubts"], balance_line(opened.attrs["ledger"])])
+
+
+def test_there_are_at_least_sixty_variants():
+    assert len(FILE) + len(LABELS) + len(TIMES) >= 60
+
+
+@pytest.mark.parametrize("name", FILE)
+def test_a_file_in_another_form_gives_the_same_or_names_the_part(tmp_path, name):
+    edit, expected = FILE[name]
+    for folder in ("plain", "variant"):
+        for number in (1, 2):
+            path = write_nwb(tmp_path / folder / f"m{number}.nwb", animal(number))
+            if folder == "variant" and (number == 2 or expected == "same"):
+                with h5py.File(path, "a") as file:
+                    edit(file)
+    plain, _ = outcome(tmp_path / "plain")
+    variant, words = outcome(tmp_path / "variant")
+    if expected == "same":
+        assert variant is not None, words
+        np.testing.assert_array_equal(variant["counts"], plain["counts"])
+        assert variant["stimulus"].values.tolist() == plain["stimulus"].values.tolist()
+    else:
+        assert re.search(expected, words), words
+    assert "balance does not close" not in words
+
+
+@pytest.mark.parametrize("name", LABELS)
+def test_labels_in_another_form_are_merged_or_said(tmp_path, name):
+    values, expected = LABELS[name]
+    clean = ["\u00e9", "b", "c"] if expected.startswith("count") else ["a", "b", "c"]
+    clean = [0.1, 0.2, 0.3] if name in ("float32", "products", "texts", "nearly") else clean
+    for number, labels in ((1, clean), (2, values)):
+        write_nwb(tmp_path / f"m{number}.nwb", animal(number, labels))
+    opened, words = outcome(tmp_path)
+    assert expected in words
+    assert len(opened.attrs["vocabulary"]) == 3 + ("different" in expected or "mean" in expected)
+
+
+@pytest.mark.parametrize("name", TIMES)
+def test_times_that_are_no_seconds_of_the_session_are_told(tmp_path, name):
+    change, expected = TIMES[name]
+    write_recordings(tmp_path / "a.h5", animal(1, change=change))
+    assert expected in outcome(tmp_path / "a.h5")[1]
