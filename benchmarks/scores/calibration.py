@@ -2,7 +2,7 @@
 
     python -m benchmarks.scores.calibration [NAME ...] [--simulations N] [--workers N] [--seed N] [--write]
 
-Names: nulls, coverage, pairs, over-time, dimensions, corrections, crossnobis, recovery, ceiling, faults; all by
+Names: nulls, coverage, noise, pairs, over-time, dimensions, corrections, crossnobis, recovery, ceiling, faults; all by
 default. ``--write`` puts the tables into RESULTS.md and docs/calibration.md, and the figures into docs/images.
 """
 
@@ -14,6 +14,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,7 @@ from scipy import stats
 
 from benchmarks.report import publish, script_parser, table
 from benchmarks.scores import simulated_boards
-from benchmarks.scores.simulated_boards import BIN, BOARDS, RULES, Study
+from benchmarks.scores.simulated_boards import BIN, BOARDS, RULES, NoisyStudy, Study
 from brainbench.core.contracts import Trials
 from brainbench.core.figures.style import COLORS, INK, PALE, panels, save_figure
 from brainbench.core.files import write_text
@@ -140,6 +141,33 @@ def coverage(run: Run) -> Result:
 
     columns = ["stimuli", "animals", "share", "true value", "mean value", "mean scaled", "coverage", "width"]
     return Result("Coverage of 95 % intervals, animals and stimuli drawn anew", columns, rows, picture=draw)
+
+
+def noise(run: Run) -> Result:
+    """Coverage over trials, reliability and stimuli, and how often such a study is ``ok``."""
+    rows, designs = [], list(product((10, 30, 100), (4, 7, 20), (0.3, 0.5, 0.7, 0.95)))
+    # Studies of many stimuli take ten times as long, and their intervals are narrow.
+    counts = [run.simulations // (3 if design[0] == 100 else 1) for design in designs]
+    jobs = [
+        NoisyStudy(seed, *each) for each, count in zip(designs, counts, strict=True) for seed in run.seeds()[:count]
+    ]
+    studies = np.split(np.array(run.each(simulated_boards.noisy_study, jobs)), np.cumsum(counts)[:-1])
+    for design, found in zip(designs, studies, strict=True):
+        ok, value, low, high, truth, estimate = np.moveaxis(found, -1, 0)
+        row = [*map("{:g}".format, design), f"{np.nanmean(estimate):.2f}", f"{ok[:, 0].mean():.2f}"]
+        for column in range(found.shape[1]):
+            usable, true = ok[:, column] > 0, truth[:, column].mean()
+            held = ((low <= true) & (true <= high))[usable, column]
+            bias = value[usable, column].mean() / true - 1 if usable.any() else math.nan
+            row.append(f"{held.mean():.2f} ({100 * bias:+.0f} %)" if len(held) >= _FEWEST_OK else "–")
+        rows.append(row)
+    columns = ["stimuli", "trials", "reliability", "estimated", "ok"]
+    columns += [f"coverage (bias), true score {share:g}" for share in simulated_boards.SHARES_OF_NOISY]
+    return Result("Coverage of 95 % intervals of studies that are ok, eight animals", columns, rows)
+
+
+_FEWEST_OK = 15
+"""Studies that are ``ok`` below which a coverage says nothing."""
 
 
 def pairs(run: Run) -> Result:
@@ -435,6 +463,7 @@ def faults(run: Run) -> Result:
 JOBS: dict[str, Callable[[Run], Result]] = {
     "nulls": nulls,
     "coverage": coverage,
+    "noise": noise,
     "pairs": pairs,
     "over-time": over_time,
     "dimensions": dimensions,

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
+from brainbench.core.contracts import Trials
 from brainbench.core.records import Score
 from brainbench.core.statistics import two_factor_error
 from brainbench.datasets.synthetic import PopulationDesign, ResponseGeometry
@@ -84,6 +85,59 @@ def score_study(study: Study) -> tuple[list[Score], np.ndarray]:
         own = rdm(layers["0"], method="sqeuclidean")
         truths.append(compare_all(own[None], np.stack(noiseless), method="whitened-cosine").mean())
     return scores, np.array(truths)
+
+
+@dataclass(frozen=True)
+class NoisyStudy:
+    """Animals whose RDMs have one reliability: eight of 60 linear units, with Gaussian noise of trials."""
+
+    seed: int
+    stimuli: int
+    trials: int
+    reliability: float
+
+    def noise(self, patterns: np.ndarray) -> float:
+        """Return the variance of a trial at which the RDM of patterns [K, U] has the reliability."""
+        centred = patterns - patterns.mean(axis=0)
+        (count, units), n = centred.shape, self.trials
+        # Variance of unbiased products: σ²/n (|x|² + |y|²) + U σ⁴/n², on the diagonal 4σ²/n |x|² + 2U σ⁴/(n(n − 1)).
+        square = float((centred**2).sum())
+        linear = (2 * (count - 1) + 4) * square / n
+        quadratic = count * (count - 1) * units / n**2 + 2 * count * units / (n * (n - 1))
+        wanted = float(((centred @ centred.T) ** 2).sum()) * (1 / self.reliability - 1)
+        return (math.sqrt(linear**2 + 4 * quadratic * wanted) - linear) / (2 * quadratic)
+
+
+class FewSplits(RSA):
+    """RSA with few splits and orders, whose p and chance are coarse."""
+
+    orders = 19
+
+
+SHARES_OF_NOISY = (0.0, 0.5, 1.0)
+
+
+def noisy_study(study: NoisyStudy) -> list[tuple[float, float, float, float, float, float]]:
+    """Return ok, value, low, high, the noiseless comparison and the reliability, for models of three shares."""
+    rng = np.random.default_rng([study.seed, study.stimuli, study.trials, round(100 * study.reliability)])
+    shared, metric = rng.normal(size=(study.stimuli, DIMENSIONS)), FewSplits(splits=20)
+    names, labels = [f"s{index}" for index in range(study.stimuli)], np.repeat(np.arange(study.stimuli), study.trials)
+    animals, noiseless = [], []
+    for index in range(8):
+        patterns = shared @ rng.normal(size=(DIMENSIONS, 60))
+        trials = patterns[labels] + math.sqrt(study.noise(patterns)) * rng.normal(size=(len(labels), 60))
+        keys = [f"{study.seed}/{index}/{trial}" for trial in range(len(labels))]
+        animals.append(metric.animal(f"m{index}", [Trials(trials, labels, keys)], study.stimuli))
+        noiseless.append(rdm(patterns, method="sqeuclidean"))
+    found = []
+    for share in SHARES_OF_NOISY:
+        layer = {"0": mixed(shared, share, rng)}
+        score = metric.score(layer, animals, name="", stimuli=names)
+        own = rdm(layer["0"], method="sqeuclidean")
+        truth = compare_all(own[None], np.stack(noiseless), method="whitened-cosine").mean()
+        span = (score.interval.low, score.interval.high) if score.interval else (math.nan, math.nan)
+        found.append((float(score.status == "ok"), score.value, *span, float(truth), score.reliability))
+    return found
 
 
 def null_p(study: Study) -> float:

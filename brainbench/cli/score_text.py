@@ -98,7 +98,7 @@ def _rows(score: Score) -> Iterator[list[str]]:
         yield ["raw r", spanned(score.r), ceiling_text]
     if math.isfinite(score.reliability):
         reliability = spanned(score.reliability, score.reliability_interval, most=1.0)
-        yield ["reliability", reliability, "of the animals' RDMs: split halves, Spearman-Brown, mean"]
+        yield ["reliability", reliability, "of the animals' RDMs, from halves of their trials, mean"]
     if math.isfinite(score.p):
         yield ["permutation p", _p(score.p), f"{score.p_method}; smallest possible {_p(score.p_smallest)}"]
     if score.layer is not None:

@@ -28,7 +28,7 @@ it; ``undefined``: no number exists. The reason stands in words beside it."""
 RECORD_SCHEMA: Literal[2] = 2
 """Version of the result-record JSON layout."""
 
-ESTIMATOR_VERSION = 2
+ESTIMATOR_VERSION = 3
 """Raised whenever the same recordings and activations would get another number from the default estimator."""
 
 _ROUNDING = 1e-6
@@ -109,7 +109,7 @@ class SubjectScore(_NullIsNaN):
     r: Number
     """Raw comparison of the model's RDM with this animal's."""
     reliability: Number
-    """Spearman-Brown-corrected split-half reliability of this animal's RDM."""
+    """Share of this animal's squared RDM that is no noise, from halves of its trials."""
     status: Status = "ok"
     units: Count = 0
     """Neurons that entered."""
@@ -186,7 +186,7 @@ class Score(_NullIsNaN, _Document):
     r: Number = math.nan
     """Mean raw comparison over animals."""
     reliability: Number = math.nan
-    """Mean Spearman-Brown-corrected split-half reliability over animals."""
+    """Mean reliability over animals."""
     reliability_interval: Interval | None = None
     """Interval of ``reliability``, over animals."""
     interval: Interval | None = None

@@ -131,6 +131,55 @@ def newcombe_interval(
     return Interval(share - other_share - low, share - other_share + high, LEVEL, f"Newcombe over {over}")
 
 
+CONFOUNDED = 0.1
+"""Share of the variance of trial times, beyond that of shuffled labels, from which label and time are confounded."""
+_CONFOUNDED_P = 1e-4
+"""Recordings have up to some hundred sessions, of which none may be suspected by chance."""
+
+
+@dataclass(frozen=True)
+class PresentationOrder:
+    """How much of the variance of the times (ranks) of a session's trials their label explains."""
+
+    share: float
+    expected: float
+    """The same of shuffled labels, mean."""
+    p: float
+    """Of a share as large for shuffled labels (F test of ranks)."""
+
+    @property
+    def confounded(self) -> bool:
+        """True where slow changes over the session tell labels apart without any tuning."""
+        return self.p <= _CONFOUNDED_P and self.share - self.expected >= CONFOUNDED * (1 - self.expected)
+
+    def __str__(self) -> str:
+        share, expected = round(100 * self.share), round(100 * self.expected)
+        return f"the label explains {share} % of the variance of trial times ({expected} % if shuffled)"
+
+
+def presentation_order(times: ArrayLike, labels: ArrayLike) -> PresentationOrder | None:
+    """Return what labels [R] explain of the times [R] of a session's trials; None below three labels of two trials.
+
+    >>> presentation_order([1, 2, 3, 4, 5, 6, 7, 8, 9], list("aaabbbccc")).share
+    0.9
+    """
+    from scipy.special import fdtrc
+
+    names, codes = np.unique(np.asarray(labels), return_inverse=True)
+    order = np.asarray(times, dtype=np.float64)
+    counts = np.bincount(codes)
+    if len(names) < 3 or counts.min() < 2 or not np.isfinite(order).all() or not np.ptp(order):
+        return None
+    # Trials that begin together have the mean of their ranks.
+    _, place, number = np.unique(order, return_inverse=True, return_counts=True)
+    ranks = (np.cumsum(number) - (number + 1) / 2)[place]
+    ranks = ranks - ranks.mean()
+    share = float((np.bincount(codes, weights=ranks) ** 2 / counts).sum() / (ranks**2).sum())
+    between, within = len(names) - 1, len(order) - len(names)
+    p = float(fdtrc(between, within, share / max(1 - share, 1e-300) * within / between))
+    return PresentationOrder(share, between / (between + within), p)
+
+
 def is_finite(interval: Interval | None) -> TypeGuard[Interval]:
     """Return whether there is an interval and both its ends are numbers."""
     return interval is not None and math.isfinite(interval.low) and math.isfinite(interval.high)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -15,7 +15,7 @@ from brainbench.core.statistics import t_interval
 from brainbench.metrics.hooks import MetricHooks
 from brainbench.metrics.inference.permutation import canonical_order
 from brainbench.metrics.rdms.pairs import Floats, Ints
-from brainbench.metrics.reliability.noise_correction import Corrected, noise_ceiling
+from brainbench.metrics.reliability.noise_correction import RELIABILITY_GATE, Corrected, noise_ceiling
 from brainbench.metrics.reliability.subject_rdm import SubjectRDM, is_flat
 
 
@@ -72,9 +72,22 @@ def gather(metric: MetricHooks, subjects: Sequence[SubjectRDM], stimuli: int, *,
     # Whoever is not averaged is named, so no animal disappears in silence.
     left_out = [i for i in range(len(ordered)) if i not in scored]
     reasons = [f"animal {names[i]} left out: {corrections[i].reason}" for i in left_out]
+    # The study is gated, not the animal: see ``ANIMAL_GATE``.
+    if estimator == "default" and good:
+        # The mean of those that pass is too high where most do not: the median of all counts as well.
+        every = np.array([each.reliability for each in corrections])
+        measured = [subject.problem is None for subject in ordered]
+        reliability = min(float(every[list(good)].mean()), float(np.median(np.nan_to_num(every[measured]))))
+        if not reliability >= RELIABILITY_GATE:
+            why = f"the animals' reliability, {reliability:.2f}, is below {RELIABILITY_GATE}: no correction holds"
+            corrections = tuple(
+                replace(each, status="unreliable", reason=why) if i in good else each
+                for i, each in enumerate(corrections)
+            )
     reliable = bool(scored) and all(corrections[i].status == "ok" for i in scored)
     if scored and not reliable:
-        reasons += [f"{names[i]}: {corrections[i].reason}" for i in scored if corrections[i].status != "ok"]
+        single = [f"{names[i]}: {corrections[i].reason}" for i in scored if corrections[i].status != "ok"]
+        reasons += [corrections[scored[0]].reason] if good and estimator == "default" else single
     reasons += [f"{ordered[i].subject}: {note}" for i in usable for note in ordered[i].notes]
     return Animals(ordered, corrections, usable, scored, reliable, tuple(reasons))
 

@@ -37,7 +37,7 @@ from brainbench.metrics.reliability.subject_rdm import SubjectRDM
 
 _TIE = 1e-12
 
-Kind = Literal["fixed", "others", "halves", "maximum"]
+Kind = Literal["fixed", "others", "halves", "maximum", "each"]
 
 
 @dataclass(frozen=True)
@@ -61,6 +61,8 @@ class LayerRule:
             pairs = r.reshape(*r.shape[:-1], -1, 2)[..., ::-1]
             return first_best(pairs.reshape(r.shape))
         shape = (*r.shape[:-2], r.shape[-1])
+        if self.kind == "each":
+            return np.broadcast_to(np.arange(r.shape[-1]), shape)
         if self.kind == "maximum":
             weighted = r if self.factors is None else r * self.factors
             return np.broadcast_to(first_best(weighted.mean(axis=-1)[..., None]), shape)
@@ -89,6 +91,7 @@ def layer_rule(
     return LayerRule("others", "chosen on the other animals, evaluated on the animal held out")
 
 
+EACH = LayerRule("each", "every animal has a layer of its own")
 HALVES = LayerRule("halves", "chosen on one half of the only animal's trials, evaluated on the other half")
 
 
@@ -227,18 +230,25 @@ def defined_layers(metric: MetricHooks, layers: Mapping[str, Floats]) -> list[st
 
 
 def evaluate(
-    every: LayerComparisons, names: list[str], animals: Animals, estimator: str, committed: str | None, seed: int
+    every: LayerComparisons,
+    names: list[str],
+    animals: Animals,
+    estimator: str,
+    committed: str | None,
+    seed: int,
+    *,
+    each: bool = False,
 ) -> tuple[LayerEvaluation | None, list[str], tuple[str, ...]]:
     """Compare, choose layers by the rule and test; also return the layers with a value, and notes."""
     metric, factors = every.metric, animals.factors(animals.scored)
     r = every.given()
     rows = np.flatnonzero(np.isfinite(r).all(axis=1)).tolist()
     names, r = [names[row] for row in rows], r[rows]
-    if not names or (committed is not None and committed not in names):
+    if not names or (committed is not None and committed not in names) or (each and len(names) < len(every.animals)):
         return None, names, ()
     compared = every.among([every.layers[row] for row in rows], every.animals)
     voters = 1 if metric.of_model_alone else len(factors)
-    rule = layer_rule(names, voters, committed=committed, estimator=estimator, factors=factors)
+    rule = EACH if each else layer_rule(names, voters, committed=committed, estimator=estimator, factors=factors)
     votes = _Votes(rule, compared, r, compared, factors)
     if rule.kind == "maximum" and estimator == "default" and len(factors) == 1:
         halves = metric.halves(animals.subjects[animals.scored[0]], animals.order)
@@ -252,7 +262,9 @@ def evaluate(
     values = chosen_r * weights
     # The layers of the data serve without a stimulus too: where the choice jumps between layers that are nearly alike,
     # a jackknife that repeats it measures the jumps instead of the stimuli.
-    without = take_layers(votes.compared.without_each(), chosen) @ weights / len(weights)
+    single = rule is HALVES or estimator != "default"
+    factors_without = weights if single else metric.factors_without(votes.compared.animals, weights)
+    without = (take_layers(votes.compared.without_each(), chosen) * factors_without).mean(axis=-1)
     test, null = _test(votes.permuted, rule, weights[: len(votes.permuted.animals)], seed)
     if rule is HALVES:
         values, chosen_r = values.mean(keepdims=True), chosen_r.mean(keepdims=True)

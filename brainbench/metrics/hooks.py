@@ -108,6 +108,10 @@ class MetricHooks:
         """Return the factor that corrects a comparison for an animal's noise, and whether the animal is reliable."""
         return gated(1.0, animal.reliability)
 
+    def factors_without(self, animals: Sequence[SubjectRDM], factors: Floats) -> Floats:
+        """Return the factors [K, A] of comparisons without each stimulus in turn, from those of all stimuli [A]."""
+        return np.tile(factors, (animals[0].count, 1))
+
     def attainable(self, animals: Sequence[SubjectRDM], seed: int) -> Floats:
         """Return the raw value [A] of a model that has each animal's own responses without their noise."""
         # In the order in which stimuli are scored: folds and noise then do not depend on how they were listed.

@@ -78,23 +78,26 @@ def score_layers(
     seed: int = 0,
     device: Any = None,
     committed: str | None = None,
+    each: bool = False,
 ) -> tuple[Score, PermutationTest | None]:
     """Score the layers of a model against animals; also return the permutation test with all statistics.
 
     ``layers`` are what :meth:`Metric.layer` made of each layer, in network order, ``subjects`` what
     :meth:`Metric.animal` made of each animal. ``committed`` is a layer that was chosen before anything was scored;
-    without a torch ``device`` numpy computes the permutations.
+    without a torch ``device`` numpy computes the permutations. With ``each``, layers are those of the animals, by name.
     """
     check_once("A score", map(str, stimuli))
     if committed is not None:
         check_name("layer", committed, layers)
     animals = gather(metric, subjects, len(stimuli), estimator=estimator)
+    if each:
+        layers = {animals.subjects[i].subject: layers[animals.subjects[i].subject] for i in animals.scored}
     names, result, notes = list(layers), None, ()
     usable = defined = defined_layers(metric, layers)
     if animals.scored and defined and len(stimuli) >= metric.fewest:
         ordered = [metric.take(layers[label], animals.order) for label in defined]
         compared = LayerComparisons(metric, ordered, animals.sorted, device)
-        result, defined, notes = evaluate(compared, defined, animals, estimator, committed, seed)
+        result, defined, notes = evaluate(compared, defined, animals, estimator, committed, seed, each=each)
     lacking = {
         "constant or not finite": [name for name in names if name not in usable],
         "not comparable with every animal": [name for name in usable if name not in defined],
@@ -145,7 +148,7 @@ def score_layers(
         r=float(result.r.mean()),
         interval=two_factor_interval(value, result.values, result.without),
         p=result.test.p,
-        p_method=result.test.summary(1 if result.rule.kind == "fixed" else len(defined), repeated),
+        p_method=result.test.summary(1 if result.rule.kind in ("fixed", "each") else len(defined), repeated),
         layer=defined[chosen],
         layer_rule=result.rule.words,
         best_layer=defined[best],

@@ -20,6 +20,7 @@ from brainbench.core.progress import Progress, stages
 from brainbench.core.provenance import Provenance
 from brainbench.core.records import ESTIMATOR_VERSION, ResultRecord, Score
 from brainbench.scoring.options import ScoreOptions
+from brainbench.scoring.presentation import presentation_of
 
 if TYPE_CHECKING:
     from brainbench.metrics import Metric
@@ -94,7 +95,7 @@ def score_record(
 
     Args:
         model, options, **changes: as in :func:`score`.
-        baselines: also score the raw input, random features and animal against animal.
+        baselines: also score the raw input, random features, times of presentation and animal against animal.
         command: the command line that makes this record, kept in its provenance.
         progress: called with (done, total, what).
 
@@ -223,6 +224,13 @@ def _compare(inputs: ScoreInputs, *, baselines: bool) -> tuple[list[Score], Scor
             for name, layers in features.items()
         ]
         between = inputs.metric.score_animals(inputs.animals, **how) if baselines else None
+    presentation = presentation_of(inputs, control=baselines)
+    stated = scores[0].provenance
+    scores[0] = replace(scores[0], provenance=replace(stated, statistics=stated.statistics | presentation.statistics))
+    if doubt := presentation.doubt:
+        scores, between = [_doubted(score, doubt) for score in scores], between and _doubted(between, doubt)
+    if baselines and presentation.control is not None:
+        scores.append(presentation.control)
     if brain.label_doubt:
         scores = [_doubted(score, brain.label_doubt) for score in scores]
         between = between and _doubted(between, brain.label_doubt)

@@ -47,7 +47,7 @@ def test_a_users_file_is_scored_on_a_users_arrays(run, files):
     assert result.status == 0, result.err
     record = json.loads(result.out)["record"]
     assert {item["layer"] for item in record["score"]["layers"]} == {"gru", "output"}
-    assert set(record["baselines"]) == {"raw input", "random features"}
+    assert set(record["baselines"]) == {"raw input", "random features", "presentation time"}
 
 
 def test_labels_are_matched_by_a_file(run, files, tmp_path):

@@ -34,15 +34,25 @@ def test_unreliable_animals_do_not_vote_and_are_named():
     latent = make_latent(5)
     layers, good = _make_layers(latent), _make_animals(latent, 4)
     rng = np.random.default_rng(0)
-    noisy = make_subject("z", make_rdm(rng), reliability=0.3)
+    noisy = make_subject("z", make_rdm(rng), reliability=0.2)
     score, without = _score(layers, [*good, noisy]), _score(layers, good)
     assert score.value == pytest.approx(without.value, abs=1e-15)
     assert score.p == without.p
     assert score.status == "ok"
-    assert "animal z left out: reliability 0.30 is below 0.5, where no noise correction is trustworthy" in score.reasons
+    assert "animal z left out: reliability 0.20 is below 0.3" in score.reasons
     last = score.subjects[-1]
     assert (last.subject, last.status) == ("z", "unreliable")
     assert math.isfinite(last.value)
+
+
+@pytest.mark.parametrize(("reliabilities", "status"), [((0.4, 0.45, 0.6), "unreliable"), ((0.4, 0.6, 0.65), "ok")])
+def test_the_mean_reliability_of_the_study_decides_not_that_of_single_animals(reliabilities, status):
+    rng = np.random.default_rng(6)
+    animals = [make_subject(f"m{i}", make_rdm(rng), reliability=r, seed=i) for i, r in enumerate(reliabilities)]
+    score = _score({"a": make_rdm(rng)}, animals)
+    assert score.status == status
+    assert [subject.status for subject in score.subjects] == [status] * 3
+    assert ("reliability, 0.45, is below 0.5" in "; ".join(score.reasons)) == (status == "unreliable")
 
 
 def test_when_no_animal_is_reliable_the_value_is_reported_as_unreliable():

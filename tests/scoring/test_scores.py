@@ -286,7 +286,7 @@ def arrays(tmp_path: Path) -> Path:
 def test_a_plain_module_is_scored_on_arrays_without_registration(recordings: xr.Dataset, arrays: Path):
     record = score_record(_Tiny(), recordings=recordings, stimuli=str(arrays))
     assert [item.layer for item in record.score.layers] == ["fc", "output"]
-    assert set(record.baselines) == {"raw input", "random features"}
+    assert set(record.baselines) == {"raw input", "random features", "presentation time"}
     assert record.card is not None
     assert record.card.parameters == 45
     assert record.card.input == "as given"

@@ -20,7 +20,7 @@ class Finding:
 
     severity: Severity
     check: str
-    """Name: file, units, spikes, duplicates, refractory, silent, tables, times, labels, coverage or clock."""
+    """Name: file, units, spikes, duplicates, refractory, silent, tables, times, labels, order, coverage or clock."""
     message: str
     """The fault, in numbers."""
     advice: str = ""

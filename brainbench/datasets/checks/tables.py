@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from brainbench.core.contracts import as_labels
 from brainbench.core.errors import BrainbenchError, DataError, nearest, repeats
+from brainbench.core.statistics import presentation_order
 from brainbench.datasets.checks.findings import LONGEST_SESSION, Finding, Severity, share, some
 from brainbench.datasets.inspection import propose
 from brainbench.datasets.layouts.registry import RecordingLayout
@@ -50,8 +51,21 @@ def check_labels(session: Session, layout: RecordingLayout | None, conditions: C
         yield from _strangers(counts, vocabulary, layout)
         counts = Counter({label: counts[label] for label in vocabulary})
     yield from _balance(counts, vocabulary)
+    yield from _order(table, values)
     if {"outcome", "choice", "rewarded_side"} <= set(table.columns):
         yield from _answers(table)
+
+
+def _order(table: SessionTable, values: NDArray[np.str_]) -> Iterator[Finding]:
+    """Labels in blocks: slow changes over the session then pass for differences between stimuli."""
+    labels = np.array(joined_labels(values))
+    present = labels != ""
+    with contextlib.suppress(DataError):
+        order = presentation_order(table.times("start_time")[present], labels[present])
+        if order is not None and order.confounded:
+            message = f"stimulus and time are confounded: {order}"
+            advice = "Drift alone then tells stimuli apart; `score` compares with the times of presentation."
+            yield Finding("warning", "order", message, advice, {"share": order.share, "p": order.p})
 
 
 def _strangers(counts: Counter[str], vocabulary: tuple[str, ...], layout: RecordingLayout | None) -> Iterator[Finding]:

@@ -15,16 +15,25 @@ from brainbench.core.limits import Count, limited
 from brainbench.core.records import Score
 from brainbench.metrics.hooks import usable_features
 from brainbench.metrics.measures.metric import Metric
-from brainbench.metrics.rdms.comparison import check_comparison, compare_all, permuted_comparisons
+from brainbench.metrics.rdms.comparison import (
+    WITHOUT,
+    check_comparison,
+    compare_all,
+    permuted_comparisons,
+    products_without,
+)
 from brainbench.metrics.rdms.comparison import compare as compare_rdms
 from brainbench.metrics.rdms.dissimilarity import RDM_METHODS, rdm
 from brainbench.metrics.rdms.noise import NOISE_METHODS
 from brainbench.metrics.rdms.pairs import Floats, Ints, permuted_pairs, rdm_stack, square, stimulus_count
-from brainbench.metrics.reliability.noise_correction import ESTIMATORS, Corrected, noise_corrected
+from brainbench.metrics.reliability.noise_correction import ESTIMATORS, Corrected, correction_by, noise_corrected
 from brainbench.metrics.reliability.subject_rdm import SubjectRDM, is_flat
 from brainbench.metrics.score import score_layers
 
 _CHUNK_ELEMENTS = 1 << 22
+_ROUNDING = 1e-12
+_LEAST_WITHOUT = 0.25
+"""Smallest reliability without a stimulus, as a share of that with all, which the jackknife divides by."""
 
 
 @dataclass(frozen=True)
@@ -90,6 +99,8 @@ class RSA(Metric):
         if count <= 3:
             return np.full((count, len(layers), len(animals)), np.nan)
         rdms, brain = np.stack(layers), np.stack([animal.rdm for animal in animals])
+        if self.comparison in WITHOUT and np.isfinite(rdms).all() and np.isfinite(brain).all():
+            return np.moveaxis(_comparisons_without(rdms, brain, self.comparison), -1, 0)
         rest = np.array([np.delete(np.arange(count), stimulus) for stimulus in range(count)])
         pairs = permuted_pairs(rest, count)
         step = max(1, _CHUNK_ELEMENTS // (count * count * (len(rdms) + len(brain))))
@@ -102,7 +113,18 @@ class RSA(Metric):
 
     def correction(self, animal: SubjectRDM, estimator: str) -> Corrected:
         """Return the factor of the estimator; it is linear in the comparison, so that of a comparison of 1."""
+        if estimator == "default":
+            return correction_by(animal.reliability_by(self.comparison))
         return noise_corrected(1.0, animal.split_half_by(self.comparison), estimator=estimator)
+
+    def factors_without(self, animals: Sequence[SubjectRDM], factors: Floats) -> Floats:
+        """Return the factors [K, A] of all animals' RDMs without each stimulus in turn."""
+        without = np.tile(factors, (animals[0].count, 1))
+        for index, animal in enumerate(animals):
+            if animal.comparison == self.comparison and len(animal.signal_without):
+                least = _LEAST_WITHOUT * animal.reliability
+                without[:, index] = 1 / np.sqrt(np.clip(animal.signal_without, least, 1.0))
+        return without
 
     def attainable(self, animals: Sequence[SubjectRDM], seed: int) -> Floats:
         """Return the raw comparison [A] that is corrected to 1."""
@@ -128,6 +150,10 @@ class RSA(Metric):
         # Halves are averaged split by split, so every animal must have them.
         splits = min(len(one.halves) for one in others)
         halves = np.mean([one.halves[:splits] for one in others], axis=0)
+        if estimator == "default":
+            r = compare_rdms(halves[:, 0], halves[:, 1], method=self.comparison)
+            mean = replace(others[0], rdm=self.partner(animal, others), halves=halves, split_half_r=r, comparison="")
+            return correction_by(animal.reliability_by(self.comparison), mean.reliability_by(self.comparison))
         return noise_corrected(
             1.0,
             animal.split_half_by(self.comparison)[:splits],
@@ -152,6 +178,20 @@ class RSA(Metric):
         # Boards and audits tell metrics apart by these words.
         noise = "" if self.noise == "none" else f" divided by noise ({self.noise})"
         return f"RSA: {'/'.join(methods)} RDM{noise}, {self.comparison} comparison"
+
+
+def _comparisons_without(layers: Floats, animals: Floats, comparison: str) -> Floats:
+    """Return comparisons [L, A, K] of RDMs without each stimulus; NaN where nothing of one is left."""
+    both = products_without(layers, animals, comparison)
+    left, right = (
+        np.stack([products_without(part[None], part[None], comparison)[0, 0] for part in side])
+        for side in (layers, animals)
+    )
+    # What rounding leaves of an RDM that has no other distance is no distance.
+    left, right = (
+        np.where(part > _ROUNDING * part.max(axis=-1, keepdims=True), part, np.nan) for part in (left, right)
+    )
+    return both / np.sqrt(left[:, None] * right[None])
 
 
 def score_rdms(

@@ -106,6 +106,27 @@ def permuted_comparisons(
         yield fetch((permuted @ right).swapaxes(0, 1))
 
 
+def products(a: Floats, b: Floats, method: str) -> Floats:
+    """Return the inner products [...] of RDMs [..., P] that a comparison divides by both lengths; of all but ranks."""
+    return np.einsum("...p,...p->...", LINEAR[method](a), LINEAR[method](b))
+
+
+def products_without(a: Floats, b: Floats, method: str) -> Floats:
+    """Return the inner products [..., N, A, K] of every ``a`` [..., N, P] with every ``b`` [..., A, P] by one of
+    :data:`WITHOUT`, without each stimulus in turn."""
+    if method == "cosine":
+        left, right = square(a), square(b)
+        rows = np.einsum("...nik,...aik->...nak", left, right)
+        return rows.sum(axis=-1, keepdims=True) / 2 - rows
+    left, right = (_second_moment(rdms).reshape(square(rdms).shape) for rdms in (a, b))
+    rows = np.einsum("...nik,...aik->...nak", left, right)
+    own = np.einsum("...nkk,...akk->...nak", left, right)
+    # Rows of a centred matrix add up to 0, so those of what is left add up to −M_ik, and all of it to M_kk: centring
+    # the rest anew takes no second pass.
+    rest = left.shape[-1] - 1
+    return rows.sum(axis=-1, keepdims=True) - 2 * rows + own - 2 * (rows - own) / rest + own / rest**2
+
+
 def features(rdms: Floats, method: str) -> Floats:
     """Return vectors whose inner product is the comparison; NaN where it has no value."""
     return _METHODS[method][0](rdms)
@@ -177,6 +198,17 @@ def _second_moment(rdms: Floats) -> Floats:
     matrix -= matrix.mean(axis=-2, keepdims=True)
     return matrix.reshape(*rdms.shape[:-1], -1)
 
+
+LINEAR: dict[str, Transform] = {
+    "pearson": _centred,
+    "cosine": lambda rdms: rdms,
+    "whitened-cosine": _second_moment,
+    "whitened-pearson": lambda rdms: _second_moment(_centred(rdms)),
+}
+"""Comparisons that are products of linear functions of both RDMs, divided by their lengths."""
+
+WITHOUT = ("cosine", "whitened-cosine")
+"""Comparisons whose products without a stimulus follow from those of all."""
 
 _METHODS: dict[str, tuple[Transform, Transform]] = {
     "pearson": (_pearson, _pearson),

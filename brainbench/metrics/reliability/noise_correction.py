@@ -1,10 +1,11 @@
 """Correction of an RDM comparison for noise in the brain's RDM.
 
 A noisy RDM can correlate with the best model by no more than the square root of its reliability
-(Spearman 1904), so r is divided by that. Reliability comes from split halves, lengthened to all
-trials by Spearman and Brown's formula, which assumes that the noise variance halves as the trials
-double. The noise of a distance can fall up to twice as fast where single units are very noisy; then
-the corrected value errs upwards, by at most 15 % at a reliability of .5, 5 % at .8 and 3 % at .9.
+(Spearman 1904), so r is divided by that. Unbiased distances d + noise have the mean product ‖d‖² over
+halves without common trials, whatever the law by which their noise falls with the trials, so their
+reliability is that product over ‖d + noise‖² of all trials (:attr:`SubjectRDM.signal`). Other distances
+have the same bias in both halves; theirs is the halves' correlation, lengthened by Spearman and Brown's
+formula, which assumes that the noise variance halves as the trials double.
 """
 
 from __future__ import annotations
@@ -24,13 +25,12 @@ from brainbench.metrics.rdms.comparison import check_comparison, compare, poolin
 from brainbench.metrics.rdms.pairs import Floats, rdm_stack
 
 RELIABILITY_GATE = 0.5
-"""Smallest Spearman-Brown reliability of an animal's RDM whose corrected score is trusted.
+"""Smallest mean reliability of a study's animals whose corrected score is trusted: from there on intervals hold the
+value without noise (docs/calibration.md, table ``noise``)."""
 
-From 13,258 simulated animals (6 stimuli, 60 units, 20 trials each, true r about .74): with estimated
-reliability in .5–.6 the bias of ``default`` is +.02 and the root mean square error of one animal .21;
-in .3–.4 it is .35, in .1–.2 .65 with a bias of +.28, in 0–.1 3.3 with a bias of +1.1. The mean and the
-median of ratios fare no better there, so a low reliability is reported instead of corrected cleverly.
-"""
+ANIMAL_GATE = 0.3
+"""Smallest reliability of an animal that is scored with the others. It lies well below the gate of the study: animals
+kept just above a gate are those whose reliability came out too high, and their scores too low."""
 
 THESIS_FILTER = 0.5
 """The published estimator drops split halves whose raw correlation is below this."""
@@ -127,10 +127,8 @@ def noise_corrected(
 def _default(r_xy: Floats, halves: Floats, others: Floats | None, sides: list[float]) -> tuple[float, int, str]:
     # Correlations are averaged before the ratio is formed, so that no split with a denominator near zero dominates.
     lowest = min(sides) if not any(map(math.isnan, sides)) else math.nan
-    if math.isnan(lowest):
-        return math.nan, 0, "the split-half reliability is undefined"
-    if lowest <= 0:
-        return math.nan, 0, f"the reliability is {lowest:.2f}, not positive: the split halves share no geometry"
+    if not lowest > 0:
+        return math.nan, 0, _no_reliability(lowest)
     return float(finite_mean(r_xy)) / math.sqrt(math.prod(sides)), int(np.isfinite(halves).sum()), ""
 
 
@@ -159,10 +157,28 @@ ESTIMATORS = tuple(_ESTIMATORS)
 
 def gated(factor: float, reliability: float) -> Corrected:
     """Return a factor with the status that the animal's reliability gives it."""
-    if not reliability >= RELIABILITY_GATE:
-        text = f"reliability {reliability:.2f} is below {RELIABILITY_GATE}"
+    if not reliability >= ANIMAL_GATE:
+        text = f"reliability {reliability:.2f} is below {ANIMAL_GATE}"
         return Corrected(factor, "unreliable", text, 1.0, reliability)
     return Corrected(factor, "ok", "", 1.0, reliability)
+
+
+def correction_by(*reliabilities: float) -> Corrected:
+    """Return the factor 1/√(r₁ r₂ …) of a comparison of RDMs with some reliabilities; the lowest one gives its status.
+
+    >>> round(correction_by(0.64).value, 3)
+    1.25
+    """
+    lowest = min(reliabilities) if not any(map(math.isnan, reliabilities)) else math.nan
+    if not lowest > 0:
+        return Corrected(math.nan, "undefined", _no_reliability(lowest), 1.0, lowest)
+    return gated(1 / math.sqrt(math.prod(reliabilities)), lowest)
+
+
+def _no_reliability(lowest: float) -> str:
+    if math.isnan(lowest):
+        return "the split-half reliability is undefined"
+    return f"the reliability is {lowest:.2f}, not positive: the split halves share no geometry"
 
 
 class NoiseCeiling(NamedTuple):

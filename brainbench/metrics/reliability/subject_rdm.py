@@ -23,7 +23,8 @@ from brainbench.core.contracts import Trials
 from brainbench.core.errors import DataError, UsageError, check_name
 from brainbench.core.reading.ranges import check_number
 from brainbench.core.records import Interval
-from brainbench.metrics.rdms.comparison import check_comparison, compare
+from brainbench.metrics.arrays import finite_mean
+from brainbench.metrics.rdms.comparison import LINEAR, WITHOUT, check_comparison, compare, products, products_without
 from brainbench.metrics.rdms.dissimilarity import RDM_METHODS
 from brainbench.metrics.rdms.noise import NOISE_METHODS
 from brainbench.metrics.rdms.pairs import Floats, Ints, permuted_pairs, stimulus_count
@@ -58,13 +59,20 @@ class SubjectRDM:
     """Dissimilarity of two stimuli."""
     comparison: str = "pearson"
     reliability: float = math.nan
-    """Spearman-Brown reliability of the mean of ``split_half_r`` (averaged before, not after, the formula)."""
+    """The mean of ``signal``, at most 1; without it the Spearman-Brown reliability of the mean of ``split_half_r``
+    (averaged before, not after, the formula)."""
     spread: Interval | None = None
-    """Percentiles of single splits' Spearman-Brown values: how much one split would have misled, not a
-    confidence interval of the reliability."""
+    """Percentiles of single splits' values: how much one split would have misled, not a confidence interval of the
+    reliability."""
     seed: int = 0
     problem: str | None = None
     """Reason for having no usable RDM, in words; None otherwise."""
+    signal: Floats = field(default_factory=lambda: np.empty(0), repr=False)
+    """[S] product of the RDMs of a split's halves over the squared RDM of all trials, by ``comparison``: on average the
+    share of it that is no noise. Empty where distances are biased or ranks compared; then Spearman and Brown's formula
+    serves."""
+    signal_without: Floats = field(default_factory=lambda: np.empty(0), repr=False)
+    """[K] the mean of ``signal`` without each stimulus in turn; empty where it is not known."""
     notes: tuple[str, ...] = ()
     """Sessions and units that were left out, in words."""
     patterns: Floats = field(default_factory=lambda: np.empty((0, 0)), repr=False)
@@ -78,10 +86,12 @@ class SubjectRDM:
         """Return the animal with some stimuli [K'], in this order; the split halves' comparisons stay as they are."""
         pairs = permuted_pairs(np.asarray(stimuli)[None], self.count)[0]
         prepared = len(self.patterns) > 0
+        every = len(self.signal_without) == len(stimuli)
         return replace(
             self,
             rdm=self.rdm[pairs],
             halves=self.halves[:0],
+            signal_without=self.signal_without[stimuli] if every else self.signal_without[:0],
             patterns=self.patterns[stimuli] if prepared else self.patterns,
             noise=self.noise[stimuli] if prepared else self.noise,
             nuisances={name: values[pairs] for name, values in self.nuisances.items()},
@@ -97,6 +107,19 @@ class SubjectRDM:
         if comparison == self.comparison or self.problem is not None:
             return self.split_half_r
         return compare(self.halves[:, 0], self.halves[:, 1], method=comparison)
+
+    def signal_by(self, comparison: str) -> Floats:
+        """Return ``signal`` by any comparison (from the stored halves if need be); empty where there is none."""
+        if comparison == self.comparison or self.problem is not None:
+            return self.signal
+        return _signal(self.halves[:, 0], self.halves[:, 1], self.rdm, self.method, comparison)
+
+    def reliability_by(self, comparison: str) -> float:
+        """Return the reliability of the RDM in a comparison."""
+        signal = self.signal_by(comparison)
+        if signal.size:
+            return min(1.0, float(signal.mean()))
+        return float(spearman_brown(finite_mean(self.split_half_by(comparison))))
 
 
 def subject_rdm(
@@ -157,18 +180,18 @@ def subject_rdm(
     if distance != "poisson":
         sessions = shifted_sessions(sessions, n_stimuli, by_unit=distance != "correlation")
     rdm = SplitRDMs(sessions, n_stimuli, distance).whole()
-    halves, r = _split_halves(sessions, n_stimuli, distance, comparison, splits, seed)
-    animal = replace(empty, rdm=rdm, split_half_r=r, halves=halves, patterns=patterns, noise=variances)
+    halves, r, signal = _split_halves(sessions, n_stimuli, distance, comparison, splits, seed, rdm)
+    animal = replace(empty, rdm=rdm, split_half_r=r, halves=halves, patterns=patterns, noise=variances, **signal)
     finite = r[np.isfinite(r)]
     if not np.isfinite(rdm).all() or not finite.size:
         flat = np.isnan(rdm).any()
         reason = "the mean responses to a stimulus are constant across units" if flat else "all pairs are equal"
         return replace(animal, problem=f"its RDM is undefined: {reason}")
     # The formula has a pole at r = −1, across which percentiles mean nothing.
-    low, high = np.percentile(spearman_brown(finite), [2.5, 97.5]) if (finite > -1).all() else (math.nan, math.nan)
+    single = animal.signal if animal.signal.size else spearman_brown(finite)
+    low, high = np.percentile(single, [2.5, 97.5]) if (finite > -1).all() else (math.nan, math.nan)
     spread = Interval(float(low), float(high), 0.95, "percentiles over random splits; not a confidence interval")
-    # Correlations are averaged before the formula, which is not linear.
-    return replace(animal, reliability=float(spearman_brown(finite.mean())), spread=spread)
+    return replace(animal, reliability=animal.reliability_by(comparison), spread=spread)
 
 
 def _mean_responses(sessions: list[SortedTrials], count: int) -> tuple[Floats, Floats]:
@@ -188,21 +211,38 @@ def _mean_responses(sessions: list[SortedTrials], count: int) -> tuple[Floats, F
 
 
 def _split_halves(
-    sessions: list[SortedTrials], count: int, method: str, comparison: str, splits: int, seed: int
-) -> tuple[Floats, Floats]:
-    """Return the RDMs [S′, 2, P] of the halves that are kept, and the comparison [S] of every split's."""
+    sessions: list[SortedTrials], count: int, method: str, comparison: str, splits: int, seed: int, whole: Floats
+) -> tuple[Floats, Floats, dict[str, Floats]]:
+    """Return the RDMs [S′, 2, P] of the halves that are kept, the comparison [S] of every split's, and their signal."""
     pairs = count * (count - 1) // 2
     most = max(1, min(splits, _HALVES_BYTES // (16 * pairs)))
-    halves, r = np.empty((most, 2, pairs)), np.empty(splits)
+    halves, r, signal, without = np.empty((most, 2, pairs)), np.empty(splits), [], np.zeros(count)
     # Chunks of splits: memory does not grow with their number.
     step = max(1, _CHUNK_BYTES // (8 * pairs))
     for start in range(0, splits, step):
         index = np.arange(start, min(start + step, splits))
         first, second = half_rdms(sessions, count, method, index, seed)
         r[index] = compare(first, second, method=comparison)
+        signal.append(_signal(first, second, whole, method, comparison))
+        if signal[-1].size and comparison in WITHOUT:
+            without += products_without(first[:, None], second[:, None], comparison).sum(axis=(0, 1, 2)) / splits
         stored = index[index < most]
         halves[stored, 0], halves[stored, 1] = first[: len(stored)], second[: len(stored)]
-    return halves, r
+    parts = {"signal": np.concatenate(signal)}
+    if without.any():
+        with np.errstate(invalid="ignore", divide="ignore"):
+            parts["signal_without"] = without / products_without(whole[None], whole[None], comparison)[0, 0]
+    return halves, r, parts
+
+
+def _signal(first: Floats, second: Floats, whole: Floats, method: str, comparison: str) -> Floats:
+    """Return the products [S] of the RDMs [S, P] of halves over the square of that of all trials, where it is known."""
+    # Only unbiased distances have halves whose product holds no noise.
+    if method != "crossnobis" or comparison not in LINEAR:
+        return np.empty(0)
+    square = products(whole, whole, comparison)
+    # A flat RDM has no comparison either; its halves are products of noise.
+    return products(first, second, comparison) / square if square > 0 else np.empty(0)
 
 
 def is_flat(rdms: Floats) -> NDArray[np.bool_]:

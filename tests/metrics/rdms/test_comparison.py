@@ -10,7 +10,7 @@ from scipy import stats
 
 from brainbench.core.errors import UsageError
 from brainbench.metrics import compare
-from brainbench.metrics.rdms.comparison import COMPARISONS, compare_all
+from brainbench.metrics.rdms.comparison import COMPARISONS, compare_all, products, products_without
 from brainbench.metrics.rdms.pairs import permuted_pairs
 from tests.factories.rsatoolbox_names import THEIRS
 
@@ -121,3 +121,14 @@ def test_what_is_no_dissimilarity_is_not_taken_for_a_missing_one(wrong) -> None:
     assert compare([1, 2, np.nan], [1, 2, 4]) == pytest.approx(1.0)
     with pytest.raises(UsageError, match="a must"):
         compare(wrong, [1, 2, 4])
+
+
+@pytest.mark.parametrize("method", ["cosine", "whitened-cosine"])
+def test_products_without_a_stimulus_follow_from_those_of_all(method):
+    rng, count = np.random.default_rng(3), 7
+    left, right = rng.normal(size=(2, 21)) ** 2, rng.normal(size=(3, 21))
+    found = products_without(left, right, method)
+    for stimulus in range(count):
+        pairs = permuted_pairs(np.delete(np.arange(count), stimulus)[None], count)[0]
+        expected = products(left[:, None, pairs], right[None, :, pairs], method)
+        np.testing.assert_allclose(found[..., stimulus], expected, atol=1e-12)

@@ -7,10 +7,16 @@ import math
 import numpy as np
 import pytest
 
+from brainbench.core.contracts import Trials
 from brainbench.core.errors import UsageError
 from brainbench.metrics import compare, noise_ceiling, noise_corrected, rdm
 from brainbench.metrics.rdms.comparison import COMPARISONS
-from brainbench.metrics.reliability.noise_correction import RELIABILITY_GATE, corrected_splits, spearman_brown
+from brainbench.metrics.reliability.noise_correction import (
+    RELIABILITY_GATE,
+    corrected_splits,
+    correction_by,
+    spearman_brown,
+)
 from brainbench.metrics.reliability.subject_rdm import subject_rdm
 from tests.factories.animals import make_block, make_latent
 from tests.factories.rsatoolbox_names import THEIRS
@@ -145,6 +151,25 @@ def test_truth_is_recovered_at_high_signal_and_flagged_at_low_signal():
     assert abs(errors.mean()) < 0.01
     _, reliabilities = _simulated_errors(20, noise=40.0, seed=2)
     assert (reliabilities < RELIABILITY_GATE).mean() > 0.9
+
+
+def test_products_of_halves_tell_the_noise_of_unbiased_distances_where_spearman_and_brown_do_not():
+    rng, unbiased, lengthened = np.random.default_rng(5), [], []
+    stimuli, trials = 30, 7
+    labels = np.repeat(np.arange(stimuli), trials)
+    for animal in range(40):
+        patterns = rng.normal(size=(stimuli, 8)) @ rng.normal(size=(8, 60)) / math.sqrt(8)
+        responses = patterns[labels] + 3.4 * rng.normal(size=(len(labels), 60))
+        keys = [f"{animal}/{trial}" for trial in range(len(labels))]
+        how = {"method": "crossnobis", "comparison": "whitened-cosine", "noise": "none", "splits": 40}
+        subject = subject_rdm("a", [Trials(responses, labels, keys)], stimuli, **how)
+        r = float(compare(rdm(patterns, method="sqeuclidean"), subject.rdm, method="whitened-cosine"))
+        unbiased.append(r * correction_by(subject.reliability).value)
+        lengthened.append(noise_corrected(r, subject.split_half_r).value)
+        assert subject.reliability == pytest.approx(float(subject.signal.mean()))
+    # A perfect model has the value 1.
+    assert np.mean(unbiased) == pytest.approx(1.0, abs=0.02)
+    assert np.mean(lengthened) > 1.05
 
 
 @pytest.mark.slow

@@ -1,0 +1,111 @@
+"""The order of presentation: blocks under drift are no tuning, and the times of presentation are a control."""
+
+from __future__ import annotations
+
+import h5py
+import numpy as np
+import pytest
+import xarray as xr
+
+from brainbench.core.statistics import presentation_order
+from brainbench.scoring.presentation import CONTROL
+from brainbench.scoring.scores import score_record
+
+STIMULI, TRIALS, UNITS = 12, 8, 30
+NAMES = tuple(f"s{index:02d}" for index in range(STIMULI))
+
+
+def _make_recordings(*, blocked, tuning=0.0, animals=4, times=True):
+    """Counts of neurons whose rates drift over the session, tuned to a shared geometry by ``tuning``."""
+    rng, parts = np.random.default_rng(0), []
+    geometry = rng.normal(size=(STIMULI, 4))
+    counts = np.full((animals, STIMULI * TRIALS, 1, animals * UNITS), np.nan)
+    for animal in range(animals):
+        labels = np.repeat(np.arange(STIMULI), TRIALS)
+        labels = labels if blocked else rng.permutation(labels)
+        time = np.linspace(-1, 1, len(labels))[:, None]
+        drift = 0.35 * np.concatenate([time, time**2], axis=1) @ rng.normal(size=(2, UNITS))
+        rate = 20 * np.exp(drift + tuning * (geometry @ rng.normal(size=(4, UNITS)))[labels])
+        counts[animal, :, 0, animal * UNITS : (animal + 1) * UNITS] = rng.poisson(rate)
+        parts.append(labels)
+    trials, units = np.repeat(np.arange(animals), STIMULI * TRIALS), np.repeat(np.arange(animals), UNITS)
+    coordinates = {
+        "time": ("time", [0.0]),
+        "stimulus": ("trial", [NAMES[label] for labels in parts for label in labels]),
+        "subject": ("trial", [f"m{animal}" for animal in trials]),
+        "session": ("trial", ["1"] * len(trials)),
+        "trial_id": ("trial", [str(row) for row in range(len(trials))]),
+        "unit_subject": ("unit", [f"m{animal}" for animal in units]),
+        "unit_session": ("unit", ["1"] * len(units)),
+        "unit_id": ("unit", [str(unit) for unit in range(len(units))]),
+    }
+    if times:
+        coordinates["window_start"] = ("trial", np.tile(np.arange(STIMULI * TRIALS, dtype=float), animals))
+    values = counts.reshape(-1, 1, animals * UNITS)
+    dataset = xr.Dataset(
+        {
+            "counts": (("trial", "time", "unit"), values.astype(np.float32)),
+            "duration": (("trial", "time"), np.ones(values.shape[:2])),
+        },
+        coordinates,
+    )
+    about = {"window": "", "selection": {}, "removed": {}, "synthetic": True, "content_hash": "made", "source": "test"}
+    return dataset.assign_attrs(vocabulary=list(NAMES), **about), geometry
+
+
+def _score(folder, features, recordings):
+    path = folder / "features.h5"
+    with h5py.File(path, "w") as file:
+        file.attrs["brainbench_features"] = 1
+        file.create_dataset("labels", data=list(NAMES), dtype=h5py.string_dtype())
+        file["activations/layer"] = features
+    return score_record(str(path), recordings=recordings)
+
+
+def _rank():
+    return np.arange(STIMULI)[:, None] + 0.3 * np.random.default_rng(1).normal(size=(STIMULI, 3))
+
+
+def test_the_label_explains_the_times_of_blocks_and_nothing_of_interleaved_trials():
+    labels, times = np.repeat(np.arange(8), 10), np.arange(80.0)
+    blocked = presentation_order(times, labels)
+    assert (round(blocked.share, 2), blocked.confounded) == (0.98, True)
+    for seed in range(200):
+        shuffled = presentation_order(times, np.random.default_rng(seed).permutation(labels))
+        assert not shuffled.confounded
+        assert shuffled.expected == pytest.approx(7 / 79, abs=0.02)
+    # One of each label in every block of eight explains less than chance.
+    assert not presentation_order(times, np.tile(np.arange(8), 10)).confounded
+    assert presentation_order(times, np.tile([0, 1], 40)) is None
+
+
+def test_the_clock_scores_in_blocks_under_drift_and_is_not_believed(tmp_path):
+    recordings, _ = _make_recordings(blocked=True)
+    record = _score(tmp_path, _rank(), recordings)
+    assert record.score.p <= 0.01
+    assert record.score.status == "unreliable"
+    assert "confounded in 4 of 4 sessions" in record.score.reasons[0]
+    assert record.baselines[CONTROL].scaled > 0.7
+    assert record.score.provenance.statistics["presentation"]["confounded"] == 4
+
+
+def test_tuned_neurons_in_an_interleaved_session_are_believed(tmp_path):
+    recordings, geometry = _make_recordings(blocked=False, tuning=0.2)
+    record = _score(tmp_path, geometry, recordings)
+    assert record.score.status == "ok"
+    assert not any("confounded" in reason for reason in record.score.reasons)
+    assert record.baselines[CONTROL].scaled < 0.3
+
+
+def test_blocks_whose_times_explain_nothing_are_believed_and_unknown_times_make_no_control(tmp_path):
+    recordings, geometry = _make_recordings(blocked=False, tuning=0.2)
+    # Blocked order without drift of the tuned neurons: the times are those of blocks, the rates are not.
+    order = np.argsort(recordings["stimulus"].values.reshape(4, -1), axis=1, kind="stable")
+    times = np.empty(order.shape)
+    np.put_along_axis(times, order, np.arange(order.shape[1], dtype=float)[None], axis=1)
+    record = _score(tmp_path, geometry, recordings.assign_coords(window_start=("trial", times.ravel())))
+    assert record.score.provenance.statistics["presentation"]["confounded"] == 4
+    assert record.baselines[CONTROL].p > 0.05
+    assert record.score.status == "ok"
+    unknown, _ = _make_recordings(blocked=True, times=False)
+    assert CONTROL not in _score(tmp_path, _rank(), unknown).baselines
