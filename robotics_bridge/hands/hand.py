@@ -228,6 +228,7 @@ def all_from_file(path: Path) -> tuple[Hand, ...]:
 def from_file(path: Path, palm: str | None = None) -> Hand:
     """Return the hand of a file, or of several the one with that palm; what gets no taxels is named."""
     hands = all_from_file(path)
+    first = hands[0]
     if palm is not None:
         check_name("palm", palm, [hand.palm for hand in hands])
         return next(hand for hand in hands if hand.palm == palm)
@@ -235,10 +236,10 @@ def from_file(path: Path, palm: str | None = None) -> Hand:
         others = listing([hand.palm for hand in hands[1:]])
         _log.warning(
             "%s holds %d hands: that of palm %s is taken, and links of %s get no taxels. hands.load_all reads all, "
-            "hands.load(path, palm=...) another.", brief(path.name), len(hands), brief(hands[0].palm), others,
+            "hands.load(path, palm=...) another.", brief(path.name), len(hands), brief(first.palm), others,
         )  # fmt: skip
-    if hands[0].couplers:
+    if first.couplers:
         _log.warning("Hand %s: %s only move other links and get no taxels.", brief(path.stem),
-                     listing(sorted(hands[0].couplers)))  # fmt: skip
+                     listing(sorted(first.couplers)))  # fmt: skip
     # The name of a file's hand is that of the file, whatever else the file holds.
-    return replace(hands[0], name=path.stem)
+    return replace(first, name=path.stem)
