@@ -9,7 +9,7 @@ the times explain nothing.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
@@ -20,7 +20,8 @@ from brainbench.core.records import Score
 from brainbench.core.statistics import PresentationOrder, presentation_order
 
 if TYPE_CHECKING:
-    from brainbench.scoring.scores import ScoreInputs
+    from brainbench.metrics import Metric
+    from brainbench.scoring.neural_responses import NeuralResponses
 
 CONTROL = "presentation time"
 """Name of the control among the baselines of a record."""
@@ -60,31 +61,34 @@ class Presentation:
         return {"presentation": {**stated, "share": worst.share, "expected": worst.expected, "p": worst.p}}
 
 
-def presentation_of(inputs: ScoreInputs, *, control: bool) -> Presentation:
+def presentation_of(
+    brain: NeuralResponses, metric: Metric, animals: Sequence[Any], labels: Sequence[str], *, control: bool, seed: int
+) -> Presentation:
     """Return the orders of presentation; the control is scored if it is asked for or if they are confounded."""
     from brainbench.metrics.hooks import MetricHooks
 
-    times = dict(_sessions(inputs))
+    times = dict(_sessions(brain, labels))
     orders = {
         f"{subject} {session}": order
         for (subject, session), (start, codes) in times.items()
         if (order := presentation_order(start, codes)) is not None
     }
     result = Presentation(orders)
-    metric = inputs.metric
     comparable = isinstance(metric, MetricHooks) and not metric.of_model_alone
     if comparable and (control or any(order.confounded for order in orders.values())):
-        return replace(result, control=_control(inputs, times))
+        return replace(result, control=_control(metric, animals, labels, times, seed))
     return result
 
 
-def _sessions(inputs: ScoreInputs) -> Iterator[tuple[tuple[str, str], tuple[NDArray[Any], NDArray[Any]]]]:
+def _sessions(
+    brain: NeuralResponses, labels: Sequence[str]
+) -> Iterator[tuple[tuple[str, str], tuple[NDArray[Any], NDArray[Any]]]]:
     """Yield the begin [R] of the trials of every session and the places [R] of their stimuli; only of known times."""
-    data = inputs.brain.dataset
+    data = brain.dataset
     if "window_start" not in data.coords:
         return
     start = np.asarray(data["window_start"].values, dtype=np.float64)
-    place = {label: index for index, label in enumerate(inputs.labels)}
+    place = {label: index for index, label in enumerate(labels)}
     codes = np.array([place.get(label, -1) for label in data["stimulus"].values.astype(str).tolist()])
     names = list(zip(*(data[name].values.astype(str).tolist() for name in ("subject", "session")), strict=True))
     for name in dict.fromkeys(names):
@@ -93,13 +97,19 @@ def _sessions(inputs: ScoreInputs) -> Iterator[tuple[tuple[str, str], tuple[NDAr
             yield name, (start[rows], codes[rows])
 
 
-def _control(inputs: ScoreInputs, times: dict[tuple[str, str], tuple[NDArray[Any], NDArray[Any]]]) -> Score | None:
+def _control(
+    metric: Metric,
+    animals: Sequence[Any],
+    labels: Sequence[str],
+    times: dict[tuple[str, str], tuple[NDArray[Any], NDArray[Any]]],
+    seed: int,
+) -> Score | None:
     """Score the mean times of each animal's stimuli, sessions side by side, as its own layer."""
     from brainbench.metrics.score import score_layers
 
-    count, metric = len(inputs.labels), inputs.metric
+    count = len(labels)
     layers: dict[str, Any] = {}
-    for animal in inputs.animals:
+    for animal in animals:
         columns = [
             _mean_places(*trials, count)
             for (subject, _), trials in times.items()
@@ -108,8 +118,8 @@ def _control(inputs: ScoreInputs, times: dict[tuple[str, str], tuple[NDArray[Any
         if not columns:
             return None
         layers[animal.subject] = metric.layer(np.stack(columns, axis=1))
-    how: dict[str, Any] = {"stimuli": inputs.labels, "seed": inputs.options.seed, "each": True}
-    return score_layers(metric, layers, inputs.animals, name=CONTROL, **how)[0]
+    how: dict[str, Any] = {"stimuli": labels, "seed": seed, "each": True}
+    return score_layers(metric, layers, animals, name=CONTROL, **how)[0]
 
 
 def _mean_places(start: NDArray[Any], codes: NDArray[Any], count: int) -> NDArray[np.float64]:

@@ -224,7 +224,9 @@ def _compare(inputs: ScoreInputs, *, baselines: bool) -> tuple[list[Score], Scor
             for name, layers in features.items()
         ]
         between = inputs.metric.score_animals(inputs.animals, **how) if baselines else None
-    presentation = presentation_of(inputs, control=baselines)
+    presentation = presentation_of(
+        brain, inputs.metric, inputs.animals, inputs.labels, control=baselines, seed=options.seed
+    )
     stated = scores[0].provenance
     scores[0] = replace(scores[0], provenance=replace(stated, statistics=stated.statistics | presentation.statistics))
     if doubt := presentation.doubt:
