@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from brainbench.core.errors import UsageError, check_each
 from brainbench.core.reading.ranges import check_number
 from robotics_bridge.deploy.driver import Clock, Driver, HandReading, Source
-from robotics_bridge.deploy.safety import SafeLink, SafetyLimits
+from robotics_bridge.deploy.safety import Command, SafeLink, SafetyLimits
 from robotics_bridge.envs import ActionMap
 from robotics_bridge.envs.step import VELOCITY
 from robotics_bridge.policies.contract import RATE, PolicyContract
@@ -165,8 +165,8 @@ class Controller:
     ) -> None:
         self.run_policy, self.driver, self.contract, self.limits = run, driver, contract, limits
         self.clock = clock or Clock()
-        self.link = SafeLink(driver, limits, self.clock)
         check_number("control steps per second", contract.rate, least=RATE[0], most=RATE[1])
+        self.link = SafeLink(driver, limits, self.clock, 1 / contract.rate)
         self.rate, self.sources, self.record = contract.rate, dict(sources or {}), record
         if missing := [name for name in contract.inputs if name not in {"proprio", *self.sources}]:
             raise UsageError(f"The policy reads the group {missing[0]!r}, and nothing here gives it.")
@@ -190,18 +190,19 @@ class Controller:
         begun = self.clock()
         reason: str | None = "the control loop was interrupted"
         try:
-            reason = self._wait()
-            start = self.clock()
-            due = start
-            while reason is None and self.clock() - start < seconds:
-                before = self.clock()
-                reason = self._tick()
-                spent = self.clock() - before
-                self.overruns += spent > 1 / self.rate
-                # Due times lie on a fixed raster, so late ticks do not lower the rate; after a long stall at most one
-                # is made up for.
-                due = max(due + 1 / self.rate, self.clock() - 1 / self.rate)
-                self.clock.sleep(max(0.0, due - self.clock()))
+            with self.link.watched():
+                reason = self._wait()
+                start = self.clock()
+                due = start
+                while reason is None and self.clock() - start < seconds:
+                    before = self.clock()
+                    reason = self._tick()
+                    spent = self.clock() - before
+                    self.overruns += spent > 1 / self.rate
+                    # Due times lie on a fixed raster, so late ticks do not lower the rate; after a long stall at most
+                    # one is made up for.
+                    due = max(due + 1 / self.rate, self.clock() - 1 / self.rate)
+                    self.clock.sleep(max(0.0, due - self.clock()))
         finally:
             # Whatever happened, an exception included: the hand holds.
             self.link.stop()
@@ -232,6 +233,7 @@ class Controller:
             reason = f"control runs at {rate:.1f} Hz instead of {self.rate:g}"
         if reason is not None:
             return reason
+        deadline = self.link.deadline(reading)
         obs = self._observe(reading)
         if fault := next((name for name, value in obs.items() if not np.isfinite(value).all()), None):
             return f"the observation {fault!r} holds values that are no numbers"
@@ -247,7 +249,7 @@ class Controller:
         moved = zip(self.contract.moved, self.actions.targets(action).tolist(), strict=True)
         targets = self._limit({**self.contract.frozen, **dict(moved)}, reading)
         # Whatever took its time since the report was read: sources, the policy, or this computer.
-        if (reason := self.link.send(targets, reading)) is not None:
+        if (reason := self.link.send(Command(targets, reading, deadline))) is not None:
             return reason
         self.latency.append(self.clock() - begun)
         self.processor.append(time.thread_time() - busy)

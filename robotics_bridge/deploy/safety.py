@@ -5,7 +5,10 @@ Limits, finiteness and age are checked where a command is sent, after all that c
 
 from __future__ import annotations
 
+import contextlib
 import math
+import threading
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -122,15 +125,36 @@ class ClockOffset:
         return now - stamp - self._least
 
 
+@dataclass(frozen=True, eq=False)
+class Command:
+    """What a hand is asked for, with the report that it was decided from and the time until which it holds."""
+
+    targets: NDArray[np.float64]
+    """[J] (rad)."""
+    reading: HandReading
+    """Carries the time of the report."""
+    deadline: float
+    """Latest time (s, by the link's clock) at which it may be sent (:meth:`SafeLink.deadline`)."""
+
+
+SILENCE = 0.25
+"""Longest time without a command (s) after which the link stops the hand, in a thread of its own."""
+
+
 class SafeLink:
     """The one way to a hand, which lets no command pass that is unsafe or comes from an old report.
 
-    ``driver`` is the hand, ``clock`` that by which its reports are stamped when they arrive.
+    ``driver`` is the hand, ``clock`` that by which its reports are stamped when they arrive; ``step`` is the time of a
+    control step (s), for which a target may move on. A stop is final.
     """
 
-    def __init__(self, driver: Driver, limits: SafetyLimits, clock: Clock) -> None:
-        self._driver, self._limits, self._clock = driver, limits, clock
+    def __init__(self, driver: Driver, limits: SafetyLimits, clock: Clock, step: float) -> None:
+        self._driver, self._limits, self._clock, self._step = driver, limits, clock, step
         self._offset = ClockOffset()
+        self._before: NDArray[np.float64] | None = None
+        self._turn = threading.Lock()
+        self._due = math.inf
+        self._stopped = ""
 
     def read(self) -> HandReading | None:
         """Return the newest report, or None before the first."""
@@ -138,23 +162,65 @@ class SafeLink:
 
     def fault(self, reading: HandReading) -> str | None:
         """Return why a report must not be acted upon now, in words; None if it may."""
-        return self._limits.fault(reading, self._age(reading))
+        return self._stopped or self._limits.fault(reading, self._age(reading))
 
-    def send(self, targets: NDArray[np.float64], reading: HandReading) -> str | None:
-        """Send the targets [J] that were decided from a report; return why they were not sent, or None."""
-        if not self._limits.allows(targets):
+    def deadline(self, reading: HandReading) -> float:
+        """Return the latest time (s) at which a command from a report may be sent."""
+        return self._clock() - self._age(reading) + self._limits.timeout
+
+    def send(self, command: Command) -> str | None:
+        """Send a command; return why it was not sent, or None."""
+        targets, limits = command.targets, self._limits
+        if not limits.allows(targets):
             return "a command would be no numbers or beyond the joints' limits"
-        # Measured last: all that happened since the report was read counts, and the hand has moved on meanwhile.
-        if (age := self._age(reading)) > self._limits.timeout:
-            return (
-                f"a command came {1e3 * age:.0f} ms after the report it was decided from (allowed "
-                f"{1e3 * self._limits.timeout:.0f} ms)"
-            )
-        self._driver.send(targets)
+        before = command.reading.position if self._before is None else self._before
+        # From outside its range a joint is brought back at once.
+        way = np.abs(targets - np.clip(before, limits.low, limits.high)) - limits.speed * self._step
+        if (way > 1e-6).any():
+            return f"a command would move joint {int(way.argmax())} faster than allowed"
+        with self._turn:
+            if self._stopped:
+                return self._stopped
+            # Measured last: all that happened since the report was read counts, and the hand has moved on meanwhile.
+            now, timeout = self._clock(), limits.timeout
+            if not now <= command.deadline:
+                age = now - command.deadline + timeout
+                return (
+                    f"a command came {1e3 * age:.0f} ms after the report it was decided from (allowed "
+                    f"{1e3 * timeout:.0f} ms)"
+                )
+            self._driver.send(targets)
+            self._before, self._due = np.array(targets), now + self._step + SILENCE
         return None
+
+    @contextlib.contextmanager
+    def watched(self) -> Iterator[None]:
+        """Stop the hand if the next command does not come in time, whatever holds the loop up, until the block ends.
+
+        A clock of tests moves when it is told to, and no thread waits for it.
+        """
+        ended = threading.Event()
+
+        def watch() -> None:
+            while not ended.wait(SILENCE / 10):
+                with self._turn:
+                    if self._clock() > self._due and not self._stopped:
+                        self._stopped = f"no command came for {1e3 * (self._step + SILENCE):.0f} ms"
+                        self._driver.stop()
+
+        thread = threading.Thread(target=watch, daemon=True) if type(self._clock) is Clock else None
+        if thread is not None:
+            thread.start()
+        try:
+            yield
+        finally:
+            ended.set()
+            if thread is not None:
+                thread.join(1.0)
 
     def stop(self) -> None:
         """Tell the hand to hold where it is."""
+        self._stopped = self._stopped or "the hand was stopped"
         self._driver.stop()
 
     def _age(self, reading: HandReading) -> float:

@@ -31,6 +31,8 @@ MOST_AT_ONCE = 256
 """Datagrams read at once; a flood must not hold the control loop up."""
 FARTHEST = 4 * math.pi
 """Targets further from zero have no effect (rad or m): no joint of a hand has such a range."""
+MOST_OFFERS = 64
+"""Greetings that a hand remembers until a session starts; the oldest goes first."""
 _ERRORS = 8
 """Errors of the connection that are kept."""
 
@@ -218,7 +220,7 @@ class HandLink:
         self.stopped = True
         """True until a session begins, and after its stop: the hand holds where it is."""
         self._key, self._challenge = key, secrets.token_bytes(frames.NONCE)
-        self._offered: tuple[Any, bytes, bytes] = ((), b"", b"")  # who may start a session, and its two keys
+        self._offered: dict[tuple[Any, bytes], tuple[bytes, bytes]] = {}  # who may start a session → its two keys
         self._receiver: Receiver | None = None
         self._send_key = b""
         self._sequence = 0
@@ -258,7 +260,11 @@ class HandLink:
         hello = frames.decode(data, self._key)
         if hello is None or (hello.kind, hello.joints, hello.fingers) != (frames.HELLO, self.joints, self.fingers):
             return
-        self._offered = (sender, *frames.session_keys(self._key, hello.body, self._challenge))
+        # Each greeting has an offer of its own: one that a stranger repeats takes no place of another.
+        self._offered.pop((sender, hello.body), None)
+        self._offered[sender, hello.body] = frames.session_keys(self._key, hello.body, self._challenge)
+        if len(self._offered) > MOST_OFFERS:
+            del self._offered[next(iter(self._offered))]
         body = hello.body + self._challenge
         welcome = frames.encode(Frame(frames.WELCOME, self.joints, self.fingers, 0, now, body), self._key)
         with contextlib.suppress(OSError):
@@ -266,14 +272,18 @@ class HandLink:
 
     def _start(self, data: bytes, sender: Any, now: float) -> bool:
         """Begin the session that was offered to this sender; return False where the datagram starts none."""
-        offered, ours, theirs = self._offered
-        if sender != offered or (frame := frames.decode(data, ours)) is None or frame.kind != frames.START:
+        for (offered, _), keys in self._offered.items():
+            frame = frames.decode(data, keys[0]) if sender == offered else None
+            if frame is not None and frame.kind == frames.START:
+                break
+        else:
             return False
+        ours, theirs = keys
         self._receiver, self._send_key, self._sequence = Receiver(ours), theirs, 0
         self._receiver.judge(frame, now)
         self.peer, self.stopped = sender, False
         # Used once: what was recorded of this session starts no other.
-        self._offered, self._challenge = ((), b"", b""), secrets.token_bytes(frames.NONCE)
+        self._offered, self._challenge = {}, secrets.token_bytes(frames.NONCE)
         return True
 
     def _command(self, data: bytes, sender: Any, now: float) -> NDArray[np.float64] | None:

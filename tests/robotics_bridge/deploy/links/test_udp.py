@@ -326,6 +326,23 @@ def test_a_repeated_greeting_leaves_the_session_as_it_is(wire) -> None:
     assert wire.driver.read().sequence == 1
 
 
+def test_greetings_that_are_repeated_while_a_session_begins_do_not_prevent_it(wire) -> None:
+    recorded = wire.seen[0]
+    driver = UdpDriver(wire.front.getsockname(), ("a", "b"), ("thumb",), KEY)
+    wire._stack.callback(driver.close)
+    wire.controller = driver._socket.getsockname()
+    for _ in range(3):  # between greeting, welcome and start
+        wire.pass_on()
+        for source in (wire.back, wire.stranger):
+            wire.told(recorded, source=source)
+        wire.pass_on()
+        driver.read()
+    wire.pass_on()
+    wire.hand.receive(time.monotonic())
+    driver.send(np.full(J, 0.4))
+    np.testing.assert_allclose(wire.told(wire.front.recv(8192)), 0.4)
+
+
 def test_stop_is_heeded_even_late(wire) -> None:
     command = wire.capture(0.5)
     wire.driver.stop()
