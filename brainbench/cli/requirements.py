@@ -174,9 +174,8 @@ def _linked(callback: Callable[..., Output]) -> Callable[..., Output]:
         "allow_linked", inspect.Parameter.KEYWORD_ONLY, default=None, annotation=Annotated[list[Path] | None, option]
     )
     signature = inspect.signature(callback, eval_str=True)
-    run.__signature__ = signature.replace(  # pyright: ignore[reportFunctionMemberAccess]
-        parameters=[*(item.replace(kind=added.kind) for item in signature.parameters.values()), added]
-    )
+    parameters = [*(item.replace(kind=added.kind) for item in signature.parameters.values()), added]
+    setattr(run, "__signature__", signature.replace(parameters=parameters))  # noqa: B010 - unknown to type checkers
     return run
 
 

@@ -155,7 +155,7 @@ def _write_sessions(file: h5py.File, sessions: list[Session]) -> None:
             raise UsageError(f"Recordings are a data set or sessions of make_session; received {brief(session)}.")
         name = f"{session.subject}-{session.session}".replace("/", "_")
         if name in root:  # such as the probes of one session; their trials tell whether they are
-            name += f" {sum(key.partition(' ')[0] == name for key in root) + 1}"
+            name += f" {sum(str(key).partition(' ')[0] == name for key in root) + 1}"
         if session.units is None:
             raise DataError(f"Session {name!r} has no units table; there are no spikes to write.")
         session.units.rows(SPIKES)  # what no reader takes is not written
@@ -186,7 +186,7 @@ def columns_of(group: h5py.Group, path: Path) -> dict[str, Any]:
     import h5py
 
     columns: dict[str, Any] = {}
-    for name in group:
+    for name in map(str, group):
         reason = dead_link(group, name, path)
         node = group[name] if reason is None else LostColumn(reason)
         if isinstance(node, (h5py.Dataset, LostColumn)):
@@ -201,7 +201,8 @@ def dead_link(group: h5py.Group, name: str, path: Path) -> str | None:
     with contextlib.suppress(KeyError, OSError):
         group[name]
         return None
-    link, place = group.get(name, getlink=True), f"{(group.name or '').rstrip('/')}/{name}"
+    link: Any = group.get(name, getlink=True)
+    place = f"{(group.name or '').rstrip('/')}/{name}"
     target = f"{link.path!r} of {link.filename!r}" if isinstance(link, h5py.ExternalLink) else repr(link.path)
     return f"{place} of {path} is a link to {target}, which is not there; put that in its place or remove the link."
 

@@ -133,7 +133,8 @@ def _walk(parent: h5py.Group, path: Path, place: str = "") -> Iterator[tuple[str
     """Yield the groups that may be tables by place, and each dead link as a table that says so."""
     import h5py
 
-    for name in parent if place else [root for root in _ROOTS if root in parent or parent.get(root, getlink=True)]:
+    roots = [root for root in _ROOTS if root in parent or parent.get(root, getlink=True)]
+    for name in map(str, parent if place else roots):
         here = f"{place}/{name}" if place else name
         if (reason := dead_link(parent, name, path)) is not None:
             yield here, SessionTable(name, {}, str(path), reason)

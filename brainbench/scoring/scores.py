@@ -51,7 +51,7 @@ class ScoreInputs:
     options: ScoreOptions
 
     @cached_property
-    def features(self) -> dict[str, Any]:
+    def features(self) -> Mapping[str, Any]:
         """Features [K, F] of every layer of the model."""
         return self.network.features(self.rows)
 
@@ -228,7 +228,8 @@ def _compare(inputs: ScoreInputs, *, baselines: bool) -> tuple[list[Score], Scor
         brain, inputs.metric, inputs.animals, inputs.labels, control=baselines, seed=options.seed
     )
     stated = scores[0].provenance
-    scores[0] = replace(scores[0], provenance=replace(stated, statistics=stated.statistics | presentation.statistics))
+    statistics = {**stated.statistics, **presentation.statistics}
+    scores[0] = replace(scores[0], provenance=replace(stated, statistics=statistics))
     if doubt := presentation.doubt:
         scores, between = [_doubted(score, doubt) for score in scores], between and _doubted(between, doubt)
     if baselines and presentation.control is not None:

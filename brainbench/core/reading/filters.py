@@ -32,7 +32,7 @@ def naming_filters(file: h5py.File, path: str | os.PathLike[str]) -> Iterator[No
 
 
 def _need(name: str, node: Any) -> str | None:
-    from h5py import Dataset, h5z
+    from h5py import Dataset, h5z  # pyright: ignore[reportAttributeAccessIssue]
 
     create = node.id.get_create_plist() if isinstance(node, Dataset) else None
     codes = [create.get_filter(place)[0] for place in range(create.get_nfilters())] if create else []

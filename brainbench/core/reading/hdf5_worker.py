@@ -139,7 +139,7 @@ def _array(node: Any, name: str) -> None:
 
 
 def _lacks_filter(node: Any) -> bool:
-    from h5py import h5z
+    from h5py import h5z  # pyright: ignore[reportAttributeAccessIssue]
 
     create = node.id.get_create_plist()
     return not all(h5z.filter_avail(create.get_filter(place)[0]) for place in range(create.get_nfilters()))
@@ -199,7 +199,7 @@ class _Copy:
 
         if hops > MOST_HOPS:
             raise Refused(f"has links that lead to themselves or over more than {MOST_HOPS} others ({path[:80]!r})")
-        node = group.file["/"] if path.startswith("/") else group
+        node: Any = group.file["/"] if path.startswith("/") else group
         for step in path.split("/"):
             if step in ("", "."):
                 continue

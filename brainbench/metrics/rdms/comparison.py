@@ -120,11 +120,11 @@ def products_without(a: Floats, b: Floats, method: str) -> Floats:
         return rows.sum(axis=-1, keepdims=True) / 2 - rows
     left, right = (_second_moment(rdms).reshape(square(rdms).shape) for rdms in (a, b))
     rows = np.einsum("...nik,...aik->...nak", left, right)
-    own = np.einsum("...nkk,...akk->...nak", left, right)
+    squares = np.einsum("...nkk,...akk->...nak", left, right)
     # Rows of a centred matrix add up to 0, so those of what is left add up to −M_ik, and all of it to M_kk: centring
     # the rest anew takes no second pass.
-    rest = left.shape[-1] - 1
-    return rows.sum(axis=-1, keepdims=True) - 2 * rows + own - 2 * (rows - own) / rest + own / rest**2
+    rest = rows.shape[-1] - 1
+    return rows.sum(axis=-1, keepdims=True) - 2 * rows + squares - 2 * (rows - squares) / rest + squares / rest**2
 
 
 def features(rdms: Floats, method: str) -> Floats:
