@@ -258,7 +258,7 @@ def join_labels(
             stimuli that were not recorded are left out.
     """
     explicit = read_match(match) if isinstance(match, (str, os.PathLike)) else dict(match or {})
-    sides = f"recordings: {listing(vocabulary, limit=40)}; stimuli: {listing(labels, limit=40)}"
+    sides = f"recordings: {listing(vocabulary, limit=5)}; stimuli: {listing(labels, limit=5)}"
     # The same number or text in another form is the same label, unless two stimuli share it.
     forms = [as_label(label) for label in labels]
     equals = {form: label for form, label in zip(forms, labels, strict=True) if forms.count(form) == 1}
@@ -277,7 +277,7 @@ def join_labels(
     if alone := [label for label, partner in pairs.items() if partner not in labels]:
         unused = [label for label in labels if label not in pairs.values()]
         lonely = {"without a stimulus": alone, "without recordings": unused}
-        words = "; ".join(f"{what}: {listing(names, limit=40)}" for what, names in lonely.items() if names)
+        words = "; ".join(f"{what}: {listing(names, limit=5)}" for what, names in lonely.items() if names)
         # What may mean a missing value is dropped, and only a label that has no equal is paired.
         partner = "" if alone[0].lower() in DOUBTFUL_WORDS else next(iter(unused), "")
         raise UsageError(
