@@ -39,6 +39,7 @@ from brainbench.metrics.rdms.comparison import compare
 from brainbench.metrics.rdms.dissimilarity import rdm
 from brainbench.metrics.rdms.pairs import Floats, rdm_stack, stimulus_count
 from brainbench.metrics.reliability.noise_correction import (
+    ANIMAL_GATE,
     RELIABILITY_GATE,
     THESIS_FILTER,
     corrected_splits,
@@ -198,7 +199,7 @@ def explain_score(layer_rdms: Mapping[str, ArrayLike], subjects: Sequence[Subjec
         ("no split is left out", unfiltered),
         ("two negative reliabilities no longer pass", replace(unfiltered, negative_pairs=False)),
         (_AVERAGED, replace(CORRECTED, best_layer=True, no_gate=True)),
-        (f"animals with a reliability below {RELIABILITY_GATE} left out", replace(CORRECTED, best_layer=True)),
+        (f"animals with a reliability below {ANIMAL_GATE} left out", replace(CORRECTED, best_layer=True)),
         ("layer chosen on the other animals: the default", CORRECTED),
     )
     return tuple(_step(change, switches, rdms, usable) for change, switches in walk)
@@ -207,7 +208,7 @@ def explain_score(layer_rdms: Mapping[str, ArrayLike], subjects: Sequence[Subjec
 def _step(change: str, switches: Switches, rdms: Floats, subjects: list[SubjectRDM]) -> WalkStep:
     targets = [(subject.subject, subject.rdm, subject.split_half_by("pearson")) for subject in subjects]
     if not switches.no_gate:
-        trusted = [float(spearman_brown(r[np.isfinite(r)].mean())) >= RELIABILITY_GATE for _, _, r in targets]
+        trusted = [float(spearman_brown(r[np.isfinite(r)].mean())) >= ANIMAL_GATE for _, _, r in targets]
         targets = [target for target, keep in zip(targets, trusted, strict=True) if keep]
     if switches.best_target and len(subjects) > 1:
         # The published pool joined units, which are not kept here; the animals' mean RDM stands for it.
