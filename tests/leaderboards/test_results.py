@@ -48,8 +48,9 @@ def test_there_are_at_least_24_entries_with_twins_over_5_seeds_and_their_spread(
     seeds = Counter(entry.seeds for entry in entries if not entry.trained)
     assert seeds[5] >= 12
     assert all(len({record.score.value for record in entry.records}) == 5 for entry in entries if entry.seeds == 5)
-    assert {item.name for item in board.baselines} == {"animal-to-animal", "raw input", "random features"}
-    assert [item.notes for item in board.baselines] == [()] * 3  # one brain side and one seed of the statistics
+    controls = {"animal-to-animal", "raw input", "random features", "presentation time"}
+    assert {item.name for item in board.baselines} == controls
+    assert [item.notes for item in board.baselines] == [()] * 4  # one brain side and one seed of the statistics
     full = [entry for entry in entries if "-small" not in entry.name]
     assert len(full) >= 12
 
