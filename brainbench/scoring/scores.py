@@ -263,9 +263,10 @@ def _optional(name: str) -> Any:
 
 
 def _doubted(score: Score, doubt: str) -> Score:
-    """Return a score that is never ``ok``, with the doubt as its first reason."""
-    status = "unreliable" if score.status == "ok" else score.status
-    return replace(score, status=status, reasons=(doubt, *score.reasons))
+    """Return a score that is never ``ok``; why it has no value at all goes before the doubt."""
+    if score.status == "undefined":
+        return replace(score, reasons=(*score.reasons, doubt))
+    return replace(score, status="unreliable", reasons=(doubt, *score.reasons))
 
 
 def metric_of(options: ScoreOptions) -> Metric:

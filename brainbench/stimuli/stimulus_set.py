@@ -98,6 +98,7 @@ def read_stimulus_set(path: str | os.PathLike[str]) -> xr.Dataset:
         dataset = check_stimulus_set(stored.load())
         to_json(dataset.attrs).encode()  # bytes that are no text would end whatever shows them
         same = hash_stimulus_set(dataset) == dataset.attrs["content_hash"]
+    dataset.encoding["source"] = name
     if not same:
         raise DataError(
             f"The numbers in {name!r} do not match the content hash in the file: it was damaged or edited;"

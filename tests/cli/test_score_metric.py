@@ -29,7 +29,8 @@ def test_decoding_and_partial_rsa_print_what_they_add_and_layers_have_p_in_json(
     arguments = ("score", files["features"], "--recordings", files["recordings"], "--conditions", "trials:texture")
     found = run(*arguments, "--metric", "decoding", "--out", files["out"])
     assert found.status == 0, found.err
-    assert "name no property" in found.out or "Decoding of stimuli left out" in found.out
+    text = " ".join(found.out.split())
+    assert "name no property" in text or "Decoding of stimuli left out" in text
     data = json.loads(run(*arguments, "--out", files["out"], "--json").out)
     score = data["record"]["score"]
     tests = {item["layer"]: item for item in score["provenance"]["statistics"]["layer_tests"]}
