@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from brainbench.core.errors import DataError, UsageError, brief
+from brainbench.core.errors import DataError, UsageError, brief, listing
 from robotics_bridge.policies.contract import TrainedMap, from_json, trained_contacts
 from robotics_bridge.policies.shipped import stored
 from robotics_bridge.tasks.settings import contacts_name
@@ -65,8 +65,8 @@ def check_actions(described: Mapping[str, Any], env: Env, name: str) -> None:
     action_map, here = from_json(TrainedMap, given["action_map"], f"action_map of {name}"), env.action_map
     if action_map.names != here.names:
         raise UsageError(
-            f"The policy {name!r} moves {', '.join(action_map.names)} (task {str(given.get('task'))[:80]!r}), and the "
-            f"task {env.task.name!r} moves {', '.join(here.names)}: take the task in which it was trained."
+            f"The policy {name!r} moves {listing(action_map.names, limit=3)} (task {str(given.get('task'))[:80]!r}), "
+            f"and the task {env.task.name!r} moves {listing(here.names, limit=3)}: take the task of its training."
         )
     sides = (("are counted from", action_map.default, here.default), ("move by", action_map.scale, here.scale))
     for what, theirs, ours in sides:

@@ -227,7 +227,7 @@ class _Elimination:
 
     def take(self, block: slice) -> None:
         """Put a block of features into the regression."""
-        factor = torch.linalg.cholesky(self._gram[block, block])
+        factor = torch.linalg.cholesky(_regular(self._gram[block, block]))
         explained = torch.cholesky_solve(self._gram[block], factor)  # B: features of the block → all features
         weights = torch.cholesky_solve(self._product[block], factor)
         # Schur complement on the learning side; x − x_S B and y − x_S w on the test side.
@@ -243,10 +243,14 @@ class _Elimination:
         """Return by how much each taxel [N] would raise R² on the test environments."""
         blocks, own_test = (_blocks(gram[first:, first:], taxels, width) for gram in (self._gram, self._test_gram))
         product, test = (m[first:].unflatten(0, (taxels, width)) for m in (self._product, self._test_product))
-        # Of taken taxels nothing but the penalty's rest is left; it keeps the blocks regular.
-        weights = torch.linalg.solve(blocks + 1e-9 * torch.eye(width, dtype=blocks.dtype), product)
+        weights = torch.linalg.solve(_regular(blocks), product)
         lost = (weights * (own_test @ weights)).sum(1) - 2 * (weights * test).sum(1)
         return -(lost / self._spread).mean(1)
+
+
+def _regular(blocks: torch.Tensor) -> torch.Tensor:
+    """Return moments [..., F, F] that can be solved: of what is explained already only rounding is left."""
+    return blocks + 1e-9 * torch.eye(blocks.shape[-1], dtype=blocks.dtype)
 
 
 def _blocks(gram: torch.Tensor, taxels: int, width: int) -> torch.Tensor:

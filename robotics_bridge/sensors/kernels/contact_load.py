@@ -447,7 +447,8 @@ def tilt_group(
 ) -> bool:
     """Tilt the forces under one face of a body so that their moment is that of its contacts, their sum the same.
 
-    False where the taxels under it carry other faces as well, or not all of it: these are left as they are.
+    False where the sum is to be verified: after a tilt, and where the taxels under it carry other faces as well, or not
+    all of it, which are left as they are.
     """
     # The first contact of a face leads it.
     force = wp.vec3f()
@@ -469,6 +470,8 @@ def tilt_group(
     body = nodes.other[leader]
     push = nodes.normal[leader]
     span = plan.spans[sensor]
+    origin = nodes.point[leader]
+    verified = bool(True)
     steepest = float(2.0)
     last = float(1.0e30)
     # One tilt is enough unless the moment takes more than some taxels bear; then the rest is tilted again.
@@ -487,8 +490,10 @@ def tilt_group(
                     total += f
                     turning += wp.cross(x, f)
                     weight += size
-                    center += size * x
-                    spread += size * wp.outer(x, x)
+                    # From the contact, so that little is lost to rounding.
+                    arm = x - origin
+                    center += size * arm
+                    spread += size * wp.outer(arm, arm)
             if not (wp.length(total - force) <= 1.0e-4 * weight):
                 return False
             # As exact as a hundredth of a millimetre, or nothing won by the last tilt: done.
@@ -497,6 +502,7 @@ def tilt_group(
                 return True
             last = rest
             center = center / weight
+            extent = spread[0, 0] + spread[1, 1] + spread[2, 2]
             # Tensor of inertia of the forces' sizes about their centre: the forces |f| θ × r have the moment J θ and
             # the sum 0.
             spread -= weight * wp.outer(center, center)
@@ -504,8 +510,11 @@ def tilt_group(
             # A little more on its diagonal lets a row of taxels, which bears no moment along it, be solved.
             inertia = 1.0001 * trace * wp.identity(n=3, dtype=wp.float32) - spread
             tilt = wp.vec3f()
-            if trace > 1.0e-12 * weight:
+            # Taxels at one place bear no moment: what rounding leaves of their inertia is none.
+            if trace > 1.0e-4 * extent:
                 tilt = wp.inverse(inertia) @ (moment - turning)
+                verified = False
+            center += origin
             steepest = float(0.0)
             for n in range(span[0], span[1]):
                 if shares(press, env, n, body, push):
@@ -518,7 +527,7 @@ def tilt_group(
                     write_wrench(io.truth, env, n, x, tilted(force_of(io.truth, env, n), x, center, tilt))
                     if noisy == 1:
                         write_wrench(io.measured, env, n, x, tilted(force_of(io.measured, env, n), x, center, tilt))
-    return True
+    return verified
 
 
 @cache

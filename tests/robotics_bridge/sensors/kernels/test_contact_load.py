@@ -89,7 +89,7 @@ def test_a_face_larger_than_the_patch_is_felt_by_the_taxels_under_it() -> None:
     np.testing.assert_allclose(total[:3], expected[:3], atol=1e-3 * 51)
     assert abs(expected[4]) > 0.1
     np.testing.assert_allclose(total[3:], expected[3:], atol=1e-3 * 51 * 0.01)
-    assert suite.read("t")[..., 2].max() <= 0
+    assert suite.read("t")[..., 2].max() <= 1e-6  # rounding of 51 N
     assert _missing(suite) == 0
 
 
