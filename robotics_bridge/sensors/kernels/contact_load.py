@@ -433,18 +433,9 @@ def shares(press: PressArrays, env: int, n: int, body: int, push: wp.vec3f) -> b
 
 @wp.func
 def tilt_group(
-    plan: SpreadPlan,
-    probes: ProbeArrays,
-    nodes: ContactNodes,
-    press: PressArrays,
-    noisy: int,
-    io: ReadoutArrays,
-    env: int,
-    sensor: int,
-    k: int,
-    head: int,
-    leader: int,
-) -> bool:
+    plan: SpreadPlan, probes: ProbeArrays, nodes: ContactNodes, press: PressArrays, noisy: int, io: ReadoutArrays,
+    env: int, sensor: int, k: int, head: int, leader: int,
+) -> bool:  # fmt: skip
     """Tilt the forces under one face of a body so that their moment is that of its contacts, their sum the same.
 
     False where the sum is to be verified: after a tilt, and where the taxels under it carry other faces as well, or not
@@ -561,16 +552,9 @@ def settle_kernel(kinds: frozenset[int], raycast: bool, in_turn: bool) -> Any:
 
     @wp.func
     def weigh(
-        plan: SpreadPlan,
-        solids: SolidArrays,
-        pairs: PairArrays,
-        probes: ProbeArrays,
-        nodes: ContactNodes,
-        node: int,
-        env: int,
-        n: int,
-        place: int,
-    ) -> float:
+        plan: SpreadPlan, solids: SolidArrays, pairs: PairArrays, probes: ProbeArrays, nodes: ContactNodes,
+        node: int, env: int, n: int, place: int,
+    ) -> float:  # fmt: skip
         """Return what a taxel takes of a contact: by overlap with the geometry at ``place``, or −1: by nearness."""
         radius = probes.radius[n]
         if radius <= 0.0:

@@ -254,8 +254,12 @@ def wall(shape: SolidShape, x: wp.vec3f, facing: wp.vec3f, reach: float) -> wp.v
     slope = wp.dot(wp.vec3f(found[0], found[1], found[2]), facing)
     if slope <= 0.2 * radius:
         return outer(found, facing)
-    # A surface farther behind the sensor than its radius was not passed.
-    if found[3] >= radius:
+    # A surface farther behind the sensor than its radius was not passed; nor was one that thins out to its rim, as a
+    # lens does, farther behind than it is thick.
+    limit = radius
+    if shape.size[2] > 1.5 * shape.size[1]:
+        limit = wp.min(radius, shape.size[2])
+    if found[3] >= limit:
         return found
     # The nearest side faces away from the sensor, so the point lies past the middle. Going back along the sensor's
     # normal, the first face that is left, and not entered, is the one that the sensor came through.
@@ -378,7 +382,8 @@ def shape_functions(kinds: frozenset[int], raycast: bool) -> SimpleNamespace:
         slope = wp.dot(wp.vec3f(found[0], found[1], found[2]), facing)
         if slope <= 0.2 * radius:
             return outer(found, facing)
-        if found[3] >= radius:
+        # A surface farther behind the sensor than the solid is thick was not passed: it lies on a thin link.
+        if found[3] >= wp.min(radius, shape.thickness):
             return found
         back = -facing / radius
         most = (wp.max(found[3], 0.0) + 2.0 * shape.thickness) * radius / slope
