@@ -47,7 +47,7 @@ def test_actions_counted_from_another_pose_are_refused() -> None:
         twice = apply_overrides(tasks.load("in_palm_rotate"), ["action_ratio=1"])
         with pytest.raises(UsageError, match=r"by \S*thumb_bend_joint = 0\.916 rad, and here 1\.832 rad"):
             check_fit(described, tasks.make(twice, num_envs=1, threads=1), name)
-        with pytest.raises(UsageError, match="take the task in which it was trained"):
+        with pytest.raises(UsageError, match="take the task of its training"):
             check_fit(described, tasks.make("screwdriver", num_envs=1, threads=1), name)
     with pytest.raises(DataError, match="action_map"):
         check_fit({**stored("in_palm_rotate.teacher"), "action_map": {"names": ["a"]}}, _env(), "damaged")
