@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from brainbench.cli.destinations import out_file_option
+from brainbench.cli.options import with_options
 from brainbench.cli.output import Output, progress_bar, table_of
 from brainbench.cli.requirements import needs
 
@@ -19,7 +20,14 @@ _DISTANCES = {"close": 0.0, "medium": 4e-4, "far": 8e-4}
 
 
 @needs(cache=True)
+@with_options(
+    "robotics_bridge.envs.simulation:EnvOptions",
+    ("placement", "resolution", "noisy", "seed"),
+    parameter="touch",
+    build=False,
+)
 def hand(
+    touch: dict[str, Any],
     out: Annotated[Path | None, out_file_option("Stimulus-set file to write (.h5).")] = None,
     objects: Annotated[
         list[str] | None,
@@ -33,13 +41,9 @@ def hand(
         typer.Option(help="lateral_motion, static_pressure, enclosure, contour_following; all by default."),
     ] = None,
     robot: Annotated[str, typer.Option("--hand", help="xhand1, sharpa, or a URDF or MJCF file.")] = "xhand1",
-    placement: Annotated[str, typer.Option(help="Taxels on: hand, fingers, tips or palm.")] = "hand",
-    resolution: Annotated[str, typer.Option(help="Of the taxels: low, med or high.")] = "med",
     diagonal: Annotated[float, typer.Option(help="Size of shapes and meshes (mm).")] = 55.0,
     unit: Annotated[str | None, typer.Option(help="Length unit of mesh files.")] = None,
-    noisy: Annotated[bool, typer.Option("--noisy", help="Taxels with the published imperfections.")] = False,
     frames: Annotated[int, typer.Option(help="Frames of 9 ms; a multiple of 5.")] = 110,
-    seed: Annotated[int, typer.Option(help="Of the noise.")] = 0,
 ) -> Output:
     """Record exploratory procedures of a robot hand as a stimulus set that any model can be scored or probed on.
 
@@ -57,9 +61,8 @@ def hand(
     explored = [item for text in objects or ["primitives"] for item in objects_of(text, diagonal * 1e-3, unit)]
     with progress_bar() as progress:
         recording = record_exploration(
-            explored, tuple(procedure or PROCEDURES), hand=robot, resolution=resolution, placement=placement,
-            noisy=noisy, frames=frames, seed=seed, progress=progress,
-        )  # fmt: skip
+            explored, tuple(procedure or PROCEDURES), hand=robot, frames=frames, progress=progress, **touch
+        )
     calibration = recording.calibration()
     dataset = recording.dataset(calibration)
     dataset.attrs["content_hash"] = hash_stimulus_set(dataset)
@@ -77,7 +80,7 @@ def hand(
     ]
     silent = [item["stimulus"] for item in data if not item["sites_touched"]]
     unit_of = f"one unit = {calibration.force:.3g} N, {calibration.moment:.3g} N·m"
-    title = f"{recording.hand}, {placement}, {resolution}; {unit_of}"
+    title = f"{recording.hand}, {touch['placement']}, {touch['resolution']}; {unit_of}"
     columns = {
         "stimulus": "{0[stimulus]}",
         ">sites touched": lambda row: f"{row['sites_touched']} of {sites}",

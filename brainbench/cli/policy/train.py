@@ -18,18 +18,22 @@ from brainbench.cli.policy.options import DeviceOption, TaskArgument, TaskFileOp
     "robotics_bridge.policies.training.teacher:TeacherRun",
     ("iterations", "minutes", "start", "start_std", "observe", "encoder", "loggers", "save_every", "seed"),
 )
+@with_options(
+    "robotics_bridge.tasks.settings:TeacherSettings",
+    ("num_envs", "steps_per_env", "rnd_weight", "initial_std"),
+    parameter="changes",
+    flags={"num_envs": ("--envs",), "steps_per_env": ("--steps",), "rnd_weight": ("--curiosity",)},
+    given=True,
+)
 @in_world
 def train(
     world: World,
     options: Any,
+    changes: dict[str, Any],
     out: Annotated[Path | None, out_folder_option("Folder of the run; started again, it goes on.")] = None,
-    envs: Annotated[int | None, typer.Option("--envs", help="Environments at once (published: 8192).")] = None,
-    steps: Annotated[int | None, typer.Option(help="Control steps per environment and iteration.")] = None,
-    curiosity: Annotated[float | None, typer.Option(help="Weight of the RND reward (published: 100).")] = None,
     touch: Annotated[str, typer.Option(help="Tactile observation type of touch.")] = "agg_bool",
     placement: Annotated[str, typer.Option(help="Place of the taxels: hand, fingers, tips or palm.")] = "hand",
     resolution: Annotated[str, typer.Option(help="Number of taxels: low, med or high.")] = "med",
-    initial_std: Annotated[float | None, typer.Option(help="Of the first policy's actions (published: 1).")] = None,
     device: DeviceOption = "cpu",
 ) -> Output:
     """Train the teacher of a task by PPO, or go on with a run.
@@ -40,12 +44,10 @@ def train(
     """
     from robotics_bridge.policies.training import teacher
 
-    count = envs or (8192 if device != "cpu" else 64)
+    changes = {"num_envs": 8192 if device != "cpu" else 64} | changes
     senses = {"observe": touch, "placement": placement, "resolution": resolution} if "touch" in options.observe else {}
-    env = world.make(num_envs=count, device=device, seed=options.seed, **senses)
-    given: dict[str, Any] = {"steps_per_env": steps, "rnd_weight": curiosity, "initial_std": initial_std}
-    chosen = {name: value for name, value in given.items() if value is not None}
-    settings = replace(env.task.teacher, num_envs=count, **chosen)
+    env = world.make(num_envs=changes["num_envs"], device=device, seed=options.seed, **senses)
+    settings = replace(env.task.teacher, **changes)
     run = out or Path("runs") / f"{world.task}-{env.hand.name}-{options.seed}"
     with progress_bar() as progress:
         result = teacher.train(env, run, options, settings=settings, progress=progress)
@@ -128,15 +130,15 @@ def distill(
     return Output(result, "\n".join(lines), failure=failure)
 
 
+@with_options(DISTILL, ("num_envs", "iterations"), parameter="changes", flags=DISTILL_FLAGS, given=True)
 def sweep(
+    changes: dict[str, Any],
     file: Annotated[Path | None, typer.Argument(help="A sweep (TOML); by default table 4.10 of the thesis.")] = None,
     subset: Annotated[str, typer.Option(help="all, types, encoders, or an observation type.")] = "all",
     count: Annotated[bool, typer.Option("--count", help="Print how many students there are, and stop.")] = False,
     names: Annotated[bool, typer.Option("--list", help="Print their names, and stop.")] = False,
     out: Annotated[Path, typer.Option(callback=out_folder, help="Folder of the runs.")] = Path("students"),
     shard: Annotated[str, typer.Option(help="Part of the students, as 0/4.")] = "0/1",
-    envs: Annotated[int | None, typer.Option(help="Environments at once, in place of the file's.")] = None,
-    iterations: Annotated[int | None, typer.Option(help="In place of the file's.")] = None,
     episodes: Annotated[int, typer.Option(help="Of the evaluation, per seed.")] = 100,
     device: DeviceOption = "cpu",
     task_file: TaskFileOption = None,
@@ -156,8 +158,6 @@ def sweep(
         text = table("", ["entry or type", "students"], rows, right=(1,))
         return Output(numbers, f"{text}\n\n{numbers['students']} students in {plan.name}, {subset}{extra}")
     part, parts = part_of(shard, "--shard takes")
-    changes: dict[str, Any] = {"num_envs": envs, "iterations": iterations}
-    changes = {name: value for name, value in changes.items() if value is not None}
     students = [replace(student, **changes) for student in plan.students(subset)][part::parts]
     if names:
         return Output([student.name for student in students], "\n".join(student.name for student in students))

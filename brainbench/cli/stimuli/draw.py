@@ -3,19 +3,29 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from brainbench.cli.destinations import out_file_option
-from brainbench.cli.options import numbers, refuse
+from brainbench.cli.options import numbers, refuse, with_options
 from brainbench.cli.output import Output, progress_bar
 from brainbench.cli.stimuli import scenes
 from brainbench.cli.stimuli.scenes import BackendOption, FidelityOption, StimulusOption, WhiskersOption
 from brainbench.stimuli.engines.fidelity import DEFAULT_ENGINE
 
 
+@with_options(
+    "brainbench.stimuli.figures.pictures:Style",
+    ("color", "thickness", "opacity", "frames_per_second"),
+    parameter="style",
+    flags={"frames_per_second": ("--fps",)},
+    build=False,
+)
+@with_options("brainbench.stimuli.figures.camera:Camera", ("projection",), parameter="lens", build=False)
 def render(
+    style: dict[str, Any],
+    lens: dict[str, Any],
     source: Annotated[str, typer.Argument(help="A recipe name or a scene file (.toml).")],
     out: Annotated[Path, out_file_option("File to write: .png for one instant, .mp4 or .gif.")],
     stimulus: StimulusOption = None,
@@ -27,17 +37,12 @@ def render(
         float | None, typer.Option(help="Last instant of a film, ms. [default: 150 ms after start]")
     ] = None,
     step: Annotated[float, typer.Option(help="Time between the frames of a film, ms.")] = 2.0,
-    fps: Annotated[float, typer.Option(help="Frames per second of a film.")] = 25.0,
     view: Annotated[
         str, typer.Option(help="top, bottom, side, left, front, back, oblique, or a direction x,y,z to the camera.")
     ] = "oblique",
-    projection: Annotated[str, typer.Option(help="perspective or orthographic.")] = "perspective",
     look_at: Annotated[str | None, typer.Option(help="Point x,y,z in the middle, mm. [default: all in view]")] = None,
     width: Annotated[float | None, typer.Option(help="Width of the picture at that point, mm.")] = None,
-    color: Annotated[str, typer.Option(help="Colour whiskers by row or by bending moment: row or moment.")] = "row",
     moment_limit: Annotated[float | None, typer.Option(help="Moment at the end of the colours, µN·m.")] = None,
-    thickness: Annotated[float, typer.Option(help="Draw whiskers so many times as thick as they are.")] = 2.0,
-    opacity: Annotated[float, typer.Option(help="Opacity of objects, 0 to 1.")] = 1.0,
     size: Annotated[str | None, typer.Option(help="Pixels. [default: 1280x960, a film 800x600]")] = None,
     whiskers: WhiskersOption = "all",
     fidelity: FidelityOption = "balanced",
@@ -52,7 +57,10 @@ def render(
     suffix = check_format(out, drawing.FORMATS)
     scene = scenes.choose_scene(scenes.open_recipe(source, whiskers), stimulus)
     if suffix == ".png":
-        refuse({"--start": start != 0, "--stop": stop, "--step": step != 2.0, "--fps": fps != 25.0}, "for a picture")
+        refuse(
+            {"--start": start != 0, "--stop": stop, "--step": step != 2.0, "--fps": style["frames_per_second"] != 25.0},
+            "for a picture",
+        )
         times = [drawing.still_time(scene) if at is None else at * 1e-3]
     else:
         refuse({"--at": at}, "for a film, which takes --start, --stop and --step")
@@ -60,24 +68,18 @@ def render(
     target = None if look_at is None else numbers(look_at, "--look-at", float, count=3)
     camera = Camera(
         view=view if view.replace("-", "").isalpha() else numbers(view, "--view", float, count=3),  # type: ignore[arg-type]
-        projection=projection,  # type: ignore[arg-type]
+        **lens,
         target=None if target is None else tuple(1e-3 * value for value in target),  # type: ignore[arg-type]
         width=None if width is None else width * 1e-3,
     )
     default_size = Style().size if suffix == ".png" else drawing.FILM_SIZE
     pixels = default_size if size is None else numbers(size, "--size", count=2)
-    style = Style(
-        color=color,  # type: ignore[arg-type]
-        moment_limit=None if moment_limit is None else moment_limit * 1e-6,
-        thickness=thickness,
-        opacity=opacity,
-        size=(pixels[0], pixels[1]),
-        frames_per_second=fps,
-    )
-    how = {"times": times, "camera": camera, "style": style}
+    limit = None if moment_limit is None else moment_limit * 1e-6
+    drawn = Style(**style, moment_limit=limit, size=(pixels[0], pixels[1]))
+    how = {"times": times, "camera": camera, "style": drawn}
     with progress_bar() as progress:
         path = drawing.render(scene, out, **how, fidelity=fidelity, backend=backend, progress=progress)
-    data = {"path": path, "stimulus": scene.label, "times_s": times, "camera": camera, "style": style}
+    data = {"path": path, "stimulus": scene.label, "times_s": times, "camera": camera, "style": drawn}
     what = f"{times[0] * 1e3:g}" if len(times) == 1 else f"{len(times)} frames, {times[0] * 1e3:g}–{times[-1] * 1e3:g}"
     return Output(data, f"{scene.label} ({what} ms)  {path}")
 

@@ -39,6 +39,7 @@ class Camera:
     view: str | Vector = "oblique"
     """A name of :data:`VIEWS`, or the direction from the target to the camera (world)."""
     projection: Literal["perspective", "orthographic"] = "perspective"
+    """``perspective``, or ``orthographic`` for measuring."""
     target: Point | None = None
     """Point in the middle of the picture [m, world]; None frames what is shown."""
     width: Length | None = None
