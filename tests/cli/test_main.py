@@ -77,6 +77,7 @@ def test_ctrl_c_while_the_command_line_itself_is_imported_prints_no_traceback(tm
     assert len(done.stderr.strip().splitlines()) == 1
 
 
+@pytest.mark.slow
 def test_ctrl_c_is_answered_in_one_sentence_that_says_how_to_go_on(tmp_path):
     model, begun = tmp_path / "slow.py", tmp_path / "begun"
     model.write_text(f"import pathlib, time\npathlib.Path({str(begun)!r}).touch()\ntime.sleep(60)\n")
@@ -111,6 +112,7 @@ def _command(*words: str, stdout=subprocess.PIPE, **environment: str) -> subproc
     )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_a_board_is_built_without_docstrings_and_has_the_same_schema(boards, tmp_path):
     for level in ("", "2"):
         done = _command(
@@ -121,12 +123,14 @@ def test_a_board_is_built_without_docstrings_and_has_the_same_schema(boards, tmp
     assert len(schemas) == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("words", [("models", "list"), ("stimuli", "objects"), ("--help",), ("doctor",)])
 def test_commands_need_no_docstrings(words):
     done = _command(*words, PYTHONOPTIMIZE="2")
     assert (done.returncode, "Traceback" in done.stderr) == (0, False)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("encoding", ["ascii", "latin-1"])
 def test_characters_that_a_terminal_lacks_are_replaced(boards, encoding):
     done = _command("leaderboard", "diff", *boards, PYTHONIOENCODING=encoding)

@@ -80,6 +80,7 @@ def test_the_reliability_of_scores_is_shown_before_scoring(run, folder):
     assert "'cka'" in refused.err
 
 
+@pytest.mark.slow
 def test_the_demo_recordings_can_be_looked_into_and_checked(run):
     assert "trials:stimulus" in run("recordings", "inspect", "demo").out
     result = run("recordings", "check", "demo")

@@ -24,6 +24,7 @@ def _options(folder, out):
     return ("--data", folder, "--out", str(out), "--epochs", "2", "--batch-size", "8", "--device", "cpu")
 
 
+@pytest.mark.slow
 def test_a_model_is_trained_scored_by_its_folder_and_exported(run, folder, tmp_path):
     trained = run("train", "s4-small", *_options(folder, tmp_path / "run"), "--augmentation", "none")
     assert trained.status == 0, trained.err

@@ -34,6 +34,7 @@ def _streams_alike(name, path, format):
     return made
 
 
+@pytest.mark.slow
 def test_an_onnx_file_computes_what_the_network_does(tmp_path):
     made = _streams_alike("zhuang-ugrnn-ln-small", tmp_path / "model", "onnx")
     assert made.path.suffix == ".onnx"

@@ -228,6 +228,7 @@ def _agrees(ours, theirs, share, largest=None):
     assert error <= share, f"{error:.1e} of the largest value"
 
 
+@pytest.mark.slow
 @pytest.mark.shared
 @pytest.mark.parametrize("name", ALL)
 @torch.no_grad()

@@ -81,6 +81,7 @@ def test_a_score_is_the_best_layer_and_target_of_their_procedure(arrays, feature
     assert any("maximum over 4 layers and 4 targets" in reason for reason in score.reasons)
 
 
+@pytest.mark.slow
 @pytest.mark.shared
 def test_the_example_file_scores_as_their_procedure_does(reference, features):
     with np.load(reference / "published" / "rodgers6_example.npz", allow_pickle=False) as stored:

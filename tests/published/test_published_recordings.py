@@ -36,6 +36,7 @@ def features():
     return {f"layer{number}": rng.normal(size=(6, 30)) for number in range(3)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("options", [{}, {"metric": "rsa-correlation"}, {"metric": "ridge"}, {"estimator": "thesis"}])
 def test_no_score_is_ok_and_the_first_reason_is_the_labels(file, features, options):
     record = score_record(features, recordings=file, stimuli="rodgers", **options)

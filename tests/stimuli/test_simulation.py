@@ -285,6 +285,7 @@ def test_scenes_that_do_not_fit_together_are_refused(scenes, message):
         _simulate(scenes)
 
 
+@pytest.mark.slow
 def test_new_scenes_twist_and_shipped_recipes_state_that_they_do_not():
     new = simulate([_scene("new")], fidelity="fast", cache=False)
     assert json.loads(new.attrs["fidelity"])["twist"] is True

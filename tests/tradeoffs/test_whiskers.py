@@ -31,6 +31,7 @@ SOLVED = whiskers.REFERENCE.fidelity.contact_tolerance
 FINE = SimulationSetting(Fidelity(links=8, time_step=2e-4, steps_per_period=10), "mujoco")
 
 
+@pytest.mark.slow
 def test_a_setting_is_measured_once_and_the_reference_differs_from_itself_by_nothing(quick, tmp_path):
     path = tmp_path / "table.json"
     (first,) = run_study(whiskers.study([FINE]), path)

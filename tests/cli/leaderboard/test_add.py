@@ -36,6 +36,7 @@ def test_diff_names_what_changed(run, scored, tmp_path):
     assert "No difference." in run("leaderboard", "diff", old, old).out
 
 
+@pytest.mark.slow
 def test_models_are_scored_once_and_the_batch_goes_on_where_it_stopped(run, files, tmp_path):
     batch = tmp_path / "batch.toml"
     options = f'recordings = "{files["recordings"]}"\nstimuli = "{files["arrays"]}"\nconditions = "trials:texture"\n'

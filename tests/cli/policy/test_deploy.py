@@ -42,6 +42,7 @@ def test_deploy_refuses_files_without_a_contract_and_unknown_faults(tmp_path) ->
         run_policy("deploy", path)
 
 
+@pytest.mark.slow
 def test_deploy_asks_for_what_is_missing_before_a_hand_is_started(tmp_path, monkeypatch) -> None:
     path = export_small(tmp_path)
 
@@ -73,6 +74,7 @@ def test_deploy_asks_for_what_is_missing_before_a_hand_is_started(tmp_path, monk
             run_policy("deploy", path, *words)
 
 
+@pytest.mark.slow
 def test_a_student_plays_with_its_own_touch_and_is_exported(tmp_path: Path) -> None:
     from robotics_bridge.deploy.session import read_deployed
     from robotics_bridge.tasks.settings import CONTACTS

@@ -50,6 +50,7 @@ def test_a_policy_that_plays_forgets_an_episode_that_ended(quick: Path, monkeypa
     assert steps == [4, 4, 2]
 
 
+@pytest.mark.slow
 def test_playing_needs_no_package_for_training_and_checks_names_first() -> None:
     code = """
 import sys

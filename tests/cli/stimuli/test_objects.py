@@ -21,6 +21,7 @@ def test_the_families_are_listed(run):
     assert "family:NAME" in run("stimuli", "objects").out
 
 
+@pytest.mark.slow
 def test_a_member_of_a_family_is_described_and_written(run, tmp_path):
     out = tmp_path / "torus.obj"
     arguments = ("stimuli", "objects", "torus", "--seed", "3", "--diagonal-mm", "30", "--export", str(out))

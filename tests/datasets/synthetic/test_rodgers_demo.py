@@ -151,6 +151,7 @@ def test_inspection_says_that_it_is_synthetic(folder):
     assert report.proposals[0].labels == LABELS
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
 def test_files_are_valid_for_pynwb_and_free_of_critical_findings(folder):
     pynwb = pytest.importorskip("pynwb")

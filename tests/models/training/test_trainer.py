@@ -178,6 +178,7 @@ def test_a_finished_run_is_not_repeated(tmp_path):
     assert len(_lines(tmp_path)) == 3
 
 
+@pytest.mark.slow
 def test_a_run_is_compared_with_raw_input_random_features_and_its_twin_once(tmp_path, monkeypatch):
     shared = tmp_path / "search"
     first = train(_config(epochs=1), tiny(), out=shared / "a", controls=shared, device="cpu")

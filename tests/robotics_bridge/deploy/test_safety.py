@@ -312,6 +312,7 @@ print(json.dumps([max(hand.ages), report.status, report.reason, hand.stops]), fl
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="signals")
 def test_a_session_that_was_suspended_stops_when_it_goes_on() -> None:
     root = os.fspath(Path(__file__).parents[3])

@@ -59,6 +59,7 @@ class _Waits(TorchDispatchMode):
         return func(*args, **(kwargs or {}))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("task", "options"), CASES, ids=[case[0] for case in CASES])
 def test_a_control_step_neither_copies_from_the_host_nor_waits_for_the_device(task: str, options: Any) -> None:
     env = _make(task, options, threads=1)

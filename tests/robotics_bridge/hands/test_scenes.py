@@ -134,6 +134,7 @@ def test_a_hand_closes_by_a_share_between_none_and_all(share):
         closing(hands.load("xhand1"), share)
 
 
+@pytest.mark.slow
 @pytest.mark.shared
 def test_a_urdf_without_drives_gets_servos_and_closes_too(reference):
     hand = hands.load(reference / "hands/sharpa/sharpa_right_updated_effort.urdf")

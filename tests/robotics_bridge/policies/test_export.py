@@ -172,6 +172,7 @@ SLOWER = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["mlp", *SLOWER])
 def test_onnx_file_follows_the_policy_for_sixty_steps_with_resets(name, tmp_path) -> None:
     policy = _make_policy(name, tactile={"time": "resampled"} if name == NETWORK else {})
@@ -220,6 +221,7 @@ class _Numb(StepPolicy):
         return super().forward(*(0.0 * item if item.ndim > 2 else item for item in inputs))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("wrong", "message"), [(_HeadOnly, "no input 'tactile'"), (_Numb, "differs from the policy")])
 def test_an_export_that_loses_the_encoder_fails_and_leaves_no_file(wrong, message, tmp_path) -> None:
     with torch.random.fork_rng():

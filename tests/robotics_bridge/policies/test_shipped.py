@@ -34,6 +34,7 @@ def test_every_teacher_fits_its_task_and_has_a_card(name: str) -> None:
     assert torch.isfinite(action).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", list_policies("student"))
 def test_every_student_reads_what_a_hand_measures_and_exports(name: str, tmp_path: Path) -> None:
     student, facts = load_student(name)

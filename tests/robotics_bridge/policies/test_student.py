@@ -136,6 +136,7 @@ SLOWER = [
 ]
 
 
+@pytest.mark.slow
 def test_a_policy_that_was_sampled_in_training_is_exported_and_never_as_a_program(tmp_path) -> None:
     policy = _make_policy("zhuang-small", distribution_cfg={"class_name": "GaussianDistribution", "init_std": 1.0})
     assert export_policy(policy, tmp_path / "policy").difference < 1e-4

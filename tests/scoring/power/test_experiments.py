@@ -89,6 +89,7 @@ def test_power_is_that_of_the_scores_own_test():
     assert found / 400 == pytest.approx(expected.power, abs=0.06)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dimensions", [2, 10])
 def test_the_power_predicted_from_a_pilot_is_that_of_new_experiments(dimensions):
     """Trials of 60 neurons and whole experiments on them; everything that the prediction takes is measured on them."""

@@ -81,6 +81,7 @@ def test_unstable_whiskers_say_so():
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", ["png", "svg", "pdf"])
 def test_several_stimuli_make_a_file_each_with_equal_bytes_every_time(few, tmp_path, suffix):
     paths = plot(few, tmp_path / f"traces.{suffix}", size=(400, 240))

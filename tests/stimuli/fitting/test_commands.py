@@ -39,6 +39,7 @@ def test_a_ring_down_is_fitted_written_and_drawn(run, ringdown_file, tmp_path):
     assert (tmp_path / "fit.png").stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_contacts_of_a_track_are_printed(run, tmp_path):
     from brainbench.stimuli.fitting.curves import LoadedWhisker
 

@@ -45,6 +45,7 @@ def test_shapes_are_those_of_the_elastica(whisker, at, depth):
     np.testing.assert_allclose(found.force[0] * force, contact.force, rtol=1e-5, atol=1e-10)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("whisker", "at", "depth"), [(MOUSE, 0.4, 0.12), (RAT, 0.6, -0.1), (RAT, 0.8, 0.15)])
 def test_force_and_place_come_back_within_a_tenth_at_20_micrometres(whisker, at, depth):
     arc, force = _press(whisker, at, depth)
@@ -101,6 +102,7 @@ def test_a_free_whisker_shows_no_contact_also_in_neighbouring_frames():
     assert "No sign of a contact" in str(found["reason"].values[0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("bend", [0.7, 1.0, 1.3])
 def test_a_wrong_rest_curvature_is_told(caplog, bend):
     rat = WhiskerArray.rat()["C1"].whisker
@@ -110,6 +112,7 @@ def test_a_wrong_rest_curvature_is_told(caplog, bend):
     assert ("same side" in caplog.text) == (bend != 1)
 
 
+@pytest.mark.slow
 def test_another_whiskers_stiffness_or_taper_is_noticed_or_scales_the_force():
     arc, force = _press(MOUSE, 0.6, 0.2)
     points, _ = _shape(MOUSE, arc, force)
@@ -134,6 +137,7 @@ def test_the_shape_of_the_rod_engine_tells_its_own_force():
     assert float(found["arc"][0]) == pytest.approx(test.contact_arc, rel=0.03)
 
 
+@pytest.mark.slow
 def test_shapes_in_a_tilted_plane_give_the_same_force():
     arc, force = _press(MOUSE, 0.6, 0.15)
     points, _ = _shape(MOUSE, arc, force)
@@ -198,6 +202,7 @@ def test_reversed_and_mirrored_tracks_are_named_as_such(way, words):
     assert all(words in reason for reason in contacts["reason"].values)
 
 
+@pytest.mark.slow
 def test_a_trace_that_may_begin_off_the_base_needs_its_first_arc():
     shapes, force = _track(lambda points: points, begin=0.2)
     contacts = find_contacts(shapes, RAT)

@@ -210,6 +210,7 @@ def test_intervals_contain_the_error_of_links_and_steps():
             assert result[name].interval.low <= truth <= result[name].interval.high, (name, seed)
 
 
+@pytest.mark.slow
 def test_a_pole_is_found_by_the_forces_on_the_base():
     scene, trial = _pole()
     trace = simulate_trial(trial, options=QUICK)

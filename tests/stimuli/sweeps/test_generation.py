@@ -128,6 +128,7 @@ def _threads(processes):
     return ThreadPoolExecutor(processes)
 
 
+@pytest.mark.slow
 def test_several_processes_write_the_same_bytes(plan, unbroken, tmp_path):
     generate(plan, tmp_path / "set", workers=2)
     assert files_of(tmp_path / "set") == files_of(unbroken)

@@ -18,6 +18,7 @@ def _force(whisker, at, share):
     return share * whisker.arc_length / references.point_load_deflection(straight, 1.0, at)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("whisker", "backend"), [(MOUSE, "rod"), (RAT, "rod"), (RAT, "mujoco")], ids=["mouse-rod", "rat-rod", "rat-mujoco"]
 )

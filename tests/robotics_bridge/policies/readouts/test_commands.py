@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 
+import pytest
 from typer.testing import CliRunner
 
 from brainbench.cli import app
@@ -17,6 +18,7 @@ def _run(*arguments: object, code: int = 0) -> str:
     return result.stdout
 
 
+@pytest.mark.slow
 def test_a_probe_feels_as_its_student_does(tmp_path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
     teacher, small = ("--teacher", "in_palm_rotate.teacher"), ("--envs", 2, "--iterations", 1, "--episodes", 0)

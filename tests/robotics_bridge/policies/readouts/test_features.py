@@ -78,6 +78,7 @@ def test_noise_is_no_touch() -> None:
     assert float(features.bits(felt, links).mean()) < 0.1
 
 
+@pytest.mark.slow
 def test_what_is_read_does_not_set_the_unit_of_the_encoders() -> None:
     env = tasks.make(
         "in_palm_rotate", num_envs=4, observe="force_torque", placement="palm", resolution="low", threads=1, seed=3

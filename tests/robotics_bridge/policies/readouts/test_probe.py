@@ -84,6 +84,7 @@ def test_an_arm_differs_from_itself_by_nothing_and_draws_widen_the_interval() ->
     assert both.per_draw("spin")[0] > 0.99 > 0.1 > both.per_draw("spin")[1]
 
 
+@pytest.mark.slow
 def test_a_rollout_in_a_task_is_read_from_every_arm_of_a_probe() -> None:
     env = tasks.make(
         "in_palm_rotate", num_envs=10, observe="force_torque", placement="tips", resolution="low", threads=1

@@ -267,6 +267,7 @@ def _sensing_run(folder: Path, iterations: int, **options: object) -> dict[str, 
     return student.state_dict()
 
 
+@pytest.mark.slow
 def test_a_policy_of_joints_and_touch_learns_goes_on_and_acts_as_a_student(tmp_path: Path) -> None:
     whole = _sensing_run(tmp_path / "whole", 2, loggers=("csv",))
     _sensing_run(tmp_path / "parts", 1)

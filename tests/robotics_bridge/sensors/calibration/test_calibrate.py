@@ -20,6 +20,7 @@ PLANTED = Noise(
 )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_planted_values_are_recovered_within_their_intervals():
     found = calibrate(log_of(PLANTED))
     noise = found.noise
@@ -40,6 +41,7 @@ def test_planted_values_are_recovered_within_their_intervals():
     assert 0.1 <= noise.dead_range[0] <= noise.dead_range[1] <= 0.6 + 1e-6
 
 
+@pytest.mark.slow
 def test_presses_that_the_model_does_not_explain_are_told():
     knobs = {"white": 0.02, "gain": (0.8, 1.2), "hysteresis": 0.4, "hysteresis_tau": 0.06, "bias": 0.1}
     told = [calibrate(log_of(Noise(**knobs, read_delay=0.02, jitter=j), 1500, 6, seed=2)).notes for j in (0.0, 0.01)]

@@ -37,6 +37,7 @@ def test_jitter_is_told_from_few_presses(delay, seed):
     assert abs(found.noise.hysteresis) < 0.02
 
 
+@pytest.mark.slow
 def test_a_log_may_begin_under_load():
     noise = Noise(white=0.02, hysteresis=0.4, hysteresis_tau=0.06, gain=(0.8, 1.2), read_delay=0.03)
     log = log_of(noise, 1500, 12)

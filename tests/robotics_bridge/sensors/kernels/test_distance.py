@@ -50,6 +50,7 @@ def test_a_sheet_reads_like_a_thick_block(half: float) -> None:
     assert thin[0] < -40
 
 
+@pytest.mark.slow
 def test_a_disc_reads_like_a_thick_cylinder_and_a_lens_like_its_mesh() -> None:
     thick = _read(0.01, kind="cylinder", size=(0.02, 0.01))
     np.testing.assert_allclose(_read(HALF, kind="cylinder", size=(0.02, HALF)), thick, rtol=1e-4)
@@ -58,6 +59,7 @@ def test_a_disc_reads_like_a_thick_cylinder_and_a_lens_like_its_mesh() -> None:
     assert _read(HALF, kind="mesh", mesh=_ball(0.02, 0.02, HALF))[0] == pytest.approx(lens[0], rel=0.03)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("radius", [0.15e-3, 0.4e-3, 1e-3])
 def test_wires_and_beads_push_whatever_they_are_made_of(radius: float) -> None:
     """Taxels 2.7 mm beside what is pressed past its middle, and taxels under it."""

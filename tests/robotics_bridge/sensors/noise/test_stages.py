@@ -260,6 +260,7 @@ def test_a_signal_with_other_axes_is_refused():
         simulate(Noise(), np.zeros((3, 4)), dt=0.01)
 
 
+@pytest.mark.slow
 def test_noise_in_the_sensors_kernel_and_in_stages_measures_alike():
     from robotics_bridge.physics import Geometry, HandState, TouchScene
     from robotics_bridge.sensors import KinematicTaxel, Probes, SensorSuite

@@ -59,6 +59,7 @@ def _readings(counts: tuple[int, ...], envs: int, noise: Noise, query: Any) -> l
     return read
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("counts", [(1,), (3,), (5,), (33,), (1, 3, 33, 5)])
 @pytest.mark.parametrize("noise", [Noise(), NOISE, Noise(crosstalk=0.3)], ids=["clean", "noisy", "staged"])
 def test_probes_that_share_a_thread_read_the_same(

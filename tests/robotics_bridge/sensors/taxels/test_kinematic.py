@@ -140,6 +140,7 @@ def test_grazing_and_deep_contact_give_finite_forces(stiffness: float, depth: fl
     assert (read[..., 2] <= 0).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shape", ["sphere", "box", "cylinder"])
 def test_fields_scaled_to_the_engine_carry_the_weight_of_what_lies_on_them(shape: str) -> None:
     """A solid of known mass at rest on a pad, under three gravities: the field adds up to its weight within 1 %."""

@@ -115,6 +115,7 @@ def _run(chain, centres, radii, velocity):
     return tuple(x.numpy() for x in (nodes, bound, gap, link, margin, measured))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(4))
 def test_bounds_hold_and_nothing_near_is_missed(seed):
     rng = np.random.default_rng(seed)

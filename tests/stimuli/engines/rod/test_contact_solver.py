@@ -205,6 +205,7 @@ def test_contacts_keep_signorini_and_coulomb(seed, friction, hinges, tolerance):
 
 
 # Few iterations do not find a direction of slip in the second problem.
+@pytest.mark.slow
 @pytest.mark.parametrize(("seed", "tolerance", "unsolved"), [(1, None, 0), (2, None, 1), (2, 1e-8, 0)])
 def test_a_group_of_threads_finds_what_one_finds(seed, tolerance, unsolved):
     problem = _problem(4, 0.4, seed)

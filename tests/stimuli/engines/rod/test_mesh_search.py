@@ -273,6 +273,7 @@ def test_triangles_measured_side_by_side_are_those_measured_one_by_one():
     assert len(np.unique(together[:, 3] % WIDE)) == WIDE
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lanes", [2, 4, 8])
 def test_threads_that_search_together_find_what_one_finds(lanes):
     surface = _surface()

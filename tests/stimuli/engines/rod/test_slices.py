@@ -75,6 +75,7 @@ def _launch(scenes, name, **tuning):
     return launcher.launch([(name, GRID.sweeps(name))])
 
 
+@pytest.mark.slow
 def test_threads_that_take_turns_on_a_gpu_get_what_one_alone_gets(as_a_gpu):
     objects = resolve_objects(["torus-1", "gear-0", "brick-0"], surfaces=True)
     scenes = SweepScenes(GRID, {name: item.load for name, item in objects.items()})
