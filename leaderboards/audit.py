@@ -19,7 +19,7 @@ from typing import Any, Literal
 
 from brainbench.core.errors import look_alike
 from brainbench.core.files import to_plain
-from brainbench.core.identity import ScoreIdentity
+from brainbench.core.identity import ScoreIdentity, plan_note
 from brainbench.core.records import ESTIMATOR_VERSION, ResultRecord, Score
 from leaderboards.boards import rank
 from leaderboards.store import StoredRecord, read_records
@@ -33,7 +33,7 @@ MOST_NAMED = 3
 def remarks(stored: Iterable[StoredRecord]) -> dict[str, tuple[str, ...]]:
     """Return for each doubtful record, by its identity, one sentence per doubt.
 
-    Every sentence begins with ``stale:``, ``conflict:``, ``doubtful:`` or ``look-alike:``.
+    Every sentence begins with ``stale:``, ``conflict:``, ``doubtful:``, ``look-alike:`` or ``plan:``.
     """
     usable = [item.record for item in stored if item.record is not None]
     doubts: dict[str, list[str]] = defaultdict(list)
@@ -42,6 +42,8 @@ def remarks(stored: Iterable[StoredRecord]) -> dict[str, tuple[str, ...]]:
     for record in usable:
         doubts[record.identity] += [f"stale: {reason}" for reason in _stale(record, newest)]
         doubts[record.identity] += [f"doubtful: {doubt}" for score in record.scores for doubt in score.doubts]
+        if (note := plan_note(record)) and not note.startswith("follows"):
+            doubts[record.identity].append(f"plan: {note}")
         groups[ScoreIdentity.of(record)].append(record)
     names: dict[str, set[str]] = defaultdict(set)
     for name in {record.score.name for record in usable}:

@@ -26,9 +26,9 @@ BUDGETS = {
     "brainbench/datasets": 7_300,  # the balance of a reading, copies of sessions, signals
     "brainbench/metrics": 5_100,
     "brainbench/cli": 4_900,  # check-submission
-    "brainbench/core": 5_650,  # the sealed door for files of others, seals of the cache, the filter of foreign text
+    "brainbench/core": 5_800,  # the sealed door, seals of the cache, the filter of foreign text, sealed plans
     "leaderboards": 3_550,
-    "brainbench/scoring": 3_850,  # presentation time as a control
+    "brainbench/scoring": 3_900,  # presentation time as a control, plans
     "brainbench/geometry": 1_050,
     "brainbench/published": 2_700,
     "brainbench/tradeoffs": 1_100,

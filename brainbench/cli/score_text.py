@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from brainbench.cli.output import table, table_of
+from brainbench.core.identity import plan_note
 from brainbench.core.records import ResultRecord, Score, spanned
 from brainbench.core.statistics import compare_scores
 from brainbench.models.activations import ReadReport
@@ -50,6 +51,8 @@ def _headline(record: ResultRecord) -> Iterator[str]:
     if record.synthetic:
         yield "Synthetic recordings: ranks on them say nothing about brains."
     yield from left_out(score.provenance.recordings)
+    if plan := plan_note(record):
+        yield f"Plan: {plan}."
     if reading := score.provenance.get("reading"):
         yield f"Network: {ReadReport.of(reading)}."
 

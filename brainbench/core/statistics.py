@@ -120,17 +120,6 @@ def wilson_interval(successes: float, count: int, *, over: str = "trials") -> In
     return Interval(max(0.0, middle - half), min(1.0, middle + half), LEVEL, f"Wilson score over {count} {over}")
 
 
-def newcombe_interval(
-    successes: float, count: int, other_successes: float, other_count: int, *, over: str = "trials"
-) -> Interval:
-    """Return the interval of the difference of two independent proportions (Newcombe 1998, method 10)."""
-    share, other_share = successes / max(count, 1), other_successes / max(other_count, 1)
-    first, second = wilson_interval(successes, count), wilson_interval(other_successes, other_count)
-    low = math.hypot(share - first.low, second.high - other_share)
-    high = math.hypot(first.high - share, other_share - second.low)
-    return Interval(share - other_share - low, share - other_share + high, LEVEL, f"Newcombe over {over}")
-
-
 CONFOUNDED = 0.1
 """Share of the variance of trial times, beyond that of shuffled labels, from which label and time are confounded."""
 _CONFOUNDED_P = 1e-4

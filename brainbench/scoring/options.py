@@ -28,12 +28,12 @@ TIME_BIN = 0.05
 
 _NO_NUMBERS = (
     "recordings", "title", "stimuli", "match", "select", "window", "whiskers", "fidelity", "metric", "layer",
-    "estimator",
+    "estimator", "plan",
 )  # fmt: skip
 """Fields that take much in Python, and a number nowhere; a batch file can hold one."""
-_ELSEWHERE = ("recordings", "match", "explain", "title", "strict", "memory")
-"""Fields whose effect stands in other entries of the provenance (``recordings``, ``pairs``, ``statistics``), or in
-none."""
+_ELSEWHERE = ("recordings", "match", "explain", "title", "strict", "memory", "plan")
+"""Fields whose effect stands in other entries of the provenance (``recordings``, ``pairs``, ``statistics``, ``plan``),
+or in none."""
 
 
 @dataclass(frozen=True)
@@ -93,6 +93,8 @@ class ScoreOptions:
     """Layers and steps of a network of the study: default (ours), or published (its names, its steps, its averages)."""
     memory: Positive = 2.0
     """Memory for the activations of a model, GiB; layers beyond it lie in temporary files."""
+    plan: Path | str | None = None
+    """Sealed plan that 'power' or 'recovery' wrote with --plan; what the score does otherwise is marked."""
     explain: bool = False
     """Also walk from the published estimator to the default one, fault by fault (RSA only); MODEL may then be an .npz
     of stored splits (arrays r_xy, r_yy and r_xx)."""

@@ -14,7 +14,8 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 from brainbench.core.errors import MissingDependencyError, UsageError, check_name, listing
-from brainbench.core.files import provenance
+from brainbench.core.files import provenance, to_plain
+from brainbench.core.identity import SealedPlan
 from brainbench.core.plugins import load_optional
 from brainbench.core.progress import Progress, stages
 from brainbench.core.provenance import Provenance
@@ -108,6 +109,7 @@ def score_record(
     started = clock.perf_counter()
     stage_done = stages(STAGES, "scoring", progress)
     options = _options(model, {**vars(options or ScoreOptions()), **changes})
+    plan = None if options.plan is None else SealedPlan.read(options.plan)
     _prepare(model, options, progress)
     # Whatever can be wrong with a name or a file is found before the slow part, the simulation.
     metric = metric_of(options)
@@ -124,6 +126,8 @@ def score_record(
     stage_done()
     pairs = brain.pairs(network.labels, options.match)
     labels = tuple(pairs)
+    if plan is not None:
+        plan.check_stimuli((*labels, *pairs.values()))
     rows = [network.labels.index(label) for label in pairs.values()]
     inputs = ScoreInputs(brain, network, metric, labels, rows, brain.animals(labels, metric, options), options)
     stage_done()
@@ -142,6 +146,7 @@ def score_record(
             settings=options.settings | settings,
             seconds=round(clock.perf_counter() - started, 2),
             **({"command": command} if command else {}),
+            **({"plan": to_plain(plan)} if plan else {}),
         )
     )
     statistics = [score.provenance.statistics for score in scores]
@@ -156,7 +161,10 @@ def score_record(
     rest = [replace(score, brain_rdm=()) for score in rest]
     if between is not None:
         between = replace(between, brain_rdm=(), provenance=replace(origin, statistics=between.provenance.statistics))
-    return ResultRecord(first, between, {score.name: score for score in rest}, network.card, brain.synthetic)
+    record = ResultRecord(first, between, {score.name: score for score in rest}, network.card, brain.synthetic)
+    if plan is not None and any(plan.deviations(record)):
+        first = replace(first, reasons=(*first.reasons, f"deviates from its sealed plan {plan.hash}"))
+    return replace(record, score=first)
 
 
 def _options(model: Any, values: Mapping[str, Any]) -> ScoreOptions:

@@ -9,6 +9,8 @@ import pytest
 
 from brainbench.core import records
 from brainbench.core.errors import DataFileNotFoundError
+from brainbench.core.files import to_plain
+from brainbench.core.identity import SealedPlan
 from leaderboards import build_leaderboard
 from leaderboards.audit import MOST_NAMED, compare_builds, conflicting, differences, open_build, remarks
 from leaderboards.boards import rank
@@ -51,6 +53,16 @@ def test_an_interval_that_misses_its_number_is_doubtful(make_record, tmp_path, c
     ((doubt,),) = remarks([_stored(make_record(**change), tmp_path)]).values()
     assert doubt.startswith("doubtful: ")
     assert words in doubt
+
+
+def test_what_deviates_from_a_sealed_plan_is_marked_whatever_the_record_says_of_it(make_record, tmp_path):
+    record = make_record()
+    plan = SealedPlan("power", len(record.score.stimuli) or 2, 99)
+    ((remark,),) = remarks([_stored(_with(record, plan=to_plain(plan)), tmp_path)]).values()
+    assert remark.startswith(f"plan: deviates from the sealed plan {plan.hash}: ")
+    assert "planned 99" in remark
+    ((remark,),) = remarks([_stored(_with(record, plan={"made_by": "power"}), tmp_path)]).values()
+    assert remark.startswith("plan: its plan cannot be read")
 
 
 def test_stimuli_of_an_earlier_definition_of_a_fidelity_are_stale(make_record, tmp_path):

@@ -20,6 +20,7 @@ ELSEWHERE = {
     "title": "recordings",
     "strict": "recordings",
     "memory": "",
+    "plan": "plan",
 }
 """Options whose effect stands in another entry of the provenance than its settings, or in none."""
 

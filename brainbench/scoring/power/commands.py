@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import shlex
+import sys
 from dataclasses import replace
-from typing import Annotated, Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -12,6 +15,11 @@ from brainbench.cli.output import Output, progress_bar, table_of, tracked
 from brainbench.cli.requirements import needs
 from brainbench.core.errors import UsageError
 from brainbench.core.files import to_plain
+from brainbench.core.identity import SealedPlan
+from brainbench.core.provenance import Provenance
+
+if TYPE_CHECKING:
+    from brainbench.scoring.neural_responses import NeuralResponses
 
 _EFFECTS = (0.0, 0.3, 0.5, 0.7)
 DESIGN = "brainbench.scoring.power.experiments:ExperimentDesign"
@@ -40,6 +48,10 @@ def power(
     target: Annotated[float, typer.Option(help="Power that is wanted.")] = 0.8,
     simulations: Annotated[int, typer.Option(help="Simulated experiments per number.")] = 500,
     seed: Annotated[int, typer.Option(help="Seed of the experiments.")] = 0,
+    layer: Annotated[str | None, typer.Option(help="Layer that the plan commits to.")] = None,
+    plan: Annotated[
+        Path | None, typer.Option(help="Seal the design in this JSON file, for 'brainbench score --plan'.")
+    ] = None,
 ) -> Output:
     """Say how often a true effect would be found, and how many stimuli or animals are needed.
 
@@ -48,10 +60,12 @@ def power(
     """
     from brainbench.scoring.power import experiments
 
+    if layer is not None and (plan is None or options["layers"] != 1):
+        raise UsageError("--layer is what a --plan of one layer commits to; give --plan FILE, and leave out --layers.")
     effects = _EFFECTS if effect is None else (effect,)
     # Whatever is wrong with the design is told before recordings are opened.
     designs = [experiments.ExperimentDesign(effect=one, **options) for one in effects]
-    number, origin = _dimensions(dimensions, recordings, conditions, model)
+    number, origin, pilot = _dimensions(dimensions, recordings, conditions, model)
     designs = [replace(design, dimensions=number) for design in designs]
     rows = []
     for design in tracked(designs, "simulating experiments"):
@@ -87,11 +101,29 @@ def power(
         "dimensions": {"number": number, "origin": origin},
         "results": [{**to_plain(result), "needed": enough, "target": target} for result, enough in rows],
     }
-    return Output(data, f"{title}\n\n{table_of('', rows, columns)}\n\n{note}")
+    text = f"{title}\n\n{table_of('', rows, columns)}\n\n{note}"
+    if plan is not None:
+        names = () if pilot is None or len(pilot.vocabulary) != first.stimuli else pilot.vocabulary
+        sealed = SealedPlan(
+            "power",
+            first.stimuli,
+            first.animals,
+            layer=layer,
+            layers=first.layers,
+            names=tuple(names),
+            pilot=None if pilot is None else Provenance.of({"recordings": pilot.origin}).recordings_hash,
+            expected={f"true score {row[0].design.effect:g}": row[0].power for row in rows},
+            command=shlex.join(["brainbench", *sys.argv[1:]]),
+        )
+        data["plan"] = {"path": sealed.write(plan), "hash": sealed.hash}
+        text += f"\n\nplan  {plan}\nhash  {sealed.hash}"
+    return Output(data, text)
 
 
-def _dimensions(dimensions: str, recordings: str | None, conditions: str | None, model: str | None) -> tuple[int, str]:
-    """Return the number of dimensions, and where it comes from in words."""
+def _dimensions(
+    dimensions: str, recordings: str | None, conditions: str | None, model: str | None
+) -> tuple[int, str, NeuralResponses | None]:
+    """Return the number of dimensions, where it comes from in words, and the pilot recordings."""
     from brainbench.scoring.power.experiments import DIMENSIONS
 
     if conditions is not None and recordings is None:
@@ -104,15 +136,17 @@ def _dimensions(dimensions: str, recordings: str | None, conditions: str | None,
             raise UsageError(
                 f"--dimensions {dimensions} is given, so {sources[0]} has nothing to estimate; leave one out."
             )
-        return int(dimensions), "given"
+        return int(dimensions), "given", None
     if len(sources) > 1:
         raise UsageError("Dimensions are estimated from --recordings or from --model, not both.")
     if recordings is not None:
         return _of_recordings(recordings, conditions)
-    return (DIMENSIONS, "assumed; --recordings or --model estimates them") if model is None else _of_model(model)
+    if model is not None:
+        return (*_of_model(model), None)
+    return DIMENSIONS, "assumed; --recordings or --model estimates them", None
 
 
-def _of_recordings(recordings: str, conditions: str | None) -> tuple[int, str]:
+def _of_recordings(recordings: str, conditions: str | None) -> tuple[int, str, NeuralResponses]:
     from brainbench.datasets.trials.session_trials import trials_by_subject
     from brainbench.scoring.neural_responses import open_neural_responses
     from brainbench.scoring.power.dimensions import signal_dimensions
@@ -120,7 +154,7 @@ def _of_recordings(recordings: str, conditions: str | None) -> tuple[int, str]:
     with progress_bar() as progress:
         brain = open_neural_responses(recordings, progress=progress, conditions=conditions)
     estimate = signal_dimensions(trials_by_subject(brain.dataset).values(), len(brain.vocabulary))
-    return round(estimate), f"{estimate:.1f} estimated from {brain.source}"
+    return round(estimate), f"{estimate:.1f} estimated from {brain.source}", brain
 
 
 def _of_model(model: str) -> tuple[int, str]:

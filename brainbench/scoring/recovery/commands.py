@@ -18,6 +18,7 @@ from brainbench.cli.output import Output, progress_bar, table_of
 from brainbench.cli.requirements import Requirement, needs
 from brainbench.core.errors import UsageError
 from brainbench.core.files import provenance, to_plain, write_json
+from brainbench.core.identity import SealedPlan
 from brainbench.core.reading.ranges import check_number
 
 if TYPE_CHECKING:
@@ -65,6 +66,9 @@ def recovery(
     seed: Annotated[int, typer.Option(help="Seed of the animals, and of untrained weights.")] = 0,
     out: Annotated[
         Path | None, out_folder_option("Folder for result and picture, and for going on after an interruption.")
+    ] = None,
+    plan: Annotated[
+        Path | None, typer.Option(help="Seal the design in this JSON file, for 'brainbench score --plan'.")
     ] = None,
     workers: WorkersOption = None,
     scheduler: SchedulerOption = None,
@@ -118,7 +122,29 @@ def recovery(
     if out is not None:
         text += f"\n\nresult   {write_json(out / 'recovery.json', data)}"
         text += f"\npicture  {plot_confusion(result, out / 'recovery.png')}"
+    if plan is not None:
+        sealed = _plan(result, candidates)
+        data["plan"] = {"path": sealed.write(plan), "hash": sealed.hash}
+        text += f"\n\nplan  {plan}\nhash  {sealed.hash}"
     return Output(data, text)
+
+
+def _plan(recovery: Recovery, candidates: Sequence[Candidate]) -> SealedPlan:
+    """Return what a score of the planned experiment is held to; stimuli drawn anew for each board have no names."""
+    design = recovery.design
+    names = recovery.names
+    return SealedPlan(
+        "recovery",
+        recovery.stimuli,
+        design.population.animals,
+        metric=design.metric,
+        names=candidates[0].stimuli if recovery.stimuli == len(candidates[0].stimuli) else (),
+        models=names,
+        units=design.population.units,
+        trials=design.population.trial_range[0],
+        expected={name: float(recovery.firsts[row, row] / recovery.counts[row]) for row, name in enumerate(names)},
+        command=shlex.join(["brainbench", *sys.argv[1:]]),
+    )
 
 
 def _find(patterns: Sequence[str] | None) -> list[str]:

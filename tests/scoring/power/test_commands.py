@@ -50,3 +50,29 @@ def test_dimensions_that_are_no_number_are_refused(run):
     alone = run("power", "--conditions", "trials:stimulus")
     assert alone.status == 2
     assert "--recordings" in alone.err
+
+
+def test_a_plan_is_sealed_and_a_score_that_deviates_is_marked(run, study, tmp_path):
+    plan = str(tmp_path / "plan.json")
+    design = ("--stimuli", "8", "--animals", "5", "--effect", "0.5", "--simulations", "20", "--dimensions", "4")
+    sealed = run("power", *design, "--layer", "fc", "--plan", plan, "--json")
+    assert sealed.status == 0, sealed.err
+    mark = json.loads(sealed.out)["plan"]["hash"]
+    score = ("score", study["features"], "-r", study["data"], "--conditions", "trials:texture", "--out", study["out"])
+    scored = run(*score, "--plan", plan)
+    assert scored.status == 0, scored.err
+    assert f"Plan: deviates from the sealed plan {mark}: 4 animals, planned 5." in " ".join(scored.out.split())
+    record = json.loads(run(*score, "--plan", plan, "--json").out)["record"]
+    assert f"deviates from its sealed plan {mark}" in record["score"]["reasons"]
+    assert record["score"]["provenance"]["plan"]["animals"] == 5
+    changed = json.loads((tmp_path / "plan.json").read_text()) | {"animals": 4}
+    (tmp_path / "plan.json").write_text(json.dumps(changed))
+    refused = run(*score, "--plan", plan)
+    assert refused.status != 0
+    assert "was changed after it was written" in refused.err
+
+
+def test_a_layer_without_a_plan_is_refused(run):
+    refused = run("power", "--layer", "fc")
+    assert refused.status == 2
+    assert "--plan" in refused.err

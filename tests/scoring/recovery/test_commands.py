@@ -3,6 +3,7 @@ import json
 import numpy as np
 import pytest
 
+from brainbench.core.identity import SealedPlan
 from brainbench.models.features import write_features
 
 QUICK = ("--animals", "4", "--units", "20", "--trials", "6-8", "--boards", "2", "--workers", "1")
@@ -20,14 +21,19 @@ def networks(tmp_path):
 
 
 def test_recovery_answers_first_and_writes_what_it_found(run, networks, tmp_path):
-    out = tmp_path / "out"
-    found = run("recovery", *networks, *QUICK, "--out", str(out))
+    out, file = tmp_path / "out", tmp_path / "plan.json"
+    found = run("recovery", *networks, *QUICK, "--out", str(out), "--plan", str(file))
     assert found.status == 0
     assert found.out.split()[0] in ("Yes,", "No,", "Undecided")
     kept = json.loads((out / "recovery.json").read_text())
     assert kept["names"] == ["one", "other"]
     assert sum(map(sum, kept["firsts"])) == 4
     assert kept["provenance"]["settings"]["design"]["population"]["animals"] == 4
+    plan = SealedPlan.read(file)
+    assert plan.hash in found.out
+    assert (plan.made_by, plan.stimuli, plan.animals, plan.units, plan.trials) == ("recovery", 14, 4, 20, 6)
+    assert plan.names == tuple(f"s{index}" for index in range(14))
+    assert set(plan.expected) == set(plan.models) == {"one", "other"}
     assert (out / "recovery.png").read_bytes()[:4] == b"\x89PNG"
     again = json.loads(run("recovery", *networks, *QUICK, "--json").out)
     assert again["boards"] == kept["boards"]
