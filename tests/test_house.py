@@ -36,7 +36,7 @@ BUDGETS = {
 }
 """Folder → lines of Python that it may have: as the rooms stand, with two per cent to move in. Who adds a capability
 pays in the same folder, or raises the number in the commit that needs it, with the reason."""
-MOST_PRODUCT_LINES, MOST_PRODUCT_MODULES = 93_500, 505
+MOST_PRODUCT_LINES, MOST_PRODUCT_MODULES = 94_000, 505
 VAGUE = frozenset(
     re.findall(r"\w+", "found told own kept known asked one other item shown made named taken usual"),
 )
