@@ -65,6 +65,31 @@ def level(interval: Interval) -> str:
     return f"{100 * interval.level:g} % interval" + (f", {interval.method}" if interval.method else "")
 
 
+def group_rows(statistics: Mapping[str, Any]) -> dict[str, Any] | None:
+    """Return what a page shows of the board of groups of units; None without a usable one."""
+    try:
+        board = statistics["groups"]
+        rows = []
+        for group in board["groups"]:
+            numbers = {
+                name: math.nan if group[name] is None else float(group[name]) for name in ("scaled", "p_corrected")
+            }
+            ends = group["interval"]
+            rows.append(
+                {
+                    **{name: str(group[name] or "") for name in ("group", "status", "rank", "layer")},
+                    **{name: int(group[name]) for name in ("units", "animals")},
+                    "scaled": numbers["scaled"],
+                    "p": numbers["p_corrected"],
+                    "interval": Interval(float(ends["low"]), float(ends["high"])) if ends else None,
+                }
+            )
+        return {"by": str(board["by"]), "reason": str(board["reason"]), "rows": rows}
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError):
+        # Statistics are free text in a record that somebody else may have written.
+        return None
+
+
 def p_sentence(score: Score) -> str:
     """Say how the p-value was found and how small it could have been."""
     parts = [score.p_method] if score.p_method else []

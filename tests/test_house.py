@@ -28,7 +28,7 @@ BUDGETS = {
     "brainbench/cli": 4_900,  # check-submission
     "brainbench/core": 5_800,  # the sealed door, seals of the cache, the filter of foreign text, sealed plans
     "leaderboards": 3_550,
-    "brainbench/scoring": 3_900,  # presentation time as a control, plans
+    "brainbench/scoring": 4_080,  # presentation time as a control, plans, boards of areas, layers and cell types
     "brainbench/geometry": 1_050,
     "brainbench/published": 2_700,
     "brainbench/tradeoffs": 1_100,

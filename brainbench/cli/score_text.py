@@ -8,7 +8,7 @@ from typing import Any
 
 from brainbench.cli.output import table, table_of
 from brainbench.core.identity import plan_note
-from brainbench.core.records import ResultRecord, Score, spanned
+from brainbench.core.records import Interval, ResultRecord, Score, spanned
 from brainbench.core.statistics import compare_scores
 from brainbench.models.activations import ReadReport
 
@@ -155,6 +155,8 @@ def _details(statistics: Mapping[str, Any]) -> list[str]:
     parts = []
     if course := statistics.get("time_course"):
         parts.append(_over_time(course))
+    if board := statistics.get("groups"):
+        parts.append(_groups(board))
     if accuracies := statistics.get("decoding"):
         columns = {
             "property": "{0[property]}",
@@ -171,6 +173,30 @@ def _details(statistics: Mapping[str, Any]) -> list[str]:
             f"{shares['unique_nuisance']:.2f}, by either {shares['shared']:.2f}"
         )
     return parts
+
+
+def _groups(board: Mapping[str, Any]) -> str:
+    """Lay out the scores of groups of units, and which is told apart."""
+
+    def scaled(row: Mapping[str, Any]) -> str:
+        value, interval = row["scaled"], row["interval"]
+        return spanned(
+            math.nan if value is None else value, Interval(interval["low"], interval["high"]) if interval else None
+        )
+
+    columns = {
+        "group": "{0[group]}",
+        ">score": scaled,
+        ">p": lambda row: "–" if row["p_corrected"] is None else f"{row['p_corrected']:.2g}",
+        "rank": "{0[rank]}",
+        ">units": "{0[units]:,}",
+        ">animals": "{0[animals]}",
+        "layer": lambda row: row["layer"] or "–",
+        "": lambda row: row["status"] if row["status"] == "ok" else "; ".join([row["status"], *row["reasons"][:1]]),
+    }
+    reason = board["reason"]
+    text = table_of(f"By {board['by']}; p and ranks are corrected for the number of groups", board["groups"], columns)
+    return f"{text}\n{reason[:1].upper()}{reason[1:]}."
 
 
 def _over_time(course: Mapping[str, Any]) -> str:

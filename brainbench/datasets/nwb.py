@@ -23,7 +23,7 @@ from brainbench.core.errors import DataError
 from brainbench.core.writing.hdf5 import create_hdf5
 from brainbench.datasets.hdf5 import columns_of, dead_link, write_array
 from brainbench.datasets.sessions import SPIKES, Series, Session, SessionTable, decode, neurodata_type, text
-from brainbench.datasets.trials.counting import LICKS
+from brainbench.datasets.trials.counting import LICKS, OTHER_NAMES
 from brainbench.datasets.trials.windows import CONTACTS
 
 if TYPE_CHECKING:
@@ -108,7 +108,7 @@ def _tables(file: h5py.File, path: Path) -> tuple[dict[str, SessionTable], dict[
         kind, name = neurodata_type(group), place.rpartition("/")[2]
         if kind == "Units" or place == "units":
             if "units" not in units:
-                units[place] = _table(group, "units", path)
+                units[place] = _with_areas(_table(group, "units", path), group)
             continue
         if kind == _SIGNAL:
             signals |= {place: replace(_one_series(group), name=place)}
@@ -123,6 +123,25 @@ def _tables(file: h5py.File, path: Path) -> tuple[dict[str, SessionTable], dict[
             stop = {"stop_time": begin + table.times("duration")} if "duration" in table else {}
             intervals[name] = table.with_columns(start_time=begin, **stop)
     return intervals, units, signals
+
+
+def _with_areas(units: SessionTable, group: h5py.Group) -> SessionTable:
+    """Return units with the column ``area``, from the location of each one's first electrode where none states it."""
+    import h5py
+
+    electrodes, rows = group.file.get("general/extracellular_ephys/electrodes"), units.data.get("electrodes")
+    if not isinstance(electrodes, h5py.Group) or not isinstance(electrodes.get("location"), h5py.Dataset):
+        return units
+    if not isinstance(rows, h5py.Dataset) or any(name in units for name in ("area", *OTHER_NAMES["area"])):
+        return units
+    locations, numbers = as_labels(decode(electrodes["location"][...])), np.asarray(rows[...]).ravel()
+    try:
+        ends = units.ends("electrodes") if "electrodes" in units.index else np.arange(1, len(units) + 1)
+        begins = [0, *ends[:-1].tolist()]
+        first = [numbers[begin] if begin < end else len(locations) for begin, end in zip(begins, ends, strict=True)]
+    except (DataError, IndexError):  # electrodes are no part of a score
+        return units
+    return units.with_columns(area=np.array([*locations, ""])[np.clip(first, 0, len(locations)).astype(np.int64)])
 
 
 _SIGNAL = "RoiResponseSeries"

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from brainbench.core.contracts import join_labels
-from brainbench.core.errors import UsageError, listing
+from brainbench.core.contracts import join_labels, natural_key
+from brainbench.core.errors import DataError, UsageError, check_each, check_name, check_once, listing
 from brainbench.core.files import content_hash
 from brainbench.core.progress import Progress
 from brainbench.scoring.demo import DEMOS, HIDDEN_NETWORK, demo_identity, demo_recordings
@@ -115,6 +115,27 @@ class NeuralResponses:
     def published(self) -> bool:
         """True for a published file of rates, whose zeros the published estimators count."""
         return self.dataset.attrs.get("layout") == PUBLISHED_LAYOUT
+
+    def groups(self, by: str) -> dict[str, NeuralResponses]:
+        """Return the parts of each group of units; those without a group are in none.
+
+        ``by`` is a column, or ``COLUMN=a|b`` for some of its groups.
+        """
+        from brainbench.datasets.trials.counting import GROUPS
+
+        column, _, words = by.partition("=")
+        check_name("group of units", column, GROUPS, hint="(of --by)")
+        columns = {name: self.dataset[name].values.astype(str) for name in GROUPS if name in self.dataset.coords}
+        columns = {name: values for name, values in columns.items() if (values != "").any()}
+        if column not in columns:
+            others = f"they have {listing(columns)}" if columns else f"nor of {listing({*GROUPS} - {column})}"
+            raise DataError(f"No unit of these recordings has a value of {column!r}; {others}.")
+        names = sorted({*columns[column].tolist()} - {""}, key=natural_key)
+        wanted = [word.strip() for word in words.split("|")] if words else names
+        check_each(column, wanted, names)
+        check_once("--by", wanted)
+        rows = {name: np.flatnonzero(columns[column] == name) for name in wanted}
+        return {name: replace(self, dataset=self.dataset.isel(unit=units)) for name, units in rows.items()}
 
     def stated_pairs(self, pairs: Mapping[str, str]) -> dict[str, str | None]:
         """Return pairs of labels as a record states them: None for labels that were dropped."""

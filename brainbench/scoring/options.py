@@ -28,10 +28,10 @@ TIME_BIN = 0.05
 
 _NO_NUMBERS = (
     "recordings", "title", "stimuli", "match", "select", "window", "whiskers", "fidelity", "metric", "layer",
-    "estimator", "plan",
+    "estimator", "plan", "by",
 )  # fmt: skip
 """Fields that take much in Python, and a number nowhere; a batch file can hold one."""
-_ELSEWHERE = ("recordings", "match", "explain", "title", "strict", "memory", "plan")
+_ELSEWHERE = ("recordings", "match", "by", "explain", "title", "strict", "memory", "plan")
 """Fields whose effect stands in other entries of the provenance (``recordings``, ``pairs``, ``statistics``, ``plan``),
 or in none."""
 
@@ -76,6 +76,8 @@ class ScoreOptions:
     """Bin width of the spike counts in seconds."""
     over_time: bool = False
     """Also score each time, in bins of --bin (.05 s), and measure each layer's latency (RSA metrics only)."""
+    by: str | None = None
+    """Also score and rank each group of units: area, layer or cell_type, or some as in 'area=S1|M1'."""
     estimator: str = "default"
     """default, thesis or thesis-input (as published)."""
     metric: str | Metric = "rsa"

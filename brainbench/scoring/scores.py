@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 PARTS = "brainbench.scoring"
 """Entry points of what stands in optional folders: additions to a record's statistics by the name of their option, and
 ``published_arrays``, the comparison of a published file as its authors' code takes it."""
-_ADDITIONS = ("explain", "over_time")
+_ADDITIONS = ("by", "explain", "over_time")
 STAGES = 5
 """Stages of a score that progress is told of: model, recordings, its responses, the animals' RDMs, comparisons."""
 
@@ -196,6 +196,8 @@ def _check_inputs(resolved: ResolvedModel, brain: NeuralResponses, options: Scor
     from brainbench.scoring.model_responses import DEFAULT_STIMULI
     from brainbench.stimuli.sources import known_labels
 
+    if options.by is not None:
+        brain.groups(options.by)
     if brain.published and options.estimator != "default" and options.units_reliability is not None:
         raise UsageError(f"The estimator {options.estimator!r} takes all published units; leave out units_reliability.")
     if resolved.activations is not None and (options.whiskers != "all" or options.fidelity not in (None, "balanced")):

@@ -177,6 +177,7 @@ def _score_view(record: ResultRecord) -> dict[str, Any]:
         "model_rdm": rdm_picture(score.model_rdm, score.stimuli),
         "brain_rdm": rdm_picture(score.brain_rdm, score.stimuli),
         "pairs": pairs if len(pairs) <= _MOST_PAIRS else [],
+        "groups": text.group_rows(score.provenance.statistics),
         "time_course": draw_time_course(score.provenance.statistics),
         "comparisons": comparisons(record),
         "methods": text.methods([record]),

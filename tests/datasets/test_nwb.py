@@ -250,3 +250,16 @@ def test_a_probe_export_without_trials_says_what_it_lacks(reference):
 def test_sessions_are_built_from_arrays_with_ids():
     session = make_session("m", "1", [np.zeros(2)], {"t": {"start_time": [0.0]}}, unit_columns={"id": [99]})
     assert session.units.ids().tolist() == [99]
+
+
+def test_units_without_an_area_have_that_of_their_first_electrode(tmp_path):
+    path = write_nwb(tmp_path / "a.nwb")
+    with h5py.File(path, "a") as file:
+        file["general/extracellular_ephys/electrodes/location"] = ["M1", "S1", "S2"]
+        file["units/electrodes"] = [1, 2]
+        file["units/electrodes_index"] = [2]
+        file["units/electrodes_index"].attrs["neurodata_type"] = "VectorIndex"
+    assert open_recordings(path, conditions="trials:texture")["area"].values.tolist() == ["S1"]
+    with h5py.File(path, "a") as file:
+        file["units/electrodes_index"][...] = 5
+    assert open_recordings(path, conditions="trials:texture")["area"].values.tolist() == [""]

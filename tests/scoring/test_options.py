@@ -16,6 +16,7 @@ NAMES = [item.name for item in fields(ScoreOptions)]
 ELSEWHERE = {
     "recordings": "recordings",
     "match": "pairs",
+    "by": "statistics",
     "explain": "statistics",
     "title": "recordings",
     "strict": "recordings",

@@ -65,8 +65,16 @@ def _inside(times: NDArray[np.float64], edges: NDArray[np.float64]) -> NDArray[n
     return np.diff(np.searchsorted(times, edges, side="left"), axis=1)[:, 0].astype(np.float64)
 
 
-UNIT_COLUMNS = {"depth": float, "layer": str, "inhibitory": float}
+GROUPS = ("area", "layer", "cell_type")
+"""Unit columns whose values are groups of units."""
+UNIT_COLUMNS = {"depth": float, "inhibitory": float, **dict.fromkeys(GROUPS, str)}
 """Unit columns carried along where present, with the type that can say "missing"."""
+OTHER_NAMES = {
+    "area": ("brain_area", "brain_region", "region", "location"),
+    "layer": ("cortical_layer",),
+    "cell_type": ("celltype", "cell_class"),
+}
+"""Names that files give to a unit column, in the order in which they are looked for."""
 
 _TRUTH = {"true": 1.0, "false": 0.0}
 _MOST_COUNTS = 1 << 32
@@ -513,6 +521,7 @@ def missing_column(kind: type, units: int) -> NDArray[Any]:
 
 def _unit_column(units: SessionTable, name: str, kind: type, rows: NDArray[np.int64], notes: list[str]) -> NDArray[Any]:
     """Return a unit column of the kept units, of one type in all sessions: a text that is no number is NaN."""
+    name = next((column for column in (name, *OTHER_NAMES.get(name, ())) if column in units), name)
     if name not in units:
         return missing_column(kind, len(rows))
     values = units.column(name)[rows]
