@@ -50,6 +50,7 @@ def test_the_area_that_shares_the_geometry_is_named_and_ranked_first():
     assert board.best == "S1"
     first, *others = board.groups
     assert (first.group, first.rank, first.layer, first.animals, first.units) == ("S1", "1", "shared", 10, 800)
+    assert first.interval is not None
     assert first.interval.low <= first.scaled <= first.interval.high
     assert {group.rank for group in others} == {"2–3"}
     assert "told apart above" in board.reason
@@ -78,8 +79,8 @@ def recordings(tmp_path_factory):
     units = np.flatnonzero(np.arange(counts.shape[2]) % 2)
     for subject in np.unique(subjects):
         rows = [np.flatnonzero((subjects == subject) & (labels == label)) for label in LABELS[:12]]
-        counts[np.ix_(np.concatenate(rows), range(1), units)] = data["counts"].values[
-            np.ix_(np.concatenate([rows[number] for number in order]), range(1), units)
+        counts[np.ix_(np.concatenate(rows), np.arange(1), units)] = data["counts"].values[
+            np.ix_(np.concatenate([rows[number] for number in order]), np.arange(1), units)
         ]
     area = np.where(np.arange(counts.shape[2]) % 2, "M1", "S1").astype("U2")
     area[:2] = ""
