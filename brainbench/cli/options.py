@@ -239,6 +239,15 @@ def filled_from(
     return run
 
 
+def typed_options(words: Iterable[str]) -> list[str]:
+    """Return the fields of a score's options for which a flag stands among the words of a command line."""
+    flags, plain = (
+        {word.partition("=")[0] for word in words},
+        {name: name.replace("_", "-") for name in option_fields(SCORE)},
+    )
+    return [name for name, flag in plain.items() if flags & {f"--{flag}", f"--no-{flag}", *SCORE_FLAGS.get(name, ())}]
+
+
 def option(kind: str, name: str, *flags: str) -> Any:
     """Return typer's description of an option whose help is that of a field of a dataclass."""
     return typer.Option(*flags, help=option_fields(kind)[name].help)

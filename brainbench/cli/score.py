@@ -12,7 +12,7 @@ import typer
 
 from brainbench.cli import destinations
 from brainbench.cli.destinations import out_folder_option
-from brainbench.cli.options import SCORE, SCORE_FLAGS, with_options
+from brainbench.cli.options import SCORE, SCORE_FLAGS, typed_options, with_options
 from brainbench.cli.output import Output, progress_bar
 from brainbench.core.errors import UsageError
 
@@ -69,8 +69,10 @@ def score(
     if record is None:
         from brainbench.scoring.scores import score_record
 
+        # Beside a benchmark a default that was typed is a choice too.
+        typed = {name: getattr(options, name) for name in typed_options(sys.argv) if options.benchmark is not None}
         with progress_bar() as progress:
-            record, note = score_record(model, options, command=command, progress=progress), ""
+            record, note = score_record(model, options, command=command, progress=progress, **typed), ""
         keep(record, cached)
     path = write_record(record, out)
     report = write_report(record, path.with_suffix(".html"))

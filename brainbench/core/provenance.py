@@ -27,9 +27,11 @@ class Provenance(Mapping[str, Any]):
     """Time that the computation took [s]."""
     command: str = ""
     """Command line that makes the score again."""
+    benchmark: Mapping[str, Any] = field(default_factory=dict)
+    """``name``, ``hash``, ``citation`` and origin of the benchmark that was scored on; empty for none."""
     recordings: Mapping[str, Any] = field(default_factory=dict)
-    """``source``, ``content_hash``, ``window``, ``selection``, ``removed`` and ``synthetic`` of the recordings, and
-    ``config_hash`` of the demo, which names it on every machine."""
+    """``source``, ``content_hash``, ``window``, ``selection``, ``removed``, ``synthetic`` and ``citation`` of the
+    recordings, and ``config_hash`` of the demo, which names it on every machine."""
     stimuli: Mapping[str, Any] = field(default_factory=dict)
     """``description``, ``content_hash``, ``config_hash`` and ``backend``; empty for features computed elsewhere."""
     pairs: Mapping[str, str | None] = field(default_factory=dict)
@@ -67,6 +69,17 @@ class Provenance(Mapping[str, Any]):
         Of demo recordings it is that of how they were made, as for stimuli; of all others that of their content.
         """
         return _text(self.recordings.get("config_hash")) or _text(self.recordings.get("content_hash")) or None
+
+    @property
+    def benchmark_name(self) -> str:
+        """Name of the benchmark; empty if none is stated."""
+        return _text(self.benchmark.get("name"))
+
+    @property
+    def citations(self) -> list[str]:
+        """Works that the recordings and the benchmark ask to cite, in their own words."""
+        stated = (_text(origin.get("citation")) for origin in (self.recordings, self.benchmark))
+        return [*dict.fromkeys(filter(None, stated))]
 
     @property
     def stimuli_name(self) -> str:

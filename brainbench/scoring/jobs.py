@@ -92,11 +92,16 @@ def missing(jobs: Sequence[ScoringJob], records: Iterable[ResultRecord]) -> list
     from brainbench.metrics import get_metric
     from brainbench.scoring.model_responses import DEFAULT_STIMULI
     from brainbench.scoring.neural_responses import open_neural_responses
+    from brainbench.scoring.scores import with_benchmark
     from brainbench.stimuli import load_stimuli
 
+    scored = []
+    for job in jobs:
+        benchmark = with_benchmark(job.options)
+        scored.append(job if benchmark is None else replace(job, options=benchmark.options))
     # Jobs of --model and of a batch file may have other recordings and stimuli.
     inputs: dict[str, tuple[NeuralResponses, Stimuli]] = {}
-    for options in (job.options for job in jobs):
+    for options in (job.options for job in scored):
         if (key := _opened_by(options)) not in inputs:
             brain = open_neural_responses(options.recordings, progress=None, **options.selection)
             brain = replace(brain, covariates=get_metric(options.metric).of_covariates)
@@ -107,17 +112,12 @@ def missing(jobs: Sequence[ScoringJob], records: Iterable[ResultRecord]) -> list
         origin = record.score.provenance
         additions = ("estimator_walk" in origin.statistics, bool(origin.settings.get("over_time")))
         present.add((ScoreIdentity.of(record), origin.recordings.get("title"), *additions))
-    return [
-        job
-        for job in jobs
-        if (
-            _identity_of(job, *inputs[_opened_by(job.options)]),
-            job.options.title,
-            job.options.explain,
-            job.options.over_time,
-        )
-        not in present
-    ]
+    absent = []
+    for job, full in zip(jobs, scored, strict=True):
+        identity, options = _identity_of(full, *inputs[_opened_by(full.options)]), full.options
+        if (identity, options.title, options.explain, options.over_time) not in present:
+            absent.append(job)
+    return absent
 
 
 def _identity_of(job: ScoringJob, brain: NeuralResponses, stimuli: Stimuli) -> ScoreIdentity:

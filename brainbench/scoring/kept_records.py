@@ -25,7 +25,8 @@ def record_path(model: str, options: ScoreOptions, command: str) -> Path | None:
     # A path, or FILE.py:NAME, has characters that no name of the package has.
     if not all(re.fullmatch(r"[\w.+-]+", str(name)) for name in (model, options.metric)):
         return None
-    if str(options.recordings) not in DEMOS or any(getattr(options, name) for name in ("stimuli", "match", "plan")):
+    foreign = ("stimuli", "match", "plan", "benchmark")
+    if str(options.recordings) not in DEMOS or any(getattr(options, name) for name in foreign):
         return None
     try:
         entry, metric = locate_model(model), get_metric(options.metric)

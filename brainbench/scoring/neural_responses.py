@@ -215,7 +215,7 @@ def open_neural_responses(recordings: Any, *, progress: Progress | None, **selec
         dataset = open_recordings(folder, **selection, progress=progress)
         return NeuralResponses(dataset, recordings, definition=demo_identity(folder, dataset.attrs))
     several = not isinstance(recordings, (str, os.PathLike))
-    name = ", ".join(map(_short, recordings if several else [recordings]))
+    name = ", ".join(map(short_name, recordings if several else [recordings]))
     return NeuralResponses(open_recordings(recordings, **selection, progress=progress), name)
 
 
@@ -229,7 +229,7 @@ def _flat(responses: NDArray[np.float64], share: NDArray[np.float64]) -> NDArray
     return responses.reshape(trials, bins * units)
 
 
-def _short(source: str | os.PathLike[str]) -> str:
+def short_name(source: str | os.PathLike[str]) -> str:
     """Return the name of a file or a folder; of a pattern, that of the folder it searches."""
     path = Path(source)
     while glob.has_magic(path.name):

@@ -27,19 +27,19 @@ TIME_BIN = 0.05
 """Bin width of scores over time, seconds."""
 
 _NO_NUMBERS = (
-    "recordings", "title", "stimuli", "match", "select", "window", "whiskers", "fidelity", "metric", "layer",
-    "estimator", "plan", "by",
+    "recordings", "title", "stimuli", "conditions", "match", "select", "window", "whiskers", "fidelity", "metric",
+    "layer", "estimator", "plan", "benchmark", "by",
 )  # fmt: skip
 """Fields that take much in Python, and a number nowhere; a batch file can hold one."""
-_ELSEWHERE = ("recordings", "match", "by", "explain", "title", "strict", "memory", "plan")
-"""Fields whose effect stands in other entries of the provenance (``recordings``, ``pairs``, ``statistics``, ``plan``),
-or in none."""
+_ELSEWHERE = ("recordings", "match", "by", "explain", "title", "strict", "memory", "plan", "benchmark")
+"""Fields whose effect stands in other entries of the provenance (``recordings``, ``pairs``, ``statistics``, ``plan``,
+``benchmark``), or in none."""
 
 
 @dataclass(frozen=True)
 @limited(
     names={"time": "time rule"},
-    unresolved=("recordings", "stimuli", "match", "select", "window", "fidelity", "metric", "layers"),
+    unresolved=("recordings", "stimuli", "match", "select", "window", "fidelity", "metric", "layers", "benchmark"),
 )
 class ScoreOptions:
     """Options of scoring a model against recordings."""
@@ -100,6 +100,9 @@ class ScoreOptions:
     explain: bool = False
     """Also walk from the published estimator to the default one, fault by fault (RSA only); MODEL may then be an .npz
     of stored splits (arrays r_xy, r_yy and r_xx)."""
+    benchmark: str | os.PathLike[str] | None = None
+    """File (.toml, .zip) or name of a benchmark, which states the recordings and all that is compared; it takes the
+    place of the options for these."""
 
     def __post_init__(self) -> None:
         """Refuse what no score can be made with, before anything is loaded."""

@@ -8,7 +8,7 @@ both → a noise-corrected comparison with honest statistics.
 from __future__ import annotations
 
 import time as clock
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     from brainbench.scoring.neural_responses import NeuralResponses
 
 PARTS = "brainbench.scoring"
-"""Entry points of what stands in optional folders: additions to a record's statistics by the name of their option, and
-``published_arrays``, the comparison of a published file as its authors' code takes it."""
+"""Entry points of what stands in optional folders: additions to a record's statistics by the name of their option,
+``published_arrays``, the comparison of a published file as its authors' code takes it, and ``benchmark``."""
 _ADDITIONS = ("by", "explain", "over_time")
 STAGES = 5
 """Stages of a score that progress is told of: model, recordings, its responses, the animals' RDMs, comparisons."""
@@ -108,7 +108,9 @@ def score_record(
 
     started = clock.perf_counter()
     stage_done = stages(STAGES, "scoring", progress)
-    options = _options(model, {**vars(options or ScoreOptions()), **changes})
+    options = ScoreOptions.of({**vars(options or ScoreOptions()), **changes})
+    benchmark = with_benchmark(options, changes)
+    options = _options(model, options if benchmark is None else benchmark.options)
     plan = None if options.plan is None else SealedPlan.read(options.plan)
     _prepare(model, options, progress)
     # Whatever can be wrong with a name or a file is found before the slow part, the simulation.
@@ -118,6 +120,7 @@ def score_record(
     stage_done()
     brain = open_neural_responses(options.recordings, progress=progress, **options.selection)
     brain = replace(brain, title=options.title, covariates=metric.of_covariates)
+    brain = brain if benchmark is None else benchmark.checked(brain)
     stage_done()
     # Recordings name the stimuli that the animals felt; the caller's choice goes first.
     options = replace(options, stimuli=brain.stimuli if options.stimuli is None else options.stimuli)
@@ -147,6 +150,7 @@ def score_record(
             seconds=round(clock.perf_counter() - started, 2),
             **({"command": command} if command else {}),
             **({"plan": to_plain(plan)} if plan else {}),
+            **({"benchmark": benchmark.stated} if benchmark else {}),
         )
     )
     statistics = [score.provenance.statistics for score in scores]
@@ -162,17 +166,26 @@ def score_record(
     if between is not None:
         between = replace(between, brain_rdm=(), provenance=replace(origin, statistics=between.provenance.statistics))
     record = ResultRecord(first, between, {score.name: score for score in rest}, network.card, brain.synthetic)
-    if plan is not None and any(plan.deviations(record)):
-        first = replace(first, reasons=(*first.reasons, f"deviates from its sealed plan {plan.hash}"))
-    return replace(record, score=first)
+    record = record if benchmark is None else benchmark.portable(record)
+    if plan is None or not any(plan.deviations(record)):
+        return record
+    reasons = (*record.score.reasons, f"deviates from its sealed plan {plan.hash}")
+    return replace(record, score=replace(record.score, reasons=reasons))
 
 
-def _options(model: Any, values: Mapping[str, Any]) -> ScoreOptions:
-    """Return the options that values state; a seed or a fidelity that would reach nothing is refused."""
+def with_benchmark(options: ScoreOptions, explicit: Iterable[str] = ()) -> Any:
+    """Return the open benchmark that options name, with those of the score (``.options``); None where none is named.
+
+    ``explicit`` are options that count as given although they are the defaults.
+    """
+    return None if options.benchmark is None else _optional("benchmark")(options, explicit)
+
+
+def _options(model: Any, options: ScoreOptions) -> ScoreOptions:
+    """Return options; a seed or a fidelity that would reach nothing is refused."""
     from brainbench.scoring.model_responses import follows_seed
     from brainbench.stimuli.sources import is_finished
 
-    options = ScoreOptions.of(values)
     if options.weights_seed not in (None, options.seed) and not follows_seed(model):
         raise UsageError("weights_seed is that of untrained weights, and those of this model are given; leave it out.")
     if options.stimuli is not None and is_finished(options.stimuli) and options.fidelity not in (None, "balanced"):

@@ -52,6 +52,8 @@ def _bad_values(annotation: Any, limit: msgspec.Meta | None = None) -> Iterator[
         yield "no such name"
     elif annotation is bool:
         yield "yes"
+    elif annotation is str and limit is not None:
+        yield from ("x" * size for size in [(limit.min_length or 0) - 1, (limit.max_length or -2) + 1] if size >= 0)
     elif annotation in (int, float):
         yield "text"
         yield math.nan
@@ -95,6 +97,8 @@ def _good_value(annotation: Any, limit: msgspec.Meta | None = None) -> Any:
             return annotation(least if least is not None else most)
         low, high = above if above is not None else (below or 2) - 2, below if below is not None else (above or 0) + 2
         return annotation((low + high) / 2)
+    if annotation is str and limit is not None:
+        return "x" * (limit.min_length or 1)
     return None
 
 

@@ -22,6 +22,7 @@ ELSEWHERE = {
     "strict": "recordings",
     "memory": "",
     "plan": "plan",
+    "benchmark": "benchmark",
 }
 """Options whose effect stands in another entry of the provenance than its settings, or in none."""
 

@@ -13,7 +13,8 @@ from brainbench.cli.output import Output
 from brainbench.core.errors import UsageError, visible
 
 OFFERED = (
-    "recordings", "conditions", "select", "window", "stimuli", "fidelity", "whiskers", "metric", "estimator", "time"
+    "benchmark", "recordings", "conditions", "select", "window", "stimuli", "fidelity", "whiskers", "metric",
+    "estimator", "time",
 )  # fmt: skip
 """Options of a score that have a flag here; a batch file can set the others too."""
 
