@@ -56,6 +56,10 @@ class Board:
     """Name of the network that made synthetic recordings; empty where none is stated."""
     entries: tuple[Entry, ...]
     baselines: tuple[Baseline, ...] = field(default=())
+    benchmark: str = ""
+    """Name of the benchmark that most of its records state; empty where none does."""
+    citations: tuple[str, ...] = ()
+    """Works that recordings and benchmark ask to cite."""
     lacks: str = ""
     """Lack that forbids ranks, in words; empty when models can be told apart."""
 
@@ -99,6 +103,8 @@ def _board(key: tuple[Any, ...], records: list[ResultRecord], remarks: Mapping[s
     lacks = "records that say which recordings they used" if recordings_hash is None else ""
     lacks = lacks or lacking(animals, len(conditions))
     entries = _rank(fold_seeds(records, key, remarks), baselines, lacks)
+    origins = [record.score.provenance for record in records]
+    stated = [origin.benchmark_name for origin in origins if origin.benchmark_name]
     truths = [record.score.provenance.recordings.get("truth") for record in records]
     return Board(
         recordings=_most_common(record.score.provenance.recordings_name for record in records),
@@ -113,6 +119,8 @@ def _board(key: tuple[Any, ...], records: list[ResultRecord], remarks: Mapping[s
         truth=next((truth for truth in truths if isinstance(truth, str)), ""),
         entries=tuple(sorted(entries, key=lambda entry: entry.order)),
         baselines=baselines,
+        benchmark=_most_common(stated) if stated else "",
+        citations=tuple(dict.fromkeys(work for origin in origins for work in origin.citations)),
         lacks=lacks,
     )
 

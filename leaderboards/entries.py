@@ -20,7 +20,7 @@ from brainbench.core.files import content_hash
 from brainbench.core.identity import unusual_settings
 from brainbench.core.records import Interval, ModelCard, ResultRecord, Score
 from brainbench.core.statistics import is_finite
-from leaderboards.ranking import CHANCE_LEVEL, STANDINGS, Sample, Standing, not_repeatable, standing_of
+from leaderboards.ranking import CHANCE_LEVEL, STANDINGS, Sample, Standing, not_repeatable, rank_in_print, standing_of
 
 UNTRAINED = "untrained"
 _SAME = 1e-6
@@ -55,10 +55,8 @@ class Entry:
 
     @property
     def rank(self) -> str:
-        """The rank in print: ``2``, ``2–5``, or a dash when not ranked."""
-        if self.first is None:
-            return "–"
-        return str(self.first) if self.first == self.last else f"{self.first}–{self.last}"
+        """The rank in print."""
+        return rank_in_print(self.first, self.last)
 
     @property
     def score(self) -> Score:

@@ -58,12 +58,16 @@ class Sample:
         return (float(np.var(self.seeds, ddof=1)) / count, count - 1.0) if count > 1 else (0.0, 0.0)
 
     @property
+    def error(self) -> tuple[Any, Any]:
+        """Standard error over animals, stimuli and seeds, and its degrees of freedom."""
+        return _with_seeds(*two_factor_error([*self.animals.values()], self.without_stimulus), [self.seed_variance])
+
+    @property
     def interval(self) -> Interval | None:
         """95 % interval over animals, stimuli and seeds; None where a variance is unknown."""
         from scipy.special import stdtrit
 
-        error, freedom = two_factor_error(list(self.animals.values()), self.without_stimulus)
-        error, freedom = _with_seeds(error, freedom, [self.seed_variance])
+        error, freedom = self.error
         if not math.isfinite(error) or not math.isfinite(self.value):
             return None
         half = float(stdtrit(freedom, (1 + LEVEL) / 2) * error)
@@ -73,16 +77,23 @@ class Sample:
 
 
 def told_apart(samples: Sequence[Sample]) -> NDArray[np.bool_]:
-    """Return [N, N] for each pair whether model j is told apart above model i.
+    """Return [N, N] for each pair whether model j is told apart above model i."""
+    return apart(*differences(samples)) if samples else np.zeros((0, 0), dtype=bool)
 
-    The false discovery rate over all pairs that can be tested is :data:`FALSE_DISCOVERY_RATE` (Benjamini & Hochberg
-    1995).
+
+def apart(
+    difference: NDArray[np.float64], error: NDArray[np.float64], freedom: NDArray[np.float64]
+) -> NDArray[np.bool_]:
+    """Return [N, N] for each difference i − j, with standard error and degrees of freedom, whether j is above i.
+
+    NaN is not tested. The false discovery rate over all pairs is :data:`FALSE_DISCOVERY_RATE` (Benjamini & Hochberg
+    1995). Of models of one seed each the test is that of :func:`brainbench.core.statistics.compare_scores`.
     """
+    from scipy.special import stdtr
     from scipy.stats import false_discovery_control
 
-    if not samples:
-        return np.zeros((0, 0), dtype=bool)
-    difference, p = _tests(samples)
+    t = np.divide(np.abs(difference), error, out=np.where(difference == 0, 0.0, math.inf), where=error > 0)
+    p = np.where(np.isnan(difference), math.nan, 2 * stdtr(np.where(error > 0, freedom, 1.0), -t))
     pairs = np.triu(np.isfinite(p), 1)
     adjusted = np.ones_like(p)
     if pairs.any():
@@ -102,6 +113,11 @@ def rank_ranges(above: NDArray[np.bool_]) -> list[tuple[int, int]]:
     return [(int(first), int(last)) for first, last in zip(best, worst, strict=True)]
 
 
+def rank_in_print(first: int | None, last: int | None) -> str:
+    """Write a rank: ``2``, ``2–5``, or a dash where there is none."""
+    return "–" if first is None else f"{first}" if first == last else f"{first}–{last}"
+
+
 def lacking(animals: int, stimuli: int) -> str:
     """Return what a design lacks for ranks, in words; empty when it has enough animals and stimuli.
 
@@ -112,13 +128,8 @@ def lacking(animals: int, stimuli: int) -> str:
     return " and ".join(f"at least {fewest} {what} (here {n})" for what, fewest, n in rules if n < fewest)
 
 
-def _tests(samples: Sequence[Sample]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return differences i − j and two-sided p, each [N, N]; NaN: not tested.
-
-    Of models of one seed each the test is that of :func:`brainbench.core.statistics.compare_scores`.
-    """
-    from scipy.special import stdtr
-
+def differences(samples: Sequence[Sample]) -> tuple[NDArray[np.float64], ...]:
+    """Return differences i − j, their standard errors and degrees of freedom, each [N, N]; NaN: not tested."""
     names = sorted({name for sample in samples for name in sample.animals})
     size = max(len(sample.without_stimulus) for sample in samples)
     table = np.array([[sample.animals.get(name, math.nan) for name in names] for sample in samples])
@@ -127,7 +138,7 @@ def _tests(samples: Sequence[Sample]) -> tuple[NDArray[np.float64], NDArray[np.f
     for row, sample in zip(left_out, samples, strict=True):
         if len(sample.without_stimulus) == size:
             row[:] = sample.without_stimulus
-    difference, p = (np.full((len(samples), len(samples)), math.nan) for _ in range(2))
+    difference, errors, freedoms = (np.full((len(samples), len(samples)), math.nan) for _ in range(3))
     variances = np.array([sample.seed_variance for sample in samples])
     for i in range(len(samples)):
         animals, stimuli = table[i] - table, left_out[i] - left_out
@@ -139,10 +150,8 @@ def _tests(samples: Sequence[Sample]) -> tuple[NDArray[np.float64], NDArray[np.f
         mean = np.nanmean(animals[enough], axis=1)
         error, freedom = two_factor_error(animals[enough], stimuli[enough])
         error, freedom = _with_seeds(error, freedom, [variances[i], variances[enough].T])
-        t = np.divide(np.abs(mean), error, out=np.where(mean == 0, 0.0, math.inf), where=error > 0)
-        difference[i, enough] = mean
-        p[i, enough] = 2 * stdtr(np.where(error > 0, freedom, 1.0), -t)
-    return difference, p
+        difference[i, enough], errors[i, enough], freedoms[i, enough] = mean, error, freedom
+    return difference, errors, freedoms
 
 
 def _with_seeds(error: NDArray[np.float64], freedom: NDArray[np.float64], seeds: Sequence[Any]) -> tuple:

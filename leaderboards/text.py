@@ -115,6 +115,8 @@ def methods(records: Sequence[ResultRecord]) -> str:
     )
     scores = [record.score for record in records]
     stated = {
+        "Benchmark": [one.provenance.benchmark_name for one in scores],
+        "Recordings from": [" / ".join(one.provenance.citations) for one in scores],
         "Stimuli": [one.provenance.stimuli_name.rstrip(".") for one in scores],
         "Fidelity of the simulation": [str(one.provenance.settings.get("fidelity") or "") for one in scores],
         "Time axis": [origin.time_rule],

@@ -39,7 +39,7 @@ def make(
     ] = None,
 ) -> Output:
     """Write a benchmark from the options that brainbench score would take: everything but the model."""
-    from brainbench.benchmarks.making import make as make_benchmark
+    from brainbench.benchmarks.opening import make as make_benchmark
     from brainbench.core.errors import UsageError
     from brainbench.core.files import write_text
 
@@ -61,7 +61,7 @@ def check(benchmark: NamedBenchmark) -> Output:
 
     Exit status 1 if anything is not as it states; what others will miss in it is named too.
     """
-    from brainbench.benchmarks.making import check as check_benchmark
+    from brainbench.benchmarks.opening import check as check_benchmark
 
     with progress_bar() as progress:
         stated, findings = check_benchmark(benchmark, progress)

@@ -84,10 +84,19 @@ class NeuralResponses:
         truth = {"truth": HIDDEN_NETWORK} if self.source == "demo" and self.synthetic else {}
         truth |= {"config_hash": self.definition} if self.definition else {}
         truth |= {"title": self.title} if self.title else {}
+        truth |= {"citation": self.citation} if self.citation else {}
         truth |= {"ledger": ledger} if (ledger := self.dataset.attrs.get("ledger")) else {}
         truth |= {"skipped": skipped} if (skipped := self.dataset.attrs.get("skipped")) else {}
         stated = {name: self.dataset.attrs[name] for name in names}
         return {"source": self.source, "content_hash": self.content_hash, **stated, **truth}
+
+    @property
+    def citation(self) -> str:
+        """Work to cite for recordings of a layout that is known here; empty for what a program made."""
+        from brainbench.datasets.layouts.registry import get_layout, list_layouts
+
+        name = str(self.dataset.attrs.get("layout", "")).partition(" (")[0]
+        return get_layout(name).citation if not self.synthetic and name in list_layouts() else ""
 
     @property
     def label_doubt(self) -> str:

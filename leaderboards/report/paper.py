@@ -14,7 +14,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from brainbench.core.errors import DataError, check_name, missing_dependency, visible
+from brainbench.core.errors import DataError, check_name, listing, missing_dependency, visible
 from brainbench.core.files import write_together
 from brainbench.core.records import ResultRecord
 from brainbench.core.version import __version__
@@ -24,6 +24,7 @@ from leaderboards.entries import Entry
 from leaderboards.figures.charts import Figure, board_figures
 from leaderboards.figures.record import diagram, layers
 from leaderboards.figures.svg import STYLE, standalone
+from leaderboards.means import caption_of, columns_of, means_over, rows_of
 from leaderboards.site.score_page import render, render_markdown
 from leaderboards.site.table import board_label
 from leaderboards.store import StoredRecord
@@ -81,6 +82,11 @@ def references(records: Iterable[ResultRecord]) -> list[Reference]:
         if score.ceiling is not None:
             keys.append("nili2014")
         keys += [key for word, key in _METRICS.items() if word in score.metric.lower()]
+        for work in score.provenance.citations:
+            if "Rodgers C. C., Scientific Data 9:620" in work:
+                keys.append("rodgers2022")
+            else:
+                references.setdefault((reference := _other(work)).key, reference)
         if "rodgers" in f"{score.provenance.stimuli_name} {score.provenance.recordings_name}".lower():
             keys.append("rodgers2022")
         if card is not None:
@@ -108,7 +114,9 @@ def _toolkit() -> Reference:
 def _other(text: str) -> Reference:
     key = re.sub(r"[^a-z0-9]+", "", text.lower())[:24] or "other"
     safe = re.sub(r"[{}\\]", " ", visible(text))
-    return Reference(key, text, f"@misc{{{key},\n  note = {{{safe}}}\n}}")
+    doi = re.search(r"\b10\.\d{4,9}/[^\s,;{}\\]+", safe)
+    fields = f"  note = {{{safe}}}" + (f",\n  doi = {{{doi[0].rstrip('.')}}}" if doi else "")
+    return Reference(key, text, f"@misc{{{key},\n{fields}\n}}")
 
 
 FORMATS = ("md", "html", "pdf")
@@ -151,11 +159,12 @@ def write_paper(
         raise DataError("There are no usable result records for a report; make one with: brainbench score MODEL")
     boards = rank(usable)
     cited = references(usable)
+    sections = [_section(board, place, path) for place, board in enumerate(boards, start=1)]
     bib = {path.with_suffix(".bib"): "\n\n".join(item.bibtex for item in cited) + "\n"}
     paper = {
         "title": title,
         "synthetic": any(board.synthetic for board in boards),
-        "sections": [_section(board, place, path) for place, board in enumerate(boards, start=1)],
+        "sections": [*_over_benchmarks(boards, path), *sections],
         "references": cited,
         "commands": list(
             dict.fromkeys(visible(text) for record in usable if (text := record.score.provenance.command))
@@ -163,7 +172,7 @@ def write_paper(
         "bib": path.with_suffix(".bib").name,
     }
     if kind == "md":
-        drawn = [figure for section in paper["sections"] for figure in section["figures"]]
+        drawn = [figure for section in sections for figure in section["figures"]]
         figures = {place: standalone(figure.drawing) for figure, place in drawn}
         return write_together({path: render_markdown("paper.md.j2", **paper), **bib, **figures})
     text = render("paper.html.j2", **paper, style_of_figures=STYLE)
@@ -186,6 +195,17 @@ def _pdf(text: str, path: Path) -> bytes:
     except Exception as error:
         why = f"{type(error).__name__}: {str(error)[:80]}"
         raise DataError(f"WeasyPrint could not print {str(path)!r} ({why}); {instead}.") from error
+
+
+def _over_benchmarks(boards: Sequence[Board], path: Path) -> list[dict[str, Any]]:
+    """Return the section of means over benchmarks, where there are several."""
+    names, means = means_over(boards)
+    if not names:
+        return []
+    table = PaperTable(caption_of(names), columns_of(names), tuple(rows_of(names, means)))
+    empty = {"conclusions": [], "figures": [], "absent": [], "folder": path.parent}
+    methods = f"The benchmarks are {listing(names, limit=20, quoted=False)}. Each has a section of its own below."
+    return [{"title": "Mean over benchmarks", "methods": methods, "tables": [table], **empty}]
 
 
 def _section(board: Board, place: int, path: Path) -> dict[str, Any]:

@@ -30,6 +30,7 @@ from leaderboards import text as words
 from leaderboards.audit import remarks
 from leaderboards.boards import Board, conclusions, rank
 from leaderboards.figures.charts import board_figures
+from leaderboards.means import caption_of, columns_of, means_over, rows_of
 from leaderboards.site.score_page import model_page, render, script_json
 from leaderboards.site.table import COLUMNS, board_label, page_board, table_csv, table_rows
 from leaderboards.store import MAKE_ONE, SCHEMA_PATH, StoredRecord, record_text
@@ -178,6 +179,7 @@ def _pages(stored: Sequence[StoredRecord], title: str) -> Iterator[tuple[str, st
     """Yield each file of the site with its content, the first page first."""
     boards = rank([item.record for item in stored if item.record is not None], remarks(stored))
     synthetic = any(board.synthetic for board in boards)
+    benchmarks, means = means_over(boards)
     columns = [page_board(str(place), board) for place, board in enumerate(boards, start=1)]
     yield (
         "index.html",
@@ -189,6 +191,7 @@ def _pages(stored: Sequence[StoredRecord], title: str) -> Iterator[tuple[str, st
             labels=[board_label(board) for board in boards],
             concluded=[conclusions(board) for board in boards],
             synthetic=synthetic,
+            benchmarks=benchmarks and (caption_of(benchmarks), columns_of(benchmarks), rows_of(benchmarks, means)),
             problems=[item for item in stored if item.record is None],
             downloads=DOWNLOADS.items(),
             data=script_json({"boards": columns, "columns": COLUMNS, "page": PAGE}),
@@ -212,6 +215,8 @@ def _pages(stored: Sequence[StoredRecord], title: str) -> Iterator[tuple[str, st
     rows = [row for board in boards for row in table_rows(board)]
     data = (table_csv(rows), to_json(rows) + "\n", _records_zip(texts), SCHEMA_PATH.read_bytes())
     yield from zip(DOWNLOADS, data, strict=True)
+    if benchmarks:
+        yield "data/benchmarks.json", to_json({"benchmarks": benchmarks, "models": means}) + "\n"
 
 
 def _count(boards: Sequence[Board]) -> str:

@@ -43,7 +43,7 @@ COLUMNS: tuple[dict[str, Any], ...] = (
     {"key": "version", "label": "version", "title": "brainbench version", "wide": True},
 )  # fmt: skip
 
-_COMMON = ("recordings", "recordings_hash", "stimuli_hash", "time", "estimator", "metric", "synthetic")
+_COMMON = ("benchmark", "recordings", "recordings_hash", "stimuli_hash", "time", "estimator", "metric", "synthetic")
 _CARD = ("family", "encoder", "attender", "objective", "augmentation", "parameters", "multiply_adds", "top1", "top5")
 FIELDS = (
     *_COMMON, "kind", "rank_first", "rank_last", "name", "scaled", "scaled_low", "scaled_high", "standing", "same_as",
@@ -54,8 +54,8 @@ FIELDS = (
 
 
 def board_label(board: Board) -> str:
-    """Return the recordings of a board and what tells it from others of the same recordings."""
-    return f"{board.recordings}: {_rules(board)}"
+    """Return benchmark and recordings of a board and what tells it from others of the same recordings."""
+    return f"{f'{board.benchmark}: ' if board.benchmark else ''}{board.recordings}: {_rules(board)}"
 
 
 def table_rows(board: Board) -> list[dict[str, Any]]:
@@ -94,7 +94,9 @@ def page_board(key: str, board: Board) -> dict[str, Any]:
     animals = next((row for row in columns if row["kind"] == "animals" and row["score_low"] is not None), None)
     return {
         "key": key,
-        "recordings": board.recordings + (f" ({board.recordings_hash[:6]})" if board.recordings_hash else ""),
+        "recordings": (f"{board.benchmark}: " if board.benchmark else "")
+        + board.recordings
+        + (f" ({board.recordings_hash[:6]})" if board.recordings_hash else ""),
         "label": _rules(board),
         "about": _about(board),
         "conclusions": conclusions(board),
@@ -118,7 +120,9 @@ def _rules(board: Board) -> str:
 def _about(board: Board) -> list[str]:
     first = f"{board.recordings}: {len(board.conditions)} stimuli, estimator {board.estimator}."
     brain, stimuli = board.recordings_hash or "unknown", board.stimuli_hash or "unknown"
-    return [*filter(None, (first, board.stimuli)), f"Hash of the recordings {brain}, of the stimuli {stimuli}."]
+    about = [f"Benchmark {board.benchmark}." if board.benchmark else "", first, board.stimuli]
+    about += [f"Cite: {work.rstrip('.')}." for work in board.citations]
+    return [*filter(None, about), f"Hash of the recordings {brain}, of the stimuli {stimuli}."]
 
 
 def _entry_row(entry: Entry) -> dict[str, Any]:

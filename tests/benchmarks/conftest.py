@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from brainbench.benchmarks.definition import Benchmark
-from brainbench.benchmarks.making import make
+from brainbench.benchmarks.opening import make
 from brainbench.core.files import write_text
 from brainbench.scoring.options import ScoreOptions
 from tests.factories.scored_files import write_study

@@ -1,0 +1,172 @@
+"""Means over benchmarks: what a model scores on all benchmarks of a set of boards, with interval and rank.
+
+The benchmarks are those that the records name, and the mean is over exactly these. Errors over animals and stimuli add
+up in squares where benchmarks share no animal; where they do, and where a model has several seeds, which it has on
+every benchmark, they add up as if they always erred alike: the interval is then too wide rather than too narrow.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from brainbench.core.identity import unusual_settings
+from brainbench.core.records import Interval
+from brainbench.core.statistics import LEVEL
+from leaderboards.boards import Board
+from leaderboards.entries import Entry
+from leaderboards.ranking import apart, differences, rank_in_print, rank_ranges
+from leaderboards.text import number, plural, span
+
+
+@dataclass(frozen=True)
+class Mean:
+    """One model over all benchmarks."""
+
+    name: str
+    scores: Mapping[str, float]
+    """Benchmark → score between chance (0) and all that is reliable (1); those that it was scored on."""
+    value: float = math.nan
+    """Mean over the benchmarks; NaN where it misses one."""
+    interval: Interval | None = None
+    first: int | None = None
+    """Best rank that the tests leave open; None when it is not ranked."""
+    last: int | None = None
+    unranked_because: str = ""
+
+    @property
+    def rank(self) -> str:
+        """The rank in print."""
+        return rank_in_print(self.first, self.last)
+
+
+def means_over(boards: Iterable[Board]) -> tuple[tuple[str, ...], list[Mean]]:
+    """Return the benchmarks of boards, and every model over them, the highest mean first; nothing for fewer than two.
+
+    A model that misses a benchmark, or has no rank on one, is not ranked; nor is any where no two are told apart.
+    """
+    groups: dict[tuple[Any, ...], list[Board]] = defaultdict(list)
+    for board in boards:
+        if board.benchmark:
+            # Features that were computed elsewhere have a board of their own, since they name no stimuli.
+            groups[board.benchmark, board.recordings_hash, board.metric, board.estimator].append(board)
+    names = _labels([*groups])
+    if len(names) < 2:
+        return (), []
+    models: dict[tuple[str, str], dict[str, Entry]] = defaultdict(dict)
+    for label, group in zip(names, groups.values(), strict=True):
+        entries = sorted((entry for board in group for entry in board.entries), key=_age)
+        for entry in entries:
+            models[entry.name, str(unusual_settings(entry.score.provenance.settings))][label] = entry
+    means = [_mean(name, entries, names) for (name, _), entries in models.items()]
+    able = [pair for pair in zip(means, models.values(), strict=True) if not pair[0].unranked_because]
+    ranks = _ranks([[entries[label] for label in names] for _, entries in able]) if able else []
+    ranked = [replace(mean, first=first, last=last) for (mean, _), (first, last) in zip(able, ranks, strict=True)]
+    rest = [mean for mean in means if mean.unranked_because]
+    return names, sorted([*ranked, *rest], key=lambda mean: (math.isnan(mean.value), -mean.value, mean.name))
+
+
+def _labels(keys: Sequence[tuple[Any, ...]]) -> tuple[str, ...]:
+    """Return a name for each benchmark; those of one name are told apart by their recordings and metric."""
+    counts = Counter(key[0] for key in keys)
+    return tuple(
+        name if counts[name] == 1 else f"{name} ({(digest or 'unknown')[:6]}, {metric or 'metric not stated'})"
+        for name, digest, metric, _ in keys
+    )
+
+
+def _age(entry: Entry) -> tuple[bool, str]:
+    """Return what sorts the entries of one model so that the one that counts is the last: repeatable, newest."""
+    return not entry.unranked_because, max(record.score.provenance.time for record in entry.records)
+
+
+def _mean(name: str, entries: dict[str, Entry], names: Sequence[str]) -> Mean:
+    scores = {label: entries[label].scaled for label in names if label in entries}
+    if missing := [label for label in names if not math.isfinite(scores.get(label, math.nan))]:
+        return Mean(name, scores, unranked_because=f"no score on {', '.join(missing)}")
+    row = [entries[label] for label in names]
+    value = math.fsum(scores.values()) / len(names)
+    error, freedom = (float(part) for part in _combined([entry.sample.error for entry in row], dependent(row)))
+    reasons = (f"{label}: {reason}" for label, entry in entries.items() if (reason := entry.unranked_because))
+    unranked = next(reasons, "")
+    return Mean(name, scores, value, _interval(value, error, freedom, len(names)), unranked_because=unranked)
+
+
+def _interval(value: float, error: float, freedom: float, benchmarks: int) -> Interval | None:
+    from scipy.special import stdtrit
+
+    if not math.isfinite(error):
+        return None
+    half = float(stdtrit(freedom, (1 + LEVEL) / 2) * error)
+    return Interval(value - half, value + half, LEVEL, f"t over animals and stimuli of {benchmarks} benchmarks")
+
+
+def dependent(entries: Sequence[Entry]) -> list[list[int]]:
+    """Return the benchmarks, by place, in groups whose errors may be alike: of shared animals, or of several seeds."""
+    groups: list[tuple[set[str], list[int]]] = []
+    for place, entry in enumerate(entries):
+        animals = {subject.subject for record in entry.records for subject in record.score.subjects}
+        places, others = [place], []
+        for group in groups:
+            if group[0] & animals or entry.seeds > 1:
+                animals |= group[0]
+                places += group[1]
+            else:
+                others.append(group)
+        groups = [*others, (animals, places)]
+    return [places for _, places in groups]
+
+
+def _combined(errors: Sequence[tuple[Any, Any]], groups: Sequence[Sequence[int]]) -> tuple[Any, Any]:
+    """Return the standard error of a mean and its degrees of freedom (Welch and Satterthwaite)."""
+    variances = [np.square(sum(errors[place][0] for place in group)) for group in groups]
+    freedoms = [np.min([errors[place][1] for place in group], axis=0) for group in groups]
+    total = sum(variances)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        spent = sum(variance**2 / freedom for variance, freedom in zip(variances, freedoms, strict=True))
+        freedom = np.where(np.asarray(total) > 0, np.square(total) / spent, np.nan)
+    return np.sqrt(total) / len(errors), freedom
+
+
+def _ranks(models: Sequence[Sequence[Entry]]) -> list[tuple[int | None, int | None]]:
+    """Return the best and the worst rank of each model by paired tests over all benchmarks."""
+    tests = [differences([entries[place].sample for entries in models]) for place in range(len(models[0]))]
+    difference: NDArray[np.float64] = np.mean([test[0] for test in tests], axis=0)
+    groups = min(map(dependent, models), key=len)
+    error, freedom = _combined([test[1:] for test in tests], groups)
+    above = apart(difference, error, freedom)
+    for place, entries in enumerate(models):
+        above[:, place] &= any(entry.above_chance for entry in entries)
+    return [*rank_ranges(above)] if above.any() else [(None, None)] * len(models)
+
+
+def columns_of(names: Sequence[str]) -> tuple[str, ...]:
+    """Return the columns of a table of means."""
+    return ("model", "rank", "mean", "interval", *names, "standing")
+
+
+def rows_of(names: Sequence[str], means: Sequence[Mean]) -> list[tuple[str, ...]]:
+    """Return the table of means as texts."""
+    return [
+        (
+            mean.name, mean.rank, "–" if math.isnan(mean.value) else number(mean.value), span(mean.interval),
+            *(number(mean.scores[name]) if name in mean.scores else "–" for name in names),
+            f"not ranked: {mean.unranked_because}" if mean.unranked_because else "",
+        )
+        for mean in means
+    ]  # fmt: skip
+
+
+def caption_of(names: Sequence[str]) -> str:
+    """Return what a table of means shows, in words."""
+    return (
+        f"Mean over {plural(len(names), 'benchmark')}, between chance (0) and all that is reliable (1), with its 95 % "
+        "interval over animals and stimuli. Models are told apart by paired tests over all of them; one that misses a "
+        "benchmark is not ranked."
+    )
