@@ -7,6 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
+from brainbench.benchmarks.definition import OPTIONS
 from brainbench.cli.destinations import out_file_option
 from brainbench.cli.options import SCORE, SCORE_FLAGS, with_options
 from brainbench.cli.output import Output, facts, progress_bar, table_of
@@ -14,16 +15,11 @@ from brainbench.cli.requirements import needs
 
 app = typer.Typer(no_args_is_help=True, help="Make, check and pack benchmarks: one file that others score on.")
 NamedBenchmark = Annotated[str, typer.Argument(help="A benchmark: FILE.toml, FILE.zip, or a name of the list.")]
-MADE_OF = (
-    "recordings", "title", "stimuli", "conditions", "match", "select", "window", "bin", "time", "whiskers", "fidelity",
-    "metric", "estimator", "units_reliability", "seed",
-)  # fmt: skip
-"""Options of a score that make a benchmark."""
 
 
 @app.command("make")
 @needs(cache=True)
-@with_options(SCORE, MADE_OF, flags=SCORE_FLAGS)
+@with_options(SCORE, ("recordings", "match", *OPTIONS), flags=SCORE_FLAGS)
 def make(
     out: Annotated[Path, out_file_option("File to write, FILE.toml, in a folder that holds the recordings.")],
     options: Any = None,

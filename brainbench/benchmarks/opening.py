@@ -88,7 +88,8 @@ def open_for_score(given: ScoreOptions, explicit: Iterable[str] = ()) -> OpenBen
     defaults = ScoreOptions()
     for name in ("recordings", "match", *OPTIONS):
         wanted, value = getattr(given, name), getattr(options, name)
-        if wanted != value and (wanted != getattr(defaults, name) or name in explicit):
+        same = wanted is None or not (wanted != value and wanted != benchmark.options.get(name, value))
+        if not same and (wanted != getattr(defaults, name) or name in explicit):
             stated = benchmark.recordings.path if name == "recordings" else "pairs" if name == "match" else value
             raise UsageError(
                 f"{name} is a matter of the benchmark {benchmark.name!r}, which states {brief(stated)}; received "

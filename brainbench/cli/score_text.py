@@ -37,7 +37,7 @@ def _headline(record: ResultRecord) -> Iterator[str]:
 
     score, animals = record.score, record.animal_to_animal
     subjects = score.subjects or (animals.subjects if animals else ())
-    name = score.provenance.recordings_name
+    name = ": ".join(filter(None, (score.provenance.benchmark_name, score.provenance.recordings_name)))
     count = f"{len(subjects)} animal{'s' * (len(subjects) != 1)}"
     yield f"{score.name}{_weights(record)}  ·  {len(score.stimuli)} stimuli  ·  {count}  ·  {name}"
     yield _against_raw_input(record)

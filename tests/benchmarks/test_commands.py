@@ -51,10 +51,17 @@ def test_a_stranger_gets_the_labs_score_byte_for_byte_from_one_file(run, study, 
     monkeypatch.chdir(fresh)
     result = run("score", study["features"], "--benchmark", "lab.zip", "--out", "theirs")
     assert result.status == 0, result.err
+    assert "lab: data" in result.out
     lab, stranger = _record(tmp_path / "ours"), _record(fresh / "theirs")
     assert json.dumps(_steady(stranger)) == json.dumps(_steady(lab))
     assert stranger["score"]["provenance"]["benchmark"]["citation"] == "Doe (2026)"
     assert stranger["score"]["provenance"]["command"].endswith("--benchmark lab.zip")
+
+    (record,) = (fresh / "theirs").glob("*.json")
+    result = run("leaderboard", "verify", str(record))
+    assert "give them with --recordings PATH, or the benchmark 'lab' with --benchmark FILE" in result.out + result.err
+    result = run("leaderboard", "verify", str(record), "--benchmark", "lab.zip", "--trust-code")
+    assert "confirmed: scored again with the same result" in result.out, result.out + result.err
 
     result = run("score", study["features"], "--benchmark", "lab.zip", "--fidelity", "balanced", "--metric", "cka")
     assert result.status == 2

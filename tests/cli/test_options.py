@@ -2,7 +2,7 @@ from dataclasses import fields, replace
 
 import pytest
 
-from brainbench.cli.options import SCORE, SCORE_FLAGS, as_flags, numbers, option_fields, part_of, refuse
+from brainbench.cli.options import SCORE, SCORE_FLAGS, as_flags, numbers, option_fields, part_of, refuse, typed_options
 from brainbench.core.errors import UsageError
 from brainbench.scoring import ScoreOptions
 
@@ -15,6 +15,11 @@ def test_options_are_written_as_flags():
     told = ["--layers", "a,b", "--no-normalize", "--weights-seed", "1", "--explain-estimator"]
     assert as_flags(SCORE, options, SCORE_FLAGS) == told
     assert set(option_fields(SCORE)) == set(NAMES)
+
+
+def test_typed_flags_are_told_from_defaults():
+    words = ["score", "zhuang", "-r", "data", "--seed=0", "--no-normalize", "--out", "x", "--json"]
+    assert typed_options(words) == ["recordings", "normalize", "seed"]
 
 
 def test_numbers_are_written_with_commas_or_as_a_size():

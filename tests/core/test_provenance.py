@@ -42,3 +42,12 @@ def test_provenance_is_typed_and_keeps_what_it_does_not_know():
     assert origin.more == {"seed": 3, "command": 7, "settings": {}}
     assert origin == stated
     assert json.loads(to_json(origin)) == stated
+
+
+def test_works_to_cite_are_read_as_texts_each_once():
+    stated = {"recordings": {"citation": "Doe (2026)"}, "benchmark": {"name": "lab", "citation": "Doe (2026)"}}
+    origin = Provenance.of(stated)
+    assert (origin.benchmark_name, origin.citations) == ("lab", ["Doe (2026)"])
+    # Anyone may write a record.
+    assert Provenance.of({"benchmark": {"name": 3, "citation": ["x"]}}).citations == []
+    assert Provenance.of({"benchmark": "lab"}).benchmark_name == ""

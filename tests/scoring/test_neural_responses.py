@@ -179,3 +179,14 @@ def test_a_bin_that_every_window_cuts_short_counts_by_its_length():
         found.append(whole.animals(whole.vocabulary, get_metric("rsa"), options))
     even, cut = ([animal.reliability for animal in animals] for animals in found)
     np.testing.assert_allclose(cut, even, atol=0.02)
+
+
+@pytest.mark.parametrize(
+    ("layout", "synthetic", "begins"),
+    [("rodgers (detected from its columns)", False, "Rodgers C. C."), ("rodgers", True, ""), ("mine", False, "")],
+)
+def test_recordings_of_a_layout_state_the_work_to_cite(layout, synthetic, begins):
+    dataset = make_recordings().assign_attrs(layout=layout, synthetic=synthetic)
+    citation = open_neural_responses(dataset, progress=None).origin.get("citation", "")
+    assert citation.startswith(begins)
+    assert bool(citation) == bool(begins)

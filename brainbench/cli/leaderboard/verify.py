@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from brainbench.cli.options import SCORE, option_fields
+from brainbench.cli.options import SCORE, SCORE_FLAGS, option_fields, with_options
 from brainbench.cli.output import Output, table_of, tracked
 from brainbench.core.errors import BrainbenchError, DataError, UsageError, brief, visible
 
@@ -19,21 +19,28 @@ if TYPE_CHECKING:
     from leaderboards.store import StoredRecord
 
 
+@dataclass(frozen=True)
+class Repetition:
+    """How records are scored again."""
+
+    recordings: str | None = None
+    """Where the recordings are, if not 'demo'."""
+    stimuli: str | None = None
+    """Stimuli, if not a recipe of the package."""
+    benchmark: str | None = None
+    """Benchmark (.zip, .toml or name) that the records are of, in place of recordings and stimuli."""
+    score: bool = True
+    """Score the model again and compare; else only read the files."""
+    tolerance: float = 1e-3
+    """Numbers that differ by no more are equal."""
+    trust_code: bool = False
+    """Also run code and weights that do not come with this package."""
+
+
+@with_options("brainbench.cli.leaderboard.verify:Repetition", parameter="how", flags=SCORE_FLAGS)
 def verify(
     records: Annotated[list[Path], typer.Argument(help="Record files or folders of them.")],
-    recordings: Annotated[
-        str | None, typer.Option("--recordings", "-r", help="Where the recordings are, if not 'demo'.")
-    ] = None,
-    stimuli: Annotated[
-        str | None, typer.Option("--stimuli", "-s", help="Stimuli, if not a recipe of the package.")
-    ] = None,
-    score: Annotated[
-        bool, typer.Option("--score/--no-score", help="Score the model again and compare; else only read the files.")
-    ] = True,
-    tolerance: Annotated[float, typer.Option(help="Numbers that differ by no more are equal.")] = 1e-3,
-    trust_code: Annotated[
-        bool, typer.Option("--trust-code", help="Also run code and weights that do not come with this package.")
-    ] = False,
+    how: Repetition,
     held_out: Annotated[
         Path | None, typer.Option("--held-out", help="Published commitment; also score on what it holds back.")
     ] = None,
@@ -52,24 +59,7 @@ def verify(
     commitment = None if held_out is None else Commitment.read(held_out)
     if commitment is not None:
         commitment.open(secret)
-    return verdicts(
-        read_records(records), Repetition(recordings, stimuli, trust_code, score, tolerance), commitment, secret
-    )
-
-
-@dataclass(frozen=True)
-class Repetition:
-    """How records are scored again."""
-
-    recordings: str | None = None
-    """Where they are, if not those of the demo."""
-    stimuli: str | None = None
-    """Stimuli in place of those that the record names."""
-    trust_code: bool = False
-    """Run code, and open files, that do not come with this package."""
-    score: bool = True
-    """Score at all, rather than read the files alone."""
-    tolerance: float = 1e-3
+    return verdicts(read_records(records), how, commitment, secret)
 
 
 def verdicts(
@@ -122,9 +112,15 @@ def score_again(record: ResultRecord, how: Repetition) -> ResultRecord:
             f"The record of {record.score.name!r} does not name a model that can be loaded (a module in memory or a "
             "record of an earlier layout); score the model again."
         )
-    refuse_foreign_code(record, trusted=how.trust_code, stimuli=how.stimuli)
+    refuse_foreign_code(record, trusted=how.trust_code, stimuli=how.stimuli or how.benchmark)
+    if how.benchmark is not None:
+        return score_record(model, ScoreOptions.stated_in(origin.settings, benchmark=how.benchmark))
     if how.recordings is None and (not isinstance(source, str) or source not in DEMOS):
-        raise UsageError(f"The record was made with recordings {str(source)[:80]!r}; give them with --recordings PATH.")
+        name = origin.benchmark_name
+        other = f", or the benchmark {brief(name)} with --benchmark FILE" if name else ""
+        raise UsageError(
+            f"The record was made with recordings {str(source)[:80]!r}; give them with --recordings PATH{other}."
+        )
     others = {"recordings": how.recordings or source, "match": origin.pairs or None}
     options = ScoreOptions.stated_in(origin.settings, **others, **({"stimuli": how.stimuli} if how.stimuli else {}))
     return score_record(model, options)
