@@ -70,9 +70,10 @@ def open_benchmark(source: str | os.PathLike[str]) -> tuple[Benchmark, Path]:
     name = os.fspath(path)
     text = read_text(path, "benchmark", most=MOST_DEFINITION)
     benchmark = Benchmark.stated_by(parse_toml(text, name), f"The benchmark {brief(name)}", sealed=False)
+    folder = path.expanduser().absolute().parent
     for file in benchmark.files:
-        _compare(benchmark, path.parent, file)
-    return benchmark, path.parent
+        _compare(benchmark, folder, file)
+    return benchmark, folder
 
 
 def pack(source: str | os.PathLike[str], out: Path) -> Benchmark:

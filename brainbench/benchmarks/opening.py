@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import os
 from collections.abc import Iterable, Iterator
@@ -14,7 +13,7 @@ from brainbench.benchmarks.definition import OPTIONS, Benchmark, Ceilings, Recor
 from brainbench.benchmarks.files import files_named_in, open_benchmark
 from brainbench.core.contracts import read_match
 from brainbench.core.errors import DataError, UsageError, brief, listing, unknown_name
-from brainbench.core.files import file_hash
+from brainbench.core.files import file_hash, to_plain
 from brainbench.core.progress import Progress
 from brainbench.core.provenance import Provenance
 from brainbench.core.reading.texts import read_toml
@@ -68,9 +67,16 @@ class OpenBenchmark:
 
     def portable(self, record: ResultRecord) -> ResultRecord:
         """Return a record that names the files from the folder of the benchmark, as on every machine."""
-        folder = json.dumps(f"{self.folder}{os.sep}", ensure_ascii=False)[1:-1]
-        text = record.to_json()
-        return ResultRecord.from_json(text.replace(folder, "")) if folder in text else record
+        return ResultRecord.from_json(_renamed(to_plain(record), f"{self.folder}{os.sep}"))
+
+
+def _renamed(value: Any, folder: str) -> Any:
+    """Return plain values whose texts, but for the command, do not hold a folder."""
+    if isinstance(value, dict):
+        return {name: inner if name == "command" else _renamed(inner, folder) for name, inner in value.items()}
+    if isinstance(value, list):
+        return [_renamed(inner, folder) for inner in value]
+    return value.replace(folder, "") if isinstance(value, str) else value
 
 
 def recordings_hash(brain: NeuralResponses) -> str | None:
@@ -107,11 +113,14 @@ def options_of(benchmark: Benchmark, folder: Path) -> ScoreOptions:
         raise unknown_name("recording layout of a benchmark", layout, list_layouts())
     recordings = path if path in DEMOS else f"{layout}{colon}{folder / path}"
     if path not in DEMOS:
-        _check_listed(benchmark, folder, path)
+        _check_listed(benchmark, folder, path, find_files(folder / path))
     if (stimuli := stated.get("stimuli")) is not None and not is_recipe(str(stimuli)):
         if stimuli not in benchmark.files:
             raise unknown_name("stimuli of a benchmark", stimuli, [*benchmark.files, *list_recipes()])
-        stated["stimuli"] = str(folder / str(stimuli))
+        scene = folder / str(stimuli)
+        if scene.suffix == ".toml":
+            _check_listed(benchmark, folder, str(stimuli), files_named_in(scene, read_toml(scene)))
+        stated["stimuli"] = str(scene)
     metric = str(stated.get("metric", "rsa"))
     if ":" in metric:
         raise UsageError(f"A benchmark brings no code, and its metric is {brief(metric)}; name one that is installed.")
@@ -120,13 +129,13 @@ def options_of(benchmark: Benchmark, folder: Path) -> ScoreOptions:
     return ScoreOptions.of({**stated, "recordings": recordings, "match": match or None})
 
 
-def _check_listed(benchmark: Benchmark, folder: Path, path: str) -> None:
-    """Refuse recordings that the benchmark does not list: a file that was put beside the others."""
+def _check_listed(benchmark: Benchmark, folder: Path, path: str, files: Iterable[Path]) -> None:
+    """Refuse files of recordings or of a scene that the benchmark does not list: added, or elsewhere."""
     listed = {(folder / name).resolve() for name in benchmark.files}
-    if more := [file.name for file in find_files(folder / path) if file.resolve() not in listed]:
+    if more := [file.name for file in files if file.resolve() not in listed]:
         raise DataError(
-            f"{brief(path)} holds {listing(more, limit=3)}, which the benchmark {benchmark.name!r} does not list; take "
-            "it away, or make the benchmark again."
+            f"{brief(path)} holds or names {listing(more, limit=3)}, which the benchmark {benchmark.name!r} does not "
+            "list; take it away, or make the benchmark again."
         )
 
 

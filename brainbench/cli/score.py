@@ -55,13 +55,12 @@ def score(
     from leaderboards.store import write_record
 
     if options.explain and Path(model).suffix == ".npz":
-        from brainbench.core.plugins import load_optional
+        from brainbench.core.plugins import require_optional
         from brainbench.scoring.scores import PARTS
 
         if options != replace(type(options)(), explain=True) or report_file is not None:
             raise UsageError("A file of stored splits is explained by itself; leave out all options but --json.")
-        explain_file = load_optional(PARTS, "explain_file", "part of a score")
-        steps = to_plain(explain_file(model)) if explain_file else []
+        steps = to_plain(require_optional(PARTS, "explain_file", "part of a score")(model))
         return Output({"estimator_walk": steps}, walk_text(steps))
     command = _command()
     cached = record_path(model, options, command)

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 from brainbench.core.errors import UsageError
 from brainbench.core.limits import Count, Limit, Positive, Seed, limited
-from brainbench.core.plugins import load_optional
+from brainbench.core.plugins import require_optional
 from brainbench.geometry.distance import Deviation
 from brainbench.geometry.mesh import Mesh
 
@@ -67,7 +67,5 @@ def decompose(mesh: Mesh, settings: DecompositionSettings | None = None) -> Deco
     Raises:
         MissingDependencyError: the folder that cuts them was taken off.
     """
-    cut = load_optional("brainbench.geometry", "decomposition", "collision")
-    if cut is None:
-        raise UsageError("No package that is installed here decomposes meshes; install brainbench again.")
+    cut = require_optional("brainbench.geometry", "decomposition", "collision")
     return cut(mesh, settings or DecompositionSettings())

@@ -95,10 +95,8 @@ def missing(jobs: Sequence[ScoringJob], records: Iterable[ResultRecord]) -> list
     from brainbench.scoring.scores import with_benchmark
     from brainbench.stimuli import load_stimuli
 
-    scored = []
-    for job in jobs:
-        benchmark = with_benchmark(job.options)
-        scored.append(job if benchmark is None else replace(job, options=benchmark.options))
+    opened = ((job, with_benchmark(job.options)) for job in jobs)
+    scored = [job if benchmark is None else replace(job, options=benchmark.options) for job, benchmark in opened]
     # Jobs of --model and of a batch file may have other recordings and stimuli.
     inputs: dict[str, tuple[NeuralResponses, Stimuli]] = {}
     for options in (job.options for job in scored):

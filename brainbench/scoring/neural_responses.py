@@ -82,12 +82,11 @@ class NeuralResponses:
         names = ("window", "selection", "removed", "synthetic")
         # Boards of the demo say whether the network that made it was found.
         truth = {"truth": HIDDEN_NETWORK} if self.source == "demo" and self.synthetic else {}
-        truth |= {"config_hash": self.definition} if self.definition else {}
-        truth |= {"title": self.title} if self.title else {}
-        truth |= {"citation": self.citation} if self.citation else {}
-        truth |= {"ledger": ledger} if (ledger := self.dataset.attrs.get("ledger")) else {}
-        truth |= {"skipped": skipped} if (skipped := self.dataset.attrs.get("skipped")) else {}
-        stated = {name: self.dataset.attrs[name] for name in names}
+        attributes = self.dataset.attrs
+        more = {"config_hash": self.definition, "title": self.title, "citation": self.citation}
+        more |= {name: attributes.get(name) for name in ("ledger", "skipped")}
+        truth |= {name: value for name, value in more.items() if value}
+        stated = {name: attributes[name] for name in names}
         return {"source": self.source, "content_hash": self.content_hash, **stated, **truth}
 
     @property

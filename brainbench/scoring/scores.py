@@ -13,10 +13,10 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
-from brainbench.core.errors import MissingDependencyError, UsageError, check_name, listing
+from brainbench.core.errors import UsageError, check_name, listing
 from brainbench.core.files import provenance, to_plain
 from brainbench.core.identity import SealedPlan
-from brainbench.core.plugins import load_optional
+from brainbench.core.plugins import require_optional
 from brainbench.core.progress import Progress, stages
 from brainbench.core.provenance import Provenance
 from brainbench.core.records import ESTIMATOR_VERSION, ResultRecord, Score
@@ -272,17 +272,8 @@ def _compare(inputs: ScoreInputs, *, baselines: bool) -> tuple[list[Score], Scor
 
 
 def _optional(name: str) -> Any:
-    """Return a part of a score that stands in an optional folder, by its entry point.
-
-    Raises:
-        MissingDependencyError: the folder was taken off.
-    """
-    part = load_optional(PARTS, name, "part of a score")
-    if part is None:
-        raise MissingDependencyError(
-            f"No installed package has the part {name!r} of a score; install brainbench again."
-        )
-    return part
+    """Return a part of a score that stands in an optional folder, by its entry point."""
+    return require_optional(PARTS, name, "part of a score")
 
 
 def _doubted(score: Score, doubt: str) -> Score:

@@ -46,8 +46,17 @@ def test_options_that_say_the_same_pass(lab):
 
 def test_a_file_put_beside_the_recordings_is_refused(lab):
     (lab / "data" / "more.h5").write_bytes((lab / "data" / "w.h5").read_bytes())
-    with pytest.raises(DataError, match=r"'data' holds 'more.h5', which the benchmark 'lab' does not list"):
+    with pytest.raises(DataError, match=r"'data' holds or names 'more.h5', which the benchmark 'lab' does not list"):
         open_for_score(ScoreOptions(benchmark=lab / "lab.toml"))
+
+
+def test_a_scene_that_names_a_file_elsewhere_is_refused(lab, laboratory, tmp_path):
+    (tmp_path / "private.csv").write_text("1")
+    (lab / "scene.toml").write_text(f'[whisking]\npath = "{tmp_path / "private.csv"}"\n')
+    files = {**laboratory[1].files, "scene.toml": file_hash(lab / "scene.toml", length=64)}
+    changed = replace(laboratory[1], options={"stimuli": "scene.toml"}, files=files)
+    with pytest.raises(DataError, match=r"'scene.toml' holds or names 'private.csv', which the benchmark"):
+        options_of(changed, lab)
 
 
 @pytest.mark.parametrize(
