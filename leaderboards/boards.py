@@ -22,6 +22,8 @@ from leaderboards.text import number, plural, span
 
 RAW_INPUT = "raw input"
 """Name of the baseline that a model must be told apart from."""
+MOST_CITED = 8
+"""Works that a board names; anyone may write records."""
 NO_SCALE = "its record states neither chance nor the scores without single stimuli; score the model again"
 
 
@@ -120,7 +122,7 @@ def _board(key: tuple[Any, ...], records: list[ResultRecord], remarks: Mapping[s
         entries=tuple(sorted(entries, key=lambda entry: entry.order)),
         baselines=baselines,
         benchmark=_most_common(stated) if stated else "",
-        citations=tuple(dict.fromkeys(work for origin in origins for work in origin.citations)),
+        citations=tuple(dict.fromkeys(work for origin in origins for work in origin.citations))[:MOST_CITED],
         lacks=lacks,
     )
 

@@ -117,9 +117,9 @@ def score_again(record: ResultRecord, how: Repetition) -> ResultRecord:
         return score_record(model, ScoreOptions.stated_in(origin.settings, benchmark=how.benchmark))
     if how.recordings is None and (not isinstance(source, str) or source not in DEMOS):
         name = origin.benchmark_name
-        other = f", or the benchmark {brief(name)} with --benchmark FILE" if name else ""
+        advice = f", or the benchmark {brief(name)} with --benchmark FILE" if name else ""
         raise UsageError(
-            f"The record was made with recordings {str(source)[:80]!r}; give them with --recordings PATH{other}."
+            f"The record was made with recordings {str(source)[:80]!r}; give them with --recordings PATH{advice}."
         )
     others = {"recordings": how.recordings or source, "match": origin.pairs or None}
     options = ScoreOptions.stated_in(origin.settings, **others, **({"stimuli": how.stimuli} if how.stimuli else {}))
