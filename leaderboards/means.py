@@ -123,7 +123,7 @@ def dependent(entries: Sequence[Entry]) -> list[list[int]]:
     return [places for _, places in groups]
 
 
-def _combined(errors: Sequence[tuple[Any, Any]], groups: Sequence[Sequence[int]]) -> tuple[Any, Any]:
+def _combined(errors: Sequence[Sequence[Any]], groups: Sequence[Sequence[int]]) -> tuple[Any, Any]:
     """Return the standard error of a mean and its degrees of freedom (Welch and Satterthwaite)."""
     variances = [np.square(sum(errors[place][0] for place in group)) for group in groups]
     freedoms = [np.min([errors[place][1] for place in group], axis=0) for group in groups]
