@@ -28,6 +28,7 @@ from brainbench.core.errors import (
     UsageError,
     unknown_name,
 )
+from brainbench.core.reading.regular import reason
 
 _LOG = logging.getLogger(__name__)
 _beside: dict[str, Path] = {}
@@ -66,16 +67,25 @@ def load_module(path: str) -> ModuleType:
     is_file = path.endswith(".py") or "/" in path or "\\" in path
     if is_file and not Path(path).is_file():
         raise DataFileNotFoundError(f"There is no Python file {path!r}.")
+    with foreign_code(f"Importing {path!r}"):
+        try:
+            return _import_file(Path(path).resolve()) if is_file else importlib.import_module(path)
+        except ModuleNotFoundError as error:
+            if not is_file and error.name is not None and (path == error.name or path.startswith(f"{error.name}.")):
+                absent = f"There is no Python module {path!r}; a file is given as {path}.py."
+                raise DataFileNotFoundError(absent) from error
+            raise DataError(f"Importing {path!r} failed: {error}.") from error
+
+
+@contextmanager
+def foreign_code(what: str, after: str = "") -> Iterator[None]:
+    """Turn whatever code of a user raises, and its wish to end the process, into one :class:`DataError`."""
     try:
-        return _import_file(Path(path).resolve()) if is_file else importlib.import_module(path)
-    except ModuleNotFoundError as error:
-        if not is_file and error.name is not None and (path == error.name or path.startswith(f"{error.name}.")):
-            raise DataFileNotFoundError(f"There is no Python module {path!r}; a file is given as {path}.py.") from error
-        raise DataError(f"Importing {path!r} failed: {error}.") from error
+        yield
     except BrainbenchError:
         raise
-    except Exception as error:
-        raise DataError(f"Importing {path!r} failed with {type(error).__name__}: {error}.") from error
+    except (Exception, SystemExit) as error:
+        raise DataError(f"{what} failed with {reason(error)}{after}.") from error
 
 
 def files_of(path: Path) -> tuple[Path, ...]:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, check_name
 from brainbench.core.files import CONFIG_VARIABLE, check_folder, content_hash, read_json, settings_dir, write_json
-from brainbench.core.plugins import files_of, load_object
+from brainbench.core.plugins import files_of, foreign_code, load_object
 from brainbench.models.architecture import check_new_name
 
 if TYPE_CHECKING:
@@ -80,13 +80,9 @@ def build_user_model(target: str, **options: Any) -> nn.Module:
 
     builder = load_object(target, "model")
     if callable(builder) and not isinstance(builder, nn.Module):
-        try:
+        given = f"with {', '.join(options)}" if options else "without arguments"
+        with foreign_code(f"Building the model {target!r}", f" (it is called {given})"):
             builder = builder(**options)
-        except Exception as error:
-            given = f"with {', '.join(options)}" if options else "without arguments"
-            raise DataError(
-                f"Building the model {target!r} failed with {type(error).__name__}: {error} (it is called {given})."
-            ) from error
     return check_module(builder, target)
 
 

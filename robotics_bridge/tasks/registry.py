@@ -7,8 +7,9 @@ from dataclasses import fields, replace
 from importlib import import_module
 from typing import Any
 
-from brainbench.core.errors import UsageError, check_name, unknown_name
+from brainbench.core.errors import DataError, UsageError, check_name, unknown_name
 from brainbench.core.overrides import kind_of, read_pairs, read_value, with_changes
+from brainbench.core.plugins import foreign_code
 from robotics_bridge.tasks.settings import CONTACTS
 from robotics_bridge.tasks.task import ACTION_LIMIT, Ending, Reward, Task
 
@@ -132,4 +133,8 @@ def load(name: str, config: str = "default") -> Task:
         hint = "A task of your own: import its file first (brainbench policy: --task-file FILE)."
         raise unknown_name("task", name, list_tasks(), hint=hint)
     check_name(f"configuration of task {name}", config, _MADE[name])
-    return _MADE[name][config]()
+    with foreign_code(f"The task {name!r}"):
+        task = _MADE[name][config]()
+    if not isinstance(task, Task):
+        raise DataError(f"The task {name!r} is a {type(task).__name__}; what is registered returns a Task.")
+    return task

@@ -20,6 +20,8 @@ TOKENS = (
     "99999999999999999999", "2147483648", "true", "null", '"x"', "[]", "{}", "[[]]", '"\\u0000"', "'" * 3,
 )  # fmt: skip
 """What takes the place of a value in a text."""
+SPECIAL = 6
+"""Seeds that put what is no file in the place of one."""
 _VALUE = re.compile(rb'"[^"\n]*"|-?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?|true|false|null')
 _NUMBER = re.compile(rb"-?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?")
 _XML = (".xml", ".urdf")
@@ -31,7 +33,7 @@ def damage(path: Path, seed: int) -> str:
     chance = random.Random(seed)
     special = (_folder, _pipe, _endless, _dangling, _loop, _empty)
     # The first seeds try each thing that is no file once; the others draw.
-    if seed < len(special):
+    if seed < SPECIAL:
         return special[seed](path)
     kinds = [_bytes]
     if path.suffix in (".h5", ".nwb"):

@@ -61,13 +61,13 @@ class Outcome:
     detail: str = ""
 
 
-def attempt(surface: Surface, good: Path, seed: int) -> Outcome:
-    """Damage a copy of the folder of ``good`` and read it."""
+def attempt(surface: Surface, good: Path, seed: int, change: Callable[[Path, int], str] = damage) -> Outcome:
+    """Change a copy of the folder of ``good``, by default by damage, and read it."""
     with tempfile.TemporaryDirectory() as folder:
         copy = Path(folder) / "case"
         shutil.copytree(good.parent, copy)
         path = copy / good.name
-        what = damage(path, seed)
+        what = change(path, seed)
         before = _entries(copy)
         try:
             with warnings.catch_warnings(), time_limit(), _memory_limit():
@@ -82,7 +82,7 @@ def attempt(surface: Surface, good: Path, seed: int) -> Outcome:
             return Outcome("hang", what)
         except MemoryError as error:
             return Outcome("memory", what, str(error))
-        except Exception as error:  # noqa: BLE001 - to find them is the purpose
+        except (Exception, SystemExit) as error:  # noqa: BLE001 - to find them is the purpose
             return Outcome("traceback", what, f"{type(error).__name__}: {str(error)[:200]}")
         finally:
             remove(path)

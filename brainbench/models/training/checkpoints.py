@@ -7,6 +7,7 @@ options it was built with; weights may be stored in half precision and are alway
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, get_args
@@ -26,6 +27,8 @@ PREFIXES = (LOCAL, HUB)
 DType = Literal["float32", "float16", "bfloat16"]
 DTYPES: tuple[DType, ...] = get_args(DType)
 FOREIGN, SCORED, SETTINGS = "*.ckpt", "val_best.ckpt", "config.yaml"
+_NAME = re.compile(r"\w[\w.+-]*", re.ASCII)
+"""A part of a name on a hub: none leads out of the folder that the hub sends."""
 IMPORTERS = "brainbench.checkpoints"
 """Entry points of functions that make a model's folder of a foreign file and its settings (None without any)."""
 
@@ -131,7 +134,8 @@ def find_folder(source: str) -> Path:
         return _imported(folder, source)
     place, _, revision = source.removeprefix(HUB).partition("@")
     owner, name, *inner = place.split("/") if "/" in place else ("", "")
-    if not source.startswith(HUB) or not all((owner, name, *inner)):
+    parts = (owner, name, *inner, *filter(None, revision.split("/")))
+    if not source.startswith(HUB) or not all(map(_NAME.fullmatch, parts)):
         raise UsageError(f"A folder is local-dir:PATH or hf-hub:OWNER/NAME[/FOLDER][@REVISION]; received {source!r}.")
     with needing("huggingface_hub", extra="hub", purpose="Loading a model from a hub"):
         from huggingface_hub import snapshot_download

@@ -28,6 +28,10 @@ if TYPE_CHECKING:
     import xarray as xr
 
 AXES = ("x", "y", "z")
+FARTHEST = 1e3
+"""Magnitude [m] beyond which no point of a whisker is, also where millimetres are taken for metres."""
+LARGEST_FORCE = 1e3
+"""Magnitude [N, N·m] that no base of a whisker feels."""
 _NOISE = "noise of a measurement (standard deviation, SI units)"
 
 
@@ -47,6 +51,7 @@ def new_shapes(times: ArrayLike, points: ArrayLike, *, noise: float | None = Non
         raise DataError(
             f"Traced shapes are points [time, point, 2 or 3], at least one point a frame; received {values.shape}."
         )
+    _check_largest("points of a track (m)", values, FARTHEST, "the scale (metres per pixel) or the file is wrong")
     # A point with one missing coordinate is missing.
     values = np.where(np.isfinite(values).all(axis=-1, keepdims=True), values, np.nan)
     if not np.isfinite(values).any():
@@ -92,6 +97,7 @@ def new_wrenches(
         raise DataError(f"Wrenches are numbers [time, {len(channels)}]; received an array of shape {array.shape}.")
     if not np.isfinite(array).any():
         raise DataError("The wrenches hold no number.")
+    _check_largest("wrenches (N, N·m)", array, LARGEST_FORCE, "the unit or the file is wrong")
     dataset = xr.Dataset(
         {"wrench": (("time", "channel"), array, {"units": "N (F), N m (M)"})},
         coords={
@@ -106,6 +112,13 @@ def new_wrenches(
             check_number(_NOISE, level, above=0)
         dataset["noise"] = ("channel", levels.copy())
     return dataset
+
+
+def _check_largest(what: str, values: NDArray[np.float64], most: float, hint: str) -> None:
+    """Refuse measurements beyond what can be; NaN is missing."""
+    largest = float(np.nanmax(np.abs(values), initial=0.0))
+    if largest > most:
+        raise DataError(f"The {what} reach {largest:.3g}; at most {most:g} can be: {hint}.")
 
 
 def check_times(times: ArrayLike, count: int) -> NDArray[np.float64]:

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from brainbench.core.errors import DataError, UsageError, brief, check_each, choose_name, listing
 from brainbench.core.limits import Limit, Positive, Share, limited
+from brainbench.core.reading.apart import read_apart
 from brainbench.core.reading.hdf5 import open_hdf5
 from brainbench.core.reading.regular import MOST_TABLE, MOST_TEXT, check_file, readable
 from brainbench.core.reading.tables import read_columns, read_rows, to_numbers
@@ -163,14 +164,20 @@ def _read_identities(path: str) -> tuple[dict[tuple[int, int], int], dict[tuple[
             f"{listing(names)}."
         )
     columns = {name: table[:, names.index(name)] for name in names}
-    return _identities(columns)
+    return _identities(columns, path)
+
+
+def _keys(columns: Mapping[str, Array], path: str | os.PathLike[str]) -> list[tuple[int, int]]:
+    """Return frame and number of each trace."""
+    return list(zip(*(frame_numbers(columns[name], path).tolist() for name in ("fid", "wid")), strict=True))
 
 
 def _identities(
-    columns: dict[str, Array],
+    columns: dict[str, Array], path: str | os.PathLike[str]
 ) -> tuple[dict[tuple[int, int], int], dict[tuple[int, int], Array]]:
-    keys = [(int(frame), int(number)) for frame, number in zip(columns["fid"], columns["wid"], strict=True)]
-    labels = {key: int(label) for key, label in zip(keys, columns["label"], strict=True)} if "label" in columns else {}
+    keys = _keys(columns, path)
+    given = frame_numbers(columns["label"], path).tolist() if "label" in columns else ()
+    labels = dict(zip(keys, given, strict=bool(given)))
     if not {"follicle_x", "follicle_y"} <= set(columns):
         return labels, {}
     places = np.stack([columns["follicle_x"], columns["follicle_y"]], axis=1)
@@ -192,8 +199,7 @@ def _read_whiskiwrap(
             raise DataError(f"The summary of {brief(os.fspath(path))} has no frame and no number of each trace.")
         pairs = zip(arrays["pixels_x"], arrays["pixels_y"], strict=True)
         points = [np.stack([np.asarray(x, dtype=float), np.asarray(y, dtype=float)], axis=1) for x, y in pairs]
-    keys = [(int(frame), int(number)) for frame, number in zip(columns["fid"], columns["wid"], strict=True)]
-    return dict(zip(keys, points, strict=True)), *_identities(columns)
+    return dict(zip(_keys(columns, path), points, strict=True)), *_identities(columns, path)
 
 
 def _stack(traces: Mapping[int, Array], frames: NDArray[np.int_], follicles: Mapping[int, Array], most: int) -> Array:
@@ -315,8 +321,8 @@ def pandas_groups(file: Any) -> list[Any]:
 
 def frame_numbers(values: Array, path: str | os.PathLike[str]) -> NDArray[np.int_]:
     """Return frame numbers [n] as integers; others are a :class:`DataError`."""
-    if not np.isfinite(values).all() or (values % 1).any():
-        raise DataError(f"The frame numbers of {brief(os.fspath(path))} are not whole numbers.")
+    if not (np.abs(values) < 2**53).all() or (values % 1).any():
+        raise DataError(f"The numbers of frames or traces of {brief(os.fspath(path))} are not whole numbers.")
     return values.astype(int)
 
 
@@ -395,14 +401,23 @@ def _read_structs(path: str | os.PathLike[str]) -> list[dict[str, Any]]:
         head = stream.read(520)
     if b"\x89HDF\r\n" in head:  # MATLAB 7.3
         return _structs_of_hdf5(path)
+    arrays = read_apart(f"{__name__}:matlab_arrays", path, "track of WhiskerMan (MATLAB file)")
+    return [{name: arrays[f"{name}{place}"] for name in _STRUCT_FIELDS} for place in range(len(arrays) // 3)]
+
+
+def matlab_arrays(path: str) -> dict[str, Array]:
+    """Return the numbers of WhiskerMan's structs in a MATLAB file up to version 7, by field and place.
+
+    SciPy's compiled reader crashes on some damaged files: :func:`~brainbench.core.reading.apart.read_apart` calls this.
+    """
     from scipy.io import loadmat
 
-    with readable(path, "track of WhiskerMan (MATLAB file)"):
-        data = loadmat(file, variable_names=["whisker"], struct_as_record=True, appendmat=False)
+    data = loadmat(path, variable_names=["whisker"], struct_as_record=True, appendmat=False)
     if "whisker" not in data or data["whisker"].dtype.names is None:
-        raise DataError(f"{brief(os.fspath(path))} is no track of WhiskerMan: the struct 'whisker' is missing.")
+        raise DataError(f"{brief(path)} is no track of WhiskerMan: the struct 'whisker' is missing.")
     _need(data["whisker"].dtype.names, path)
-    return [{name: one[name] for name in _STRUCT_FIELDS} for one in data["whisker"].ravel()]
+    structs = enumerate(data["whisker"].ravel())
+    return {f"{name}{place}": np.asarray(one[name], float) for place, one in structs for name in _STRUCT_FIELDS}
 
 
 def _structs_of_hdf5(path: str | os.PathLike[str]) -> list[dict[str, Any]]:

@@ -201,7 +201,10 @@ def _columns(
     """Return the checked columns of the table, and those by which LeRobot counts."""
     length, columns = len(frames[PARTS[0]]), dict[str, NDArray]()
     for name, shape in shapes.items():
-        columns[name] = np.asarray(frames[name], dtype=np.float32)
+        try:
+            columns[name] = np.asarray(frames[name], dtype=np.float32)
+        except (TypeError, ValueError, OverflowError) as error:
+            raise UsageError(f"{name} is not an array of numbers of the shape {(length, *shape)}.") from error
         if not length or columns[name].shape != (length, *shape):
             raise UsageError(f"{name} has the shape {columns[name].shape}; expected {(length, *shape)}.")
         if not np.isfinite(columns[name]).all():

@@ -12,6 +12,9 @@ from brainbench.core.errors import UsageError, brief
 from brainbench.core.reading.ranges import check_fields, check_number, check_numbers
 from brainbench.geometry import Mesh
 
+FARTHEST = 10.0
+"""Distance [m] from its link beyond which no probe is, and largest radius."""
+
 
 @dataclass(frozen=True, eq=False)
 class Probes:
@@ -45,6 +48,8 @@ class Probes:
             raise UsageError(f"{count} positions do not go with {len(normal)} normals in the shape {shape}.")
         if not (np.isfinite(position).all() and np.isfinite(normal).all() and np.isfinite(radius).all()):
             raise UsageError("Positions, normals and radii of probes must be finite numbers.")
+        if max(np.abs(position).max(), radius.max()) > FARTHEST:
+            raise UsageError(f"Positions and radii of probes are in m, at most {FARTHEST:g}; write metres, not mm.")
         if (radius < 0).any():
             raise UsageError(f"The radius of a probe is positive, or 0 for a filler; received {radius.min():g} m.")
         if self.pitch is not None:

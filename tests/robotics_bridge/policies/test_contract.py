@@ -12,8 +12,9 @@ import pytest
 from brainbench.core.errors import BrainbenchError, DataError, UsageError
 from robotics_bridge.policies.contract import PolicyContract
 from robotics_bridge.tasks.settings import CONTACTS
-from tests.factories.mutations import mutate, mutate_text
+from tests.factories.mutations import mutate_text
 from tests.factories.policies import contract_of
+from tests.factories.structures import mutate
 
 NAN, INF = math.nan, math.inf
 

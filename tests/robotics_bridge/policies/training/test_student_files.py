@@ -11,8 +11,9 @@ from safetensors.torch import load_file, save_file
 
 from brainbench.core.errors import BrainbenchError, DataError, UsageError
 from robotics_bridge.policies.training.student_files import CONFIG, MODEL, load_student
-from tests.factories.mutations import mutate, mutate_text
+from tests.factories.mutations import mutate_text
 from tests.factories.policies import student_folder
+from tests.factories.structures import mutate
 
 
 def _changed(folder, **changes):

@@ -28,7 +28,8 @@ from robotics_bridge.policies.training.teacher import TeacherRun, Trainer, load_
 from robotics_bridge.policies.training.teacher import train as train_teacher
 from robotics_bridge.tasks.goals import SteppingRotation
 from robotics_bridge.tasks.settings import TeacherSettings
-from tests.factories.mutations import mutate, mutate_text
+from tests.factories.mutations import mutate_text
+from tests.factories.structures import mutate
 
 SMALL = TeacherSettings(num_envs=4, steps_per_env=6, iterations=4, epochs=2, minibatches=2, hidden=(16, 16))
 

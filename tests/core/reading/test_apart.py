@@ -1,0 +1,70 @@
+"""Files that are read in a process of their own."""
+
+import os
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from brainbench.core.errors import DataError
+from brainbench.core.reading import apart
+from brainbench.core.reading.apart import read_apart
+
+
+def whole(path):
+    return {"size": np.array(Path(path).stat().st_size), "words": np.array(["a", "b"])}
+
+
+def crash(path):
+    os.abort()
+
+
+def refuse(path):
+    raise DataError("This is no track.")
+
+
+def fail(path):
+    raise ValueError("bad magic")
+
+
+def hang(path):
+    while True:
+        pass
+
+
+def objects(path):
+    return {"code": np.array([print], dtype=object)}
+
+
+@pytest.fixture
+def read(tmp_path, monkeypatch):
+    (tmp_path / "file").write_bytes(b"abc")
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(sys.path))
+    return lambda function: read_apart(f"{__name__}:{function.__name__}", tmp_path / "file", "track")
+
+
+def test_arrays_come_back(read):
+    arrays = read(whole)
+    assert arrays["size"] == 3
+    assert arrays["words"].tolist() == ["a", "b"]
+
+
+@pytest.mark.parametrize(
+    ("function", "sentence"),
+    [
+        (crash, "is no track, or damaged: the library that reads it crashed"),
+        (refuse, "This is no track."),
+        (fail, "not a readable file .*ValueError: bad magic"),
+        (objects, "Python objects"),
+    ],
+)
+def test_failures_are_one_sentence(read, function, sentence):
+    with pytest.raises(DataError, match=sentence):
+        read(function)
+
+
+def test_what_never_ends_is_ended(read, monkeypatch):
+    monkeypatch.setattr(apart, "SECONDS", 1.5)
+    with pytest.raises(DataError, match=r"took over 1\.5 s"):
+        read(hang)
