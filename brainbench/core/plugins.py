@@ -43,9 +43,6 @@ def load_object(target: str, kind: str) -> Any:
     Args:
         target: as above. The file's own folder can be imported from while it loads.
         kind: what is loaded, for messages: ``model``, ``metric``, ``layout``.
-
-    Raises:
-        DataFileNotFoundError: there is no such file or module.
     """
     path, _, name = target.rpartition(":")
     if not path or not name:
@@ -58,12 +55,7 @@ def load_object(target: str, kind: str) -> Any:
 
 
 def load_module(path: str) -> ModuleType:
-    """Import ``path/to/file.py`` or ``package.module``.
-
-    Raises:
-        DataFileNotFoundError: there is no such file or module.
-        BrainbenchError: what the code itself raises of this kind stays as it is.
-    """
+    """Import ``path/to/file.py`` or ``package.module``; errors of ours that the code raises stay as they are."""
     is_file = path.endswith(".py") or "/" in path or "\\" in path
     if is_file and not Path(path).is_file():
         raise DataFileNotFoundError(f"There is no Python file {path!r}.")

@@ -86,16 +86,6 @@ def two_factor_interval(
     return Interval(value - half, value + half, level, what)
 
 
-def student_tail(distance: float, error: float, freedom: float) -> float:
-    """Return P(t ≥ distance/error) with some degrees of freedom."""
-    from scipy.special import stdtr
-
-    # Without spread the t statistic is infinite; the sign of the distance alone decides.
-    if error == 0:
-        return 0.0 if distance > 0 else 1.0 if distance < 0 else 0.5
-    return float(stdtr(freedom, -distance / error))
-
-
 def _spread(values: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the sum [...] of squared deviations from the mean of the finite values [..., N]."""
     finite = np.isfinite(values)
@@ -209,6 +199,8 @@ def compare_scores(first: Score, second: Score) -> PairTest:
 
     Fewer than :data:`FEWEST_ANIMALS` animals or :data:`FEWEST_STIMULI` stimuli give no p.
     """
+    from scipy.special import stdtr
+
     animals, without = paired_differences(first, second)
     names = first.name, second.name
     if len(animals) < 2:
@@ -221,7 +213,8 @@ def compare_scores(first: Score, second: Score) -> PairTest:
         why = f"{len(animals)} animals and {stimuli} stimuli; at least {FEWEST_ANIMALS} and {FEWEST_STIMULI} are needed"
         return PairTest(*names, difference, interval, math.nan, math.nan, why)
     error, freedom = two_factor_error(animals, without)
-    p = 2 * student_tail(abs(difference), float(error), float(freedom))
+    # Without spread the t statistic is infinite, or there is no difference.
+    p = 2 * float(stdtr(freedom, -abs(difference) / float(error))) if error > 0 else float(difference == 0)
     return PairTest(*names, difference, interval, p, math.nan)
 
 

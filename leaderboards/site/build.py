@@ -15,7 +15,7 @@ import hashlib
 import io
 import os
 import zipfile
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -209,11 +209,19 @@ def _pages(stored: Sequence[StoredRecord], title: str) -> Iterator[tuple[str, st
     yield "figures.html", render("board_figures.html.j2", boards=sections, **about)
     for entry in (entry for board in boards for entry in board.entries):
         yield f"models/{entry.page}", model_page(entry)
-    records = (record for board in boards for entry in board.entries for record in entry.records)
-    texts = {record.file_name: record_text(record) for record in records}
-    yield from ((f"records/{name}", text) for name, text in texts.items())
+    records = {record.file_name: record for board in boards for entry in board.entries for record in entry.records}
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED, compresslevel=9) as archive:
+        # One after the other: the texts of thousands of records are gigabytes. Their names are those of their content,
+        # so that unpacking into a folder merges them.
+        for name, record in sorted(records.items()):
+            text = record.to_json() + "\n"  # it was read from a file, or checked by _stored
+            entry = zipfile.ZipInfo(name)  # its fixed date of 1980 keeps the bytes equal
+            entry.compress_type = zipfile.ZIP_DEFLATED
+            archive.writestr(entry, text)
+            yield f"records/{name}", text
     rows = [row for board in boards for row in table_rows(board)]
-    data = (table_csv(rows), to_json(rows) + "\n", _records_zip(texts), SCHEMA_PATH.read_bytes())
+    data = (table_csv(rows), to_json(rows) + "\n", stream.getvalue(), SCHEMA_PATH.read_bytes())
     yield from zip(DOWNLOADS, data, strict=True)
     if benchmarks:
         yield "data/benchmarks.json", to_json({"benchmarks": benchmarks, "models": means}) + "\n"
@@ -225,14 +233,3 @@ def _count(boards: Sequence[Board]) -> str:
     text = f"{words.plural(models, 'model')}"
     text += f", {words.plural(results, 'record')}" if results != models else ""
     return text + (f" on {words.plural(len(boards), 'board')}." if len(boards) != 1 else ".")
-
-
-def _records_zip(texts: Mapping[str, str]) -> bytes:
-    """Return the record files under their content-hash names: unpacking into a folder merges them."""
-    stream = io.BytesIO()
-    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED, compresslevel=9) as archive:
-        for name, text in sorted(texts.items()):
-            entry = zipfile.ZipInfo(name)  # its fixed date of 1980 keeps the bytes equal
-            entry.compress_type = zipfile.ZIP_DEFLATED
-            archive.writestr(entry, text)
-    return stream.getvalue()

@@ -170,19 +170,23 @@ EPISODE: dict[str, Any] = {
 }
 
 
+def _written_episode(folder: Path, frames: Any, facts: Any, places: Any) -> Path:
+    return write_lerobot(folder, frames, SessionFacts(points=TactilePoints(**places), **facts))
+
+
 def _episode(path: Path) -> Any:
     told = read_mapping(path)
     frames, facts, places = (told.get(name) for name in ("frames", "facts", "points"))
     kinds = ((frames, PARTS), (facts, EPISODE["facts"]), (places, EPISODE["points"]))
     if not all(isinstance(given, dict) and set(given) == set(names) for given, names in kinds):
         raise DataError("Other names than those of Python's arguments.")
-    folder = write_lerobot(path.parent / "set", frames, SessionFacts(points=TactilePoints(**places), **facts))
+    folder = _written_episode(path.parent / "set", frames, facts, places)
     table = pandas.read_parquet(folder / "data" / "chunk-000" / "file-000.parquet")
     info, tactile = (json.loads((folder / "meta" / f"{name}.json").read_text()) for name in ("info", "tactile"))
     assert set(table.columns) == set(info["features"])
     assert len(table) == info["total_frames"]
     assert all(len(tactile[name]) == len(tactile["links"]) for name in ("position", "normal"))
-    return table[["action"]].explode("action").to_numpy(dtype=float)
+    return np.stack(list(table["action"])).astype(float)
 
 
 def _settings(folder: Path) -> Path:

@@ -183,7 +183,8 @@ class _Copy:
             if isinstance(node, h5py.Group) and _key(node) not in self.seen:
                 self._group(node, target[name])
             elif isinstance(node, h5py.Dataset) and (node.is_virtual or node.external):
-                values, attributes = self._values(node), [(key, *_typed(node, key)) for key in node.attrs]
+                values = self._values(node)
+                attributes = [(key, node.attrs[key], node.attrs.get_id(key).dtype) for key in node.attrs]
                 del target[name]
                 array = target.create_dataset(name, data=values, dtype=node.dtype)
                 for key, value, kind in attributes:
@@ -291,10 +292,6 @@ def _key(node: Any) -> tuple[int, int]:
 
     status = h5o.get_info(node.id)
     return status.fileno, status.addr
-
-
-def _typed(node: Any, key: str) -> tuple[Any, Any]:
-    return node.attrs[key], node.attrs.get_id(key).dtype
 
 
 def _selected(space: Any, shape: tuple[int, ...]) -> Any:

@@ -72,10 +72,9 @@ def reason(error: BaseException) -> str:
     """Return why something failed: the first line of an error, short, with its type unless it is about the file."""
     if isinstance(error, OSError) and error.strerror and error.errno:
         return error.strerror
-    try:
+    text = ""
+    with contextlib.suppress(Exception):  # an error of foreign code may fail to describe itself
         text = next(iter(str(error).strip().splitlines()), "")
-    except Exception:  # noqa: BLE001 - an error of foreign code, which fails to describe itself
-        text = ""
     plain = isinstance(error, (OSError, UnicodeDecodeError)) or type(error).__name__.endswith("DecodeError")
     words = text if plain else f"{type(error).__name__}: {text}"
     return brief(words.removesuffix(": "), quoted=False, most=160)

@@ -177,7 +177,7 @@ def _identities(
 ) -> tuple[dict[tuple[int, int], int], dict[tuple[int, int], Array]]:
     keys = _keys(columns, path)
     given = frame_numbers(columns["label"], path).tolist() if "label" in columns else ()
-    labels = dict(zip(keys, given, strict=bool(given)))
+    labels: dict[tuple[int, int], int] = dict(zip(keys, given, strict=bool(given)))
     if not {"follicle_x", "follicle_y"} <= set(columns):
         return labels, {}
     places = np.stack([columns["follicle_x"], columns["follicle_y"]], axis=1)
