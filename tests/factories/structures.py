@@ -147,7 +147,7 @@ def _alter(value: Any, chance: random.Random) -> str:
         holder[chance.choice((key.translate(TWINS), key.upper(), f"{key} ", "__class__"))] = holder.pop(key)
     elif kind == "extra":
         holder[chance.choice(("x", "__proto__", "", "é", key + "_"))] = old
-    elif kind == "double":
+    elif kind == "double" and isinstance(holder, list):
         holder.append(old)
     elif kind == "swap":
         holder[key], holder[0] = holder[0], holder[key]

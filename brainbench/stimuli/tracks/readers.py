@@ -176,8 +176,9 @@ def _identities(
     columns: dict[str, Array], path: str | os.PathLike[str]
 ) -> tuple[dict[tuple[int, int], int], dict[tuple[int, int], Array]]:
     keys = _keys(columns, path)
-    given = frame_numbers(columns["label"], path).tolist() if "label" in columns else ()
-    labels: dict[tuple[int, int], int] = dict(zip(keys, given, strict=bool(given)))
+    labels: dict[tuple[int, int], int] = {}
+    if "label" in columns:
+        labels = dict(zip(keys, frame_numbers(columns["label"], path).tolist(), strict=True))
     if not {"follicle_x", "follicle_y"} <= set(columns):
         return labels, {}
     places = np.stack([columns["follicle_x"], columns["follicle_y"]], axis=1)
