@@ -31,6 +31,8 @@ wp = warp()
 
 TILTS = 6
 """Times that forces are tilted at most."""
+UNSEEN = wp.constant(-1)
+"""Mark of a contact whose taxels were not looked for yet."""
 
 
 @wp.struct
@@ -116,59 +118,41 @@ class PressArrays:
     Σ y, Σ y (m · n) and Σ y q."""
 
 
-@wp.kernel
-def list_contacts(
-    plan: SpreadPlan,
-    slots: SlotArrays,
-    link_of: wp.array(dtype=wp.int32),
-    state: StateArrays,
-    friction: wp.array(dtype=wp.vec3f),
-    nodes: ContactNodes,
-):
-    """List the contacts of every link that carries sensors. Thread: node [2 C]."""
-    node = wp.tid()
+@wp.func
+def list_contact(
+    plan: SpreadPlan, slots: SlotArrays, link_of: wp.array(dtype=wp.int32), state: StateArrays,
+    friction: wp.array(dtype=wp.vec3f), nodes: ContactNodes, node: int, other: int,
+):  # fmt: skip
+    """List a node whose link carries sensors, if any of them looks at what pushes."""
     c = node // 2
-    if c >= state.contact_count[0]:
-        return
-    nodes.watched[node] = 0
-    nodes.felt[node] = 0
-    pair = state.contact_geom[c]
-    mine = pair[node % 2]
-    other = pair[1 - node % 2]
-    # A state made by hand may hold numbers of no geometry; −1 stands for a flex.
-    if mine < 0 or wp.max(pair) >= link_of.shape[0] or other < -1:
-        return
-    load = state.contact_force[c]
-    link = link_of[mine]
-    # What the engine does not tell (NaN) is read as such.
-    if plan.sensors[link, 0] < 0 or load <= 0.0:
-        return
-    env = state.contact_env[c]
-    felt = int(0)
+    link = link_of[state.contact_geom[c][node % 2]]
+    watched = int(0)
     for k in range(plan.sensors.shape[1]):
         sensor = plan.sensors[link, k]
         if sensor >= 0:
             nodes.carried[node, k] = 0
-            watched = plan.whole[sensor] == 1
+            looks = plan.whole[sensor] == 1
             if other >= 0:
-                watched = slots.place[plan.spans[sensor][2], other] >= 0
-            if watched:
-                felt = felt | (1 << k)
-    if felt == 0:
+                looks = slots.place[plan.spans[sensor][2], other] >= 0
+            if looks:
+                watched = watched | (1 << k)
+    if watched == 0:
         return
+    env = state.contact_env[c]
+    load = state.contact_force[c]
     # The normal leads from the first to the second, which it pushes away.
     sign = wp.where(node % 2 == 0, -1.0, 1.0)
     here = state.pose[env, link]
     turn = wp.transform_get_rotation(here)
-    point = wp.quat_rotate_inv(turn, state.contact_position[c] - wp.transform_get_translation(here))
     normal = wp.quat_rotate_inv(turn, sign * state.contact_normal[c])
-    nodes.watched[node] = felt
+    nodes.watched[node] = watched
+    nodes.felt[node] = UNSEEN
     nodes.geometry[node] = other
     nodes.overlap[node] = wp.max(-state.contact_distance[c], 0.0)
     nodes.other[node] = -1
     if other >= 0:
         nodes.other[node] = link_of[other]
-    nodes.point[node] = point
+    nodes.point[node] = wp.quat_rotate_inv(turn, state.contact_position[c] - wp.transform_get_translation(here))
     nodes.normal[node] = normal
     nodes.load[node] = load
     nodes.force[node] = load * normal + plan.slip * wp.quat_rotate_inv(turn, sign * friction[c])
@@ -176,9 +160,67 @@ def list_contacts(
 
 
 @wp.kernel
-def sort_contacts(nodes: ContactNodes):
-    """Bring lists into the order of contacts, so that sums do not depend on threads. Thread: [B, L]."""
-    env, link = wp.tid()
+def list_contacts(
+    plan: SpreadPlan, slots: SlotArrays, link_of: wp.array(dtype=wp.int32), state: StateArrays,
+    friction: wp.array(dtype=wp.vec3f), stride: int, nodes: ContactNodes,
+):  # fmt: skip
+    """List the contacts of every link that carries sensors. Thread: contacts [C], ``stride`` apart."""
+    c = wp.tid()
+    count = wp.min(state.contact_count[0], state.contact_env.shape[0])
+    while c < count:
+        pair = state.contact_geom[c]
+        load = state.contact_force[c]
+        nodes.felt[2 * c] = 0
+        nodes.felt[2 * c + 1] = 0
+        # A state made by hand may hold numbers of no geometry; −1 stands for a flex. What the engine does not tell
+        # (NaN) is read as such.
+        if not (load <= 0.0) and wp.min(pair) >= -1 and wp.max(pair) < link_of.shape[0]:
+            for side in range(2):
+                mine = pair[side]
+                if mine >= 0:
+                    if plan.sensors[link_of[mine], 0] >= 0:
+                        list_contact(plan, slots, link_of, state, friction, nodes, 2 * c + side, pair[1 - side])
+        c += stride
+
+
+@wp.func
+def alike(nodes: ContactNodes, first: int, second: int) -> bool:
+    """Return whether one body pushes at two contacts from one side, within 60°."""
+    same = nodes.other[first] == nodes.other[second]
+    return same and wp.dot(nodes.normal[first], nodes.normal[second]) > 0.5
+
+
+@wp.func
+def near_taxels(plan: SpreadPlan, probes: ProbeArrays, nodes: ContactNodes, head: int, link: int, node: int) -> int:
+    """Return which sensors have taxels near a contact, or between it and others of the same face."""
+    # A sphere around all points of the face: a flat one is reported at its corners.
+    low = nodes.point[node]
+    high = nodes.point[node]
+    other = head
+    while other >= 0:
+        if alike(nodes, node, other):
+            low = wp.min(low, nodes.point[other])
+            high = wp.max(high, nodes.point[other])
+        other = nodes.follower[other]
+    center = 0.5 * (low + high)
+    extent = 0.5 * wp.length(high - low) + nodes.overlap[node]
+    felt = int(0)
+    for k in range(plan.sensors.shape[1]):
+        if ((nodes.watched[node] >> k) & 1) == 1:
+            span = plan.spans[plan.sensors[link, k]]
+            for n in range(span[0], span[1]):
+                if wp.length(probes.position[n] - center) <= plan.reach[n] + extent:
+                    felt = felt | (1 << k)
+                    break
+    return felt
+
+
+@wp.kernel
+def find_taxels(plan: SpreadPlan, probes: ProbeArrays, nodes: ContactNodes):
+    """Bring lists into the order of contacts, so that sums do not depend on threads, and note which sensors have taxels
+    near each. Thread: [B, M]."""
+    env, number = wp.tid()
+    link = plan.links[number]
     first = int(-1)
     node = nodes.head[env, link]
     while node >= 0:
@@ -195,50 +237,10 @@ def sort_contacts(nodes: ContactNodes):
             nodes.follower[before] = node
         node = later
     nodes.head[env, link] = first
-
-
-@wp.func
-def alike(nodes: ContactNodes, first: int, second: int) -> bool:
-    """Return whether one body pushes at two contacts from one side, within 60°."""
-    same = nodes.other[first] == nodes.other[second]
-    return same and wp.dot(nodes.normal[first], nodes.normal[second]) > 0.5
-
-
-@wp.kernel
-def find_taxels(
-    plan: SpreadPlan,
-    link_of: wp.array(dtype=wp.int32),
-    probes: ProbeArrays,
-    state: StateArrays,
-    nodes: ContactNodes,
-):
-    """Note which sensors have taxels near a contact, or between it and others of the same face. Thread: node [2 C]."""
-    node = wp.tid()
-    c = node // 2
-    if c >= state.contact_count[0] or nodes.watched[node] == 0:
-        return
-    env = state.contact_env[c]
-    link = link_of[state.contact_geom[c][node % 2]]
-    # A sphere around all points of the face: a flat one is reported at its corners.
-    low = nodes.point[node]
-    high = nodes.point[node]
-    other = nodes.head[env, link]
-    while other >= 0:
-        if alike(nodes, node, other):
-            low = wp.min(low, nodes.point[other])
-            high = wp.max(high, nodes.point[other])
-        other = nodes.follower[other]
-    center = 0.5 * (low + high)
-    extent = 0.5 * wp.length(high - low) + nodes.overlap[node]
-    felt = int(0)
-    for k in range(plan.sensors.shape[1]):
-        if ((nodes.watched[node] >> k) & 1) == 1:
-            span = plan.spans[plan.sensors[link, k]]
-            for n in range(span[0], span[1]):
-                if wp.length(probes.position[n] - center) <= plan.reach[n] + extent:
-                    felt = felt | (1 << k)
-                    break
-    nodes.felt[node] = felt
+    node = first
+    while node >= 0:
+        nodes.felt[node] = near_taxels(plan, probes, nodes, first, link, node)
+        node = nodes.follower[node]
 
 
 @wp.func
@@ -255,27 +257,17 @@ def nearness(alone: bool, point: wp.vec3f, push: wp.vec3f, x: wp.vec3f, normal: 
     return 1.0 / (away * away)
 
 
-@wp.kernel
-def share_contacts(
-    plan: SpreadPlan,
-    link_of: wp.array(dtype=wp.int32),
-    probes: ProbeArrays,
-    state: StateArrays,
-    press: PressArrays,
-    nodes: ContactNodes,
-):
-    """Work out what a unit of weight carries of each contact. Thread: node and sensor of its link [2 C, K].
+@wp.func
+def share_contact(
+    plan: SpreadPlan, probes: ProbeArrays, press: PressArrays, nodes: ContactNodes,
+    env: int, link: int, node: int, k: int,
+):  # fmt: skip
+    """Work out what a unit of weight of a sensor carries of a contact.
 
     One thread adds all taxels of a contact in a fixed order, so that sums do not depend on the device.
     """
-    node, k = wp.tid()
-    c = node // 2
-    if c >= state.contact_count[0]:
+    if nodes.felt[node] == UNSEEN or ((nodes.felt[node] >> k) & 1) == 0:
         return
-    if ((nodes.felt[node] >> k) & 1) == 0:
-        return
-    env = state.contact_env[c]
-    link = link_of[state.contact_geom[c][node % 2]]
     sensor = plan.sensors[link, k]
     alone = nodes.follower[nodes.head[env, link]] < 0
     push = nodes.normal[node]
@@ -299,13 +291,15 @@ def share_contacts(
             total = press.total[env, n]
             if weight > 0.0 and total > 0.0 and press.body[env, n] == other:
                 m = press.normal[env, n]
-                y = weight * nearness(alone, point, push, probes.position[n], m, plan.reach[n]) / total
-                whole += y
-                straight += y * wp.dot(m, push)
-                way = m
-                if held:
-                    way = m + press.sigma[env, n]
-                field += y * way
+                near = nearness(alone, point, push, probes.position[n], m, plan.reach[n])
+                if near > 0.0:
+                    y = weight * near / total
+                    whole += y
+                    straight += y * wp.dot(m, push)
+                    way = m
+                    if held:
+                        way = m + press.sigma[env, n]
+                    field += y * way
     load = nodes.load[node]
     share = wp.vec4f(0.0)
     if whole > 0.0:
@@ -316,6 +310,19 @@ def share_contacts(
         share = wp.vec4f(scale, rest[0], rest[1], rest[2])
         nodes.carried[node, k] = 1
     nodes.share[node, k] = share
+
+
+@wp.kernel
+def share_contacts(
+    plan: SpreadPlan, link_of: wp.array(dtype=wp.int32), state: StateArrays, probes: ProbeArrays, press: PressArrays,
+    nodes: ContactNodes,
+):  # fmt: skip
+    """Share every contact among the taxels of every sensor. Thread: node and sensor of its link [2 C, K]."""
+    node, k = wp.tid()
+    c = node // 2
+    if c < state.contact_count[0] and nodes.felt[node] != 0:
+        link = link_of[state.contact_geom[c][node % 2]]
+        share_contact(plan, probes, press, nodes, state.contact_env[c], link, node, k)
 
 
 @wp.func
@@ -329,17 +336,9 @@ def write_wrench(out: wp.array3d(dtype=wp.float32), env: int, n: int, x: wp.vec3
 
 @wp.func
 def spread_row(
-    plan: SpreadPlan,
-    probes: ProbeArrays,
-    rows: wp.array(dtype=wp.vec4i),
-    press: PressArrays,
-    nodes: ContactNodes,
-    noisy: int,
-    written: wp.array2d(dtype=wp.uint8),
-    io: ReadoutArrays,
-    env: int,
-    at_row: int,
-):
+    plan: SpreadPlan, probes: ProbeArrays, rows: wp.array(dtype=wp.vec4i), press: PressArrays, nodes: ContactNodes,
+    noisy: int, written: wp.array2d(dtype=wp.uint8), io: ReadoutArrays, env: int, at_row: int,
+):  # fmt: skip
     """Write the readings of a row of taxels."""
     span = rows[at_row]
     part = span[3]
@@ -394,15 +393,9 @@ def spread_row(
 
 @wp.kernel
 def spread_contacts(
-    plan: SpreadPlan,
-    probes: ProbeArrays,
-    rows: wp.array(dtype=wp.vec4i),
-    press: PressArrays,
-    nodes: ContactNodes,
-    noisy: int,
-    written: wp.array2d(dtype=wp.uint8),
-    io: ReadoutArrays,
-):
+    plan: SpreadPlan, probes: ProbeArrays, rows: wp.array(dtype=wp.vec4i), press: PressArrays, nodes: ContactNodes,
+    noisy: int, written: wp.array2d(dtype=wp.uint8), io: ReadoutArrays,
+):  # fmt: skip
     """Write the readings. Thread: environment and row of taxels [B, R].
 
     ``written`` [B, R] is 1 where a row may hold anything but zeros; most touch nothing, now and before.
@@ -426,9 +419,9 @@ def tilted(f: wp.vec3f, x: wp.vec3f, center: wp.vec3f, tilt: wp.vec3f) -> wp.vec
 @wp.func
 def shares(press: PressArrays, env: int, n: int, body: int, push: wp.vec3f) -> bool:
     """Return whether a taxel carries contacts of a body on a side."""
-    if press.total[env, n] <= 0.0 or press.body[env, n] != body:
-        return False
-    return wp.dot(press.normal[env, n], push) > 0.0
+    # All is asked for at once, so that a GPU waits for memory once.
+    faces = wp.dot(press.normal[env, n], push) > 0.0
+    return press.total[env, n] > 0.0 and press.body[env, n] == body and faces
 
 
 @wp.func
@@ -438,7 +431,7 @@ def tilt_group(
 ) -> bool:  # fmt: skip
     """Tilt the forces under one face of a body so that their moment is that of its contacts, their sum the same.
 
-    False where the sum is to be verified: after a tilt, and where the taxels under it carry other faces as well, or not
+    False where the sum is to be verified: a tilt changed it, or the taxels under it carry other faces as well, or not
     all of it, which are left as they are.
     """
     # The first contact of a face leads it.
@@ -473,6 +466,7 @@ def tilt_group(
             turning = wp.vec3f()
             center = wp.vec3f()
             spread = wp.mat33f()
+            widest = float(0.0)
             for n in range(span[0], span[1]):
                 if shares(press, env, n, body, push):
                     f = force_of(io.truth, env, n)
@@ -483,6 +477,7 @@ def tilt_group(
                     weight += size
                     # From the contact, so that little is lost to rounding.
                     arm = x - origin
+                    widest = wp.max(widest, wp.length(arm))
                     center += size * arm
                     spread += size * wp.outer(arm, arm)
             if not (wp.length(total - force) <= 1.0e-4 * weight):
@@ -504,20 +499,26 @@ def tilt_group(
             # Taxels at one place bear no moment: what rounding leaves of their inertia is none.
             if trace > 1.0e-4 * extent:
                 tilt = wp.inverse(inertia) @ (moment - turning)
-                verified = False
+            # Most tilts are too small to turn any taxel round, whichever lies farthest.
+            steepest = wp.length(tilt) * (widest + wp.length(center))
             center += origin
-            steepest = float(0.0)
-            for n in range(span[0], span[1]):
-                if shares(press, env, n, body, push):
-                    steepest = wp.max(steepest, wp.length(wp.cross(tilt, probes.position[n] - center)))
+            if steepest > 1.0:
+                steepest = float(0.0)
+                for n in range(span[0], span[1]):
+                    if shares(press, env, n, body, push):
+                        steepest = wp.max(steepest, wp.length(wp.cross(tilt, probes.position[n] - center)))
             # No taxel is turned round: where the patch is too small for the moment, as much as it bears.
             tilt = tilt / wp.max(steepest, 1.0)
+            total = wp.vec3f()
             for n in range(span[0], span[1]):
                 if shares(press, env, n, body, push):
                     x = probes.position[n]
-                    write_wrench(io.truth, env, n, x, tilted(force_of(io.truth, env, n), x, center, tilt))
+                    f = tilted(force_of(io.truth, env, n), x, center, tilt)
+                    total += f
+                    write_wrench(io.truth, env, n, x, f)
                     if noisy == 1:
                         write_wrench(io.measured, env, n, x, tilted(force_of(io.measured, env, n), x, center, tilt))
+            verified = wp.length(total - force) <= 1.0e-4 * weight
     return verified
 
 
@@ -587,16 +588,22 @@ def settle_kernel(kinds: frozenset[int], raycast: bool, in_turn: bool) -> Any:
     ):
         env, number = wp.tid()
         link = plan.links[number]
+        head = nodes.head[env, link]
         if wp.static(in_turn):
             for k in range(plan.sensors.shape[1]):
                 sensor = plan.sensors[link, k]
                 if sensor >= 0:
+                    node = head
+                    while node >= 0:
+                        share_contact(plan, probes, press, nodes, env, link, node, k)
+                        node = nodes.follower[node]
                     for row in range(plan.row_first[sensor], plan.row_first[sensor + 1]):
                         spread_row(plan, probes, rows, press, nodes, noisy, written, io, env, row)
+        # The next update lists anew.
+        nodes.head[env, link] = -1
         if (io.status[env] & 1) != 0:
             plan.loads[1, env, link] = wp.nan
             return
-        head = nodes.head[env, link]
         if plan.fresh == 1:
             plan.loads[0, env, link] = 0.0
             plan.loads[1, env, link] = 0.0

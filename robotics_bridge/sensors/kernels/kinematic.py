@@ -12,7 +12,14 @@ from functools import cache
 from typing import Any
 
 from brainbench.core.devices import warp
-from robotics_bridge.sensors.kernels.contact_load import ContactNodes, PressArrays, SpreadPlan, nearness
+from robotics_bridge.sensors.kernels.contact_load import (
+    UNSEEN,
+    ContactNodes,
+    PressArrays,
+    SpreadPlan,
+    near_taxels,
+    nearness,
+)
 from robotics_bridge.sensors.kernels.distance import FAR, SIDED, SolidArrays, SolidShape, shape_functions
 from robotics_bridge.sensors.kernels.noise import NoiseParams, episode_draw, radius_noise
 from robotics_bridge.sensors.kernels.pairs import PairArrays
@@ -161,7 +168,7 @@ def kinematic_kernel(
     mode: int,
     hysteresis: bool,
     walk: bool,
-    fast: bool = False,
+    cuda: bool = False,
     single: bool = False,
 ) -> Any:
     """Return the kernel of KinematicTaxel (4.6–4.9). Dim [B R], R rows of probes that one thread takes in turn.
@@ -177,13 +184,13 @@ def kinematic_kernel(
         mode: of the readout.
         hysteresis: whether it is stored.
         walk: whether it is stored.
-        fast: square roots and quotients of the GPU's approximate units (2 units in the last place).
+        cuda: a GPU runs it, with square roots and quotients of its approximate units (2 units in the last place).
         single: every row is one taxel; nothing is kept for another.
     """
     shapes, readout = shape_functions(kinds, raycast), readout_functions(mode, hysteresis, walk)
     shape_of, distance_to = shapes.shape_of, shapes.distance_to
     emit_six, recall_six = readout.emit_six, readout.recall_six
-    fast = fast and not raycast
+    fast = cuda and not raycast
     wrench = kinematic_function(physical, sticky, fast)
     power = series_power
 
@@ -223,6 +230,14 @@ def kinematic_kernel(
                 return
             alone = nodes.follower[head] < 0
             push = nodes.normal[head]
+            if wp.static(not cuda):
+                # The first row of a link looks for its contacts' taxels, which a GPU does in a launch before.
+                seen = head
+                while seen >= 0:
+                    if nodes.felt[seen] == UNSEEN:
+                        link = plan.link[part]
+                        nodes.felt[seen] = near_taxels(plan, probes, nodes, head, link, seen)
+                    seen = nodes.follower[seen]
         slot = probes.slot[span[0]]
         variant = int(0)
         if solids.kind.shape[0] > 1:

@@ -131,28 +131,27 @@ class ContactLoadRuntime(KinematicRuntime):
         c, room = self.context, state.contact_env.shape[0]
         if self.nodes.felt.shape[0] != 2 * room:
             self.nodes = self._make_nodes(room)
-        plan, nodes, press = self.plan, self.nodes, self.press
-        # A processor can look how many contacts there are; on a GPU that would wait for it.
-        contacts = room if c.device.is_cuda else min(room, int(state.contact_count.numpy()[0]))
-        nodes.head.fill_(-1)
-        arrays = [plan, c.pairs.plan, c.solids.struct.link]
-        c.launch(kernels.list_contacts, 2 * contacts, *arrays, state.arrays, state.contact_friction, nodes)
-        if c.device.is_cuda:
-            c.launch(kernels.sort_contacts, nodes.head.shape, nodes)
-        seen = [plan, c.solids.struct.link, self.probes, state.arrays]
-        c.launch(kernels.find_taxels, 2 * contacts, *seen, nodes)
-        super().run_kernels(state, dt)
-        c.launch(kernels.share_contacts, (2 * contacts, self._most), *seen, press, nodes)
+        plan, nodes, press, cuda = self.plan, self.nodes, self.press, c.device.is_cuda
+        # A processor takes all contacts in one thread, so that the launch stays the same whatever their number.
+        threads = room if cuda else 1
+        c.launch(kernels.list_contacts, threads, plan, c.pairs.plan, c.solids.struct.link, state.arrays,
+                 state.contact_friction, threads, nodes)  # fmt: skip
+        links = plan.links.shape[0]
         inputs = [int(self.noisy), self._written, self.io]
-        if c.device.is_cuda:
+        if cuda:
+            c.launch(kernels.find_taxels, (c.num_envs, links), plan, self.probes, nodes)
+        super().run_kernels(state, dt)
+        if cuda:
+            seen = [plan, c.solids.struct.link, state.arrays, self.probes, press, nodes]
+            c.launch(kernels.share_contacts, (2 * room, self._most), *seen)
             spread = [plan, self.probes, self.rows, press, nodes, *inputs]
             c.launch(kernels.spread_contacts, (c.num_envs, self.rows.shape[0]), *spread)
-        c.launch(self._settle, (c.num_envs, plan.links.shape[0]), plan, self.probes, self.rows, c.solids.struct,
+        c.launch(self._settle, (c.num_envs, links), plan, self.probes, self.rows, c.solids.struct,
                  c.pairs.struct, nodes, press, *inputs)  # fmt: skip
 
     def _make_nodes(self, room: int) -> Any:
         c, nodes = self.context, kernels.ContactNodes()
-        nodes.head = c.zeros((c.num_envs, len(c.scene.links)), int)
+        nodes.head = c.array(np.full((c.num_envs, len(c.scene.links)), -1), int)
         for name in ("follower", "watched", "felt", "other", "geometry"):
             setattr(nodes, name, c.zeros(2 * room, int))
         nodes.carried, nodes.overlap = c.zeros((2 * room, self._most), int), c.zeros(2 * room)
