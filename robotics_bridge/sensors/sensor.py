@@ -61,9 +61,20 @@ class Sensor(abc.ABC):
         """True if it reads forces that do not follow the forces of the engine, which users are told of once."""
         return False
 
+    @property
+    def needs(self) -> tuple[str, str]:
+        """What it asks of everything that touches its link and a flex does not have, and what to do; or nothing."""
+        return "", ""
+
     def for_scene(self, scene: TouchScene) -> Sensor:
-        """Return the sensor with what it leaves open settled for a scene; what it cannot feel there is refused."""
-        del scene
+        """Return the sensor with what it leaves open settled for a scene; flexes that it cannot feel are refused."""
+        need, remedy = self.needs
+        if need and scene.flexes:
+            raise UsageError(
+                f"{type(self).__name__} on link {self.link!r} asks for {need}, which the flex {scene.flexes[0]!r} does "
+                f"not have: {remedy}, or use KinematicTaxel(total='engine'), which feels flexes by the engine's "
+                "contacts."
+            )
         return self
 
     def group(self) -> Hashable:
@@ -102,15 +113,10 @@ class ProbeSensor(Sensor):
         """Return the shape (N,) or (rows, columns) of the reading of one environment, without channels."""
         return self.probes.shape
 
-    def for_scene(self, scene: TouchScene) -> Sensor:
-        """Return the sensor; raise UsageError if it would look at flexes, which have no distance."""
-        if scene.flexes and not self.track:
-            raise UsageError(
-                f"{type(self).__name__} on link {self.link!r} asks for distances, which the flex {scene.flexes[0]!r} "
-                f"does not have: name the links it looks at with track=(...), or use KinematicTaxel(total='engine'), "
-                "which feels flexes by the engine's contacts."
-            )
-        return self
+    @property
+    def needs(self) -> tuple[str, str]:
+        """Distances, unless it looks at named links alone."""
+        return "" if self.track else "distances", "name the links it looks at with track=(...)"
 
     @property
     def followed(self) -> tuple[object, ...]:

@@ -19,12 +19,13 @@ def add_contact_forces(
         return
     pair = geoms[c]
     f = force[c]
-    if pair[0] < 0 or pair[1] < 0 or not wp.isfinite(f):
+    if not wp.isfinite(f):
         return
     # Newton's third law with the normal from the first geometry to the second; friction is left out, as in the
-    # published senses.
+    # published senses. A flex (−1) has no row, and what it presses does.
     push = f * normal[c]
-    if row[pair[1]] >= 0:
-        wp.atomic_add(total, env[c], row[pair[1]], push)
-    if row[pair[0]] >= 0:
-        wp.atomic_add(total, env[c], row[pair[0]], -push)
+    for side in range(2):
+        geometry = pair[side]
+        if geometry >= 0:
+            if row[geometry] >= 0:
+                wp.atomic_add(total, env[c], row[geometry], wp.where(side == 1, push, -push))

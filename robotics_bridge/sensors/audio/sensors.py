@@ -143,6 +143,11 @@ class ContactAudio(AudioSensor):
     contact_time: NotNegative = 0.0
     """Duration of an impact's pulse [s]: longer ones excite high modes less. At most the time step; 0 is one sample."""
 
+    @property
+    def needs(self) -> tuple[str, str]:
+        """Speeds of slip, unless it hears impacts alone."""
+        return "a speed of slip" if self.scrape else "", "leave out the sound of sliding with scrape=0"
+
     def layout(self) -> tuple[int, ...]:
         """Return the shape of one emitter."""
         return (1,)

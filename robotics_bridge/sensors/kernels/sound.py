@@ -68,13 +68,19 @@ def gather_contacts(state: StateArrays, own: ContactSoundArrays):
         return
     env = state.contact_env[c]
     pair = state.contact_geom[c]
-    if not in_scene(pair, own.link_of.shape[0]):
-        return
-    a = own.link_of[pair[0]]
-    b = own.link_of[pair[1]]
     f = state.contact_force[c]
     if not (f > float(0.0)) or not wp.isfinite(f):
         return
+    if not in_scene(pair, own.link_of.shape[0]):
+        # A flex (−1) strikes as other bodies do; how fast it slides is not known.
+        mine = wp.max(pair)
+        if wp.min(pair) == -1 and mine >= 0 and mine < own.link_of.shape[0]:
+            for s in range(own.sources.shape[0]):
+                if own.sources[s].link == own.link_of[mine]:
+                    wp.atomic_add(own.force, env, s, f)
+        return
+    a = own.link_of[pair[0]]
+    b = own.link_of[pair[1]]
     p = state.contact_position[c]
     va = state.velocity[env, a]
     vb = state.velocity[env, b]

@@ -147,6 +147,11 @@ class TemperatureGrid(Sensor):
             material(body.material)
         material(self.material)
 
+    @property
+    def needs(self) -> tuple[str, str]:
+        """Materials and temperatures, which belong to links."""
+        return "a material and a temperature", "make it a rigid body"
+
     def layout(self) -> tuple[int, ...]:
         """Return the shape (nx, ny, nz) of the reading of one environment."""
         return tuple(int(n) for n in self.cells)

@@ -5,11 +5,24 @@ import logging
 import numpy as np
 import pytest
 
+from brainbench.core.devices import warp
+from brainbench.core.errors import UsageError
+from robotics_bridge.envs.kernels.contact_forces import add_contact_forces
 from robotics_bridge.physics import MujocoEngine
-from robotics_bridge.sensors import ContactProbe, KinematicTaxel, Probes, SensorSuite
+from robotics_bridge.sensors import (
+    ContactAudio,
+    ContactProbe,
+    KinematicTaxel,
+    Noise,
+    Probes,
+    SensorSuite,
+    TemperatureGrid,
+)
+from robotics_bridge.sensors.audio.sensors import Modes
 from tests.factories.sensor_episode import require_processor
 
 mujoco = pytest.importorskip("mujoco")
+wp = warp()
 PAD = '<body name="pad"><geom type="box" size=".05 .05 .01"/></body>'
 GRID = Probes.grid(16, 16, size=(0.1, 0.1), center=(0, 0, 0.01), radius=0.004)
 
@@ -202,3 +215,45 @@ def test_the_law_stays_where_its_settings_are_stated() -> None:
     sensors = {name: KinematicTaxel(link="pad", probes=GRID, **settings) for name, settings in stated.items()}
     suite = SensorSuite(engine.scene, sensors, num_envs=1)
     assert [suite.sensors[name].total for name in stated] == ["engine", "law", "law", "law"]
+
+
+def test_a_flex_strikes_a_link_and_presses_a_finger_and_is_refused_where_it_has_no_answer() -> None:
+    engine = _engine(CLOTH, steps=1)
+    scene, modes = engine.scene, Modes((500.0,), (40.0,), (1.0,))
+    sensors = {"speed of slip": ContactAudio(link="pad", modes=modes), "material": TemperatureGrid(link="pad")}
+    for need, sensor in sensors.items():
+        with pytest.raises(UsageError, match=f"{need}.*flex 'cloth'"):
+            SensorSuite(scene, {"s": sensor}, num_envs=1)
+    suite = SensorSuite(scene, {"s": ContactAudio(link="pad", modes=modes, scrape=0.0, threshold=0.0)}, num_envs=1)
+    rows = wp.array(np.zeros(len(scene.geometries)), dtype=wp.int32)
+    total, loudest = wp.zeros((1, 1), dtype=wp.vec3f), 0.0
+    for _ in range(600):
+        engine.step()
+        suite.update(engine.state, 0.002)
+        loudest = max(loudest, float(suite.read("s").abs().max()))
+    assert loudest > 0
+    s = engine.state
+    inputs = [s.contact_count, s.contact_geom, s.contact_env, s.contact_normal, s.contact_force, rows, total]
+    wp.launch(add_contact_forces, dim=s.contact_env.shape[0], inputs=inputs)
+    assert total.numpy()[0, 0, 2] == pytest.approx(-0.981, rel=0.02)
+
+
+def test_suites_at_several_rates_read_one_engine_as_each_would_alone() -> None:
+    def course(strides: dict[str, int]) -> dict[str, list[np.ndarray]]:
+        engine = _engine(_free("ball", "0 0 .022", 'type="sphere" size=".01" mass=".1"'), steps=1)
+        sensor = KinematicTaxel(link="pad", probes=GRID, friction=0.5, noise=Noise(white=1e-3, walk=1e-3))
+        suites = {name: SensorSuite(engine.scene, {"t": sensor}, num_envs=1) for name in strides}
+        courses: dict[str, list[np.ndarray]] = {name: [] for name in strides}
+        for step in range(12):
+            engine.step()
+            for name, stride in strides.items():
+                if step % stride == 0:
+                    suites[name].update(engine.state, 0.002 * stride)
+                    courses[name] += [suites[name].read("t").numpy().copy(), suites[name].missing.numpy().copy()]
+        return courses
+
+    together = course({"fast": 1, "slow": 3})
+    assert np.abs(together["slow"][-2]).max() > 1e-3
+    for name, stride in (("fast", 1), ("slow", 3)):
+        for left, right in zip(together[name], course({name: stride})[name], strict=True):
+            np.testing.assert_array_equal(left, right)
