@@ -1,0 +1,57 @@
+"""``brainbench tactile replay``: a real hand's log beside the simulated hand."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from brainbench.cli.destinations import out_file_option
+from brainbench.cli.output import Output, table_of
+from brainbench.cli.policy.options import HandOption
+
+
+def replay(
+    log: Annotated[Path, typer.Argument(help="LeRobot data set (a folder), or CSV of time, joints and taxels.")],
+    hand: HandOption = "xhand1",
+    episode: Annotated[int, typer.Option(help="Episode of a data set.")] = 0,
+    placement: Annotated[str, typer.Option(help="Taxels of a log that does not place them: hand, tips, …")] = "tips",
+    resolution: Annotated[str, typer.Option(help="Of those: low, med or high.")] = "low",
+    out: Annotated[Path | None, out_file_option("Write both readings of every taxel here (.csv).")] = None,
+) -> Output:
+    """Let the simulated hand follow a real hand's log, and show real beside simulated readings of every taxel.
+
+    The simulated hand holds a ball, whatever lay in the real one. Forces are normal ones (N).
+    """
+    import numpy as np
+
+    from robotics_bridge import hands
+    from robotics_bridge.deploy.links import replay as replays
+
+    model = hands.load(hand)
+    record = replays.read_touch_log(log, model, model.layout(resolution, placement), episode)
+    result = replays.replay(record, hand)
+    rows = result.rows()
+    if out is not None:
+        names = [row["taxel"] for row in rows]
+        header = ",".join(["time", *(f"{name} {side}" for name in names for side in ("real", "simulated"))])
+        pairs = np.stack([record.force, result.simulated], axis=-1).reshape(len(record.time), -1)
+        np.savetxt(out, np.c_[record.time, pairs], delimiter=",", fmt="%.6g", header=header, comments="")
+    touched = [row for row in rows if row["real_peak"] > 0 or row["simulated_peak"] > 0]
+    columns = {
+        "taxel": "{0[taxel]}",
+        f">real peak ({record.unit})": "{0[real_peak]:.3g}",
+        ">simulated (N)": "{0[simulated_peak]:.3g}",
+        ">rms error": "{0[error]:.3g}",
+        ">bias": "{0[bias]:.3g}",
+        ">correlation": lambda row: "" if row["correlation"] is None else f"{row['correlation']:.2f}",
+    }
+    title = f"{record.name}: {len(record.time)} frames, {len(record.joints)} joints, {len(rows)} taxels on {model.name}"
+    text = table_of(title, touched, columns)
+    text += f"\n\n{len(rows) - len(touched)} taxels felt nothing, real or simulated. Joints follow within "
+    text += f"{result.tracking:.2g} rad (rms)."
+    if record.unit != "N":
+        text += f" Forces of the log are in {record.unit!r}: only the correlations compare."
+    text += f"\nWrote {out}." if out is not None else ""
+    return Output({"taxels": rows, "tracking": result.tracking, "unit": record.unit, "out": out}, text)
