@@ -241,22 +241,38 @@ def contact_pressure(
         state: that was read. With it, pressures are scaled so that they add up to the normal forces of the engine's
             contacts between the pad's link and what the sensor tracks; the modulus then plays no part.
     """
-    runtime = cast(ElastomerRuntime, suite.runtime_of(name, ElastomerTaxel, "elastomer"))
-    sensor = cast(ElastomerTaxel, suite.sensors[name])
     check_number("modulus (Pa)", modulus, above=0)
     check_number("poisson", poisson, least=0, most=0.5)
-    pitch = sensor.probes.pitch
-    if not sensor.planar or pitch is None or min(sensor.probes.shape) < 2:
-        raise UsageError(f"The pressure on {name!r} needs a regular planar grid of markers (Probes.grid).")
-    place = runtime.slices[name]
-    height = warp().to_torch(runtime.pads.height)[0, :, place.span].unflatten(1, place.layout).double()
-    compliance = (1 - poisson**2) / (math.pi * modulus) * _love(place.layout, pitch)
-    pressure = _solve(height, torch.as_tensor(compliance, device=height.device))
+    sensor, pitch, _kernel, pressure = _pressed(suite, name)
+    pressure = pressure * (math.pi * modulus / (1 - poisson**2))
     if state is not None:
         load = _load(suite, sensor, state).double()
         total = pressure.sum((1, 2)) * pitch[0] * pitch[1]
         pressure = pressure * (load / total.clamp_min(1e-30)).where(total > 0, 0.0)[:, None, None]
     return pressure.masked_fill(suite.diverged[:, None, None], math.nan).float()
+
+
+def gel_surface(suite: SensorSuite, name: str) -> torch.Tensor:
+    """Return how far (m) [B, R, C] the surface of an elastomer is pushed in at each marker, beside contacts too.
+
+    Where a body touches, that is its overlap; elsewhere the surface of a half-space under the pressure of
+    :func:`contact_pressure`, whatever the modulus. Environments that diverged are NaN.
+    """
+    _sensor, _pitch, kernel, pressure = _pressed(suite, name)
+    return _sink(pressure, kernel).masked_fill(suite.diverged[:, None, None], math.nan).float()
+
+
+def _pressed(suite: SensorSuite, name: str) -> tuple[ElastomerTaxel, tuple[float, float], torch.Tensor, torch.Tensor]:
+    """Return a sensor, its pitch, the kernel of :func:`_love`, and the pressure [B, R, C] for π E / (1 − ν²) = 1."""
+    runtime = cast(ElastomerRuntime, suite.runtime_of(name, ElastomerTaxel, "elastomer"))
+    sensor = cast(ElastomerTaxel, suite.sensors[name])
+    pitch = sensor.probes.pitch
+    if not sensor.planar or pitch is None or min(sensor.probes.shape) < 2:
+        raise UsageError(f"The pressure on {name!r} needs a regular planar grid of markers (Probes.grid).")
+    place = runtime.slices[name]
+    height = warp().to_torch(runtime.pads.height)[0, :, place.span].unflatten(1, place.layout).double()
+    kernel = torch.as_tensor(_love(place.layout, pitch), device=height.device)
+    return sensor, pitch, kernel, _solve(height, kernel)
 
 
 def _love(layout: tuple[int, ...], pitch: tuple[float, float]) -> np.ndarray:
@@ -276,19 +292,19 @@ def _love(layout: tuple[int, ...], pitch: tuple[float, float]) -> np.ndarray:
     return corner(x + a, y + b) - corner(x - a, y + b) - corner(x + a, y - b) + corner(x - a, y - b)
 
 
+def _sink(pressure: torch.Tensor, kernel: torch.Tensor) -> torch.Tensor:
+    """Return by how much the surface sinks [B, R, C]: pressures convolved with the kernel, in Fourier space."""
+    rows, columns = pressure.shape[1:]
+    size = (3 * rows - 2, 3 * columns - 2)
+    full = torch.fft.irfft2(torch.fft.rfft2(pressure, s=size) * torch.fft.rfft2(kernel, s=size), s=size)
+    return full[:, rows - 1 : 2 * rows - 1, columns - 1 : 2 * columns - 1]
+
+
 def _solve(height: torch.Tensor, kernel: torch.Tensor) -> torch.Tensor:
     """Return p ≥ 0 [B, R, C] under which the surface sinks by ``height`` where p > 0, and by no less elsewhere.
 
-    Conjugate gradients on the set in contact (Polonsky & Keer 1999), convolutions in Fourier space. NaN where they do
-    not converge.
+    Conjugate gradients on the set in contact (Polonsky & Keer 1999). NaN where they do not converge.
     """
-    rows, columns = height.shape[1:]
-    size = (3 * rows - 2, 3 * columns - 2)
-    spectrum = torch.fft.rfft2(kernel, s=size)
-
-    def sink(p: torch.Tensor) -> torch.Tensor:
-        full = torch.fft.irfft2(torch.fft.rfft2(p, s=size) * spectrum, s=size)
-        return full[:, rows - 1 : 2 * rows - 1, columns - 1 : 2 * columns - 1]
 
     def dot(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
         return (a * b).sum((1, 2), keepdim=True)
@@ -297,12 +313,12 @@ def _solve(height: torch.Tensor, kernel: torch.Tensor) -> torch.Tensor:
     p = height / kernel.sum()
     way, before, keep = torch.zeros_like(p), torch.ones_like(p[:, :1, :1]), torch.zeros_like(p[:, :1, :1])
     for _ in range(_STEPS):
-        gap = sink(p) - height
+        gap = _sink(p, kernel) - height
         inside = p > 0
         residual = gap * inside
         square = dot(residual, residual)
         way = (residual + keep * square / before.clamp_min(tiny) * way) * inside
-        step = dot(residual, way) / dot(sink(way), way).clamp_min(tiny)
+        step = dot(residual, way) / dot(_sink(way, kernel), way).clamp_min(tiny)
         new = (p - step * way).clamp_min(0)
         # Cells without pressure that the body would overlap come into contact, and the search begins anew.
         overlap = (new == 0) & (gap < 0) & ~inside

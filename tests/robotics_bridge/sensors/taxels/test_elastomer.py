@@ -9,7 +9,7 @@ import pytest
 from brainbench.core.errors import UsageError
 from robotics_bridge.physics import Geometry, MujocoEngine
 from robotics_bridge.sensors import ContactProbe, ElastomerTaxel, Probes, SensorSuite
-from robotics_bridge.sensors.taxels.elastomer import contact_pressure
+from robotics_bridge.sensors.taxels.elastomer import contact_pressure, gel_surface
 from tests.factories.touch_scenes import pad_scene, poses_at, state_of
 
 RADIUS, PITCH, MODULUS, POISSON = 0.01, 1e-4, 2e5, 0.45
@@ -35,6 +35,12 @@ def test_pressure_under_a_ball_is_that_of_hertz(depth: float) -> None:
     inner = far < 0.8 * a
     np.testing.assert_allclose(pressure[0][inner], hertz[inner], rtol=0.03)
     assert pressure[0][far > a + PITCH].max() < 0.02 * hertz.max()
+    # Its surface is the ball's below it, and sinks beside it too (Johnson 1985, eq. 3.42a).
+    share = np.minimum(a / far.clip(1e-9), 1)
+    beside = ((2 * a**2 - far**2) * np.arcsin(share) + a * np.sqrt((far**2 - a**2).clip(0))) / (np.pi * RADIUS)
+    surface = gel_surface(suite, "gel").numpy()
+    np.testing.assert_allclose(surface[0], np.where(far < a, depth - far**2 / (2 * RADIUS), beside), atol=0.03 * depth)
+    assert not surface[1].any()
 
 
 def test_pressures_add_up_to_the_contact_forces_of_the_engine() -> None:
