@@ -8,8 +8,11 @@ import pytest
 
 from brainbench.core.errors import UsageError
 from robotics_bridge import hands
-from robotics_bridge.hands.scenes import closing, holding
+from robotics_bridge.hands.observations import sensors_for
+from robotics_bridge.hands.scenes import closing, holding, replace_drives
 from robotics_bridge.hands.tree import Tree, driven, pulled
+from robotics_bridge.physics import MujocoEngine
+from robotics_bridge.sensors import SensorSuite
 from robotics_bridge.tasks.scenes import drives_of
 from tests.factories.hand_gallery import GALLERY
 
@@ -43,6 +46,28 @@ def test_the_other_hand_of_a_file_is_named_and_can_be_chosen(tmp_path, caplog) -
     with pytest.raises(UsageError, match="right_palm"):
         hands.load(path, palm="right_plam")
     assert len(hands.load_all(path)) == 2
+
+
+def test_both_hands_of_a_file_carry_a_board_in_one_scene(tmp_path) -> None:
+    both = hands.load_all(GALLERY["two-hands"].write(tmp_path, "pair"))
+    spec = both[0].mjspec()
+    replace_drives(spec)
+    model = both[0].model
+    places = [model.body(hand.palm).pos for hand in both]
+    top = max(place[2] + model.geom_size[model.body_geomadr[model.body(hand.palm).id]][2]
+              for hand, place in zip(both, places, strict=True))  # fmt: skip
+    middle, span = sum(places) / 2, abs(places[1] - places[0]).max() / 2
+    board = spec.worldbody.add_body(name="board", pos=[middle[0], middle[1], top + 0.0051])
+    board.add_freejoint()
+    board.add_geom(type=6, size=[span + 0.02, 0.02, 0.005], mass=1.0)
+    engine = MujocoEngine(spec.compile(), 1)
+    engine.step(300)
+    layout = {link: probes for hand in both for link, probes in hand.layout("low").items()}
+    suite = SensorSuite(engine.scene, sensors_for("force", layout), num_envs=1)
+    suite.update(engine.state)
+    for hand in both:
+        assert float(suite.read(hand.palm)[0, ..., 2].sum()) == pytest.approx(-9.81 / 2, rel=0.01)
+    assert float(suite.missing.max()) < 1e-3
 
 
 def test_followers_of_a_model_without_loops_are_those_that_mimic(tmp_path) -> None:
