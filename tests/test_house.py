@@ -37,7 +37,7 @@ BUDGETS = {
 }
 """Folder → lines of Python that it may have: as the rooms stand, with two per cent to move in. Who adds a capability
 pays in the same folder, or raises the number in the commit that needs it, with the reason."""
-MOST_PRODUCT_LINES, MOST_PRODUCT_MODULES = 95_100, 510
+MOST_PRODUCT_LINES, MOST_PRODUCT_MODULES = 95_700, 513
 VAGUE = frozenset(
     re.findall(r"\w+", "found told own kept known asked one other item shown made named taken usual"),
 )
