@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -95,7 +96,7 @@ class GelCamera:
         for picture, field in zip(pictures, values, strict=True):
             if not np.isfinite(field).all():
                 continue
-            pixels = field
+            pixels: Any = field
             if pitch is not None:
                 rows, columns = (
                     (np.arange(count) - (count - 1) / 2) * self.pixel / step + (markers - 1) / 2
@@ -103,7 +104,8 @@ class GelCamera:
                 )
                 places = np.meshgrid(rows, columns, indexing="ij")
                 pixels = ndimage.map_coordinates(field, places, order=3, mode="nearest")
-            change = _looked_up(self.table, _bins(np.stack(np.gradient(pixels, self.pixel))))
+            slopes: Any = np.gradient(pixels, self.pixel)
+            change = _looked_up(self.table, _bins(np.stack(slopes)))
             picture[:] = np.round(255 * (self.background + change).clip(0, 1))
         return pictures
 
@@ -137,7 +139,9 @@ def _colours(picture: ArrayLike) -> NDArray[np.float64]:
 def _markers(colours: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Return a mask [H, W] of dark markers and their rims."""
     darkest = colours.min(axis=-1)
-    return ndimage.binary_dilation(darkest < ndimage.grey_closing(darkest, _WIDEST) - _MARKER, iterations=2)
+    around: Any = ndimage.grey_closing(darkest, _WIDEST)
+    markers: Any = ndimage.binary_dilation(darkest < around - _MARKER, iterations=2)
+    return markers
 
 
 def _ball_slopes(
@@ -164,16 +168,18 @@ def _tabulate(at: NDArray[np.float64], change: NDArray[np.float64]) -> NDArray[n
     bins = tuple(np.round(at).astype(int))
     np.add.at(total, bins, change)
     np.add.at(count, bins, 1.0)
-    total, count = (ndimage.gaussian_filter(values, (_BLUR, _BLUR, 0)) for values in (total, count))
+    blurred: list[Any] = [ndimage.gaussian_filter(values, (_BLUR, _BLUR, 0)) for values in (total, count)]
+    total, count = blurred
     # Slopes that the ball does not show take the colour of the nearest that it does.
     unseen = count[..., 0] < 1e-3
-    nearest = ndimage.distance_transform_edt(unseen, return_distances=False, return_indices=True)
+    nearest: Any = ndimage.distance_transform_edt(unseen, return_distances=False, return_indices=True)
     return (total / np.maximum(count, 1e-12))[tuple(nearest)]
 
 
 def _looked_up(table: NDArray[np.float64], at: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return changes of colour [H, W, 3] at places [2, H, W] of a table."""
-    return np.stack([ndimage.map_coordinates(plane, at, order=1) for plane in np.moveaxis(table, -1, 0)], axis=-1)
+    planes: list[Any] = [ndimage.map_coordinates(plane, at, order=1) for plane in np.moveaxis(table, -1, 0)]
+    return np.stack(planes, axis=-1)
 
 
 def _fitted(colours: NDArray[np.float64], clear: NDArray[np.bool_]) -> NDArray[np.float64]:
