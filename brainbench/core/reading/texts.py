@@ -19,11 +19,7 @@ LARGEST_WHOLE = 2**63 - 1
 
 
 def read_text(path: str | os.PathLike[str], kind: str = "text file", *, most: int = MOST_TEXT) -> str:
-    """Read UTF-8 text.
-
-    Raises:
-        DataFileNotFoundError: there is no such file.
-    """
+    """Read UTF-8 text."""
     file = check_file(path, kind, most=most)
     with readable(path, kind):
         return file.read_text(encoding="utf-8-sig")
@@ -57,11 +53,7 @@ def parse_toml(text: str, name: str) -> dict[str, Any]:
 
 
 def read_json(path: str | os.PathLike[str], kind: str = "file") -> Any:
-    """Read JSON.
-
-    Raises:
-        DataFileNotFoundError: there is no such file.
-    """
+    """Read JSON."""
     return parse_json(read_text(path, kind), os.fspath(path))
 
 
@@ -71,11 +63,7 @@ def read_toml(path: str | os.PathLike[str], kind: str = "file") -> dict[str, Any
 
 
 def read_yaml(path: str | os.PathLike[str], kind: str = "file") -> Any:
-    """Read YAML.
-
-    Raises:
-        DataFileNotFoundError: there is no such file.
-    """
+    """Read YAML."""
     with needing("pyyaml", extra="hub", purpose="Reading YAML settings"):
         import yaml
     text, name = read_text(path, kind), os.fspath(path)
@@ -107,11 +95,7 @@ def _check_keys(node: Any, name: str) -> None:
 
 
 def read_mapping(path: str | os.PathLike[str], kind: str = "file") -> dict[str, Any]:
-    """Read names and values from a TOML, JSON or YAML file, which its ending tells apart.
-
-    Raises:
-        DataFileNotFoundError: there is no such file.
-    """
+    """Read names and values from a TOML, JSON or YAML file, which its ending tells apart."""
     suffix = Path(path).suffix.lower()
     read = read_json if suffix == ".json" else read_yaml if suffix in (".yaml", ".yml") else read_toml
     values = read(path, kind)
