@@ -89,6 +89,12 @@ class Entry:
         return self._mean("scaled")
 
     @property
+    def unique(self) -> float:
+        """Mean over seeds of the part that raw input and contacts do not explain; NaN where a seed states none."""
+        parts = [record.score.provenance.unique for record in self.records]
+        return float(np.mean([math.nan if part is None or part.status != "ok" else part.unique for part in parts]))
+
+    @property
     def r(self) -> float:
         """Mean raw comparison over seeds."""
         return self._mean("r")

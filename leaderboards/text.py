@@ -10,6 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
 from typing import Any
 
+from brainbench.core.errors import listing, visible
 from brainbench.core.records import Interval, ModelCard, ResultRecord, Score
 from leaderboards.ranking import not_repeatable
 
@@ -88,6 +89,22 @@ def group_rows(statistics: Mapping[str, Any]) -> dict[str, Any] | None:
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError):
         # Statistics are free text in a record that somebody else may have written.
         return None
+
+
+def unique_sentence(score: Score) -> str:
+    """Say what the network explains beyond its controls; empty where nothing is stated of it."""
+    part = score.provenance.unique
+    if part is None:
+        return ""
+    if part.status == "undefined" or not math.isfinite(part.unique):
+        return f"No unique part: {visible(part.reason or 'no number is stated')}."
+    ends = f" [{number(part.low, 2)}, {number(part.high, 2)}]" if math.isfinite(part.low + part.high) else ""
+    doubt = "" if part.status == "ok" else f"; {visible(part.status)}: {visible(part.reason)}"
+    controls = visible(listing(part.controls, quoted=False))
+    return (
+        f"Unique part {number(part.unique, 2)}{ends}, beyond {controls}; shared with "
+        f"them {number(part.shared, 2)} (0 = equal distances, 1 = all that is reliable){doubt}."
+    )
 
 
 def p_sentence(score: Score) -> str:

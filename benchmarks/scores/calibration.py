@@ -2,8 +2,8 @@
 
     python -m benchmarks.scores.calibration [NAME ...] [--simulations N] [--workers N] [--seed N] [--write]
 
-Names: nulls, coverage, noise, pairs, over-time, dimensions, corrections, crossnobis, recovery, ceiling, faults; all by
-default. ``--write`` puts the tables into RESULTS.md and docs/calibration.md, and the figures into docs/images.
+Names: nulls, coverage, noise, unique, pairs, over-time, dimensions, corrections, crossnobis, recovery, ceiling, faults;
+all by default. ``--write`` puts the tables into RESULTS.md and docs/calibration.md, and the figures into docs/images.
 """
 
 from __future__ import annotations
@@ -164,6 +164,23 @@ def noise(run: Run) -> Result:
     columns = ["stimuli", "trials", "reliability", "estimated", "ok"]
     columns += [f"coverage (bias), true score {share:g}" for share in simulated_boards.SHARES_OF_NOISY]
     return Result("Coverage of 95 % intervals of studies that are ok, eight animals", columns, rows)
+
+
+def unique(run: Run) -> Result:
+    """Coverage of the interval of the unique part, and how often it is found where there is one and where not."""
+    rows = []
+    for stimuli, reliability in product((12, 24, 40), (0.5, 0.8)):
+        jobs = [NoisyStudy(seed, stimuli, 10, reliability) for seed in run.seeds()]
+        studies = np.array(run.each(simulated_boards.unique_study, jobs))
+        for (kind, share_hidden), (part, low, high, truth) in zip(
+            simulated_boards.UNIQUE_CASES, np.moveaxis(studies, 0, 2), strict=True
+        ):
+            true, known = np.nanmean(truth), np.isfinite(part)
+            part, low, high = part[known], low[known], high[known]
+            numbers = f"{true:.3f}", f"{part.mean():.3f}", share((low <= true) & (true <= high)), share(low > 0)
+            rows.append([str(stimuli), f"{reliability:g}", f"{kind}, {share_hidden:g}", *numbers])
+    columns = ["stimuli", "reliability", "network, hidden share", "true", "mean", "coverage", "found above 0"]
+    return Result("Unique part of networks of six layers, eight animals, ten trials", columns, rows)
 
 
 _FEWEST_OK = 15
@@ -464,6 +481,7 @@ JOBS: dict[str, Callable[[Run], Result]] = {
     "nulls": nulls,
     "coverage": coverage,
     "noise": noise,
+    "unique": unique,
     "pairs": pairs,
     "over-time": over_time,
     "dimensions": dimensions,

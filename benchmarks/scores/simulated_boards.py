@@ -15,13 +15,16 @@ import numpy as np
 from scipy import stats
 
 from brainbench.core.contracts import Trials
-from brainbench.core.records import Score
+from brainbench.core.records import Interval, Score
 from brainbench.core.statistics import two_factor_error
 from brainbench.datasets.synthetic import PopulationDesign, ResponseGeometry
 from brainbench.datasets.synthetic.populations import draw_sessions
 from brainbench.metrics import get_metric, rdm
+from brainbench.metrics.animals import gather
 from brainbench.metrics.measures.rsa import RSA
+from brainbench.metrics.measures.unique import unique_part
 from brainbench.metrics.rdms.comparison import compare_all
+from brainbench.metrics.reliability.subject_rdm import SubjectRDM
 from brainbench.scoring.over_time import AnimalMovie, score_over_time
 
 DIMENSIONS = 10
@@ -138,6 +141,51 @@ def noisy_study(study: NoisyStudy) -> list[tuple[float, float, float, float, flo
         span = (score.interval.low, score.interval.high) if score.interval else (math.nan, math.nan)
         found.append((float(score.status == "ok"), score.value, *span, float(truth), score.reliability))
     return found
+
+
+UNIQUE_CASES = (("hidden", 1.0), ("hidden", 0.5), ("hidden", 0.2), ("raw", 0.5), ("unrelated", 0.5))
+"""What the network has, and the share of the animals' features that the raw input lacks."""
+
+
+def without_noise(distances: np.ndarray) -> SubjectRDM:
+    """Return an animal whose RDM [P] is known exactly."""
+    return SubjectRDM("animal", distances, np.empty(0), np.empty((0, 2, len(distances))))
+
+
+def unique_study(study: NoisyStudy) -> list[tuple[float, float, float, float]]:
+    """Return the unique part, its interval, and that of the same study without noise, for each of the cases.
+
+    Animals mix features of the raw input and hidden ones; networks have six layers, one of which says something.
+    """
+    rng = np.random.default_rng([study.seed, study.stimuli, study.trials, round(100 * study.reliability)])
+    raw, hidden = rng.normal(size=(2, study.stimuli, DIMENSIONS))
+    names, labels = [f"s{index}" for index in range(study.stimuli)], np.repeat(np.arange(study.stimuli), study.trials)
+    metric, results = FewSplits(splits=20), []
+    for kind, share in UNIQUE_CASES:
+        felt, animals, noiseless = np.hstack([math.sqrt(1 - share) * raw, math.sqrt(share) * hidden]), [], []
+        for index in range(8):
+            patterns = felt @ rng.normal(size=(2 * DIMENSIONS, 60))
+            trials = patterns[labels] + math.sqrt(study.noise(patterns)) * rng.normal(size=(len(labels), 60))
+            keys = [f"{study.seed}/{index}/{trial}" for trial in range(len(labels))]
+            animals.append(metric.animal(f"m{index}", [Trials(trials, labels, keys)], study.stimuli, stimuli=names))
+            noiseless.append(rdm(patterns, method="sqeuclidean"))
+        layers = [metric.layer(rng.normal(size=(study.stimuli, 20))) for _ in range(6)]
+        if kind != "unrelated":
+            layers[0] = metric.layer((hidden if kind == "hidden" else raw) @ rng.normal(size=(DIMENSIONS, 40)))
+        gathered = gather(metric, animals, study.stimuli)
+        factors = gathered.factors(gathered.scored)
+        scored = [gathered.subjects[index] for index in gathered.scored]
+        if not scored:
+            results.append((math.nan,) * 4)
+            continue
+        without = metric.factors_without(scored, factors)
+        sides = ({str(place): layer for place, layer in enumerate(layers)}, {"raw input": metric.layer(raw)})
+        how: dict[str, Any] = {"comparison": metric.comparison}
+        part = unique_part(*sides, scored, factors=factors, factors_without=without, **how)
+        truth = unique_part(*sides, [without_noise(each) for each in noiseless], factors=np.ones(8), **how)
+        span = part.interval or Interval(math.nan, math.nan)
+        results.append((part.unique, span.low, span.high, truth.unique))
+    return results
 
 
 def null_p(study: Study) -> float:

@@ -1,4 +1,4 @@
-"""A score as text: what was found in the first three lines, the statistics behind it after them."""
+"""A score as text: what was found in the first four lines, the statistics behind it after them."""
 
 from __future__ import annotations
 
@@ -32,14 +32,16 @@ def score_text(record: ResultRecord) -> str:
 
 
 def _headline(record: ResultRecord) -> Iterator[str]:
-    """Yield what was scored, whether it is told apart from the raw input, the score, and what limits it."""
+    """Yield what was scored, its unique part, whether it is told apart from raw input, the score, and its limits."""
     from leaderboards.ranking import CHANCE_LEVEL
+    from leaderboards.text import unique_sentence
 
     score, animals = record.score, record.animal_to_animal
     subjects = score.subjects or (animals.subjects if animals else ())
     name = ": ".join(filter(None, (score.provenance.benchmark_name, score.provenance.recordings_name)))
     count = f"{len(subjects)} animal{'s' * (len(subjects) != 1)}"
     yield f"{score.name}{_weights(record)}  ·  {len(score.stimuli)} stimuli  ·  {count}  ·  {name}"
+    yield from filter(None, (unique_sentence(score),))
     yield _against_raw_input(record)
     if score.status == "undefined":
         yield "No score: it is undefined."

@@ -2,12 +2,47 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any
 
 from brainbench.core.errors import listing
 from brainbench.core.files import content_hash
+
+
+@dataclass(frozen=True)
+class UniqueStated:
+    """The unique part of a network as a record states it: 0 is equal distances, 1 all that is reliable."""
+
+    status: str
+    reason: str
+    unique: float
+    """NaN where there is none, for a reason."""
+    low: float
+    high: float
+    shared: float
+    controls: tuple[str, ...]
+
+    @classmethod
+    def of(cls, stated: Mapping[str, Any]) -> UniqueStated:
+        """Return what a mapping states; numbers that are none are NaN."""
+
+        def number(value: Any) -> float:
+            real = isinstance(value, (int, float)) and not isinstance(value, bool)
+            return float(value) if real and math.isfinite(value) else math.nan
+
+        span, controls, reasons = stated.get("interval"), stated.get("controls"), stated.get("reasons")
+        low, high = span if isinstance(span, (list, tuple)) and len(span) == 2 else (math.nan, math.nan)
+        return cls(
+            _text(stated.get("status")),
+            "; ".join(map(_text, reasons)) if isinstance(reasons, (list, tuple)) else "",
+            number(stated.get("unique")),
+            number(low),
+            number(high),
+            number(stated.get("shared")),
+            tuple(map(_text, controls)) if isinstance(controls, (list, tuple)) else (),
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,6 +151,12 @@ class Provenance(Mapping[str, Any]):
                 if isinstance(p, (int, float)) and not isinstance(p, bool):
                     values[test["layer"]] = float(p)
         return values
+
+    @property
+    def unique(self) -> UniqueStated | None:
+        """What a network explains beyond controls, where numbers state it: a record is data that anyone may write."""
+        stated = self.statistics.get("unique")
+        return UniqueStated.of(stated) if isinstance(stated, Mapping) else None
 
     def __getitem__(self, name: str) -> Any:
         """Return a stated entry."""

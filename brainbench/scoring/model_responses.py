@@ -18,6 +18,7 @@ from brainbench.core.files import file_hash
 from brainbench.core.progress import Progress
 from brainbench.core.reading.regular import readable
 from brainbench.core.records import Interval, ModelCard
+from brainbench.scoring.unique import contact_kinematics
 
 if TYPE_CHECKING:
     import torch
@@ -64,6 +65,8 @@ class ModelResponses:
     """[K, T, F] what the model received; None for features computed elsewhere."""
     origin: Mapping[str, Any] = field(default_factory=dict)
     """Provenance of stimuli and weights."""
+    kinematics: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
+    """What simulated stimuli state of contacts, [K, W] by name."""
     seconds: float | None = None
     """Duration of the stimuli, over which the steps of every layer are spread evenly; None where unknown."""
 
@@ -145,7 +148,8 @@ class ResolvedModel:
             steps = comparable if comparable.ndim > 2 else comparable[:, None, :]
             model_input = steps.reshape(*steps.shape[:2], -1)
         seconds = None if simulated is None else _seconds(simulated)
-        return ModelResponses(card, labels, activations, options.time, model_input, origin, seconds)
+        kinematics = {} if simulated is None else contact_kinematics(simulated.dataset)
+        return ModelResponses(card, labels, activations, options.time, model_input, origin, kinematics, seconds)
 
 
 def follows_seed(model: Any) -> bool:

@@ -22,6 +22,7 @@ from brainbench.core.provenance import Provenance
 from brainbench.core.records import ESTIMATOR_VERSION, ResultRecord, Score
 from brainbench.scoring.options import ScoreOptions
 from brainbench.scoring.presentation import presentation_of
+from brainbench.scoring.unique import RAW_INPUT, unique_of
 
 if TYPE_CHECKING:
     from brainbench.metrics import Metric
@@ -235,8 +236,8 @@ def _compare(inputs: ScoreInputs, *, baselines: bool) -> tuple[list[Score], Scor
     The published estimators take a published file as its authors' code does: zeros kept, the maximum over all layers.
     """
     brain, network, options = inputs.brain, inputs.network, inputs.options
-    features = {network.card.name: inputs.features}
-    features |= network.baseline_features(inputs.rows, options.seed) if baselines else {}
+    rivals = network.baseline_features(inputs.rows, options.seed) if baselines else {}
+    features = {network.card.name: inputs.features, **rivals}
     if brain.published and options.estimator != "default":
         scores, between = _optional("published_arrays")(inputs, features, agreement=baselines)
     else:
@@ -251,7 +252,13 @@ def _compare(inputs: ScoreInputs, *, baselines: bool) -> tuple[list[Score], Scor
         brain, inputs.metric, inputs.animals, inputs.labels, control=baselines, seed=options.seed
     )
     stated = scores[0].provenance
-    statistics = {**stated.statistics, **presentation.statistics}
+    controls = {}
+    if raw := rivals.get(RAW_INPUT):
+        controls = {RAW_INPUT: raw["input"]}
+        controls |= {name: values[inputs.rows] for name, values in network.kinematics.items()}
+    shared: dict[str, Any] = {"committed": network.card.layer, "seed": options.seed}
+    unique = unique_of(scores[0], inputs.metric, inputs.animals, inputs.features, controls, **shared)
+    statistics = {**stated.statistics, **presentation.statistics, **({"unique": unique.stated} if unique else {})}
     scores[0] = replace(scores[0], provenance=replace(stated, statistics=statistics))
     if doubt := presentation.doubt:
         scores, between = [_doubted(score, doubt) for score in scores], between and _doubted(between, doubt)

@@ -138,7 +138,7 @@ def comparisons(record: ResultRecord) -> list[str]:
     score, others = record.score, dict(record.baselines)
     if record.animal_to_animal is not None:
         others["animal-to-animal"] = record.animal_to_animal
-    sentences, untested = [], []
+    sentences, untested = [*filter(None, (text.unique_sentence(score),))], []
     for name, baseline in others.items():
         comparison = compare_scores(score, baseline)
         if not comparison.verdict or not "ok" == score.status == baseline.status:

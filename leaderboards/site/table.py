@@ -21,6 +21,8 @@ COLUMNS: tuple[dict[str, Any], ...] = (
     {"key": "name", "label": "model", "title": "model", "shown": True},
     {"key": "score", "label": "score", "title": "score and interval", "number": True, "shown": True, "down": True},
     {"key": "interval", "label": "interval", "title": "interval as a picture", "shown": True},
+    {"key": "unique", "label": "unique", "title": "unique part, beyond raw input and contacts", "number": True,
+     "wide": True, "down": True, "shown": True},
     {"key": "standing", "label": "standing", "title": "standing", "wide": True, "shown": True},
     {"key": "p", "label": "p", "title": "permutation p", "number": True, "wide": True, "shown": True},
     {"key": "spread", "label": "spread", "title": "spread over seeds", "number": True, "wide": True},
@@ -46,8 +48,8 @@ COLUMNS: tuple[dict[str, Any], ...] = (
 _COMMON = ("benchmark", "recordings", "recordings_hash", "stimuli_hash", "time", "estimator", "metric", "synthetic")
 _CARD = ("family", "encoder", "attender", "objective", "augmentation", "parameters", "multiply_adds", "top1", "top5")
 FIELDS = (
-    *_COMMON, "kind", "rank_first", "rank_last", "name", "scaled", "scaled_low", "scaled_high", "standing", "same_as",
-    "unranked_because", "notes", "p", "spread", "value", "low", "high", "r", "reliability", "ceiling_lower",
+    *_COMMON, "kind", "rank_first", "rank_last", "name", "scaled", "scaled_low", "scaled_high", "unique", "standing",
+    "same_as", "unranked_because", "notes", "p", "spread", "value", "low", "high", "r", "reliability", "ceiling_lower",
     "ceiling_upper", "layer", "seeds", "animals", *_CARD, "seed", "weights", "version", "get", "page", "records",
 )  # fmt: skip
 """Columns of the downloads."""
@@ -130,7 +132,7 @@ def _entry_row(entry: Entry) -> dict[str, Any]:
     low, high = interval_ends(entry.interval) or (None, None)
     # Where there are several seeds, what one of them states does not stand for all.
     alone = {"low": None, "high": None} if entry.seeds > 1 else {"seed": card.seed, "weights": card.weights}
-    names = ("name", "scaled", "standing", "p", "spread", "value", "r", "seeds", "page")
+    names = ("name", "scaled", "unique", "standing", "p", "spread", "value", "r", "seeds", "page")
     return {
         **_score_row(score), **{name: getattr(card, name) for name in _CARD},
         **{name: getattr(entry, name) for name in names},

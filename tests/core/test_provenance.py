@@ -51,3 +51,23 @@ def test_works_to_cite_are_read_as_texts_each_once():
     # Anyone may write a record.
     assert Provenance.of({"benchmark": {"name": 3, "citation": ["x"]}}).citations == []
     assert Provenance.of({"benchmark": "lab"}).benchmark_name == ""
+
+
+def test_a_unique_part_is_read_where_numbers_state_it():
+    stated = {
+        "status": "ok",
+        "reasons": [],
+        "unique": 0.5,
+        "interval": [0.25, 0.75],
+        "shared": 0.1,
+        "controls": ["raw"],
+    }
+    part = _make_score(provenance={"statistics": {"unique": stated}}).provenance.unique
+    assert part is not None
+    assert (part.unique, part.low, part.high, part.shared, part.controls) == (0.5, 0.25, 0.75, 0.1, ("raw",))
+    assert _make_score().provenance.unique is None
+    for damaged in ({"unique": "1"}, {"unique": True, "interval": 3}, {"unique": None, "interval": [1], "controls": 4}):
+        part = _make_score(provenance={"statistics": {"unique": damaged}}).provenance.unique
+        assert part is not None
+        assert math.isnan(part.unique)
+        assert math.isnan(part.low)

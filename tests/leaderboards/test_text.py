@@ -88,3 +88,20 @@ def test_statistics_of_the_provenance_are_rounded_and_what_a_table_shows_is_not_
     assert rows["statistics: bootstrap"] == "draws: 1000, interval: low: -0.47, high: 0.8, spread: 0.333"
     assert rows["settings: bin"] == "0.0123456"
     assert "statistics: layer tests" not in rows
+
+
+def test_the_unique_part_is_one_sentence_or_the_reason_for_none(make_score):
+    assert words.unique_sentence(make_score()) == ""
+    stated = {"status": "ok", "unique": 0.75, "interval": [0.62, 0.88], "shared": 0.02, "controls": ["raw input"]}
+
+    def said(**changes):
+        return words.unique_sentence(make_score(provenance={"statistics": {"unique": stated | changes}}))
+
+    assert said() == (
+        "Unique part 0.75 [0.62, 0.88], beyond raw input; shared with them 0.02 (0 = equal distances, 1 = all that is "
+        "reliable)."
+    )
+    assert said(status="unreliable", reasons=["the score is not ok"]).endswith("; unreliable: the score is not ok.")
+    assert said(status="undefined", reasons=["few stimuli"]) == "No unique part: few stimuli."
+    assert said(unique="much") == "No unique part: no number is stated."
+    assert "\x1b" not in said(controls=["\x1b[31mred"])
