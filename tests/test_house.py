@@ -24,20 +24,20 @@ BUDGETS = {
     "robotics_bridge": 24_800,  # newtons that no taxel has, trees of any hand, deadlines, replays, gel pictures
     "brainbench/models": 8_500,  # the proof that a layer is a response
     "brainbench/datasets": 7_300,  # the balance of a reading, copies of sessions, signals
-    "brainbench/metrics": 5_100,
+    "brainbench/metrics": 5_400,  # the unique part
     "brainbench/cli": 4_950,  # check-submission, options of benchmarks
     "brainbench/core": 5_800,  # the sealed door, seals of the cache, the filter of foreign text, sealed plans
     "leaderboards": 3_700,  # benchmarks and citations on boards, means over benchmarks, boards of areas
-    "brainbench/scoring": 4_080,  # presentation time as a control, plans, boards of areas, layers and cell types
+    "brainbench/scoring": 4_280,  # presentation time, plans, boards of areas and layers, controls of the unique part
     "brainbench/geometry": 1_050,
     "brainbench/published": 2_700,
     "brainbench/tradeoffs": 1_100,
     "brainbench/benchmarks": 760,
-    "benchmarks": 7_500,
+    "benchmarks": 7_600,  # calibration of the unique part
 }
 """Folder → lines of Python that it may have: as the rooms stand, with two per cent to move in. Who adds a capability
 pays in the same folder, or raises the number in the commit that needs it, with the reason."""
-MOST_PRODUCT_LINES, MOST_PRODUCT_MODULES = 95_700, 513
+MOST_PRODUCT_LINES, MOST_PRODUCT_MODULES = 96_300, 516
 VAGUE = frozenset(
     re.findall(r"\w+", "found told own kept known asked one other item shown made named taken usual"),
 )
