@@ -18,7 +18,7 @@ import numpy as np
 
 from brainbench.core.devices import pick_device, warp
 from brainbench.stimuli import Fidelity
-from brainbench.stimuli.engines.rod.launch import WhiskerSolver
+from brainbench.stimuli.engines.rod.launch import Launch, WhiskerSolver
 from brainbench.stimuli.engines.rod.limits import NOTHING
 from brainbench.stimuli.engines.rod.packing import PackedJobs, PackedMotions, still_knots
 from brainbench.stimuli.engines.rod.shapes import PackedShapes
@@ -63,7 +63,8 @@ def free(
     jobs = PackedJobs(which, zeros, zeros, np.arange(lanes, dtype=np.int32), zeros, zeros + 1)
     kernels = []
     for _ in range(4):
-        result = solver.launch(jobs, motions, shapes, np.array([steps * step]), (lanes, 1), gravity=gravity)
+        given = Launch(jobs, motions, shapes, np.array([steps * step]), (lanes, 1), gravity=gravity)
+        result = solver.launch(given)
         kernels.append(result.seconds["kernel"])
     seconds = statistics.median(kernels[1:])
     print(

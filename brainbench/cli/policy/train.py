@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -133,18 +134,25 @@ def distill(
 @with_options(DISTILL, ("num_envs", "iterations"), parameter="changes", flags=DISTILL_FLAGS, given=True)
 def sweep(
     changes: dict[str, Any],
-    file: Annotated[Path | None, typer.Argument(help="A sweep (TOML); by default table 4.10 of the thesis.")] = None,
+    file: Annotated[Path | None, typer.Argument(help="TOML file, placement-and-type, or table-4.10 (default).")] = None,
     subset: Annotated[str, typer.Option(help="all, types, encoders, or an observation type.")] = "all",
     count: Annotated[bool, typer.Option("--count", help="Print how many students there are, and stop.")] = False,
     names: Annotated[bool, typer.Option("--list", help="Print their names, and stop.")] = False,
     out: Annotated[Path, typer.Option(callback=out_folder, help="Folder of the runs.")] = Path("students"),
     shard: Annotated[str, typer.Option(help="Part of the students, as 0/4.")] = "0/1",
+    stop_at: Annotated[int | None, typer.Option(help="Stop each student, and evaluate it, after so many.")] = None,
     episodes: Annotated[int, typer.Option(help="Of the evaluation, per seed.")] = 100,
+    evaluations: Annotated[int, typer.Option("--seeds", help="Seeds of the evaluation.", min=1, max=3)] = 3,
     device: DeviceOption = "cpu",
     task_file: TaskFileOption = None,
 ) -> Output:
-    """Distil every student of a sweep that is not finished yet; what was interrupted goes on."""
+    """Distil every student of a sweep that is not finished yet; what was interrupted goes on.
+
+    Start it once on each GPU, with the same folder: every process takes the next student that none has.
+    """
+    from brainbench.core.errors import UsageError
     from brainbench.core.files import read_json
+    from brainbench.core.writing.locks import lock_folder
     from robotics_bridge.policies.training.distill_config import PUBLISHED, read_sweep
     from robotics_bridge.policies.training.students import EVALUATION, is_done, success_of, train_student
 
@@ -164,18 +172,22 @@ def sweep(
     results = []
     for student in students:
         folder = out / student.name
-        if is_done(student, folder):
-            results.append(
-                {
-                    "student": student.name,
-                    "status": "there already",
-                    "success": success_of(read_json(folder / EVALUATION)),
-                }
-            )
-            continue
-        with progress_bar() as progress:
-            done = train_student(student, folder, device=device, episodes=episodes, progress=progress)
-        results.append({"student": student.name, "status": done.result.status, "success": done.success})
+        with ExitStack() as held:
+            try:
+                held.enter_context(lock_folder(out / ".taken" / student.name, wait=False))
+            except UsageError:
+                results.append({"student": student.name, "status": "at another process", "success": None})
+                continue
+            if is_done(student, folder, stop_at):
+                status, success = "there already", success_of(read_json(folder / EVALUATION))
+            else:
+                with progress_bar() as progress:
+                    done = train_student(
+                        student, folder, device=device, episodes=episodes, evaluations=evaluations, stop_at=stop_at,
+                        progress=progress,
+                    )  # fmt: skip
+                status, success = done.result.status, done.success
+            results.append({"student": student.name, "status": status, "success": success})
     columns = {
         "student": "{0[student]}",
         "status": "{0[status]}",

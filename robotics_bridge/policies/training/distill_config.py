@@ -3,7 +3,7 @@
 Per entry of a sweep (task, hand, placements) there are the baseline ``none`` and the product of observation types,
 placements, resolutions and clean or noisy readings (thesis, table 4.10). Subsets: ``all``; ``types``, every type at the
 pinned resolution and noise; ``encoders``, the arms of tactile encoders there; or one type's name, all its resolutions
-and noise.
+and noise. A file may list ``[[students]]`` instead, each with its own settings; ``all`` is then that list.
 """
 
 from __future__ import annotations
@@ -186,7 +186,7 @@ PUBLISHED = Path(__file__).parents[1] / "sweeps" / "table-4.10.toml"
 SUBSETS = ("all", "types", "encoders")
 _KEYS = (
     "types", "extra_types", "resolutions", "noisy", "seeds", "variant", "teacher", "pinned", "encoders", "entries",
-    "settings",
+    "settings", "students",
 )  # fmt: skip
 _ENTRY = ("task", "hand", "placements", "iterations", "settings")
 
@@ -226,6 +226,8 @@ class StudentSweep:
     """Observation types of the subset ``encoders``."""
     arms: tuple[Mapping[str, Any], ...]
     """Encoder and its settings, for the subset ``encoders``."""
+    listed: tuple[Mapping[str, Any], ...] = ()
+    """Settings of every student of an entry and a seed, in place of the product."""
     variant: str = "default"
     """Configuration of the tasks."""
     teacher: str = "teachers/{task}-{hand}"
@@ -234,7 +236,9 @@ class StudentSweep:
     def students(self, subset: str = "all") -> list[DistillConfig]:
         """Return every student of a subset: ``all``, ``types``, ``encoders`` or an observation type."""
         every = (*self.types, *self.extra_types)
-        check_name("subset of the sweep", subset, (*SUBSETS, *every))
+        listed = {arm["observe"] for arm in self.listed if "observe" in arm}
+        choices = ("all", *sorted(listed)) if self.listed else (*SUBSETS, *every)
+        check_name("subset of the sweep", subset, choices)
         each = product(self.entries, self.seeds)
         students = [student for entry, seed in each for student in self._of_entry(entry, seed, subset, every)]
         if twice := repeats(student.name for student in students):
@@ -255,6 +259,9 @@ class StudentSweep:
                 )
                 for kind, placement, arm in product(self.encoder_types, entry.placements, self.arms)
             ]  # fmt: skip
+        if self.listed:
+            chosen = [arm for arm in self.listed if subset in ("all", arm.get("observe"))]
+            return [DistillConfig.of({**common, **arm}) for arm in chosen]
         types = every if subset in SUBSETS else (subset,)
         pin = subset == "types"
         resolutions = (self.pinned_resolution,) if pin else self.resolutions
@@ -277,19 +284,29 @@ class StudentSweep:
 
 
 def read_sweep(path: str | Path = PUBLISHED) -> StudentSweep:
-    """Read a sweep.
+    """Read a sweep: a file, or one that ships, by its name without ending.
 
     Raises:
         DataFileNotFoundError: there is no such file.
     """
-    document = read_toml(path, f"sweep (the published one is {PUBLISHED.name})")
+    shipped = PUBLISHED.parent / f"{path}.toml"
+    path = shipped if not Path(path).exists() and shipped.is_file() else path
+    document = read_toml(
+        path, f"sweep (shipped: {', '.join(sorted(one.stem for one in PUBLISHED.parent.glob('*.toml')))})"
+    )
     with readable(path, "sweep of students"):
         return _sweep(Path(path), document)
 
 
 def _sweep(path: Path, document: Mapping[str, Any]) -> StudentSweep:
     check_each("key of a sweep", document, _KEYS)
-    entries = tuple(_entry(item, document.get("settings", {})) for item in document.get("entries", ()))
+    listed = tuple(document.get("students", ()))
+    if listed and (
+        idle := sorted({"types", "extra_types", "resolutions", "noisy", "pinned", "encoders"} & set(document))
+    ):
+        raise UsageError(f"The sweep {path.name!r} lists its students one by one; leave out {listing(idle)}.")
+    settings = document.get("settings", {})
+    entries = tuple(_entry(item, settings, bool(listed)) for item in document.get("entries", ()))
     if not entries:
         raise UsageError(f"The sweep {str(path)!r} has no entries; each is a table [[entries]] with a task and a hand.")
     pinned, encoders = document.get("pinned", {}), document.get("encoders", {})
@@ -299,7 +316,7 @@ def _sweep(path: Path, document: Mapping[str, Any]) -> StudentSweep:
     sweep = StudentSweep(
         name=path.stem, entries=entries, pinned_resolution=pinned.get("resolution", "med"),
         pinned_noisy=pinned.get("noisy", False), encoder_types=tuple(encoders.get("types", ())),
-        arms=tuple(encoders.get("arms", ())),
+        arms=tuple(encoders.get("arms", ())), listed=listed,
         **{key: tuple(document[key]) for key in lists if key in document},
         **{key: document[key] for key in ("variant", "teacher") if key in document},
     )  # fmt: skip
@@ -312,17 +329,17 @@ def _sweep(path: Path, document: Mapping[str, Any]) -> StudentSweep:
         if "encoder" not in arm:
             raise UsageError(f"An arm of the sweep {path.name!r} names no 'encoder': {brief(dict(arm))}.")
     # Every student is made once, so that no value is found wrong in the middle of a sweep.
-    for subset in SUBSETS:
+    for subset in ("all",) if listed else SUBSETS:
         sweep.students(subset)
     return sweep
 
 
-def _entry(table: Mapping[str, Any], settings: Mapping[str, Any]) -> SweepEntry:
-    check_each("key of a sweep's entry", table, _ENTRY)
-    for key in ("task", "hand", "placements"):
+def _entry(table: Mapping[str, Any], settings: Mapping[str, Any], listed: bool) -> SweepEntry:
+    check_each("key of a sweep's entry", table, [key for key in _ENTRY if not (listed and key == "placements")])
+    for key in ("task", "hand") if listed else ("task", "hand", "placements"):
         if not table.get(key):
             raise UsageError(f"An entry of a sweep needs {key!r}; received {brief(dict(table))}.")
     combined = {**settings, **table.get("settings", {})}
     if "iterations" in table:
         combined["iterations"] = table["iterations"]
-    return SweepEntry(table["task"], table["hand"], tuple(table["placements"]), combined)
+    return SweepEntry(table["task"], table["hand"], tuple(table.get("placements", ())), combined)

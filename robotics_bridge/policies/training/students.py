@@ -112,8 +112,8 @@ def train_student(
     return Student(out, result, evaluate_student(out, env, episodes, result.iterations, progress, evaluations))
 
 
-def is_done(config: DistillConfig, out: Path) -> bool:
-    """Return whether a folder holds this very student, evaluated after its last iteration."""
+def is_done(config: DistillConfig, out: Path, stop_at: int | None = None) -> bool:
+    """Return whether a folder holds this very student, evaluated after its last iteration, or after ``stop_at``."""
     if not (out / EVALUATION).is_file():
         return False
     mine = config.resolved(tasks.load(config.task, config.variant).student)
@@ -122,7 +122,8 @@ def is_done(config: DistillConfig, out: Path) -> bool:
     settings = {**stored.encoder_settings, **mine.encoder_settings}
     mine = replace(mine, encoder_settings=settings, contacts=mine.contacts or stored.contacts)
     total = stored.iterations or 0
-    return mine == stored and all(item.get("iterations", total) >= total for item in read_json(out / EVALUATION))
+    wanted = min(total, stop_at or total)
+    return mine == stored and all(item.get("iterations", total) >= wanted for item in read_json(out / EVALUATION))
 
 
 def calibrated(config: DistillConfig, env: Any, teacher: Any, out: Path) -> DistillConfig:

@@ -8,6 +8,8 @@ from typer.testing import CliRunner
 
 from brainbench.cli import app
 from brainbench.core.errors import UsageError
+from brainbench.core.files import read_json
+from brainbench.core.writing.locks import lock_folder
 from robotics_bridge import hands
 from robotics_bridge.hands.layouts import write_probes
 from tests.factories.policy_commands import run_policy
@@ -32,6 +34,32 @@ def test_a_task_of_ones_own_is_trained_and_evaluated(tmp_path: Path, quick: Path
     senses = ("--observe", "agg_bool", "--placement", "tips", "--encoder", "mlp")
     words = ("--teacher", str(run), *senses, *student, "--out", str(tmp_path / "student"))
     assert json.loads(run_policy("distill", "quick", *words))["iterations"] == 1
+    tasks.forget("quick")
+    _sweep_that_two_processes_share(tmp_path, str(run), str(quick))
+
+
+def _sweep_that_two_processes_share(folder: Path, teacher: str, task: str) -> None:
+    from robotics_bridge import tasks
+
+    plan, out = folder / "plan.toml", folder / "students"
+    plan.write_text(
+        f'teacher = "{teacher}"\n[settings]\nnum_envs = 2\niterations = 2\n[[entries]]\ntask = "quick"\n'
+        'hand = "xhand1"\n[[students]]\nobserve = "none"\n[[students]]\nobserve = "none"\nembedder = "none"\n'
+    )
+    common = (str(plan), "--task-file", task, "--episodes", "2", "--seeds", "1", "--out", str(out), "--json")
+    names = json.loads(run_policy("sweep", *common, "--list"))
+    tasks.forget("quick")
+
+    def statuses(*words: str) -> list[str]:
+        rows = json.loads(run_policy("sweep", *common, *words))
+        tasks.forget("quick")
+        return [row["status"] for row in rows]
+
+    with lock_folder(out / ".taken" / names[0]):
+        assert statuses("--stop-at", "1") == ["at another process", "stopped"]
+    assert statuses("--stop-at", "1") == ["stopped", "there already"]
+    assert statuses() == ["finished", "finished"]
+    assert {len(read_json(out / name / "evaluation.json")) for name in names} == {1}
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,10 @@ from __future__ import annotations
 import pytest
 
 from brainbench.core.errors import DataError, UsageError
+from robotics_bridge import hands
+from robotics_bridge.hands.observations import OBSERVATIONS
 from robotics_bridge.policies.training.distill_config import PUBLISHED, DistillConfig, read_sweep
+from robotics_bridge.policies.training.student_files import build_student
 
 
 @pytest.mark.parametrize(
@@ -119,3 +122,41 @@ def test_students_of_every_subset_are_looked_at_when_a_sweep_is_read(tmp_path) -
         read_sweep(path)
     path.write_text(f'types = ["bool"]\n[settings]\nencoder = "rnn"\n{ENTRY}')
     assert [student.encoder for student in read_sweep(path).students()] == ["auto", "rnn"]
+
+
+def test_a_sweep_may_list_its_students_one_by_one(tmp_path) -> None:
+    path = tmp_path / "s.toml"
+    entry = ENTRY.replace('placements = ["tips"]\n', "")
+    some = '[[students]]\nobserve = "none"\n[[students]]\nobserve = "bool"\nplacement = "tips"\nhidden = [8, 8]\n'
+    path.write_text(f"seeds = [0, 1]\n[settings]\nnum_envs = 64\n{entry}{some}")
+    sweep = read_sweep(path)
+    assert [(s.observe, s.seed, s.num_envs, s.hidden[0]) for s in sweep.students()] == [
+        ("none", 0, 64, 512), ("bool", 0, 64, 8), ("none", 1, 64, 512), ("bool", 1, 64, 8),
+    ]  # fmt: skip
+    assert [s.seed for s in sweep.students("bool")] == [0, 1]
+    with pytest.raises(UsageError, match="did you mean 'bool'"):
+        sweep.students("bol")
+    for text, message in (
+        (f'types = ["bool"]\n{entry}{some}', r"lists its students one by one; leave out 'types'"),
+        (f"{ENTRY}{some}", "key of a sweep's entry 'placements'"),
+        (f'{entry}[[students]]\nobserv = "bool"\n', "did you mean 'observe'"),
+        (f"{entry}{some}{some}", "twice"),
+    ):
+        path.write_text(text)
+        with pytest.raises(UsageError, match=message):
+            read_sweep(path)
+
+
+def test_students_of_the_comparison_of_touch_have_equally_many_parameters() -> None:
+    sweep = read_sweep("placement-and-type")
+    students = [student for student in sweep.students() if student.seed == 0]
+    arms = {(student.observe, student.placement) for student in students if student.observe != "none"}
+    assert arms == {(kind, place) for kind in OBSERVATIONS if kind != "none" for place in ("hand", "tips")}
+    counts = []
+    for student in students:
+        shapes = {"proprio": (29,), "command": (1,)}
+        if student.tactile is not None:
+            shapes["tactile"] = student.tactile.build().shape
+        policy = build_student(student, shapes, list(shapes), len(hands.load("xhand1").joints) - 7)
+        counts.append(sum(weight.numel() for weight in policy.parameters() if weight.requires_grad))
+    assert max(counts) < 1.005 * min(counts)

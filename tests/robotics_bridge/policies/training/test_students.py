@@ -91,6 +91,8 @@ def test_a_student_is_done_once_the_very_one_was_evaluated_after_its_last_iterat
     for iterations, done in ((stored.iterations, True), (3, False)):
         write_json(tmp_path / "evaluation.json", [{"seed": 1000, "success": [0.0], "iterations": iterations}])
         assert is_done(config, tmp_path) is done
+    assert is_done(config, tmp_path, stop_at=3)
+    assert not is_done(config, tmp_path, stop_at=4)
     write_json(tmp_path / "evaluation.json", [{"seed": 1000, "success": [0.0]}])
     assert is_done(config, tmp_path)
     changes = ({"iterations": 3}, {"steps_per_env": 3}, {"contacts": "published"}, {"teacher": "runs/other"})
