@@ -76,6 +76,12 @@ class NetworkKey(NamedTuple):
         return ".".join(filter(None, (model, self.objective, self.variant)))
 
     @property
+    def family(self) -> str:
+        """Kind of its encoder: the ConvRNNs differ in their cells alone."""
+        stem = self.encoder.partition("-")[0]
+        return "ConvRNNs" if stem == "zhuang" else stem
+
+    @property
     def untrained(self) -> NetworkKey:
         """The same architecture as it is drawn."""
         return self._replace(objective="untrained", variant="")

@@ -5,7 +5,8 @@ two parts, which are added, with the degrees of freedom of Welch and Satterthwai
 
 - *training*: with three comparisons or more their variance over the comparisons; with fewer the variance over seeds,
   pooled over the networks of the same objectives that were trained more than once, or of all objectives where there are
-  none (of differences seed by seed where the two networks of a comparison begin from the same initial state);
+  none (of differences seed by seed where the two networks of a comparison begin from the same initial state), and where
+  a side is the mean of several networks the variance between them;
 - *test*: of accuracies the binomial variance over test sweeps, as if every network had its own; of fits the variance
   over animals and stimuli (:func:`brainbench.core.statistics.two_factor_error`).
 """
@@ -168,7 +169,12 @@ def _training(
     repeated = [item for item in pool if item.objective and len(item.seeds) > 1]
     same = [item for item in repeated if item.objective in objectives]
     variance, freedom = _pooled([list(item.seeds.values()) for item in same or repeated])
-    return variance * sum(weight**2 / len(item.seeds) for weight, item in trained), freedom
+    seeds = variance * sum(weight**2 / len(item.seeds) for weight, item in trained)
+    # A mean over several networks speaks of networks like these, so the spread between them counts.
+    sides = [side for item in comparisons for side in (item.one, item.other) if len(side) > 1]
+    means = [[member.value for member in side] for side in sides]
+    between = sum(float(np.var(values, ddof=1)) / len(values) for values in means) / count**2
+    return (between, sum(map(len, means)) - len(means)) if between > seeds else (seeds, freedom)
 
 
 def _pooled(groups: Sequence[Sequence[float]]) -> tuple[float, float]:

@@ -94,7 +94,7 @@ def _spread(values: NDArray[np.float64]) -> NDArray[np.float64]:
     return (np.where(finite, values - mean, 0.0) ** 2).sum(axis=-1)
 
 
-def wilson_interval(successes: float, count: int, *, over: str = "trials") -> Interval:
+def wilson_interval(successes: float, count: int, *, over: str = "trials", level: float = LEVEL) -> Interval:
     """Return Wilson's score interval of a proportion of independent trials (Wilson 1927)."""
     from scipy.special import ndtri
 
@@ -103,11 +103,11 @@ def wilson_interval(successes: float, count: int, *, over: str = "trials") -> In
     # A share times a count may lie beyond by its last digit.
     if not -1e-9 <= successes <= count + 1e-9:
         raise UsageError(f"Of {count:,} observations {successes} cannot be successes.")
-    z = float(ndtri(0.5 + LEVEL / 2))
+    z = float(ndtri(0.5 + level / 2))
     share = min(max(successes / count, 0.0), 1.0)
     middle = (share + z * z / (2 * count)) / (1 + z * z / count)
     half = z / (1 + z * z / count) * math.sqrt(share * (1 - share) / count + z * z / (4 * count * count))
-    return Interval(max(0.0, middle - half), min(1.0, middle + half), LEVEL, f"Wilson score over {count} {over}")
+    return Interval(max(0.0, middle - half), min(1.0, middle + half), level, f"Wilson score over {count} {over}")
 
 
 CONFOUNDED = 0.1
