@@ -111,7 +111,7 @@ def _tables(file: h5py.File, path: Path) -> tuple[dict[str, SessionTable], dict[
                 units[place] = _with_areas(_table(group, "units", path), group)
             continue
         if kind == _SIGNAL:
-            signals |= {place: replace(_one_series(group), name=place)}
+            signals |= {place: replace(_one_series(group), name=place, columns=_cells(group))}
             continue
         if name in intervals:
             name = place.partition("/")[2] if place.count("/") > 1 else place
@@ -146,6 +146,23 @@ def _with_areas(units: SessionTable, group: h5py.Group) -> SessionTable:
 
 _SIGNAL = "RoiResponseSeries"
 """Type of the responses of imaged cells."""
+
+
+def _cells(group: h5py.Group) -> dict[str, Any]:
+    """Return what the plane segmentation of a signal says of its cells: ``iscell``, and the area of the plane."""
+    rois, columns = group.get("rois"), {}
+    try:
+        plane = group.file[rois.attrs["table"]]  # pyright: ignore[reportOptionalMemberAccess]
+        rows = np.asarray(rois[...], dtype=np.int64).ravel()  # pyright: ignore[reportOptionalSubscript]
+        if "iscell" in plane:
+            # Suite2p keeps the probability beside it.
+            flags = np.asarray(plane["iscell"][...], dtype=np.float64)
+            columns["iscell"] = flags.reshape(len(flags), -1)[rows, 0]
+        if "imaging_plane/location" in plane:
+            columns["area"] = np.full(len(rows), _string(plane, "imaging_plane/location"))
+    except (AttributeError, KeyError, ValueError, TypeError, IndexError):  # without a plane every column is a cell
+        return {}
+    return columns if len(rows) == group["data"].shape[-1] else {}
 
 
 def _walk(parent: h5py.Group, path: Path, place: str = "") -> Iterator[tuple[str, Any]]:
@@ -225,7 +242,7 @@ def _groups(parent: Any) -> list[tuple[str, h5py.Group]]:
     return groups
 
 
-def _string(file: h5py.File, name: str) -> str:
+def _string(file: h5py.Group, name: str) -> str:
     values = _words(file.get(name), lower=False)
     return values[0].strip() if values else ""
 

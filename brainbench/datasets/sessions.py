@@ -230,6 +230,8 @@ class Series:
     """[samples] s, or None for regular sampling from ``start`` at ``rate``."""
     start: float = 0.0
     rate: float = math.nan
+    columns: Mapping[str, Any] = field(default_factory=dict)
+    """What is known of each column of the samples, such as whether it is a cell: name → [units]."""
 
     @property
     def gigabytes(self) -> float:

@@ -17,7 +17,7 @@ from brainbench.datasets.ledger import Ledger
 from brainbench.datasets.sessions import OBSERVED, SPIKES, Series, Session, SessionTable
 from brainbench.datasets.trials.conditions import Conditions, joined_labels
 from brainbench.datasets.trials.selection import Selection, Tally
-from brainbench.datasets.trials.signals import frame_times, response_series, window_means
+from brainbench.datasets.trials.signals import fading, frame_times, response_series, window_means
 from brainbench.datasets.trials.windows import CONTACTS, Window
 
 COVARIATES = ("contacts", "licks", "choice")
@@ -167,7 +167,59 @@ def count_session(
         keep = tally.apply(keep, ~overlap, "trials: overlap with invalid_times")
 
     if series is not None:
-        return _count_signal(session, series, options, table, values, labels, keep, edges, tally)
+        part = _signal_responses(session, series, table, options, edges, keep, tally)
+    else:
+        part = _spike_responses(session, table, options, edges, keep, tally, look)
+    rows, ids = part.rows, as_labels(table.ids())
+    names = ("subject", "session", "source", "synthetic", "stimuli", "guessed")
+    _enter_tables(part.ledger, session, options.conditions.table)
+    return SessionCounts(
+        **{name: getattr(session, name) for name in names},
+        **{name: value for name, value in vars(part).items() if name != "rows"},
+        values=tuple(tuple(values[row].tolist()) for row in rows),
+        labels=tuple(labels[rows].tolist()),
+        trial_ids=tuple(ids[rows].tolist()),
+        edges=edges[rows],
+        covariates=trial_covariates(session, table, rows, edges[rows]),
+        tally=tally,
+        trials=len(table),
+        forms=options.conditions.forms(table),
+        found_labels=frozenset(labels.tolist()) - {""},
+    )
+
+
+@dataclass(frozen=True)
+class _Responses:
+    """What spikes and signals differ in: the responses of the trials and units that are left."""
+
+    rows: NDArray[np.int64]
+    """[R] rows of the table of trials, in order."""
+    unit_ids: tuple[str, ...]
+    counts: NDArray[np.float32]
+    duration: NDArray[np.float64]
+    columns: dict[str, NDArray[Any]]
+    units: int
+    """Units in the file before any rule."""
+    ledger: Ledger
+    measure: str = "spikes"
+
+
+def _in_order(table: SessionTable, keep: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Return the rows that are kept by start time, then id, so that the order of rows in the file changes nothing."""
+    start, ids = table.times("start_time"), as_labels(table.ids())
+    return _sorted(keep, lambda row: (start[row], natural_key(ids[row])))
+
+
+def _spike_responses(
+    session: Session,
+    table: SessionTable,
+    options: ReadingOptions,
+    edges: NDArray[np.float64],
+    keep: NDArray[np.bool_],
+    tally: Tally,
+    look: Callable[[Session, Sequence[NDArray[np.float64]]], str] | None,
+) -> _Responses:
+    """Count the spikes in the windows of the trials that rules keep [rows]."""
     assert session.units is not None
     spikes = read_spikes(session.units, tally.doubts)
     if fault := time_fault(spikes, table):
@@ -178,57 +230,26 @@ def count_session(
     covered, unit_kept = _coverage(session.units, spikes, edges, options.selection, tally)
     keep = tally.apply(keep, covered.any(axis=1), "trials: outside the recorded span")
     unit_kept = tally.apply(unit_kept, covered[keep].any(axis=0) | ~keep.any(), "units: recorded in no kept trial")
-
-    # Trials by start time, then id, and units by id, so that the order of rows in the file changes nothing. Equal ids
-    # of units (several probes) are told apart by number of spikes and first spike.
-    start, ids, unit_ids = table.times("start_time"), as_labels(table.ids()), as_labels(session.units.ids())
-    rows = _sorted(keep, lambda row: (start[row], natural_key(ids[row])))
+    # Units by id. Equal ids (several probes) are told apart by number of spikes and first spike.
+    rows, unit_ids = _in_order(table, keep), as_labels(session.units.ids())
     units = _sorted(unit_kept, lambda unit: (natural_key(unit_ids[unit]), len(spikes[unit]), spikes[unit][:1].tolist()))
-    counts, duration = count(
-        [spikes[unit] for unit in units], edges[rows], covered[np.ix_(rows, units)], options.bin, options.window.length
-    )
+    used, seen = [spikes[unit] for unit in units], covered[np.ix_(rows, units)]
+    counts, duration = count(used, edges[rows], seen, options.bin, options.window.length)
     ledger = Ledger()
-    _enter_tables(ledger, session, options.conditions.table)
-    used = [spikes[unit] for unit in units]
-    _enter_spikes(ledger, spikes, used, edges[rows], covered[np.ix_(rows, units)], counts)
-    return SessionCounts(
-        subject=session.subject,
-        session=session.session,
-        source=session.source,
-        values=tuple(tuple(values[row].tolist()) for row in rows),
-        labels=tuple(labels[rows].tolist()),
-        trial_ids=tuple(ids[rows].tolist()),
-        unit_ids=tuple(unit_ids[units].tolist()),
-        edges=edges[rows],
-        counts=counts,
-        duration=duration,
-        columns={
-            name: _unit_column(session.units, name, kind, units, tally.notes) for name, kind in UNIT_COLUMNS.items()
-        },
-        covariates=trial_covariates(session, table, rows, edges[rows]),
-        tally=tally,
-        trials=len(table),
-        units=len(session.units),
-        synthetic=session.synthetic,
-        stimuli=session.stimuli,
-        guessed=session.guessed,
-        forms=options.conditions.forms(table),
-        ledger=ledger,
-        found_labels=frozenset(labels.tolist()) - {""},
-    )
+    _enter_spikes(ledger, spikes, used, edges[rows], seen, counts)
+    columns = {name: _unit_column(session.units, name, kind, units, tally.notes) for name, kind in UNIT_COLUMNS.items()}
+    return _Responses(rows, tuple(unit_ids[units].tolist()), counts, duration, columns, len(session.units), ledger)
 
 
-def _count_signal(
+def _signal_responses(
     session: Session,
     series: Series,
-    options: ReadingOptions,
     table: SessionTable,
-    values: NDArray[np.str_],
-    labels: NDArray[np.str_],
-    keep: NDArray[np.bool_],
+    options: ReadingOptions,
     edges: NDArray[np.float64],
+    keep: NDArray[np.bool_],
     tally: Tally,
-) -> SessionCounts:
+) -> _Responses:
     """Average a sampled signal over the windows of the trials that rules keep [rows]; negative values are values.
 
     Responses stand in the counts as mean × s, so that whoever divides by the duration gets the mean.
@@ -236,11 +257,10 @@ def _count_signal(
     times = frame_times(series)
     step = float(np.median(np.diff(times))) if len(times) > 1 else math.nan
     number = 1 if series.data.ndim == 1 else series.data.shape[1]
-    cells = SessionTable("cells", {"id": np.arange(number)}, session.source)
+    cells = SessionTable("cells", {"id": np.arange(number), **series.columns}, session.source)
     inside = (edges[:, 0] >= times[0] - step) & (edges[:, 1] <= times[-1] + step)
     keep = tally.apply(keep, inside, "trials: outside the recorded span")
-    start, ids = table.times("start_time"), as_labels(table.ids())
-    rows = _sorted(keep, lambda row: (start[row], natural_key(ids[row])))
+    rows = _in_order(table, keep)
     _, duration = count([], edges[rows], np.zeros((len(rows), 0), dtype=bool), options.bin, options.window.length)
     shortest = float(duration[duration > 0].min(initial=math.inf))
     if shortest < step:
@@ -251,34 +271,16 @@ def _count_signal(
     bounds = edges[rows][:, :1] + np.concatenate([np.zeros((len(rows), 1)), np.cumsum(duration, axis=1)], axis=1)
     means = window_means(series, times, bounds)
     unit_kept = tally.select(cells, options.selection.units, "units")
+    if "iscell" in cells:
+        unit_kept = tally.apply(unit_kept, cells.times("iscell") > 0, "units: no cell (iscell)")
     unit_kept = tally.apply(unit_kept, np.isfinite(means).any(axis=(0, 1)), "units: no finite frame in any window")
     units = np.flatnonzero(unit_kept)
-    ledger = Ledger()
-    _enter_tables(ledger, session, options.conditions.table)
-    return SessionCounts(
-        subject=session.subject,
-        session=session.session,
-        source=session.source,
-        values=tuple(tuple(values[row].tolist()) for row in rows),
-        labels=tuple(labels[rows].tolist()),
-        trial_ids=tuple(ids[rows].tolist()),
-        unit_ids=tuple(map(str, units.tolist())),
-        edges=edges[rows],
-        counts=(means[:, :, units] * duration[:, :, None]).astype(np.float32),
-        duration=duration,
-        columns={name: missing_column(kind, len(units)) for name, kind in UNIT_COLUMNS.items()},
-        covariates=trial_covariates(session, table, rows, edges[rows]),
-        tally=tally,
-        trials=len(table),
-        units=len(cells),
-        synthetic=session.synthetic,
-        stimuli=session.stimuli,
-        guessed=session.guessed,
-        forms=options.conditions.forms(table),
-        ledger=ledger,
-        found_labels=frozenset(labels.tolist()) - {""},
-        measure=f"{series.name} ({series.kind})",
-    )
+    counts = (means[:, :, units] * duration[:, :, None]).astype(np.float32)
+    if doubt := fading(means[:, :, units]):
+        tally.doubts.append(f"{series.name} of {session.source}: {doubt}")
+    columns = {name: _unit_column(cells, name, kind, units, tally.notes) for name, kind in UNIT_COLUMNS.items()}
+    measure = f"{series.name} ({series.kind})"
+    return _Responses(rows, tuple(map(str, units.tolist())), counts, duration, columns, number, Ledger(), measure)
 
 
 def _enter_tables(ledger: Ledger, session: Session, conditions: str) -> None:

@@ -54,3 +54,24 @@ def window_means(series: Series, times: Floats, bounds: Floats) -> NDArray[np.fl
         number = finite.sum(axis=0)
         means[row, column] = np.divide(total, number, out=np.full(len(number), np.nan), where=number > 0)
     return means
+
+
+def fading(means: NDArray[np.float32]) -> str:
+    """Return a doubt where the responses [R, T, U] of trials in order of time drift, as where an indicator bleaches."""
+    finite = np.isfinite(means)
+    number = finite.sum(axis=(1, 2))
+    course = np.where(finite, means, 0.0).sum(axis=(1, 2), dtype=np.float64)[number > 0] / number[number > 0]
+    if len(course) < FEWEST_TRIALS or not np.ptp(course):
+        return ""
+    r = float(np.corrcoef(course, np.arange(len(course)))[0, 1])
+    if r * r < DRIFT:
+        return ""
+    return (
+        f"the mean over cells {'rises' if r > 0 else 'falls'} over the session (time explains {r * r:.0%} of its "
+        "variance), as where an indicator bleaches; take ΔF/F of a running baseline"
+    )
+
+
+FEWEST_TRIALS, DRIFT = 12, 0.5
+"""Trials from which a drift is looked for, and the share of the variance over trials from which it is one: without
+drift it is 1 / (R − 1), and .5 or more in one of 100 sessions of 12 trials."""

@@ -4,6 +4,7 @@ import pytest
 
 from brainbench.core.errors import DataError
 from brainbench.datasets import open_recordings, write_recordings
+from brainbench.datasets.trials.signals import fading
 from tests.factories.recording_files import write_nwb
 
 SERIES = "processing/ophys/DfOverF/dff"
@@ -79,3 +80,33 @@ def test_of_several_signals_the_only_dff_is_read_and_others_are_asked_for(tmp_pa
     imaged(path, np.ones((70, 3)), place="processing/ophys/DfOverF/second")
     with pytest.raises(DataError, match="several signals"):
         means(path)
+
+
+def segmented(path, iscell):
+    with h5py.File(path, "a") as file:
+        plane = file.create_group("processing/ophys/ImageSegmentation/plane")
+        plane["id"], plane["iscell"] = np.arange(len(iscell)), iscell
+        file["general/optophysiology/plane/location"] = "S1 barrel field"
+        plane["imaging_plane"] = h5py.SoftLink("/general/optophysiology/plane")
+        rois = file[SERIES].create_dataset("rois", data=np.array([2, 1, 0]))
+        rois.attrs["table"] = plane.ref
+    return path
+
+
+def test_what_is_no_cell_is_left_out_and_cells_have_the_area_of_their_plane(tmp_path):
+    data = np.random.default_rng(0).normal(size=(70, 3))
+    path = segmented(imaged(tmp_path / "a.nwb", data), [[1.0, 0.9], [1.0, 0.8], [0.0, 0.1]])
+    opened, values = means(path)
+    assert opened["unit_id"].values.tolist() == ["1", "2"]
+    assert set(opened["area"].values.tolist()) == {"S1 barrel field"}
+    assert opened.attrs["removed"]["units: no cell (iscell)"] == 1
+    np.testing.assert_allclose(values[0, 0], data[:5, 1:].mean(axis=0), rtol=1e-5)
+
+
+def test_responses_that_fade_over_the_session_are_doubted():
+    random = np.random.default_rng(0)
+    steady = random.normal(size=(40, 1, 20)).astype(np.float32)
+    assert fading(steady) == ""
+    assert fading(steady[:8]) == ""
+    steady[3] = np.nan
+    assert "falls over the session" in fading(steady - 0.05 * np.arange(40, dtype=np.float32)[:, None, None])
