@@ -68,8 +68,10 @@ def simulate(
         channel] (float32; N, N·m; action of the whisker on its base, about the base point, axes as the frames say) with
         ``contact`` [stimulus, time, whisker], ``contact_arc`` (m along the whisker, NaN without contact),
         ``first_contact`` (s, when the first reading with contact was taken; NaN without), ``penetration`` (m, deepest
-        overlap; a poor contact when large), ``status`` and ``reason`` [stimulus, whisker]. From the instant a whisker
-        became ``unstable`` its numbers are NaN. Attributes say how frames were made (``readout``), their ``axes`` and
+        overlap; a poor contact when large), ``error`` (estimated, as a share of force or moment; NaN where it is not),
+        ``damping`` (ratio of the first mode), ``status``, ``reason``, ``remark`` [stimulus, whisker]. The remark says
+        that an error is beyond what the fidelity promises. From the instant a whisker became ``unstable`` its numbers
+        are NaN. Attributes say how frames were made (``readout``), their ``axes`` and
         how many components were clipped in each stimulus (``clipped``). The attribute ``config_hash`` names what was
         asked for and is equal on every machine; ``content_hash`` names the numbers, whose last digits depend on the
         processor. :meth:`brainbench.stimuli.explain.Explanation.of` reads what was simulated, shared and left out.
@@ -131,7 +133,7 @@ def resolve(
     backend: WhiskerEngine | str, fidelity: Fidelity | str | None, scenes: Iterable[Scene]
 ) -> tuple[WhiskerEngine, Fidelity]:
     """Return the engine of some scenes, and the fidelity with whether their whiskers twist."""
-    engine = get_engine(backend) if isinstance(backend, str) else backend
+    engine = get_engine(backend, errors=True) if isinstance(backend, str) else backend
     return engine, Fidelity.of(fidelity).resolved(engine.twists and any(scene.twist for scene in scenes))
 
 
@@ -225,6 +227,8 @@ def _assemble(
     meanings = {
         "contact_arc": {"units": "m", "long_name": "arc length of the force-weighted contact point"},
         "first_contact": {"units": "s", "long_name": "time of the first reading with contact"},
+        "error": {"units": "1", "long_name": "estimated error of base force or moment, as a share of it"},
+        "damping": {"units": "1", "long_name": "damping ratio of the first mode that the time steps leave"},
         "penetration": {"units": "m", "long_name": "deepest overlap of whisker and object"},
     }
     dataset = new_stimulus_set(
@@ -239,6 +243,9 @@ def _assemble(
             "penetration": (grid, of("penetration", np.float32), meanings["penetration"]),
             "status": (grid, of("status")),
             "reason": (grid, of("reason")),
+            "remark": (grid, of("remark")),
+            "error": (grid, of("error", np.float32), meanings["error"]),
+            "damping": (grid, of("damping", np.float32), meanings["damping"]),
         },
         {
             "array": text({**about, "hash": content_hash([scene.mounts for scene in scenes])}),

@@ -35,7 +35,7 @@ from brainbench.core.errors import BrainbenchError, check_each, unknown_name
 from brainbench.core.tradeoffs import TradeoffPoint
 from brainbench.geometry import DecompositionSettings
 from brainbench.stimuli.engines import get_engine
-from brainbench.stimuli.engines.fidelity import DEFAULT_ENGINE, RESOLUTION, SHARES, Fidelity, list_presets
+from brainbench.stimuli.engines.fidelity import DEFAULT_ENGINE, RESOLUTION, Fidelity, list_presets
 from brainbench.stimuli.engines.reach import touched
 from brainbench.stimuli.motion.jobs import Job, Trace
 from brainbench.stimuli.objects.obstacle import Obstacle
@@ -57,6 +57,8 @@ CONTACT_TOLERANCES = (1e-6, None)
 """Tolerances of contact forces; None for few iterations."""
 COLLISIONS = ("exact", "decomposition-0.02", "decomposition-0.1", "hull")
 """Collision geometries of the concave object; a decomposition with its threshold."""
+SHARES = {0.5: "error_50", 0.9: "error_90", 0.95: "error_95"}
+"""Shares of whiskers, and the column of the table with the relative error that they stay below."""
 ERROR = SHARES[0.9]
 """Column that settings are ranked by."""
 SEED = 0
@@ -179,7 +181,7 @@ def _fields(setting: SimulationSetting) -> Row:
 
 
 def _setting(row: Mapping[str, Any]) -> SimulationSetting:
-    fidelity = Fidelity(**{item.name: row[item.name] for item in fields(Fidelity)})
+    fidelity = Fidelity(**{item.name: row.get(item.name, item.default) for item in fields(Fidelity)})
     return SimulationSetting(fidelity, row["backend"], row.get("collision"))
 
 
@@ -224,7 +226,7 @@ def _measure(setting: SimulationSetting) -> Row:
 
 def run_for_cost(setting: SimulationSetting, jobs: Sequence[Job]) -> tuple[list[Trace], float]:
     """Return the traces of jobs on one thread, and processor seconds per simulated second of a whisker."""
-    engine = get_engine(setting.backend)
+    engine = get_engine(setting.backend, errors=setting.fidelity.error is not None)
     fidelity = setting.fidelity.resolved(engine.twists)
     # What an engine loads or compiles at first use is no cost of the setting.
     engine.run([replace(job, times=job.times[:2]) for job in jobs], fidelity, workers=1)

@@ -37,9 +37,10 @@ def simulate(
     explanation = Explanation.of(dataset) if explain else None
     if out is not None:
         write_stimulus_set(dataset, out)
-    unstable = _unstable(dataset)
+    unstable, inexact = _whiskers(dataset, "reason"), _whiskers(dataset, "remark")
     data: dict[str, Any] = {
-        "content_hash": dataset.attrs["content_hash"], "stimuli": _summary(dataset), "unstable": unstable, "path": out,
+        "content_hash": dataset.attrs["content_hash"], "stimuli": _summary(dataset), "unstable": unstable,
+        "inexact": inexact, "path": out,
     }  # fmt: skip
     whiskers_in_all = dataset.sizes["whisker"]
     columns = {
@@ -47,43 +48,55 @@ def simulate(
         "whiskers touched": lambda row: f"{len(row['whiskers_touched'])} of {whiskers_in_all}",
         "peak force mN": "{0[peak_force_mN]:.3g}",
         "peak moment µN·m": "{0[peak_moment_uNm]:.3g}",
+        "error, median": lambda row: _percent(row["error_median"]),
+        "largest": lambda row: _percent(row["error_largest"]),
     }
     text = table_of(description, data["stimuli"], columns)
-    if unstable:
-        text += "\n\n" + table_of(
-            f"{len(unstable)} whiskers cannot be trusted; their numbers are missing, and networks refuse the set",
-            unstable, {"stimulus": "{0[stimulus]}", "whisker": "{0[whisker]}", "reason": "{0[reason]}"},
-        )  # fmt: skip
+    for some, key, words in (
+        (unstable, "reason", "cannot be trusted; their numbers are missing, and networks refuse the set"),
+        (inexact, "remark", "may err by more than is promised"),
+    ):
+        if some:
+            columns = {"stimulus": "{0[stimulus]}", "whisker": "{0[whisker]}", key: f"{{0[{key}]}}"}
+            text += "\n\n" + table_of(f"{len(some)} whiskers {words}", some, columns)
     if explanation is not None:
         data["explanation"] = explanation
         text += f"\n\n{explanation}"
     return Output(data, text + ("" if out is None else f"\n\nstimuli  {out}"))
 
 
-def _unstable(dataset: Any) -> list[dict[str, str]]:
-    """Return the whiskers whose numbers cannot be trusted, and why."""
+def _percent(share: float | None) -> str:
+    return "not estimated" if share is None else f"{share:.1%}"
+
+
+def _whiskers(dataset: Any, words: str) -> list[dict[str, str]]:
+    """Return the whiskers that have words of a kind, ``reason`` or ``remark``, with them."""
     import numpy as np
 
-    bad = dataset["status"].values != "ok" if "status" in dataset else np.zeros((0, 0), bool)
+    bad = dataset[words].values != "" if words in dataset else np.zeros((0, 0), bool)
     return [
         {
             "stimulus": str(dataset["stimulus"].values[i]),
             "whisker": str(dataset["whisker"].values[j]),
-            "reason": str(dataset["reason"].values[i, j]),
+            words: str(dataset[words].values[i, j]),
         }
         for i, j in np.argwhere(bad)
     ]
 
 
 def _summary(dataset: Any) -> list[dict[str, Any]]:
-    """Return, per stimulus, who touched and the largest force and moment."""
+    """Return, per stimulus, who touched, the largest force and moment, and the errors of those that touched."""
     import numpy as np
 
     wrench = dataset["wrench"].values
     # Frames after a whisker became unstable are NaN; the rest of the set still has peaks.
     force = np.nanmax(np.linalg.norm(wrench[..., :3], axis=-1), axis=(1, 2), initial=0.0) * 1e3
     moment = np.nanmax(np.linalg.norm(wrench[..., 3:], axis=-1), axis=(1, 2), initial=0.0) * 1e6
-    touched = np.asarray(dataset["contact"].values.any(axis=1)).tolist()
+    touching = np.asarray(dataset["contact"].values.any(axis=1))
+    touched = touching.tolist()
+    # Sets that were made before errors were estimated have none.
+    error = dataset["error"].values if "error" in dataset else np.full(touching.shape, np.nan)
+    errors = [values[hits & ~np.isnan(values)] for values, hits in zip(error, touching, strict=True)]
     names = [str(name) for name in dataset["whisker"].values]
     labels = [str(label) for label in dataset["stimulus"].values]
     return [
@@ -92,8 +105,10 @@ def _summary(dataset: Any) -> list[dict[str, Any]]:
             "whiskers_touched": [name for name, hit in zip(names, hits, strict=True) if hit],
             "peak_force_mN": float(peak),
             "peak_moment_uNm": float(bend),
+            "error_median": float(np.median(some)) if some.size else None,
+            "error_largest": float(some.max()) if some.size else None,
         }
-        for label, hits, peak, bend in zip(labels, touched, force, moment, strict=True)
+        for label, hits, peak, bend, some in zip(labels, touched, force, moment, errors, strict=True)
     ]
 
 

@@ -227,7 +227,7 @@ class _Evaluator:
         key = values.tobytes()
         if key not in self._kept:
             some = [self.search.changed(scene, self.names, values) for scene in self.scenes]
-            dataset = simulate(some, fidelity=self.fidelity, backend=self.backend, cache=False)
+            dataset = simulate(some, fidelity=self.fidelity, backend=get_engine(self.backend), cache=False)
             sound = bool((dataset["status"].values == "ok").all())
             self._kept[key] = [network.features(dataset) for network in self.networks] if sound else None
         return self._kept[key]

@@ -33,13 +33,16 @@ def list_engines() -> tuple[str, ...]:
     return tuple(sorted({*_ENGINES, *(name for name, part in optional_parts(_GROUP).items() if part.present)}))
 
 
-def get_engine(name: str, *, device: str | None = None, retry: int | None = None) -> WhiskerEngine:
+def get_engine(
+    name: str, *, device: str | None = None, retry: int | None = None, errors: bool | None = None
+) -> WhiskerEngine:
     """Return the engine called ``name``.
 
     Args:
         name: one of :func:`list_engines`.
         device: ``cpu`` or ``cuda``; the engine's own choice when None.
-        retry: as :attr:`WhiskerEngine.retry`; the engine's own choice when None.
+        retry, errors: as :attr:`WhiskerEngine.retry` and :attr:`WhiskerEngine.errors`; the engine's own choice when
+            None.
     """
     if name in _ENGINES:
         module, symbol = _ENGINES[name]
@@ -50,5 +53,5 @@ def get_engine(name: str, *, device: str | None = None, retry: int | None = None
         raise unknown_name("backend", name, list_engines())
     if device is not None and device not in engine.devices:
         raise UsageError(f"The backend {name!r} does not run on {device!r}; it runs on {listing(engine.devices)}.")
-    options = {"device": device, "retry": retry}
+    options = {"device": device, "retry": retry, "errors": errors}
     return engine(**{key: value for key, value in options.items() if value is not None})

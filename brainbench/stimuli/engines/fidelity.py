@@ -10,7 +10,7 @@ import math
 from dataclasses import dataclass, field, replace
 from functools import cache
 from importlib import resources
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from brainbench.core.errors import UsageError, brief, check_name
 from brainbench.core.limits import Limit, Positive, limited
@@ -19,6 +19,9 @@ from brainbench.core.reading.ranges import check_number
 from brainbench.core.tradeoffs import TradeoffPoint, cheapest
 from brainbench.stimuli.whiskers.chain import Chain
 from brainbench.stimuli.whiskers.whisker import Whisker
+
+if TYPE_CHECKING:
+    from brainbench.stimuli.motion.jobs import Job
 
 DEFAULT_ENGINE = "rod"
 """Engine of whatever does not ask for one; it needs no GPU."""
@@ -56,6 +59,11 @@ class Fidelity:
     precision. None: only few iterations, as always before there was this option; with friction this alone changes force
     and moment of some whiskers by several per cent. ``bullet`` solves them to 1e-9 in any case."""
 
+    error: Positive | None = field(default=None, metadata={"later": True})
+    """Estimated error (:attr:`brainbench.stimuli.motion.jobs.Trace.error`) that is promised to each whisker: those
+    beyond it are simulated again with more links and shorter steps, and those still beyond it have a remark. None:
+    nothing is simulated again, and beyond :data:`.error_estimates.LARGEST_ERROR` whiskers have a remark."""
+
     def __post_init__(self) -> None:
         if self.precision == "single" and (self.contact_tolerance or 1) < FINEST_SINGLE:
             raise UsageError(
@@ -88,17 +96,14 @@ class Fidelity:
         return with_changes(chosen, changes)
 
     @classmethod
-    def auto(cls, *, error: float = 0.1, share: float = 0.9, backend: str = DEFAULT_ENGINE) -> Fidelity:
-        """Return the cheapest measured setting with which a share of the whiskers err by at most ``error``.
+    def auto(cls, *, error: float = 0.1, backend: str = DEFAULT_ENGINE) -> Fidelity:
+        """Return a fidelity that promises each whisker an estimated error of at most ``error``.
 
-        Measured were mouse and rat whiskers that whisk at 5 to 20 Hz against posts, balls, edges and hollows with
-        friction 0 to .8 (:mod:`brainbench.stimuli.validation.contact_scenes`): relative error of base force or moment,
-        root mean square over the time. A setting is taken when the measured share stays below :data:`MARGIN` of
-        ``error``, so that other scenes keep the promise (benchmarks/RESULTS.md, "Settings chosen for an error"). As
-        text: ``auto=0.1``.
+        It begins with the cheapest measured setting with which half of the whiskers in random contacts err by no more;
+        an engine simulates those again, finer, whose own estimate is larger (:attr:`error`). As text: ``auto=0.1``.
         """
         check_number("error (0.05 = 5 %)", error, above=0)
-        return cls(**cheapest(measured(backend, share), error).settings)
+        return cls(**cheapest(measured(backend), error).settings, error=error)
 
     def resolved(self, twist: bool) -> Fidelity:
         """Return this fidelity with ``twist`` where it leaves that open."""
@@ -112,13 +117,26 @@ class Fidelity:
 
     def step_of(self, chain: Chain) -> float:
         """Return the time step [s] of a chain."""
-        return self.step(float(chain.frequencies()[0]) / (2 * math.pi))
+        return self.step(float(chain.frequencies()[0]) / (2 * math.pi), chain.whisker.damping_ratio)
 
-    def step(self, frequency: float) -> float:
-        """Return the time step [s] of a whisker whose first mode has this frequency [Hz]."""
+    def step(self, frequency: float, damping_ratio: float = math.inf) -> float:
+        """Return the time step [s] of a whisker whose first mode has this frequency [Hz] and is to ring with a ratio.
+
+        A step of h damps a mode ω by ω h/2 by itself, so that no step is longer than what the ratio leaves.
+        """
         if self.steps_per_period is None or self.solver == "quasistatic":
             return self.time_step
-        return min(self.time_step, 1 / (self.steps_per_period * frequency))
+        least = math.pi / max(damping_ratio, LEAST_DAMPING)
+        return min(self.time_step, 1 / (max(self.steps_per_period, least) * frequency))
+
+    def damping_of(self, job: Job) -> float:
+        """Return the damping ratio with which a whisker's first mode rings; NaN without inertia."""
+        if self.solver == "quasistatic":
+            return math.nan
+        chain, between = self.chain(job.whisker), job.spacing
+        step = self.step_of(chain)
+        # Readings end a step.
+        return chain.achieved_damping_ratio(step if between == math.inf else between / math.ceil(between / step - 1e-3))
 
     def link_count(self, arc_length: float) -> int:
         """Return the number of links of a whisker of this arc length [m]; too many are a :class:`UsageError`."""
@@ -135,10 +153,8 @@ class Fidelity:
 
 FINEST_SINGLE = 1e-6
 """Least ``contact_tolerance`` in single precision, whose rounding is not far below it."""
-SHARES = {0.5: "error_50", 0.9: "error_90", 0.95: "error_95"}
-"""Shares of whiskers, and the column of the table with the relative error that they stay below."""
-MARGIN = 0.85
-"""Measured over promised error: the sample of scenes must not decide whether a promise holds."""
+LEAST_DAMPING = 0.05
+"""Damping ratio below which steps are not shortened to keep it; isolated whiskers have .11 to .17."""
 RESOLUTION = ("links", "links_per_mm", "time_step", "steps_per_period", "contact_tolerance")
 """Fields that the measured settings differ in."""
 
@@ -155,21 +171,19 @@ def list_presets() -> tuple[str, ...]:
 
 
 @cache
-def measured(backend: str = DEFAULT_ENGINE, share: float = 0.9) -> tuple[TradeoffPoint, ...]:
-    """Return the measured settings of a backend: the error that a share of the whiskers is promised, and the cost.
+def measured(backend: str = DEFAULT_ENGINE) -> tuple[TradeoffPoint, ...]:
+    """Return the measured settings of a backend: the error below which half of the whiskers stay, and the cost.
 
-    Cost is in processor s per whisker-second. A backend or a share that was not measured is a :class:`UsageError`.
+    Cost is in processor s per whisker-second. A backend that was not measured is a :class:`UsageError`.
     """
     import json
 
-    if share not in SHARES:
-        raise UsageError(f"share must be one of {', '.join(map(str, SHARES))}; received {brief(share)}.")
     text = resources.files("brainbench.stimuli").joinpath("fidelity_table.json").read_text(encoding="utf-8")
     points: dict[str, list[TradeoffPoint]] = {}
     for point in json.loads(text)["points"]:
         if not point.get("collision") and point.get("solver", "dynamic") == "dynamic":
-            error, cost = (math.inf if point[name] is None else point[name] for name in (SHARES[share], "cost"))
+            error, cost = (math.inf if point[name] is None else point[name] for name in ("error_50", "cost"))
             settings = {name: point.get(name) for name in RESOLUTION}
-            points.setdefault(point["backend"], []).append(TradeoffPoint(error / MARGIN, cost, settings))
+            points.setdefault(point["backend"], []).append(TradeoffPoint(error, cost, settings))
     check_name("measured backend", backend, points)
     return tuple(points[backend])

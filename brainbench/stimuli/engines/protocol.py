@@ -136,6 +136,10 @@ class WhiskerEngine(ABC):
     """Divisor of the time step for whiskers that cannot be trusted, which are then simulated again, and those left once
     more with steps divided by twice this; 1 leaves them ``unstable``. Of the engines ``rod`` uses it."""
 
+    errors: bool = False
+    """Whether :meth:`run` estimates the error of every whisker (:mod:`.error_estimates`), as stimulus sets have it; two
+    further simulations of those in contact."""
+
     name: ClassVar[str]
     """Name under which :func:`brainbench.stimuli.engines.get_engine` finds it."""
     package: ClassVar[str] = ""

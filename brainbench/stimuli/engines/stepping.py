@@ -17,6 +17,7 @@ from scipy.spatial import ConvexHull
 
 from brainbench.core.devices import usable_processors
 from brainbench.core.rotations import base_rotation, to_matrices
+from brainbench.stimuli.engines.error_estimates import with_errors
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.motion_pieces import Cutting
 from brainbench.stimuli.engines.protocol import Progress, WhiskerEngine, run_groups
@@ -142,6 +143,7 @@ def silent_trace(job: Job, fidelity: Fidelity, record_shape: bool, seconds: floa
         wrench=np.zeros((count, 6)),
         contact=np.zeros(count, dtype=bool),
         contact_arc=np.full(count, np.nan),
+        error=0.0,
         seconds=seconds,
         link_positions=shape,
         contact_wrench=np.zeros((count, 6)) if record_shape else None,
@@ -337,8 +339,13 @@ class SteppedEngine(WhiskerEngine):
     ) -> list[Trace]:
         """Simulate every job; see :meth:`brainbench.stimuli.engines.protocol.WhiskerEngine.run`."""
 
+        def simulate(some: Sequence[Job], setting: Fidelity) -> list[Trace]:
+            return [self._trusted(SteppedJob(job, setting, record_shape)) for job in some]
+
         def run(group: Sequence[int]) -> dict[int, Trace]:
-            return {index: self._trusted(SteppedJob(jobs[index], fidelity, record_shape)) for index in group}
+            some = [jobs[index] for index in group]
+            traces = with_errors(simulate, some, fidelity) if self.errors else simulate(some, fidelity)
+            return dict(zip(group, traces, strict=True))
 
         with self.session():
             check_jobs(self, jobs, fidelity, workers)

@@ -18,7 +18,6 @@ from brainbench.stimuli.engines.reach import Reach, distances
 from brainbench.stimuli.engines.units import MILLI
 from brainbench.stimuli.motion.jobs import Job
 from brainbench.stimuli.objects.obstacle import Obstacle
-from brainbench.stimuli.whiskers.chain import build_chain
 from brainbench.stimuli.whiskers.whisker import Whisker
 
 logger = logging.getLogger(__name__)
@@ -63,6 +62,8 @@ LARGEST_STRUCK_CHANGE = 0.1
 """The same in rigid contacts with a :data:`BLOW`, when the step is cut to a fifth: contacts may cut a step and its half
 to the same. Of 555 whiskers it finds 99 of the 105 that err by more than a fifth, and 48 others; nothing that a single
 run tells does (benchmarks/whiskers/struck.py)."""
+LARGEST_DAMPING = 1.15
+"""Damping ratio of the steps over what was asked for beyond which a warning comes."""
 BLOW = 0.15
 """Speed (m/s) of an object against the base from which it counts as a blow. At .2 to .7 m/s 4 to 11 % of the whiskers
 err by more than a fifth with ``balanced``, at .1 m/s 2 %."""
@@ -408,20 +409,21 @@ def require_parts(jobs: Sequence[Job], backend: str) -> None:
 
 
 def warn_overdamped(jobs: Sequence[Job], fidelity: Fidelity) -> None:
-    """Warn when the time step alone damps a whisker at least twice as much as it should be damped."""
-    if fidelity.solver == "quasistatic":
-        return
-    worst, wanted = 0.0, 0.0
-    for whisker in {job.whisker for job in jobs}:
-        chain = build_chain(whisker, 8)
-        ratio = chain.achieved_damping_ratio(fidelity.step_of(chain))
-        if ratio > 2 * whisker.damping_ratio and ratio > worst:
-            worst, wanted = ratio, whisker.damping_ratio
-    if worst:
+    """Warn of time steps that damp a whisker by :data:`LARGEST_DAMPING` of what was asked for, or more."""
+    ratios = {}
+    for job in jobs:
+        place = job.whisker, job.spacing
+        if place not in ratios:
+            ratios[place] = fidelity.damping_of(job)
+    over = [
+        (ratio, whisker) for (whisker, _), ratio in ratios.items() if ratio > LARGEST_DAMPING * whisker.damping_ratio
+    ]
+    if over:
+        worst, whisker = max(over, key=lambda pair: pair[0])
         logger.warning(
             "The time step of %g s damps the first mode of at least one whisker with ratio %.2f instead of %.2f; "
             "its ringing is lost, slow bending is not; choose a smaller step to keep it.",
             fidelity.time_step,
             worst,
-            wanted,
+            whisker.damping_ratio,
         )

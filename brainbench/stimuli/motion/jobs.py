@@ -99,6 +99,11 @@ class Job:
         object.__setattr__(self, "obstacles", tuple(self.obstacles))
         object.__setattr__(self, "loads", tuple(self.loads))
 
+    @property
+    def spacing(self) -> float:
+        """Time between two frames, as a rule [s]; inf for a single one at the start."""
+        return float(np.median(np.diff(self.times, prepend=self.start))) or math.inf
+
 
 @dataclass(frozen=True, eq=False)
 class Trace:
@@ -115,6 +120,13 @@ class Trace:
     status: Literal["ok", "unstable"] = "ok"
     """``unstable``: the numbers from ``reason`` on must not be used; they are NaN."""
     reason: str = ""
+    remark: str = ""
+    """Says of an ``ok`` whisker that its estimated error is beyond what the fidelity promises, and the number."""
+    error: float = math.nan
+    """Estimated error of base force or moment, the larger, as a share of it, root mean square over the readings in
+    contact; 0 for a whisker that feels nothing, NaN where it is not estimated."""
+    damping: float = math.nan
+    """Damping ratio of the first mode that the time step leaves; at least the whisker's own."""
     steps: int = 0
     """Time steps computed; 0 when the whisker was proven silent and not simulated."""
     unsolved: int = 0

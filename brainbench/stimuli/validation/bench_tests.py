@@ -283,7 +283,7 @@ def ringdown(
     force = deflection * whisker.arc_length / references.point_load_deflection(whisker, 1.0, whisker.arc_length)
     # A first mode that settles under the load keeps e⁻⁸ of its swing, .03 %.
     release = 8 / (whisker.damping_ratio * 2 * math.pi * expected)
-    step = fidelity.step(expected)
+    step = fidelity.step(expected, whisker.damping_ratio)
     release = math.ceil(release / step) * step
     times = release + np.arange(1.0, math.ceil(10 / (whisker.damping_ratio * 2 * math.pi * expected) / step)) * step
     # Half a step before the release: rounding cannot let the load act for one step more.

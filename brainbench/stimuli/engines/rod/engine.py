@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -13,7 +14,8 @@ from numpy.typing import NDArray
 
 from brainbench.core.devices import pick_device, usable_processors, warp
 from brainbench.core.progress import Progress as NamedProgress
-from brainbench.stimuli.engines.fidelity import Fidelity
+from brainbench.stimuli.engines.error_estimates import MORE, with_errors
+from brainbench.stimuli.engines.fidelity import MOST_LINKS, Fidelity
 from brainbench.stimuli.engines.protocol import PassiveSweeps, Progress, SweepBatch, WhiskerEngine, run_groups
 from brainbench.stimuli.engines.rod.compilation import load_kernels
 from brainbench.stimuli.engines.rod.launch import (
@@ -57,7 +59,10 @@ class RodEngine(WhiskerEngine):
         device = pick_device(self.device)
         if device.is_cuda:  # which kernels are needed depends on what there is to touch
             return
-        sizes = sorted({capacity_for(fidelity.link_count(length)) for length in lengths})
+        counts = {fidelity.link_count(length) for length in lengths}
+        if self.errors:  # whiskers in contact are simulated with more links too
+            counts |= {min(math.ceil(MORE * count), MOST_LINKS) for count in counts}
+        sizes = sorted(set(map(capacity_for, counts)))
 
         def load(capacity: int) -> None:
             what = f"compiling the whisker solver for {capacity} links (once; it is kept)"
@@ -93,8 +98,14 @@ class RodEngine(WhiskerEngine):
             groups.setdefault(key, []).append(index)
         size = SLICE if device.is_cuda else 1
 
+        def simulate(some: Sequence[Job], setting: Fidelity) -> list[Trace]:
+            traces = _simulate(dict(enumerate(some)), self.retry, setting, device, record_shape)
+            return [traces[index] for index in range(len(some))]
+
         def run(group: Sequence[int]) -> dict[int, Trace]:
-            return _simulate({i: jobs[i] for i in group}, self.retry, fidelity, device, record_shape)
+            some = [jobs[index] for index in group]
+            traces = with_errors(simulate, some, fidelity) if self.errors else simulate(some, fidelity)
+            return dict(zip(group, traces, strict=True))
 
         slices = [some[i : i + size] for some in groups.values() for i in range(0, len(some), size)]
         threads = 1 if device.is_cuda else workers or usable_processors()

@@ -1,0 +1,168 @@
+"""The law of the room: every force carries its error, estimated from finer simulations of the same whisker.
+
+A whisker is simulated with half the step (and contact forces solved to :data:`TOLERANCE`), and with half as many links
+again. What each changes says how far the limit is. Contacts push along straight links, so a change of the links turns
+forces between opposed contacts at random, and no change of the step shows it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from brainbench.stimuli.engines.fidelity import LEAST_DAMPING, MOST_LINKS, Fidelity
+from brainbench.stimuli.engines.trust import SMALL_FORCE
+from brainbench.stimuli.motion.jobs import Job, Trace
+
+HALF_STEP, MORE_LINKS = 2.0, 3.0
+"""Error over what half the step changes, and over what half as many links again change. Errors that fall with the first
+power of the step and of the links have exactly these."""
+MORE = 1.5
+"""Links of the second finer simulation, over those that were asked for."""
+TOLERANCE = 1e-6
+"""Relative error to which the run in half steps solves contact forces, so that their error is seen too."""
+LARGEST_ERROR = 0.1
+"""Estimated error beyond which a whisker has a remark where the fidelity promises none."""
+SLOW = 3.0
+"""Periods of the first mode in the finest motion of a base from which a whisker follows it without ringing."""
+CALM = 1.5
+"""Error of such a whisker, which touches nothing, times the square of its links: .023, .012 and .004 for the presets,
+measured .014 to .018, .007 to .008 and .003 to .004 (mouse and rat, 5 and 20 Hz)."""
+ROUNDS = 5
+"""Times that whiskers are simulated again, with more links or shorter steps, to keep a promised error."""
+FINEST_STEP = 2e-6
+"""Step (s) below which none is halved to keep a promise: single precision ends there."""
+
+Run = Callable[[Sequence[Job], Fidelity], Sequence[Trace]]
+"""Simulates jobs, each as often as it takes to be trusted."""
+
+
+def with_errors(run: Run, jobs: Sequence[Job], fidelity: Fidelity) -> list[Trace]:
+    """Return the traces of jobs with their estimated errors.
+
+    Where the fidelity promises an ``error``, whiskers beyond it are simulated again with what errs most made finer, one
+    by one.
+    """
+    traces = list(run(jobs, fidelity))
+    settings = [fidelity] * len(traces)
+    pending: dict[int, Fidelity] = {}
+    for index, (job, trace) in enumerate(zip(jobs, traces, strict=True)):
+        if trace.status == "ok" and trace.steps:
+            if (error := calm_error(job, trace, fidelity)) > (fidelity.error or math.inf):
+                error = math.nan
+            traces[index] = replace(trace, error=error)
+            if math.isnan(error):
+                pending[index] = fidelity
+    for place in range(ROUNDS if fidelity.error is not None else 1):
+        finer: dict[int, Fidelity] = {}
+        for chosen in dict.fromkeys(pending.values()):
+            which = [index for index in pending if pending[index] == chosen]
+            if place:
+                for index, trace in zip(which, run([jobs[index] for index in which], chosen), strict=True):
+                    before = traces[index]
+                    if trace.status == "ok":
+                        steps, seconds = before.steps + trace.steps, before.seconds + trace.seconds
+                        traces[index], settings[index] = replace(trace, steps=steps, seconds=seconds), chosen
+            which = [index for index in which if settings[index] == chosen]
+            for index, (by_step, by_links, seconds) in _estimates(run, jobs, traces, which, chosen).items():
+                trace, error = traces[index], math.hypot(by_step, by_links)
+                traces[index] = replace(trace, error=error, seconds=trace.seconds + seconds)
+                if fidelity.error is not None and error > fidelity.error:
+                    finer[index] = _finer(chosen, jobs[index], by_step, by_links)
+        pending = finer
+    ratios = [settings[index].damping_of(job) for index, job in enumerate(jobs)]
+    return [
+        _judged(replace(trace, damping=ratio), fidelity.error or LARGEST_ERROR)
+        for trace, ratio in zip(traces, ratios, strict=True)
+    ]
+
+
+def calm_error(job: Job, trace: Trace, fidelity: Fidelity) -> float:
+    """Return the error of a whisker that touches nothing and follows a slow base; NaN of any other.
+
+    Its forces are those of carrying its mass along, which only the number of links changes.
+    """
+    if trace.contact.any() or job.loads or any(job.gravity) or fidelity.solver == "quasistatic":
+        return math.nan
+    chain = fidelity.chain(job.whisker)
+    period = 2 * math.pi / float(chain.frequencies()[0])
+    slow = (getattr(job.follicle, "finest", None) or 0.0) >= SLOW * period
+    return CALM / chain.links**2 if slow else math.nan
+
+
+def difference(values: NDArray, reference: NDArray, contact: NDArray[np.bool_], length: float) -> NDArray[np.float64]:
+    """Return the relative difference of base force and moment [2], root mean square over the readings in contact.
+
+    The larger of that and the same over all readings counts, so that what rings after a contact does too. Forces below
+    :data:`SMALL_FORCE`, and their moments at the whisker's tip (at ``length``, m), do not matter. Wrenches are [n, 6].
+    """
+    floor = SMALL_FORCE * np.array([1.0, length])
+    shares = []
+    for some in (contact, np.ones_like(contact)):
+        if some.any():
+            gap, whole = (
+                np.sqrt(np.mean(np.sum(part[some].reshape(-1, 2, 3) ** 2, axis=2), axis=0))
+                for part in (values - reference, reference)
+            )
+            shares.append(gap / np.maximum(whole, floor))
+    return np.max(shares, axis=0)
+
+
+def halved_step(fidelity: Fidelity, job: Job) -> Fidelity:
+    """Return a fidelity with half the step that readings and fidelity leave a job, and with solved contact forces."""
+    period, tolerance = fidelity.steps_per_period, fidelity.contact_tolerance
+    ratio = max(job.whisker.damping_ratio, LEAST_DAMPING)
+    return replace(
+        fidelity,
+        time_step=max(min(fidelity.time_step, job.spacing) / 2, 1e-7),
+        steps_per_period=None if period is None else min(2 * max(period, math.pi / ratio), 1e4),
+        contact_tolerance=TOLERANCE if tolerance is None else tolerance,
+    )
+
+
+def more_links(fidelity: Fidelity, job: Job) -> Fidelity:
+    """Return a fidelity with half as many links again, or with a third fewer where there can be no more."""
+    count = fidelity.link_count(job.whisker.arc_length)
+    changed = math.ceil(MORE * count)
+    return replace(fidelity, links=changed if changed <= MOST_LINKS else round(count / MORE), links_per_mm=None)
+
+
+def _estimates(
+    run: Run, jobs: Sequence[Job], traces: Sequence[Trace], which: Sequence[int], fidelity: Fidelity
+) -> dict[int, tuple[float, float, float]]:
+    """Return what the step and what the links err by, and the seconds spent, by index of the job."""
+    errors = {index: [0.0, 0.0] for index in which}
+    spent = dict.fromkeys(which, 0.0)
+    for place, (factor, change) in enumerate(((HALF_STEP, halved_step), (MORE_LINKS, more_links))):
+        settings = {index: change(fidelity, jobs[index]) for index in which}
+        for setting in dict.fromkeys(settings.values()):
+            some = [index for index in which if settings[index] == setting]
+            for index, finer in zip(some, run([jobs[index] for index in some], setting), strict=True):
+                spent[index] += finer.seconds
+                trace, length = traces[index], jobs[index].whisker.arc_length
+                touching = trace.contact | finer.contact
+                shares = difference(trace.wrench, finer.wrench, touching, length)
+                errors[index][place] = factor * float(shares.max()) if finer.status == "ok" else math.inf
+    return {index: (errors[index][0], errors[index][1], spent[index]) for index in which}
+
+
+def _finer(fidelity: Fidelity, job: Job, by_step: float, by_links: float) -> Fidelity:
+    """Return a fidelity that is finer in what errs most, and in both where they err alike."""
+    if by_step >= by_links / 2 and fidelity.time_step > FINEST_STEP:
+        fidelity = halved_step(fidelity, job)
+    if by_links >= by_step / 2 and MORE * fidelity.link_count(job.whisker.arc_length) <= MOST_LINKS:
+        fidelity = more_links(fidelity, job)
+    return fidelity
+
+
+def _judged(trace: Trace, promise: float) -> Trace:
+    """Return a trace that says in words if its error is beyond what is promised."""
+    if trace.status != "ok" or not trace.error > promise:
+        return trace
+    words = f"an error of {trace.error:.0%}" if np.isfinite(trace.error) else "an error that cannot be told"
+    remark = f"half the step and more links estimate {words} (root mean square), above {promise:.0%}"
+    return replace(trace, remark=f"{remark}; choose a finer fidelity, or auto=ERROR")

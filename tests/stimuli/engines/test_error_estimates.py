@@ -1,0 +1,185 @@
+"""Every force carries its error: estimates against the elastica and finer simulations, promises, damping."""
+
+import logging
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from brainbench.stimuli import Fidelity, WhiskerArray
+from brainbench.stimuli.engines import get_engine
+from brainbench.stimuli.engines.error_estimates import (
+    CALM,
+    SLOW,
+    calm_error,
+    difference,
+    halved_step,
+    more_links,
+    with_errors,
+)
+from brainbench.stimuli.engines.fidelity import list_presets
+from brainbench.stimuli.motion.jobs import Job, Load, StillFollicle, Trace
+from brainbench.stimuli.motion.trajectories import ArrayFollicle, Whisking
+from brainbench.stimuli.objects.obstacle import Capsule, Obstacle
+from brainbench.stimuli.validation.contact_scenes import HARD, contact_jobs
+from tests.factories.whiskers import C2
+
+RAT = replace(WhiskerArray.of("rat")["C2"].whisker, curvature=0.0, friction=0.0)
+TIMES = np.arange(1, 101) * 1e-3
+HELD = np.array([-2.26e-5, -8.59e-5])
+"""Base force (N) of the elastica between :func:`_opposed_posts`, turned by .3 rad."""
+
+
+def _opposed_posts():
+    """Two frictionless posts, 2 mm apart on opposite sides of a straight whisker, that turn together by .3 rad."""
+    middle, radius = RAT.arc_length / 2, 1e-4
+    offset = float(RAT.radius(middle)) + 5e-5 + radius
+
+    def post(side):
+        def motion(times):
+            share = np.clip(np.asarray(times, float) / 0.04, 0, 1)
+            turn = 0.3 * share**3 * (10 - 15 * share + 6 * share**2)
+            x, y = side * 1e-3, -side * offset
+            place = middle + np.cos(turn) * x - np.sin(turn) * y, np.sin(turn) * x + np.cos(turn) * y, 0 * turn
+            return np.stack(place, axis=1), np.tile([1.0, 0, 0, 0], (len(turn), 1))
+
+        motion.finest = 0.04
+        return Obstacle((Capsule((0, 0, -4e-3), (0, 0, 4e-3), radius),), motion, 0.0)
+
+    return Job(RAT, StillFollicle(), (post(-1), post(1)), TIMES)
+
+
+def _trace(error=0.0, **values):
+    wrench = np.full((len(TIMES), 6), 1e-4) * (1 + error)
+    return Trace(wrench, np.ones(len(TIMES), bool), np.full(len(TIMES), 0.01), steps=1, **values)
+
+
+@pytest.mark.parametrize("preset", ["fast", "balanced"])
+def test_a_whisker_between_opposed_posts_carries_an_error_no_smaller_than_the_elastica_says(preset):
+    (trace,) = get_engine("rod", errors=True).run([_opposed_posts()], Fidelity.of(preset), workers=1)
+    off = np.linalg.norm(trace.wrench[-1, :2] - HELD) / np.linalg.norm(HELD)
+    assert off <= trace.error
+    assert trace.status == "ok"
+    assert f"an error of {trace.error:.0%}" in trace.remark
+    assert np.isfinite(trace.wrench).all()
+
+
+@pytest.mark.slow
+def test_estimates_cover_the_error_of_contacts_of_all_kinds():
+    jobs = contact_jobs(3, each=1, objects=HARD)[::3]
+    finest = Fidelity(links=40, time_step=1e-5, precision="double", contact_tolerance=1e-9)
+    references = get_engine("rod").run(jobs, finest)
+    traces = get_engine("rod", errors=True).run(jobs, Fidelity.of("balanced"))
+    covered = []
+    for job, trace, reference in zip(jobs, traces, references, strict=True):
+        if trace.status == reference.status == "ok" and reference.contact.any():
+            touching = trace.contact | reference.contact
+            true = difference(trace.wrench, reference.wrench, touching, job.whisker.arc_length).max()
+            covered.append(true <= trace.error)
+    assert len(covered) >= 20
+    assert np.mean(covered) >= 0.85
+
+
+def test_half_the_step_and_more_links_each_count_by_the_order_of_their_error():
+    job = Job(C2, StillFollicle(), (), TIMES)
+    fidelity = Fidelity(links=10, time_step=1e-4)
+
+    def run(jobs, setting):
+        error = 0.0 if setting == fidelity else 0.01 if setting.links == 10 else -0.02
+        return [_trace(error) for _ in jobs]
+
+    (trace,) = with_errors(run, [job], fidelity)
+    assert trace.error == pytest.approx(np.hypot(2 * 0.01 / 1.01, 3 * 0.02 / 0.98))
+    assert (trace.status, trace.remark) == ("ok", "")
+    (trace,) = with_errors(run, [job], replace(fidelity, links=10, contact_tolerance=1e-4))
+    assert trace.error != 0
+
+
+def test_a_whisker_whose_finer_simulation_fails_has_a_remark_without_a_number():
+    def run(jobs, setting):
+        return [_trace(status="ok" if setting.links == 10 else "unstable") for _ in jobs]
+
+    (trace,) = with_errors(run, [Job(C2, StillFollicle(), (), TIMES)], Fidelity(links=10))
+    assert trace.error == np.inf
+    assert "cannot be told" in trace.remark
+
+
+def test_a_promise_makes_only_those_finer_that_need_it():
+    jobs = [Job(C2, StillFollicle(), (), TIMES), Job(RAT, StillFollicle(), (), TIMES)]
+    counts = []
+
+    def run(some, setting):
+        counts.extend((job.whisker == RAT, setting.links) for job in some)
+        return [_trace(1 / setting.links if job.whisker == RAT else 0.0) for job in some]
+
+    plain, refined = with_errors(run, jobs, Fidelity(links=10, error=0.05))
+    assert plain.error == 0
+    assert 0 < refined.error <= 0.05
+    assert (refined.remark, max(links for rat, links in counts if not rat)) == ("", 15)
+    assert max(links for rat, links in counts if rat) > 30
+
+
+def test_differences_are_relative_above_a_nanonewton_and_of_force_or_moment():
+    wrench = np.zeros((4, 6))
+    wrench[:, 0], wrench[:, 5] = 1e-3, 1e-6
+    other = wrench * np.array([1.1, 1, 1, 1, 1, 1.2])
+    contact = np.ones(4, bool)
+    np.testing.assert_allclose(difference(other, wrench, contact, 0.01), [0.1, 0.2])
+    np.testing.assert_allclose(difference(1e-8 * other, 1e-8 * wrench, contact, 0.01), [1e-3, 2e-4], rtol=1e-6)
+    # What rings after the contact counts too.
+    other[2:, 0] = 2e-3
+    assert difference(other, wrench, np.array([True, True, False, False]), 0.01)[0] > 0.5
+
+
+def test_a_whisker_in_air_that_follows_its_base_needs_no_further_simulation():
+    mount = WhiskerArray.of("mouse")["C2"]
+    whisking = Job(mount.whisker, ArrayFollicle(mount, Whisking(8.0, 0.2, 0.2)), (), TIMES)
+    silent = Trace(np.zeros((100, 6)), np.zeros(100, bool), np.full(100, np.nan), steps=1)
+    assert calm_error(whisking, silent, Fidelity(links=10)) == CALM / 100
+    shaken = replace(whisking, follicle=ArrayFollicle(mount, Whisking(SLOW * 200, 0.2, 0.2)))
+    for job in (shaken, replace(whisking, loads=(Load(0.01, (0, 1e-6, 0)),)), replace(whisking, gravity=(0, 0, -9.8))):
+        assert np.isnan(calm_error(job, silent, Fidelity(links=10)))
+
+
+def test_finer_settings_halve_the_step_that_readings_leave_and_add_half_of_the_links():
+    job = Job(replace(C2, damping_ratio=0.1), StillFollicle(), (), np.arange(1, 5) * 2e-5)
+    fast = Fidelity.preset("fast")
+    half = halved_step(fast, job)
+    assert half.time_step == pytest.approx(1e-5)
+    assert half.steps_per_period == pytest.approx(2 * np.pi / 0.1)
+    assert more_links(fast, job).link_count(C2.arc_length) == 12
+    assert more_links(Fidelity(links=90), job).links == 60
+
+
+@pytest.mark.parametrize("preset", list_presets())
+@pytest.mark.parametrize("species", ["mouse", "rat"])
+def test_presets_keep_the_damping_that_was_measured_at_any_cadence(preset, species):
+    for mount in list(WhiskerArray.of(species))[::4]:
+        for ratio in (0.05, 0.11, 0.17):
+            whisker = replace(mount.whisker, damping_ratio=ratio)
+            for spacing in (1e-5, 2.5e-4, 1e-3):
+                job = Job(whisker, StillFollicle(), (), np.arange(1, 9) * spacing)
+                assert Fidelity.of(preset).damping_of(job) == pytest.approx(ratio, rel=0.02)
+
+
+@pytest.mark.parametrize("spacing", [2.8e-4, 2e-5])
+def test_a_short_whisker_rings_with_the_damping_that_it_was_given(spacing):
+    whisker = replace(WhiskerArray.of("mouse")["A4"].whisker, curvature=0.0, damping_ratio=0.11)
+    loads = (Load(whisker.arc_length, (0.0, 1e-7, 0.0), stop=0.01),)
+    times = np.arange(0.01 + spacing, 0.016, spacing)
+    (trace,) = get_engine("rod").run([Job(whisker, StillFollicle(), (), times, loads=loads)], Fidelity.of("fast"))
+    size = np.abs(trace.wrench[:, 5])
+    # A swing loses e^(−ζ ω t); the largest readings of two windows, ten milliseconds of which hold seven periods.
+    first, second = (size[(times > start) & (times <= start + 1.41e-3)].max() for start in (0.0105, 0.01332))
+    assert np.log(first / second) / (2 * np.pi * 710 * 2.82e-3) == pytest.approx(0.11, rel=0.15)
+
+
+def test_steps_that_damp_too_much_are_warned_of_and_stored(caplog):
+    job = Job(replace(C2, damping_ratio=0.1), StillFollicle(), (), TIMES, loads=(Load(0.01, (0, 1e-6, 0)),))
+    with caplog.at_level(logging.WARNING, "brainbench.stimuli.engines.trust"):
+        (held,) = get_engine("rod", errors=True).run([job], Fidelity.of("fast"))
+        assert not caplog.records
+        (lost,) = get_engine("rod", errors=True).run([job], Fidelity(links=8, time_step=1e-3))
+    assert held.damping == pytest.approx(0.1, rel=0.02)
+    assert lost.damping == pytest.approx(0.58, rel=0.05)
+    assert "with ratio 0.5" in caplog.text
