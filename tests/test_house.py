@@ -20,13 +20,13 @@ MOST_MODULES = 16
 MOST_LINES = 700
 """Lines of a module, which is cut by idea; 150 to 450 are usual."""
 BUDGETS = {
-    "brainbench/stimuli": 26_200,
+    "brainbench/stimuli": 26_400,  # the estimated error of every whisker
     "robotics_bridge": 24_800,  # newtons that no taxel has, trees of any hand, deadlines, replays, gel pictures
     "brainbench/models": 8_500,  # the proof that a layer is a response
     "brainbench/datasets": 7_350,  # the balance of a reading, copies of sessions, signals
     "brainbench/metrics": 5_400,  # the unique part
     "brainbench/cli": 4_950,  # check-submission, options of benchmarks
-    "brainbench/core": 5_800,  # the sealed door, seals of the cache, the filter of foreign text, sealed plans
+    "brainbench/core": 5_900,  # the sealed door, seals of the cache, the filter of foreign text, sealed plans
     "leaderboards": 3_700,  # benchmarks and citations on boards, means over benchmarks, boards of areas
     "brainbench/scoring": 4_280,  # presentation time, plans, boards of areas and layers, controls of the unique part
     "brainbench/geometry": 1_050,

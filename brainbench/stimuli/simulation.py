@@ -22,7 +22,7 @@ from brainbench.core.progress import PREPARATION, Progress
 from brainbench.core.reading import sealed
 from brainbench.core.reading.sealed import keep_entry
 from brainbench.stimuli.engines import PHYSICS_VERSION, get_engine
-from brainbench.stimuli.engines.fidelity import DEFAULT_ENGINE, Fidelity
+from brainbench.stimuli.engines.fidelity import DEFAULT_ENGINE, Fidelity, steps_to_ring
 from brainbench.stimuli.engines.job_schedule import plan
 from brainbench.stimuli.engines.protocol import WhiskerEngine
 from brainbench.stimuli.explain import ATTRIBUTE, SECONDS, explain
@@ -77,7 +77,7 @@ def simulate(
         processor. :meth:`brainbench.stimuli.explain.Explanation.of` reads what was simulated, shared and left out.
     """
     chosen = _checked(scenes)
-    engine, fidelity = resolve(backend, fidelity, chosen)
+    engine, fidelity = resolve(backend, fidelity, chosen, errors=True)
     path = cache_path(chosen, fidelity, engine) if cache and isinstance(backend, str) else None
     if path is not None and (dataset := read_entry(path)) is not None:
         return dataset
@@ -124,16 +124,16 @@ def prepare(
     the same arguments and waits for the rest.
     """
     chosen = list(scenes)
-    engine, fidelity = resolve(backend, fidelity, chosen)
+    engine, fidelity = resolve(backend, fidelity, chosen, errors=True)
     if find_entry(cache_path(chosen, fidelity, engine)) is None:
         _begin(engine, chosen, fidelity, progress)
 
 
 def resolve(
-    backend: WhiskerEngine | str, fidelity: Fidelity | str | None, scenes: Iterable[Scene]
+    backend: WhiskerEngine | str, fidelity: Fidelity | str | None, scenes: Iterable[Scene], *, errors: bool = False
 ) -> tuple[WhiskerEngine, Fidelity]:
-    """Return the engine of some scenes, and the fidelity with whether their whiskers twist."""
-    engine = get_engine(backend, errors=True) if isinstance(backend, str) else backend
+    """Return the engine of some scenes, one by name estimating ``errors``, and the fidelity with whether they twist."""
+    engine = get_engine(backend, errors=errors) if isinstance(backend, str) else backend
     return engine, Fidelity.of(fidelity).resolved(engine.twists and any(scene.twist for scene in scenes))
 
 
@@ -319,5 +319,9 @@ def cache_path(
     from importlib import metadata
 
     library = metadata.version(engine.package) + engine.revision if engine.package else ""
+    # Steps that are shortened to ring as asked came later than entries that exist.
+    ratios = [mount.whisker.damping_ratio for scene in scenes for mount in scene.mounts]
+    if max(map(steps_to_ring, ratios)) > (fidelity.steps_per_period or math.inf):
+        more = (*more, "ringing")
     key = content_hash(config_hash(scenes, fidelity, engine.name), library, PHYSICS_VERSION, *more, length=24)
     return cache_dir(folder) / f"{key}.h5"

@@ -125,7 +125,7 @@ def _simulate(
     jobs: Sequence[Job], fidelity: Fidelity, engine: WhiskerEngine, progress: Progress | None
 ) -> list[NDArray[np.float64]]:
     report = None if progress is None else lambda done, total: progress(done, total, "simulating shapes")
-    traces = replace(engine, errors=False).run(jobs, fidelity, progress=report, record_shape=True)
+    traces = engine.run(jobs, fidelity, progress=report, record_shape=True)
     shapes: list[Any] = [trace.link_positions for trace in traces]
     if any(shape is None for shape in shapes):
         raise UsageError(

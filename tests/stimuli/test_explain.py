@@ -163,7 +163,7 @@ def test_equal_runs_are_planned_once():
 
 
 def test_the_same_simulation_is_explained_in_the_same_words_and_survives_the_cache(monkeypatch, tmp_path):
-    monkeypatch.setattr(simulation, "get_engine", lambda name: FakeEngine())
+    monkeypatch.setattr(simulation, "get_engine", lambda name, **options: FakeEngine())
     monkeypatch.setenv("BRAINBENCH_CACHE", str(tmp_path))
     first = simulate(_scene("near", NEAR), fidelity=FAST, backend="fake")
     second = simulate(_scene("near", NEAR), fidelity=FAST, backend="fake")

@@ -47,7 +47,7 @@ def _simulate(scenes, backend=None, **options):
 def engine(monkeypatch, tmp_path):
     """The double, found by name so that results are cached, in a cache of its own."""
     backend = FakeEngine()
-    monkeypatch.setattr(simulation, "get_engine", lambda name: backend)
+    monkeypatch.setattr(simulation, "get_engine", lambda name, **options: backend)
     monkeypatch.setenv("BRAINBENCH_CACHE", str(tmp_path))
     return backend
 
@@ -60,6 +60,7 @@ def test_the_result_is_a_stimulus_set_with_contacts_and_status():
     assert dataset["contact"].dims == dataset["contact_arc"].dims == ("stimulus", "time", "whisker")
     assert (dataset["status"] == "ok").all()
     assert dataset["penetration"].dims == dataset["status"].dims == ("stimulus", "whisker")
+    assert dataset["error"].dims == dataset["damping"].dims == dataset["remark"].dims == ("stimulus", "whisker")
     assert list(dataset["whisker"].values) == ["C1", "C2", "D6"]
     assert list(dataset["row"].values) == [2, 2, 3]
     assert list(dataset["col"].values) == [1, 2, 6]
@@ -141,7 +142,7 @@ class Preparing(FakeEngine):
 def test_an_engine_gets_ready_before_it_runs_and_not_for_what_is_in_the_cache(monkeypatch, tmp_path):
     monkeypatch.setenv("BRAINBENCH_CACHE", str(tmp_path))
     engine, fidelity = Preparing(), Fidelity.preset("fast")
-    monkeypatch.setattr(simulation, "get_engine", lambda name: engine)
+    monkeypatch.setattr(simulation, "get_engine", lambda name, **options: engine)
     scene = _scene()
     simulation.prepare([scene], fidelity="fast", backend="fake")
     for thread in threading.enumerate():

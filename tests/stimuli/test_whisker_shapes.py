@@ -73,7 +73,7 @@ def test_shapes_come_from_the_cache_and_from_nowhere_else(monkeypatch, tmp_path,
             runs.append(len(jobs))
             return super().run(jobs, *args, **options)
 
-    monkeypatch.setattr(simulation, "get_engine", lambda name: Counted())
+    monkeypatch.setattr(simulation, "get_engine", lambda name, **options: Counted())
     scene = Scene("air", ARRAY, whisking=Whisking())
     first = _record(scene, [0.002, 0.004], cache=True)
     second = _record(scene, [0.002, 0.004], cache=True)

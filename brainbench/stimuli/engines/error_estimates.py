@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.stimuli.engines.fidelity import LEAST_DAMPING, MOST_LINKS, Fidelity
+from brainbench.stimuli.engines.fidelity import Fidelity, steps_to_ring
 from brainbench.stimuli.engines.trust import SMALL_FORCE
 from brainbench.stimuli.motion.jobs import Job, Trace
 
@@ -23,6 +23,8 @@ HALF_STEP, MORE_LINKS = 2.0, 3.0
 power of the step and of the links have exactly these."""
 MORE = 1.5
 """Links of the second finer simulation, over those that were asked for."""
+MOST = 60
+"""Most links of finer simulations, which every engine can take."""
 TOLERANCE = 1e-6
 """Relative error to which the run in half steps solves contact forces, so that their error is seen too."""
 LARGEST_ERROR = 0.1
@@ -115,11 +117,12 @@ def difference(values: NDArray, reference: NDArray, contact: NDArray[np.bool_], 
 def halved_step(fidelity: Fidelity, job: Job) -> Fidelity:
     """Return a fidelity with half the step that readings and fidelity leave a job, and with solved contact forces."""
     period, tolerance = fidelity.steps_per_period, fidelity.contact_tolerance
-    ratio = max(job.whisker.damping_ratio, LEAST_DAMPING)
     return replace(
         fidelity,
         time_step=max(min(fidelity.time_step, job.spacing) / 2, 1e-7),
-        steps_per_period=None if period is None else min(2 * max(period, math.pi / ratio), 1e4),
+        steps_per_period=None
+        if period is None
+        else min(2 * max(period, steps_to_ring(job.whisker.damping_ratio)), 1e4),
         contact_tolerance=TOLERANCE if tolerance is None else tolerance,
     )
 
@@ -128,7 +131,7 @@ def more_links(fidelity: Fidelity, job: Job) -> Fidelity:
     """Return a fidelity with half as many links again, or with a third fewer where there can be no more."""
     count = fidelity.link_count(job.whisker.arc_length)
     changed = math.ceil(MORE * count)
-    return replace(fidelity, links=changed if changed <= MOST_LINKS else round(count / MORE), links_per_mm=None)
+    return replace(fidelity, links=changed if changed <= MOST else round(count / MORE), links_per_mm=None)
 
 
 def _estimates(
@@ -154,7 +157,7 @@ def _finer(fidelity: Fidelity, job: Job, by_step: float, by_links: float) -> Fid
     """Return a fidelity that is finer in what errs most, and in both where they err alike."""
     if by_step >= by_links / 2 and fidelity.time_step > FINEST_STEP:
         fidelity = halved_step(fidelity, job)
-    if by_links >= by_step / 2 and MORE * fidelity.link_count(job.whisker.arc_length) <= MOST_LINKS:
+    if by_links >= by_step / 2 and MORE * fidelity.link_count(job.whisker.arc_length) <= MOST:
         fidelity = more_links(fidelity, job)
     return fidelity
 

@@ -126,8 +126,7 @@ class Fidelity:
         """
         if self.steps_per_period is None or self.solver == "quasistatic":
             return self.time_step
-        least = math.pi / max(damping_ratio, LEAST_DAMPING)
-        return min(self.time_step, 1 / (max(self.steps_per_period, least) * frequency))
+        return min(self.time_step, 1 / (max(self.steps_per_period, steps_to_ring(damping_ratio)) * frequency))
 
     def damping_of(self, job: Job) -> float:
         """Return the damping ratio with which a whisker's first mode rings; NaN without inertia."""
@@ -149,6 +148,11 @@ class Fidelity:
                 f"at most {MOST_LINKS} are possible; choose fewer per mm."
             )
         return count
+
+
+def steps_to_ring(damping_ratio: float) -> float:
+    """Return the fewest steps in a period with which a mode rings with a ratio."""
+    return math.pi / max(damping_ratio, LEAST_DAMPING)
 
 
 FINEST_SINGLE = 1e-6

@@ -5,24 +5,19 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.rotations import base_rotation, euler_matrix
-from brainbench.geometry import Mesh
 from brainbench.stimuli.motion.jobs import Job, Trace
 from brainbench.stimuli.motion.trajectories import ArrayFollicle, Whisking
-from brainbench.stimuli.objects.obstacle import Box, Capsule, Obstacle
+from brainbench.stimuli.objects.obstacle import Obstacle
 from brainbench.stimuli.objects.solid import Solid, box, capsule, rodgers_solid, sphere
 from brainbench.stimuli.whiskers.array import SPECIES, MountedWhisker, WhiskerArray
 
 OBJECTS = ("post", "ball", "edge", "hollow")
-HARD = ("opposed", "slot", "comb", "tip", "mesh")
-"""Kinds that single contacts do not stand for: two posts on opposite sides, a slot between two boxes, the teeth of a
-comb, a post near the tip that the whisker slips past, and a ball of triangles."""
 FRICTIONS = (0.0, 0.4, 0.8)
 FREQUENCIES = (5.0, 10.0, 20.0)
 """Whisks per second [Hz]."""
@@ -40,7 +35,7 @@ def contact_jobs(
     it), size and turn of the object are drawn. Read every ms. Other seeds are other scenes of the same kinds.
 
     Args:
-        objects: kinds of objects, of :data:`OBJECTS` or :data:`HARD`.
+        objects: kinds of objects, of :data:`OBJECTS`.
         hollow: another solid of the shape and size of :func:`rodgers_solid`, touched in its place.
     """
     random = np.random.default_rng(seed)
@@ -76,20 +71,14 @@ def _draw(
     random: np.random.Generator,
 ) -> Job:
     mount = mounts[random.integers(len(mounts))]
-    # Whiskers rest between what stands on both sides of them.
-    around = kind in ("opposed", "slot", "comb")
-    touch, depth = np.radians(random.uniform((0.3 if around else -3, 4), (2 if around else 3, 14)))
-    whisking = Whisking(frequency, touch + depth * (2 if kind == "tip" else 1), _RETRACTION, onset=0.025)
-    point, axes = _contact(mount, whisking, touch, random.uniform(*((0.8, 0.95) if kind == "tip" else (0.4, 0.85))))
+    touch, depth = np.radians(random.uniform((-3, 4), (3, 14)))
+    whisking = Whisking(frequency, touch + depth, _RETRACTION, onset=0.025)
+    point, axes = _contact(mount, whisking, touch, random.uniform(0.4, 0.85))
     scale = mount.whisker.arc_length / 0.02
-    if kind in HARD:
-        # How far behind the touched surface that of the other side is: as far again as the whisker is from it.
-        gap = 2 * abs(touch) * float(np.linalg.norm(point - mount.position))
-        body, place, rotation = _hard_object(kind, scale, gap, random), np.zeros(3), axes
-    else:
-        solid, turn, place = _object(kind, scale, hollow, random)
-        body, rotation = Obstacle(solid.parts, surface=solid.surface), axes @ turn
-    obstacle = replace(body, friction=friction).moved(rotation, point - rotation @ place)
+    solid, turn, place = _object(kind, scale, hollow, random)
+    rotation = axes @ turn
+    body = Obstacle(solid.parts, friction=friction, surface=solid.surface)
+    obstacle = body.moved(rotation, point - rotation @ place)
     duration = max(0.15, 1.5 / frequency)
     return Job(mount.whisker, ArrayFollicle(mount, whisking), (obstacle,), np.arange(1e-3, duration, 1e-3))
 
@@ -113,30 +102,6 @@ def _contact(
     ahead = np.cross(across, tangent / np.linalg.norm(tangent))
     # The surface touches the whisker's surface, not its centre line.
     return now[0] + mount.whisker.radius(arc[0]) * ahead, np.column_stack([np.cross(ahead, across), ahead, across])
-
-
-def _hard_object(kind: str, scale: float, gap: float, random: np.random.Generator) -> Obstacle:
-    """Return an object of :data:`HARD` that touches at the origin; whiskers come along y and lie along x."""
-    radius, half, way = 2e-4 * scale * random.uniform(1, 3), 0.015 * scale, scale * random.uniform(0.5e-3, 3e-3)
-    if kind == "mesh":
-        import trimesh
-
-        ball = trimesh.creation.icosphere(subdivisions=3, radius=10 * radius)
-        return Obstacle((), surface=Mesh(ball.vertices + np.array([0, 10 * radius, 0]), ball.faces.astype(np.int32)))
-
-    def post(x: float, y: float) -> Capsule:
-        return Capsule((x, y, -half), (x, y, half), radius)
-
-    if kind == "tip":
-        return Obstacle((post(0, radius),))
-    if kind == "opposed":
-        side = float(random.choice([-1, 1]))
-        return Obstacle((post(0, radius), post(side * way, -radius - gap)))
-    if kind == "comb":
-        teeth = [(x * way, y) for x in (-1, 0, 1) for y in (radius, -radius - gap)]
-        return Obstacle(tuple(itertools.starmap(post, teeth)))
-    sizes = (way, radius, half)
-    return Obstacle((Box((0, radius, 0), sizes), Box((0, -radius - gap, 0), sizes)))
 
 
 def _object(

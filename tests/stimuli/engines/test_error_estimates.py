@@ -21,7 +21,7 @@ from brainbench.stimuli.engines.fidelity import list_presets
 from brainbench.stimuli.motion.jobs import Job, Load, StillFollicle, Trace
 from brainbench.stimuli.motion.trajectories import ArrayFollicle, Whisking
 from brainbench.stimuli.objects.obstacle import Capsule, Obstacle
-from brainbench.stimuli.validation.contact_scenes import HARD, contact_jobs
+from tests.factories.hard_contacts import hard_jobs
 from tests.factories.whiskers import C2
 
 RAT = replace(WhiskerArray.of("rat")["C2"].whisker, curvature=0.0, friction=0.0)
@@ -66,7 +66,7 @@ def test_a_whisker_between_opposed_posts_carries_an_error_no_smaller_than_the_el
 
 @pytest.mark.slow
 def test_estimates_cover_the_error_of_contacts_of_all_kinds():
-    jobs = contact_jobs(3, each=1, objects=HARD)[::3]
+    jobs = hard_jobs(3)[::3]
     finest = Fidelity(links=40, time_step=1e-5, precision="double", contact_tolerance=1e-9)
     references = get_engine("rod").run(jobs, finest)
     traces = get_engine("rod", errors=True).run(jobs, Fidelity.of("balanced"))
@@ -122,21 +122,22 @@ def test_a_promise_makes_only_those_finer_that_need_it():
 def test_differences_are_relative_above_a_nanonewton_and_of_force_or_moment():
     wrench = np.zeros((4, 6))
     wrench[:, 0], wrench[:, 5] = 1e-3, 1e-6
-    other = wrench * np.array([1.1, 1, 1, 1, 1, 1.2])
+    ringing = wrench * np.array([1.1, 1, 1, 1, 1, 1.2])
     contact = np.ones(4, bool)
-    np.testing.assert_allclose(difference(other, wrench, contact, 0.01), [0.1, 0.2])
-    np.testing.assert_allclose(difference(1e-8 * other, 1e-8 * wrench, contact, 0.01), [1e-3, 2e-4], rtol=1e-6)
+    np.testing.assert_allclose(difference(ringing, wrench, contact, 0.01), [0.1, 0.2])
+    np.testing.assert_allclose(difference(1e-8 * ringing, 1e-8 * wrench, contact, 0.01), [1e-3, 2e-4], rtol=1e-6)
     # What rings after the contact counts too.
-    other[2:, 0] = 2e-3
-    assert difference(other, wrench, np.array([True, True, False, False]), 0.01)[0] > 0.5
+    ringing[2:, 0] = 2e-3
+    assert difference(ringing, wrench, np.array([True, True, False, False]), 0.01)[0] > 0.5
 
 
 def test_a_whisker_in_air_that_follows_its_base_needs_no_further_simulation():
     mount = WhiskerArray.of("mouse")["C2"]
-    whisking = Job(mount.whisker, ArrayFollicle(mount, Whisking(8.0, 0.2, 0.2)), (), TIMES)
+    slow, fast = Whisking(8.0, 0.2, 0.2), Whisking(SLOW * 200, 0.2, 0.2)
+    whisking = Job(mount.whisker, ArrayFollicle(mount, slow, finest=slow.finest), (), TIMES)
     silent = Trace(np.zeros((100, 6)), np.zeros(100, bool), np.full(100, np.nan), steps=1)
     assert calm_error(whisking, silent, Fidelity(links=10)) == CALM / 100
-    shaken = replace(whisking, follicle=ArrayFollicle(mount, Whisking(SLOW * 200, 0.2, 0.2)))
+    shaken = replace(whisking, follicle=ArrayFollicle(mount, fast, finest=fast.finest))
     for job in (shaken, replace(whisking, loads=(Load(0.01, (0, 1e-6, 0)),)), replace(whisking, gravity=(0, 0, -9.8))):
         assert np.isnan(calm_error(job, silent, Fidelity(links=10)))
 

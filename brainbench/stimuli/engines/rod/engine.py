@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from brainbench.core.devices import pick_device, usable_processors, warp
 from brainbench.core.progress import Progress as NamedProgress
-from brainbench.stimuli.engines.error_estimates import MORE, with_errors
-from brainbench.stimuli.engines.fidelity import MOST_LINKS, Fidelity
+from brainbench.stimuli.engines.error_estimates import MORE, MOST, with_errors
+from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.protocol import PassiveSweeps, Progress, SweepBatch, WhiskerEngine, run_groups
 from brainbench.stimuli.engines.rod.compilation import load_kernels
 from brainbench.stimuli.engines.rod.launch import (
@@ -61,7 +61,7 @@ class RodEngine(WhiskerEngine):
             return
         counts = {fidelity.link_count(length) for length in lengths}
         if self.errors:  # whiskers in contact are simulated with more links too
-            counts |= {min(math.ceil(MORE * count), MOST_LINKS) for count in counts}
+            counts |= {min(math.ceil(MORE * count), MOST) for count in counts}
         sizes = sorted(set(map(capacity_for, counts)))
 
         def load(capacity: int) -> None:
