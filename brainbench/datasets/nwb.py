@@ -134,11 +134,14 @@ def _with_areas(units: SessionTable, group: h5py.Group) -> SessionTable:
         return units
     if not isinstance(rows, h5py.Dataset) or any(name in units for name in ("area", *OTHER_NAMES["area"])):
         return units
-    locations, numbers = as_labels(decode(electrodes["location"][...])), np.asarray(rows[...]).ravel()
+    location = electrodes["location"]
+    assert isinstance(location, h5py.Dataset)
+    locations, numbers = as_labels(decode(location[...])), np.asarray(rows[...]).ravel()
     try:
         ends = units.ends("electrodes") if "electrodes" in units.index else np.arange(1, len(units) + 1)
         begins = [0, *ends[:-1].tolist()]
-        first = [numbers[begin] if begin < end else len(locations) for begin, end in zip(begins, ends, strict=True)]
+        spans = zip(begins, ends, strict=True)
+        first = [int(numbers[begin]) if begin < end else len(locations) for begin, end in spans]
     except (DataError, IndexError):  # electrodes are no part of a score
         return units
     return units.with_columns(area=np.array([*locations, ""])[np.clip(first, 0, len(locations)).astype(np.int64)])
@@ -150,10 +153,13 @@ _SIGNAL = "RoiResponseSeries"
 
 def _cells(group: h5py.Group) -> dict[str, Any]:
     """Return what the plane segmentation of a signal says of its cells: ``iscell``, and the area of the plane."""
-    rois, columns = group.get("rois"), {}
+    # A file of others may hold anything in these places; whatever it is not is an error that is caught.
+    rois: Any = group.get("rois")
+    columns: dict[str, Any] = {}
     try:
-        plane = group.file[rois.attrs["table"]]  # pyright: ignore[reportOptionalMemberAccess]
-        rows = np.asarray(rois[...], dtype=np.int64).ravel()  # pyright: ignore[reportOptionalSubscript]
+        plane: Any = group.file[rois.attrs["table"]]
+        rows = np.asarray(rois[...], dtype=np.int64).ravel()
+        data: Any = group["data"]
         if "iscell" in plane:
             # Suite2p keeps the probability beside it.
             flags = np.asarray(plane["iscell"][...], dtype=np.float64)
@@ -162,7 +168,7 @@ def _cells(group: h5py.Group) -> dict[str, Any]:
             columns["area"] = np.full(len(rows), _string(plane, "imaging_plane/location"))
     except (AttributeError, KeyError, ValueError, TypeError, IndexError):  # without a plane every column is a cell
         return {}
-    return columns if len(rows) == group["data"].shape[-1] else {}
+    return columns if len(rows) == data.shape[-1] else {}
 
 
 def _walk(parent: h5py.Group, path: Path, place: str = "") -> Iterator[tuple[str, Any]]:

@@ -67,7 +67,8 @@ def unique_of(
     scored = [gathered.subjects[index] for index in gathered.scored]
     factors = gathered.factors(gathered.scored)
     part = unique_part(
-        *({name: metric.layer(values) for name, values in side.items()} for side in (features, controls)),
+        {name: metric.layer(values) for name, values in features.items()},
+        {name: metric.layer(values) for name, values in controls.items()},
         scored,
         comparison=metric.comparison,
         factors=factors,

@@ -40,6 +40,8 @@ WORDS = {
     "train": ("no-such-model", "--data", "none"),
     "score": ("no-such-model",),
     "power": (),
+    "benchmark make": ("--recordings", "none", "--out", "lab.toml"),
+    "benchmark check": ("none",),
 }
 """Command lines whose input does not exist: that would be told next."""
 

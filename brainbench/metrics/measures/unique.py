@@ -238,10 +238,9 @@ class _Sides:
         """Return raw comparisons [V, 4, A] of sums with animals; weights or products are of one set for all."""
         number, ends = max(len(weights), len(products)), self.rivals + self.layers
         rivals = np.tile(np.arange(self.rivals), (len(layers), 1))
-        index = np.concatenate([rivals, self.rivals + layers[:, None]], axis=1)
-        index, weights, products = (
-            np.broadcast_to(part, (number, *part.shape[1:])) for part in (index, weights, products)
-        )
+        index: Ints = np.concatenate([rivals, self.rivals + layers[:, None]], axis=1)
+        index = np.broadcast_to(index, (number, index.shape[1]))
+        weights, products = (np.broadcast_to(part, (number, *part.shape[1:])) for part in (weights, products))
         rows = np.arange(number)[:, None]
         gram = products[rows[:, :, None], index[:, :, None], index[:, None, :]]
         animals = np.sqrt(np.diagonal(products, axis1=-2, axis2=-1)[:, None, ends:])
