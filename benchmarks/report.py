@@ -39,7 +39,7 @@ QUESTIONS = (
 )  # fmt: skip
 """Question of a reader, subjects and words of the titles that answer it; a section stands under the first that fits."""
 HEADLINES = (
-    ("whiskers below the 10 % error that `Fidelity.auto` promises to 90 %", "Settings chosen for an error",
+    ("whiskers below 10 % error with the setting measured for 90 % of them", "Settings chosen for an error",
      r"\| 10% \|[^|]*\| ([^|]*) \|", ""),
     ("median error at that setting", "Settings chosen for an error", r"\| 10% \|[^|]*\|[^|]*\| ([^|]*) \|", ""),
     ("processor time of a simulated second of one whisker, there", "Settings chosen for an error",
