@@ -181,6 +181,9 @@ def _pages(stored: Sequence[StoredRecord], title: str) -> Iterator[tuple[str, st
     synthetic = any(board.synthetic for board in boards)
     benchmarks, means = means_over(boards)
     columns = [page_board(str(place), board) for place, board in enumerate(boards, start=1)]
+    # Records of earlier versions state no unique part.
+    unique = any(part is not None for board in columns for part in board["data"].get("unique", ()))
+    table = [column for column in COLUMNS if unique or column["key"] != "unique"]
     yield (
         "index.html",
         render(
@@ -194,7 +197,7 @@ def _pages(stored: Sequence[StoredRecord], title: str) -> Iterator[tuple[str, st
             benchmarks=benchmarks and (caption_of(benchmarks), columns_of(benchmarks), rows_of(benchmarks, means)),
             problems=[item for item in stored if item.record is None],
             downloads=DOWNLOADS.items(),
-            data=script_json({"boards": columns, "columns": COLUMNS, "page": PAGE}),
+            data=script_json({"boards": columns, "columns": table, "page": PAGE}),
             here="table",
             root="",
         ),

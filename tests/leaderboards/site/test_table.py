@@ -65,6 +65,17 @@ def test_every_column_has_its_data(make_record, tmp_path):
     assert keys <= set(board["data"])
 
 
+def test_the_unique_part_has_a_column_where_a_record_states_it(make_record, tmp_path):
+    record = make_record()
+    keys = [column["key"] for column in data(build([record], tmp_path / "without"))["columns"]]
+    assert "unique" not in keys
+    stated = {"statistics": {"unique": {"status": "ok", "unique": 0.75, "interval": [0.6, 0.9], "controls": ["raw"]}}}
+    record = replace(record, score=replace(record.score, provenance=stated))
+    page = data(build([record], tmp_path / "with"))
+    assert "unique" in [column["key"] for column in page["columns"]]
+    assert page["boards"][0]["data"]["unique"][0] == 0.75
+
+
 def test_page_csv_and_json_agree(tmp_path):
     records = draw_board({"low": 0.0, "a": 0.9, "b": 0.85, "c": 0.3})
     records[1] = replace(records[1], card=replace(records[1].card, family="user module"))
