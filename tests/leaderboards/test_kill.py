@@ -96,6 +96,7 @@ def _check_add(source: Path, work: Path, kills: int) -> None:
     assert cut > kills // 3
 
 
+@pytest.mark.slow
 def test_a_killed_build_is_repeated_to_the_same_bytes(source, tmp_path):
     _check_build(source, tmp_path, kills=1)
 

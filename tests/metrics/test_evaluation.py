@@ -55,6 +55,7 @@ def _naive_p(score):
     return stats.norm.sf(best / 0.27)
 
 
+@pytest.mark.slow
 def test_p_stays_calibrated_after_choosing_a_layer_and_the_naive_maximum_does_not():
     p, _, naive = _null_scores(150, seed=2)
     assert stats.kstest(p, "uniform").pvalue > 0.01

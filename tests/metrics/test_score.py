@@ -332,6 +332,7 @@ def _difference(rng, stimuli, animals, shares):
     return each.mean(), float(error), float(freedom)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("stimuli", "animals"), [(12, 4), (24, 8)])
 def test_models_that_know_nothing_are_rarely_told_apart_and_a_better_one_mostly_is(stimuli, animals):
     rng = np.random.default_rng(stimuli)

@@ -391,6 +391,7 @@ def test_a_folder_with_one_such_file_is_a_model(file, original):
         load_model(name)
 
 
+@pytest.mark.slow
 def test_a_damaged_import_in_the_cache_is_made_again(file, tmp_path, monkeypatch, caplog):
     monkeypatch.setenv("BRAINBENCH_CACHE", str(tmp_path / "cache"))
     weights = import_to_cache(file) / "model.safetensors"

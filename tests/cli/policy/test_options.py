@@ -10,6 +10,7 @@ from tests.factories.policies import teacher_in
 from tests.factories.policy_commands import run_policy
 
 
+@pytest.mark.slow
 def test_a_policy_plays_in_the_contacts_that_it_was_trained_in_unless_told_otherwise(tmp_path: Path) -> None:
     other = str(teacher_in("published", tmp_path / "other"))
 

@@ -18,6 +18,7 @@ def test_tasks_are_listed() -> None:
     assert {"in_palm_rotate", "in_hand_repose", "screwdriver", "hot_ball"} <= {row["task"] for row in found}
 
 
+@pytest.mark.slow
 def test_what_a_shipped_policy_did_is_told_in_goals_turns_and_drops() -> None:
     words = ("play", "in_palm_rotate", "--agent", "in_palm_rotate.teacher", "--seconds", "2", "--seed", "2")
     told = {line.split("  ")[0]: line.split("  ")[-1].strip() for line in run_policy(*words).splitlines()}

@@ -15,6 +15,7 @@ from robotics_bridge.hands.layouts import write_probes
 from tests.factories.policy_commands import run_policy
 
 
+@pytest.mark.slow
 def test_a_task_of_ones_own_is_trained_and_evaluated(tmp_path: Path, quick: Path) -> None:
     run = tmp_path / "run"
     out = run_policy(

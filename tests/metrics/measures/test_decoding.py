@@ -128,6 +128,7 @@ def test_a_model_with_axes_is_decoded_and_one_without_is_not():
     )
 
 
+@pytest.mark.slow
 def test_animals_are_decoded_each_by_itself(monkeypatch):
     metric = get_metric("decoding")
     monkeypatch.setattr(LabelDecoding, "orders_between", 59)

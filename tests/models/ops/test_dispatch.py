@@ -50,6 +50,7 @@ def _plainly(work: Callable[[], Any], monkeypatch: pytest.MonkeyPatch) -> Any:
         return work()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "unroll"),
     [("intersection", "biological"), ("intersection", "full"), ("gru", "full"), ("time-decay", "biological")],
@@ -75,6 +76,7 @@ def test_a_cell_without_norms_has_the_gradients_of_pytorch(
         assert (ours - theirs).norm() <= 1e-4 * theirs.norm() + 1e-6
 
 
+@pytest.mark.slow
 def test_answers_that_only_the_last_step_gives_have_the_gradients_of_pytorch(
     single: torch.device, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -117,6 +119,7 @@ def test_streaming_and_sweeps_agree_without_gradients(kind: str, single: torch.d
             torch.testing.assert_close(y, whole[:, t], atol=1e-5, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_flat_state_streams_with_the_kernels(single: torch.device, monkeypatch: pytest.MonkeyPatch) -> None:
     step = StreamingStep(load_model("zhuang-intersection-ln-small", seed=1).eval()).to(single)
     x = 1e-4 * torch.randn(2, 2, 30, 5, 7, device=single)

@@ -68,6 +68,7 @@ def test_gradients_reach_what_an_objective_trains_and_nothing_else(objective):
     assert frozen == (set() if objective == "supervised" else {"model.decoder.weight", "model.decoder.bias"})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("objective", NAMES)
 def test_ten_steps_on_one_batch_lower_the_loss(objective):
     learner = _learner(objective, "zhuang-ugrnn-ln-small")

@@ -29,6 +29,7 @@ def test_jitter_is_recovered_with_what_it_would_otherwise_blur(jitter, seed):
     assert found.noise.hysteresis_tau == pytest.approx(0.06, rel=0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("delay", "seed"), [(0.02, 0), (0.03, 1), (0.02, 4)])
 def test_jitter_is_told_from_few_presses(delay, seed):
     found = calibrate(log_of(Noise(white=0.02, read_delay=delay, jitter=0.01), steps=1500, probes=6, seed=seed))

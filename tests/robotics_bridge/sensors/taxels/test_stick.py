@@ -57,6 +57,7 @@ def test_a_spring_holds_up_to_the_limit_of_coulomb_and_slides_beyond() -> None:
     np.testing.assert_allclose(slide.to(-0.004)[:, 0], -MU * PUSH, rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_nothing_drifts_in_two_thousand_steps_of_trembling() -> None:
     slide = Slide()
     slide.to(0)
@@ -160,6 +161,7 @@ GRIPPER = """<mujoco><option timestep="0.002" cone="elliptic" impratio="10"/><wo
 </worldbody><actuator><motor joint="j"/></actuator></mujoco>"""
 
 
+@pytest.mark.slow
 def test_a_block_held_against_gravity_reads_its_weight_for_ten_seconds_and_slip_in_one_step() -> None:
     engine = MujocoEngine(mujoco.MjModel.from_xml_string(GRIPPER), 1)
     sensors = {
