@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.stimuli.engines.fidelity import Fidelity, steps_to_ring
-from brainbench.stimuli.engines.trust import SMALL_FORCE
+from brainbench.stimuli.engines.trust import SMALL_FORCE, start_jump
 from brainbench.stimuli.motion.jobs import Job, Trace
 
 HALF_STEP, MORE_LINKS = 2.0, 3.0
@@ -147,8 +147,11 @@ def _estimates(
             for index, finer in zip(some, run([jobs[index] for index in some], setting), strict=True):
                 spent[index] += finer.seconds
                 trace, length = traces[index], jobs[index].whisker.arc_length
-                touching = trace.contact | finer.contact
-                shares = difference(trace.wrench, finer.wrench, touching, length)
+                # The blow that undoes an overlap at the start is the larger the shorter the step; it is no error.
+                force, finer_force = (part.wrench[None, :, None, :3] for part in (trace, finer))
+                calm = ~start_jump(force, finer_force)[0, :, 0]
+                touching = (trace.contact | finer.contact)[calm]
+                shares = difference(trace.wrench[calm], finer.wrench[calm], touching, length)
                 errors[index][place] = factor * float(shares.max()) if finer.status == "ok" else math.inf
     return {index: (errors[index][0], errors[index][1], spent[index]) for index in which}
 

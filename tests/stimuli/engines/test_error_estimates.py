@@ -20,7 +20,7 @@ from brainbench.stimuli.engines.error_estimates import (
 from brainbench.stimuli.engines.fidelity import list_presets
 from brainbench.stimuli.motion.jobs import Job, Load, StillFollicle, Trace
 from brainbench.stimuli.motion.trajectories import ArrayFollicle, Whisking
-from brainbench.stimuli.objects.obstacle import Capsule, Obstacle
+from brainbench.stimuli.objects.obstacle import Capsule, Obstacle, Sphere
 from tests.factories.hard_contacts import hard_jobs
 from tests.factories.whiskers import C2
 
@@ -150,6 +150,17 @@ def test_finer_settings_halve_the_step_that_readings_leave_and_add_half_of_the_l
     assert half.steps_per_period == pytest.approx(2 * np.pi / 0.1)
     assert more_links(fast, job).link_count(C2.arc_length) == 12
     assert more_links(Fidelity(links=90), job).links == 60
+
+
+def test_a_still_touch_is_no_error_however_its_overlap_was_undone():
+    middle = RAT.arc_length / 2
+    place = (middle, 5e-6 - 1e-3 - float(RAT.radius(middle)), 0)
+    job = Job(RAT, StillFollicle(), (Obstacle((Sphere(place, 1e-3),), None),), np.arange(1, 61) * 1e-3)
+    (trace,) = get_engine("rod", errors=True).run([job], Fidelity.of("balanced"))
+    assert trace.status == "ok"
+    assert trace.contact.any()
+    assert trace.error < 0.1
+    assert not trace.remark
 
 
 @pytest.mark.parametrize("preset", list_presets())
