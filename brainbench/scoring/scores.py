@@ -251,25 +251,23 @@ def _compare(inputs: ScoreInputs, *, baselines: bool) -> tuple[list[Score], Scor
     presentation = presentation_of(
         brain, inputs.metric, inputs.animals, inputs.labels, control=baselines, seed=options.seed
     )
-    stated = scores[0].provenance
+    spikes = "many trials share spikes with another one of their stimulus, which makes noise look reliable"
+    recorded = brain.label_doubt, spikes if brain.dependent else ""
+    scores = [_doubted(score, presentation.doubt, *recorded) for score in scores]
     controls = {}
     if raw := rivals.get(RAW_INPUT):
         controls = {RAW_INPUT: raw["input"]}
         controls |= {name: values[inputs.rows] for name, values in network.kinematics.items()}
+    # After the doubts: what says little of the score says little of its parts.
     shared: dict[str, Any] = {"committed": network.card.layer, "seed": options.seed}
     unique = unique_of(scores[0], inputs.metric, inputs.animals, inputs.features, controls, **shared)
+    stated = scores[0].provenance
     statistics = {**stated.statistics, **presentation.statistics, **({"unique": unique.stated} if unique else {})}
     scores[0] = replace(scores[0], provenance=replace(stated, statistics=statistics))
-    if doubt := presentation.doubt:
-        scores, between = [_doubted(score, doubt) for score in scores], between and _doubted(between, doubt)
+    between = between and _doubted(between, presentation.doubt, *recorded)
     if baselines and presentation.control is not None:
-        scores.append(presentation.control)
-    if brain.label_doubt:
-        scores = [_doubted(score, brain.label_doubt) for score in scores]
-        between = between and _doubted(between, brain.label_doubt)
-    if brain.dependent:
-        doubt = "many trials share spikes with another one of their stimulus, which makes noise look reliable"
-        scores, between = [_doubted(score, doubt) for score in scores], between and _doubted(between, doubt)
+        # That the times alone explain something is no doubt about the times.
+        scores.append(_doubted(presentation.control, *recorded))
     doubts, unfelt = brain.doubts, [label for row, label in enumerate(network.labels) if row not in inputs.rows]
     if unfelt and options.match is None:
         names = listing(unfelt, limit=6, quoted=False)
@@ -283,11 +281,14 @@ def _optional(name: str) -> Any:
     return require_optional(PARTS, name, "part of a score")
 
 
-def _doubted(score: Score, doubt: str) -> Score:
-    """Return a score that is never ``ok``; why it has no value at all goes before the doubt."""
+def _doubted(score: Score, *doubts: str) -> Score:
+    """Return a score that is never ``ok`` with a doubt, empty ones aside; why it has no value at all goes first."""
+    reasons = tuple(filter(None, doubts))
+    if not reasons:
+        return score
     if score.status == "undefined":
-        return replace(score, reasons=(*score.reasons, doubt))
-    return replace(score, status="unreliable", reasons=(doubt, *score.reasons))
+        return replace(score, reasons=(*score.reasons, *reasons))
+    return replace(score, status="unreliable", reasons=(*reversed(reasons), *score.reasons))
 
 
 def metric_of(options: ScoreOptions) -> Metric:
