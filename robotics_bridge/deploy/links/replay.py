@@ -61,8 +61,11 @@ class TouchLog:
     force: NDArray[np.float64]
     """[T, N] along inward normals, in ``unit``."""
     unit: str = "N"
+    taxels: tuple[str, ...] = ()
+    """[N] ``LINK:NUMBER`` by the numbers of the log; by default counted on each link in their order."""
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "taxels", self.taxels or tuple(taxel_names(self.points.links)))
         for what in ("time", "position", "target", "force"):
             values = getattr(self, what)
             if not np.isfinite(values).all():
@@ -98,7 +101,7 @@ class Replay:
     def rows(self) -> list[dict[str, Any]]:
         """Return link, number, peaks, error and correlation of every taxel."""
         rows = []
-        for index, name in enumerate(taxel_names(self.log.points.links)):
+        for index, name in enumerate(self.log.taxels):
             real, simulated = self.log.force[:, index], self.simulated[:, index]
             moving = min(np.ptp(real), np.ptp(simulated)) > 0
             rows.append({
@@ -173,7 +176,8 @@ def _read_table(path: Path, hand: Hand, layout: Layout) -> TouchLog:
     points = _placed(links, [int(word) for word in words], layout, path.name)
     position = table[:, [header.index(name) for name in joints]]
     force = table[:, [header.index(name) for name in taxels]]
-    return TouchLog(path.name, table[:, header.index("time")], tuple(joints), position, position, points, force)
+    time = table[:, header.index("time")]
+    return TouchLog(path.name, time, tuple(joints), position, position, points, force, taxels=tuple(taxels))
 
 
 def _read_episode(folder: Path, hand: Hand, layout: Layout, episode: int) -> TouchLog:
