@@ -18,6 +18,7 @@ import numpy as np
 
 from brainbench.core.records import Interval, Status
 from brainbench.core.statistics import two_factor_interval
+from brainbench.metrics.evaluation import first_best
 from brainbench.metrics.inference.permutation import canonical_order
 from brainbench.metrics.rdms.comparison import LINEAR, products_without
 from brainbench.metrics.rdms.pairs import Floats, Ints, permuted_pairs, stimulus_count
@@ -158,6 +159,8 @@ def _factor(animal: SubjectRDM, factor: float, halves: Sequence[Ints], compariso
     trials = animal.halves[:_MOST_TRIAL_SPLITS]
     if not len(trials):
         return factor
+    # Unbiased distances: the share of the square that is no noise. Others: Spearman and Brown of the mean comparison.
+    unbiased = animal.signal_by(comparison).size > 0
     agreement, size, cosines = 0.0, 0.0, []
     for half in halves:
         pairs = permuted_pairs(half[None], animal.count)[0]
@@ -166,9 +169,9 @@ def _factor(animal: SubjectRDM, factor: float, halves: Sequence[Ints], compariso
         )
         product = (first * second).sum(axis=-1)
         agreement, size = agreement + float(np.nanmean(product)), size + float((every**2).sum())
-        cosines.append(product / np.sqrt((first**2).sum(axis=-1) * (second**2).sum(axis=-1)))
-    # Unbiased distances: the share of the square that is no noise. Others: Spearman and Brown of the mean comparison.
-    share = agreement / size if animal.signal_by(comparison).size else float(spearman_brown(np.nanmean(cosines)))
+        if not unbiased:
+            cosines.append(product / np.sqrt((first**2).sum(axis=-1) * (second**2).sum(axis=-1)))
+    share = agreement / size if unbiased else float(spearman_brown(np.nanmean(cosines)))
     return 1 / math.sqrt(min(max(share, _LEAST_SHARE / factor**2), 1.0))
 
 
@@ -226,7 +229,7 @@ class _Sides:
         full = non_negative(gram, sums)
         size = np.sqrt(np.einsum("vlj,vljk,vlk->vl", full, gram, full))
         fit = np.divide((full * sums).sum(axis=-1), size, out=np.zeros_like(size), where=size > 0)
-        layers = np.argmax(fit >= fit.max(axis=-1, keepdims=True) - 1e-12, axis=-1)
+        layers = first_best(fit[..., None])[..., 0]
         rows = np.arange(len(products))
         gram, sums = gram[rows, layers], sums[rows, layers]
         weights = np.stack([full[rows, layers], *(_fitted_to(gram, sums, part, rivals) for part in _PARTS[1:])], axis=1)
@@ -257,7 +260,7 @@ def _fitted_to(gram: Floats, sums: Floats, part: str, rivals: int) -> Floats:
         used[-1] = False
     if part in ("network", "equal"):
         used[1:-1] = False
-    return non_negative(gram, np.where(used, sums, -1.0) if not used.all() else sums, used)
+    return non_negative(gram, sums, used)
 
 
 def non_negative(gram: Floats, sums: Floats, used: Any = None) -> Floats:
