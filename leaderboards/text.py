@@ -97,9 +97,9 @@ def unique_sentence(score: Score) -> str:
     if part is None:
         return ""
     if part.status == "undefined" or not math.isfinite(part.unique):
-        return f"No unique part: {visible(part.reason or 'no number is stated')}."
+        return f"No unique part: {visible('; '.join(part.reasons) or 'no number is stated')}."
     ends = f" [{number(part.low, 2)}, {number(part.high, 2)}]" if math.isfinite(part.low + part.high) else ""
-    doubt = "" if part.status == "ok" else f"; {visible(part.status)}: {visible(part.reason)}"
+    doubt = "" if part.status == "ok" else f"; {visible(part.status)}: {visible('; '.join(part.reasons))}"
     controls = visible(listing(part.controls, quoted=False))
     return (
         f"Unique part {number(part.unique, 2)}{ends}, beyond {controls}; shared with "

@@ -15,12 +15,12 @@ import numpy as np
 from scipy import stats
 
 from brainbench.core.contracts import Trials
-from brainbench.core.records import Interval, Score
+from brainbench.core.records import Score
 from brainbench.core.statistics import two_factor_error
 from brainbench.datasets.synthetic import PopulationDesign, ResponseGeometry
 from brainbench.datasets.synthetic.populations import draw_sessions
 from brainbench.metrics import get_metric, rdm
-from brainbench.metrics.animals import gather
+from brainbench.metrics.evaluation import gather
 from brainbench.metrics.measures.rsa import RSA
 from brainbench.metrics.measures.unique import unique_part
 from brainbench.metrics.rdms.comparison import compare_all
@@ -183,8 +183,7 @@ def unique_study(study: NoisyStudy) -> list[tuple[float, float, float, float]]:
         how: dict[str, Any] = {"comparison": metric.comparison}
         part = unique_part(*sides, scored, factors=factors, factors_without=without, **how)
         truth = unique_part(*sides, [without_noise(each) for each in noiseless], factors=np.ones(8), **how)
-        span = part.interval or Interval(math.nan, math.nan)
-        results.append((part.unique, span.low, span.high, truth.unique))
+        results.append((part.unique, part.low, part.high, truth.unique))
     return results
 
 

@@ -12,37 +12,62 @@ from brainbench.core.files import content_hash
 
 
 @dataclass(frozen=True)
-class UniqueStated:
-    """The unique part of a network as a record states it: 0 is equal distances, 1 all that is reliable."""
+class UniquePart:
+    """What a network explains beyond controls, in parts of what is reliable and more than equal distances.
+
+    Equal distances explain 0, all that is reliable is 1. ``total`` is the sum of ``unique``, ``shared`` and
+    ``controls_alone``. A number is NaN where there is none.
+    """
 
     status: str
-    reason: str
-    unique: float
-    """NaN where there is none, for a reason."""
-    low: float
-    high: float
-    shared: float
-    controls: tuple[str, ...]
+    reasons: tuple[str, ...] = ()
+    unique: float = math.nan
+    """What the network explains beyond the controls."""
+    low: float = math.nan
+    """Interval of ``unique``, over animals and stimuli."""
+    high: float = math.nan
+    total: float = math.nan
+    """What network and controls explain together."""
+    shared: float = math.nan
+    """What either explains; negative where one hides the other."""
+    controls_alone: float = math.nan
+    """What the controls explain beyond the network."""
+    controls: tuple[str, ...] = ()
+    layer: str | None = None
+    """The layer chosen most often."""
+    monte_carlo_error: float = math.nan
+    """Standard error of ``unique`` from the number of random halves."""
 
     @classmethod
-    def of(cls, stated: Mapping[str, Any]) -> UniqueStated:
-        """Return what a mapping states; numbers that are none are NaN."""
+    def of(cls, stated: Mapping[str, Any]) -> UniquePart:
+        """Return what a mapping states; numbers that are none are NaN: a record is data that anyone may write."""
 
         def number(value: Any) -> float:
             real = isinstance(value, (int, float)) and not isinstance(value, bool)
             return float(value) if real and math.isfinite(value) else math.nan
 
-        span, controls, reasons = stated.get("interval"), stated.get("controls"), stated.get("reasons")
+        span = stated.get("interval")
         low, high = span if isinstance(span, (list, tuple)) and len(span) == 2 else (math.nan, math.nan)
+        numbers = ("unique", "total", "shared", "controls_alone", "monte_carlo_error")
+        texts = {
+            name: tuple(map(_text, values)) if isinstance(values := stated.get(name), (list, tuple)) else ()
+            for name in ("reasons", "controls")
+        }
         return cls(
-            _text(stated.get("status")),
-            "; ".join(map(_text, reasons)) if isinstance(reasons, (list, tuple)) else "",
-            number(stated.get("unique")),
-            number(low),
-            number(high),
-            number(stated.get("shared")),
-            tuple(map(_text, controls)) if isinstance(controls, (list, tuple)) else (),
+            status=_text(stated.get("status")),
+            layer=_text(stated.get("layer")) or None,
+            low=number(low),
+            high=number(high),
+            **{name: number(stated.get(name)) for name in numbers},
+            **texts,
         )
+
+    @property
+    def stated(self) -> dict[str, Any]:
+        """What a record keeps."""
+        values = {item.name: getattr(self, item.name) for item in fields(self) if item.name not in ("low", "high")}
+        span = [self.low, self.high] if math.isfinite(self.low + self.high) else None
+        return {**values, "reasons": list(self.reasons), "controls": list(self.controls), "interval": span}
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,10 +178,10 @@ class Provenance(Mapping[str, Any]):
         return values
 
     @property
-    def unique(self) -> UniqueStated | None:
-        """What a network explains beyond controls, where numbers state it: a record is data that anyone may write."""
+    def unique(self) -> UniquePart | None:
+        """What a network explains beyond controls; None where nothing is stated of it."""
         stated = self.statistics.get("unique")
-        return UniqueStated.of(stated) if isinstance(stated, Mapping) else None
+        return UniquePart.of(stated) if isinstance(stated, Mapping) else None
 
     def __getitem__(self, name: str) -> Any:
         """Return a stated entry."""

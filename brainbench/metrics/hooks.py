@@ -6,7 +6,7 @@ and stimuli, chance and what is attainable. :class:`brainbench.metrics.Metric` j
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 
 from brainbench.core.contracts import Trials
 from brainbench.core.errors import UsageError
+from brainbench.core.provenance import UniquePart
 from brainbench.metrics.arrays import fetch
 from brainbench.metrics.inference.permutation import SMALLEST_STIMULI, canonical_order
 from brainbench.metrics.rdms.pairs import Floats, Ints
@@ -154,6 +155,21 @@ class MetricHooks:
     def statistics(self, layer: Floats, animals: Sequence[SubjectRDM], seed: int) -> dict[str, Any]:
         """Return what else a record keeps of the chosen layer; nothing unless overridden."""
         return {}
+
+    def unique(
+        self,
+        layers: Mapping[str, Floats],
+        controls: Mapping[str, Floats],
+        animals: Sequence[SubjectRDM],
+        factors: Floats,
+        **options: Any,
+    ) -> UniquePart | None:
+        """Return what layers explain of animals beyond controls; None where a metric does not say.
+
+        ``factors`` [A] correct comparisons for noise; ``options`` are ``attainable``, ``committed`` and ``seed``, as of
+        the score.
+        """
+        return None
 
     def describe(self, animals: Sequence[SubjectRDM]) -> str:
         """Name the metric in words, for the record."""

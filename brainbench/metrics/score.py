@@ -15,19 +15,24 @@ from typing import Any
 import numpy as np
 
 from brainbench.core.errors import UsageError, check_name, check_once
-from brainbench.core.provenance import Provenance
+from brainbench.core.provenance import Provenance, UniquePart
 from brainbench.core.records import LayerScore, Score, Status, SubjectScore
 from brainbench.core.statistics import FEWEST_ANIMALS, FEWEST_STIMULI, t_interval, two_factor_interval
-from brainbench.metrics.animals import Animals, ceiling_of, gather, mean_rdm, mean_reliability, recorded_rdm
 from brainbench.metrics.arrays import finite_mean
 from brainbench.metrics.evaluation import (
+    Animals,
     LayerComparisons,
     LayerEvaluation,
     attainable_value,
+    ceiling_of,
     defined_layers,
     evaluate,
     first_best,
+    gather,
+    mean_rdm,
+    mean_reliability,
     most_chosen,
+    recorded_rdm,
 )
 from brainbench.metrics.hooks import MetricHooks
 from brainbench.metrics.inference.permutation import (
@@ -79,12 +84,14 @@ def score_layers(
     device: Any = None,
     committed: str | None = None,
     each: bool = False,
+    controls: Mapping[str, Floats] | None = None,
 ) -> tuple[Score, PermutationTest | None]:
     """Score the layers of a model against animals; also return the permutation test with all statistics.
 
     ``layers`` are what :meth:`Metric.layer` made of each layer, in network order, ``subjects`` what
     :meth:`Metric.animal` made of each animal. ``committed`` is a layer that was chosen before anything was scored;
     without a torch ``device`` numpy computes the permutations. With ``each``, layers are those of the animals, by name.
+    What layers explain beyond ``controls`` is stated by the default estimator, where the metric says.
     """
     check_once("A score", map(str, stimuli))
     if committed is not None:
@@ -117,11 +124,15 @@ def score_layers(
         "stimuli": tuple(map(str, stimuli)),
         "brain_rdm": mean_rdm(animals) if metric.of_rdms else (),
     }
+    beyond = controls if estimator == "default" else None
     splits = max(len(subject.split_half_r) for subject in animals.subjects)
-    stated = {"seed": seed, "splits": splits, "reliability_gate": RELIABILITY_GATE}
+    stated: dict[str, Any] = {"seed": seed, "splits": splits, "reliability_gate": RELIABILITY_GATE}
     if result is None:
         empty = tuple(LayerScore(label, math.nan, math.nan, "undefined") for label in names)
         parts = tuple(_subject(animals, index, math.nan, math.nan, None) for index in range(len(animals.subjects)))
+        if beyond and metric.of_rdms:
+            part = UniquePart("undefined", ("the score is undefined",))
+            stated["statistics"] = {"unique": part.stated}
         return Score(value=math.nan, layers=empty, subjects=parts, provenance=Provenance.of(stated), **about), None
     means = result.layer_values.mean(axis=1)
     best, chosen = first_best(means[:, None]).item(), most_chosen(result.chosen)
@@ -140,6 +151,10 @@ def score_layers(
     if result.layer_null.size:
         tests = zip(defined, *(p.tolist() for p in layer_p(result.layer_null)), strict=True)
         statistics["layer_tests"] = [{"layer": name, "p": p, "p_corrected": corrected} for name, p, corrected in tests]
+    if beyond:
+        how = {"attainable": attainable, "committed": committed, "seed": seed}
+        if part := metric.unique(layers, beyond, scored, animals.factors(animals.scored), **how):
+            statistics["unique"] = part.stated
     rows = {label: row for row, label in enumerate(defined)}
     repeated = f"{'layer chosen' if estimator == 'default' else 'maximum over layers taken'} anew in each"
     value = float(result.values.mean())

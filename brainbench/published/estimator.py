@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.provenance import Provenance
 from brainbench.core.records import LayerScore, Score, SubjectScore
-from brainbench.metrics.animals import recorded_rdm
+from brainbench.metrics.evaluation import recorded_rdm
 from brainbench.metrics.inference.permutation import EXACT_STIMULI, make_test, permuted_values
 from brainbench.metrics.rdms.comparison import compare
 from brainbench.metrics.rdms.dissimilarity import correlation_distances

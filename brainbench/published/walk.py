@@ -32,8 +32,7 @@ from brainbench.core.files import to_plain
 from brainbench.core.progress import Progress
 from brainbench.core.reading.archives import read_npz
 from brainbench.core.records import Status
-from brainbench.metrics.animals import gather
-from brainbench.metrics.evaluation import held_out
+from brainbench.metrics.evaluation import gather, held_out
 from brainbench.metrics.measures.rsa import RSA
 from brainbench.metrics.rdms.comparison import compare
 from brainbench.metrics.rdms.dissimilarity import rdm

@@ -18,7 +18,6 @@ from brainbench.core.files import file_hash
 from brainbench.core.progress import Progress
 from brainbench.core.reading.regular import readable
 from brainbench.core.records import Interval, ModelCard
-from brainbench.scoring.unique import contact_kinematics
 
 if TYPE_CHECKING:
     import torch
@@ -29,6 +28,8 @@ if TYPE_CHECKING:
 
 _LOG = logging.getLogger(__name__)
 DEFAULT_STIMULI = "rodgers"
+RAW_INPUT = "raw input"
+"""Name of the first baseline, which is the first control of the unique part too."""
 RANDOM_FEATURES = 512
 """Width of the random-features baseline."""
 _ELSEWHERE = "features computed elsewhere"
@@ -81,7 +82,7 @@ class ModelResponses:
         raw = self.model_input[rows].astype(np.float64)
         weights = np.random.default_rng(seed).standard_normal((raw.shape[-1], RANDOM_FEATURES)) / np.sqrt(raw.shape[-1])
         return {
-            "raw input": {"input": reduce_time(raw, self.time)},
+            RAW_INPUT: {"input": reduce_time(raw, self.time)},
             "random features": {"random": reduce_time(np.maximum(raw @ weights, 0.0), self.time)},
         }
 
@@ -317,3 +318,22 @@ def reduce_time(values: NDArray[np.floating], time: str) -> NDArray[np.floating]
         return values.mean(axis=1, dtype=np.float64)
     flat = values.reshape(len(values), -1)
     return flat.astype(np.float64, copy=False) if time == "mean" else flat
+
+
+def contact_kinematics(dataset: Any) -> dict[str, NDArray[np.float64]]:
+    """Return what a stimulus set states of contacts by name, [K, W]; nothing of a set without contacts.
+
+    *First contact* (s) is the end of the stimulus for a whisker that touches nothing, whose *contact arc* (m along the
+    whisker, mean over the contact) is 0; *contact duration* is a share of the stimulus.
+    """
+    if not {"contact", "contact_arc", "first_contact"} <= set(getattr(dataset, "data_vars", ())):
+        return {}
+    contact = dataset["contact"].values.astype(bool)
+    count = contact.sum(axis=1)
+    arc = np.nansum(np.where(contact, dataset["contact_arc"].values, 0.0), axis=1, dtype=np.float64)
+    first, time = dataset["first_contact"].values, dataset["time"].values
+    return {
+        "first contact": np.where(np.isfinite(first), first, float(time[-1])),
+        "contact duration": count / contact.shape[1],
+        "contact arc": arc / np.maximum(count, 1),
+    }

@@ -168,7 +168,7 @@ class NeuralResponses:
 
         Units are chosen over the whole window, before their bins become features.
         """
-        from brainbench.metrics.reliability.units import reliable_units
+        from brainbench.metrics.reliability.halves import reliable_units
 
         given, how = self.trials(labels, averaged=averaged), {"least": options.units_reliability, "seed": options.seed}
         # Without a gate no unit is judged.

@@ -22,7 +22,6 @@ from brainbench.core.provenance import Provenance
 from brainbench.core.records import ESTIMATOR_VERSION, ResultRecord, Score
 from brainbench.scoring.options import ScoreOptions
 from brainbench.scoring.presentation import presentation_of
-from brainbench.scoring.unique import RAW_INPUT, unique_of
 
 if TYPE_CHECKING:
     from brainbench.metrics import Metric
@@ -235,6 +234,8 @@ def _compare(inputs: ScoreInputs, *, baselines: bool) -> tuple[list[Score], Scor
 
     The published estimators take a published file as its authors' code does: zeros kept, the maximum over all layers.
     """
+    from brainbench.scoring.model_responses import RAW_INPUT
+
     brain, network, options = inputs.brain, inputs.network, inputs.options
     rivals = network.baseline_features(inputs.rows, options.seed) if baselines else {}
     features = {network.card.name: inputs.features, **rivals}
@@ -242,9 +243,12 @@ def _compare(inputs: ScoreInputs, *, baselines: bool) -> tuple[list[Score], Scor
         scores, between = _optional("published_arrays")(inputs, features, agreement=baselines)
     else:
         how: dict[str, Any] = {"stimuli": inputs.labels, "estimator": options.estimator, "seed": options.seed}
-        committed = {network.card.name: network.card.layer}
+        more: dict[str, Any] = {network.card.name: {"layer": network.card.layer}}
+        if (raw := rivals.get(RAW_INPUT)) and inputs.metric.of_rdms:
+            kinematics = {name: values[inputs.rows] for name, values in network.kinematics.items()}
+            more[network.card.name]["controls"] = {RAW_INPUT: raw["input"], **kinematics}
         scores = [
-            inputs.metric.score(layers, inputs.animals, name=name, layer=committed.get(name), **how)
+            inputs.metric.score(layers, inputs.animals, name=name, **more.get(name, {}), **how)
             for name, layers in features.items()
         ]
         between = inputs.metric.score_animals(inputs.animals, **how) if baselines else None
@@ -254,16 +258,9 @@ def _compare(inputs: ScoreInputs, *, baselines: bool) -> tuple[list[Score], Scor
     spikes = "many trials share spikes with another one of their stimulus, which makes noise look reliable"
     recorded = brain.label_doubt, spikes if brain.dependent else ""
     scores = [_doubted(score, presentation.doubt, *recorded) for score in scores]
-    controls = {}
-    if raw := rivals.get(RAW_INPUT):
-        controls = {RAW_INPUT: raw["input"]}
-        controls |= {name: values[inputs.rows] for name, values in network.kinematics.items()}
-    # After the doubts: what says little of the score says little of its parts.
-    shared: dict[str, Any] = {"committed": network.card.layer, "seed": options.seed}
-    unique = unique_of(scores[0], inputs.metric, inputs.animals, inputs.features, controls, **shared)
     stated = scores[0].provenance
-    statistics = {**stated.statistics, **presentation.statistics, **({"unique": unique.stated} if unique else {})}
-    scores[0] = replace(scores[0], provenance=replace(stated, statistics=statistics))
+    statistics = {**stated.statistics, **presentation.statistics}
+    scores[0] = held_parts(replace(scores[0], provenance=replace(stated, statistics=statistics)))
     between = between and _doubted(between, presentation.doubt, *recorded)
     if baselines and presentation.control is not None:
         # That the times alone explain something is no doubt about the times.
@@ -289,6 +286,16 @@ def _doubted(score: Score, *doubts: str) -> Score:
     if score.status == "undefined":
         return replace(score, reasons=(*score.reasons, *reasons))
     return replace(score, status="unreliable", reasons=(*reversed(reasons), *score.reasons))
+
+
+def held_parts(score: Score) -> Score:
+    """Return a score whose parts are as doubtful as it is: what says little of the score says little of them."""
+    part = score.provenance.unique
+    if part is None or part.status != "ok" or score.status == "ok":
+        return score
+    part = replace(part, status="unreliable", reasons=("the score is not ok", *part.reasons))
+    statistics = {**score.provenance.statistics, "unique": part.stated}
+    return replace(score, provenance=replace(score.provenance, statistics=statistics))
 
 
 def metric_of(options: ScoreOptions) -> Metric:

@@ -13,7 +13,7 @@ from brainbench.core.errors import UsageError
 from brainbench.datasets import open_recordings, write_recordings
 from brainbench.datasets.sessions import make_session
 from brainbench.models.registry import load_model
-from brainbench.scoring.model_responses import resolve_model
+from brainbench.scoring.model_responses import contact_kinematics, resolve_model
 from brainbench.scoring.options import ScoreOptions
 from brainbench.stimuli import Frames, Scene, WhiskerArray, simulate
 
@@ -152,3 +152,20 @@ def test_frames_unlike_those_of_the_training_are_told(model: str, frames: Frames
     card = resolve_model(model).respond(ScoreOptions(stimuli=air)).card
     assert card.input == "SI (N, N·m); normalised inside the model" + f"; unlike its training: {told}" * bool(told)
     assert (told in caplog.text) if told else "was trained on" not in caplog.text
+
+
+def test_contacts_are_their_beginning_duration_and_place():
+    contact = np.zeros((2, 4, 2), dtype=bool)
+    contact[0, 1:3, 0] = True
+    arc = np.where(contact, 0.01, np.nan)
+    first = np.array([[0.1, np.nan], [np.nan, np.nan]])
+    over_time = ("stimulus", "time", "whisker")
+    dataset = xr.Dataset(
+        {"contact": (over_time, contact), "contact_arc": (over_time, arc), "first_contact": (over_time[::2], first)},
+        coords={"time": [0.0, 0.1, 0.2, 0.3]},
+    )
+    kinematics = contact_kinematics(dataset)
+    np.testing.assert_allclose(kinematics["first contact"], [[0.1, 0.3], [0.3, 0.3]])
+    np.testing.assert_allclose(kinematics["contact duration"], [[0.5, 0], [0, 0]])
+    np.testing.assert_allclose(kinematics["contact arc"], [[0.01, 0], [0, 0]])
+    assert contact_kinematics(dataset.drop_vars("contact")) == contact_kinematics(None) == {}

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,12 +12,14 @@ from torch import nn
 
 import brainbench
 from brainbench.cli.leaderboard.verify import Repetition, score_again
+from brainbench.core.contracts import Trials
 from brainbench.core.errors import UsageError
 from brainbench.datasets import open_recordings, write_recordings
 from brainbench.datasets.sessions import make_session
 from brainbench.datasets.trials.session_trials import pooled
+from brainbench.metrics import get_metric
 from brainbench.models.features import write_features
-from brainbench.scoring.scores import score_record
+from brainbench.scoring.scores import held_parts, score_record
 from leaderboards.audit import differences
 
 LABELS = ("a", "b", "c", "d", "e", "f")
@@ -360,3 +363,34 @@ def test_the_published_estimators_use_correlation_distances(truth: Path, recordi
     assert "correlation RDM, pearson" in brainbench.score(str(truth), recordings=recordings, estimator="thesis").metric
     with pytest.raises(UsageError, match="'ridge'"):
         brainbench.score(str(truth), recordings=recordings, estimator="thesis", metric="ridge")
+
+
+def test_a_record_states_the_part_or_why_there_is_none(files):
+    options = {"recordings": files["recordings"], "stimuli": files["arrays"], "conditions": "trials:texture"}
+    part = score_record(files["model"], **options).score.provenance.unique
+    assert part.status == "undefined"
+    assert "stimuli are too few" in part.reasons[0]
+    assert score_record(files["model"], baselines=False, **options).score.provenance.unique is None
+    assert score_record(files["model"], metric="cka", **options).score.provenance.unique is None
+
+
+def test_a_doubted_score_has_a_doubted_unique_part():
+    rng, labels = np.random.default_rng(0), np.repeat(np.arange(12), 8)
+    hidden, names = rng.normal(size=(12, 5)), [f"s{place}" for place in range(12)]
+    metric, animals = get_metric("rsa"), []
+    for animal in range(3):
+        responses = (hidden @ rng.normal(size=(5, 40)))[labels] + rng.normal(size=(96, 40))
+        keys = [f"{animal}/{trial}" for trial in range(96)]
+        animals.append(metric.animal(f"m{animal}", [Trials(responses, labels, keys)], 12))
+    how = {"name": "net", "stimuli": names, "controls": {"raw input": rng.normal(size=(12, 5))}}
+    score = metric.score({"layer": hidden}, animals, **how)
+    part = score.provenance.unique
+    assert (score.status, part.status) == ("ok", "ok")
+    assert part.unique > 0.8
+    doubted = held_parts(replace(score, status="unreliable")).provenance.unique
+    assert (doubted.status, doubted.unique) == ("unreliable", part.unique)
+    assert held_parts(score) is score
+    undefined = metric.score({"layer": np.ones((12, 5))}, animals, **how).provenance.unique
+    assert (undefined.status, undefined.reasons) == ("undefined", ("the score is undefined",))
+    assert metric.score({"layer": hidden}, animals, name="net", stimuli=names).provenance.unique is None
+    assert get_metric("cka").score({"layer": hidden}, animals, **how).provenance.unique is None

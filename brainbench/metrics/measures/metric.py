@@ -33,11 +33,19 @@ class Metric(MetricHooks):
         estimator: str = "default",
         seed: int = 0,
         layer: str | None = None,
+        controls: Mapping[str, ArrayLike] | None = None,
     ) -> Score:
-        """Score a model by the features [K, F] of its layers; ``layer`` is one committed to beforehand."""
+        """Score a model by the features [K, F] of its layers; ``layer`` is one committed to beforehand.
+
+        With the features of ``controls`` the score also states what the layers explain beyond them, where the metric
+        says (:meth:`unique`).
+        """
         check_features(features, stimuli)
-        layers = {label: self.layer(values) for label, values in features.items()}
+        layers, rivals = (
+            {label: self.layer(values) for label, values in side.items()} for side in (features, controls or {})
+        )
         options = {"name": name, "stimuli": stimuli, "estimator": estimator, "seed": seed, "committed": layer}
+        options["controls"] = rivals
         return score_layers(self, layers, animals, **options)[0]
 
     def score_animals(

@@ -12,9 +12,11 @@ from numpy.typing import ArrayLike
 
 from brainbench.core.errors import UsageError, check_each, check_name
 from brainbench.core.limits import Count, limited
+from brainbench.core.provenance import UniquePart
 from brainbench.core.records import Score
 from brainbench.metrics.hooks import usable_features
 from brainbench.metrics.measures.metric import Metric
+from brainbench.metrics.measures.unique import unique_part
 from brainbench.metrics.rdms.comparison import (
     WITHOUT,
     check_comparison,
@@ -171,6 +173,19 @@ class RSA(Metric):
             others = (moved.sum(axis=1, keepdims=True) - moved) / (len(rdms) - 1)
             agreements.append(compare_rdms(moved, others, method=self.comparison) @ factors / len(factors))
         return np.concatenate(agreements)
+
+    def unique(
+        self,
+        layers: Mapping[str, Floats],
+        controls: Mapping[str, Floats],
+        animals: Sequence[SubjectRDM],
+        factors: Floats,
+        **options: Any,
+    ) -> UniquePart:
+        """Return what the layers' RDMs explain of the animals' beyond those of the controls."""
+        without = self.factors_without(animals, factors)
+        how: dict[str, Any] = {"comparison": self.comparison, "factors": factors, "factors_without": without}
+        return unique_part(layers, controls, animals, **how, **options)
 
     def describe(self, animals: Sequence[SubjectRDM]) -> str:
         """Name the RDMs, the noise that they are divided by, and their comparison."""

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from brainbench.core.records import Interval, Status
+from brainbench.core.provenance import UniquePart
 from brainbench.core.statistics import two_factor_interval
 from brainbench.metrics.evaluation import first_best
 from brainbench.metrics.inference.permutation import canonical_order
@@ -35,43 +35,6 @@ _LEAST_SHARE = 0.25
 """Smallest reliability of halves, as a share of that of all stimuli, which is divided by."""
 _PARTS = ("both", "controls", "network", "equal")
 """Sums that are compared: controls and layer, controls, layer; each with equal distances, and these alone."""
-
-
-@dataclass(frozen=True)
-class UniquePart:
-    """Parts of what is reliable and more than equal distances: these explain 0, all that is reliable is 1.
-
-    ``total`` is the sum of ``unique``, ``shared`` and ``controls_alone``.
-    """
-
-    status: Status
-    reasons: tuple[str, ...] = ()
-    unique: float = math.nan
-    """What the network explains beyond the controls."""
-    interval: Interval | None = None
-    """Interval of ``unique``, over animals and stimuli."""
-    total: float = math.nan
-    """What network and controls explain together."""
-    shared: float = math.nan
-    """What either explains; negative where one hides the other."""
-    controls_alone: float = math.nan
-    """What the controls explain beyond the network."""
-    controls: tuple[str, ...] = ()
-    layer: str | None = None
-    """The layer chosen most often."""
-    monte_carlo_error: float = math.nan
-    """Standard error of ``unique`` from the number of random halves."""
-
-    @property
-    def stated(self) -> dict[str, Any]:
-        """What a record keeps."""
-        span = self.interval
-        return {
-            "status": self.status, "reasons": list(self.reasons), "unique": self.unique, "total": self.total,
-            "shared": self.shared, "controls_alone": self.controls_alone, "controls": list(self.controls),
-            "interval": None if span is None else [span.low, span.high], "layer": self.layer,
-            "monte_carlo_error": self.monte_carlo_error,
-        }  # fmt: skip
 
 
 def unique_part(
@@ -130,10 +93,12 @@ def unique_part(
         return UniquePart("undefined", ("equal distances reach all that is attainable",), controls=tuple(controls))
     both, rivals, network, equal = by_split.mean(axis=0) / span
     unique, draws = both - rivals, (by_split[:, 0] - by_split[:, 1]).mean(axis=1) / span
+    interval = two_factor_interval(float(unique.mean()), unique, (without[:, 0] - without[:, 1]) / span)
     return UniquePart(
         status="ok",
         unique=float(unique.mean()),
-        interval=two_factor_interval(float(unique.mean()), unique, (without[:, 0] - without[:, 1]) / span),
+        low=math.nan if interval is None else interval.low,
+        high=math.nan if interval is None else interval.high,
         total=float((both - equal).mean()),
         shared=float((network + rivals - both - equal).mean()),
         controls_alone=float((both - network).mean()),

@@ -47,16 +47,13 @@ def test_a_copy_of_the_raw_input_has_no_unique_part_and_the_hidden_network_nearl
     part = _part(_study(0, hidden=1.0, network="hidden"), comparison)
     assert part.status == "ok"
     assert part.unique > 0.9 * part.total > 0.5
-    assert part.interval.low > 0
+    assert part.low > 0
     assert part.total == pytest.approx(part.unique + part.shared + part.controls_alone)
 
 
 def test_networks_that_add_nothing_are_rarely_found_to_have_a_part_of_their_own():
     kinds = ("mixed", "unrelated")
-    low = [
-        _part(_study(seed, hidden=0.5, network=kinds[seed % 2], stimuli=12), splits=4).interval.low
-        for seed in range(24)
-    ]
+    low = [_part(_study(seed, hidden=0.5, network=kinds[seed % 2], stimuli=12), splits=4).low for seed in range(24)]
     assert np.count_nonzero(np.array(low) > 0) <= 2
 
 
@@ -68,7 +65,7 @@ def test_the_order_of_the_stimuli_changes_nothing_and_a_seed_repeats_it():
     parts = [{name: values[moved] for name, values in side.items()} for side in (layers, controls)]
     second = _part((*parts, brain[:, moved]))
     assert second.unique == pytest.approx(first.unique, abs=1e-9)
-    assert second.interval.low == pytest.approx(first.interval.low, abs=1e-9)
+    assert second.low == pytest.approx(first.low, abs=1e-9)
 
 
 def test_a_committed_layer_is_the_only_one_and_the_layer_is_chosen_where_weights_are_fitted():
