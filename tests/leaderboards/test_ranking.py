@@ -45,6 +45,7 @@ def test_a_range_counts_who_is_above_and_who_is_below(drawn):
         assert last == len(above) - sum(above[:, i])
 
 
+@pytest.mark.slow
 def test_equal_models_are_rarely_told_apart():
     wrong = 0
     for seed in range(200):

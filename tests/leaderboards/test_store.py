@@ -84,6 +84,7 @@ def test_missing_field_is_named(make_record):
     assert "score lacks 'status'" in str(_fault(data))
 
 
+@pytest.mark.slow
 @settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_reading_agrees_with_jsonschema_on_damaged_records(make_record, data):
@@ -262,6 +263,7 @@ def _write_all(text: str, folder: str) -> None:
         write_record(ResultRecord.from_json(item), folder)
 
 
+@pytest.mark.slow
 def test_concurrent_writers_lose_nothing(make_record, tmp_path):
     records = [make_record(f"model-{index}") for index in range(30)]
     text = json.dumps([json.loads(record.to_json()) for record in records])

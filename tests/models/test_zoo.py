@@ -104,6 +104,7 @@ def test_weights_of_a_full_model_survive_saving(name, tmp_path):
     _survives_saving(name, tmp_path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", UNIQUE_SMALL)
 def test_different_stimuli_stay_different_in_every_layer(name):
     # An untrained network is a baseline only if it does not wash its stimuli out.
@@ -126,6 +127,7 @@ def _agrees_in_half_precision(name, steps):
     assert (rough.float() - exact).norm() < 0.08 * exact.norm()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name in UNIQUE_SMALL if "-ln" not in name or "+" not in name])
 def test_half_precision_agrees(name):
     _agrees_in_half_precision(name, 6)

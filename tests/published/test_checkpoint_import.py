@@ -134,6 +134,7 @@ def _entries(names):
     return {name: torch.empty(shape, device="meta") for name, shape, _ in names}
 
 
+@pytest.mark.slow
 @pytest.mark.shared
 def test_every_network_of_the_study_is_recognised_and_every_entry_accounted_for(published):
     assert len(published.networks) == 74
@@ -257,6 +258,7 @@ def test_a_network_gives_the_authors_outputs(published, name):
         assert np.abs(np.asarray(whole) - theirs[f"mean/{layer}"]).max() <= within * np.abs(values).max()
 
 
+@pytest.mark.slow
 @pytest.mark.shared
 @pytest.mark.parametrize(("name", "share"), [("resnet18/mlp3-all", 1e-5), ("resnet18+mamba/linear-last", 3e-4)])
 @torch.no_grad()
@@ -338,6 +340,7 @@ def test_a_file_in_the_authors_layout_becomes_a_model(file, tmp_path, original):
     assert describe_model(made.name).trained["twin"] is None
 
 
+@pytest.mark.slow
 def test_a_first_stage_file_has_no_decoder(file, tmp_path):
     content = torch.load(file, weights_only=True)
     content["state_dict"] = {name: v for name, v in content["state_dict"].items() if ".decoder.mlp" not in name}
@@ -376,6 +379,7 @@ def test_an_entry_that_nobody_knows_is_refused(file, tmp_path):
         import_checkpoint(file, out=tmp_path / "made")
 
 
+@pytest.mark.slow
 @torch.no_grad()
 def test_a_folder_with_one_such_file_is_a_model(file, original):
     x = random_sweeps(1, 5)

@@ -85,6 +85,7 @@ def test_other_numbers_of_stimuli_need_a_match(file, features, tmp_path):
     assert score.status == "unreliable"
 
 
+@pytest.mark.slow
 @pytest.mark.shared
 def test_the_numbers_of_the_page_are_those_of_the_example(reference):
     page = (Path(__file__).parents[2] / "docs" / "published-files.md").read_text(encoding="utf-8")

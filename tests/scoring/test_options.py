@@ -88,6 +88,7 @@ def test_layers_are_a_list_of_names(wrong):
         ScoreOptions(layers=wrong)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("option", [{"fidelity": "fast"}, {"whiskers": "C0-C3"}])
 def test_a_simulation_cannot_be_chosen_for_features_computed_elsewhere(option):
     with pytest.raises(UsageError, match="computed elsewhere"):

@@ -69,6 +69,7 @@ def test_whiskers_without_motion_or_object_are_silent_and_a_full_simulation_feel
     assert not full["contact"].any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("label", ["convex-far", "concave-far"])
 def test_whiskers_that_the_rodgers_solid_cannot_touch_feel_the_same_in_a_full_simulation(in_full, monkeypatch, label):
     (scene,) = (scene for scene in get_recipe("rodgers").scenes if scene.label == label)
@@ -207,6 +208,7 @@ def test_a_set_without_or_with_a_damaged_explanation_is_refused_in_words():
         Explanation.of(dataset)
 
 
+@pytest.mark.slow
 def test_steps_whose_contact_forces_were_not_solved_are_told():
     pytest.importorskip("warp")
     scene = get_recipe("rodgers").scenes[0].select("C1,C2")

@@ -131,6 +131,7 @@ def test_the_solver_is_an_axis_of_the_backend_that_has_two_and_no_rival_of_the_p
     assert whiskers.best([still]) == []
 
 
+@pytest.mark.slow
 def test_what_few_iterations_leave_of_contact_forces_is_among_the_errors(quick, monkeypatch, tmp_path):
     pytest.importorskip("warp")
     monkeypatch.setattr(contact_scenes, "FRICTIONS", (0.8,))

@@ -158,6 +158,7 @@ def test_what_is_attainable_does_not_depend_on_the_order_of_units(name):
     assert second.attainable == pytest.approx(first.attainable, abs=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", METRICS)
 def test_animals_of_noise_alone_are_no_ground_for_a_score(name):
     names, features, blocks = _make(8, animals=3)

@@ -43,6 +43,7 @@ def test_a_code_for_shape_and_distance_is_decoded_for_stimuli_left_out():
         assert len(found.correct) == 6
 
 
+@pytest.mark.slow
 def test_without_information_leaving_one_out_falls_below_chance():
     rng = np.random.default_rng(2)
     values = [decode(rng.normal(size=(6, 50)), range(6), SHAPES) for _ in range(12)]
@@ -59,6 +60,7 @@ def test_all_orders_of_the_classes_are_tried_up_to_six_stimuli():
     assert decode(trials, range(8), [*SHAPES, "convex", "concave"]).count == 200
 
 
+@pytest.mark.slow
 def test_many_units_cost_no_more_than_trials():
     rng = np.random.default_rng(3)
     wide = rng.normal(size=(6, 20_000))
@@ -105,6 +107,7 @@ def test_labels_name_their_properties_in_any_number_of_parts():
     assert list(label_properties(["go", "go", "nogo", "nogo"])) == ["go/nogo"]
 
 
+@pytest.mark.slow
 def test_a_model_with_axes_is_decoded_and_one_without_is_not():
     metric = get_metric("decoding")
     rng = np.random.default_rng(1)

@@ -39,6 +39,7 @@ def _score(metric, animals, features):
     return metric.score({"l": features}, animals, name="x", stimuli=STIMULI)
 
 
+@pytest.mark.slow
 def test_a_model_that_counts_touches_scores_by_rsa_and_not_beyond_touches():
     latent = np.random.default_rng(1).normal(size=(7, 3))
     blocks = _make_blocks(latent)

@@ -49,6 +49,7 @@ def test_ridge_without_a_stimulus_is_ridge_on_the_data_without_it():
         np.testing.assert_allclose(found[stimulus] * factors, alone * scale, rtol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", OTHERS)
 def test_the_shared_geometry_is_found_and_an_unrelated_model_is_not(name):
     metric = get_metric(name)

@@ -51,12 +51,14 @@ def test_a_copy_of_the_raw_input_has_no_unique_part_and_the_hidden_network_nearl
     assert part.total == pytest.approx(part.unique + part.shared + part.controls_alone)
 
 
+@pytest.mark.slow
 def test_networks_that_add_nothing_are_rarely_found_to_have_a_part_of_their_own():
     kinds = ("mixed", "unrelated")
     low = [_part(_study(seed, hidden=0.5, network=kinds[seed % 2], stimuli=12), splits=4).low for seed in range(24)]
     assert np.count_nonzero(np.array(low) > 0) <= 2
 
 
+@pytest.mark.slow
 def test_the_order_of_the_stimuli_changes_nothing_and_a_seed_repeats_it():
     layers, controls, brain = _study(3, hidden=0.5, network="hidden")
     first = _part((layers, controls, brain))
@@ -68,6 +70,7 @@ def test_the_order_of_the_stimuli_changes_nothing_and_a_seed_repeats_it():
     assert second.low == pytest.approx(first.low, abs=1e-9)
 
 
+@pytest.mark.slow
 def test_a_committed_layer_is_the_only_one_and_the_layer_is_chosen_where_weights_are_fitted():
     layers, controls, brain = _study(4, hidden=1.0, network="unrelated")
     hidden, *_ = _study(4, hidden=1.0, network="hidden")

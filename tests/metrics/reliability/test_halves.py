@@ -29,6 +29,7 @@ def _shuffled(block, rng, units=True, stimuli=None):
     return Trials(block.responses[np.ix_(rows, columns)], labels[rows], keys)
 
 
+@pytest.mark.slow
 def test_the_mean_over_random_splits_is_the_mean_over_all_splits():
     block = make_block(make_latent(1, stimuli=4), units=5, repeats=4, noise=2.0)
     halves = list(itertools.combinations(range(4), 2))

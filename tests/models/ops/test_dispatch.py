@@ -87,6 +87,7 @@ def test_answers_that_only_the_last_step_gives_have_the_gradients_of_pytorch(
         assert (ours - theirs).norm() <= 1e-4 * theirs.norm() + 1e-6
 
 
+@pytest.mark.slow
 def test_frozen_weights_still_pass_gradients_on(single: torch.device, monkeypatch: pytest.MonkeyPatch) -> None:
     graph = _make_graph().to(single)
     graph.node("b").requires_grad_(False)
@@ -96,6 +97,7 @@ def test_frozen_weights_still_pass_gradients_on(single: torch.device, monkeypatc
         assert (ours - theirs).norm() <= 1e-4 * theirs.norm() + 1e-6
 
 
+@pytest.mark.slow
 def test_half_precision_answers_and_gradients_are_within_its_rounding(
     device: torch.device, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -108,6 +110,7 @@ def test_half_precision_answers_and_gradients_are_within_its_rounding(
         assert (ours - exact).norm() <= 2 * (theirs - exact).norm() + 0.01 * exact.norm()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["intersection", "lstm"])
 def test_streaming_and_sweeps_agree_without_gradients(kind: str, single: torch.device) -> None:
     graph = _make_graph(kind).to(single).eval()

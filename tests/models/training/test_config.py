@@ -131,6 +131,7 @@ def test_a_sweep_has_a_run_for_every_point_of_the_search_space(tmp_path):
     assert {config.warmup_epochs for config, _ in warm} == {10}
 
 
+@pytest.mark.slow
 def test_the_best_run_is_chosen_by_validation(tmp_path):
     with pytest.raises(DataError, match=rf"run .*{tmp_path.name}'"):
         best_run(tmp_path)

@@ -92,6 +92,7 @@ def test_a_short_run_warms_up_for_at_most_half_of_it():
     assert rate_factor("cosine", 2, epochs=4, warmup_epochs=10) == pytest.approx(1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", ["zhuang-small", "resnet18-small"])
 def test_a_run_of_recorded_steps_ends_with_the_weights_of_a_plain_one(model, tmp_path, monkeypatch):
     monkeypatch.setattr(optimizers, "fuse", lambda module: None)
@@ -133,6 +134,7 @@ def test_a_fused_cell_computes_what_the_plain_one_does(name, layer_norm):
     torch.testing.assert_close(results(), plain)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:The AccumulateGrad node's stream:UserWarning")
 @pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
 @pytest.mark.parametrize("objective", ["supervised", "simclr"])

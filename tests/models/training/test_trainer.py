@@ -291,6 +291,7 @@ def test_the_probe_of_half_precision_weights_is_evaluated_as_shipped(tmp_path, m
     assert all(torch.equal(value, shipped[name]) for name, value in probes[0].decoder.state_dict().items())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("precision", "stored"), [("bf16", torch.bfloat16), ("float32", torch.float32)])
 def test_weights_are_stored_as_they_were_trained(precision, stored, tmp_path):
     result = train(_config(epochs=1, precision=precision), tiny(), out=tmp_path, device="cpu")

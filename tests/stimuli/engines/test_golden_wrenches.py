@@ -15,6 +15,8 @@ ADVICE = (
     "tests.factories.shipped_stimuli'; if not, the change has a fault."
 )
 KEPT = json.loads(GOLDEN.read_text(encoding="utf-8"))
+LONG = ("mujoco fast,time_step=2e-5", "rod accurate,precision=double")
+"""Settings that take more than a few seconds."""
 
 
 def test_the_golden_wrenches_are_of_this_version_of_the_physics():
@@ -22,7 +24,9 @@ def test_the_golden_wrenches_are_of_this_version_of_the_physics():
     assert set(KEPT["wrenches"]) == set(SETTINGS)
 
 
-@pytest.mark.parametrize("setting", SETTINGS)
+@pytest.mark.parametrize(
+    "setting", [pytest.param(name, marks=[pytest.mark.slow] if name in LONG else []) for name in SETTINGS]
+)
 def test_an_engine_gives_the_golden_wrenches(setting):
     found = current_wrenches(setting)
     golden = np.reshape(KEPT["wrenches"][setting], found.shape)

@@ -49,6 +49,7 @@ def test_a_wrong_sign_is_refused(measured):
         _fit(_changed(measured, -1.0))
 
 
+@pytest.mark.slow
 def test_a_component_that_reads_zero_though_the_whisker_acts_there_is_said(measured):
     good, bad = _fit(measured), _fit(_changed(measured, zero="Fy"))
     assert (good.status, bad.status) == ("ok", "unreliable")
@@ -56,6 +57,7 @@ def test_a_component_that_reads_zero_though_the_whisker_acts_there_is_said(measu
     assert bad["young_modulus"].value == pytest.approx(good["young_modulus"].value, rel=0.02)
 
 
+@pytest.mark.slow
 def test_moments_of_another_unit_than_the_forces_are_said(measured):
     """Of 20 readings the forces tell the parameters, and the moments were taken for noise, with status ok."""
     few = measured.isel(time=slice(1, None, 2)).copy(deep=True)

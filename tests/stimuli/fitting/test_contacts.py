@@ -34,6 +34,7 @@ def _shape(whisker, arc, force, *, points=60, turn=0.3, traced=0.97):
     return np.stack([np.interp(s, arcs, column) for column in shape.place[0].T], axis=1), shape.contact[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("whisker", "at", "depth"), [(MOUSE, 0.3, 0.1), (RAT, 0.5, -0.05), (RAT, 0.8, 0.15)])
 def test_shapes_are_those_of_the_elastica(whisker, at, depth):
     length = whisker.arc_length
@@ -61,6 +62,7 @@ def test_force_and_place_come_back_within_a_tenth_at_20_micrometres(whisker, at,
     assert 0.3 < np.sqrt(np.mean(z**2)) < 2
 
 
+@pytest.mark.slow
 def test_a_known_contact_point_makes_the_force_more_certain():
     arc, force = _press(MOUSE, 0.5, 0.08)
     points, place = _shape(MOUSE, arc, force)

@@ -35,6 +35,7 @@ def test_a_chosen_motion_needs_fewer_whisks():
     assert found.scenes[0].whisking.protraction == found.values["protraction"]
 
 
+@pytest.mark.slow
 def test_distances_are_those_of_the_wrenches_over_the_noise():
     options = replace(QUICK, iterations=1, starts=1)
     one, other = (design(_scenes(3e-4, 6e-4), ["object_x"], options=replace(options, force_noise=f, moment_noise=m))

@@ -48,6 +48,7 @@ def test_two_stiffnesses_that_fit_alike_are_said_also_with_a_prior():
     assert "prior" not in found["young_modulus"].reason
 
 
+@pytest.mark.slow
 def test_a_prior_that_tells_two_stiffnesses_apart_leaves_one():
     trial = _trial(LIVELY.young_modulus, np.arange(1, 7) * 3 * PERIOD, noise=0.1)
     priors = {"young_modulus": Prior(LIVELY.young_modulus, 0.005, "the test")}

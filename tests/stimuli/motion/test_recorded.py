@@ -251,6 +251,7 @@ def test_the_published_starting_angles_belong_to_the_rat_array(reference):
         assert mirror * change[0] == pytest.approx(azimuth, abs=2e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.shared
 @pytest.mark.parametrize("species", ["mouse", "rat"])
 def test_the_sample_whisks_against_the_rodgers_stimuli(reference, species):

@@ -64,6 +64,7 @@ def test_sweeps_that_move_the_head_go_through_the_default_engine_scene_by_scene(
     np.testing.assert_array_equal(batch.wrench, dataset["wrench"].values)
 
 
+@pytest.mark.slow
 def test_steps_whose_contact_forces_are_not_solved_are_counted_as_in_scenes():
     scenes, indices = small_scenes(whiskers="C*"), range(16)
     batch = simulate_sweeps(scenes, indices, fidelity=FAST)

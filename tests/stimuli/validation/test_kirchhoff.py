@@ -23,6 +23,7 @@ def test_a_quarter_circle_yields_to_a_force_across_its_plane_by_bending_and_twis
     np.testing.assert_allclose(found.moment, force * radius * np.array([1, -1, 0]), atol=1e-6 * force * radius)
 
 
+@pytest.mark.slow
 def test_a_straight_rod_on_a_peg_is_the_elastica():
     at, travel, radius = 0.012, 0.003, 2.5e-4
     found = press_rod(KirchhoffRod.of(H), at, (0, 0, 1), (0, 1, 0), travel, radius)
@@ -32,6 +33,7 @@ def test_a_straight_rod_on_a_peg_is_the_elastica():
     assert found.arc == pytest.approx(expected.arc, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_the_moment_on_the_base_is_that_of_the_force():
     whisker = WhiskerArray.rat()["D4"].whisker
     found = load_rod(KirchhoffRod.of(whisker), 0.6 * whisker.arc_length, (1e-6, 2e-6, 1e-5))
@@ -44,6 +46,7 @@ def test_a_rod_without_force_keeps_its_shape():
     np.testing.assert_allclose(found.point, [*whisker.centre_line(0.02), 0.0], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_rod_that_slips_off_is_told():
     with pytest.raises(DataError, match=r"slips off|equilibrium"):
         press_rod(KirchhoffRod.of(H), 0.019, (0, 0, 1), (0, 1, 0), 0.015, 2.5e-4)

@@ -29,6 +29,7 @@ def test_a_whisker_yields_to_a_force_across_its_plane_as_the_rod_does(whisker, b
     assert test.moment_error < 0.005
 
 
+@pytest.mark.slow
 def test_without_twist_it_is_too_stiff():
     at = 0.8 * RAT.arc_length
     test = load_aside(RAT, at, _force(RAT, at, 0.1), fidelity="accurate,twist=false")

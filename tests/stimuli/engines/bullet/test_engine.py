@@ -93,6 +93,7 @@ def test_a_gentle_contact_is_felt_as_in_mujoco():
     assert np.isnan(ours.contact_arc[~ours.contact]).all()
 
 
+@pytest.mark.slow
 @needs_bullet
 def test_with_friction_a_resting_whisker_keeps_the_drag_and_the_step_does_not_matter():
     job = Job(CRITICAL, SWEEP, (post(0.010, 0.0022, friction=0.48),), SWEPT)

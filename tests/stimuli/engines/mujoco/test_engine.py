@@ -5,6 +5,7 @@ import re
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from brainbench.stimuli import Frames, PlacedObject, Scene, Solid, WhiskerArray, simulate
 from brainbench.stimuli.engines import get_engine
@@ -63,6 +64,7 @@ def test_an_overdamping_step_is_told_in_the_log(caplog):
     assert re.search(r"time step .*0\.001 s .*ratio", caplog.text)
 
 
+@pytest.mark.slow
 def test_a_polygonal_post_is_felt_as_the_rod_engine_feels_it():
     angle = 2 * np.pi * np.arange(64) / 64
     ring = 4e-3 * np.stack([np.cos(angle), np.sin(angle)], axis=1)

@@ -181,6 +181,7 @@ def _coulomb(problem, forces):
     return normal, rate, forces - normal[:, None] * n, velocity - rate[:, None] * n
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("friction", [0.2, 0.6])
 @pytest.mark.parametrize(("hinges", "seed"), [*product([2], range(6)), *product([3], range(4))])
 @pytest.mark.parametrize("tolerance", [None, 1e-6, 1e-9])

@@ -119,6 +119,7 @@ def test_a_step_is_split_only_for_what_is_about_to_be_touched():
     np.testing.assert_array_equal(among.wrench, alone.wrench)
 
 
+@pytest.mark.slow
 def test_a_still_whisker_touched_after_a_long_rest_feels_it_as_at_once():
     def ball(delay):
         def motion(times):
@@ -133,6 +134,7 @@ def test_a_still_whisker_touched_after_a_long_rest_feels_it_as_at_once():
     assert max(_far(late.wrench, soon.wrench)) < 1e-3
 
 
+@pytest.mark.slow
 def test_an_object_that_takes_minutes_follows_its_way_as_a_faster_one_does():
     """Its velocity changes by less from one millisecond to the next than that of a straight motion may."""
     felt = []

@@ -14,6 +14,7 @@ from tests.factories.friction_reference import Passing, Penalty, misses, solve
 LINKS = 6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("shape", "duration"), [("peg", 0.2), ("ball", 0.15)])
 def test_a_whisker_dragged_over_something_rough_feels_what_the_differential_equation_says(shape, duration):
     passing = Passing.of(WhiskerArray.mouse()["C2"].whisker, shape, 0.48)
@@ -25,6 +26,7 @@ def test_a_whisker_dragged_over_something_rough_feels_what_the_differential_equa
     assert np.all(np.array(misses(trace.wrench[: len(truth)], truth)) < 1.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("backend", "left"), [("rod", 1e-4), ("mujoco", 1e-3)])
 def test_contact_forces_are_as_exact_as_is_asked_for(backend, left):
     engine = get_engine(backend)

@@ -101,6 +101,7 @@ def _distances(surface, points):
     return trimesh.proximity.closest_point_naive(mesh, points)[1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("hint", [False, True])
 def test_the_nearest_triangle_is_found_wherever_the_search_begins(hint):
     surface = _surface()
@@ -152,6 +153,7 @@ def _inside(surface, points):
     return half.sum(axis=1) > np.pi
 
 
+@pytest.mark.slow
 def test_a_link_outside_is_never_told_that_it_overlaps_wherever_the_search_begins():
     wp.init()
     phase = specialize("narrow_phase", real=wp.float64)

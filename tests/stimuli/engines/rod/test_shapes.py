@@ -27,6 +27,7 @@ def test_a_triangle_without_a_width_in_a_sharp_edge_does_not_hide_the_other_side
     np.testing.assert_allclose(found[0, [0, 1, 2, 3]], usual[0, [0, 1, 2, 3]], atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("label", ["pyramid", "stairs", "house", "polygon"])
 def test_hulls_with_such_triangles_have_no_whisker_inside_before_they_arrive(label):
     (scene,) = (scene for scene in get_recipe("objects").scenes if scene.label == label)

@@ -45,6 +45,7 @@ def test_sweeps_do_not_depend_on_which_share_a_launch():
     assert np.concatenate([batch.wrench for batch in single]).tobytes() == together.wrench.tobytes()
 
 
+@pytest.mark.slow
 def test_whiskers_that_cannot_be_trusted_are_simulated_again_and_no_other_changes():
     from brainbench.stimuli.sweeps.shards import simulate_sweeps
 
@@ -109,6 +110,7 @@ def _few_sweeps(**grid):
     return SweepScenes(grid, {name: item.load for name, item in objects.items()}, whiskers="C1,C2,D2")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("speed", "step", "way"), [(3.0, 5e-3, "0.938 mm"), (4.0, 1e-4, "0.4 mm")])
 @pytest.mark.parametrize("path", ["sweeps", "scenes"])
 def test_an_object_too_fast_to_be_followed_is_told_of_in_sweeps_as_in_scenes(path, speed, step, way):
@@ -142,6 +144,7 @@ def test_a_force_that_no_whisker_bears_is_flagged_in_sweeps_and_not_tried_again(
     assert found.retried == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("budget", [None, 4])
 def test_whiskers_that_pause_for_every_look_at_a_mesh_feel_the_same(budget):
     objects = resolve_objects(["torus-1", "gear-0"], surfaces=True)

@@ -109,6 +109,7 @@ def _check_parts(shape):
     assert all(part.diagnosis.watertight and part.volume > 0 for part in shape.parts)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("family", ["cup", "gear", "knot", "orange", "stairs", "twist"])
 def test_the_parts_of_a_concave_shape_fill_it_and_leave_its_hollows(family):
     _check_parts(procedural.make(family, 3, detail=2000))
