@@ -52,14 +52,14 @@ class LaunchContext:
         self.episode: Any = self.zeros(self.num_envs, int)
         """Warp array [B]: resets so far."""
 
-    def launch(self, kernel: Any, dim: int | Sequence[int], *inputs: Any) -> None:
-        """Run a kernel; on a processor, what is launched again is packed once.
+    def launch(self, kernel: Any, dim: int | Sequence[int], *inputs: Any, block: int = 256) -> None:
+        """Run a kernel, on a GPU by ``block`` threads together; on a processor, what is launched again is packed once.
 
         Packing the arguments takes Warp 12 µs, which is most of a small update there. Structures may change between
         launches, arrays must not move.
         """
         if self.device.is_cuda:
-            warp().launch(kernel, dim=dim, inputs=inputs, device=self.device)
+            warp().launch(kernel, dim=dim, inputs=inputs, device=self.device, block_dim=block)
             return
         dim = dim if isinstance(dim, int) else tuple(dim)
         key = (kernel, dim, *(value if isinstance(value, int | float) else id(value) for value in inputs))

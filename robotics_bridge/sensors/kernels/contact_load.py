@@ -1,19 +1,20 @@
 """Kernels that spread every contact force of the engine over the taxels that feel it, and count what none feels.
 
-A contact c pushes with F_c at p_c, wherever the engine puts that point: it reports a flat face at its corners. A taxel
-n with weight d_n^α belongs to the contacts of the body that gives it its depth, on the side that faces it, by inverse
-distance: r_nc = g_nc / Σ_c g_nc (Shepard 1968). With y_nc = d_n^α r_nc and the outward normal m_n of what is touched::
+Contacts by which one body pushes a link from one side, within 60°, are a face, with force F, load P along its normal n
+and moment M about the middle c of the taxels that carry it. A taxel of weight y = d^α, at r from c, carries::
 
-    f_n = Σ_c y_nc (s_c q_n + (F_c − s_c Σ_n y_nc q_n) / Σ_n y_nc),    s_c = normal force / Σ_n y_nc (m_n · n_c)
+    f = y (s q + b + θ × r),    s = P / Σ y (m · n),    b = (F − s Σ y q) / Σ y,    J θ = M − s Σ r × y q
 
-so that Σ_n f_n = Σ_c F_c whatever the weights are. q_n is m_n, and m_n + σ_n for taxels that hold what they touch
-(``stick``). A node is one side of a contact: 2c of the first geometry, 2c + 1 of the second. Vectors are in the frame
-of the sensor link (m, N).
+with the outward normal m of what is touched, q = m (and m + σ for taxels that hold what they touch, ``stick``) and
+J = Σ y (r² − r rᵀ), so that Σ f = F and Σ r × f = M whatever the weights are. Where θ would pull a taxel, weights lean
+over first, y e^(λ · r), until it does not, as far as some taxels bear the moment.
 
-:func:`settle_kernel` gives the contacts that have no such taxel (a block on a card, a flex, a height field) to taxels
-that overlap the body behind the nearest one, else to those near the contact that face it; what is left is missing.
-Before, it tilts the forces under each face so that their moment is that of its contacts as well.
-Letters: B environment, L link, S sensor, C contact, N taxel, K sensor of one link.
+The carriers of a face are, by source: :data:`TOUCH`, taxels that the body
+gives their depth, from that side; else :data:`BEHIND`, those that overlap it behind what is nearer (a block on a card);
+else :data:`NEAR`, contact by contact, those near its point that face it (a flex, a height field). What is left is
+missing. A node is one side of a contact: 2c of the first geometry, 2c + 1 of the second. Vectors are in the frame of
+the sensor link (m, N). Letters: B environment, L link, M link with sensors, S sensor, C contact, N taxel, K sensor of
+one link.
 """
 
 from __future__ import annotations
@@ -23,16 +24,19 @@ from typing import Any
 
 from brainbench.core.devices import warp
 from robotics_bridge.physics.kernels.state import StateArrays
-from robotics_bridge.sensors.kernels.distance import SIDED, SolidArrays, shape_functions
+from robotics_bridge.sensors.kernels.distance import FAR, SIDED, SolidArrays, shape_functions
 from robotics_bridge.sensors.kernels.pairs import PairArrays, SlotArrays
-from robotics_bridge.sensors.kernels.readout import ProbeArrays, ReadoutArrays
+from robotics_bridge.sensors.kernels.readout import ProbeArrays, ReadoutArrays, silenced
+from robotics_bridge.sensors.kernels.wide import load_planes, store_planes
 
 wp = warp()
 
-TILTS = 6
-"""Times that forces are tilted at most."""
-UNSEEN = wp.constant(-1)
-"""Mark of a contact whose taxels were not looked for yet."""
+ROUNDS = 6
+"""Times that weights lean over at most."""
+STEEPEST = 20.0
+"""Largest exponent of a weight."""
+TOUCH, BEHIND, NEAR = range(3)
+"""Sources of carriers."""
 
 
 @wp.struct
@@ -43,12 +47,8 @@ class SpreadPlan:
     """[L, K] sensors of every link, −1 for none."""
     link: wp.array(dtype=wp.int32)
     """[S] link of a sensor."""
-    order: wp.array(dtype=wp.int32)
-    """[S] place k of a sensor on its link."""
     spans: wp.array(dtype=wp.vec3i)
     """[S] first taxel, end and slot of the pair lists."""
-    row_first: wp.array(dtype=wp.int32)
-    """[S + 1] first row of a sensor."""
     reach: wp.array(dtype=wp.float32)
     """[N] a contact this near is felt (m); negative for fillers."""
     slip: wp.float32
@@ -59,42 +59,54 @@ class SpreadPlan:
     """[M] links that carry these sensors."""
     loads: wp.array3d(dtype=wp.float32)
     """[2, B, L] sum of the forces that push a link, and what its taxels lack of them (N)."""
-    fresh: wp.int32
-    """1 for the first group of sensors of a suite, which overwrites the loads of the update before."""
+    fresh: wp.array(dtype=wp.int32)
+    """[M] 1 in the first group with sensors on a link, which overwrites its loads of the update before."""
     told: wp.array(dtype=wp.int32)
     """[1] 1 once anything was missing."""
 
 
 @wp.struct
-class ContactNodes:
-    """Contact forces on the links that carry sensors."""
+class ContactFaces:
+    """Faces that push the links with sensors, each under the number of its first node."""
 
     head: wp.array2d(dtype=wp.int32)
-    """[B, L] first node of a link, −1 for none."""
+    """[B, L] first face of a link, −1 for none."""
+    listed: wp.array2d(dtype=wp.int32)
+    """[B, L] first node of a link in any order, −1 for none (on a GPU)."""
+    items: wp.array(dtype=wp.int32)
+    """[B M] places (environment, link) at which there is something to write (on a GPU)."""
+    count: wp.array(dtype=wp.int32)
+    """[1] how many."""
+    stale: wp.array2d(dtype=wp.int32)
+    """[B, M] 1 where readings may be anything but zeros."""
+    filled: wp.array2d(dtype=wp.uint8)
+    """[B, N] 1 where a reading is anything but zeros."""
     follower: wp.array(dtype=wp.int32)
-    """[2 C] next node of the same link."""
+    """[2 C] next node of the same face, −1 for none."""
     watched: wp.array(dtype=wp.int32)
     """[2 C] bit k: sensor k of the link looks at what pushes."""
-    felt: wp.array(dtype=wp.int32)
-    """[2 C] bit k: a taxel of it lies near or between the points at which that body pushes from that side."""
-    carried: wp.array2d(dtype=wp.int32)
-    """[2 C, K] 1 where a taxel of sensor k overlaps the body from that side."""
+    next: wp.array(dtype=wp.int32)
+    """[2 C] next face of the same link, −1 for none."""
+    last: wp.array(dtype=wp.int32)
+    """[2 C] last node of a face."""
     other: wp.array(dtype=wp.int32)
     """[2 C] link on the other side, −1 for what is no geometry."""
-    geometry: wp.array(dtype=wp.int32)
-    """[2 C] geometry on the other side, −1 for none."""
-    overlap: wp.array(dtype=wp.float32)
-    """[2 C] (m)."""
-    point: wp.array(dtype=wp.vec3f)
-    """[2 C]."""
     normal: wp.array(dtype=wp.vec3f)
-    """[2 C] unit, the way the contact pushes the link."""
-    force: wp.array(dtype=wp.vec3f)
-    """[2 C] on the link, friction included."""
+    """[2 C] unit, the way its first contact pushes the link."""
+    origin: wp.array(dtype=wp.vec3f)
+    """[2 C] point of its first contact."""
+    low: wp.array(dtype=wp.vec3f)
+    """[2 C] corner of the box around its points."""
+    high: wp.array(dtype=wp.vec3f)
+    """[2 C] the opposite one."""
+    overlap: wp.array(dtype=wp.float32)
+    """[2 C] deepest (m)."""
     load: wp.array(dtype=wp.float32)
-    """[2 C] normal part of it."""
-    share: wp.array2d(dtype=wp.vec4f)
-    """[2 C, K] s_c and the rest (F_c − s_c Σ y m) / Σ y."""
+    """[2 C] sum of normal forces."""
+    force: wp.array(dtype=wp.vec3f)
+    """[2 C] sum of forces on the link, friction included."""
+    moment: wp.array(dtype=wp.vec3f)
+    """[2 C] of these about the origin (N·m)."""
 
 
 @wp.struct
@@ -106,594 +118,549 @@ class PressArrays:
     noisy: wp.array2d(dtype=wp.float32)
     """[B, N] the same with radius noise and gain."""
     normal: wp.array2d(dtype=wp.vec3f)
-    """[B, N] outward normal m of what is touched."""
+    """[B, N] outward normal m of what is touched, where a weight is above 0."""
     sigma: wp.array2d(dtype=wp.vec3f)
     """[B, N] σ: friction at rest over normal force, where taxels hold what they touch."""
     body: wp.array2d(dtype=wp.int32)
     """[B, N] its link."""
-    total: wp.array2d(dtype=wp.float32)
-    """[B, N] Σ_c g_nc; 0 where no contact explains the touch."""
-    part: wp.array2d(dtype=wp.spatial_vectorf)
-    """[B, R] of a row: number of taxels with a touch that a contact explains and, where the link has one contact alone,
-    Σ y, Σ y (m · n) and Σ y q."""
+
+
+@wp.struct
+class ContactPush:
+    """What a contact does to a link."""
+
+    point: wp.vec3f
+    normal: wp.vec3f
+    load: wp.float32
+    force: wp.vec3f
+    overlap: wp.float32
+    lean: wp.vec3f
+    """λ of the weights that carry it (1/m)."""
+
+
+@wp.struct
+class Carrier:
+    """How a taxel takes part in a face."""
+
+    weight: wp.float32
+    noisy: wp.float32
+    facing: wp.float32
+    """m · n."""
+    way: wp.vec3f
+    """q."""
 
 
 @wp.func
-def list_contact(
-    plan: SpreadPlan, slots: SlotArrays, link_of: wp.array(dtype=wp.int32), state: StateArrays,
-    friction: wp.array(dtype=wp.vec3f), nodes: ContactNodes, node: int, other: int,
-):  # fmt: skip
-    """List a node whose link carries sensors, if any of them looks at what pushes."""
+def push_of(
+    plan: SpreadPlan, state: StateArrays, friction: wp.array(dtype=wp.vec3f), link: int, node: int
+) -> ContactPush:
+    """Return what a node's contact does to its link."""
     c = node // 2
-    link = link_of[state.contact_geom[c][node % 2]]
-    watched = int(0)
-    for k in range(plan.sensors.shape[1]):
-        sensor = plan.sensors[link, k]
-        if sensor >= 0:
-            nodes.carried[node, k] = 0
-            looks = plan.whole[sensor] == 1
-            if other >= 0:
-                looks = slots.place[plan.spans[sensor][2], other] >= 0
-            if looks:
-                watched = watched | (1 << k)
-    if watched == 0:
-        return
-    env = state.contact_env[c]
-    load = state.contact_force[c]
     # The normal leads from the first to the second, which it pushes away.
     sign = wp.where(node % 2 == 0, -1.0, 1.0)
-    here = state.pose[env, link]
+    here = state.pose[state.contact_env[c], link]
     turn = wp.transform_get_rotation(here)
-    normal = wp.quat_rotate_inv(turn, sign * state.contact_normal[c])
-    nodes.watched[node] = watched
-    nodes.felt[node] = UNSEEN
-    nodes.geometry[node] = other
-    nodes.overlap[node] = wp.max(-state.contact_distance[c], 0.0)
-    nodes.other[node] = -1
-    if other >= 0:
-        nodes.other[node] = link_of[other]
-    nodes.point[node] = wp.quat_rotate_inv(turn, state.contact_position[c] - wp.transform_get_translation(here))
-    nodes.normal[node] = normal
-    nodes.load[node] = load
-    nodes.force[node] = load * normal + plan.slip * wp.quat_rotate_inv(turn, sign * friction[c])
-    nodes.follower[node] = wp.atomic_exch(nodes.head, env, link, node)
+    push = ContactPush()
+    push.point = wp.quat_rotate_inv(turn, state.contact_position[c] - wp.transform_get_translation(here))
+    push.normal = wp.quat_rotate_inv(turn, sign * state.contact_normal[c])
+    push.load = state.contact_force[c]
+    push.force = push.load * push.normal + plan.slip * wp.quat_rotate_inv(turn, sign * friction[c])
+    push.overlap = wp.max(-state.contact_distance[c], 0.0)
+    return push
 
 
-@wp.kernel
-def list_contacts(
-    plan: SpreadPlan, slots: SlotArrays, link_of: wp.array(dtype=wp.int32), state: StateArrays,
-    friction: wp.array(dtype=wp.vec3f), stride: int, nodes: ContactNodes,
+@wp.func
+def join_face(
+    plan: SpreadPlan, link_of: wp.array(dtype=wp.int32), state: StateArrays, friction: wp.array(dtype=wp.vec3f),
+    faces: ContactFaces, env: int, link: int, node: int,
 ):  # fmt: skip
-    """List the contacts of every link that carries sensors. Thread: contacts [C], ``stride`` apart."""
-    c = wp.tid()
-    count = wp.min(state.contact_count[0], state.contact_env.shape[0])
-    while c < count:
-        pair = state.contact_geom[c]
-        load = state.contact_force[c]
-        nodes.felt[2 * c] = 0
-        nodes.felt[2 * c + 1] = 0
-        # A state made by hand may hold numbers of no geometry; −1 stands for a flex. What the engine does not tell
-        # (NaN) is read as such.
-        if not (load <= 0.0) and wp.min(pair) >= -1 and wp.max(pair) < link_of.shape[0]:
-            for side in range(2):
-                mine = pair[side]
-                if mine >= 0:
-                    if plan.sensors[link_of[mine], 0] >= 0:
-                        list_contact(plan, slots, link_of, state, friction, nodes, 2 * c + side, pair[1 - side])
-        c += stride
+    """Add a node to the face of its body and side, or begin one."""
+    push = push_of(plan, state, friction, link, node)
+    geometry = state.contact_geom[node // 2][1 - node % 2]
+    other = int(-1)
+    if geometry >= 0:
+        other = link_of[geometry]
+    before = int(-1)
+    face = int(-1)
+    at = faces.head[env, link]
+    while at >= 0:
+        before = at
+        if faces.other[at] == other and wp.dot(faces.normal[at], push.normal) > 0.5:
+            face = at
+            at = int(-1)
+        else:
+            at = faces.next[at]
+    faces.follower[node] = -1
+    if face < 0:
+        face = node
+        if before < 0:
+            faces.head[env, link] = node
+        else:
+            faces.next[before] = node
+        faces.next[node] = -1
+        faces.other[node] = other
+        faces.normal[node] = push.normal
+        faces.origin[node] = push.point
+        faces.low[node] = push.point
+        faces.high[node] = push.point
+        faces.overlap[node] = push.overlap
+        faces.load[node] = push.load
+        faces.force[node] = push.force
+        faces.moment[node] = wp.vec3f()
+    else:
+        faces.follower[faces.last[face]] = node
+        faces.watched[face] = faces.watched[face] | faces.watched[node]
+        faces.low[face] = wp.min(faces.low[face], push.point)
+        faces.high[face] = wp.max(faces.high[face], push.point)
+        faces.overlap[face] = wp.max(faces.overlap[face], push.overlap)
+        faces.load[face] = faces.load[face] + push.load
+        faces.force[face] = faces.force[face] + push.force
+        faces.moment[face] = faces.moment[face] + wp.cross(push.point - faces.origin[face], push.force)
+    faces.last[face] = node
 
 
-@wp.func
-def alike(nodes: ContactNodes, first: int, second: int) -> bool:
-    """Return whether one body pushes at two contacts from one side, within 60°."""
-    same = nodes.other[first] == nodes.other[second]
-    return same and wp.dot(nodes.normal[first], nodes.normal[second]) > 0.5
+@cache
+def list_kernel(cuda: bool) -> Any:
+    """Return the kernel ``list_contacts``. Thread: contacts [C], ``stride`` apart.
+
+    A processor takes all in one thread and joins faces at once; a GPU does so afterwards, in the order of contacts
+    (:func:`join_faces`), so that sums do not depend on threads.
+    """
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def list_contacts(
+        plan: SpreadPlan, slots: SlotArrays, link_of: wp.array(dtype=wp.int32), state: StateArrays,
+        friction: wp.array(dtype=wp.vec3f), stride: int, faces: ContactFaces,
+    ):  # fmt: skip
+        c = wp.tid()
+        if c == 0:
+            faces.count[0] = 0
+        count = wp.min(state.contact_count[0], state.contact_env.shape[0])
+        while c < count:
+            pair = state.contact_geom[c]
+            # A state made by hand may hold numbers of no geometry; −1 stands for a flex. What the engine does not tell
+            # (NaN) is read as such.
+            if not (state.contact_force[c] <= 0.0) and wp.min(pair) >= -1 and wp.max(pair) < link_of.shape[0]:
+                env = state.contact_env[c]
+                for side in range(2):
+                    link = int(0)
+                    watched = int(0)
+                    other = pair[1 - side]
+                    if pair[side] >= 0:
+                        link = link_of[pair[side]]
+                        for k in range(plan.sensors.shape[1]):
+                            sensor = plan.sensors[link, k]
+                            if sensor >= 0:
+                                looks = plan.whole[sensor] == 1
+                                if other >= 0:
+                                    looks = slots.place[plan.spans[sensor][2], other] >= 0
+                                if looks:
+                                    watched = watched | (1 << k)
+                    if watched != 0:
+                        node = 2 * c + side
+                        faces.watched[node] = watched
+                        if wp.static(cuda):
+                            faces.follower[node] = wp.atomic_exch(faces.listed, env, link, node)
+                        else:
+                            join_face(plan, link_of, state, friction, faces, env, link, node)
+            c += stride
+
+    return list_contacts
 
 
-@wp.func
-def near_taxels(plan: SpreadPlan, probes: ProbeArrays, nodes: ContactNodes, head: int, link: int, node: int) -> int:
-    """Return which sensors have taxels near a contact, or between it and others of the same face."""
-    # A sphere around all points of the face: a flat one is reported at its corners.
-    low = nodes.point[node]
-    high = nodes.point[node]
-    other = head
-    while other >= 0:
-        if alike(nodes, node, other):
-            low = wp.min(low, nodes.point[other])
-            high = wp.max(high, nodes.point[other])
-        other = nodes.follower[other]
-    center = 0.5 * (low + high)
-    extent = 0.5 * wp.length(high - low) + nodes.overlap[node]
-    felt = int(0)
-    for k in range(plan.sensors.shape[1]):
-        if ((nodes.watched[node] >> k) & 1) == 1:
-            span = plan.spans[plan.sensors[link, k]]
-            for n in range(span[0], span[1]):
-                if wp.length(probes.position[n] - center) <= plan.reach[n] + extent:
-                    felt = felt | (1 << k)
-                    break
-    return felt
-
-
-@wp.kernel
-def find_taxels(plan: SpreadPlan, probes: ProbeArrays, nodes: ContactNodes):
-    """Bring lists into the order of contacts, so that sums do not depend on threads, and note which sensors have taxels
-    near each. Thread: [B, M]."""
+@wp.kernel(enable_backward=False)
+def join_faces(
+    plan: SpreadPlan, link_of: wp.array(dtype=wp.int32), state: StateArrays, friction: wp.array(dtype=wp.vec3f),
+    noisy: int, faces: ContactFaces, io: ReadoutArrays,
+):  # fmt: skip
+    """Join the listed nodes to faces in their order, and list the links that have any. Thread: [B, M]."""
     env, number = wp.tid()
     link = plan.links[number]
     first = int(-1)
-    node = nodes.head[env, link]
+    node = faces.listed[env, link]
     while node >= 0:
-        later = nodes.follower[node]
+        later = faces.follower[node]
         before = int(-1)
         after = first
         while after >= 0 and after < node:
             before = after
-            after = nodes.follower[after]
-        nodes.follower[node] = after
+            after = faces.follower[after]
+        faces.follower[node] = after
         if before < 0:
             first = node
         else:
-            nodes.follower[before] = node
+            faces.follower[before] = node
         node = later
-    nodes.head[env, link] = first
+    faces.listed[env, link] = -1
+    faces.head[env, link] = -1
     node = first
     while node >= 0:
-        nodes.felt[node] = near_taxels(plan, probes, nodes, first, link, node)
-        node = nodes.follower[node]
+        later = faces.follower[node]
+        join_face(plan, link_of, state, friction, faces, env, link, node)
+        node = later
+    full = first >= 0 or (io.status[env] & 1) != 0
+    if full or faces.stale[env, number] == 1:
+        faces.items[wp.atomic_add(faces.count, 0, 1)] = env * plan.links.shape[0] + number
+    elif plan.fresh[number] == 1:
+        plan.loads[0, env, link] = 0.0
+        plan.loads[1, env, link] = 0.0
+    faces.stale[env, number] = wp.where(full or noisy == 1, 1, 0)
 
 
 @wp.func
-def nearness(alone: bool, point: wp.vec3f, push: wp.vec3f, x: wp.vec3f, normal: wp.vec3f, reach: float) -> float:
-    """Return g_nc of a contact and a taxel at ``x``; 0 where they lie on different sides of the link.
-
-    Only ratios of it matter: of a contact that is ``alone`` on its link it is 1.
-    """
-    if wp.dot(normal, push) <= 0.0:
-        return 0.0
-    if alone:
-        return 1.0
-    away = wp.length_sq(x - point) / (reach * reach) + 0.01
-    return 1.0 / (away * away)
-
-
-@wp.func
-def share_contact(
-    plan: SpreadPlan, probes: ProbeArrays, press: PressArrays, nodes: ContactNodes,
-    env: int, link: int, node: int, k: int,
-):  # fmt: skip
-    """Work out what a unit of weight of a sensor carries of a contact.
-
-    One thread adds all taxels of a contact in a fixed order, so that sums do not depend on the device.
-    """
-    if nodes.felt[node] == UNSEEN or ((nodes.felt[node] >> k) & 1) == 0:
-        return
-    sensor = plan.sensors[link, k]
-    alone = nodes.follower[nodes.head[env, link]] < 0
-    push = nodes.normal[node]
-    point = nodes.point[node]
-    other = nodes.other[node]
-    whole = float(0.0)
-    straight = float(0.0)
-    field = wp.vec3f(0.0)
-    held = press.sigma.shape[0] == press.normal.shape[0]
-    if alone:
-        # Every touch is that of this contact: its taxels were added up row by row.
-        for row in range(plan.row_first[sensor], plan.row_first[sensor + 1]):
-            part = press.part[env, row]
-            whole += part[1]
-            straight += part[2]
-            field += wp.vec3f(part[3], part[4], part[5])
-    else:
-        span = plan.spans[sensor]
-        for n in range(span[0], span[1]):
-            weight = press.weight[env, n]
-            total = press.total[env, n]
-            if weight > 0.0 and total > 0.0 and press.body[env, n] == other:
-                m = press.normal[env, n]
-                near = nearness(alone, point, push, probes.position[n], m, plan.reach[n])
-                if near > 0.0:
-                    y = weight * near / total
-                    whole += y
-                    straight += y * wp.dot(m, push)
-                    way = m
-                    if held:
-                        way = m + press.sigma[env, n]
-                    field += y * way
-    load = nodes.load[node]
-    share = wp.vec4f(0.0)
-    if whole > 0.0:
-        # Taxels that face away from the contact by more than 60° on average would be stretched beyond all measure; the
-        # rest, which makes the sum right, then carries what is missing.
-        scale = load / wp.max(straight, 0.5 * whole)
-        rest = (nodes.force[node] - scale * field) / whole
-        share = wp.vec4f(scale, rest[0], rest[1], rest[2])
-        nodes.carried[node, k] = 1
-    nodes.share[node, k] = share
-
-
-@wp.kernel
-def share_contacts(
-    plan: SpreadPlan, link_of: wp.array(dtype=wp.int32), state: StateArrays, probes: ProbeArrays, press: PressArrays,
-    nodes: ContactNodes,
-):  # fmt: skip
-    """Share every contact among the taxels of every sensor. Thread: node and sensor of its link [2 C, K]."""
-    node, k = wp.tid()
-    c = node // 2
-    if c < state.contact_count[0] and nodes.felt[node] != 0:
-        link = link_of[state.contact_geom[c][node % 2]]
-        share_contact(plan, probes, press, nodes, state.contact_env[c], link, node, k)
-
-
-@wp.func
-def write_wrench(out: wp.array3d(dtype=wp.float32), env: int, n: int, x: wp.vec3f, f: wp.vec3f):
-    """Write a force at x and its torque about the origin of the link."""
+def wrench_at(x: wp.vec3f, f: wp.vec3f) -> wp.spatial_vectorf:
+    """Return a force at x with its torque about the origin."""
     turn = wp.cross(x, f)
-    for axis in range(3):
-        out[axis, env, n] = f[axis]
-        out[axis + 3, env, n] = turn[axis]
+    return wp.spatial_vectorf(f[0], f[1], f[2], turn[0], turn[1], turn[2])
 
 
 @wp.func
-def spread_row(
-    plan: SpreadPlan, probes: ProbeArrays, rows: wp.array(dtype=wp.vec4i), press: PressArrays, nodes: ContactNodes,
-    noisy: int, written: wp.array2d(dtype=wp.uint8), io: ReadoutArrays, env: int, at_row: int,
-):  # fmt: skip
-    """Write the readings of a row of taxels."""
-    span = rows[at_row]
-    part = span[3]
-    k = plan.order[part]
-    head = nodes.head[env, plan.link[part]]
-    diverged = (io.status[env] & 1) != 0
-    full = diverged or (head >= 0 and press.part[env, at_row][0] > 0.0)
-    if not full and written[env, at_row] == wp.uint8(0):
-        return
-    written[env, at_row] = wp.uint8(wp.where(full or noisy == 1, 1, 0))
-    held = press.sigma.shape[0] == press.normal.shape[0]
-    alone = bool(False)
-    share = wp.vec4f(0.0)
-    if full and not diverged:
-        alone = nodes.follower[head] < 0
-        share = nodes.share[head, k]
-    n = span[0]
-    while n < span[1]:
-        f = wp.vec3f(0.0)
-        x = probes.position[n]
-        weight = float(0.0)
-        measured = float(0.0)
-        if diverged and probes.radius[n] > 0.0:
-            weight = wp.nan
-            measured = wp.nan
-        elif full and not diverged and press.total[env, n] > 0.0:
-            total = press.total[env, n]
-            m = press.normal[env, n]
-            way = m
-            if held:
-                way = m + press.sigma[env, n]
-            if alone:
-                f = share[0] * way + wp.vec3f(share[1], share[2], share[3])
-            else:
-                body = press.body[env, n]
-                node = head
-                while node >= 0:
-                    if ((nodes.felt[node] >> k) & 1) == 1 and nodes.other[node] == body:
-                        near = nearness(alone, nodes.point[node], nodes.normal[node], x, m, plan.reach[n])
-                        if near > 0.0:
-                            one = nodes.share[node, k]
-                            f += near / total * (one[0] * way + wp.vec3f(one[1], one[2], one[3]))
-                    node = nodes.follower[node]
-            weight = press.weight[env, n]
-            if noisy == 1:
-                measured = press.noisy[env, n]
-        write_wrench(io.truth, env, n, x, weight * f)
-        if noisy == 1:
-            write_wrench(io.measured, env, n, x, measured * f)
-        n += span[2]
-
-
-@wp.kernel
-def spread_contacts(
-    plan: SpreadPlan, probes: ProbeArrays, rows: wp.array(dtype=wp.vec4i), press: PressArrays, nodes: ContactNodes,
-    noisy: int, written: wp.array2d(dtype=wp.uint8), io: ReadoutArrays,
-):  # fmt: skip
-    """Write the readings. Thread: environment and row of taxels [B, R].
-
-    ``written`` [B, R] is 1 where a row may hold anything but zeros; most touch nothing, now and before.
-    """
-    env, at_row = wp.tid()
-    spread_row(plan, probes, rows, press, nodes, noisy, written, io, env, at_row)
+def sphere_of(faces: ContactFaces, face: int) -> wp.vec4f:
+    """Return centre and radius of the sphere around the points of a face: a flat one is reported at its corners."""
+    low = faces.low[face]
+    high = faces.high[face]
+    center = 0.5 * (low + high)
+    return wp.vec4f(center[0], center[1], center[2], 0.5 * wp.length(high - low) + faces.overlap[face])
 
 
 @wp.func
-def force_of(planes: wp.array3d(dtype=wp.float32), env: int, n: int) -> wp.vec3f:
-    """Return the force of a reading."""
-    return wp.vec3f(planes[0, env, n], planes[1, env, n], planes[2, env, n])
+def gap_to(sphere: wp.vec4f, x: wp.vec3f) -> float:
+    """Return how far a point lies from a sphere, negative inside."""
+    return wp.length(x - wp.vec3f(sphere[0], sphere[1], sphere[2])) - sphere[3]
 
 
 @wp.func
-def tilted(f: wp.vec3f, x: wp.vec3f, center: wp.vec3f, tilt: wp.vec3f) -> wp.vec3f:
-    """Return a force with the part of a tilt about the centre that its size bears."""
-    return f + wp.length(f) * wp.cross(tilt, x - center)
-
-
-@wp.func
-def shares(press: PressArrays, env: int, n: int, body: int, push: wp.vec3f) -> bool:
-    """Return whether a taxel carries contacts of a body on a side."""
-    # All is asked for at once, so that a GPU waits for memory once.
-    faces = wp.dot(press.normal[env, n], push) > 0.0
-    return press.total[env, n] > 0.0 and press.body[env, n] == body and faces
-
-
-@wp.func
-def tilt_group(
-    plan: SpreadPlan, probes: ProbeArrays, nodes: ContactNodes, press: PressArrays, noisy: int, io: ReadoutArrays,
-    env: int, sensor: int, k: int, head: int, leader: int,
-) -> bool:  # fmt: skip
-    """Tilt the forces under one face of a body so that their moment is that of its contacts, their sum the same.
-
-    False where the sum is to be verified: a tilt changed it, or the taxels under it carry other faces as well, or not
-    all of it, which are left as they are.
-    """
-    # The first contact of a face leads it.
-    force = wp.vec3f()
-    moment = wp.vec3f()
-    node = head
-    leads = bool(True)
-    before = bool(True)
-    while node >= 0:
-        if node == leader:
-            before = False
-        if nodes.carried[node, k] == 1 and alike(nodes, node, leader):
-            if before:
-                leads = False
-            force += nodes.force[node]
-            moment += wp.cross(nodes.point[node], nodes.force[node])
-        node = nodes.follower[node]
-    if not leads:
-        return True
-    body = nodes.other[leader]
-    push = nodes.normal[leader]
-    span = plan.spans[sensor]
-    origin = nodes.point[leader]
-    verified = bool(True)
-    steepest = float(2.0)
-    last = float(1.0e30)
-    # One tilt is enough unless the moment takes more than some taxels bear; then the rest is tilted again.
-    for _ in range(wp.static(TILTS)):
-        if steepest > 1.0:
-            total = wp.vec3f()
-            weight = float(0.0)
-            turning = wp.vec3f()
-            center = wp.vec3f()
-            spread = wp.mat33f()
-            widest = float(0.0)
-            for n in range(span[0], span[1]):
-                if shares(press, env, n, body, push):
-                    f = force_of(io.truth, env, n)
-                    size = wp.length(f)
-                    x = probes.position[n]
-                    total += f
-                    turning += wp.cross(x, f)
-                    weight += size
-                    # From the contact, so that little is lost to rounding.
-                    arm = x - origin
-                    widest = wp.max(widest, wp.length(arm))
-                    center += size * arm
-                    spread += size * wp.outer(arm, arm)
-            if not (wp.length(total - force) <= 1.0e-4 * weight):
-                return False
-            # As exact as a hundredth of a millimetre, or nothing won by the last tilt: done.
-            rest = wp.length(moment - turning)
-            if rest <= 1.0e-5 * weight or rest > 0.9 * last:
-                return True
-            last = rest
-            center = center / weight
-            extent = spread[0, 0] + spread[1, 1] + spread[2, 2]
-            # Tensor of inertia of the forces' sizes about their centre: the forces |f| θ × r have the moment J θ and
-            # the sum 0.
-            spread -= weight * wp.outer(center, center)
-            trace = spread[0, 0] + spread[1, 1] + spread[2, 2]
-            # A little more on its diagonal lets a row of taxels, which bears no moment along it, be solved.
-            inertia = 1.0001 * trace * wp.identity(n=3, dtype=wp.float32) - spread
-            tilt = wp.vec3f()
-            # Taxels at one place bear no moment: what rounding leaves of their inertia is none.
-            if trace > 1.0e-4 * extent:
-                tilt = wp.inverse(inertia) @ (moment - turning)
-            # Most tilts are too small to turn any taxel round, whichever lies farthest.
-            steepest = wp.length(tilt) * (widest + wp.length(center))
-            center += origin
-            if steepest > 1.0:
-                steepest = float(0.0)
-                for n in range(span[0], span[1]):
-                    if shares(press, env, n, body, push):
-                        steepest = wp.max(steepest, wp.length(wp.cross(tilt, probes.position[n] - center)))
-            # No taxel is turned round: where the patch is too small for the moment, as much as it bears.
-            tilt = tilt / wp.max(steepest, 1.0)
-            total = wp.vec3f()
-            for n in range(span[0], span[1]):
-                if shares(press, env, n, body, push):
-                    x = probes.position[n]
-                    f = tilted(force_of(io.truth, env, n), x, center, tilt)
-                    total += f
-                    write_wrench(io.truth, env, n, x, f)
-                    if noisy == 1:
-                        write_wrench(io.measured, env, n, x, tilted(force_of(io.measured, env, n), x, center, tilt))
-            verified = wp.length(total - force) <= 1.0e-4 * weight
-    return verified
+def belongs(faces: ContactFaces, head: int, face: int, x: wp.vec3f, m: wp.vec3f, reach: float) -> bool:
+    """Return whether a taxel at ``x`` carries a face of the body that it touches: one that pushes it, the nearest."""
+    best = float(0.0)
+    nearest = int(-1)
+    at = head
+    while at >= 0:
+        if faces.other[at] == faces.other[face]:
+            facing = wp.dot(m, faces.normal[at])
+            away = wp.max(gap_to(sphere_of(faces, at), x), 0.0) / reach
+            if facing / (0.01 + away * away) > best:
+                best = facing / (0.01 + away * away)
+                nearest = at
+        at = faces.next[at]
+    return nearest == face
 
 
 @cache
-def settle_kernel(kinds: frozenset[int], raycast: bool, in_turn: bool) -> Any:
-    """Return the kernel ``settle``: contacts without a taxel of their body, missing forces, and moments. Dim [B, M].
+def spread_kernel(kinds: frozenset[int], raycast: bool, noisy: bool, sticky: bool, cuda: bool) -> Any:
+    """Return the kernel ``spread`` that writes readings and loads. Block: link of an environment, ``stride`` apart.
 
-    One thread goes through the contacts of a link in their order, so that sums do not depend on the device. A processor
-    writes the readings ``in_turn`` in the same launch (:func:`spread_contacts`).
+    The threads of a block share its taxels, and add up what each has found, so that a contact costs no more than the
+    taxels of its link divided by them. A processor takes them in one thread.
     """
     distance = shape_functions(kinds, raycast).distance
 
     @wp.func
-    def overlap_of(
-        solids: SolidArrays, pairs: PairArrays, probes: ProbeArrays, env: int, n: int, place: int
+    def behind(
+        solids: SolidArrays, pairs: PairArrays, probes: ProbeArrays, env: int, n: int, slot: int, body: int
     ) -> wp.vec4f:
-        """Return outward normal and depth of a taxel in what its list names at ``place``."""
+        """Return outward normal and distance of what a taxel overlaps of a body most."""
         row = env % solids.kind.shape[0]
-        geometry = pairs.geometry[env, place]
-        rotation = pairs.rotation[env, place]
         radius = probes.radius[n]
-        facing = wp.vec3f()
-        limit = float(0.0)
-        if wp.static(bool(kinds & SIDED)):
-            facing = rotation @ (radius * probes.normal[n])
-        if wp.static(raycast or bool(kinds & SIDED)):
-            limit = 2.0 * solids.bound[row, geometry][3] + radius
-        x = rotation @ probes.position[n] + pairs.offset[env, place]
-        found = distance(solids, row, geometry, x, facing, limit)
-        m = wp.transpose(rotation) @ wp.vec3f(found[0], found[1], found[2])
-        return wp.vec4f(m[0], m[1], m[2], radius - found[3])
+        nearest = wp.vec4f(0.0, 0.0, 1.0, wp.static(FAR))
+        first = pairs.first[slot]
+        for place in range(first, first + pairs.count[env, slot]):
+            geometry = pairs.geometry[env, place]
+            if solids.link[geometry] == body:
+                rotation = pairs.rotation[env, place]
+                facing = wp.vec3f()
+                limit = float(0.0)
+                if wp.static(bool(kinds & SIDED)):
+                    facing = rotation @ (radius * probes.normal[n])
+                if wp.static(raycast or bool(kinds & SIDED)):
+                    limit = 2.0 * solids.bound[row, geometry][3] + radius
+                x = rotation @ probes.position[n] + pairs.offset[env, place]
+                touch = distance(solids, row, geometry, x, facing, limit)
+                if touch[3] < nearest[3]:
+                    m = wp.transpose(rotation) @ wp.vec3f(touch[0], touch[1], touch[2])
+                    nearest = wp.vec4f(m[0], m[1], m[2], touch[3])
+        return nearest
 
     @wp.func
-    def weigh(
-        plan: SpreadPlan, solids: SolidArrays, pairs: PairArrays, probes: ProbeArrays, nodes: ContactNodes,
-        node: int, env: int, n: int, place: int,
-    ) -> float:  # fmt: skip
-        """Return what a taxel takes of a contact: by overlap with the geometry at ``place``, or −1: by nearness."""
-        radius = probes.radius[n]
-        if radius <= 0.0:
-            return 0.0
-        push = nodes.normal[node]
-        point = nodes.point[node]
+    def carrier_of(
+        plan: SpreadPlan, probes: ProbeArrays, solids: SolidArrays, pairs: PairArrays, faces: ContactFaces,
+        press: PressArrays, push: ContactPush, env: int, n: int, slot: int, head: int, alone: bool, face: int,
+        source: int,
+    ) -> Carrier:  # fmt: skip
+        carrier = Carrier()
         x = probes.position[n]
-        if place >= 0:
-            depth = overlap_of(solids, pairs, probes, env, n, place)
-            m = wp.vec3f(depth[0], depth[1], depth[2])
-            return wp.max(depth[3], 0.0) * nearness(False, point, push, x, m, plan.reach[n])
-        # Without a distance the taxel's own normal tells its side.
-        away = wp.length(x - point) / (plan.reach[n] + nodes.overlap[node])
-        if away > 1.0 or wp.dot(probes.normal[n], push) > 0.1:
-            return 0.0
-        return 1.001 - away * away
+        radius = probes.radius[n]
+        if radius > 0.0:
+            if source == wp.static(TOUCH):
+                weight = press.weight[env, n]
+                extra = float(0.0)
+                if wp.static(noisy):
+                    extra = press.noisy[env, n]
+                if weight + extra > 0.0:
+                    m = press.normal[env, n]
+                    mine = press.body[env, n] == faces.other[face]
+                    facing = wp.dot(m, faces.normal[face])
+                    if mine and not alone:
+                        mine = belongs(faces, head, face, x, m, plan.reach[n])
+                    if mine and facing > 0.0:
+                        carrier.weight = weight
+                        carrier.noisy = extra
+                        carrier.facing = facing
+                        carrier.way = m
+                        if wp.static(sticky):
+                            carrier.way = m + press.sigma[env, n]
+            elif source == wp.static(BEHIND):
+                touch = behind(solids, pairs, probes, env, n, slot, faces.other[face])
+                carrier.way = wp.vec3f(touch[0], touch[1], touch[2])
+                carrier.facing = wp.dot(carrier.way, faces.normal[face])
+                if carrier.facing > 0.0:
+                    carrier.weight = wp.max(radius - touch[3], 0.0)
+            else:
+                # Without a distance the taxel's own normal tells its side.
+                away = wp.length(x - push.point) / (plan.reach[n] + push.overlap)
+                if away <= 1.0 and wp.dot(probes.normal[n], push.normal) <= 0.1:
+                    carrier.weight = 1.001 - away * away
+                carrier.facing = 1.0
+                carrier.way = push.normal
+            if source != wp.static(TOUCH):
+                carrier.noisy = carrier.weight
+            elif carrier.facing > 0.0:
+                steep = wp.dot(push.lean, x - push.point)
+                if steep != 0.0:
+                    carrier.weight *= wp.exp(steep)
+                    carrier.noisy *= wp.exp(steep)
+        return carrier
+
+    @wp.func
+    def clear(faces: ContactFaces, io: ReadoutArrays, env: int, n: int):
+        if faces.filled[env, n] != wp.uint8(0):
+            store_planes(io.truth, env, n, 6, wp.spatial_vectorf())
+            faces.filled[env, n] = wp.uint8(0)
+        # Stages after this one write into the measured readings, which are then never left alone.
+        if wp.static(noisy):
+            store_planes(io.measured, env, n, 6, wp.spatial_vectorf())
 
     @wp.kernel(module="unique", enable_backward=False)
-    def settle(
+    def spread(
         plan: SpreadPlan,
         probes: ProbeArrays,
-        rows: wp.array(dtype=wp.vec4i),
+        link_of: wp.array(dtype=wp.int32),
+        state: StateArrays,
+        friction: wp.array(dtype=wp.vec3f),
         solids: SolidArrays,
         pairs: PairArrays,
-        nodes: ContactNodes,
+        faces: ContactFaces,
         press: PressArrays,
-        noisy: int,
-        written: wp.array2d(dtype=wp.uint8),
+        stride: int,
         io: ReadoutArrays,
     ):
-        env, number = wp.tid()
-        link = plan.links[number]
-        head = nodes.head[env, link]
-        if wp.static(in_turn):
+        item, lane = wp.tid()
+        threads = wp.block_dim()
+        many = plan.links.shape[0]
+        count = io.status.shape[0] * many
+        if wp.static(cuda):
+            count = faces.count[0]
+        while item < count:
+            at = item
+            if wp.static(cuda):
+                at = faces.items[item]
+            item += stride
+            env = at // many
+            link = plan.links[at % many]
+            head = faces.head[env, link]
+            diverged = (io.status[env] & 1) != 0
+            if wp.static(not cuda):
+                full = head >= 0 or diverged
+                stale = faces.stale[env, at % many] == 1
+                faces.stale[env, at % many] = wp.where(full or wp.static(noisy), 1, 0)
+                # The next update lists anew.
+                faces.head[env, link] = -1
+                if not full and not stale:
+                    if plan.fresh[at % many] == 1:
+                        plan.loads[0, env, link] = 0.0
+                        plan.loads[1, env, link] = 0.0
+                    continue
+            written = int(0)
+            pushed = float(0.0)
+            lost = float(0.0)
+            face = head
+            if diverged:
+                face = -1
+            while face >= 0:
+                alone = face == head and faces.next[face] < 0
+                sphere = sphere_of(faces, face)
+                size = wp.length(faces.force[face])
+                lack = size
+                for k in range(plan.sensors.shape[1]):
+                    if ((faces.watched[face] >> k) & 1) == 1:
+                        sensor = plan.sensors[link, k]
+                        span = plan.spans[sensor]
+                        # What this sensor does not carry of the face.
+                        rest = float(0.0)
+                        source = int(wp.static(TOUCH))
+                        node = face
+                        tilts = int(0)
+                        lean = wp.vec3f()
+                        near = bool(False)
+                        while source <= wp.static(NEAR):
+                            push = ContactPush()
+                            push.point = faces.origin[face]
+                            push.normal = faces.normal[face]
+                            push.load = faces.load[face]
+                            push.force = faces.force[face]
+                            push.lean = lean
+                            moment = faces.moment[face]
+                            if source == wp.static(NEAR):
+                                push = push_of(plan, state, friction, link, node)
+                                moment = wp.vec3f()
+                            # Sums over taxels: y, y m · n and whether any is near; columns y q, y a, y a × q; y a aᵀ
+                            # (a from the point).
+                            first = wp.vec3f()
+                            second = wp.mat33f()
+                            third = wp.mat33f()
+                            widest = float(0.0)
+                            n = span[0] + lane
+                            while n < span[1]:
+                                x = probes.position[n]
+                                if source == wp.static(TOUCH) and tilts == 0 and first[2] == 0.0:
+                                    if gap_to(sphere, x) <= plan.reach[n]:
+                                        first[2] = 1.0
+                                c = carrier_of(
+                                    plan, probes, solids, pairs, faces, press, push, env, n, span[2], head, alone,
+                                    face, source,
+                                )  # fmt: skip
+                                if c.weight > 0.0:
+                                    a = x - push.point
+                                    widest = wp.max(widest, wp.length(a))
+                                    first += c.weight * wp.vec3f(1.0, c.facing, 0.0)
+                                    second += c.weight * wp.matrix_from_cols(c.way, a, wp.cross(a, c.way))
+                                    third += c.weight * wp.outer(a, a)
+                                n += threads
+                            first = wp.tile_sum(wp.tile(first, preserve_type=True))[0]
+                            whole = first[0]
+                            if source == wp.static(TOUCH) and tilts == 0:
+                                near = first[2] > 0.0
+                            if whole > 0.0 and (near or source == wp.static(NEAR)):
+                                second = wp.tile_sum(wp.tile(second, preserve_type=True))[0]
+                                third = wp.tile_sum(wp.tile(third, preserve_type=True))[0]
+                                # Taxels that face away by more than 60° on average would be stretched beyond all
+                                # measure; b then carries what is missing.
+                                scale = push.load / wp.max(first[1], 0.5 * whole)
+                                field = wp.vec3f(second[0, 0], second[1, 0], second[2, 0])
+                                center = wp.vec3f(second[0, 1], second[1, 1], second[2, 1]) / whole
+                                turning = wp.vec3f(second[0, 2], second[1, 2], second[2, 2])
+                                even = (push.force - scale * field) / whole
+                                moment -= scale * turning + whole * wp.cross(center, even)
+                                extent = third[0, 0] + third[1, 1] + third[2, 2]
+                                third -= whole * wp.outer(center, center)
+                                trace = third[0, 0] + third[1, 1] + third[2, 2]
+                                # A little more on its diagonal lets a row of taxels, which bears no moment along it, be
+                                # solved; taxels at one place bear none, what rounding leaves of them is none.
+                                tilt = wp.vec3f()
+                                if trace > 1.0e-4 * extent:
+                                    inertia = 1.0001 * trace * wp.identity(n=3, dtype=wp.float32) - third
+                                    tilt = wp.inverse(inertia) @ moment
+                                center += push.point
+                                # How much a taxel would be pulled, in shares of the mean push.
+                                mean = push.load / whole
+                                widest = wp.tile_max(wp.tile(widest))[0] + wp.length(center - push.point)
+                                steepest = wp.length(tilt) * widest / mean
+                                # Most tilts pull none, however far it lies.
+                                if steepest > 1.0:
+                                    pull = float(0.0)
+                                    n = span[0] + lane
+                                    while n < span[1]:
+                                        c = carrier_of(
+                                            plan, probes, solids, pairs, faces, press, push, env, n, span[2], head,
+                                            alone, face, source,
+                                        )  # fmt: skip
+                                        if c.weight > 0.0:
+                                            turn = wp.cross(tilt, probes.position[n] - center)
+                                            pull = wp.max(pull, -wp.dot(turn, push.normal))
+                                        n += threads
+                                    steepest = wp.tile_max(wp.tile(pull))[0] / mean
+                                again = bool(False)
+                                if steepest > 1.0:
+                                    # What is beyond half of it moves into the weights: y e^(λ · r) for y (1 + λ · r).
+                                    lean += (1.0 - 0.5 / steepest) / mean * wp.cross(push.normal, tilt)
+                                    tilt /= steepest
+                                    tilts += 1
+                                    again = source == wp.static(TOUCH) and tilts < wp.static(ROUNDS)
+                                    steepest = wp.length(lean) * widest
+                                    if steepest > wp.static(STEEPEST):
+                                        lean *= wp.static(STEEPEST) / steepest
+                                if not again:
+                                    fresh = ((written >> k) & 1) == 0
+                                    total = wp.vec3f()
+                                    n = span[0] + lane
+                                    while n < span[1]:
+                                        c = carrier_of(
+                                            plan, probes, solids, pairs, faces, press, push, env, n, span[2], head,
+                                            alone, face, source,
+                                        )  # fmt: skip
+                                        x = probes.position[n]
+                                        if c.weight + c.noisy > 0.0:
+                                            unit = scale * c.way + even + wp.cross(tilt, x - center)
+                                            f = c.weight * unit
+                                            total += f
+                                            reading = wrench_at(x, f)
+                                            if not fresh:
+                                                reading += load_planes(io.truth, env, n, 6)
+                                            store_planes(io.truth, env, n, 6, reading)
+                                            if wp.static(noisy):
+                                                reading = wrench_at(x, c.noisy * unit)
+                                                if not fresh:
+                                                    reading += load_planes(io.measured, env, n, 6)
+                                                store_planes(io.measured, env, n, 6, reading)
+                                            faces.filled[env, n] = wp.uint8(1)
+                                        elif fresh:
+                                            clear(faces, io, env, n)
+                                        n += threads
+                                    written = written | (1 << k)
+                                    total = wp.tile_sum(wp.tile(total, preserve_type=True))[0]
+                                    gap = wp.length(push.force - total)
+                                    # Rounding of the sums is no loss.
+                                    if not (gap <= 1.0e-4 * wp.length(push.force)):
+                                        rest += gap
+                                    if source == wp.static(NEAR):
+                                        node = faces.follower[node]
+                                    else:
+                                        node = -1
+                            elif source == wp.static(NEAR):
+                                rest += wp.length(push.force)
+                                node = faces.follower[node]
+                            else:
+                                source = wp.where(near, source + 1, wp.static(NEAR))
+                            if node < 0:
+                                source = wp.static(NEAR) + 1
+                        # Sensors of a link need not all feel it.
+                        if not (rest >= lack):
+                            lack = rest
+                pushed += size
+                lost += lack
+                face = faces.next[face]
             for k in range(plan.sensors.shape[1]):
                 sensor = plan.sensors[link, k]
-                if sensor >= 0:
-                    node = head
-                    while node >= 0:
-                        share_contact(plan, probes, press, nodes, env, link, node, k)
-                        node = nodes.follower[node]
-                    for row in range(plan.row_first[sensor], plan.row_first[sensor + 1]):
-                        spread_row(plan, probes, rows, press, nodes, noisy, written, io, env, row)
-        # The next update lists anew.
-        nodes.head[env, link] = -1
-        if (io.status[env] & 1) != 0:
-            plan.loads[1, env, link] = wp.nan
-            return
-        if plan.fresh == 1:
-            plan.loads[0, env, link] = 0.0
-            plan.loads[1, env, link] = 0.0
-        if head < 0:
-            return
-        pushed = float(0.0)
-        lost = float(0.0)
-        error = float(0.0)
-        for k in range(plan.sensors.shape[1]):
-            sensor = plan.sensors[link, k]
-            if sensor < 0:
-                continue
-            span = plan.spans[sensor]
-            # What a tilt has added up needs no second sum.
-            verified = bool(True)
-            head_of = head
-            while head_of >= 0:
-                if nodes.carried[head_of, k] == 1:
-                    if not tilt_group(plan, probes, nodes, press, noisy, io, env, sensor, k, head, head_of):
-                        verified = False
-                head_of = nodes.follower[head_of]
-            force = wp.vec3f()
-            node = head
-            while node >= 0:
-                if ((nodes.watched[node] >> k) & 1) == 1:
-                    if nodes.carried[node, k] == 0:
-                        first = pairs.first[span[2]]
-                        place = int(-1)
-                        if ((nodes.felt[node] >> k) & 1) == 1:
-                            for index in range(pairs.count[env, span[2]]):
-                                if pairs.geometry[env, first + index] == nodes.geometry[node]:
-                                    place = first + index
-                        whole = float(0.0)
-                        # Overlap with the body comes first, then taxels near the contact that face it.
-                        for way in range(2):
-                            if way == 1:
-                                place = -1
-                            if whole == 0.0 and (way == 1 or place >= 0):
-                                for n in range(span[0], span[1]):
-                                    whole += weigh(plan, solids, pairs, probes, nodes, node, env, n, place)
-                                if whole > 0.0:
-                                    nodes.carried[node, k] = 1
-                                    verified = False
-                                    for row in range(plan.row_first[sensor], plan.row_first[sensor + 1]):
-                                        part = rows[row]
-                                        n = part[0]
-                                        while n < part[1]:
-                                            y = weigh(plan, solids, pairs, probes, nodes, node, env, n, place)
-                                            if y > 0.0:
-                                                x = probes.position[n]
-                                                f = y / whole * nodes.force[node]
-                                                write_wrench(io.truth, env, n, x, force_of(io.truth, env, n) + f)
-                                                if noisy == 1:
-                                                    write_wrench(
-                                                        io.measured, env, n, x, force_of(io.measured, env, n) + f
-                                                    )
-                                                written[env, row] = wp.uint8(1)
-                                            n += part[2]
-                    if nodes.carried[node, k] == 1:
-                        force += nodes.force[node]
-                node = nodes.follower[node]
-            total = wp.vec3f()
-            weight = float(0.0)
-            for n in range(span[0], span[1]):
-                if not verified:
-                    f = force_of(io.truth, env, n)
-                    total += f
-                    weight += wp.length(f)
-            gap = wp.length(force - total)
-            # Rounding of the sums is no loss.
-            if not verified and not (gap <= 1.0e-4 * (weight + wp.length(force))):
-                error = wp.max(error, gap)
-                if wp.isnan(gap):
-                    error = wp.nan
-        node = head
-        while node >= 0:
-            size = wp.length(nodes.force[node])
-            carried = int(0)
-            for k in range(plan.sensors.shape[1]):
-                if plan.sensors[link, k] >= 0:
-                    carried += nodes.carried[node, k]
-            pushed += size
-            if carried == 0:
-                lost += size
-            node = nodes.follower[node]
-        lost += error
-        # Sensors of several groups may sit on a link: the most that one of them lacks counts.
-        plan.loads[0, env, link] = wp.max(plan.loads[0, env, link], pushed)
-        plan.loads[1, env, link] = wp.where(wp.isnan(lost), lost, wp.max(plan.loads[1, env, link], lost))
-        if not (lost <= 0.01 * pushed):
-            plan.told[0] = 1
+                if sensor >= 0 and ((written >> k) & 1) == 0:
+                    span = plan.spans[sensor]
+                    n = span[0] + lane
+                    while n < span[1]:
+                        if diverged:
+                            silenced(io, 6, env, n, probes.radius[n])
+                            faces.filled[env, n] = wp.uint8(1)
+                        else:
+                            clear(faces, io, env, n)
+                        n += threads
+            if lane == 0:
+                if plan.fresh[at % many] == 1:
+                    plan.loads[0, env, link] = 0.0
+                    plan.loads[1, env, link] = 0.0
+                # Sensors of several groups may sit on a link: the most that one of them lacks counts.
+                plan.loads[0, env, link] = wp.max(plan.loads[0, env, link], pushed)
+                if diverged:
+                    lost = wp.nan
+                plan.loads[1, env, link] = wp.where(wp.isnan(lost), lost, wp.max(plan.loads[1, env, link], lost))
+                if not diverged and not (lost <= 0.01 * pushed):
+                    plan.told[0] = 1
 
-    return settle
+    return spread

@@ -12,14 +12,7 @@ from functools import cache
 from typing import Any
 
 from brainbench.core.devices import warp
-from robotics_bridge.sensors.kernels.contact_load import (
-    UNSEEN,
-    ContactNodes,
-    PressArrays,
-    SpreadPlan,
-    near_taxels,
-    nearness,
-)
+from robotics_bridge.sensors.kernels.contact_load import ContactFaces, PressArrays, SpreadPlan
 from robotics_bridge.sensors.kernels.distance import FAR, SIDED, SolidArrays, SolidShape, shape_functions
 from robotics_bridge.sensors.kernels.noise import NoiseParams, episode_draw, radius_noise
 from robotics_bridge.sensors.kernels.pairs import PairArrays
@@ -180,7 +173,7 @@ def kinematic_kernel(
         raycast: ask triangles.
         physical: convention of the forces.
         sticky: taxels hold what they touch (``taxels.kernels.stick``).
-        summed: ``press`` is written in place of readings, for links with a contact (``taxels.kernels.contact_load``).
+        summed: ``press`` is written in place of readings, for links with a contact (``contact_load``).
         mode: of the readout.
         hysteresis: whether it is stored.
         walk: whether it is stored.
@@ -209,7 +202,7 @@ def kinematic_kernel(
         laws: wp.array(dtype=KinematicParams),
         sticks: StickArrays,
         plan: SpreadPlan,
-        nodes: ContactNodes,
+        faces: ContactFaces,
         press: PressArrays,
     ):
         # Dividing unsigned numbers of 32 bits costs a third of what a launch of two dimensions does.
@@ -219,25 +212,9 @@ def kinematic_kernel(
         at_row = int(tid % count_rows)
         span = rows[at_row]
         part = span[3]
-        head = int(-1)
-        order = int(0)
-        alone = bool(False)
-        push = wp.vec3f()
         if wp.static(summed):
-            order = plan.order[part]
-            head = nodes.head[env, plan.link[part]]
-            if head < 0 or (io.status[env] & 1) != 0:
+            if faces.head[env, plan.link[part]] < 0 or (io.status[env] & 1) != 0:
                 return
-            alone = nodes.follower[head] < 0
-            push = nodes.normal[head]
-            if wp.static(not cuda):
-                # The first row of a link looks for its contacts' taxels, which a GPU does in a launch before.
-                seen = head
-                while seen >= 0:
-                    if nodes.felt[seen] == UNSEEN:
-                        link = plan.link[part]
-                        nodes.felt[seen] = near_taxels(plan, probes, nodes, head, link, seen)
-                    seen = nodes.follower[seen]
         slot = probes.slot[span[0]]
         variant = int(0)
         if solids.kind.shape[0] > 1:
@@ -265,10 +242,6 @@ def kinematic_kernel(
         rotation = wp.mat33f()
         offset = wp.vec3f()
         limit = float(0.0)
-        touched = float(0.0)
-        whole = float(0.0)
-        straight = float(0.0)
-        field = wp.vec3f()
         while n < span[1]:
             packed = load_four(probes.packed, n)
             radius = packed[3]
@@ -313,7 +286,6 @@ def kinematic_kernel(
                         sigma = hold(sticks, solids, pairs, io, env, n, place, x, normal, radius - best, grip)
                 if wp.static(summed):
                     weight = float(0.0)
-                    total = float(0.0)
                     if best < radius:
                         weight = power(radius - best, law.exponent)
                     press.weight[env, n] = weight
@@ -323,26 +295,10 @@ def kinematic_kernel(
                         noisy = wp.max(noisy, 0.0)
                         press.noisy[env, n] = noisy
                     if weight + noisy > 0.0:
-                        body = solids.link[pairs.geometry[env, place]]
-                        node = head
-                        while node >= 0:
-                            if ((nodes.felt[node] >> order) & 1) == 1 and nodes.other[node] == body:
-                                total += nearness(
-                                    alone, nodes.point[node], nodes.normal[node], x, normal, plan.reach[n]
-                                )
-                            node = nodes.follower[node]
                         press.normal[env, n] = normal
-                        press.body[env, n] = body
+                        press.body[env, n] = solids.link[pairs.geometry[env, place]]
                         if wp.static(sticky):
                             press.sigma[env, n] = sigma
-                    press.total[env, n] = total
-                    if total > 0.0:
-                        # With one contact on the link y is the weight alone (taxels.kernels.contact_load).
-                        touched += 1.0
-                        if alone:
-                            whole += weight
-                            straight += weight * wp.dot(normal, push)
-                            field += weight * (normal + sigma)
                 else:
                     truth = wp.spatial_vectorf()
                     signal = wp.spatial_vectorf()
@@ -366,15 +322,11 @@ def kinematic_kernel(
                         store_planes(io.truth, env, n, 6, truth)
                     else:
                         emit_six(io, io.knobs[part], env, n, probe, age, episode, fixed, lag, drift, truth, signal)
-            elif wp.static(summed):
-                press.total[env, n] = 0.0
-            else:
+            elif wp.static(not summed):
                 silenced(io, 6, env, n, radius)
             n += span[2]
             if wp.static(single):
                 # Told so, the compiler keeps nothing for further taxels in registers.
                 n = span[1]
-        if wp.static(summed):
-            press.part[env, at_row] = wp.spatial_vectorf(touched, whole, straight, field[0], field[1], field[2])
 
     return kinematic

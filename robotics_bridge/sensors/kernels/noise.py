@@ -238,10 +238,10 @@ def measure(
     fading = float(0.0)
     if knobs.hysteresis != float(0.0):
         fading = decay(dt / knobs.tau)
+    z = wp.vec4()
     for channel in range(x.shape[0]):
         # One call of Philox yields four words: white noise and drift of two neighbouring channels.
-        z = wp.vec4()
-        if knobs.white > float(0.0) or knobs.walk > float(0.0):
+        if channel % 2 == 0 and (knobs.white > float(0.0) or knobs.walk > float(0.0)):
             z = pair_normals(knobs, number, probe[n], channel // 2, age[env], episode[env])
         white = wp.where(channel % 2 == 0, z[0], z[2])
         step = wp.where(channel % 2 == 0, z[1], z[3])

@@ -48,6 +48,7 @@ class PairTable:
         """Warp array [B]: the most geometries that ever met a sensor whose list holds fewer; 0 where none was lost."""
         self.status: Any = context.zeros(context.num_envs, int)
         """Warp array [B] of :data:`DIVERGED` and :data:`OVERFULL`, as of the last update."""
+        self._loaded: set[int] = set()
         self.loads: Any = None
         """Warp array [2, B, L] of links with taxels of ``total="engine"``: sum of the engine's forces, and what their
         taxels lack of them (N); None where there are none (:meth:`count_loads`)."""
@@ -79,11 +80,13 @@ class PairTable:
         self._slots.append({**wanted, "center": np.asarray(center, np.float32), "reach": float(reach)})
         return len(self._slots) - 1
 
-    def count_loads(self) -> Any:
-        """Return :attr:`loads`, made by the first call."""
+    def count_loads(self, links: Sequence[int]) -> tuple[Any, list[bool]]:
+        """Return :attr:`loads`, made by the first call, and which of these links no call before has named."""
         if self.loads is None:
             self.loads = self._context.zeros((2, self._context.num_envs, len(self._solids.scene.links)))
-        return self.loads
+        fresh = [link not in self._loaded for link in links]
+        self._loaded.update(links)
+        return self.loads, fresh
 
     @property
     def state_bytes(self) -> int:

@@ -11,8 +11,14 @@ from scipy.spatial import KDTree
 from brainbench.core.devices import warp
 from robotics_bridge.physics.state import HandState
 from robotics_bridge.sensors.context import fill
-from robotics_bridge.sensors.kernels import contact_load as kernels
-from robotics_bridge.sensors.kernels.contact_load import ContactNodes, PressArrays, SpreadPlan, settle_kernel
+from robotics_bridge.sensors.kernels.contact_load import (
+    ContactFaces,
+    PressArrays,
+    SpreadPlan,
+    join_faces,
+    list_kernel,
+    spread_kernel,
+)
 from robotics_bridge.sensors.kernels.kinematic import KinematicParams, StickArrays, kinematic_kernel
 from robotics_bridge.sensors.kernels.proximity import ProximityArrays, ProximityParams, proximity_kernel
 from robotics_bridge.sensors.kernels.readout import FUSED
@@ -46,7 +52,7 @@ class KinematicRuntime(ProbeRuntime):
         self._laws = context.array(laws, KinematicParams)
         self.rows: Any = context.array(rows, wp.vec4i)
         """Warp array [R]: rows of taxels that one thread takes in turn."""
-        self.plan, self.nodes, self.press = SpreadPlan(), ContactNodes(), PressArrays()
+        self.plan, self.faces, self.press = SpreadPlan(), ContactFaces(), PressArrays()
         """Warp structures of the sums, empty here."""
         sticks, shape = StickArrays(), (context.num_envs, self.count) if first.sticky else (1, 1)
         sticks.anchor, sticks.body = context.zeros(shape, wp.vec3f), context.zeros(shape, int)
@@ -58,7 +64,7 @@ class KinematicRuntime(ProbeRuntime):
         """Run the kernel."""
         c = self.context
         inputs = [self.probes, self.rows, c.solids.struct, c.pairs.struct, self.io, self._laws, self._sticks]
-        c.launch(self._kernel, c.num_envs * self.rows.shape[0], *inputs, self.plan, self.nodes, self.press)
+        c.launch(self._kernel, c.num_envs * self.rows.shape[0], *inputs, self.plan, self.faces, self.press)
 
 
 class ProximityRuntime(ProbeRuntime):
@@ -103,62 +109,61 @@ class ContactLoadRuntime(KinematicRuntime):
         places = np.full((len(context.scene.links), self._most), -1)
         places[links, order] = np.arange(len(links))
         spans = [(p.start, p.start + p.count, slot) for p, slot in zip(self.slices.values(), self.slots, strict=True)]
-        plan = self.plan
+        plan, cuda, envs = self.plan, context.device.is_cuda, context.num_envs
         plan.sensors, plan.link = context.array(places, int), context.array(links, int)
-        plan.order, plan.spans = context.array(order, int), context.array(spans, wp.vec3i)
+        plan.spans = context.array(spans, wp.vec3i)
         plan.reach = context.array(np.concatenate([contact_reach(sensor.probes) for sensor in configs]), float)
-        plan.row_first = context.array(np.searchsorted(self.rows.numpy()[:, 3], np.arange(len(spans) + 1)), int)
         plan.whole = context.array([int(not sensor.track) for sensor in configs], int)
         plan.links = context.array(sorted(set(links)), int)
-        plan.fresh = int(context.pairs.loads is None)
-        plan.loads, plan.told = context.pairs.count_loads(), context.pairs.told
-        self._settle = settle_kernel(self.kinds, configs[0].query == "raycast", in_turn=not context.device.is_cuda)
+        plan.loads, fresh = context.pairs.count_loads(sorted(set(links)))
+        plan.fresh, plan.told = context.array(fresh, int), context.pairs.told
         plan.slip = 1.0 if configs[0].convention == "physical" else -1.0
-        shape, press = (context.num_envs, self.count), self.press
-        press.weight, press.total = context.zeros(shape), context.zeros(shape)
-        press.part = context.zeros((context.num_envs, self.rows.shape[0]), wp.spatial_vectorf)
-        press.noisy = context.zeros(shape if self.noisy else (1, 1))
+        sticky = configs[0].sticky
+        self._list, self._spread = (
+            list_kernel(cuda),
+            spread_kernel(self.kinds, configs[0].query == "raycast", self.noisy, sticky, cuda),
+        )
+        # One thread for a few taxels of a link; as many blocks as the GPU holds take the links in turn.
+        most = max(part.count for part in self.slices.values())
+        self._threads = 1 if not cuda else 32 if most <= 48 else 64 if most <= 256 else 128
+        items = envs * plan.links.shape[0]
+        self._blocks = min(items, 2048 // self._threads * context.device.sm_count) if cuda else 1
+        shape, press = (envs, self.count), self.press
+        press.weight, press.noisy = context.zeros(shape), context.zeros(shape if self.noisy else (1, 1))
         press.normal, press.body = context.zeros(shape, wp.vec3f), context.zeros(shape, int)
-        press.sigma = context.zeros(shape if configs[0].sticky else (0, 0), wp.vec3f)
-        self.scratch = [press.weight, press.total, press.normal, press.body, press.sigma, press.part]
-        self.scratch += [press.noisy] if self.noisy else []
+        press.sigma = context.zeros(shape if sticky else (1, 1), wp.vec3f)
+        self.scratch = [press.weight, press.normal, press.body]
+        self.scratch += [press.noisy] * self.noisy + [press.sigma] * sticky
+        faces = self.faces
+        faces.head, faces.listed = (context.array(np.full((envs, len(places)), -1), int) for _ in range(2))
+        faces.items, faces.count = context.zeros(items if cuda else 1, int), context.zeros(1, int)
         # Stages after this one write into the measured readings, which are then never left alone.
-        self._written = context.array(np.full((context.num_envs, self.rows.shape[0]), self.noisy), wp.uint8)
-        self.nodes = self._make_nodes(0)
+        faces.filled = context.zeros(shape, wp.uint8)
+        faces.stale = context.array(np.full((envs, plan.links.shape[0]), int(self.noisy)), int)
+        self._room(0)
+
+    def _room(self, contacts: int) -> None:
+        for name in ("follower", "watched", "next", "last", "other"):
+            setattr(self.faces, name, self.context.zeros(2 * contacts, int))
+        for name in ("normal", "origin", "low", "high", "force", "moment"):
+            setattr(self.faces, name, self.context.zeros(2 * contacts, wp.vec3f))
+        self.faces.overlap, self.faces.load = (self.context.zeros(2 * contacts) for _ in range(2))
 
     def run_kernels(self, state: HandState, dt: float) -> None:
         """Run the kernels."""
-        c, room = self.context, state.contact_env.shape[0]
-        if self.nodes.felt.shape[0] != 2 * room:
-            self.nodes = self._make_nodes(room)
-        plan, nodes, press, cuda = self.plan, self.nodes, self.press, c.device.is_cuda
+        c, room, cuda = self.context, state.contact_env.shape[0], self.context.device.is_cuda
+        if self.faces.next.shape[0] != 2 * room:
+            self._room(room)
+        plan, faces, links = self.plan, self.faces, self.plan.links.shape[0]
+        scene = [c.solids.struct.link, state.arrays, state.contact_friction]
         # A processor takes all contacts in one thread, so that the launch stays the same whatever their number.
-        threads = room if cuda else 1
-        c.launch(kernels.list_contacts, threads, plan, c.pairs.plan, c.solids.struct.link, state.arrays,
-                 state.contact_friction, threads, nodes)  # fmt: skip
-        links = plan.links.shape[0]
-        inputs = [int(self.noisy), self._written, self.io]
+        threads = max(room, 1) if cuda else 1
+        c.launch(self._list, threads, plan, c.pairs.plan, *scene, threads, faces)
         if cuda:
-            c.launch(kernels.find_taxels, (c.num_envs, links), plan, self.probes, nodes)
+            c.launch(join_faces, (c.num_envs, links), plan, *scene, int(self.noisy), faces, self.io)
         super().run_kernels(state, dt)
-        if cuda:
-            seen = [plan, c.solids.struct.link, state.arrays, self.probes, press, nodes]
-            c.launch(kernels.share_contacts, (2 * room, self._most), *seen)
-            spread = [plan, self.probes, self.rows, press, nodes, *inputs]
-            c.launch(kernels.spread_contacts, (c.num_envs, self.rows.shape[0]), *spread)
-        c.launch(self._settle, (c.num_envs, links), plan, self.probes, self.rows, c.solids.struct,
-                 c.pairs.struct, nodes, press, *inputs)  # fmt: skip
-
-    def _make_nodes(self, room: int) -> Any:
-        c, nodes = self.context, kernels.ContactNodes()
-        nodes.head = c.array(np.full((c.num_envs, len(c.scene.links)), -1), int)
-        for name in ("follower", "watched", "felt", "other", "geometry"):
-            setattr(nodes, name, c.zeros(2 * room, int))
-        nodes.carried, nodes.overlap = c.zeros((2 * room, self._most), int), c.zeros(2 * room)
-        for name in ("point", "normal", "force"):
-            setattr(nodes, name, c.zeros(2 * room, wp.vec3f))
-        nodes.load, nodes.share = c.zeros(2 * room), c.zeros((2 * room, self._most), wp.vec4f)
-        return nodes
+        inputs = [plan, self.probes, *scene, c.solids.struct, c.pairs.struct, faces, self.press, self._blocks, self.io]
+        c.launch(self._spread, (self._blocks, self._threads), *inputs, block=self._threads)
 
 
 def contact_reach(probes: Probes) -> np.ndarray:
