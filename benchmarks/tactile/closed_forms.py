@@ -19,7 +19,7 @@ from robotics_bridge.sensors.audio.sensors import ElasticMaterial
 from robotics_bridge.sensors.calibration.calibrate import calibrate
 from robotics_bridge.sensors.calibration.log import Log
 from robotics_bridge.sensors.noise.stages import simulate
-from robotics_bridge.sensors.temperature.grid import ThermalBody, ThermalMaterial, material
+from robotics_bridge.sensors.temperature.materials import ThermalBody, ThermalMaterial, material
 
 STEEL = ElasticMaterial(2e11, 0.3, 7850.0, 5.0, 3e-8)
 PLAIN = ThermalMaterial(2.0, 1000.0, 1000.0, 0.8)

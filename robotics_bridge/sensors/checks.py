@@ -28,7 +28,7 @@ from robotics_bridge.sensors.audio.modes import find_modes
 from robotics_bridge.sensors.audio.sensors import ElasticMaterial, Modes
 from robotics_bridge.sensors.noise.stages import simulate
 from robotics_bridge.sensors.sensor import Sensor
-from robotics_bridge.sensors.temperature.grid import ThermalMaterial
+from robotics_bridge.sensors.temperature.materials import ThermalMaterial
 
 Result = tuple[float, float, float]
 _GAP = math.hypot(0.003, 0.03) - 0.02

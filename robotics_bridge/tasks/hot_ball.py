@@ -19,13 +19,8 @@ from brainbench.core.devices import mujoco_module, warp
 from brainbench.core.errors import UsageError
 from brainbench.core.limits import Count, Limit, NotNegative, Positive, limited
 from robotics_bridge.sensors.taxels.sensors import PUBLISHED_TWIST
-from robotics_bridge.sensors.temperature.grid import (
-    ABSOLUTE_ZERO,
-    TemperatureGrid,
-    ThermalBody,
-    ThermalMaterial,
-    material,
-)
+from robotics_bridge.sensors.temperature.grid import TemperatureGrid
+from robotics_bridge.sensors.temperature.materials import ABSOLUTE_ZERO, ThermalBody, ThermalMaterial, material
 from robotics_bridge.sensors.temperature.runtime import link_temperature
 from robotics_bridge.tasks import terms
 from robotics_bridge.tasks.objects import ball

@@ -22,7 +22,7 @@ from robotics_bridge.physics import Geometry, HandState, MujocoEngine, MujocoWar
 from robotics_bridge.sensors import ContactAudio, ElastomerTaxel, Noise, Probes, SensorSuite, TemperatureGrid
 from robotics_bridge.sensors.audio.modes import find_modes
 from robotics_bridge.sensors.audio.sensors import Modes
-from robotics_bridge.sensors.temperature.grid import ThermalBody
+from robotics_bridge.sensors.temperature.materials import ThermalBody
 
 CLASSES = {
     "ContactProbe": "published-bool",

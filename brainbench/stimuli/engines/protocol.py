@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from brainbench.core.errors import UsageError
 from brainbench.core.progress import Progress as NamedProgress
 from brainbench.stimuli.engines.fidelity import Fidelity
-from brainbench.stimuli.motion.jobs import Job, Trace
+from brainbench.stimuli.motion.jobs import Job, StillFollicle, Trace  # noqa: F401, what a script gives an engine
 
 if TYPE_CHECKING:
     from brainbench.stimuli.objects.solid import Solid

@@ -1,4 +1,4 @@
-"""Temperature of a link in cells: ``grid`` holds materials and configuration.
+"""Temperature of a link in cells: ``grid`` is the configuration, of ``materials``.
 
 An update turns contacts into conductances, exchanges heat, diffuses it and lets the sensing element follow
 (``runtime``).

@@ -26,7 +26,8 @@ from robotics_bridge.sensors.kernels.heat import (
 )
 from robotics_bridge.sensors.runtime import Runtime, SuiteContext
 from robotics_bridge.sensors.suite import SensorSuite
-from robotics_bridge.sensors.temperature.grid import TemperatureGrid, ThermalBody, material
+from robotics_bridge.sensors.temperature.grid import TemperatureGrid
+from robotics_bridge.sensors.temperature.materials import ThermalBody, material
 
 wp = warp()
 

@@ -28,7 +28,7 @@ from robotics_bridge.sensors.audio.modes import find_modes
 from robotics_bridge.sensors.audio.runtime import joint_drive
 from robotics_bridge.sensors.audio.sensors import Modes
 from robotics_bridge.sensors.taxels.elastomer import contact_pressure
-from robotics_bridge.sensors.temperature.grid import ThermalBody
+from robotics_bridge.sensors.temperature.materials import ThermalBody
 from tests.factories.touch_scenes import pad_scene, poses_at, state_of
 
 BALL = Geometry(name="ball", link="ball", kind="sphere", size=(0.01,))

@@ -13,7 +13,8 @@ from robotics_bridge.physics.scene import Geometry, TouchScene
 from robotics_bridge.physics.state import HandState
 from robotics_bridge.sensors.noise.model import Noise
 from robotics_bridge.sensors.suite import SensorSuite
-from robotics_bridge.sensors.temperature.grid import TemperatureGrid, ThermalBody, ThermalMaterial
+from robotics_bridge.sensors.temperature.grid import TemperatureGrid
+from robotics_bridge.sensors.temperature.materials import ThermalBody, ThermalMaterial
 from robotics_bridge.sensors.temperature.runtime import diffusion, link_temperature, lost_contacts
 from tests.factories.sensor_episode import require_processor
 
