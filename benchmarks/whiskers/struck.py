@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import argparse
 import math
-from contextlib import ExitStack
 from dataclasses import replace
 from unittest.mock import patch
 
@@ -79,15 +78,12 @@ def struck(speed: float, count: int, fidelity: Fidelity) -> list[str]:
 
 def soft(each: int, fidelity: Fidelity) -> list[list[str]]:
     """Return rows for each friction: what ``mujoco`` misses beside a converged ``rod``, by whiskers flagged or not."""
-    jobs, engine = contact_jobs(21, each=each), get_engine("mujoco")
+    jobs, engine = contact_jobs(21, each=each), get_engine("mujoco", errors=True)
     fine = replace(fidelity, time_step=2e-5, steps_per_period=120, precision="double", contact_tolerance=1e-9)
     reference, judged = RodEngine().run(jobs, fine), engine.run(jobs, fidelity)
-    home = "brainbench.stimuli.engines"
-    limits = "mujoco.engine.LARGEST_CHANGE", "stepping.LARGEST_CHANGE", "stepping.LARGEST_CREEP_CHANGE"
-    with ExitStack() as stack:
-        for limit in limits:
-            stack.enter_context(patch(f"{home}.{limit}", 9.0))
-        every = engine.run(jobs, fidelity)
+    # Without the limit, what soft contacts lose of the friction has numbers too.
+    with patch("brainbench.stimuli.engines.mujoco.engine.LARGEST_CHANGE", 9.0):
+        every = get_engine("mujoco").run(jobs, fidelity)
     rows = []
     for friction in FRICTIONS:
         for flagged in (True, False):
@@ -95,7 +91,7 @@ def soft(each: int, fidelity: Fidelity) -> list[list[str]]:
             pairs = [
                 (one.wrench, right.wrench)
                 for job, told, one, right in kinds
-                if (job.obstacles[0].friction, told.status != "ok") == (friction, flagged)
+                if (job.obstacles[0].friction, told.status != "ok" or bool(told.remark)) == (friction, flagged)
                 if one.status == right.status == "ok"
             ]
             parts = [

@@ -26,7 +26,7 @@ from brainbench.stimuli.engines.fidelity import DEFAULT_ENGINE, Fidelity, steps_
 from brainbench.stimuli.engines.job_schedule import plan
 from brainbench.stimuli.engines.protocol import WhiskerEngine
 from brainbench.stimuli.explain import ATTRIBUTE, SECONDS, explain
-from brainbench.stimuli.kept_sets import find_entry
+from brainbench.stimuli.kept_sets import find_entry, with_kept_errors
 from brainbench.stimuli.motion.jobs import Trace
 from brainbench.stimuli.scenes.frames import clip_wrenches
 from brainbench.stimuli.scenes.scene import Scene
@@ -106,7 +106,7 @@ def read_entry(path: Path) -> xr.Dataset | None:
 @functools.lru_cache(maxsize=1)
 def _read_entry(path: Path, *state: int) -> xr.Dataset:
     started = time.perf_counter()
-    dataset = read_stimulus_set(path)
+    dataset = with_kept_errors(read_stimulus_set(path), path)
     dataset.encoding[SECONDS] = {"read": time.perf_counter() - started}
     return dataset
 

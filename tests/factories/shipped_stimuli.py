@@ -1,18 +1,21 @@
 """The stimulus sets that the package ships, and how to make them anew.
 
 ``python -m tests.factories.shipped_stimuli`` simulates them again, to be done whenever ``PHYSICS_VERSION`` is raised
-or the scenes of these recipes change.
+or the scenes of these recipes change; ``python -m tests.factories.shipped_stimuli errors`` only their errors.
 """
 
 from __future__ import annotations
 
+import sys
+
+import numpy as np
 import xarray as xr
 
-from brainbench.core.files import atomic_path, write_json
+from brainbench.core.files import atomic_path, to_json, write_json, write_text
 from brainbench.core.reading.sealed import seal_file
 from brainbench.stimuli import Fidelity, get_recipe
 from brainbench.stimuli.engines import get_engine
-from brainbench.stimuli.kept_sets import SHIPPED, SHIPPED_INDEX, shipped_facts
+from brainbench.stimuli.kept_sets import SHIPPED, SHIPPED_INDEX, error_file, shipped_facts
 from brainbench.stimuli.simulation import cache_path, simulate_uncached
 
 RECIPES = ("objects", "rodgers")
@@ -26,9 +29,18 @@ def entry_name(recipe: str) -> str:
     return cache_path(get_recipe(recipe).scenes, FIDELITY, get_engine("rod")).name
 
 
-def simulate_again(recipe: str) -> xr.Dataset:
+def simulate_again(recipe: str, *, errors: bool = False) -> xr.Dataset:
     """Return the set of a recipe, simulated now."""
-    return simulate_uncached(get_recipe(recipe).scenes, FIDELITY, get_engine("rod"))
+    return simulate_uncached(get_recipe(recipe).scenes, FIDELITY, get_engine("rod", errors=errors))
+
+
+def write_errors() -> None:
+    """Write the errors of the sets beside them."""
+    for recipe in RECIPES:
+        dataset = simulate_again(recipe, errors=True)
+        values = {name: np.char.mod("%.3g", dataset[name].values).astype(float) for name in ("error", "damping")}
+        assert np.isfinite(values["error"]).all()
+        write_text(error_file(SHIPPED / entry_name(recipe)), to_json(values, indent=None) + "\n")
 
 
 def write() -> None:
@@ -44,7 +56,8 @@ def write() -> None:
         seal_file(path)
         index[recipe] = {"entry": path.name, **shipped_facts(recipe)}
     write_json(SHIPPED_INDEX, index)
+    write_errors()
 
 
 if __name__ == "__main__":
-    write()
+    write_errors() if sys.argv[1:] == ["errors"] else write()

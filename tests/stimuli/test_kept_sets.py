@@ -44,6 +44,13 @@ def test_a_set_of_the_package_is_read_by_name_and_by_scenes_with_an_empty_cache(
     by_name, by_scenes = load_stimuli("rodgers"), simulate(get_recipe("rodgers").scenes)
     assert by_name.content_hash == by_scenes.attrs["content_hash"]
     assert not list(tmp_path.rglob("*.h5"))
+    # Whoever scores these stimuli sees how wrong their forces may be.
+    error, touched = by_scenes["error"].values, by_scenes["contact"].values.any(axis=1)
+    assert np.isfinite(error).all()
+    assert 0.05 < np.median(error[touched]) < 0.5
+    assert [bool(remark) for remark in by_scenes["remark"].values.flat] == (error.ravel() > 0.1).tolist()
+    assert by_name.dataset is not None
+    np.testing.assert_array_equal(by_name.dataset["error"], error)
 
 
 def test_other_options_or_changed_scenes_are_not_the_set_of_the_package(monkeypatch: pytest.MonkeyPatch):

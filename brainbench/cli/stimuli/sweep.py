@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from brainbench.stimuli.sweeps.plan import GenerationPlan
 
 SETTINGS = "brainbench.stimuli.sweeps.plan:GenerationSettings"
-OFFERED = ("split", "limit", "sample", "seed", "device", "shard_size", "retry")
+OFFERED = ("split", "limit", "sample", "seed", "device", "shard_size", "errors", "retry")
 _SHOWN = 8
 
 
@@ -99,6 +99,19 @@ def _describe(plan: GenerationPlan) -> str:
     return f"{plan.sweeps:,} sweeps in {shards}: {parts} (by {plan.settings.split})"
 
 
+def _describe_errors(errors: dict[str, Any] | None) -> str:
+    """Return the estimated errors in words; empty without any."""
+    if errors is None:
+        return ""
+    median, most, worst = (
+        "not to be told" if errors[name] is None else f"{errors[name]:.1%}" for name in ("median", "q90", "worst")
+    )
+    return (
+        f"{median} (median), {most} (90 %), {worst} (worst), estimated of {errors['whiskers']:,} whiskers in contact; "
+        f"{errors['beyond']:,} above 10 %"
+    )
+
+
 def _generate(
     plan: GenerationPlan, out: Path, workers: int | None, scheduler: str | None
 ) -> tuple[dict[str, Any], str]:
@@ -116,6 +129,7 @@ def _generate(
     )  # fmt: skip
     data = {
         **{key: manifest[key] for key in about},
+        "errors": manifest.get("errors"),
         "seconds": seconds,
         "folder": out,
         "files": [out / shard["name"] for shard in manifest["shards"]],
@@ -123,6 +137,7 @@ def _generate(
     unusable = {name: item["unusable"] for name, item in manifest["objects"].items() if "unusable" in item}
     untouched = [name for name, item in manifest["objects"].items() if "untouched" in item]
     rows = {
+        "error": _describe_errors(manifest.get("errors")),
         "steps": f"{manifest['steps']:,} of {manifest['steps_in_full']:,} computed"
         + f" ({saved:.0%} saved)" * (saved >= 0),
         "not solved": f"contact forces of {unsolved:,} time steps" if unsolved else "",

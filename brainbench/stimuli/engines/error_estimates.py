@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from brainbench.stimuli.engines.fidelity import Fidelity, steps_to_ring
 from brainbench.stimuli.engines.trust import SMALL_FORCE, start_jump
 from brainbench.stimuli.motion.jobs import Job, Trace
+from brainbench.stimuli.whiskers.whisker import Whisker
 
 HALF_STEP, MORE_LINKS = 2.0, 3.0
 """Error over what half the step changes, and over what half as many links again change. Errors that fall with the first
@@ -53,7 +54,10 @@ def with_errors(run: Run, jobs: Sequence[Job], fidelity: Fidelity) -> list[Trace
     settings = [fidelity] * len(traces)
     pending: dict[int, Fidelity] = {}
     for index, (job, trace) in enumerate(zip(jobs, traces, strict=True)):
-        if trace.status == "ok" and trace.steps:
+        if trace.status == "ok" and not trace.steps:
+            # Nothing came near enough to take a step.
+            traces[index] = replace(trace, error=0.0)
+        elif trace.status == "ok":
             if (error := calm_error(job, trace, fidelity)) > (fidelity.error or math.inf):
                 error = math.nan
             traces[index] = replace(trace, error=error)
@@ -77,9 +81,11 @@ def with_errors(run: Run, jobs: Sequence[Job], fidelity: Fidelity) -> list[Trace
                     finer[index] = _finer(chosen, jobs[index], by_step, by_links)
         pending = finer
     ratios = [settings[index].damping_of(job) for index, job in enumerate(jobs)]
+    promise = fidelity.error or LARGEST_ERROR
+    remarks = [remark_on(trace.error, promise) if trace.status == "ok" else "" for trace in traces]
     return [
-        _judged(replace(trace, damping=ratio), fidelity.error or LARGEST_ERROR)
-        for trace, ratio in zip(traces, ratios, strict=True)
+        replace(trace, damping=ratio, remark=remark)
+        for trace, ratio, remark in zip(traces, ratios, remarks, strict=True)
     ]
 
 
@@ -96,40 +102,55 @@ def calm_error(job: Job, trace: Trace, fidelity: Fidelity) -> float:
     return CALM / chain.links**2 if slow else math.nan
 
 
-def difference(values: NDArray, reference: NDArray, contact: NDArray[np.bool_], length: float) -> NDArray[np.float64]:
-    """Return the relative difference of base force and moment [2], root mean square over the readings in contact.
+def changes(
+    values: NDArray[np.floating], finer: NDArray[np.floating], contact: NDArray[np.bool_], lengths: NDArray[np.floating]
+) -> NDArray[np.float64]:
+    """Return the share [n] by which finer simulations change base force or moment, whichever is larger.
+
+    The blow that undoes an overlap at the start is the larger the shorter the step; it is no error. Arguments are those
+    of :func:`difference`.
+    """
+    calm = ~start_jump(values[:, :, None, :3], finer[:, :, None, :3])[:, :, 0]
+    return difference(values, finer, contact, lengths, calm).max(axis=1)
+
+
+def difference(
+    values: NDArray[np.floating],
+    reference: NDArray[np.floating],
+    contact: NDArray[np.bool_],
+    lengths: NDArray[np.floating],
+    counted: NDArray[np.bool_] | bool = True,
+) -> NDArray[np.float64]:
+    """Return the relative difference of base forces and moments [n, 2], root mean square over the readings in contact.
 
     The larger of that and the same over all readings counts, so that what rings after a contact does too. Forces below
-    :data:`SMALL_FORCE`, and their moments at the whisker's tip (at ``length``, m), do not matter. Wrenches are [n, 6].
+    :data:`SMALL_FORCE`, and their moments at the whisker's tip (at ``lengths`` [n], m), do not matter. Wrenches are
+    [n, t, 6]; ``contact`` and ``counted``, readings that matter at all, are [n, t].
     """
-    floor = SMALL_FORCE * np.array([1.0, length])
-    shares = []
-    for some in (contact, np.ones_like(contact)):
-        if some.any():
-            gap, whole = (
-                np.sqrt(np.mean(np.sum(part[some].reshape(-1, 2, 3) ** 2, axis=2), axis=0))
-                for part in (values - reference, reference)
-            )
-            shares.append(gap / np.maximum(whole, floor))
-    return np.max(shares, axis=0)
+    floor = SMALL_FORCE * np.stack([np.ones(len(values)), lengths], axis=1)
+    parts = [part.reshape(*part.shape[:2], 2, 3).astype(float) for part in (values - reference, reference)]
+    shares = np.zeros((len(values), 2))
+    for readings in (contact & counted, np.ones_like(contact) & counted):
+        count = np.maximum(readings.sum(axis=1), 1)[:, None]
+        gap, whole = (np.sqrt(np.einsum("ntpd,ntpd,nt->np", part, part, readings) / count) for part in parts)
+        shares = np.maximum(shares, gap / np.maximum(whole, floor))
+    return shares
 
 
-def halved_step(fidelity: Fidelity, job: Job) -> Fidelity:
-    """Return a fidelity with half the step that readings and fidelity leave a job, and with solved contact forces."""
+def halved_step(fidelity: Fidelity, whisker: Whisker, spacing: float) -> Fidelity:
+    """Return a fidelity with half the step that it and readings (``spacing``, s) leave, and solved contact forces."""
     period, tolerance = fidelity.steps_per_period, fidelity.contact_tolerance
     return replace(
         fidelity,
-        time_step=max(min(fidelity.time_step, job.spacing) / 2, 1e-7),
-        steps_per_period=None
-        if period is None
-        else min(2 * max(period, steps_to_ring(job.whisker.damping_ratio)), 1e4),
+        time_step=max(min(fidelity.time_step, spacing) / 2, 1e-7),
+        steps_per_period=None if period is None else min(2 * max(period, steps_to_ring(whisker.damping_ratio)), 1e4),
         contact_tolerance=TOLERANCE if tolerance is None else tolerance,
     )
 
 
-def more_links(fidelity: Fidelity, job: Job) -> Fidelity:
+def more_links(fidelity: Fidelity, whisker: Whisker) -> Fidelity:
     """Return a fidelity with half as many links again, or with a third fewer where there can be no more."""
-    count = fidelity.link_count(job.whisker.arc_length)
+    count = fidelity.link_count(whisker.arc_length)
     changed = math.ceil(MORE * count)
     return replace(fidelity, links=changed if changed <= MOST else round(count / MORE), links_per_mm=None)
 
@@ -140,35 +161,36 @@ def _estimates(
     """Return what the step and what the links err by, and the seconds spent, by index of the job."""
     errors = {index: [0.0, 0.0] for index in which}
     spent = dict.fromkeys(which, 0.0)
-    for place, (factor, change) in enumerate(((HALF_STEP, halved_step), (MORE_LINKS, more_links))):
-        settings = {index: change(fidelity, jobs[index]) for index in which}
+    for place, factor in enumerate((HALF_STEP, MORE_LINKS)):
+        settings = {index: _changed(fidelity, jobs[index], place) for index in which}
         for setting in dict.fromkeys(settings.values()):
             some = [index for index in which if settings[index] == setting]
             for index, finer in zip(some, run([jobs[index] for index in some], setting), strict=True):
                 spent[index] += finer.seconds
-                trace, length = traces[index], jobs[index].whisker.arc_length
-                # The blow that undoes an overlap at the start is the larger the shorter the step; it is no error.
-                force, finer_force = (part.wrench[None, :, None, :3] for part in (trace, finer))
-                calm = ~start_jump(force, finer_force)[0, :, 0]
-                touching = (trace.contact | finer.contact)[calm]
-                shares = difference(trace.wrench[calm], finer.wrench[calm], touching, length)
-                errors[index][place] = factor * float(shares.max()) if finer.status == "ok" else math.inf
+                trace, length = traces[index], np.array([jobs[index].whisker.arc_length])
+                contact = (trace.contact | finer.contact)[None]
+                change = float(changes(trace.wrench[None], finer.wrench[None], contact, length)[0])
+                errors[index][place] = factor * change if finer.status == "ok" else math.inf
     return {index: (errors[index][0], errors[index][1], spent[index]) for index in which}
+
+
+def _changed(fidelity: Fidelity, job: Job, place: int) -> Fidelity:
+    return more_links(fidelity, job.whisker) if place else halved_step(fidelity, job.whisker, job.spacing)
 
 
 def _finer(fidelity: Fidelity, job: Job, by_step: float, by_links: float) -> Fidelity:
     """Return a fidelity that is finer in what errs most, and in both where they err alike."""
     if by_step >= by_links / 2 and fidelity.time_step > FINEST_STEP:
-        fidelity = halved_step(fidelity, job)
+        fidelity = halved_step(fidelity, job.whisker, job.spacing)
     if by_links >= by_step / 2 and MORE * fidelity.link_count(job.whisker.arc_length) <= MOST:
-        fidelity = more_links(fidelity, job)
+        fidelity = more_links(fidelity, job.whisker)
     return fidelity
 
 
-def _judged(trace: Trace, promise: float) -> Trace:
-    """Return a trace that says in words if its error is beyond what is promised."""
-    if trace.status != "ok" or not trace.error > promise:
-        return trace
-    words = f"an error of {trace.error:.0%}" if np.isfinite(trace.error) else "an error that cannot be told"
+def remark_on(error: float, promise: float = LARGEST_ERROR) -> str:
+    """Return in words that an estimated error is beyond what is promised; empty where it is not."""
+    if not error > promise:
+        return ""
+    words = f"an error of {error:.0%}" if np.isfinite(error) else "an error that cannot be told"
     remark = f"half the step and more links estimate {words} (root mean square), above {promise:.0%}"
-    return replace(trace, remark=f"{remark}; choose a finer fidelity, or auto=ERROR")
+    return f"{remark}; choose a finer fidelity, or auto=ERROR"

@@ -8,7 +8,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 import numpy as np
@@ -65,6 +65,9 @@ class PassiveSweeps(Protocol):
         ...
 
 
+_BY_SWEEP = "wrench", "contact", "unstable", "error"
+
+
 @dataclass(frozen=True, eq=False)
 class SweepBatch:
     """Wrenches and contacts of some sweeps, in the order in which they were asked for."""
@@ -85,9 +88,13 @@ class SweepBatch:
     """Sweeps with a whisker that was simulated again with finer steps, because it could not be trusted at first."""
     unsolved: int = 0
     """Time steps whose contact forces were not solved (:attr:`brainbench.stimuli.motion.jobs.Trace.unsolved`)."""
+    error: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 0), dtype=np.float32))
+    """[sweep, whisker] estimated error (:attr:`brainbench.stimuli.motion.jobs.Trace.error`); NaN without one."""
 
     def __post_init__(self) -> None:
         count, _, whiskers, channels = np.shape(self.wrench)
+        if not self.error.size:
+            object.__setattr__(self, "error", np.full((count, whiskers), np.nan, dtype=np.float32))
         if channels != 6 or self.contact.shape != (count, whiskers) or self.unstable.shape != (count, whiskers):
             raise UsageError(
                 f"A batch of sweeps has wrenches [n, frame, whisker, 6] and [n, whisker] for contact and unstable; "
@@ -95,6 +102,11 @@ class SweepBatch:
             )
         if [bool(reason) for reason in self.reasons] != np.asarray(self.unstable.any(axis=1)).tolist():
             raise UsageError("Every sweep of a batch has a reason, which is empty exactly when no whisker is unstable.")
+
+    def ordered(self, order: NDArray[np.int_]) -> SweepBatch:
+        """Return the batch with its sweeps in another order."""
+        arrays = {name: getattr(self, name)[order] for name in _BY_SWEEP}
+        return replace(self, **arrays, reasons=tuple(self.reasons[place] for place in order.tolist()))
 
 
 def describe_unstable(
@@ -116,9 +128,9 @@ def join_batches(parts: Sequence[SweepBatch]) -> SweepBatch:
     """Return several batches as one."""
     if len(parts) == 1:
         return parts[0]
-    names = ("wrench", "contact", "unstable"), ("steps", "steps_in_full", "retried", "unsolved")
-    arrays: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names[0]}
-    counts: dict[str, Any] = {name: sum(getattr(part, name) for part in parts) for name in names[1]}
+    arrays: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in _BY_SWEEP}
+    names = "steps", "steps_in_full", "retried", "unsolved"
+    counts: dict[str, Any] = {name: sum(getattr(part, name) for part in parts) for name in names}
     return SweepBatch(**arrays, reasons=tuple(reason for part in parts for reason in part.reasons), **counts)
 
 
@@ -204,10 +216,12 @@ class WhiskerEngine(ABC):
         *,
         workers: int | None = None,
         packed: Mapping[str, Any] | None = None,
+        estimated: NDArray[np.bool_] | None = None,
     ) -> SweepBatch:
         """Simulate sweeps whose object moves; of engines that take :attr:`batches` alone.
 
         Results do not depend on which sweeps come together, nor on their order; ordered by object they are fastest.
         ``workers`` are threads on the CPU, one when None; ``packed`` is what :meth:`pack` made of objects, by name.
+        ``estimated`` [sweep] says whose whiskers get an error.
         """
         raise NotImplementedError(f"The engine {self.name!r} takes sweeps as single scenes.")

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import math
 import time
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import ClassVar
 
@@ -25,21 +24,12 @@ from brainbench.stimuli.engines.reach import Reach, reachable, to_obstacle_frame
 from brainbench.stimuli.engines.trust import (
     AT_BASE,
     GOT_INSIDE,
-    LARGEST_CHANGE,
-    LARGEST_CREEP_CHANGE,
     LARGEST_OVERLAP,
     LARGEST_START_OVERLAP,
     STARTED_INSIDE,
-    SUSPICIOUS_FORCE,
-    SUSPICIOUS_ROUGHNESS,
-    SUSPICIOUS_SHARE,
-    changes_words,
     check_jobs,
     fault,
-    force_change,
     passed_unseen,
-    roughness,
-    strongest_force,
     without_escape,
 )
 from brainbench.stimuli.motion.jobs import Job, Trace
@@ -251,15 +241,12 @@ class SteppedJob:
         *,
         penetration: float,
         reason: str,
-        forces: NDArray[np.float64],
+        steps: int,
         doubt: str = "",
-        creeps: bool = False,
-    ) -> tuple[Trace, float]:
-        """Return the trace of values at the frames, NaN where not trusted, and the largest change at half the step.
+    ) -> Trace:
+        """Return the trace of values at the frames, NaN where not trusted.
 
-        ``shape`` is in m; ``forces`` [s, 3] (N) are those on the base before the steps that can be trusted;
-        ``doubt`` is a fault without a time; ``creeps`` says that soft contacts hold too little friction. The change is
-        infinite without a suspicion.
+        ``shape`` is in m; ``steps`` are those that can be trusted; ``doubt`` is a fault without a time.
         """
         good, penetration = frames.good, max(penetration, self.overlap[2])
         if not reason and penetration > 2 * LARGEST_OVERLAP:
@@ -269,27 +256,17 @@ class SteppedJob:
             good, reason = good & False, doubt
         ended = self.job.times[~frames.good]
         reason = without_escape(reason, self.job, float(ended[0]) if len(ended) else np.inf)
-        trace = Trace(
+        return Trace(
             wrench=np.where(good[:, None], wrench, np.nan),
             contact=contact & good,
             contact_arc=np.where(good, arc, np.nan),
             penetration=penetration,
             status="unstable" if reason else "ok",
             reason=reason,
-            steps=len(forces),
+            steps=steps,
             seconds=time.thread_time() - self.started,
             link_positions=np.where(good[:, None, None], shape, np.nan) if self.record_shape else None,
         )
-        strongest = SUSPICIOUS_FORCE * strongest_force(self.job.whisker)
-        strong = np.linalg.norm(forces, axis=1).max(initial=0.0) > strongest
-        deep = penetration > SUSPICIOUS_SHARE * 2 * LARGEST_OVERLAP
-        suspicious = strong or deep or creeps or roughness(forces) > SUSPICIOUS_ROUGHNESS
-        allowed = LARGEST_CREEP_CHANGE if creeps else LARGEST_CHANGE
-        return trace, math.inf if reason or not suspicious else allowed
-
-    def halved(self) -> SteppedJob:
-        """Return the job in half the step; its processor time counts on."""
-        return replace(self, fidelity=replace(self.fidelity, time_step=max(self.step / 2, 1e-7)))
 
 
 class SteppedEngine(WhiskerEngine):
@@ -303,30 +280,15 @@ class SteppedEngine(WhiskerEngine):
         """Return what surrounds a run; without the engine's package it is a :class:`MissingDependencyError`."""
 
     @abstractmethod
-    def simulate(self, stepped: SteppedJob) -> tuple[Trace, float]:
+    def simulate(self, stepped: SteppedJob) -> Trace:
         """Simulate one job that is not silent; return what :meth:`SteppedJob.trace` does."""
 
-    def _trusted(self, stepped: SteppedJob) -> Trace:
-        """Return the trace of a job; one that is suspicious must be much the same with half the step."""
+    def _trace(self, stepped: SteppedJob) -> Trace:
+        """Return the trace of a job, without simulation where it is silent."""
         if is_silent(stepped.job, stepped.reach, *stepped.pose):
             seconds = time.thread_time() - stepped.started
             return silent_trace(stepped.job, stepped.fidelity, stepped.record_shape, seconds)
-        trace, allowed = self.simulate(stepped)
-        if math.isinf(allowed):
-            return trace
-        half, _ = self.simulate(stepped.halved())
-        trace = replace(trace, steps=trace.steps + half.steps, seconds=half.seconds)
-        change = float(force_change(*(one.wrench[None, :, None, :3] for one in (trace, half)))[0, 0])
-        if change <= allowed:
-            return trace
-        lost = {
-            "wrench": np.full_like(trace.wrench, np.nan),
-            "contact": np.zeros_like(trace.contact),
-            "contact_arc": np.full_like(trace.contact_arc, np.nan),
-        }
-        if trace.link_positions is not None:
-            lost["link_positions"] = np.full_like(trace.link_positions, np.nan)
-        return replace(trace, status="unstable", reason=changes_words(change), **lost)
+        return self.simulate(stepped)
 
     def run(
         self,
@@ -340,7 +302,7 @@ class SteppedEngine(WhiskerEngine):
         """Simulate every job; see :meth:`brainbench.stimuli.engines.protocol.WhiskerEngine.run`."""
 
         def simulate(some: Sequence[Job], setting: Fidelity) -> list[Trace]:
-            return [self._trusted(SteppedJob(job, setting, record_shape)) for job in some]
+            return [self._trace(SteppedJob(job, setting, record_shape)) for job in some]
 
         def run(group: Sequence[int]) -> dict[int, Trace]:
             some = [jobs[index] for index in group]

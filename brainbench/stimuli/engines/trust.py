@@ -49,15 +49,10 @@ SUSPICIOUS_PEAK = 2.0
 its radius into an edge in one step is thrown out along the whisker, with up to a thousand times the force."""
 FEWEST_READINGS = 20
 """Readings from which a peak is told from a force that grows."""
-SUSPICIOUS_ROUGHNESS = 0.05
-"""Roughness of the base force (:func:`roughness`) from which a whisker in soft contacts is suspicious. Whiskers that
-follow what they touch stay below .01; those that are thrown off and caught again have .1 to 2."""
 LARGEST_CHANGE = 0.2
 """Share by which the base force (root mean square over the readings) may change when the step is halved."""
 SMALL_FORCE = 1e-9
 """Base force (N) that does not matter: a thousandth of that of a light touch."""
-LARGEST_CREEP_CHANGE = 0.1
-"""The same in soft contacts that hold too little friction, whose force follows the step slowly."""
 LARGEST_STRUCK_CHANGE = 0.1
 """The same in rigid contacts with a :data:`BLOW`, when the step is cut to a fifth: contacts may cut a step and its half
 to the same. Of 555 whiskers it finds 99 of the 105 that err by more than a fifth, and 48 others; nothing that a single
@@ -239,15 +234,6 @@ def changes_words(change: float) -> str:
     """Return in words that the base force changes with half the step; NaN where the finer run is not reliable."""
     by = f"by {change:.0%}" if np.isfinite(change) else "beyond what can be trusted"
     return f"the base force changes {by} (root mean square) with half the step; choose a smaller time step"
-
-
-def roughness(force: NDArray[np.floating]) -> float:
-    """Return how much a force [step, 3] changes from step to step, as a share of itself (mean squares); 2 when it hops.
-
-    The force on a whisker that follows its contact hardly changes in a step; one that is thrown off and caught again
-    changes by all of it.
-    """
-    return float(np.sum(np.diff(force, axis=0) ** 2) / max(float(np.sum(force**2)), 1e-30))
 
 
 def force_change(force: NDArray[np.floating], half: NDArray[np.floating]) -> NDArray[np.floating]:

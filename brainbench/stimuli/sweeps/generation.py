@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import multiprocessing
 import os
 import shutil
@@ -13,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brainbench.core.contracts import SWEEPS_FORMAT, SWEEPS_SCHEMA
 from brainbench.core.errors import DataError, UsageError
@@ -24,6 +26,7 @@ from brainbench.core.runs.folder import begin_run
 from brainbench.core.writing.locks import lock_folder
 from brainbench.core.writing.temporaries import is_temporary
 from brainbench.stimuli.engines import get_engine
+from brainbench.stimuli.engines.error_estimates import LARGEST_ERROR
 from brainbench.stimuli.sweeps import running
 from brainbench.stimuli.sweeps.plan import SPLITS, GenerationPlan, Plan, PlannedShard
 from brainbench.stimuli.sweeps.shards import COUNTS, OK, UNUSABLE
@@ -60,7 +63,8 @@ def make_manifest(plan: Plan, folder: str | os.PathLike[str]) -> dict[str, Any]:
         name: {"label": source.label, "source": source.source, "hash": None, "sweeps": {}, "untouched": True}
         for name, source in plan.objects.items()
     }
-    shards = [_read(Path(folder) / task.name, task, objects) for task in plan.shards]
+    errors: list[NDArray[np.float32]] = []
+    shards = [_read(Path(folder) / task.name, task, objects, errors) for task in plan.shards]
     for name, entry in objects.items():
         if not entry["untouched"]:
             del entry["untouched"]
@@ -76,14 +80,31 @@ def make_manifest(plan: Plan, folder: str | os.PathLike[str]) -> dict[str, Any]:
         "format": SWEEPS_FORMAT, "schema": SWEEPS_SCHEMA,
         "content_hash": content_hash([[shard["name"], shard["content_hash"]] for shard in shards]),
         "config_hash": plan.config_hash, "config": plan.config, "provenance": about, "classes": list(plan.classes),
-        "sweeps": plan.sweeps, **totals, **plan.notes,
+        "sweeps": plan.sweeps, **totals, **_spread(errors), **plan.notes,
         "splits": {split: _summary(item for item in shards if item["split"] == split) for split in SPLITS},
         "shards": shards, "objects": objects,
     }  # fmt: skip
 
 
-def _read(path: Path, task: PlannedShard, objects: dict[str, dict[str, Any]]) -> dict[str, Any]:
-    """Return what the manifest says of a shard, and add what the shard says to its ``objects``."""
+def _spread(errors: Sequence[NDArray[np.float32]]) -> dict[str, Any]:
+    """Return what the manifest says of the estimated errors of whiskers in contact; nothing without any.
+
+    A number is None where the error cannot be told, since the finer simulation failed.
+    """
+    values = np.concatenate([*errors, []])
+    if not len(values):
+        return {}
+    median, most, worst = (
+        None if math.isinf(value) else float(value) for value in np.quantile(values, (0.5, 0.9, 1), method="higher")
+    )
+    beyond = int(np.count_nonzero(values > LARGEST_ERROR))
+    return {"errors": {"whiskers": len(values), "median": median, "q90": most, "worst": worst, "beyond": beyond}}
+
+
+def _read(
+    path: Path, task: PlannedShard, objects: dict[str, dict[str, Any]], errors: list[NDArray[np.float32]]
+) -> dict[str, Any]:
+    """Return what the manifest says of a shard, and add what it says to its ``objects`` and to ``errors``."""
     with open_hdf5(path, "shard", "Run the same command again.") as opened:
         file: Any = opened
         # Shards of data sets that were begun before steps were counted as unsolved do not tell.
@@ -93,6 +114,9 @@ def _read(path: Path, task: PlannedShard, objects: dict[str, dict[str, Any]]) ->
         owner, status, reasons = file["owner"][:], file["status"][:], file["reason"][:]
         # Sweeps that failed, and converted ones whose contacts are NaN, are not known to be untouched.
         touched = ((file["contact"][:] != 0) | (status != OK)).any(axis=1)
+        if "error" in file:
+            error = file["error"][:]
+            errors.append(error[~np.isnan(error) & (file["contact"][:] > 0)])
     for index, body in enumerate(task.objects):
         mine, entry = np.flatnonzero(owner == index), objects[body.name]
         if entry["hash"] not in (None, hashes[index]):

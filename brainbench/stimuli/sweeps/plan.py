@@ -99,6 +99,9 @@ class GenerationSettings:
     """Only this fraction of all sweeps, drawn at random; all when None."""
     shard_size: Count | None = None
     """Sweeps per shard; by backend and device when None."""
+    errors: Annotated[float, Limit(least=0, most=1)] = 0.05
+    """Share of the sweeps whose whiskers get an estimated error, drawn at random, one of each object at least; 0 for
+    none, 1 for all. Each such whisker in contact is simulated twice more, with 2 and 1.5 times the work."""
     retry: Count = 5
     """Whiskers that cannot be trusted are simulated again with steps divided by this, and those left by twice this
     (backend ``rod``); 1 leaves them as they are."""
@@ -147,7 +150,7 @@ class PlannedShard:
     @property
     def bytes(self) -> int:
         """About how large the file becomes."""
-        return len(self) * (len(self.config["whiskers"]["names"]) * (24 * self.frames + 5) + 200) + 40_000
+        return len(self) * (len(self.config["whiskers"]["names"]) * (24 * self.frames + 9) + 200) + 40_000
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -160,6 +163,8 @@ class ShardTask(PlannedShard):
     """[sweep] index into ``objects``, ascending."""
     within: NDArray[np.int64]
     """[sweep] which sweep of its object."""
+    estimated: NDArray[np.bool_]
+    """[sweep] whether its whiskers get an estimated error."""
     settings: GenerationSettings
 
 
@@ -274,6 +279,15 @@ class GenerationPlan:
         return mask.reshape(len(self.objects), count)
 
     @cached_property
+    def estimated(self) -> NDArray[np.bool_]:
+        """[object, sweep] whether the whiskers of a sweep get an estimated error."""
+        settings = self.settings
+        generator = np.random.default_rng(int(content_hash(["errors", settings.seed]), 16))
+        draws = np.where(self.chosen, generator.random(self.chosen.shape), 2.0)
+        drawn = (draws < settings.errors) | (draws == draws.min(axis=1, keepdims=True))
+        return self.chosen & drawn & (settings.errors > 0)
+
+    @cached_property
     def splits(self) -> NDArray[np.int8]:
         """[object, sweep] number of each sweep's split in :data:`SPLITS`."""
         labels = {name: item.label for name, item in self.objects.items()}
@@ -307,7 +321,7 @@ class GenerationPlan:
                     index=owners[part] * count + within[part], frames=self.grid.frames.count, config=self.config,
                     config_hash=self.config_hash, grid=self.grid, whiskers=self.whiskers,
                     owner=np.array([local[owner] for owner in owners[part].tolist()]), within=within[part],
-                    settings=self.settings,
+                    estimated=self.estimated[owners[part], within[part]], settings=self.settings,
                 )  # fmt: skip
                 shards.append(task)
         return tuple(shards)

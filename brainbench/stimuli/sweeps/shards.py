@@ -44,6 +44,7 @@ def simulate_sweeps(
     workers: int | None = None,
     retry: int = 1,
     packed: Mapping[str, Any] | None = None,
+    estimated: NDArray[np.bool_] | None = None,
 ) -> SweepBatch:
     """Simulate the sweeps of some indices, many at once where the engine can (:attr:`WhiskerEngine.batches`).
 
@@ -52,9 +53,16 @@ def simulate_sweeps(
     """
     engine = get_engine(backend, device=device, retry=retry)
     if takes_sweeps(engine, scenes.grid):
-        return engine.run_sweeps(scenes, indices, fidelity, workers=workers, packed=packed)
-    parts = [indices[first : first + _TOGETHER] for first in range(0, len(indices), _TOGETHER)]
-    return join_batches([_one_by_one(scenes, part, fidelity, engine, workers) for part in parts])
+        return engine.run_sweeps(scenes, indices, fidelity, workers=workers, packed=packed, estimated=estimated)
+    mask = np.zeros(len(indices), dtype=bool) if estimated is None else estimated
+    order, batches = np.argsort(~mask, kind="stable"), []
+    for errors in (True, False):
+        engine = get_engine(backend, device=device, retry=retry, errors=errors)
+        some = order[mask[order] == errors].tolist()
+        for first in range(0, len(some), _TOGETHER):
+            part = [indices[place] for place in some[first : first + _TOGETHER]]
+            batches.append(_one_by_one(scenes, part, fidelity, engine, workers))
+    return join_batches(batches).ordered(np.argsort(order))
 
 
 def takes_sweeps(engine: WhiskerEngine, grid: SweepGrid) -> bool:
@@ -78,6 +86,7 @@ def _one_by_one(
         steps=explanation.steps,
         steps_in_full=explanation.steps_in_full,
         unsolved=explanation.unsolved,
+        error=dataset["error"].values,
     )
 
 
@@ -151,6 +160,7 @@ def simulate_shard(task: ShardTask, objects: Sequence[BuiltObject] = (), workers
     shape = (len(task), frames.count, whiskers, 6)
     contact = np.zeros((len(task), whiskers), dtype=np.float32)
     status = np.full((len(task), whiskers), UNUSABLE, dtype=np.uint8)
+    error = np.full(contact.shape, np.nan, dtype=np.float32)
     reasons = [built[owner].reason for owner in task.owner.tolist()]
     counts: dict[str, int] = dict.fromkeys(COUNTS, 0)
     wrench = np.empty((0, *shape[1:]), dtype=np.float32)
@@ -160,9 +170,12 @@ def simulate_shard(task: ShardTask, objects: Sequence[BuiltObject] = (), workers
         indices = [place[int(task.owner[i])] * count + int(task.within[i]) for i in chosen.tolist()]
         scenes = SweepScenes(task.grid, solids, whiskers=task.whiskers)
         packed = {task.objects[owner].name: one.packed for owner, one in usable.items() if one.packed is not None}
-        batch = simulate_sweeps(scenes, indices, workers=workers, packed=packed, **settings)
+        batch = simulate_sweeps(
+            scenes, indices, workers=workers, packed=packed, estimated=task.estimated[chosen], **settings
+        )
         if batch.wrench.shape != (len(chosen), *shape[1:]):
             raise UsageError(f"The engine gave wrenches {batch.wrench.shape}; expected {(len(chosen), *shape[1:])}.")
+        error[chosen] = batch.error
         contact[chosen], status[chosen] = batch.contact, np.where(batch.unstable, UNSTABLE, OK)
         for index, reason in zip(chosen.tolist(), batch.reasons, strict=True):
             reasons[index] = reason
@@ -176,6 +189,7 @@ def simulate_shard(task: ShardTask, objects: Sequence[BuiltObject] = (), workers
         **_conditions(task),
         "contact": contact,
         "status": status,
+        **({"error": error} if task.settings.errors else {}),
         "reason": encode_texts(reasons),
         "wrench": np.ascontiguousarray(wrench, dtype="<f4"),
     }
@@ -294,7 +308,7 @@ def _name_axes(file: Any) -> None:
     """Attach the tables as dimension scales, so that xarray opens the file with named axes."""
     axes = {
         "wrench": ("sweep", "time", "whisker", "channel"),
-        **dict.fromkeys(("contact", "status"), ("sweep", "whisker")),
+        **dict.fromkeys(("contact", "status", "error"), ("sweep", "whisker")),
         **dict.fromkeys(("label", "owner", "reason", *_CONDITIONS), ("sweep",)),
         **dict.fromkeys(("row", "col"), ("whisker",)),
         **dict.fromkeys(("object_class", "object_hash"), ("object",)),
@@ -302,6 +316,8 @@ def _name_axes(file: Any) -> None:
     for scale in ("sweep", "time", "whisker", "channel", "class", "object"):
         file[scale].make_scale(scale)
     for name, scales in axes.items():
+        if name not in file:  # data sets may have no errors
+            continue
         for axis, scale in enumerate(scales):
             file[name].dims[axis].attach_scale(file[scale])
 

@@ -54,6 +54,10 @@ def _trace(error=0.0, **values):
     return Trace(wrench, np.ones(len(TIMES), bool), np.full(len(TIMES), 0.01), steps=1, **values)
 
 
+def _difference(values, reference, contact, length):
+    return difference(values[None], reference[None], contact[None], np.array([length]))[0]
+
+
 @pytest.mark.parametrize("preset", ["fast", "balanced"])
 def test_a_whisker_between_opposed_posts_carries_an_error_no_smaller_than_the_elastica_says(preset):
     (trace,) = get_engine("rod", errors=True).run([_opposed_posts()], Fidelity.of(preset), workers=1)
@@ -74,7 +78,7 @@ def test_estimates_cover_the_error_of_contacts_of_all_kinds():
     for job, trace, reference in zip(jobs, traces, references, strict=True):
         if trace.status == reference.status == "ok" and reference.contact.any():
             touching = trace.contact | reference.contact
-            true = difference(trace.wrench, reference.wrench, touching, job.whisker.arc_length).max()
+            true = _difference(trace.wrench, reference.wrench, touching, job.whisker.arc_length).max()
             covered.append(true <= trace.error)
     assert len(covered) >= 20
     assert np.mean(covered) >= 0.85
@@ -104,6 +108,12 @@ def test_a_whisker_whose_finer_simulation_fails_has_a_remark_without_a_number():
     assert "cannot be told" in trace.remark
 
 
+def test_a_whisker_that_needed_no_step_has_no_error():
+    still = Trace(np.zeros((100, 6)), np.zeros(100, bool), np.full(100, np.nan), steps=0)
+    (trace,) = with_errors(lambda jobs, setting: [still], [Job(C2, StillFollicle(), (), TIMES)], Fidelity(links=10))
+    assert trace.error == 0
+
+
 def test_a_promise_makes_only_those_finer_that_need_it():
     jobs = [Job(C2, StillFollicle(), (), TIMES), Job(RAT, StillFollicle(), (), TIMES)]
     counts = []
@@ -124,11 +134,11 @@ def test_differences_are_relative_above_a_nanonewton_and_of_force_or_moment():
     wrench[:, 0], wrench[:, 5] = 1e-3, 1e-6
     ringing = wrench * np.array([1.1, 1, 1, 1, 1, 1.2])
     contact = np.ones(4, bool)
-    np.testing.assert_allclose(difference(ringing, wrench, contact, 0.01), [0.1, 0.2])
-    np.testing.assert_allclose(difference(1e-8 * ringing, 1e-8 * wrench, contact, 0.01), [1e-3, 2e-4], rtol=1e-6)
+    np.testing.assert_allclose(_difference(ringing, wrench, contact, 0.01), [0.1, 0.2])
+    np.testing.assert_allclose(_difference(1e-8 * ringing, 1e-8 * wrench, contact, 0.01), [1e-3, 2e-4], rtol=1e-6)
     # What rings after the contact counts too.
     ringing[2:, 0] = 2e-3
-    assert difference(ringing, wrench, np.array([True, True, False, False]), 0.01)[0] > 0.5
+    assert _difference(ringing, wrench, np.array([True, True, False, False]), 0.01)[0] > 0.5
 
 
 def test_a_whisker_in_air_that_follows_its_base_needs_no_further_simulation():
@@ -145,11 +155,11 @@ def test_a_whisker_in_air_that_follows_its_base_needs_no_further_simulation():
 def test_finer_settings_halve_the_step_that_readings_leave_and_add_half_of_the_links():
     job = Job(replace(C2, damping_ratio=0.1), StillFollicle(), (), np.arange(1, 5) * 2e-5)
     fast = Fidelity.preset("fast")
-    half = halved_step(fast, job)
+    half = halved_step(fast, job.whisker, job.spacing)
     assert half.time_step == pytest.approx(1e-5)
     assert half.steps_per_period == pytest.approx(2 * np.pi / 0.1)
-    assert more_links(fast, job).link_count(C2.arc_length) == 12
-    assert more_links(Fidelity(links=90), job).links == 60
+    assert more_links(fast, C2).link_count(C2.arc_length) == 12
+    assert more_links(Fidelity(links=90), C2).links == 60
 
 
 def test_a_still_touch_is_no_error_however_its_overlap_was_undone():

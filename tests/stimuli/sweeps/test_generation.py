@@ -5,6 +5,8 @@ import os
 import shutil
 from collections import namedtuple
 
+import h5py
+import numpy as np
 import pytest
 import trimesh
 
@@ -96,7 +98,7 @@ def test_a_shard_cut_off_by_a_power_cut_is_made_again(plan, unbroken, tmp_path):
 def test_a_set_of_sweeps_has_the_hash_that_it_always_had(tmp_path, monkeypatch):
     # Too far away to be felt: what whiskers feel has last digits that differ between processors.
     far = dataclasses.replace(GRID, distance=(0.05,), height=(-0.002, 0.0, 0.002))
-    plan = small_plan(("brick:2", "cone:1"), grid=far, backend="rod", shard_size=5, whiskers="C1,C2,C3")
+    plan = small_plan(("brick:2", "cone:1"), grid=far, backend="rod", shard_size=5, whiskers="C1,C2,C3", errors=0)
     manifest = generate(plan, tmp_path / "set", workers=1)
     assert (manifest["sweeps"], manifest["steps"], manifest["unstable"]) == (18, 0, 0)
     # Made by commit a79787b0.
@@ -106,6 +108,26 @@ def test_a_set_of_sweeps_has_the_hash_that_it_always_had(tmp_path, monkeypatch):
     assert all(
         (tmp_path / "set" / task.name).read_bytes() == (tmp_path / task.name).read_bytes() for task in plan.shards
     )
+
+
+@pytest.mark.parametrize(("share", "sweeps"), [(0.05, 4), (1, 16)])
+def test_a_data_set_states_the_errors_of_whiskers_in_sweeps_of_every_object(tmp_path, share, sweeps):
+    plan = small_plan(("brick:2", "cone:2"), backend="rod", errors=share, fidelity=Fidelity.parse("fast,twist=false"))
+    manifest = generate(plan, tmp_path, workers=1)
+    count, values = 0, []
+    for task in plan.shards:
+        with h5py.File(tmp_path / task.name) as file:
+            error, touched = file["error"][:], file["contact"][:] > 0
+            estimated = np.isfinite(error).any(axis=1)
+            assert set(file["owner"][:][estimated]) == set(range(len(task.objects)))
+            assert (error[estimated] >= 0).all()
+            count += int(estimated.sum())
+            values += error[touched & np.isfinite(error)].tolist()
+    assert count == sweeps
+    errors = manifest["errors"]
+    assert errors["whiskers"] == len(values) > 0
+    assert (errors["worst"], errors["beyond"]) == (pytest.approx(max(values)), sum(value > 0.1 for value in values))
+    assert 0 < errors["median"] <= errors["q90"] <= errors["worst"]
 
 
 def test_a_setting_means_the_same_on_a_gpu_as_on_a_processor():

@@ -56,6 +56,20 @@ def test_neither_batch_nor_order_nor_threads_change_a_number():
     np.testing.assert_array_equal(together.contact, alone.contact)
 
 
+@pytest.mark.parametrize("backend", ["rod", "mujoco"])
+def test_whiskers_of_some_sweeps_get_the_error_that_their_scenes_have(backend):
+    scenes, indices, estimated = small_scenes(whiskers="C2,C3"), [9, 2, 3], np.array([True, False, True])
+    plain = simulate_sweeps(scenes, indices, fidelity=FAST, backend=backend)
+    batch = simulate_sweeps(scenes, indices, fidelity=FAST, backend=backend, estimated=estimated)
+    np.testing.assert_array_equal(batch.wrench, plain.wrench)
+    np.testing.assert_array_equal(batch.contact, plain.contact)
+    assert np.isnan(plain.error).all()
+    assert np.isnan(batch.error[1]).all()
+    shown = simulate([scenes[9], scenes[3]], fidelity=FAST, backend=backend, cache=False)["error"].values
+    assert shown.max() > 0
+    np.testing.assert_allclose(batch.error[estimated], shown, rtol=0.05)
+
+
 def test_sweeps_that_move_the_head_go_through_the_default_engine_scene_by_scene():
     scenes = small_scenes(grid=dataclasses.replace(GRID, mover="head"))
     batch = simulate_sweeps(scenes, [1, 2], fidelity=FAST)

@@ -209,7 +209,7 @@ class BulletEngine(SteppedEngine):
         """See :meth:`SteppedEngine.session`."""
         return nullcontext(engine())
 
-    def simulate(self, stepped: SteppedJob) -> tuple[Trace, float]:
+    def simulate(self, stepped: SteppedJob) -> Trace:
         """See :meth:`SteppedEngine.simulate`."""
         gravity = np.asarray(stepped.job.gravity, float)
         shape = stepped.frames(len(stepped.times)).nearest.tolist() if stepped.record_shape else []
@@ -227,7 +227,7 @@ class BulletEngine(SteppedEngine):
             np.stack([run.shapes[step] for step in nearest.tolist()]) / MILLI if stepped.record_shape else np.zeros(0),
             penetration=run.penetration / MILLI,
             reason=reason,
-            forces=run.wrench[: min(failed, run.steps), :3],
+            steps=min(failed, run.steps),
         )
 
 

@@ -27,9 +27,6 @@ from brainbench.stimuli.whiskers.chain import Chain
 
 logger = logging.getLogger(__name__)
 
-CREEPS = 0.9
-"""Share of the friction that contacts hold below which a whisker is compared with half the step. It lets go too early
-or too late, and at another time in half the step."""
 CHUNK = 250
 """Steps per native call: bounds the memory of a job, and the drift of prescribed joints between resets."""
 
@@ -54,7 +51,7 @@ class MujocoWhiskerEngine(SteppedEngine):
         finally:
             mujoco.set_mju_user_warning(before)
 
-    def simulate(self, stepped: SteppedJob) -> tuple[Trace, float]:
+    def simulate(self, stepped: SteppedJob) -> Trace:
         """See :meth:`SteppedEngine.simulate`."""
         job, chain = stepped.job, stepped.chain
         free = stepped.fidelity.twist is not False
@@ -72,7 +69,6 @@ class MujocoWhiskerEngine(SteppedEngine):
         if stepped.record_shape:
             # As the wrench: between steps a whisking follicle turns by more than its whisker bends.
             shape = frames.interpolate(lambda steps: _shape(built, chain, hinges[steps], steps))
-        friction, held = _friction(sensors[:failed, 6:], job, stepped.reach)
         return stepped.trace(
             frames,
             frames.interpolate(lambda steps: _wrench(built, sensors, steps)),
@@ -81,9 +77,8 @@ class MujocoWhiskerEngine(SteppedEngine):
             shape / MILLI,
             penetration=_penetration(sensors[: failed + 1, 6:], hinges[: failed + 1], built, chain),
             reason=reason,
-            forces=sensors[:failed, :3] / MILLI,
-            doubt=_lost_friction(friction, held),
-            creeps=held < CREEPS * friction,
+            steps=failed,
+            doubt=_lost_friction(*_friction(sensors[:failed, 6:], job, stepped.reach)),
         )
 
 

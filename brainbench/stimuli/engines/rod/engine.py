@@ -121,7 +121,7 @@ class RodEngine(WhiskerEngine):
         if device.is_mempool_supported:
             # Shards come and go; what went back to the system at every wait would have to be asked for anew.
             warp().set_mempool_release_threshold(device, 0.8)
-        SweepLauncher(scenes, fidelity, self.device).solver.free()
+        SweepLauncher(scenes, fidelity, self.device).free()
 
     def pack(self, solid: Solid) -> tuple[float, PackedSurface]:
         """See :func:`brainbench.stimuli.engines.rod.sweeps.pack_object`."""
@@ -137,13 +137,14 @@ class RodEngine(WhiskerEngine):
         *,
         workers: int | None = None,
         packed: Mapping[str, Any] | None = None,
+        estimated: NDArray[np.bool_] | None = None,
     ) -> SweepBatch:
         """See :meth:`brainbench.stimuli.engines.protocol.WhiskerEngine.run_sweeps`."""
         from brainbench.stimuli.engines.rod.sweeps import SweepLauncher
 
         launcher = SweepLauncher(scenes, fidelity, self.device, packed=packed)
-        batch = launcher.run(indices, self.retry, workers or 1)
-        launcher.solver.free()
+        batch = launcher.run(indices, self.retry, workers or 1, estimated)
+        launcher.free()
         return batch
 
 

@@ -9,7 +9,8 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
-from functools import cache, partial
+from dataclasses import replace
+from functools import cache, cached_property, partial
 from itertools import groupby
 from typing import Any
 
@@ -19,6 +20,7 @@ from numpy.typing import NDArray
 from brainbench.core.devices import pick_device
 from brainbench.core.errors import UsageError
 from brainbench.core.rotations import base_rotation, euler_matrix, from_matrices
+from brainbench.stimuli.engines.error_estimates import HALF_STEP, MORE_LINKS, changes, halved_step, more_links
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.protocol import PassiveSweeps, SweepBatch, describe_unstable, join_batches
 from brainbench.stimuli.engines.rod.launch import (
@@ -71,8 +73,12 @@ class SweepLauncher:
         self.seconds: dict[str, float] = {}
         """Elapsed time of the last launch for placing objects, uploading, and computing."""
         mounts = list(scenes.array)
-        chains = [fidelity.chain(mount.whisker) for mount in mounts]
-        self.solver = WhiskerSolver(chains, fidelity, self.device, MESHES, block=BLOCK, sliced=sliced, bounds=bounds)
+        self.whiskers = [mount.whisker for mount in mounts]
+        self._solver_of = partial(
+            WhiskerSolver, device=self.device, needs=MESHES, block=BLOCK, sliced=sliced, bounds=bounds
+        )
+        self.fidelity = fidelity
+        self.solver = self._solver_of([fidelity.chain(whisker) for whisker in self.whiskers], fidelity)
         self._head = grid.head.matrix
         self._origin = np.asarray(grid.head.position)
         self._packed = packed or {}
@@ -86,8 +92,25 @@ class SweepLauncher:
         self.steps_in_full = sum(int(np.ceil(spans / step - 1e-3).clip(1).sum()) for step in steps)
         """Steps that the whiskers of one sweep take from start to end."""
 
+    def free(self) -> None:
+        """Give back what is on the device; no launch may follow."""
+        for solver in (self.solver, *(solver for _, solver in vars(self).get("finer", ()))):
+            solver.free()
+
+    @cached_property
+    def finer(self) -> list[tuple[float, WhiskerSolver]]:
+        """Solvers whose forces tell the error (:mod:`..error_estimates`), and what their changes are multiplied by."""
+        spacing = float(np.median(np.diff(self.grid.frames.readings, prepend=0.0)))
+        least = min(self.whiskers, key=lambda whisker: whisker.damping_ratio)
+        half, chains = halved_step(self.fidelity, least, spacing), self.solver.chains
+        longer = [more_links(self.fidelity, whisker).chain(whisker) for whisker in self.whiskers]
+        return [(HALF_STEP, self._solver_of(chains, half)), (MORE_LINKS, self._solver_of(longer, self.fidelity))]
+
     def launch(
-        self, objects: Sequence[tuple[str, Sequence[Any]]], tries: Sequence[tuple[NDArray[np.bool_], int]] = ()
+        self,
+        objects: Sequence[tuple[str, Sequence[Any]]],
+        tries: Sequence[tuple[NDArray[np.bool_], int]] = (),
+        solver: WhiskerSolver | None = None,
     ) -> LaunchResult:
         """Simulate sweeps, object by object: all whiskers, [sweep, whisker], or some of them, one a row.
 
@@ -95,7 +118,9 @@ class SweepLauncher:
             objects: (name, its sweeps) in order.
             tries: which whiskers [sweep, whisker] and what divides their time steps. Rows of the result are those of
                 the first try in their order, then those of the next.
+            solver: one of :attr:`finer`, or the usual one.
         """
+        solver = solver or self.solver
         started = time.perf_counter()
         motions, shapes = PackedMotions(), PackedShapes()
         bases = motions.add_straight(np.concatenate(self._bases))
@@ -114,9 +139,9 @@ class SweepLauncher:
             # Neighbouring threads take the same whisker past the same object.
             whisker, sweep = np.indices((whiskers, count), dtype=np.int32).reshape(2, -1)
             row, column, finer, size = sweep, whisker, np.ones_like(sweep), (count, whiskers)
-        radii = np.array([chain.whisker.base_radius for chain in self.solver.chains])
+        radii = np.array([chain.whisker.base_radius for chain in solver.chains])
         speeds = speed[sweep]
-        way, farthest = followed(speeds, speeds, self.solver.steps[whisker] / MILLI, radii[whisker])
+        way, farthest = followed(speeds, speeds, solver.steps[whisker] / MILLI, radii[whisker])
         numbers = way, farthest, np.where(way > farthest, 0.0, np.inf), speeds > BLOW
         approach = Approach(*(np.empty(size, dtype=values.dtype) for values in numbers))
         for whole, values in zip(vars(approach).values(), numbers, strict=True):
@@ -124,7 +149,7 @@ class SweepLauncher:
         placed = time.perf_counter() - started
         jobs = PackedJobs(whisker, sweep, bases[whisker], row, column, finer)
         readings = self.grid.frames.readings
-        result = self.solver.launch(Launch(jobs, motions, shapes, readings, size, axes=self._head, approach=approach))
+        result = solver.launch(Launch(jobs, motions, shapes, readings, size, axes=self._head, approach=approach))
         self.seconds = {"objects": placed, **result.seconds}
         return result
 
@@ -150,8 +175,13 @@ class SweepLauncher:
             unsolved=int(result.counts["unsolved"].sum()),
         )
 
-    def trusted(self, objects: Sequence[tuple[str, Sequence[Any]]], retry: int) -> SweepBatch:
-        """Simulate sweeps as :meth:`launch` takes them, and whiskers that cannot be trusted again with finer steps."""
+    def trusted(
+        self, objects: Sequence[tuple[str, Sequence[Any]]], retry: int, estimated: NDArray[np.bool_] | None = None
+    ) -> SweepBatch:
+        """Simulate sweeps as :meth:`launch` takes them, and whiskers that cannot be trusted again with finer steps.
+
+        ``estimated`` [sweep] says whose whiskers get an error.
+        """
 
         def launch(tries: Sequence[Try]) -> list[LaunchResult]:
             some = [(which, finer) for which, finer in tries if which is not None]
@@ -159,10 +189,50 @@ class SweepLauncher:
                 result = self.launch(objects, some)
             return result.split([int(which.sum()) for which, _ in some] or [len(result.wrench)])
 
-        return self.batch(run_with_retries(launch, retry, ahead=self.ahead))
+        result = run_with_retries(launch, retry, ahead=self.ahead)
+        if estimated is None:
+            return self.batch(result)
+        which = estimated[:, None] & ~result.verdict.unstable
+        return replace(self.batch(result), error=self._errors(objects, result, which, retry))
 
-    def run(self, indices: Sequence[int], retry: int, workers: int) -> SweepBatch:
-        """Simulate sweeps of the grid; on a processor ``workers`` threads each take one object at a time."""
+    def _errors(
+        self, objects: Sequence[tuple[str, Sequence[Any]]], result: LaunchResult, which: NDArray[np.bool_], retry: int
+    ) -> NDArray[np.float32]:
+        """Return the errors of some whiskers (``which`` [sweep, whisker]), NaN of the others.
+
+        A whisker that felt nothing has none: its base stands still.
+        """
+        error = np.where(which, 0.0, np.nan).astype(np.float32)
+        which = which & (result.wrench != 0).any(axis=(1, 3))
+        row, whisker = np.nonzero(which)
+        if not len(row):
+            return error
+        values, contact = result.wrench[row, :, whisker], result.contact[row, :, whisker] >= 0
+        lengths = np.array([one.arc_length for one in self.whiskers])[whisker]
+        squares = np.zeros(len(row))
+        for factor, solver in self.finer:
+
+            def launch(tries: Sequence[Try], solver: WhiskerSolver = solver) -> list[LaunchResult]:
+                masks = []
+                for mask, divisor in tries:
+                    whole = np.zeros_like(which)
+                    whole[which] = True if mask is None else mask[:, 0]
+                    masks.append((whole, divisor))
+                return self.launch(objects, masks, solver).split([int(whole.sum()) for whole, _ in masks])
+
+            finer = run_with_retries(launch, retry, ahead=self.ahead)
+            change = changes(values, finer.wrench[:, :, 0], contact | (finer.contact[:, :, 0] >= 0), lengths)
+            squares += np.where(finer.verdict.unstable[:, 0], np.inf, factor * change) ** 2
+        error[which] = np.sqrt(squares)
+        return error
+
+    def run(
+        self, indices: Sequence[int], retry: int, workers: int, estimated: NDArray[np.bool_] | None = None
+    ) -> SweepBatch:
+        """Simulate sweeps of the grid; on a processor ``workers`` threads each take one object at a time.
+
+        ``estimated`` is as in :meth:`trusted`.
+        """
         # Thousands of sweeps fill a GPU; small groups let the threads of a processor end together.
         limit = 4096 if self.device.is_cuda else 4
         groups: list[tuple[str, list[Any]]] = []
@@ -172,10 +242,16 @@ class SweepLauncher:
             every = self.grid.sweeps(name)
             sweeps = [every[index % count] for index in some]
             groups += [(name, sweeps[first : first + limit]) for first in range(0, len(sweeps), limit)]
+        if self.device.is_cuda or estimated is None or not estimated.any():
+            masks = [None] * len(groups)
+        else:
+            # Threads share the solvers, so that one makes them.
+            _ = self.finer
+            masks = np.split(estimated, np.cumsum([len(sweeps) for _, sweeps in groups])[:-1])
         if self.device.is_cuda:
-            return self.trusted(groups, retry)
+            return self.trusted(groups, retry, estimated)
         with ThreadPoolExecutor(max_workers=workers) as pool:
-            return join_batches(list(pool.map(lambda group: self.trusted([group], retry), groups)))
+            return join_batches(list(pool.map(lambda group, mask: self.trusted([group], retry, mask), groups, masks)))
 
     def _prepare(self, names: Sequence[str]) -> dict[str, tuple[float, PackedSurface]]:
         """Return objects as :func:`pack_object` packs them.

@@ -111,7 +111,7 @@ def test_sweeps_are_placed_as_ever(monkeypatch):
 
     monkeypatch.setattr(launch.WhiskerSolver, "launch", record)
     monkeypatch.setattr(sweeps, "join_batches", list)
-    monkeypatch.setattr(launcher, "trusted", lambda groups, retry: launcher.launch(groups))
+    monkeypatch.setattr(launcher, "trusted", lambda groups, retry, _: launcher.launch(groups))
     launcher.run([*range(0, 208, 16), *range(208, 416, 16)], 1, 1)
     # Made by commit a79787b0.
     assert (len(placed), content_hash(portable(placed))) == (26, "1de2c1bec32592d6")
