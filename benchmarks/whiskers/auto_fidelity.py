@@ -21,7 +21,7 @@ from brainbench.core.statistics import wilson_interval
 from brainbench.stimuli.engines import get_engine
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.motion.jobs import Job, Trace
-from brainbench.stimuli.validation.contact_scenes import FRICTIONS, contact_jobs, difference
+from brainbench.stimuli.validation.bench_tests import FRICTIONS, contact_jobs, difference
 from brainbench.tradeoffs.whiskers import REFERENCE, SimulationSetting, run_for_cost
 
 ERRORS = (0.4, 0.2, 0.1, 0.07, 0.05)

@@ -28,7 +28,7 @@ from brainbench.stimuli.fitting.gradients import GradientRun, JobParameters
 from brainbench.stimuli.motion.jobs import Job, Load, StillFollicle, Trace
 from brainbench.stimuli.motion.trajectories import smooth_step
 from brainbench.stimuli.objects.obstacle import Capsule, Obstacle
-from brainbench.stimuli.validation.contact_scenes import OBJECTS, contact_jobs
+from brainbench.stimuli.validation.bench_tests import OBJECTS, contact_jobs
 from tests.factories.gradients import traces_at
 
 FIDELITY = Fidelity(links=11, time_step=1e-4, precision="double")

@@ -21,7 +21,7 @@ from brainbench.stimuli.engines.trust import LARGEST_CHANGE, LARGEST_STRUCK_CHAN
 from brainbench.stimuli.motion.jobs import Job, StillFollicle
 from brainbench.stimuli.objects.obstacle import Obstacle
 from brainbench.stimuli.objects.solid import box, capsule, sphere
-from brainbench.stimuli.validation.contact_scenes import FRICTIONS, contact_jobs, difference
+from brainbench.stimuli.validation.bench_tests import FRICTIONS, contact_jobs, difference
 from brainbench.stimuli.whiskers.array import SPECIES, WhiskerArray
 
 Array = np.ndarray

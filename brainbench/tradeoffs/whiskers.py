@@ -1,10 +1,10 @@
 """Error and cost of whisker simulations over their settings: the data behind ``Fidelity.auto``.
 
-Per setting, in the random scenes of contact of :mod:`brainbench.stimuli.validation.contact_scenes`, against a converged
+Per setting, in the random scenes of contact of :mod:`brainbench.stimuli.validation.bench_tests`, against a converged
 simulation (:data:`REFERENCE`):
 
 - ``error_50``, ``error_90``, ``error_95``: what so many per cent of the whiskers stay below
-  (:func:`.contact_scenes.difference`); null where more of them cannot be trusted;
+  (:func:`.bench_tests.difference`); null where more of them cannot be trusted;
 - ``untrusted``: share of whiskers that were flagged;
 - ``cost``: processor seconds per simulated second of one whisker.
 
@@ -40,7 +40,7 @@ from brainbench.stimuli.engines.reach import touched
 from brainbench.stimuli.motion.jobs import Job, Trace
 from brainbench.stimuli.objects.obstacle import Obstacle
 from brainbench.stimuli.objects.solid import Solid, rodgers_solid, touchable
-from brainbench.stimuli.validation import contact_scenes
+from brainbench.stimuli.validation import bench_tests
 from brainbench.stimuli.validation.bench_tests import peg, ringdown
 from brainbench.stimuli.whiskers.array import WhiskerArray
 from brainbench.stimuli.whiskers.whisker import Whisker
@@ -136,7 +136,7 @@ def study(chosen: Sequence[SimulationSetting] | None = None) -> Study:
         [_fields(setting) for setting in chosen],
         lambda row: _measure(_setting(row)),
         about={
-            "subject": f"{contact_scenes.CELLS} kinds of contact, seed {SEED}",
+            "subject": f"{bench_tests.CELLS} kinds of contact, seed {SEED}",
             "error": "of base force or moment, root mean square; so many per cent of the whiskers stay below it",
             "cost": "processor seconds per whisker-second",
         },
@@ -195,13 +195,13 @@ def _references(reference: SimulationSetting, objects: tuple[str, ...]) -> dict[
 
     Only traces are there that can be trusted and touch something.
     """
-    jobs = contact_scenes.contact_jobs(SEED, objects=objects)
+    jobs = bench_tests.contact_jobs(SEED, objects=objects)
     traces = get_engine(reference.backend).run(jobs, reference.fidelity.resolved(True))
     return {i: trace for i, trace in enumerate(traces) if trace.status == "ok" and trace.contact.any()}
 
 
 def _measure(setting: SimulationSetting) -> Row:
-    objects = ("hollow",) if setting.collision else contact_scenes.OBJECTS
+    objects = ("hollow",) if setting.collision else bench_tests.OBJECTS
     values: Row = {**dict.fromkeys((*SHARES.values(), "untrusted", "cost")), "note": ""}
     try:
         solid = None
@@ -212,9 +212,9 @@ def _measure(setting: SimulationSetting) -> Row:
         else:
             values |= _test_bench(setting)
         references = _references(REFERENCE, objects)
-        jobs = contact_scenes.contact_jobs(SEED, objects=objects, hollow=solid)
+        jobs = bench_tests.contact_jobs(SEED, objects=objects, hollow=solid)
         traces, values["cost"] = run_for_cost(setting, [jobs[index] for index in references])
-        errors = [contact_scenes.difference(*pair) for pair in zip(traces, references.values(), strict=True)]
+        errors = [bench_tests.difference(*pair) for pair in zip(traces, references.values(), strict=True)]
         values["untrusted"] = float(np.isinf(errors).mean())
         for share, name in SHARES.items():
             bound = float(np.quantile(errors, share, method="higher"))

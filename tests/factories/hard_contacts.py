@@ -11,7 +11,7 @@ from brainbench.stimuli import WhiskerArray
 from brainbench.stimuli.motion.jobs import Job
 from brainbench.stimuli.motion.trajectories import ArrayFollicle, Whisking
 from brainbench.stimuli.objects.obstacle import Box, Capsule, Obstacle
-from brainbench.stimuli.validation import contact_scenes
+from brainbench.stimuli.validation import bench_tests
 
 HARD = ("opposed", "slot", "comb", "tip", "mesh", "post")
 
@@ -19,7 +19,7 @@ HARD = ("opposed", "slot", "comb", "tip", "mesh", "post")
 def hard_jobs(seed, kinds=HARD):
     """Jobs of whiskers that whisk against objects of these kinds, one of each species, friction and frequency."""
     random = np.random.default_rng(seed)
-    cells = itertools.product(contact_scenes.SPECIES, kinds, contact_scenes.FRICTIONS, contact_scenes.FREQUENCIES)
+    cells = itertools.product(bench_tests.SPECIES, kinds, bench_tests.FRICTIONS, bench_tests.FREQUENCIES)
     jobs = [_job(*cell, random) for cell in cells]
     return [jobs[index] for index in random.permutation(len(jobs))]
 
@@ -32,7 +32,7 @@ def _job(species, kind, friction, frequency, random):
     touch, depth = np.radians(random.uniform((0.3 if around else -3, 4), (2 if around else 3, 14)))
     whisking = Whisking(frequency, touch + depth * (2 if kind == "tip" else 1), math.radians(12), onset=0.025)
     share = random.uniform(*((0.8, 0.95) if kind == "tip" else (0.4, 0.85)))
-    point, axes = contact_scenes._contact(mount, whisking, touch, share)
+    point, axes = bench_tests._contact(mount, whisking, touch, share)
     gap = 2 * abs(touch) * float(np.linalg.norm(point - mount.position))
     body = _body(kind, mount.whisker.arc_length / 0.02, gap, random)
     duration = max(0.15, 1.5 / frequency)

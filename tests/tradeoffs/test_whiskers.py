@@ -9,7 +9,7 @@ import pytest
 
 from brainbench.core.errors import DataError, MissingDependencyError, UsageError
 from brainbench.stimuli.engines.fidelity import Fidelity
-from brainbench.stimuli.validation import contact_scenes
+from brainbench.stimuli.validation import bench_tests
 from brainbench.tradeoffs import whiskers
 from brainbench.tradeoffs.study import draw_study, run_study, write_csv
 from brainbench.tradeoffs.whiskers import SimulationSetting
@@ -21,9 +21,9 @@ def quick(monkeypatch):
     coarse = SimulationSetting(Fidelity(links=8, time_step=2e-4, steps_per_period=10), "mujoco")
     monkeypatch.setattr(whiskers, "REFERENCE", coarse)
     monkeypatch.setattr(whiskers, "PEGS", ((0.5, 0.1),))
-    monkeypatch.setattr(contact_scenes, "SPECIES", ("mouse",))
-    monkeypatch.setattr(contact_scenes, "FREQUENCIES", (20.0,))
-    monkeypatch.setattr(contact_scenes, "FRICTIONS", (0.0,))
+    monkeypatch.setattr(bench_tests, "SPECIES", ("mouse",))
+    monkeypatch.setattr(bench_tests, "FREQUENCIES", (20.0,))
+    monkeypatch.setattr(bench_tests, "FRICTIONS", (0.0,))
 
 
 COARSE = SimulationSetting(Fidelity(links=6, time_step=2e-4, steps_per_period=10), "mujoco")
@@ -134,7 +134,7 @@ def test_the_solver_is_an_axis_of_the_backend_that_has_two_and_no_rival_of_the_p
 @pytest.mark.slow
 def test_what_few_iterations_leave_of_contact_forces_is_among_the_errors(quick, monkeypatch, tmp_path):
     pytest.importorskip("warp")
-    monkeypatch.setattr(contact_scenes, "FRICTIONS", (0.8,))
+    monkeypatch.setattr(bench_tests, "FRICTIONS", (0.8,))
     same = Fidelity(links=8, time_step=2e-4, steps_per_period=10, precision="double")
     monkeypatch.setattr(whiskers, "REFERENCE", SimulationSetting(replace(same, contact_tolerance=SOLVED), "rod"))
     chosen = [SimulationSetting(replace(same, contact_tolerance=each), "rod") for each in (None, 1e-6)]

@@ -14,7 +14,7 @@ from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.trust import LARGEST_OVERLAP, LARGEST_STRAIN, LOST, halved, judge
 from brainbench.stimuli.motion.jobs import Job, Load, StillFollicle
 from brainbench.stimuli.objects.obstacle import Box, Capsule, Obstacle, Sphere
-from brainbench.stimuli.validation.contact_scenes import contact_jobs, difference
+from brainbench.stimuli.validation.bench_tests import contact_jobs, difference
 from tests.factories.trust import facts
 from tests.factories.whiskers import C2
 
@@ -123,7 +123,9 @@ NOT_FLAGGED = {
     "overlaps for a step": lambda: _judged(depth=0.9 * LARGEST_OVERLAP),
     "has an object behind its base": lambda: _reason(Obstacle((Sphere((-1.1e-3, 0.0, 0.0), 1e-3),))),
     "slides with contact forces that were not solved": _rubbing,
-    "sticks or slips at another time, or is thrown off by soft contacts": lambda: str(judge(facts()).suspicious[0] or ""),
+    "sticks or slips at another time, or is thrown off by soft contacts": lambda: str(
+        judge(facts()).suspicious[0] or ""
+    ),
     "lies in bodies that overlap": lambda: _reason(_overlapping_boxes()),
 }
 

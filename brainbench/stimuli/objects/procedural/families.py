@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from brainbench.core.errors import check_name
 from brainbench.core.reading.ranges import check_number
 from brainbench.geometry import Mesh, convex_hull
-from brainbench.stimuli.objects.procedural import assembled, extruded, turned
+from brainbench.stimuli.objects.procedural import builders
 from brainbench.stimuli.objects.procedural.bodies import Body, ShapeSampler
 
 if TYPE_CHECKING:
@@ -32,11 +32,10 @@ DETAIL = (2_000, 20_000)
 
 _FAMILIES: dict[str, Callable[[ShapeSampler, int], Body]] = {
     name: value
-    for module in (turned, extruded, assembled)
-    for name, value in vars(module).items()
-    if isinstance(value, FunctionType) and value.__module__ == module.__name__ and not name.startswith("_")
+    for name, value in vars(builders).items()
+    if isinstance(value, FunctionType) and value.__module__ == builders.__name__ and not name.startswith("_")
 }
-"""Builders by name: every public function of these modules is a family."""
+"""Builders by name: every public function of :mod:`.builders` is a family."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,7 +7,7 @@ import pytest
 
 from brainbench.stimuli.engines import get_engine
 from brainbench.stimuli.engines.fidelity import Fidelity
-from brainbench.stimuli.validation.contact_scenes import contact_jobs, difference
+from brainbench.stimuli.validation.bench_tests import contact_jobs, difference
 from brainbench.stimuli.whiskers.array import WhiskerArray
 from tests.factories.friction_reference import Passing, Penalty, misses, solve
 

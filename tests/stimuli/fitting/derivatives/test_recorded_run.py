@@ -12,7 +12,7 @@ from brainbench.stimuli.engines.rod.engine import RodEngine
 from brainbench.stimuli.engines.rod.tasks import PackedTasks, make_task
 from brainbench.stimuli.fitting.derivatives.recorded_run import RecordingSolver
 from brainbench.stimuli.objects.obstacle import Capsule
-from brainbench.stimuli.validation.contact_scenes import contact_jobs
+from brainbench.stimuli.validation.bench_tests import contact_jobs
 from tests.factories.gradients import COARSE, touching_job
 
 FINE = replace(COARSE, precision="double")

@@ -17,7 +17,7 @@ from brainbench.stimuli.fitting.gradients import GradientRun, JobParameters
 from brainbench.stimuli.fitting.gradients.run import PackedPlaces, contact_events, packed_change, packed_part
 from brainbench.stimuli.motion.jobs import Job, Load, StillFollicle
 from brainbench.stimuli.objects.obstacle import Box, Capsule, Cylinder, Obstacle, Sphere
-from brainbench.stimuli.validation.contact_scenes import contact_jobs
+from brainbench.stimuli.validation.bench_tests import contact_jobs
 from tests.factories.gradients import COARSE, WHISKER, Swing, gradient_errors, touching_job, traces_at
 
 POST = Capsule((11e-3, 2.2e-3, -8e-3), (11e-3, 2.7e-3, 8e-3), 5e-4)
