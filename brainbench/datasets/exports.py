@@ -39,7 +39,7 @@ from brainbench.datasets.sessions import (
     ragged,
 )
 from brainbench.datasets.trials.counting import LICKS, has_units, lick_times, no_units, read_spikes, recorded_span
-from brainbench.datasets.trials.selection import EVERYTHING, Selection, Tally, check_values
+from brainbench.datasets.trials.selection import EVERYTHING, Selection, check_values, select_rows
 
 _LOG = logging.getLogger(__name__)
 
@@ -61,7 +61,7 @@ def export(source: Source, target: str | os.PathLike[str], *, select: Selection 
     layout, paths = find_recordings(source, ledger)
     paths = suitable_files(paths, ledger)
     chosen = EVERYTHING if select is None else resolve_selection(select)
-    sessions, subjects, tallies = [], set(), []
+    sessions, subjects, ledgers = [], set(), []
     for path in paths:
         with open_file(path) as file:
             for session, session_layout in each_session(file, path, layout):
@@ -69,11 +69,11 @@ def export(source: Source, target: str | os.PathLike[str], *, select: Selection 
                 if not has_units(session):
                     ledger.leave("sessions", no_units(session), lost=True)
                 elif session.subject in (chosen.subjects or subjects):
-                    tallies.append(Tally())
+                    ledgers.append(Ledger())
                     table = session_layout.conditions.table if session_layout else "trials"
-                    sessions.append(subset(session, chosen, table, tallies[-1]))
+                    sessions.append(subset(session, chosen, table, ledgers[-1]))
     check_each("subject", chosen.subjects, sorted(subjects))
-    check_values(tallies)
+    check_values(ledgers)
     for reason in ledger.skipped:
         _LOG.warning("Not copied: %s", reason)
     if not sessions:
@@ -93,18 +93,18 @@ def export(source: Source, target: str | os.PathLike[str], *, select: Selection 
 
 
 def subset(
-    session: Session, selection: Selection = EVERYTHING, table: str = "trials", tally: Tally | None = None
+    session: Session, selection: Selection = EVERYTHING, table: str = "trials", ledger: Ledger | None = None
 ) -> Session:
     """Read a session into memory: spikes, tables and plain columns of the rows that a selection keeps.
 
-    ``tally`` takes what the rules removed and met.
+    ``ledger`` takes what the rules removed and met.
     """
     units = session.units
     if units is None:
         raise DataError(f"{session.source} has no units table; there are no spikes to copy.")
-    tally = tally or Tally()
-    spikes = read_spikes(units, tally.notes)
-    chosen = tally.select(units, selection.units, "units")
+    ledger = ledger or Ledger()
+    spikes = read_spikes(units, ledger.notes)
+    chosen = select_rows(units, selection.units, "units", ledger)
     chosen &= np.array([len(times) for times in spikes]) >= selection.min_spikes
     if not chosen.any():
         raise DataError(f"No unit of {session.source} passes {'; '.join(selection.lines())}; nothing to copy.")
@@ -116,7 +116,9 @@ def subset(
     tables = {}
     for name, original in session.tables.items():
         rows = (
-            tally.select(original, selection.trials, "trials") if name == table else np.ones(len(original), dtype=bool)
+            select_rows(original, selection.trials, "trials", ledger)
+            if name == table
+            else np.ones(len(original), dtype=bool)
         )
         tables[name] = SessionTable(name, _plain(original, rows), original.where)
     if LICKS not in tables and (licks := lick_times(session)) is not None:

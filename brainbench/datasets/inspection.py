@@ -26,7 +26,7 @@ from brainbench.datasets.reading import each_session, find_recordings, open_file
 from brainbench.datasets.sessions import SPIKES, Session, SessionTable
 from brainbench.datasets.trials.conditions import natural_vocabulary
 from brainbench.datasets.trials.counting import has_units, no_units, read_spikes, recorded_span, time_fault
-from brainbench.datasets.trials.selection import Tally
+from brainbench.datasets.trials.selection import select_rows
 from brainbench.datasets.trials.signals import response_series
 
 if TYPE_CHECKING:
@@ -398,7 +398,7 @@ def propose(session: Session, layout: RecordingLayout | None = None) -> list[Pro
 def _selected(table: SessionTable, layout: RecordingLayout) -> NDArray[np.bool_]:
     """Return which rows of the table of trials a layout selects; all where its rules do not fit the table."""
     try:
-        return Tally().select(table, layout.selection.trials, "trials")
+        return select_rows(table, layout.selection.trials, "trials", Ledger())
     except BrainbenchError:
         return np.ones(len(table), dtype=bool)
 

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Hashable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from brainbench.core.errors import DataError, listing
 
@@ -38,6 +41,11 @@ class Ledger:
     left: list[LeftOut] = field(default_factory=list)
     incidental: set[Path] = field(default_factory=set)
     """Files that a search came upon, and nobody named."""
+    notes: list[str] = field(default_factory=list)
+    doubts: list[str] = field(default_factory=list)
+    """Notes that every result must state."""
+    seen: dict[Hashable, set[str]] = field(default_factory=dict)
+    """Rule → the values that its column has."""
 
     def find(self, kind: str, number: int = 1) -> None:
         """Note that so many were found."""
@@ -51,19 +59,31 @@ class Ledger:
         """Note that so many were not read, and why. Raises DataError for a lost one if the ledger is strict."""
         if lost and self.strict:
             raise DataError(reason)
-        if number:
-            self.left.append(LeftOut(kind, reason, number, lost))
+        self.left.append(LeftOut(kind, reason, number, lost))
 
-    def remove(self, removed: Mapping[str, int]) -> None:
-        """Take over the rows that rules removed, each under ``KIND: RULE``."""
-        for rule, number in removed.items():
-            kind, _, reason = rule.partition(": ")
-            self.leave(kind, reason, number)
+    def apply(self, keep: NDArray[np.bool_], passes: Any, kind: str, rule: str) -> NDArray[np.bool_]:
+        """Return the rows of one kind that remain, and leave those that only now fell out by a rule."""
+        self.leave(kind, rule, int(np.sum(keep & ~passes)))
+        return keep & passes
+
+    @property
+    def removed(self) -> dict[str, int]:
+        """``KIND: RULE`` → trials or units that it removed, each counted once, in the order of the rules."""
+        removed: dict[str, int] = {}
+        for entry in self.left:
+            if entry.kind in ("trials", "units"):
+                rule = f"{entry.kind}: {entry.reason}"
+                removed[rule] = removed.get(rule, 0) + entry.number
+        return removed
 
     def add(self, part: Ledger) -> Ledger:
-        """Take over all numbers of another balance; returns this one."""
+        """Take over all that another balance holds; returns this one."""
         self.totals += part.totals
         self.read += part.read
+        self.notes += part.notes
+        self.doubts += part.doubts
+        for rule, values in part.seen.items():
+            self.seen.setdefault(rule, set()).update(values)
         for entry in part.left:
             self.leave(entry.kind, entry.reason, entry.number, lost=entry.lost)
         return self
@@ -98,7 +118,7 @@ class Ledger:
                 "read": self.read[kind],
                 "left_out": [
                     {"reason": reason, "number": number, "lost": lost}
-                    for (reason, lost), number in _joined(entry for entry in self.left if entry.kind == kind).items()
+                    for (reason, lost), number in _joined(self.left, kind).items()
                 ],
             }
             for kind in KINDS
@@ -106,9 +126,9 @@ class Ledger:
         }
 
 
-def _joined(entries: Iterable[LeftOut]) -> dict[tuple[str, bool], int]:
+def _joined(entries: Iterable[LeftOut], kind: str) -> dict[tuple[str, bool], int]:
     numbers: dict[tuple[str, bool], int] = {}
-    for entry in entries:
+    for entry in (entry for entry in entries if entry.kind == kind and entry.number):
         key = (entry.reason, entry.lost)
         numbers[key] = numbers.get(key, 0) + entry.number
     return numbers

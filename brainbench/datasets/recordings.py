@@ -123,8 +123,6 @@ class _Reader:
     """Made for the first session and kept for all others."""
     counted: list[SessionCounts] = field(default_factory=list)
     copies: Copies = field(default_factory=Copies)
-    notes: list[str] = field(default_factory=list)
-    doubts: list[str] = field(default_factory=list)
     first: str = ""
     """Source of the session for which the options were made."""
     other_tables: dict[str, str] = field(default_factory=dict)
@@ -171,7 +169,6 @@ class _Reader:
         if options.selection.subjects and session.subject not in options.selection.subjects:
             return f"{session.subject} is not among the chosen animals", False
         part = count_session(session, options, self.copies.compare)
-        self.notes += session.notes
         self.counted.append(part)
         return "", False
 
@@ -217,10 +214,9 @@ class _Reader:
             raise DataError(f"No session of the chosen subjects can be counted. {skipped[0]}")
         name = self.layout.name if self.layout else ""
         name += "" if self.layout_given or not name else " (detected from its columns)"
-        parts = joined_probes(self.counted, self.doubts)
-        joined = join_sessions(
-            parts, self.options, source=source, layout=name, notes=self.notes + skipped, doubts=self.doubts
-        )
+        parts = joined_probes(self.counted, self.ledger.doubts)
+        stated = {"source": source, "layout": name, "notes": skipped, "doubts": self.ledger.doubts}
+        joined = join_sessions(parts, self.options, **stated)
         if self.bin is not None and (longest := float(joined["duration"].max())) < (1 - 1e-6) * self.bin:
             raise UsageError(
                 f"A bin of {self.bin:g} s is longer than every window (up to {longest:g} s), so it cuts nothing; leave "
@@ -245,11 +241,6 @@ class _Reader:
             ledger.leave("labels", f"{label}: no trial is left")
         for part in parts:
             ledger.add(part.ledger)
-            ledger.find("trials", part.trials)
-            ledger.take("trials", len(part.labels))
-            ledger.find("units", part.units)
-            ledger.take("units", len(part.unit_ids))
-            ledger.remove(part.tally.removed)
         for entry in ledger.close():
             joined.attrs["doubts"] = [*joined.attrs["doubts"], f"the balance does not close: {entry}"]
         joined.attrs |= {"skipped": ledger.skipped, "ledger": ledger.stated()}

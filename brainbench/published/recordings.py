@@ -8,6 +8,7 @@ are not stored.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise, permutations
@@ -21,9 +22,10 @@ from brainbench.core.errors import DataError, UsageError, listing
 from brainbench.core.reading.archives import read_npz
 from brainbench.datasets.checks.findings import Finding, share
 from brainbench.datasets.layouts.registry import RecordingLayout
+from brainbench.datasets.ledger import Ledger
 from brainbench.datasets.trials.conditions import Conditions
 from brainbench.datasets.trials.counting import UNIT_COLUMNS, ReadingOptions, SessionCounts, missing_column
-from brainbench.datasets.trials.selection import Selection, Tally
+from brainbench.datasets.trials.selection import Selection
 from brainbench.datasets.trials.session_trials import join_sessions
 from brainbench.datasets.trials.windows import FIRST_CONTACT, Window
 
@@ -37,7 +39,7 @@ SLOTS = tuple(f"slot-{number}" for number in range(1, 7))
 MOST_RATE = 1e6
 """Spikes per second beyond those of any neuron, even in the shortest window."""
 RATES = f"rates [trials, {len(SLOTS)}, units]"
-SILENT = "trials: no rate above 0 in any slot, so the stimulus cannot be known"
+SILENT = "no rate above 0 in any slot, so the stimulus cannot be known"
 
 
 @dataclass(frozen=True)
@@ -155,6 +157,8 @@ def open_published(path: Path, **options: object) -> xr.Dataset:
 def _session_counts(session: ZeroFilledSession, path: Path) -> SessionCounts:
     recorded = np.flatnonzero(session.slots >= 0)
     labels = tuple(SLOTS[slot] for slot in session.slots[recorded].tolist())
+    ledger = Ledger(totals=Counter(trials=len(session.slots), units=session.units))
+    ledger.leave("trials", SILENT, len(session.slots) - len(recorded))
     return SessionCounts(
         subject=session.subject,
         session=session.session,
@@ -168,9 +172,7 @@ def _session_counts(session: ZeroFilledSession, path: Path) -> SessionCounts:
         duration=np.ones((len(recorded), 1)),
         columns={name: missing_column(kind, session.units) for name, kind in UNIT_COLUMNS.items()},
         covariates={},
-        tally=Tally(removed={SILENT: len(session.slots) - len(recorded)}),
-        trials=len(session.slots),
-        units=session.units,
+        ledger=ledger,
         synthetic=False,
         stimuli=LAYOUT.stimuli,
     )
@@ -337,7 +339,7 @@ LAYOUT = RecordingLayout(
     open_counted=open_published,
     check_counted=check_published,
     remarks=(
-        SILENT,
+        f"trials: {SILENT}",
         "labels: slots, in the file's order; they cannot be trusted, because every session numbers its stimuli anew",
         "sessions: neighbouring units with other numbers of trials, or with rates in other slots of the same trial",
         "rates: spikes/s over windows of unequal length, which the file does not state, in whole bins of 45 ms, "

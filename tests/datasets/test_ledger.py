@@ -12,7 +12,8 @@ def test_a_balance_that_does_not_close_is_said_and_refused_when_strict():
     ledger = Ledger()
     ledger.find("units", 5)
     ledger.take("units", 3)
-    ledger.remove({"units: too deep": 1, "trials: spoiled": 0})
+    ledger.leave("units", "too deep")
+    ledger.leave("trials", "spoiled", 0)
     assert ledger.close() == ["5 units were found, 3 read and 1 left out"]
     with pytest.raises(DataError, match="5 units were found"):
         Ledger(strict=True).add(ledger).close()

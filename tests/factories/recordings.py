@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from collections import Counter
+
 import numpy as np
 
 from brainbench.core.contracts import CHANNELS
+from brainbench.datasets.ledger import Ledger
 from brainbench.datasets.sessions import Session, make_session
 from brainbench.datasets.synthetic import PopulationDesign
 from brainbench.datasets.synthetic.populations import draw_sessions
 from brainbench.datasets.synthetic.sessions import spike_session, trial_times
 from brainbench.datasets.trials.conditions import Conditions
 from brainbench.datasets.trials.counting import UNIT_COLUMNS, ReadingOptions, SessionCounts, missing_column
-from brainbench.datasets.trials.selection import EVERYTHING, Tally
+from brainbench.datasets.trials.selection import EVERYTHING
 from brainbench.datasets.trials.session_trials import join_sessions
 from brainbench.datasets.trials.windows import Window
 
@@ -104,9 +107,7 @@ def as_recordings(geometry, design=None, *, seed=0):
                 duration=np.full((trials, 1), length),
                 columns={name: missing_column(kind, units) for name, kind in UNIT_COLUMNS.items()},
                 covariates={},
-                tally=Tally(),
-                trials=trials,
-                units=units,
+                ledger=Ledger(totals=Counter(trials=trials, units=units)),
                 synthetic=True,
             )
         )

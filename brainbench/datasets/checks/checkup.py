@@ -16,9 +16,17 @@ from pathlib import Path
 from brainbench.core.errors import BrainbenchError, DataError
 from brainbench.core.progress import Progress, track
 from brainbench.datasets import hdf5
-from brainbench.datasets.checks.findings import SEVERITIES, Finding, Severity, some
-from brainbench.datasets.checks.tables import check_coverage, check_labels, check_tables
-from brainbench.datasets.checks.timing import check_clock, check_spikes
+from brainbench.datasets.checks.findings import (
+    SEVERITIES,
+    Finding,
+    Severity,
+    check_clock,
+    check_coverage,
+    check_labels,
+    check_spikes,
+    check_tables,
+    some,
+)
 from brainbench.datasets.layouts.registry import RecordingLayout, counted_layout
 from brainbench.datasets.ledger import Ledger
 from brainbench.datasets.reading import Source, each_session, find_recordings, open_file

@@ -26,8 +26,6 @@ if TYPE_CHECKING:
 
     import xarray as xr
 
-    from brainbench.datasets.checks.findings import Finding
-
 ENTRY_POINTS = "brainbench.recordings"
 
 
@@ -65,8 +63,8 @@ class RecordingLayout:
     """Endings of files whose responses are counted already, in lower case; ``open_counted`` reads them."""
     open_counted: Callable[..., xr.Dataset] | None = None
     """Returns the recordings of such a file; takes the options of ``open_recordings``, which it may refuse."""
-    check_counted: Callable[[Path, list[str]], Iterator[Finding]] | None = None
-    """Yields what is wrong with such a file, and adds the names of its sessions to the list."""
+    check_counted: Callable[[Path, list[str]], Iterator[Any]] | None = None
+    """Yields each Finding about such a file, and adds the names of its sessions to the list."""
 
     def matches(self, session: Session) -> bool:
         """Return whether a session's condition table has the columns of this data set."""

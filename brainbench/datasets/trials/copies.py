@@ -18,7 +18,6 @@ from brainbench.core.errors import DataError, listing
 from brainbench.datasets.ledger import Ledger
 from brainbench.datasets.sessions import Session
 from brainbench.datasets.trials.counting import COVARIATES, SessionCounts
-from brainbench.datasets.trials.selection import Tally
 
 _FEWEST_SPIKES = 6
 """Spikes that a unit needs to be recognised."""
@@ -142,12 +141,6 @@ def _joined(first: SessionCounts, second: SessionCounts, same: dict[int, int]) -
             values[rows] = second.covariates[name]
         if name in first.covariates:
             values[: len(first.labels)] = first.covariates[name]
-    tally = Tally(
-        _sum_removed(first, second, len(more)),
-        [*first.tally.notes, *second.tally.notes],
-        {**first.tally.seen, **second.tally.seen},
-        [*first.tally.doubts, *second.tally.doubts],
-    )
     return replace(
         first,
         source=f"{first.source}, {second.source}",
@@ -160,23 +153,21 @@ def _joined(first: SessionCounts, second: SessionCounts, same: dict[int, int]) -
         duration=duration[order],
         columns={name: np.concatenate([first.columns[name], second.columns[name]]) for name in first.columns},
         covariates={name: values[order] for name, values in covariates.items()},
-        tally=tally,
-        units=first.units + second.units,
-        ledger=Ledger().add(first.ledger).add(second.ledger),
+        ledger=_joined_ledger(first.ledger, second.ledger, trials, len(more)),
         found_labels=first.found_labels | second.found_labels,
         forms={key: {*first.forms.get(key, ()), *second.forms.get(key, ())} for key in {**first.forms, **second.forms}},
     )
 
 
-def _sum_removed(first: SessionCounts, second: SessionCounts, more: int) -> dict[str, int]:
-    """Return what rules removed of both: units of either, and of the trials, which both have, those of neither."""
-    removed = dict(first.tally.removed)
-    for rule, number in second.tally.removed.items():
-        if not rule.startswith("trials: "):
-            removed[rule] = removed.get(rule, 0) + number
+def _joined_ledger(first: Ledger, second: Ledger, trials: int, more: int) -> Ledger:
+    """Return the balance of both: all of either, but of the trials, which both have, those that neither took."""
+    ledger = Ledger().add(first).add(second)
+    ledger.totals["trials"], ledger.read["trials"] = first.totals["trials"], trials
+    left = [entry for entry in ledger.left if entry.kind != "trials"]
     # Trials that only the second part kept were removed from the first by its last rules.
-    for rule in reversed([rule for rule in removed if rule.startswith("trials: ")]):
-        back = min(more, removed[rule])
-        removed[rule] -= back
+    for entry in reversed([entry for entry in first.left if entry.kind == "trials"]):
+        back = min(more, entry.number)
+        left.insert(0, replace(entry, number=entry.number - back))
         more -= back
-    return removed
+    ledger.left = left
+    return ledger

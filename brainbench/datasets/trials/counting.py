@@ -14,10 +14,10 @@ from brainbench.core.contracts import as_labels, as_number, natural_key
 from brainbench.core.errors import DataError, UsageError, listing
 from brainbench.core.reading.ranges import check_number
 from brainbench.datasets.ledger import Ledger
-from brainbench.datasets.sessions import OBSERVED, SPIKES, Series, Session, SessionTable
+from brainbench.datasets.sessions import OBSERVED, SPIKES, Session, SessionTable
 from brainbench.datasets.trials.conditions import Conditions, joined_labels
-from brainbench.datasets.trials.selection import Selection, Tally
-from brainbench.datasets.trials.signals import fading, frame_times, response_series, window_means
+from brainbench.datasets.trials.selection import Selection, select_rows
+from brainbench.datasets.trials.signals import Samples, response_series
 from brainbench.datasets.trials.windows import CONTACTS, Window
 
 COVARIATES = ("contacts", "licks", "choice")
@@ -117,11 +117,6 @@ class SessionCounts:
     """Unit columns [U]."""
     covariates: dict[str, NDArray[np.float64]]
     """Covariate → its value in each trial [R]."""
-    tally: Tally
-    trials: int
-    """Rows of the condition table before any rule."""
-    units: int
-    """Units in the file before any rule."""
     synthetic: bool
     stimuli: str = ""
     """Recipe of the stimuli, where the file names one."""
@@ -130,7 +125,7 @@ class SessionCounts:
     forms: dict[tuple[str, str], set[str]] = field(default_factory=dict)
     """Column and label → how the file writes the value."""
     ledger: Ledger = field(default_factory=Ledger)
-    """Balance of the tables and spikes of the file."""
+    """Balance of the file: tables, trials, units, spikes."""
     measure: str = "spikes"
     """What the responses are: spikes, or name and NWB type of a signal."""
     found_labels: frozenset[str] = frozenset()
@@ -146,141 +141,151 @@ def count_session(
     series = None if has_units(session) else response_series(session)
     if series is None and not has_units(session):
         raise DataError(no_units(session))
-    tally = Tally()
+    ledger = Ledger(notes=[*session.notes])
     table = session.table(options.conditions.table)
     if "start_time" not in table:
         raise DataError(f"{table.label} has no start_time; conditions need a table of time intervals.")
     values = options.conditions.values(table)
     labels = np.array(joined_labels(values), dtype=str)
     # Each rule counts only rows that no earlier rule removed, so removed and kept rows add up to the table.
-    keep = tally.select(table, options.selection.trials, "trials")
-    keep = tally.apply(keep, labels != "", f"trials: no value of {','.join(options.conditions.columns)}")
+    keep = select_rows(table, options.selection.trials, "trials", ledger)
+    keep = ledger.apply(keep, labels != "", "trials", f"no value of {','.join(options.conditions.columns)}")
     if options.vocabulary is not None:
-        keep = tally.apply(keep, np.isin(labels, options.vocabulary), "trials: label outside the vocabulary")
-    edges = options.window.edges(session, table, tally.notes)
-    keep = tally.apply(keep, np.isfinite(edges).all(axis=1), f"trials: no event for the window {options.window}")
-    keep = tally.apply(keep, ~(edges[:, 1] <= edges[:, 0]), "trials: window of no length")
+        keep = ledger.apply(keep, np.isin(labels, options.vocabulary), "trials", "label outside the vocabulary")
+    edges = options.window.edges(session, table, ledger.notes)
+    keep = ledger.apply(keep, np.isfinite(edges).all(axis=1), "trials", f"no event for the window {options.window}")
+    keep = ledger.apply(keep, ~(edges[:, 1] <= edges[:, 0]), "trials", "window of no length")
     invalid = session.tables.get("invalid_times")
     if invalid is not None:
         begin, end = invalid.times("start_time"), invalid.times("stop_time")
         overlap = ((edges[:, :1] < end) & (edges[:, 1:] > begin)).any(axis=1)
-        keep = tally.apply(keep, ~overlap, "trials: overlap with invalid_times")
-
-    if series is not None:
-        part = _signal_responses(session, series, table, options, edges, keep, tally)
-    else:
-        part = _spike_responses(session, table, options, edges, keep, tally, look)
-    rows, ids = part.rows, as_labels(table.ids())
-    names = ("subject", "session", "source", "synthetic", "stimuli", "guessed")
-    _enter_tables(part.ledger, session, options.conditions.table)
+        keep = ledger.apply(keep, ~overlap, "trials", "overlap with invalid_times")
+    source = SpikeTrains.of(session, table, ledger, look) if series is None else Samples.of(session, series)
+    chosen = select_rows(source.units, options.selection.units, "units", ledger)
+    chosen = source.rule_out(chosen, options.selection, ledger)
+    # A window outside the recorded span is missing data, not silence: zero counts there would lower every mean.
+    covered = source.covered(edges, ledger)
+    # A trial that only removed units saw is of no use, but with no unit left it is not the trial's fault.
+    covered = covered & chosen if chosen.any() else covered
+    keep = ledger.apply(keep, covered.any(axis=1), "trials", "outside the recorded span")
+    # Trials by start and id, units by id: the order of rows in the file changes nothing.
+    start, ids, unit_ids = table.times("start_time"), as_labels(table.ids()), as_labels(source.units.ids())
+    rows = _sorted(keep, lambda row: (start[row], natural_key(ids[row])))
+    units = _sorted(chosen, lambda unit: (natural_key(unit_ids[unit]), *source.key(unit)))
+    bounds = bin_bounds(edges[rows], options.bin, options.window.length, units=len(units))
+    counts = source.respond(units, bounds)
+    counts, duration = mask_missing(counts, bounds, covered[np.ix_(rows, units)])
+    seen = np.isfinite(counts).any(axis=(0, 1)) | ~keep.any()
+    ledger.leave("units", "recorded in no kept trial", int((~seen).sum()))
+    if not seen.all():
+        units, counts = units[seen], counts[:, :, seen]
+    source.enter(units, bounds, counts, ledger)
+    for kind, number, found in (("trials", len(rows), len(table)), ("units", len(units), len(source.units))):
+        ledger.find(kind, found)
+        ledger.take(kind, number)
+    _enter_tables(ledger, session, options.conditions.table)
+    stated = ("subject", "session", "source", "synthetic", "stimuli", "guessed")
+    columns = UNIT_COLUMNS.items()
     return SessionCounts(
-        **{name: getattr(session, name) for name in names},
-        **{name: value for name, value in vars(part).items() if name != "rows"},
+        **{name: getattr(session, name) for name in stated},
         values=tuple(tuple(values[row].tolist()) for row in rows),
         labels=tuple(labels[rows].tolist()),
         trial_ids=tuple(ids[rows].tolist()),
+        unit_ids=tuple(unit_ids[units].tolist()),
         edges=edges[rows],
+        counts=counts,
+        duration=duration,
+        columns={name: _unit_column(source.units, name, kind, units, ledger.notes) for name, kind in columns},
         covariates=trial_covariates(session, table, rows, edges[rows]),
-        tally=tally,
-        trials=len(table),
+        measure=source.measure,
         forms=options.conditions.forms(table),
         found_labels=frozenset(labels.tolist()) - {""},
+        ledger=ledger,
     )
 
 
 @dataclass(frozen=True)
-class _Responses:
-    """What spikes and signals differ in: the responses of the trials and units that are left."""
+class SpikeTrains:
+    """Units with spike times, whose responses are counts; for signals see :class:`Samples`."""
 
-    rows: NDArray[np.int64]
-    """[R] rows of the table of trials, in order."""
-    unit_ids: tuple[str, ...]
-    counts: NDArray[np.float32]
-    duration: NDArray[np.float64]
-    columns: dict[str, NDArray[Any]]
-    units: int
-    """Units in the file before any rule."""
-    ledger: Ledger
+    units: SessionTable
+    spikes: list[NDArray[np.float64]]
+    """[U] ascending times, s."""
     measure: str = "spikes"
 
+    @classmethod
+    def of(
+        cls,
+        session: Session,
+        table: SessionTable,
+        ledger: Ledger,
+        look: Callable[[Session, Sequence[NDArray[np.float64]]], str] | None,
+    ) -> SpikeTrains:
+        """Read the spikes of a session, which must be on the clock of its trials."""
+        assert session.units is not None
+        spikes = read_spikes(session.units, ledger.doubts)
+        if fault := time_fault(spikes, table):
+            raise DataError(f"{session.source}: {fault}.")
+        if look is not None and (doubt := look(session, spikes)):
+            ledger.doubts.append(doubt)
+        return cls(session.units, spikes)
 
-def _in_order(table: SessionTable, keep: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Return the rows that are kept by start time, then id, so that the order of rows in the file changes nothing."""
-    start, ids = table.times("start_time"), as_labels(table.ids())
-    return _sorted(keep, lambda row: (start[row], natural_key(ids[row])))
+    def rule_out(self, keep: NDArray[np.bool_], selection: Selection, ledger: Ledger) -> NDArray[np.bool_]:
+        """Leave out units with too few spikes."""
+        if selection.min_spikes:
+            few = "no spikes" if selection.min_spikes == 1 else f"fewer than {selection.min_spikes} spikes"
+            numbers = np.array([len(times) for times in self.spikes], dtype=np.int64)
+            keep = ledger.apply(keep, numbers >= selection.min_spikes, "units", few)
+        return keep
 
+    def covered(self, edges: NDArray[np.float64], ledger: Ledger) -> NDArray[np.bool_]:
+        """Return which windows lie in the observed spans, or, without any, between the first and the last spike."""
+        if (observed := inside_observed_spans(self.units, edges)) is not None:
+            return observed
+        covered = np.zeros((len(edges), len(self.spikes)), dtype=bool)
+        if (span := recorded_span(self.spikes)) is not None:
+            low, high = span
+            # One span for all units: a unit that fires rarely would get too short a span from its own spikes.
+            covered[:] = ((edges[:, 0] >= low) & (edges[:, 1] <= high))[:, None]
+            taken = f"recorded span taken from first to last spike, {low:.3f}–{high:.3f} s"
+            ledger.notes.append(f"{self.units.label}: no obs_intervals; {taken}")
+        return covered
 
-def _spike_responses(
-    session: Session,
-    table: SessionTable,
-    options: ReadingOptions,
-    edges: NDArray[np.float64],
-    keep: NDArray[np.bool_],
-    tally: Tally,
-    look: Callable[[Session, Sequence[NDArray[np.float64]]], str] | None,
-) -> _Responses:
-    """Count the spikes in the windows of the trials that rules keep [rows]."""
-    assert session.units is not None
-    spikes = read_spikes(session.units, tally.doubts)
-    if fault := time_fault(spikes, table):
-        raise DataError(f"{session.source}: {fault}.")
-    if look is not None and (doubt := look(session, spikes)):
-        tally.doubts.append(doubt)
-    # A window outside the recorded span is missing data, not silence: zero counts there would lower every mean.
-    covered, unit_kept = _coverage(session.units, spikes, edges, options.selection, tally)
-    keep = tally.apply(keep, covered.any(axis=1), "trials: outside the recorded span")
-    unit_kept = tally.apply(unit_kept, covered[keep].any(axis=0) | ~keep.any(), "units: recorded in no kept trial")
-    # Units by id. Equal ids (several probes) are told apart by number of spikes and first spike.
-    rows, unit_ids = _in_order(table, keep), as_labels(session.units.ids())
-    units = _sorted(unit_kept, lambda unit: (natural_key(unit_ids[unit]), len(spikes[unit]), spikes[unit][:1].tolist()))
-    used, seen = [spikes[unit] for unit in units], covered[np.ix_(rows, units)]
-    counts, duration = count(used, edges[rows], seen, options.bin, options.window.length)
-    ledger = Ledger()
-    _enter_spikes(ledger, spikes, used, edges[rows], seen, counts)
-    columns = {name: _unit_column(session.units, name, kind, units, tally.notes) for name, kind in UNIT_COLUMNS.items()}
-    return _Responses(rows, tuple(unit_ids[units].tolist()), counts, duration, columns, len(session.units), ledger)
+    def key(self, unit: int) -> tuple[Any, ...]:
+        """Equal ids (several probes) are told apart by number of spikes and first spike."""
+        return len(self.spikes[unit]), self.spikes[unit][:1].tolist()
 
+    def respond(self, units: NDArray[np.int64], bounds: NDArray[np.float64]) -> NDArray[np.float32]:
+        """Count the spikes of units in bins [begin, end) between bounds [R, T + 1] (s): [R, T, units]."""
+        counts = np.empty((len(units), len(bounds), bounds.shape[1] - 1), dtype=np.float32)
+        for index, unit in enumerate(units):
+            # Differences of the numbers of spikes before each bound; "left" puts a spike on a bound into the later bin.
+            counts[index] = np.diff(np.searchsorted(self.spikes[unit], bounds, side="left"), axis=1)
+        return np.ascontiguousarray(counts.transpose(1, 2, 0))
 
-def _signal_responses(
-    session: Session,
-    series: Series,
-    table: SessionTable,
-    options: ReadingOptions,
-    edges: NDArray[np.float64],
-    keep: NDArray[np.bool_],
-    tally: Tally,
-) -> _Responses:
-    """Average a sampled signal over the windows of the trials that rules keep [rows]; negative values are values.
-
-    Responses stand in the counts as mean × s, so that whoever divides by the duration gets the mean.
-    """
-    times = frame_times(series)
-    step = float(np.median(np.diff(times))) if len(times) > 1 else math.nan
-    number = 1 if series.data.ndim == 1 else series.data.shape[1]
-    cells = SessionTable("cells", {"id": np.arange(number), **series.columns}, session.source)
-    inside = (edges[:, 0] >= times[0] - step) & (edges[:, 1] <= times[-1] + step)
-    keep = tally.apply(keep, inside, "trials: outside the recorded span")
-    rows = _in_order(table, keep)
-    _, duration = count([], edges[rows], np.zeros((len(rows), 0), dtype=bool), options.bin, options.window.length)
-    shortest = float(duration[duration > 0].min(initial=math.inf))
-    if shortest < step:
-        raise DataError(
-            f"{series.name} of {session.source} has a frame every {step:.3g} s, and windows or bins are as short as "
-            f"{shortest:.3g} s; take longer ones."
-        )
-    bounds = edges[rows][:, :1] + np.concatenate([np.zeros((len(rows), 1)), np.cumsum(duration, axis=1)], axis=1)
-    means = window_means(series, times, bounds)
-    unit_kept = tally.select(cells, options.selection.units, "units")
-    if "iscell" in cells:
-        unit_kept = tally.apply(unit_kept, cells.times("iscell") > 0, "units: no cell (iscell)")
-    unit_kept = tally.apply(unit_kept, np.isfinite(means).any(axis=(0, 1)), "units: no finite frame in any window")
-    units = np.flatnonzero(unit_kept)
-    counts = (means[:, :, units] * duration[:, :, None]).astype(np.float32)
-    if doubt := fading(means[:, :, units]):
-        tally.doubts.append(f"{series.name} of {session.source}: {doubt}")
-    columns = {name: _unit_column(cells, name, kind, units, tally.notes) for name, kind in UNIT_COLUMNS.items()}
-    measure = f"{series.name} ({series.kind})"
-    return _Responses(rows, tuple(map(str, units.tolist())), counts, duration, columns, number, Ledger(), measure)
+    def enter(
+        self, units: NDArray[np.int64], bounds: NDArray[np.float64], counts: NDArray[np.float32], to: Ledger
+    ) -> None:
+        """Enter all spikes, those of the units that are used in their windows, and those between these."""
+        edges = bounds[:, [0, -1]]
+        used, total = [self.spikes[unit] for unit in units], sum(map(len, self.spikes))
+        to.find("spikes", total)
+        to.leave("spikes", "of units that are left out", total - sum(map(len, used)))
+        inside, outside = 0, 0
+        covered = np.asarray(np.isfinite(counts).any(axis=1))
+        bounds_of: dict[bytes, NDArray[np.float64]] = {}
+        for unit, times in enumerate(used):
+            key = covered[:, unit].tobytes()
+            if key not in bounds_of:
+                bounds_of[key] = np.array(_merged(edges[covered[:, unit]])).reshape(-1)
+            place = np.searchsorted(bounds_of[key], times, side="right")
+            inside += int((place % 2 == 1).sum())
+            outside += int((place % 2 == 0).sum())
+        to.leave("spikes", "between the windows", outside)
+        begin, end = edges[np.argsort(edges[:, 0])].T
+        # A spike in two windows is counted in both; else the counts themselves must add up.
+        apart = bool((begin[1:] >= end[:-1]).all())
+        to.take("spikes", int(np.nansum(counts, dtype=np.float64)) if apart else inside)
 
 
 def _enter_tables(ledger: Ledger, session: Session, conditions: str) -> None:
@@ -290,33 +295,6 @@ def _enter_tables(ledger: Ledger, session: Session, conditions: str) -> None:
     for name, table in session.tables.items():
         if name not in used:
             ledger.leave("tables", table.fault or "not asked for", lost=bool(table.fault))
-
-
-def _enter_spikes(
-    ledger: Ledger,
-    spikes: list[NDArray[np.float64]],
-    used: list[NDArray[np.float64]],
-    edges: NDArray[np.float64],
-    covered: NDArray[np.bool_],
-    counts: NDArray[np.float32],
-) -> None:
-    """Enter all spikes, those of the units that are used [U] in their windows [R, 2] (s), and those between these."""
-    ledger.find("spikes", sum(map(len, spikes)))
-    ledger.leave("spikes", "of units that are left out", sum(map(len, spikes)) - sum(map(len, used)))
-    inside, outside = 0, 0
-    bounds_of: dict[bytes, NDArray[np.float64]] = {}
-    for unit, times in enumerate(used):
-        key = covered[:, unit].tobytes()
-        if key not in bounds_of:
-            bounds_of[key] = np.array(_merged(edges[covered[:, unit]])).reshape(-1)
-        place = np.searchsorted(bounds_of[key], times, side="right")
-        inside += int((place % 2 == 1).sum())
-        outside += int((place % 2 == 0).sum())
-    ledger.leave("spikes", "between the windows", outside)
-    begin, end = edges[np.argsort(edges[:, 0])].T
-    # A spike in two windows is counted in both; else the counts themselves must add up.
-    apart = bool((begin[1:] >= end[:-1]).all())
-    ledger.take("spikes", int(np.nansum(counts, dtype=np.float64)) if apart else inside)
 
 
 def has_units(session: Session) -> bool:
@@ -412,74 +390,41 @@ def recorded_span(spikes: list[NDArray[np.float64]]) -> tuple[float, float] | No
     return (float(min(times[0] for times in firing)), float(max(times[-1] for times in firing))) if firing else None
 
 
-def count(
-    spikes: list[NDArray[np.float64]],
-    edges: NDArray[np.float64],
-    covered: NDArray[np.bool_],
-    bin: float | None,
-    length: float | None = None,
-) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
-    """Count spikes in bins from each window's begin.
+def bin_bounds(
+    edges: NDArray[np.float64], bin: float | None, length: float | None = None, *, units: int = 1
+) -> NDArray[np.float64]:
+    """Return the bounds [R, T + 1] (s) of bins from the begin of each window [R, 2] (s); without ``bin`` (s), one bin.
 
-    A bin is half open, [begin, end). Bins past the end of a short window are NaN with duration 0; the last bin of a
-    window may be shorter than ``bin`` and its duration says so. ``spikes`` [U] are ascending times (s), ``edges`` [R,
-    2] the windows (s), ``covered`` [R, U] says whether a unit was recorded. ``length`` (s) is common to all windows, if
-    they have one; no ``bin`` (s) is one bin. Returns counts [R, T, U] (float32) and duration [R, T] (s).
+    The last bin of a window may be shorter than ``bin``; those past its end have no length. ``length`` (s) is common to
+    all windows, if they have one.
     """
-    span = edges[:, 1] - edges[:, 0]
     if bin is None:
-        bounds = edges
-    else:
-        check_number("bin (s)", bin, above=0)
-        longest = max([length or 0.0, *span.tolist()])
-        # Rounding must not add an empty bin when the length is a whole number of bins.
-        number = max(1, math.ceil(longest / bin - 1e-6))
-        if number * len(edges) * max(1, len(spikes)) > _MOST_COUNTS:
-            raise UsageError(
-                f"A bin of {bin:g} s cuts windows of up to {longest:g} s into {number:,} bins; with {len(edges):,} "
-                f"trials and {len(spikes):,} units that is more than {_MOST_COUNTS:,} counts. Take wider bins."
-            )
-        # Bounds past the end of a shorter window are moved onto it; bins between them have no length and become NaN.
-        bounds = np.minimum(edges[:, :1] + bin * np.arange(number + 1), edges[:, 1:])
-        # The tolerance above may leave the last bound just short of the end, which would lose a spike in between.
-        bounds[:, -1] = edges[:, 1]
+        return edges
+    check_number("bin (s)", bin, above=0)
+    longest = max([length or 0.0, *(edges[:, 1] - edges[:, 0]).tolist()])
+    # Rounding must not add an empty bin when the length is a whole number of bins.
+    number = max(1, math.ceil(longest / bin - 1e-6))
+    if number * len(edges) * max(1, units) > _MOST_COUNTS:
+        raise UsageError(
+            f"A bin of {bin:g} s cuts windows of up to {longest:g} s into {number:,} bins; with {len(edges):,} "
+            f"trials and {units:,} units that is more than {_MOST_COUNTS:,} counts. Take wider bins."
+        )
+    # Bounds past the end of a shorter window are moved onto it.
+    bounds = np.minimum(edges[:, :1] + bin * np.arange(number + 1), edges[:, 1:])
+    # The tolerance above may leave the last bound just short of the end, which would lose a spike in between.
+    bounds[:, -1] = edges[:, 1]
+    return bounds
+
+
+def mask_missing(
+    counts: NDArray[np.float32], bounds: NDArray[np.float64], covered: NDArray[np.bool_]
+) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
+    """Return counts [R, T, U], NaN in bins of no length and where not ``covered`` [R, U], and duration [R, T] (s)."""
     duration = np.diff(bounds, axis=1)
-    counted = np.empty((len(spikes), *duration.shape), dtype=np.float32)
-    for index, times in enumerate(spikes):
-        # Differences of the numbers of spikes before each bound; "left" puts a spike on a bound into the later bin.
-        counted[index] = np.diff(np.searchsorted(times, bounds, side="left"), axis=1)
-    counts = np.ascontiguousarray(counted.transpose(1, 2, 0))
     # NaN says "not recorded"; zero would say that the unit was silent for a time that nobody observed.
     counts[duration <= 1e-9] = np.nan
     counts[np.broadcast_to(~covered[:, None, :], counts.shape)] = np.nan
     return counts, np.where(duration > 1e-9, duration, 0.0)
-
-
-def _coverage(
-    units: SessionTable,
-    spikes: list[NDArray[np.float64]],
-    edges: NDArray[np.float64],
-    selection: Selection,
-    tally: Tally,
-) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Return which windows each unit was recorded in [rows, units] and which units pass [units]."""
-    keep = tally.select(units, selection.units, "units")
-    numbers = np.array([len(times) for times in spikes], dtype=np.int64)
-    if selection.min_spikes:
-        few = "no spikes" if selection.min_spikes == 1 else f"fewer than {selection.min_spikes} spikes"
-        keep = tally.apply(keep, numbers >= selection.min_spikes, f"units: {few}")
-    covered = np.zeros((len(edges), len(spikes)), dtype=bool)
-    if (observed := inside_observed_spans(units, edges)) is not None:
-        covered = observed
-    elif (span := recorded_span(spikes)) is not None:
-        low, high = span
-        # One span for all units: a unit that fires rarely would get too short a span from its own spikes.
-        covered[:] = ((edges[:, 0] >= low) & (edges[:, 1] <= high))[:, None]
-        tally.notes.append(
-            f"{units.label}: no obs_intervals; recorded span taken from first to last spike, {low:.3f}–{high:.3f} s"
-        )
-    # A trial that only removed units saw is of no use, but with no unit left it is not the trial's fault.
-    return covered & keep if keep.any() else covered, keep
 
 
 def inside_observed_spans(units: SessionTable, edges: NDArray[np.float64]) -> NDArray[np.bool_] | None:

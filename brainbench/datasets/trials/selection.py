@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Collection, Iterable, Iterator
-from dataclasses import dataclass, field, replace
+from collections.abc import Collection, Hashable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from brainbench.core.contracts import MISSING_WORDS, as_label, as_labels, as_number, natural_key
 from brainbench.core.errors import UsageError, brief, check_once, nearest, unknown_name
 from brainbench.core.reading.ranges import check_fields
+from brainbench.datasets.ledger import Ledger
 from brainbench.datasets.sessions import SessionTable
 
 _TRUTH = (("true", "1"), ("false", "0"))
@@ -68,7 +69,7 @@ class Rule:
             parts.append(f"{self.column}={low}..{high}")
         return " and ".join(parts)
 
-    def keep(self, table: SessionTable, seen: dict[Rule, set[str]] | None = None) -> NDArray[np.bool_] | None:
+    def keep(self, table: SessionTable, seen: dict[Hashable, set[str]] | None = None) -> NDArray[np.bool_] | None:
         """Return which rows of ``table`` pass [rows], or None where an optional column is absent.
 
         ``seen`` takes the values that the column has, and those of the rule that some row has in another spelling, for
@@ -183,46 +184,30 @@ DEFAULT = Selection(name="default")
 """All trials; units with at least one spike."""
 
 
-@dataclass
-class Tally:
-    """Numbers of rows that each rule removed; trials and units stand under separate keys."""
-
-    removed: dict[str, int] = field(default_factory=dict)
-    notes: list[str] = field(default_factory=list)
-    seen: dict[Rule, set[str]] = field(default_factory=dict)
-    """Values that the columns of the rules have."""
-    doubts: list[str] = field(default_factory=list)
-    """Notes that every result must state."""
-
-    def apply(self, keep: NDArray[np.bool_], passes: Any, rule: str) -> NDArray[np.bool_]:
-        """Return the rows that remain and count those that only now fell out."""
-        self.removed[rule] = self.removed.get(rule, 0) + int(np.sum(keep & ~passes))
-        return keep & passes
-
-    def select(self, table: SessionTable, rules: tuple[Rule, ...], scope: str) -> NDArray[np.bool_]:
-        """Apply rules in order to all rows of a table; returns which remain [rows]."""
-        keep = np.ones(len(table), dtype=bool)
-        for rule in rules:
-            passes = rule.keep(table, self.seen)
-            if passes is None:
-                self.doubts.append(f"{table.label}: no column {rule.column!r}, so the rule {rule} did not apply")
-            else:
-                keep = self.apply(keep, passes, f"{scope}: {rule}")
-        return keep
+def select_rows(table: SessionTable, rules: Sequence[Rule], kind: str, ledger: Ledger) -> NDArray[np.bool_]:
+    """Apply rules in order to all rows of a table of ``trials`` or ``units``; returns which remain [rows]."""
+    keep = np.ones(len(table), dtype=bool)
+    for rule in rules:
+        passes = rule.keep(table, ledger.seen)
+        if passes is None:
+            ledger.doubts.append(f"{table.label}: no column {rule.column!r}, so the rule {rule} did not apply")
+        else:
+            keep = ledger.apply(keep, passes, kind, str(rule))
+    return keep
 
 
-def check_values(tallies: Iterable[Tally]) -> list[str]:
+def check_values(ledgers: Iterable[Ledger]) -> list[str]:
     """Check the values of rules against those of all sessions.
 
     Returns:
         A note for each value to remove that no row has but that is spelt nearly as one that rows have.
     """
-    values_of: dict[Rule, set[str]] = {}
-    for tally in tallies:
-        for rule, values in tally.seen.items():
-            values_of.setdefault(rule, set()).update(values)
+    seen = Ledger()
+    for ledger in ledgers:
+        seen.add(ledger)
     notes = []
-    for rule, values in values_of.items():
+    for rule, values in seen.seen.items():
+        assert isinstance(rule, Rule)
         present = sorted(values - {""}, key=natural_key)
         for value in (*rule.allow, *rule.refuse):
             if value in values:

@@ -209,14 +209,14 @@ def join_sessions(
 
     # The order must not depend on that of the files: equal data then have equal content hashes.
     parts = sorted(parts, key=lambda part: (natural_key(part.subject), natural_key(part.session)))
-    doubts = [*doubts, *check_values(part.tally for part in parts), *_doubtful_names(parts)]
-    doubts += [doubt for part in parts for doubt in part.tally.doubts]
+    doubts = [*doubts, *check_values(part.ledger for part in parts), *_doubtful_names(parts)]
+    doubts += [doubt for part in parts for doubt in part.ledger.doubts]
     measure = listing(sorted({part.measure for part in parts}), quoted=False)
     if measure != "spikes":
         doubts.append(f"responses are means over the window of {measure}, not spike counts")
     removed: Counter[str] = Counter()
     for part in parts:
-        removed.update(part.tally.removed)
+        removed.update(part.ledger.removed)
     # A session without trials would add units that are missing in every row.
     everything, parts = parts, [part for part in parts if part.labels] or parts
     empty = [part for part in everything if not part.labels]
@@ -287,7 +287,7 @@ def join_sessions(
         "selection": {"name": options.selection.name, "rules": list(options.selection.lines())},
         "removed": dict(removed),
         "sessions": [_about(part) for part in everything],
-        "notes": [*notes, *doubts, *(note for part in everything for note in part.tally.notes)],
+        "notes": [*notes, *doubts, *(note for part in everything for note in part.ledger.notes)],
         "doubts": doubts,
         "overlap": alike / trials,
         "source": source,
@@ -352,9 +352,9 @@ def _about(part: SessionCounts) -> dict[str, Any]:
         "session": part.session,
         "source": part.source,
         "trials": len(part.labels),
-        "trials_in_file": part.trials,
+        "trials_in_file": part.ledger.totals["trials"],
         "units": len(part.unit_ids),
-        "units_in_file": part.units,
-        "removed": dict(part.tally.removed),
+        "units_in_file": part.ledger.totals["units"],
+        "removed": part.ledger.removed,
         "synthetic": part.synthetic,
     }

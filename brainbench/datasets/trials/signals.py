@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import dataclass
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.errors import DataError, listing
-from brainbench.datasets.sessions import Series, Session
+from brainbench.datasets.ledger import Ledger
+from brainbench.datasets.sessions import Series, Session, SessionTable
+from brainbench.datasets.trials.selection import Selection
 
 Floats = NDArray[np.float64]
 
@@ -38,25 +44,75 @@ def frame_times(series: Series) -> Floats:
     return times
 
 
-def window_means(series: Series, times: Floats, bounds: Floats) -> NDArray[np.float32]:
-    """Return the mean of each cell over the frames in each bin [R, T, U], bins [begin, end) from ``bounds`` [R, T + 1].
+@dataclass(frozen=True)
+class Samples:
+    """Units whose signal is sampled; their responses are means, of which negative ones are values too."""
 
-    Frames that are NaN are left out; a bin without any other is NaN.
-    """
-    values = np.asarray(series.data[...], dtype=np.float32)
-    values = values[:, None] if values.ndim == 1 else values
-    place = np.searchsorted(times, bounds, side="left")
-    means = np.full((len(bounds), bounds.shape[1] - 1, values.shape[1]), np.nan, dtype=np.float32)
-    for row, column in np.ndindex(means.shape[:2]):
-        frames = values[place[row, column] : place[row, column + 1]]
-        finite = np.isfinite(frames)
-        total = np.where(finite, frames, 0.0).sum(axis=0, dtype=np.float64)
-        number = finite.sum(axis=0)
-        means[row, column] = np.divide(total, number, out=np.full(len(number), np.nan), where=number > 0)
-    return means
+    units: SessionTable
+    series: Series
+    times: Floats
+    """[F] times of the frames, s."""
+    source: str
+    measure: str
+
+    @classmethod
+    def of(cls, session: Session, series: Series) -> Samples:
+        """Take a signal of a session."""
+        number = 1 if series.data.ndim == 1 else series.data.shape[1]
+        cells = SessionTable("cells", {"id": np.arange(number), **series.columns}, session.source)
+        return cls(cells, series, frame_times(series), session.source, f"{series.name} ({series.kind})")
+
+    @property
+    def step(self) -> float:
+        """Time from a frame to the next, s."""
+        return float(np.median(np.diff(self.times))) if len(self.times) > 1 else math.nan
+
+    def rule_out(self, keep: NDArray[np.bool_], selection: Selection, ledger: Ledger) -> NDArray[np.bool_]:
+        """Leave out what the file calls no cell."""
+        if "iscell" in self.units:
+            keep = ledger.apply(keep, self.units.times("iscell") > 0, "units", "no cell (iscell)")
+        return keep
+
+    def covered(self, edges: Floats, ledger: Ledger) -> NDArray[np.bool_]:
+        """Return which windows lie between the first and the last frame."""
+        inside = (edges[:, 0] >= self.times[0] - self.step) & (edges[:, 1] <= self.times[-1] + self.step)
+        return np.repeat(inside[:, None], len(self.units), axis=1)
+
+    def key(self, unit: int) -> tuple[Any, ...]:
+        """Ids are unique."""
+        return ()
+
+    def respond(self, units: NDArray[np.int64], bounds: Floats) -> NDArray[np.float32]:
+        """Return mean × length of the frames in bins [begin, end); NaN frames are left out.
+
+        A bin without any other frame is NaN. Raises DataError where a bin is shorter than a frame.
+        """
+        duration = np.diff(bounds, axis=1)
+        shortest = float(duration[duration > 1e-9].min(initial=math.inf))
+        if shortest < self.step:
+            raise DataError(
+                f"{self.series.name} of {self.source} has a frame every {self.step:.3g} s, and windows or bins are as "
+                f"short as {shortest:.3g} s; take longer ones."
+            )
+        values = np.asarray(self.series.data[...], dtype=np.float32)
+        values = (values[:, None] if values.ndim == 1 else values)[:, units]
+        place = np.searchsorted(self.times, bounds, side="left")
+        means = np.full((*duration.shape, len(units)), np.nan, dtype=np.float32)
+        for row, column in np.ndindex(duration.shape):
+            frames = values[place[row, column] : place[row, column + 1]]
+            finite = np.isfinite(frames)
+            total = np.where(finite, frames, 0.0).sum(axis=0, dtype=np.float64)
+            number = finite.sum(axis=0)
+            means[row, column] = np.divide(total, number, out=np.full(len(number), np.nan), where=number > 0)
+        return (means * duration[:, :, None]).astype(np.float32)
+
+    def enter(self, units: NDArray[np.int64], bounds: Floats, counts: NDArray[np.float32], to: Ledger) -> None:
+        """Doubt responses that fade over the session."""
+        if doubt := fading(counts / np.diff(bounds, axis=1)[:, :, None]):
+            to.doubts.append(f"{self.series.name} of {self.source}: {doubt}")
 
 
-def fading(means: NDArray[np.float32]) -> str:
+def fading(means: NDArray[np.floating[Any]]) -> str:
     """Return a doubt where the responses [R, T, U] of trials in order of time drift, as where an indicator bleaches."""
     finite = np.isfinite(means)
     number = finite.sum(axis=(1, 2))

@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 
 from brainbench.core.errors import UsageError
 from brainbench.datasets import export, open_recordings, write_recordings
-from brainbench.datasets.sessions import make_session
-from brainbench.datasets.trials.counting import count
+from brainbench.datasets.sessions import SessionTable, make_session
+from brainbench.datasets.trials.counting import SpikeTrains, bin_bounds, mask_missing
 from brainbench.datasets.trials.session_trials import trials_by_subject
 
 
@@ -56,6 +56,13 @@ def test_copies_keep_them(tmp_path, name):
     for covariate in ("contacts", "licks", "choice"):
         np.testing.assert_array_equal(one[covariate].values, two[covariate].values)
     assert one.attrs["content_hash"] == two.attrs["content_hash"]
+
+
+def count(spikes, edges, covered, bin):
+    """Counts [R, T, U] and durations [R, T] of units in windows."""
+    bounds = bin_bounds(edges, bin, units=len(spikes))
+    trains = SpikeTrains(SessionTable("units", {}), spikes)
+    return mask_missing(trains.respond(np.arange(len(spikes)), bounds), bounds, covered)
 
 
 TIMES = st.lists(st.floats(0, 10, width=32), max_size=40).map(sorted).map(np.array)

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from brainbench.core.errors import DataError, UsageError
+from brainbench.datasets.ledger import Ledger
 from brainbench.datasets.sessions import SessionTable
-from brainbench.datasets.trials.selection import Rule, Selection, Tally, check_values
+from brainbench.datasets.trials.selection import Rule, Selection, check_values, select_rows
 
 
 def make_table(**columns):
@@ -14,10 +15,10 @@ def make_table(**columns):
 
 def test_each_row_is_counted_under_the_first_rule_that_removes_it():
     table = make_table(outcome=["spoil", "correct", "spoil", "error"], laser=[True, True, False, False])
-    tally = Tally()
+    ledger = Ledger()
     rules = (Rule("outcome", refuse=("spoil",)), Rule("laser", refuse=("true",)))
-    assert tally.select(table, rules, "trials").tolist() == [False, False, False, True]
-    assert tally.removed == {"trials: outcome!=spoil": 2, "trials: laser!=true": 1}
+    assert select_rows(table, rules, "trials", ledger).tolist() == [False, False, False, True]
+    assert ledger.removed == {"trials: outcome!=spoil": 2, "trials: laser!=true": 1}
 
 
 @pytest.mark.parametrize("values", [[True, False], [1, 0], [1.0, 0.0], ["True", "False"], ["1", "0"]])
@@ -39,10 +40,10 @@ def test_truth_is_recognised_however_the_file_spells_it(values):
     ],
 )
 def test_a_number_is_recognised_however_the_rule_spells_it(value, column):
-    tally = Tally()
-    assert Rule("a", refuse=(value,)).keep(make_table(a=column), tally.seen).tolist() == [False, True]
-    assert Rule("a", allow=(value,)).keep(make_table(a=column), tally.seen).tolist() == [True, False]
-    assert check_values([tally]) == []
+    ledger = Ledger()
+    assert Rule("a", refuse=(value,)).keep(make_table(a=column), ledger.seen).tolist() == [False, True]
+    assert Rule("a", allow=(value,)).keep(make_table(a=column), ledger.seen).tolist() == [True, False]
+    assert check_values([ledger]) == []
 
 
 def test_texts_and_numbers_out_of_range_are_compared_as_they_are():
@@ -59,10 +60,10 @@ def test_a_missing_value_fails_what_is_asked_for_and_passes_what_is_refused():
 
 
 def test_an_optional_rule_without_its_column_says_so():
-    tally = Tally()
-    assert tally.select(make_table(a=[1, 2]), (Rule("b", refuse=("x",), required=False),), "trials").all()
-    assert "rule b!=x" in tally.doubts[0]
-    assert tally.removed == {}
+    ledger = Ledger()
+    assert select_rows(make_table(a=[1, 2]), (Rule("b", refuse=("x",), required=False),), "trials", ledger).all()
+    assert "rule b!=x" in ledger.doubts[0]
+    assert ledger.removed == {}
 
 
 def test_a_required_rule_without_its_column_suggests_the_nearest():
