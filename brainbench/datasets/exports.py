@@ -38,7 +38,7 @@ from brainbench.datasets.sessions import (
     neurodata_type,
     ragged,
 )
-from brainbench.datasets.trials.counting import LICKS, has_units, lick_times, no_units, read_spikes, recorded_span
+from brainbench.datasets.trials.counting import LICKS, lick_times, no_units, read_spikes, recorded_span
 from brainbench.datasets.trials.selection import EVERYTHING, Selection, check_values, select_rows
 
 _LOG = logging.getLogger(__name__)
@@ -66,7 +66,7 @@ def export(source: Source, target: str | os.PathLike[str], *, select: Selection 
         with open_file(path) as file:
             for session, session_layout in each_session(file, path, layout):
                 subjects.add(session.subject)
-                if not has_units(session):
+                if not session.has_spikes:
                     ledger.leave("sessions", no_units(session), lost=True)
                 elif session.subject in (chosen.subjects or subjects):
                     ledgers.append(Ledger())

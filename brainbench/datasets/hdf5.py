@@ -1,4 +1,4 @@
-"""Our own HDF5 layout for recordings, version 1: spike times, or responses that are already counted.
+"""Our own HDF5 layout for recordings, version 1: spike times, samples by trial, or responses already counted.
 
 The root carries the attributes ``format`` = "brainbench-recordings", ``version`` = 1 and ``kind``.
 
@@ -17,6 +17,15 @@ The root carries the attributes ``format`` = "brainbench-recordings", ``version`
             start_time          float64 [rows], s; stop_time likewise, optional
             id                  optional, [rows]
             <column>            [rows]: numbers, booleans or UTF-8 text
+
+``kind`` = "responses": the same, with responses in place of spike times::
+
+    /sessions/<name>/
+        response                [trial, time, unit] numbers, NaN where missing; attributes unit ("dF/F", "spikes" for
+                                counts, …) and table (of its trials, "trials" by default)
+        time                    float64 [time], s from the start_time of the trial, ascending, begin of each sample;
+                                without it there is one sample, that of the whole trial
+        units/, tables/         as above, without spike_times
 
 ``kind`` = "counts": one recordings data set (:func:`brainbench.core.contracts.check_recordings`)::
 
@@ -39,11 +48,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from brainbench.core.contracts import check_counts
-from brainbench.core.errors import DataError, UsageError, brief
+from brainbench.core.errors import DataError, UsageError, brief, listing
 from brainbench.core.files import to_json
 from brainbench.core.reading.texts import parse_json
 from brainbench.core.writing.hdf5 import create_hdf5
-from brainbench.datasets.sessions import SPIKES, LostColumn, Session, SessionTable, decode, text
+from brainbench.datasets.sessions import SPIKES, LostColumn, Series, Session, SessionTable, decode, text
 
 if TYPE_CHECKING:
     import h5py
@@ -51,6 +60,9 @@ if TYPE_CHECKING:
 
 FORMAT = "brainbench-recordings"
 VERSION = 1
+KINDS = ("spikes", "responses", "counts")
+RESPONSE = "response"
+"""Data set with the samples of a session by trial."""
 
 
 def write_recordings(path: str | os.PathLike[str], recordings: xr.Dataset | Session | Iterable[Session]) -> Path:
@@ -82,12 +94,12 @@ def holds_counts(file: h5py.File, path: Path) -> bool:
     if not is_ours(file):
         return False
     version, kind = file.attrs.get("version"), text(file.attrs.get("kind", ""))
-    if version != VERSION or kind not in ("spikes", "counts"):
+    if version != VERSION or kind not in KINDS:
         later = isinstance(version, (int, np.integer)) and version > VERSION
         newer = " A newer brainbench wrote it: update this one." if later else ""
         raise DataError(
             f"{path} is {FORMAT} version {brief(version)}, kind {brief(kind)}; this brainbench reads "
-            f"version {VERSION}, kinds 'spikes' and 'counts'.{newer}"
+            f"version {VERSION}, kinds {listing(KINDS)}.{newer}"
         )
     return kind == "counts"
 
@@ -112,9 +124,18 @@ def read_sessions(file: h5py.File, path: Path) -> list[Session]:
                 synthetic=bool(group.attrs.get("synthetic", False)),
                 stimuli=text(group.attrs.get("stimuli", "")),
                 guessed=not stated["subject"],
+                populations={RESPONSE: _samples(group, units, source)} if RESPONSE in group else {},
             )
         )
     return sessions
+
+
+def _samples(group: h5py.Group, units: SessionTable, source: str) -> Series:
+    data: Any = group[RESPONSE]
+    if not (unit := text(data.attrs.get("unit", "")).strip()):
+        raise DataError(f"{RESPONSE} of {source} has no attribute 'unit', such as 'dF/F', or 'spikes' for counts.")
+    table = text(data.attrs.get("table", "trials"))
+    return Series(RESPONSE, "samples", data, group.get("time"), unit=unit, table=table, columns=units.data)
 
 
 def read_counts(file: h5py.File, path: Path) -> xr.Dataset:
@@ -148,21 +169,30 @@ def _write_counts(file: h5py.File, dataset: xr.Dataset) -> None:
 def _write_sessions(file: h5py.File, sessions: list[Session]) -> None:
     if not sessions:
         raise UsageError("There is no session to write; pass at least one.")
-    file.attrs["kind"] = "spikes"
+    if strangers := [session for session in sessions if not isinstance(session, Session)]:
+        raise UsageError(f"Recordings are a data set or sessions of make_session; received {brief(strangers[0])}.")
+    file.attrs["kind"] = "responses" if any(RESPONSE in session.populations for session in sessions) else "spikes"
     root = file.create_group("sessions")
     for session in sessions:
-        if not isinstance(session, Session):
-            raise UsageError(f"Recordings are a data set or sessions of make_session; received {brief(session)}.")
         name = f"{session.subject}-{session.session}".replace("/", "_")
         if name in root:  # such as the probes of one session; their trials tell whether they are
             name += f" {sum(str(key).partition(' ')[0] == name for key in root) + 1}"
-        if session.units is None:
+        samples, units = session.populations.get(RESPONSE), session.units
+        if samples is not None:
+            units = SessionTable("units", samples.columns)
+        elif units is None:
             raise DataError(f"Session {name!r} has no units table; there are no spikes to write.")
-        session.units.rows(SPIKES)  # what no reader takes is not written
+        else:
+            units.rows(SPIKES)  # what no reader takes is not written
         group = root.create_group(name)
+        if samples is not None:
+            data = write_array(group, RESPONSE, samples.data)
+            data.attrs.update({"unit": samples.unit, "table": samples.table})
+            if samples.timestamps is not None:
+                write_array(group, "time", samples.timestamps)
         for key in ("subject", "session", "start", "synthetic", "stimuli"):
             group.attrs[key] = getattr(session, key)
-        _write_table(group.create_group("units"), session.units)
+        _write_table(group.create_group("units"), units)
         group.create_group("tables")
         for key, table in session.tables.items():
             _write_table(group.create_group(f"tables/{key.replace('/', '_')}"), table)

@@ -25,7 +25,7 @@ from brainbench.datasets.ledger import Ledger, balance_line
 from brainbench.datasets.reading import each_session, find_recordings, open_file, suitable_files
 from brainbench.datasets.sessions import SPIKES, Session, SessionTable
 from brainbench.datasets.trials.conditions import natural_vocabulary
-from brainbench.datasets.trials.counting import has_units, no_units, read_spikes, recorded_span, time_fault
+from brainbench.datasets.trials.counting import no_units, read_spikes, recorded_span, time_fault
 from brainbench.datasets.trials.selection import select_rows
 from brainbench.datasets.trials.signals import response_series
 
@@ -236,10 +236,15 @@ def _merged(proposals: list[Proposal]) -> tuple[Proposal, ...]:
 def _summary(session: Session, usable: bool, ledger: Ledger) -> SessionSummary:
     units = _units(session)
     tables = tuple(_table(table) for table in session.tables.values())
-    signal = response_series(session) if units is None else None
-    missing = [no_units(session)] if units is None and signal is None else []
-    if signal is not None:
-        missing.append(f"no spikes: the responses of trials are means of {signal.name}, {signal.data.shape} samples")
+    missing = []
+    try:
+        if (signal := response_series(session)) is not None:
+            shape = " × ".join(map(str, signal.data.shape))
+            missing.append(f"no spikes: the responses of trials are means of {signal.name}, {shape} samples")
+        elif units is None:
+            missing.append(no_units(session))
+    except DataError as error:
+        missing.append(str(error))
     missing += [units.problem] if units is not None and units.problem else []
     missing += [f"table {table.name}: {table.problem}" for table in tables if table.problem]
     for table in tables:
@@ -277,7 +282,7 @@ def _summary(session: Session, usable: bool, ledger: Ledger) -> SessionSummary:
 
 def _units(session: Session) -> UnitsSummary | None:
     table = session.units
-    if table is None or not has_units(session):
+    if table is None or not session.has_spikes:
         return None
     try:
         spikes = read_spikes(table, [])
@@ -299,7 +304,7 @@ def _units(session: Session) -> UnitsSummary | None:
 def _time_faults(session: Session) -> list[str]:
     """Return what speaks against seconds of one clock, once for all tables."""
     with contextlib.suppress(BrainbenchError):  # of spikes, which is told already
-        if session.units is not None and has_units(session):
+        if session.units is not None and session.has_spikes:
             spikes = read_spikes(session.units, [])
             tables = (table for table in session.tables.values() if not table.fault)
             return [fault for table in tables if (fault := time_fault(spikes, table))][:1]

@@ -61,6 +61,10 @@ class Ledger:
             raise DataError(reason)
         self.left.append(LeftOut(kind, reason, number, lost))
 
+    def note(self, text: str) -> None:
+        """Add a note, once."""
+        self.notes += [] if text in self.notes else [text]
+
     def apply(self, keep: NDArray[np.bool_], passes: Any, kind: str, rule: str) -> NDArray[np.bool_]:
         """Return the rows of one kind that remain, and leave those that only now fell out by a rule."""
         self.leave(kind, rule, int(np.sum(keep & ~passes)))

@@ -110,7 +110,7 @@ def _tables(file: h5py.File, path: Path) -> tuple[dict[str, SessionTable], dict[
             if "units" not in units:
                 units[place] = _with_areas(_table(group, "units", path), group)
             continue
-        if kind == _SIGNAL:
+        if kind in _SIGNALS:
             signals |= {place: replace(_one_series(group), name=place, columns=_cells(group))}
             continue
         if name in intervals:
@@ -147,19 +147,21 @@ def _with_areas(units: SessionTable, group: h5py.Group) -> SessionTable:
     return units.with_columns(area=np.array([*locations, ""])[np.clip(first, 0, len(locations)).astype(np.int64)])
 
 
-_SIGNAL = "RoiResponseSeries"
-"""Type of the responses of imaged cells."""
+_SIGNALS = {"RoiResponseSeries": "rois", "ElectricalSeries": "electrodes"}
+"""Types of signals of cells or channels → name of the rows of the table that describes these."""
 
 
 def _cells(group: h5py.Group) -> dict[str, Any]:
-    """Return what the plane segmentation of a signal says of its cells: ``iscell``, and the area of the plane."""
+    """Return what tables say of the columns of a signal: ``iscell``, and the area of the plane or the electrode."""
     # A file of others may hold anything in these places; whatever it is not is an error that is caught.
-    rois: Any = group.get("rois")
+    rois: Any = group.get(_SIGNALS[neurodata_type(group)])
     columns: dict[str, Any] = {}
     try:
         plane: Any = group.file[rois.attrs["table"]]
         rows = np.asarray(rois[...], dtype=np.int64).ravel()
         data: Any = group["data"]
+        if "location" in plane:
+            columns["area"] = decode(plane["location"][...])[rows]
         if "iscell" in plane:
             # Suite2p keeps the probability beside it.
             flags = np.asarray(plane["iscell"][...], dtype=np.float64)
@@ -168,7 +170,7 @@ def _cells(group: h5py.Group) -> dict[str, Any]:
             columns["area"] = np.full(len(rows), _string(plane, "imaging_plane/location"))
     except (AttributeError, KeyError, ValueError, TypeError, IndexError):  # without a plane every column is a cell
         return {}
-    return columns if len(rows) == data.shape[-1] else {}
+    return columns if len(rows) == (data.shape[1] if data.ndim > 1 else 1) else {}
 
 
 def _walk(parent: h5py.Group, path: Path, place: str = "") -> Iterator[tuple[str, Any]]:
@@ -182,7 +184,7 @@ def _walk(parent: h5py.Group, path: Path, place: str = "") -> Iterator[tuple[str
             yield here, SessionTable(name, {}, str(path), reason)
         elif isinstance(group := parent[name], h5py.Group):
             if (
-                neurodata_type(group) == _SIGNAL
+                neurodata_type(group) in _SIGNALS
                 or "colnames" in group.attrs
                 or "id" in group
                 or place == "intervals"
@@ -230,7 +232,11 @@ def _one_series(group: h5py.Group) -> Series:
     path, start, rate, begin = (group.name or "").strip("/"), 0.0, math.nan, group.get("starting_time")
     if isinstance(begin, h5py.Dataset) and begin.shape == ():
         start, rate = float(begin[()]), float(begin.attrs.get("rate", math.nan))
-    return Series(path, neurodata_type(group), group["data"], group.get("timestamps"), start, rate)
+    data: Any = group["data"]
+    conversion: Any = data.attrs.get("conversion", 1.0)
+    if isinstance(channels := group.get("channel_conversion"), h5py.Dataset):
+        conversion = conversion * channels[...]
+    return Series(path, neurodata_type(group), data, group.get("timestamps"), start, rate, conversion=conversion)
 
 
 def _groups(parent: Any) -> list[tuple[str, h5py.Group]]:

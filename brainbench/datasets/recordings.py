@@ -30,7 +30,7 @@ from brainbench.datasets.reading import (
 from brainbench.datasets.sessions import Session
 from brainbench.datasets.trials.conditions import Conditions
 from brainbench.datasets.trials.copies import Copies, joined_probes
-from brainbench.datasets.trials.counting import ReadingOptions, SessionCounts, count_session, has_units, no_units
+from brainbench.datasets.trials.counting import ReadingOptions, SessionCounts, count_session, no_units
 from brainbench.datasets.trials.selection import DEFAULT, Selection
 from brainbench.datasets.trials.session_trials import join_sessions
 from brainbench.datasets.trials.signals import response_series
@@ -158,7 +158,7 @@ class _Reader:
 
     def _count(self, session: Session, session_layout: RecordingLayout | None) -> tuple[str, bool]:
         """Count a session; else return why not, and whether nobody asked for that."""
-        if not has_units(session) and response_series(session) is None:
+        if not session.has_spikes and response_series(session, self.window) is None:
             return no_units(session), True
         table = None if self.conditions is None else self.conditions.table
         if self.lenient and table is not None and table not in session.tables:

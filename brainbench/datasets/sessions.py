@@ -230,6 +230,12 @@ class Series:
     """[samples] s, or None for regular sampling from ``start`` at ``rate``."""
     start: float = 0.0
     rate: float = math.nan
+    unit: str = ""
+    """Unit of the samples, where the file states one; ``spikes`` for counts."""
+    conversion: Any = 1.0
+    """Factor to volts of each sample, or [units] of each column."""
+    table: str = ""
+    """Table of the rows of ``data`` [trial, time, unit]; times then count from the start of each."""
     columns: Mapping[str, Any] = field(default_factory=dict)
     """What is known of each column of the samples, such as whether it is a cell: name → [units]."""
 
@@ -286,6 +292,11 @@ class Session:
     populations: Mapping[str, Any] = field(default_factory=dict)
     """All tables of units by place, and other responses; ``units`` is the one that is read."""
 
+    @property
+    def has_spikes(self) -> bool:
+        """True with at least one unit that has spike times."""
+        return self.units is not None and SPIKES in self.units and len(self.units) > 0
+
     def table(self, name: str) -> SessionTable:
         """Return one interval table."""
         check_name("table", name, self.tables, hint=f"(interval tables of {self.source})")
@@ -299,7 +310,7 @@ class Session:
 def make_session(
     subject: str,
     session: str,
-    spikes: Sequence[NDArray[Any]],
+    spikes: Sequence[NDArray[Any]] | None,
     tables: Mapping[str, Mapping[str, Sequence[Any] | NDArray[Any]]],
     *,
     unit_columns: Mapping[str, Sequence[Any] | NDArray[Any]] | None = None,
@@ -307,8 +318,14 @@ def make_session(
     start: str = "",
     synthetic: bool = False,
     stimuli: str = "",
+    response: NDArray[Any] | None = None,
+    time: NDArray[Any] | None = None,
+    unit: str = "",
 ) -> Session:
     """Build a session from arrays, to be written with :func:`~brainbench.datasets.write_recordings`.
+
+    In place of ``spikes`` (None) it may have a ``response`` [trial, time, unit] to the rows of ``trials`` in some
+    ``unit`` ("dF/F", "spikes" for counts), at each ``time`` [time] (s) from the start of the trial.
 
     ``spikes`` are the times (s) of each unit, below 0 before the clock began; ``tables`` mappings of columns with at
     least ``start_time``, ``unit_columns`` such as ``id``, ``depth`` (µm) and ``layer``, ``observed`` the recorded spans
@@ -321,9 +338,12 @@ def make_session(
             raise UsageError(
                 f"A session starts at a time of ISO 8601, such as 2025-01-31T12:00:00+00:00; received {brief(start)}."
             ) from None
-    data: dict[str, Any] = {"id": np.arange(len(spikes))}
+    if (spikes is None) == (response is None) or (response is not None and (response.ndim != 3 or not unit)):
+        raise UsageError("A session has spikes, or else a response [trial, time, unit] with its unit, such as 'dF/F'.")
+    number = len(spikes) if spikes is not None else response.shape[2] if response is not None else 0
+    data: dict[str, Any] = {"id": np.arange(number)}
     data |= {name: np.asarray(values) for name, values in (unit_columns or {}).items()}
-    data |= ragged(SPIKES, spikes)
+    data |= ragged(SPIKES, spikes) if spikes is not None else {}
     if observed is not None:
         data |= ragged(OBSERVED, [np.reshape(item, (-1, 2)) for item in observed])
     arrays = {name: {key: np.asarray(item) for key, item in table.items()} for name, table in tables.items()}
@@ -333,7 +353,8 @@ def make_session(
         for name in table.columns:
             if name not in table.index and len(table.data[name]) != len(table):
                 raise DataError(f"Column {name!r} of {table.label} has {len(table.data[name])} of {len(table)} rows.")
-    units.rows(SPIKES)
+    if spikes is not None:
+        units.rows(SPIKES)
     if observed is not None:
         units.ends(OBSERVED)
         if not (data[OBSERVED][:, 0] <= data[OBSERVED][:, 1]).all():
@@ -341,6 +362,11 @@ def make_session(
     for table in named_tables.values():
         table.require("start_time")
     stated = {"source": session, "start": start, "synthetic": synthetic, "stimuli": stimuli}
+    if response is not None:
+        samples = Series("response", "samples", np.asarray(response), time, unit=unit, table="trials", columns=data)
+        return Session(
+            subject, session, None, named_tables, format="arrays", populations={samples.name: samples}, **stated
+        )
     return Session(subject, session, units, named_tables, format="arrays", **stated)
 
 

@@ -70,7 +70,7 @@ def test_zeros_of_other_slots_are_missing_and_silent_trials_are_counted(tmp_path
     array[5] = 0
     dataset = open_recordings(write_published(tmp_path / "a.npz", m1=array))
     kept = np.delete(np.arange(24), 5)
-    assert dataset.attrs["removed"] == {SILENT: 1}
+    assert dataset.attrs["removed"] == {f"trials: {SILENT}": 1}
     assert dataset["stimulus"].values.tolist() == [f"slot-{slot + 1}" for slot in slots[0][kept]]
     np.testing.assert_allclose(dataset["counts"].values[:, 0], array[kept, slots[0][kept]], rtol=1e-6)
 
@@ -80,7 +80,7 @@ def test_a_trial_whose_window_has_no_length_is_missing(tmp_path):
     # The mean over no bins: NaN in the slot of the trial, zeros elsewhere.
     array[7, slots[0][7], :6] = np.nan
     dataset = open_recordings(write_published(tmp_path / "a.npz", m1=array))
-    assert dataset.attrs["removed"] == {SILENT: 1}
+    assert dataset.attrs["removed"] == {f"trials: {SILENT}": 1}
     assert np.unique(dataset["session"].values, return_counts=True)[1].tolist() == [23, 30]
 
 

@@ -30,10 +30,10 @@ from brainbench.datasets.checks.findings import (
 from brainbench.datasets.layouts.registry import RecordingLayout, counted_layout
 from brainbench.datasets.ledger import Ledger
 from brainbench.datasets.reading import Source, each_session, find_recordings, open_file
-from brainbench.datasets.sessions import Session
+from brainbench.datasets.sessions import Series, Session
 from brainbench.datasets.trials.conditions import Conditions, joined_labels, label_doubts
 from brainbench.datasets.trials.copies import Copies
-from brainbench.datasets.trials.counting import has_units, no_units, read_spikes, time_fault
+from brainbench.datasets.trials.counting import no_units, read_spikes, time_fault
 
 _NUMBER = re.compile(r"\d+(?:,\d{3})*(?:\.\d+)?")
 
@@ -160,13 +160,17 @@ def check_session(
 ) -> Iterator[Finding]:
     """Yield the findings about one session, which must still be open."""
     every = every or _Everything()
-    if not has_units(session) or session.units is None:
+    signals = [place for place, item in session.populations.items() if isinstance(item, Series)]
+    if not session.has_spikes and not signals:
         # Nothing else matters of a file that scores skip.
         yield Finding("error", "units", no_units(session))
         return
     conditions = conditions or (layout.conditions if layout else None)
     yield from check_tables(session)
     yield from check_labels(session, layout, conditions)
+    if not session.has_spikes or session.units is None:
+        yield Finding("note", "units", f"holds signals and no spikes ({some(signals)}); only tables are checked")
+        return
     table = session.tables.get(conditions.table if conditions else "trials")
     with contextlib.suppress(BrainbenchError):
         if table is not None and conditions is not None:

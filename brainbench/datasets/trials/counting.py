@@ -17,7 +17,7 @@ from brainbench.datasets.ledger import Ledger
 from brainbench.datasets.sessions import OBSERVED, SPIKES, Session, SessionTable
 from brainbench.datasets.trials.conditions import Conditions, joined_labels
 from brainbench.datasets.trials.selection import Selection, select_rows
-from brainbench.datasets.trials.signals import Samples, response_series
+from brainbench.datasets.trials.signals import VOLTAGES, Samples, response_series
 from brainbench.datasets.trials.windows import CONTACTS, Window
 
 COVARIATES = ("contacts", "licks", "choice")
@@ -138,8 +138,8 @@ def count_session(
     look: Callable[[Session, Sequence[NDArray[np.float64]]], str] | None = None,
 ) -> SessionCounts:
     """Count the trials of one session; ``look`` sees it with the spikes of all units, and may return a doubt."""
-    series = None if has_units(session) else response_series(session)
-    if series is None and not has_units(session):
+    series = response_series(session, options.window)
+    if series is None and not session.has_spikes:
         raise DataError(no_units(session))
     ledger = Ledger(notes=[*session.notes])
     table = session.table(options.conditions.table)
@@ -147,24 +147,17 @@ def count_session(
         raise DataError(f"{table.label} has no start_time; conditions need a table of time intervals.")
     values = options.conditions.values(table)
     labels = np.array(joined_labels(values), dtype=str)
-    # Each rule counts only rows that no earlier rule removed, so removed and kept rows add up to the table.
-    keep = select_rows(table, options.selection.trials, "trials", ledger)
-    keep = ledger.apply(keep, labels != "", "trials", f"no value of {','.join(options.conditions.columns)}")
-    if options.vocabulary is not None:
-        keep = ledger.apply(keep, np.isin(labels, options.vocabulary), "trials", "label outside the vocabulary")
-    edges = options.window.edges(session, table, ledger.notes)
-    keep = ledger.apply(keep, np.isfinite(edges).all(axis=1), "trials", f"no event for the window {options.window}")
-    keep = ledger.apply(keep, ~(edges[:, 1] <= edges[:, 0]), "trials", "window of no length")
-    invalid = session.tables.get("invalid_times")
-    if invalid is not None:
-        begin, end = invalid.times("start_time"), invalid.times("stop_time")
-        overlap = ((edges[:, :1] < end) & (edges[:, 1:] > begin)).any(axis=1)
-        keep = ledger.apply(keep, ~overlap, "trials", "overlap with invalid_times")
-    source = SpikeTrains.of(session, table, ledger, look) if series is None else Samples.of(session, series)
+    keep, parts = _windows(session, table, labels, options, ledger)
+    edges, *before = parts
+    source = (
+        SpikeTrains.of(session, table, ledger, look)
+        if series is None
+        else Samples.of(session, series, table, options.window, options.bin)
+    )
     chosen = select_rows(source.units, options.selection.units, "units", ledger)
     chosen = source.rule_out(chosen, options.selection, ledger)
     # A window outside the recorded span is missing data, not silence: zero counts there would lower every mean.
-    covered = source.covered(edges, ledger)
+    covered = np.all([source.covered(part, ledger) for part in parts], axis=0)
     # A trial that only removed units saw is of no use, but with no unit left it is not the trial's fault.
     covered = covered & chosen if chosen.any() else covered
     keep = ledger.apply(keep, covered.any(axis=1), "trials", "outside the recorded span")
@@ -173,13 +166,18 @@ def count_session(
     rows = _sorted(keep, lambda row: (start[row], natural_key(ids[row])))
     units = _sorted(chosen, lambda unit: (natural_key(unit_ids[unit]), *source.key(unit)))
     bounds = bin_bounds(edges[rows], options.bin, options.window.length, units=len(units))
-    counts = source.respond(units, bounds)
+    counts = source.respond(rows, units, bounds)
     counts, duration = mask_missing(counts, bounds, covered[np.ix_(rows, units)])
     seen = np.isfinite(counts).any(axis=(0, 1)) | ~keep.any()
     ledger.leave("units", "recorded in no kept trial", int((~seen).sum()))
     if not seen.all():
         units, counts = units[seen], counts[:, :, seen]
     source.enter(units, bounds, counts, ledger)
+    measure = source.measure
+    for part in before:
+        rates = source.respond(rows, units, part[rows]) / np.diff(part[rows], axis=1)[:, :, None]
+        counts = (counts - rates * duration[:, :, None]).astype(np.float32)
+        measure += f" minus their mean in {options.window.baseline}"
     for kind, number, found in (("trials", len(rows), len(table)), ("units", len(units), len(source.units))):
         ledger.find(kind, found)
         ledger.take(kind, number)
@@ -197,11 +195,35 @@ def count_session(
         duration=duration,
         columns={name: _unit_column(source.units, name, kind, units, ledger.notes) for name, kind in columns},
         covariates=trial_covariates(session, table, rows, edges[rows]),
-        measure=source.measure,
+        measure=measure,
         forms=options.conditions.forms(table),
         found_labels=frozenset(labels.tolist()) - {""},
         ledger=ledger,
     )
+
+
+def _windows(
+    session: Session, table: SessionTable, labels: NDArray[np.str_], options: ReadingOptions, ledger: Ledger
+) -> tuple[NDArray[np.bool_], list[NDArray[np.float64]]]:
+    """Return which trials are left by rules, labels and events, and their windows and baselines [rows, 2] (s)."""
+    # Each rule counts only rows that no earlier rule removed, so removed and kept rows add up to the table.
+    keep = select_rows(table, options.selection.trials, "trials", ledger)
+    keep = ledger.apply(keep, labels != "", "trials", f"no value of {','.join(options.conditions.columns)}")
+    if options.vocabulary is not None:
+        keep = ledger.apply(keep, np.isin(labels, options.vocabulary), "trials", "label outside the vocabulary")
+    edges = options.window.edges(session, table, ledger.notes)
+    keep = ledger.apply(keep, np.isfinite(edges).all(axis=1), "trials", f"no event for the window {options.window}")
+    keep = ledger.apply(keep, ~(edges[:, 1] <= edges[:, 0]), "trials", "window of no length")
+    parts = [edges]
+    if (baseline := options.window.baseline) is not None:
+        parts.append(baseline.edges(session, table, ledger.notes))
+        keep = ledger.apply(keep, parts[1][:, 1] > parts[1][:, 0], "trials", f"no event for the baseline {baseline}")
+    invalid = session.tables.get("invalid_times")
+    if invalid is not None:
+        begin, end = invalid.times("start_time"), invalid.times("stop_time")
+        overlap = np.any([((part[:, :1] < end) & (part[:, 1:] > begin)).any(axis=1) for part in parts], axis=0)
+        keep = ledger.apply(keep, ~overlap, "trials", "overlap with invalid_times")
+    return keep, parts
 
 
 @dataclass(frozen=True)
@@ -247,15 +269,17 @@ class SpikeTrains:
             low, high = span
             # One span for all units: a unit that fires rarely would get too short a span from its own spikes.
             covered[:] = ((edges[:, 0] >= low) & (edges[:, 1] <= high))[:, None]
-            taken = f"recorded span taken from first to last spike, {low:.3f}–{high:.3f} s"
-            ledger.notes.append(f"{self.units.label}: no obs_intervals; {taken}")
+            note = f"{self.units.label}: no obs_intervals; recorded span taken from first to last spike"
+            ledger.note(f"{note}, {low:.3f}–{high:.3f} s")
         return covered
 
     def key(self, unit: int) -> tuple[Any, ...]:
         """Equal ids (several probes) are told apart by number of spikes and first spike."""
         return len(self.spikes[unit]), self.spikes[unit][:1].tolist()
 
-    def respond(self, units: NDArray[np.int64], bounds: NDArray[np.float64]) -> NDArray[np.float32]:
+    def respond(
+        self, rows: NDArray[np.int64], units: NDArray[np.int64], bounds: NDArray[np.float64]
+    ) -> NDArray[np.float32]:
         """Count the spikes of units in bins [begin, end) between bounds [R, T + 1] (s): [R, T, units]."""
         counts = np.empty((len(units), len(bounds), bounds.shape[1] - 1), dtype=np.float32)
         for index, unit in enumerate(units):
@@ -297,15 +321,16 @@ def _enter_tables(ledger: Ledger, session: Session, conditions: str) -> None:
             ledger.leave("tables", table.fault or "not asked for", lost=bool(table.fault))
 
 
-def has_units(session: Session) -> bool:
-    """Return whether a session has at least one unit with spike times."""
-    return session.units is not None and SPIKES in session.units and len(session.units) > 0
-
-
 def no_units(session: Session) -> str:
     """Return one sentence: why a session without units cannot be used, and what it holds instead."""
     series = ", ".join(f"{number} {kind}" for kind, number in session.intracellular.items())
     total = sum(session.intracellular.values())
+    voltages = [place for place, item in session.populations.items() if getattr(item, "kind", "") == VOLTAGES]
+    if voltages:
+        return (
+            f"{session.source} has no spike times; its voltages ({listing(voltages, limit=3)}) are read as power in a "
+            f"band (Hz) that the window names, such as 'start..stop of {voltages[0]}@70..150'."
+        )
     if total:
         return (
             f"{session.source} has no units table: it holds {total} intracellular series ({series}), which are "

@@ -1,37 +1,72 @@
-"""Responses that are sampled, such as ΔF/F of imaged cells: the mean of each cell over a window."""
+"""Responses that are sampled: ΔF/F of imaged cells, power of voltages in a band, or samples by trial.
+
+The response of a trial is the mean of each cell or channel over the window.
+"""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.errors import DataError, listing
+from brainbench.core.errors import DataError, UsageError, listing, unknown_name
 from brainbench.datasets.ledger import Ledger
 from brainbench.datasets.sessions import Series, Session, SessionTable
 from brainbench.datasets.trials.selection import Selection
+from brainbench.datasets.trials.windows import WHOLE, Window
 
 Floats = NDArray[np.float64]
+VOLTAGES = "ElectricalSeries"
+"""Type of signals that are read as power in a band."""
+ORDER = 4
+"""Order of the Butterworth filter of a band, which runs forwards and backwards."""
+SETTLING = 4.0
+"""Cycles of the lower edge, and inverse widths of the band, that are filtered on either side of what is read."""
 
 
-def response_series(session: Session) -> Series | None:
-    """Return the signal that stands for responses where a session has no spikes: its only one, or its only ΔF/F."""
+def response_series(session: Session, window: Window | None = None) -> Series | None:
+    """Return the signal that is read of a session: the one that the window names, else, without spikes, the only one.
+
+    Of several signals of imaged cells the only ΔF/F is taken, of voltages the only LFP.
+    """
     every = {place: item for place, item in session.populations.items() if isinstance(item, Series)}
-    preferred = [place for place in every if "DfOverF" in place] if len(every) > 1 else [*every]
-    if len(preferred) > 1 or (every and not preferred):
-        raise DataError(
-            f"{session.source} has several signals of cells ({listing(every)}) and no spikes; keep one of them, or one "
-            "in a DfOverF, and remove the others from a copy."
-        )
-    return every[preferred[0]] if preferred else None
+    place_named, banded = (window.signal, window.band is not None) if window is not None else ("", False)
+    if not (named or banded) and session.has_spikes:
+        return None
+    series = {place: item for place, item in every.items() if (item.kind == VOLTAGES) == banded}
+    if named:
+        matching = [place for place in every if f"/{named}/".lower() in f"/{place}/".lower()]
+        if not matching:
+            raise unknown_name("signal", named, _names(every), hint=f"(in {session.source})")
+        series = {place: item for place, item in series.items() if place in matching}
+        if not series:
+            advice = "is no voltage: leave the band out" if banded else f"needs a band in Hz, such as {named}@70..150"
+            raise UsageError(f"{matching[0]} of {session.source} {advice}.")
+    if banded and not series:
+        raise DataError(f"{session.source} has no {VOLTAGES}, of which a band is read; its signals: {listing(every)}.")
+    if len(series) > 1:
+        preferred = [place for place in series if ("LFP" if banded else "DfOverF") in place]
+        if len(preferred) != 1:
+            raise DataError(
+                f"{session.source} has several signals ({listing(series)}); name the one to read in the window, such "
+                f"as 'start..stop of {next(iter(series))}'."
+            )
+        return series[preferred[0]]
+    return next(iter(series.values()), None)
+
+
+def _names(places: Iterable[str]) -> list[str]:
+    """Return the names by which signals can be called: their own, and that of the container around each."""
+    return sorted({name for place in places for name in place.split("/")[-2:]})
 
 
 def frame_times(series: Series) -> Floats:
-    """Return the times (s) of the frames of a signal, checked."""
-    number = series.data.shape[0]
+    """Return the times (s) of the frames of a signal, checked; those of samples by trial count from its start."""
+    number = series.data.shape[1 if series.table else 0]
     if series.timestamps is None:
         if not series.rate > 0:
             raise DataError(f"The series {series.name} has neither timestamps nor a rate; its frames have no time.")
@@ -52,19 +87,54 @@ class Samples:
     series: Series
     times: Floats
     """[F] times of the frames, s."""
-    source: str
-    measure: str
+    name: str
+    """Series and file, for messages."""
+    starts: Floats | None = None
+    """[rows] s from which the times of samples by trial count."""
+    band: tuple[float, float] | None = None
+    """Band of voltages, Hz."""
 
     @classmethod
-    def of(cls, session: Session, series: Series) -> Samples:
-        """Take a signal of a session."""
-        number = 1 if series.data.ndim == 1 else series.data.shape[1]
-        cells = SessionTable("cells", {"id": np.arange(number), **series.columns}, session.source)
-        return cls(cells, series, frame_times(series), session.source, f"{series.name} ({series.kind})")
+    def of(cls, session: Session, series: Series, table: SessionTable, window: Window, bin: float | None) -> Samples:
+        """Take a signal of a session whose trials stand in a table."""
+        name, shape = f"{series.name} of {session.source}", tuple(series.data.shape)
+        cells = SessionTable("cells", {"id": np.arange(shape[-1] if len(shape) > 1 else 1), **series.columns}, name)
+        if len(cells) != (shape[-1] if len(shape) > 1 else 1):
+            raise DataError(f"{name} has the shape {shape}, and {len(cells)} units are named.")
+        if not series.table:
+            return cls(cells, series, frame_times(series), name, band=window.band)._checked()
+        if series.table != table.name or len(shape) != 3 or shape[0] != len(table):
+            raise DataError(
+                f"{name} has the shape {shape}, and trials are the {len(table)} rows of {table.name!r}; it must be "
+                f"[trial, time, unit], with the rows of {series.table!r}."
+            )
+        if series.timestamps is None and (shape[1] > 1 or bin is not None or window != WHOLE):
+            raise UsageError(
+                f"{name} says no time of its {shape[1]} samples of a trial, which have no windows or bins then: "
+                "'time' (s from the start of the trial) is missing beside it, or one sample is read without a window."
+            )
+        times = np.zeros(1) if series.timestamps is None else frame_times(series)
+        return cls(cells, series, times, name, table.times("start_time"))
+
+    def _checked(self) -> Samples:
+        if self.band is not None and not 2 * self.band[1] * self.step < 1:
+            raise DataError(
+                f"{self.name} has {1 / self.step:.6g} samples/s, and a band of voltages ends below half of that; "
+                f"received {self.band[0]:g}..{self.band[1]:g} Hz."
+            )
+        return self
+
+    @property
+    def measure(self) -> str:
+        """What the responses are."""
+        if self.series.unit == "spikes":
+            return "spikes"
+        band = "" if self.band is None else f"power at {self.band[0]:g}..{self.band[1]:g} Hz of "
+        return f"{band}{self.series.name} ({self.series.unit or self.series.kind})"
 
     @property
     def step(self) -> float:
-        """Time from a frame to the next, s."""
+        """Time from a frame to the next, s; NaN of a single one."""
         return float(np.median(np.diff(self.times))) if len(self.times) > 1 else math.nan
 
     def rule_out(self, keep: NDArray[np.bool_], selection: Selection, ledger: Ledger) -> NDArray[np.bool_]:
@@ -74,42 +144,77 @@ class Samples:
         return keep
 
     def covered(self, edges: Floats, ledger: Ledger) -> NDArray[np.bool_]:
-        """Return which windows lie between the first and the last frame."""
-        inside = (edges[:, 0] >= self.times[0] - self.step) & (edges[:, 1] <= self.times[-1] + self.step)
-        return np.repeat(inside[:, None], len(self.units), axis=1)
+        """Return which windows [rows, 2] (s) lie between the first and the last frame: [rows, U]."""
+        begin, end = (edges if self.starts is None else edges - self.starts[:, None]).T
+        inside = (begin >= self.times[0] - self.step) & (end <= self.times[-1] + self.step)
+        return np.repeat((inside | math.isnan(self.step))[:, None], len(self.units), axis=1)
 
     def key(self, unit: int) -> tuple[Any, ...]:
-        """Ids are unique."""
-        return ()
+        """Cells of one id stand as in the file."""
+        return (unit,)
 
-    def respond(self, units: NDArray[np.int64], bounds: Floats) -> NDArray[np.float32]:
-        """Return mean × length of the frames in bins [begin, end); NaN frames are left out.
+    def respond(self, rows: NDArray[np.int64], units: NDArray[np.int64], bounds: Floats) -> NDArray[np.float32]:
+        """Return mean × length of the frames in bins [begin, end) of trials; NaN frames are left out.
 
-        A bin without any other frame is NaN. Raises DataError where a bin is shorter than a frame.
+        A bin without any other frame is NaN. Raises DataError where a bin is shorter than a frame, or a cycle.
         """
         duration = np.diff(bounds, axis=1)
         shortest = float(duration[duration > 1e-9].min(initial=math.inf))
-        if shortest < self.step:
+        least, what = (self.step, "frame") if self.band is None else (1 / self.band[0], f"cycle of {self.band[0]:g} Hz")
+        if shortest < (1 - 1e-6) * least:
             raise DataError(
-                f"{self.series.name} of {self.source} has a frame every {self.step:.3g} s, and windows or bins are as "
-                f"short as {shortest:.3g} s; take longer ones."
+                f"{self.name} has a {what} every {least:.3g} s, and windows or bins are as short as {shortest:.3g} s; "
+                "take longer ones."
             )
-        values = np.asarray(self.series.data[...], dtype=np.float32)
-        values = (values[:, None] if values.ndim == 1 else values)[:, units]
-        place = np.searchsorted(self.times, bounds, side="left")
         means = np.full((*duration.shape, len(units)), np.nan, dtype=np.float32)
-        for row, column in np.ndindex(duration.shape):
-            frames = values[place[row, column] : place[row, column + 1]]
-            finite = np.isfinite(frames)
-            total = np.where(finite, frames, 0.0).sum(axis=0, dtype=np.float64)
-            number = finite.sum(axis=0)
-            means[row, column] = np.divide(total, number, out=np.full(len(number), np.nan), where=number > 0)
+        for index, row in enumerate(rows):
+            begin = 0.0 if self.starts is None else self.starts[row]
+            times, values = self._read(int(row), units, *(bounds[index, [0, -1]] - begin))
+            place = np.searchsorted(times, bounds[index] - begin, side="left")
+            if math.isnan(self.step):
+                place = np.array([0, 1])
+            for column in range(duration.shape[1]):
+                frames = values[place[column] : place[column + 1]]
+                finite = np.isfinite(frames)
+                total, number = np.where(finite, frames, 0.0).sum(axis=0, dtype=np.float64), finite.sum(axis=0)
+                mean = np.divide(total, number, out=np.full(len(number), np.nan), where=number > 0)
+                # Counts add up over frames; all else is averaged.
+                sums = self.series.unit == "spikes" and duration[index, column] > 1e-9
+                means[index, column] = mean * len(frames) / duration[index, column] if sums else mean
         return (means * duration[:, :, None]).astype(np.float32)
+
+    def _read(self, row: int, units: NDArray[np.int64], begin: float, end: float) -> tuple[Floats, NDArray[Any]]:
+        """Return the frames of a window: times [F] (s) and values [F, units], or their power in the band."""
+        if self.starts is not None:
+            values = np.asarray(self.series.data[row], dtype=np.float32)[:, units]
+            return self.times, values
+        settling = 0.0 if self.band is None else SETTLING / min(self.band[0], self.band[1] - self.band[0])
+        first, last = np.searchsorted(self.times, [begin - settling, end + settling], side="left")
+        values = np.asarray(self.series.data[first:last], dtype=np.float32)
+        values = (values[:, None] if values.ndim == 1 else values)[:, units]
+        if self.band is None:
+            return self.times[first:last], values
+        microvolts = 1e6 * np.broadcast_to(np.asarray(self.series.conversion, np.float64), len(self.units))[units]
+        return self.times[first:last], self._power(self.times[first:last], values * microvolts)
+
+    def _power(self, times: Floats, values: NDArray[Any]) -> NDArray[Any]:
+        """Return the power (µV²) of voltages [F, U] in the band; NaN for channels and times that have gaps."""
+        from scipy.signal import butter, sosfiltfilt
+
+        sections = np.asarray(butter(ORDER, self.band, "bandpass", fs=1 / self.step, output="sos"))
+        gaps = np.diff(times, prepend=times[:1]) > 1.5 * self.step
+        if gaps.any() or len(values) <= 3 * (2 * len(sections) + 1):
+            return np.full(values.shape, np.nan)
+        # A filter spreads what is missing over all that follows.
+        missing = ~np.isfinite(values).all(axis=0)
+        power = sosfiltfilt(sections, np.where(missing, 0.0, values), axis=0) ** 2
+        power[:, missing] = np.nan
+        return power
 
     def enter(self, units: NDArray[np.int64], bounds: Floats, counts: NDArray[np.float32], to: Ledger) -> None:
         """Doubt responses that fade over the session."""
-        if doubt := fading(counts / np.diff(bounds, axis=1)[:, :, None]):
-            to.doubts.append(f"{self.series.name} of {self.source}: {doubt}")
+        if self.band is None and (doubt := fading(counts / np.diff(bounds, axis=1)[:, :, None])):
+            to.doubts.append(f"{self.name}: {doubt}")
 
 
 def fading(means: NDArray[np.floating[Any]]) -> str:

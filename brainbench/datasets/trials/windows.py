@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +22,7 @@ _EDGE = re.compile(r"(?P<name>.*?)(?P<offset>[+-](\d+\.?\d*|\.\d+)(e[+-]?\d+)?)?
 _NO_NAME = re.compile(r"[+−–]|\.\.|^-|-(inf|infinity|nan)$", re.IGNORECASE)
 """Signs of a number that was not read: no event has them in its name."""
 
+_BAND = re.compile(r"(?P<low>\d*\.?\d+)\.\.(?P<high>\d*\.?\d+)")
 _UNITS = {"s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6}
 _WITH_UNIT = re.compile(r"(?P<number>[+-]\d*\.?\d+) ?(?P<unit>s|sec|ms|us|µs)$", re.IGNORECASE)
 
@@ -48,6 +49,12 @@ class Window:
     and do not. A negative value counts them too."""
     fallback: Window | None = None
     """Used for all trials of a session that has no contact tables at all, and said in the notes."""
+    baseline: Window | None = None
+    """Its mean is taken from that of the window: rates of spikes, or a signal."""
+    signal: str = ""
+    """Place of the signal that is read, such as ``DfOverF``; by default spikes, else the only signal."""
+    band: tuple[float, float] | None = None
+    """Power of the signal in this band (Hz), for voltages."""
 
     def __post_init__(self) -> None:
         if self.stop is None and self.length is None:
@@ -60,16 +67,41 @@ class Window:
             raise UsageError(f"shortest_contact and fallback are of a window from {FIRST_CONTACT!r}; leave them out.")
         if self.stop == FIRST_CONTACT:
             raise UsageError("A window cannot end at the first contact, which is sought before its end.")
+        if self.baseline is not None and (self.baseline.baseline or self.baseline.signal or self.baseline.band):
+            raise UsageError("A baseline is a plain window, with neither a baseline nor a signal of its own.")
+        if self.band is not None and not 0 < self.band[0] < self.band[1] < np.inf:
+            raise UsageError(f"A band is two frequencies above 0 Hz, the lower first; received {brief(self.band)}.")
 
     @classmethod
     def parse(cls, source: str) -> Window:
         """Read a window from text ``FROM[±s]..TO[±s]``, ``FROM[±s]..+LENGTH`` or ``FROM[±s]..TO[±s] or +LENGTH``.
 
+        `` minus WINDOW`` behind it names a baseline, and `` of SIGNAL``, `` of SIGNAL@LOW..HIGH`` or `` of @LOW..HIGH``
+        (Hz) what is read.
+
         >>> str(Window.parse("first-contact..choice"))
         'first-contact..choice'
         >>> Window.parse("start+0.2..+0.5").length
         0.5
+        >>> Window.parse("start..+0.5 minus start-0.5..start of LFP@70..150").band
+        (70.0, 150.0)
         """
+        source, of, signal = source.partition(" of ")
+        source, minus, baseline = source.partition(" minus ")
+        if minus or of:
+            place, at, frequencies = (part.strip() for part in signal.partition("@"))
+            band = _BAND.fullmatch(frequencies)
+            if (of and not place and not band) or (at and not band):
+                raise UsageError(
+                    f"The signal {brief(signal)} of a window cannot be read; write its place in the file and, of "
+                    "voltages, a band in Hz, such as 'DfOverF', 'LFP@70..150' or '@70..150'."
+                )
+            return replace(
+                cls.parse(source),
+                baseline=cls.parse(baseline) if minus else None,
+                signal=place,
+                band=(float(band["low"]), float(band["high"])) if band else None,
+            )
         first, dots, last = (part.strip() for part in source.partition(".."))
         last, _, most = (part.strip() for part in last.partition(" or "))
         if with_unit := _WITH_UNIT.search(first) or _WITH_UNIT.search(last):
@@ -98,7 +130,10 @@ class Window:
     def __str__(self) -> str:
         ends = [f"{self.stop}{_signed(self.stop_offset)}"] if self.stop else []
         ends += [_signed(self.length)] if self.length is not None else []
-        return f"{self.anchor}{_signed(self.offset)}..{' or '.join(ends)}"
+        more = f" minus {self.baseline}" if self.baseline else ""
+        band = f"@{self.band[0]:g}..{self.band[1]:g}" if self.band else ""
+        more += f" of {self.signal}{band}" if self.signal or band else ""
+        return f"{self.anchor}{_signed(self.offset)}..{' or '.join(ends)}{more}"
 
     def edges(self, session: Session, table: SessionTable, notes: list[str]) -> NDArray[np.float64]:
         """Return begin and end of the window of every row [rows, 2] (s); NaN where an event is missing."""

@@ -62,7 +62,7 @@ def count(spikes, edges, covered, bin):
     """Counts [R, T, U] and durations [R, T] of units in windows."""
     bounds = bin_bounds(edges, bin, units=len(spikes))
     trains = SpikeTrains(SessionTable("units", {}), spikes)
-    return mask_missing(trains.respond(np.arange(len(spikes)), bounds), bounds, covered)
+    return mask_missing(trains.respond(np.arange(len(edges)), np.arange(len(spikes)), bounds), bounds, covered)
 
 
 TIMES = st.lists(st.floats(0, 10, width=32), max_size=40).map(sorted).map(np.array)

@@ -2,10 +2,12 @@ import h5py
 import numpy as np
 import pytest
 
-from brainbench.core.errors import DataError
-from brainbench.datasets import open_recordings, write_recordings
+from brainbench.core.errors import DataError, UsageError
+from brainbench.datasets import check, inspect, open_recordings, write_recordings
+from brainbench.datasets.sessions import make_session
 from brainbench.datasets.trials.signals import fading
 from tests.factories.recording_files import write_nwb
+from tests.factories.recordings import make_simple_session
 
 SERIES = "processing/ophys/DfOverF/dff"
 
@@ -110,3 +112,171 @@ def test_responses_that_fade_over_the_session_are_doubted():
     assert fading(steady[:8]) == ""
     steady[3] = np.nan
     assert "falls over the session" in fading(steady - 0.05 * np.arange(40, dtype=np.float32)[:, None, None])
+
+
+def test_the_mean_of_a_baseline_is_taken_away_from_signals_and_rates(tmp_path):
+    data = np.random.default_rng(0).normal(size=(70, 3))
+    opened, values = means(imaged(tmp_path / "a.nwb", data), window="start+0.5..+0.4 minus start..+0.5")
+    expected = [data[10 * n + 5 : 10 * n + 9].mean(axis=0) - data[10 * n : 10 * n + 5].mean(axis=0) for n in range(6)]
+    np.testing.assert_allclose(values[:, 0], expected, rtol=1e-4, atol=1e-6)
+    assert opened.attrs["window"] == "start+0.5..+0.4 minus start..+0.5"
+    path = write_recordings(tmp_path / "b.h5", make_simple_session())
+    window, before = (
+        open_recordings(path, conditions="trials:stimulus", window=text) for text in ("start..+0.5", "start-0.5..start")
+    )
+    both = open_recordings(path, conditions="trials:stimulus", window="start..+0.5 minus start-0.5..start")
+    rows = np.isin(window["trial_id"].values, both["trial_id"].values)
+    rates = (both["counts"] / both["duration"]).values
+    np.testing.assert_allclose(rates, 2 * (window["counts"].values[rows] - before["counts"].values), rtol=1e-5)
+    assert rates.min() < 0
+    assert "spikes minus their mean in start-0.5..start" in both.attrs["measure"]
+    again = open_recordings(write_recordings(tmp_path / "c.h5", both))
+    np.testing.assert_array_equal(again["counts"], both["counts"])
+
+
+def test_trials_without_their_baseline_are_left_out(tmp_path):
+    path = imaged(tmp_path / "a.nwb", np.random.default_rng(0).normal(size=(70, 3)))
+    opened, _ = means(path, window="start..stop minus start-0.5..start")
+    assert opened.attrs["removed"]["trials: outside the recorded span"] == 1
+    with pytest.raises(DataError, match=r"no event for the baseline start\.\.start removed 6"):
+        means(path, window="start..stop minus start..start")
+
+
+def voltages(path, data, *, rate=1000.0, place="processing/ecephys/LFP/lfp", **attributes):
+    """A signal of voltages over six trials of half a second."""
+    imaged(path, data, rate=rate, place=place)
+    with h5py.File(path, "a") as file:
+        file[place].attrs["neurodata_type"] = "ElectricalSeries"
+        file[f"{place}/data"].attrs.update({"conversion": 1e-6, **attributes})
+    return path
+
+
+def tones(amplitudes, hertz, *, seconds=7.0, rate=1000.0):
+    """Voltages (µV) of channels with a tone each, beside a slow one that is larger."""
+    time = np.arange(int(seconds * rate)) / rate
+    slow = 50 * np.sin(2 * np.pi * 5 * time)[:, None]
+    return (np.array(amplitudes) * np.sin(2 * np.pi * hertz * time)[:, None] + slow).astype(np.float32)
+
+
+def test_voltages_are_read_as_power_in_a_band(tmp_path):
+    path = voltages(tmp_path / "a.nwb", tones([1.0, 2.0, 4.0], 100.0))
+    opened, values = means(path, window="start..stop of LFP@70..150")
+    # A sine of amplitude A has the power A² / 2.
+    np.testing.assert_allclose(values[:, 0], np.tile([0.5, 2.0, 8.0], (6, 1)), rtol=0.02)
+    assert opened.attrs["measure"] == "power at 70..150 Hz of processing/ecephys/LFP/lfp (ElectricalSeries)"
+    assert opened.attrs["window"] == "start..stop of LFP@70..150"
+    _, slow = means(path, window="start..stop of @2..10")
+    np.testing.assert_allclose(slow[2:5], 1250.0, rtol=0.05)
+
+
+def test_power_of_a_window_is_that_of_the_whole_recording(tmp_path):
+    from scipy.signal import butter, sosfiltfilt
+
+    data = np.random.default_rng(0).normal(size=(7000, 2)).astype(np.float32)
+    _, values = means(voltages(tmp_path / "a.nwb", data), window="start..stop of @70..150")
+    whole = sosfiltfilt(butter(4, (70, 150), "bandpass", fs=1000, output="sos"), data, axis=0) ** 2
+    expected = [whole[1000 * trial : 1000 * trial + 500].mean(axis=0) for trial in range(6)]
+    np.testing.assert_allclose(values[1:, 0], expected[1:], rtol=1e-3)
+
+
+def test_channels_have_the_area_of_their_electrode_and_gaps_are_missing(tmp_path):
+    data = tones([1.0, 2.0], 100.0)
+    data[2100:2110, 1] = np.nan
+    path = voltages(tmp_path / "a.nwb", data)
+    with h5py.File(path, "a") as file:
+        table = file.create_group("general/extracellular_ephys/electrodes")
+        table["id"], table["location"] = np.arange(3), np.array([b"S1", b"S1", b"S2"])
+        rows = file["processing/ecephys/LFP/lfp"].create_dataset("electrodes", data=np.array([2, 0]))
+        rows.attrs["table"] = table.ref
+    opened, values = means(path, window="start..stop of @70..150")
+    assert opened["area"].values.tolist() == ["S2", "S1"]
+    assert np.isnan(values[:, 0, 1]).tolist() == [False, False, True, False, False, False]
+
+
+@pytest.mark.parametrize(
+    ("window", "words"),
+    [
+        ("start..stop of @300..600", r"1000 samples/s.* ends below half of that; received 300\.\.600 Hz"),
+        ("start..+0.1 of @4..8", r"a cycle of 4 Hz every 0\.25 s, and windows or bins are as short as 0\.1 s"),
+        ("start..stop of LPF@70..150", "did you mean"),
+        ("start..stop of LFP", "needs a band in Hz, such as LFP@70..150"),
+        ("start..stop of @", "'DfOverF', 'LFP@70..150'"),
+        ("start..stop of ", "cannot be read"),
+        ("start..stop of @150..70", "the lower first"),
+        ("start..stop minus start..+1 minus start..+1", "a plain window"),
+        (None, "read as power in a band"),
+    ],
+)
+def test_bands_that_cannot_be_read_are_refused(tmp_path, window, words):
+    path = voltages(tmp_path / "a.nwb", tones([1.0, 2.0], 100.0))
+    with pytest.raises((DataError, UsageError), match=words):
+        means(path, window=window)
+
+
+def test_voltages_without_a_time_base_are_refused(tmp_path):
+    path = voltages(tmp_path / "a.nwb", tones([1.0], 100.0), rate=None)
+    with pytest.raises(DataError, match="neither timestamps nor a rate"):
+        means(path, window="start..stop of @70..150")
+
+
+def sampled(path, response, *, time=None, unit="dF/F", **columns):
+    """Responses [trial, time, unit] to six trials of a second every two seconds."""
+    start = 2.0 * np.arange(len(response))
+    labels = np.resize(["a", "b", "c"], len(response))
+    table = {"start_time": start, "stop_time": start + 1.0, "texture": labels}
+    session = make_session(
+        path.stem, "1", None, {"trials": table}, response=response, time=time, unit=unit, unit_columns=columns
+    )
+    return write_recordings(path, session)
+
+
+def test_responses_by_trial_are_averaged_over_windows(tmp_path):
+    response = np.random.default_rng(0).normal(size=(6, 20, 3))
+    time = -0.5 + np.arange(20) / 10
+    path = sampled(tmp_path / "m1.h5", response, time=time, layer=["4", "5", "5"])
+    opened, values = means(path, window="start..+0.5 minus start-0.5..start", select="units.layer=5")
+    expected = response[:, 5:10, 1:].mean(axis=1) - response[:, :5, 1:].mean(axis=1)
+    np.testing.assert_allclose(values[:, 0], expected, rtol=1e-4, atol=1e-6)
+    assert opened.attrs["measure"].startswith("response (dF/F)")
+    sampled(tmp_path / "m2.h5", response, time=time)
+    assert set(means(tmp_path)[0]["subject"].values.tolist()) == {"m1", "m2"}
+
+
+def test_counts_by_trial_add_up_and_one_sample_needs_no_time(tmp_path):
+    counts = np.random.default_rng(0).poisson(2.0, size=(6, 10, 3))
+    path = sampled(tmp_path / "a.h5", counts, time=np.arange(10) / 10, unit="spikes")
+    opened, _ = means(path)
+    np.testing.assert_allclose(opened["counts"].values[:, 0], counts.sum(axis=1), rtol=1e-6)
+    assert opened.attrs["measure"] == "spikes"
+    whole = sampled(tmp_path / "b.h5", counts[:, :1], unit="spikes")
+    np.testing.assert_allclose(means(whole)[0]["counts"].values, counts[:, :1], rtol=1e-6)
+    with pytest.raises(UsageError, match="says no time of its 1 samples"):
+        means(whole, window="start..+0.5")
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda session: session["response"].attrs.pop("unit"), "no attribute 'unit'"),
+        (lambda session: session.pop("time"), "says no time of its 20 samples"),
+        (lambda session: session["response"].attrs.update(table="licks"), r"with the rows of 'licks'"),
+        (lambda session: session["units"].pop("id"), None),
+    ],
+)
+def test_responses_that_are_incomplete_are_refused(tmp_path, change, words):
+    path = sampled(tmp_path / "m1.h5", np.ones((6, 20, 3)), time=np.arange(20) / 10)
+    with h5py.File(path, "a") as file:
+        change(file["sessions/m1-1"])
+    if words is None:
+        assert means(path)[0].sizes["unit"] == 3
+        return
+    with pytest.raises((DataError, UsageError), match=words):
+        means(path)
+
+
+def test_signals_are_inspected_and_checked_without_an_error(tmp_path):
+    path = imaged(tmp_path / "a.nwb", np.ones((70, 3)))
+    imaged(path, np.ones((70, 3)), place="processing/ophys/DfOverF/second")
+    assert "several signals" in str(inspect(path))
+    assert check(path).count("error") == 0
+    assert "holds signals and no spikes" in str(check(path))
