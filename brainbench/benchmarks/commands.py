@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from brainbench.benchmarks.definition import OPTIONS
+from brainbench.benchmarks.files import OPTIONS
 from brainbench.cli.destinations import out_file_option
 from brainbench.cli.options import SCORE, SCORE_FLAGS, with_options
 from brainbench.cli.output import Output, facts, progress_bar, table_of

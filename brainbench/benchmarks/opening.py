@@ -9,8 +9,7 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
-from brainbench.benchmarks.definition import OPTIONS, Benchmark, Ceilings, Recordings
-from brainbench.benchmarks.files import files_named_in, open_benchmark
+from brainbench.benchmarks.files import OPTIONS, Benchmark, Ceilings, Recordings, files_named_in, open_benchmark
 from brainbench.core.contracts import read_match
 from brainbench.core.errors import DataError, UsageError, brief, listing, unknown_name
 from brainbench.core.files import file_hash, to_plain
@@ -152,7 +151,7 @@ def make(
 ) -> Benchmark:
     """Return the benchmark of a score's options, for a file at ``out`` beside or above the files that it needs.
 
-    ``origin`` are entries of :class:`~brainbench.benchmarks.definition.Recordings`.
+    ``origin`` are entries of :class:`~brainbench.benchmarks.files.Recordings`.
     """
     folder, source = out.absolute().parent, str(options.recordings)
     defaults = ScoreOptions()

@@ -10,13 +10,11 @@ files, ``exports`` copies them, ``synthetic`` makes them, ``whisking`` reads swe
 
 from brainbench.datasets.checks.checkup import check
 from brainbench.datasets.exports import export
-from brainbench.datasets.fetching import fetch
 from brainbench.datasets.hdf5 import write_recordings
 from brainbench.datasets.inspection import inspect
-from brainbench.datasets.layouts.registry import RecordingLayout, register_layout
+from brainbench.datasets.layouts.registry import RecordingLayout, fetch, register_layout
 from brainbench.datasets.recordings import open_recordings
-from brainbench.datasets.trials.conditions import Conditions
-from brainbench.datasets.trials.selection import Rule, Selection
+from brainbench.datasets.trials.selection import Conditions, Rule, Selection
 from brainbench.datasets.trials.windows import Window
 from brainbench.datasets.whisking.dataset import WhiskingDataset
 

@@ -24,9 +24,8 @@ from brainbench.datasets.layouts.registry import RecordingLayout, counted_layout
 from brainbench.datasets.ledger import Ledger, balance_line
 from brainbench.datasets.reading import each_session, find_recordings, open_file, suitable_files
 from brainbench.datasets.sessions import SPIKES, Session, SessionTable
-from brainbench.datasets.trials.conditions import natural_vocabulary
 from brainbench.datasets.trials.counting import no_units, read_spikes, recorded_span, time_fault
-from brainbench.datasets.trials.selection import select_rows
+from brainbench.datasets.trials.selection import natural_vocabulary, select_rows
 from brainbench.datasets.trials.signals import response_series
 
 if TYPE_CHECKING:

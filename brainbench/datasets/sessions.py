@@ -361,13 +361,11 @@ def make_session(
             raise DataError(f"Recorded spans of {units.label} must be [begin, end] in seconds, the earlier time first.")
     for table in named_tables.values():
         table.require("start_time")
-    stated = {"source": session, "start": start, "synthetic": synthetic, "stimuli": stimuli}
-    if response is not None:
-        samples = Series("response", "samples", np.asarray(response), time, unit=unit, table="trials", columns=data)
-        return Session(
-            subject, session, None, named_tables, format="arrays", populations={samples.name: samples}, **stated
-        )
-    return Session(subject, session, units, named_tables, format="arrays", **stated)
+    stated: dict[str, Any] = {"source": session, "start": start, "synthetic": synthetic, "stimuli": stimuli}
+    samples = {} if response is None else {"response": Series("response", "samples", response, time)}
+    samples = {name: replace(item, unit=unit, table="trials", columns=data) for name, item in samples.items()}
+    stated |= {"units": units if response is None else None, "populations": samples}
+    return Session(subject, session, tables=named_tables, format="arrays", **stated)
 
 
 def ragged(name: str, rows: Sequence[NDArray[Any]]) -> dict[str, NDArray[Any]]:

@@ -58,8 +58,8 @@ class ScoreOptions:
     select: str | Selection | None = None
     """Trials and units to use, e.g. 'outcome=correct; units.layer=4', or a name."""
     window: str | Window | None = None
-    """Part of a trial to read, e.g. 'first-contact..choice', 'start..+1 minus start-0.5..start' (baseline) or 'start..+1
-    of LFP@70..150' (signal, band in Hz)."""
+    """Part of a trial to read, e.g. 'first-contact..choice', 'start..+1 minus start-0.5..start' (a baseline) or
+    'start..+1 of LFP@70..150' (a signal, and its band in Hz)."""
     strict: bool = False
     """Refuse a folder with files that hold no recordings, instead of skipping them and saying so."""
     whiskers: str = "all"

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from brainbench.benchmarks.definition import Benchmark
+from brainbench.benchmarks.files import Benchmark
 from brainbench.benchmarks.opening import make
 from brainbench.core.files import write_text
 from brainbench.scoring.options import ScoreOptions

@@ -11,10 +11,9 @@ from brainbench.datasets.ledger import Ledger
 from brainbench.datasets.sessions import Session, make_session
 from brainbench.datasets.synthetic import PopulationDesign
 from brainbench.datasets.synthetic.populations import draw_sessions
-from brainbench.datasets.synthetic.sessions import spike_session, trial_times
-from brainbench.datasets.trials.conditions import Conditions
+from brainbench.datasets.synthetic.truth import spike_session, trial_times
 from brainbench.datasets.trials.counting import UNIT_COLUMNS, ReadingOptions, SessionCounts, missing_column
-from brainbench.datasets.trials.selection import EVERYTHING
+from brainbench.datasets.trials.selection import EVERYTHING, Conditions
 from brainbench.datasets.trials.session_trials import join_sessions
 from brainbench.datasets.trials.windows import Window
 

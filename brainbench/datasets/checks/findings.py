@@ -23,8 +23,8 @@ from brainbench.core.statistics import presentation_order
 from brainbench.datasets.inspection import propose
 from brainbench.datasets.layouts.registry import RecordingLayout
 from brainbench.datasets.sessions import Session, SessionTable
-from brainbench.datasets.trials.conditions import Conditions, joined_labels, label_doubts
 from brainbench.datasets.trials.counting import inside_observed_spans, recorded_span
+from brainbench.datasets.trials.selection import Conditions, joined_labels, label_doubts
 from brainbench.datasets.trials.windows import CONTACTS, FIRST_CONTACT, WHOLE, Window
 
 Severity = Literal["error", "warning", "note"]

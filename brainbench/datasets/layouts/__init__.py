@@ -3,16 +3,16 @@
 A session is matched by the columns of its trials (``registry``) and then adapted by its layout, before it is counted.
 """
 
-from brainbench.datasets.layouts import area2_bump, pole, registry, rodgers
+from brainbench.datasets.layouts import adapted, registry, rodgers
 from brainbench.datasets.layouts.registry import register_layout
 
 for _layout in (
     rodgers.LAYOUT,
     rodgers.DISCRIMINATION,
     rodgers.DETECTION,
-    pole.YU,
-    pole.HIRES,
-    area2_bump.LAYOUT,
+    adapted.YU,
+    adapted.HIRES,
+    adapted.AREA2_BUMP,
     registry.SYNTHETIC,
 ):
     register_layout(_layout)

@@ -16,8 +16,7 @@ from brainbench.core.contracts import as_labels
 from brainbench.core.errors import listing
 from brainbench.datasets.layouts.registry import RecordingLayout
 from brainbench.datasets.sessions import Session
-from brainbench.datasets.trials.conditions import Conditions, joined_labels
-from brainbench.datasets.trials.selection import Rule, Selection
+from brainbench.datasets.trials.selection import Conditions, Rule, Selection, joined_labels
 from brainbench.datasets.trials.windows import CONTACTS, FIRST_CONTACT, Window
 
 TITLE = "object recognition by whiskers, barrel cortex units (DANDI 000231)"

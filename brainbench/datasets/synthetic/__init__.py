@@ -1,9 +1,8 @@
 """Synthetic recordings whose truth is known, as arrays, sessions of spike times, or files.
 
 A ``geometry`` (from a network's features) and a ``design`` give ``populations``: expected rates, trials and
-counts. ``animals`` relates a design to its noise ceiling, ``sessions`` writes files (``spikes`` places their spikes),
-``truth`` what the neurons encode beside them, and makes files once per machine. ``rodgers_demo`` puts the same
-neurons into the task and file layout of Rodgers 2022 (``rodgers_task``).
+counts. ``truth`` relates a design to its noise ceiling, places spikes, and writes files with what the neurons encode
+beside them, once per machine. ``rodgers_demo`` puts the same neurons into the task and file layout of Rodgers 2022.
 """
 
 from __future__ import annotations
@@ -15,8 +14,7 @@ from brainbench.core.lazy import lazy_exports
 if TYPE_CHECKING:
     from brainbench.datasets.synthetic.populations import PopulationDesign, ResponseGeometry, draw_animals
     from brainbench.datasets.synthetic.rodgers_demo import ensure_rodgers_demo, make_rodgers_demo
-    from brainbench.datasets.synthetic.sessions import write_files
-    from brainbench.datasets.synthetic.truth import calibrate, measure_ceiling, read_truth
+    from brainbench.datasets.synthetic.truth import calibrate, measure_ceiling, read_truth, write_files
 
 __all__ = [
     "PopulationDesign",

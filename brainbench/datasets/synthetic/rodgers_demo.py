@@ -26,10 +26,11 @@ from brainbench.datasets.layouts import rodgers
 from brainbench.datasets.layouts.rodgers import TRACKED
 from brainbench.datasets.sessions import Series, Session, make_session
 from brainbench.datasets.synthetic.populations import PopulationDesign, ResponseGeometry, draw_counts, expected_rates
-from brainbench.datasets.synthetic.sessions import REST, spike_trains
 from brainbench.datasets.synthetic.truth import (
+    REST,
     correlation_rdm,
     ensure_recordings,
+    spike_trains,
     write_synthetic_nwb,
     write_with_truth,
 )

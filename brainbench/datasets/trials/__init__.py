@@ -1,5 +1,5 @@
-"""Counted trials from sessions of spike times.
+"""Counted trials from sessions of spike times or signals.
 
-Conditions label the trials, a selection keeps some, windows say when to read (``conditions``, ``selection``,
-``windows``); ``counting`` counts one session, ``joining`` makes one data set, ``session_trials`` hands it to metrics.
+``selection`` labels the trials and keeps some, ``windows`` say when to read; ``counting`` reads one session (spikes, or
+``signals``), ``copies`` joins probes, ``session_trials`` makes one data set and hands it to metrics.
 """

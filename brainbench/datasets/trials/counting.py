@@ -15,8 +15,7 @@ from brainbench.core.errors import DataError, UsageError, listing
 from brainbench.core.reading.ranges import check_number
 from brainbench.datasets.ledger import Ledger
 from brainbench.datasets.sessions import OBSERVED, SPIKES, Session, SessionTable
-from brainbench.datasets.trials.conditions import Conditions, joined_labels
-from brainbench.datasets.trials.selection import Selection, select_rows
+from brainbench.datasets.trials.selection import Conditions, Selection, joined_labels, select_rows
 from brainbench.datasets.trials.signals import VOLTAGES, Samples, response_series
 from brainbench.datasets.trials.windows import CONTACTS, Window
 
@@ -178,8 +177,8 @@ def count_session(
         rates = source.respond(rows, units, part[rows]) / np.diff(part[rows], axis=1)[:, :, None]
         counts = (counts - rates * duration[:, :, None]).astype(np.float32)
         measure += f" minus their mean in {options.window.baseline}"
-    for kind, number, found in (("trials", len(rows), len(table)), ("units", len(units), len(source.units))):
-        ledger.find(kind, found)
+    for kind, number, total in (("trials", len(rows), len(table)), ("units", len(units), len(source.units))):
+        ledger.find(kind, total)
         ledger.take(kind, number)
     _enter_tables(ledger, session, options.conditions.table)
     stated = ("subject", "session", "source", "synthetic", "stimuli", "guessed")

@@ -15,9 +15,8 @@ from numpy.typing import NDArray
 from brainbench.core.contracts import Trials, check_recordings, natural_key
 from brainbench.core.errors import DataError, check_name, listing
 from brainbench.core.files import content_hash, hash_arrays
-from brainbench.datasets.trials.conditions import label_doubts, natural_vocabulary
 from brainbench.datasets.trials.counting import COVARIATES, UNIT_COLUMNS, ReadingOptions, SessionCounts
-from brainbench.datasets.trials.selection import check_values
+from brainbench.datasets.trials.selection import check_values, label_doubts, natural_vocabulary
 
 if TYPE_CHECKING:
     import xarray as xr

@@ -34,17 +34,17 @@ def response_series(session: Session, window: Window | None = None) -> Series | 
     Of several signals of imaged cells the only ΔF/F is taken, of voltages the only LFP.
     """
     every = {place: item for place, item in session.populations.items() if isinstance(item, Series)}
-    place_named, banded = (window.signal, window.band is not None) if window is not None else ("", False)
-    if not (named or banded) and session.has_spikes:
+    wanted, banded = (window.signal, window.band is not None) if window is not None else ("", False)
+    if not (wanted or banded) and session.has_spikes:
         return None
     series = {place: item for place, item in every.items() if (item.kind == VOLTAGES) == banded}
-    if named:
-        matching = [place for place in every if f"/{named}/".lower() in f"/{place}/".lower()]
+    if wanted:
+        matching = [place for place in every if f"/{wanted}/".lower() in f"/{place}/".lower()]
         if not matching:
-            raise unknown_name("signal", named, _names(every), hint=f"(in {session.source})")
+            raise unknown_name("signal", wanted, _names(every), hint=f"(in {session.source})")
         series = {place: item for place, item in series.items() if place in matching}
         if not series:
-            advice = "is no voltage: leave the band out" if banded else f"needs a band in Hz, such as {named}@70..150"
+            advice = "is no voltage: leave the band out" if banded else f"needs a band in Hz, such as {wanted}@70..150"
             raise UsageError(f"{matching[0]} of {session.source} {advice}.")
     if banded and not series:
         raise DataError(f"{session.source} has no {VOLTAGES}, of which a band is read; its signals: {listing(every)}.")
@@ -102,7 +102,13 @@ class Samples:
         if len(cells) != (shape[-1] if len(shape) > 1 else 1):
             raise DataError(f"{name} has the shape {shape}, and {len(cells)} units are named.")
         if not series.table:
-            return cls(cells, series, frame_times(series), name, band=window.band)._checked()
+            samples = cls(cells, series, frame_times(series), name, band=window.band)
+            if samples.band is not None and not 2 * samples.band[1] * samples.step < 1:
+                raise DataError(
+                    f"{name} has {1 / samples.step:.6g} samples/s, and a band of voltages ends below half of that; "
+                    f"received {samples.band[0]:g}..{samples.band[1]:g} Hz."
+                )
+            return samples
         if series.table != table.name or len(shape) != 3 or shape[0] != len(table):
             raise DataError(
                 f"{name} has the shape {shape}, and trials are the {len(table)} rows of {table.name!r}; it must be "
@@ -115,14 +121,6 @@ class Samples:
             )
         times = np.zeros(1) if series.timestamps is None else frame_times(series)
         return cls(cells, series, times, name, table.times("start_time"))
-
-    def _checked(self) -> Samples:
-        if self.band is not None and not 2 * self.band[1] * self.step < 1:
-            raise DataError(
-                f"{self.name} has {1 / self.step:.6g} samples/s, and a band of voltages ends below half of that; "
-                f"received {self.band[0]:g}..{self.band[1]:g} Hz."
-            )
-        return self
 
     @property
     def measure(self) -> str:

@@ -1,22 +1,25 @@
+from __future__ import annotations
+
 import logging
+import sys
 
 import numpy as np
 import pytest
 import xarray as xr
 
-from brainbench.core.errors import DataError, UsageError
+from brainbench.core.errors import DataError, MissingDependencyError, UsageError
 from brainbench.datasets import (
     RecordingLayout,
     check,
     export,
+    fetch,
     inspect,
     open_recordings,
     register_layout,
     write_recordings,
 )
 from brainbench.datasets.layouts.registry import get_layout, list_layouts
-from brainbench.datasets.trials.conditions import Conditions
-from brainbench.datasets.trials.selection import Selection
+from brainbench.datasets.trials.selection import Conditions, Selection
 from brainbench.datasets.trials.windows import Window
 from tests.factories.dandi_files import write_area2, write_hires, write_yu
 from tests.factories.recordings import make_simple_session
@@ -148,3 +151,40 @@ def test_installed_packages_add_layouts_and_one_that_fails_takes_nothing_away(re
     assert {"their-one", "their-two", "rodgers"} <= set(names)
     assert get_layout("their-one").citation == "Them (2026)"
     assert "'broken' (broken_recordings)" in caplog.text
+
+
+# Fetching
+
+
+def test_without_the_client_nothing_is_tried(monkeypatch, tmp_path):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(MissingDependencyError, match=r"\[dandi\].*DANDI:000231"):
+        fetch("rodgers", tmp_path / "data")
+    assert not (tmp_path / "data").exists()
+    with pytest.raises(UsageError, match="'rogers'; did you mean 'rodgers'"):
+        fetch("rogers", tmp_path)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="the stand-in client is a shell script")
+@pytest.mark.parametrize(
+    ("name", "assets", "source"),
+    [
+        ("rodgers", None, "dandi://dandi/000231/*ecephys*"),
+        ("000231", "sub-231CR/*", "dandi://dandi/000231/sub-231CR/*"),
+        ("DANDI:000999", None, "DANDI:000999"),
+    ],
+)
+def test_the_client_is_asked_for_the_files_with_units(monkeypatch, tmp_path, name, assets, source):
+    client = tmp_path / "dandi"
+    client.write_text(f'#!/bin/sh\necho "$@" > {tmp_path}/asked\n')
+    client.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:/usr/bin:/bin")
+    number = "000999" if "999" in source else "000231"
+    assert fetch(name, tmp_path / "data", assets=assets) == tmp_path / "data" / number
+    asked = (tmp_path / "asked").read_text().split()
+    assert asked[0] == "download"
+    assert asked[-1] == source
+    assert ("glob" in asked) == ("dandi://" in source)
+    client.write_text("#!/bin/sh\nexit 3\n")
+    with pytest.raises(DataError, match="status 3"):
+        fetch(name, tmp_path / "data", assets=assets)

@@ -1,12 +1,12 @@
-"""Layouts of two data sets in which a mouse finds a pole with its whiskers.
+"""Layouts of data sets that store spikes, touches or labels in their own way.
 
-Hires 2015 (DANDI 000013): single layer 4 neurons, one whisker. One cell per file, and no units table: spikes are a 0/1
-signal ``acquisition/SpikeTrain`` with time stamps, touches likewise under ``acquisition/behavior``. They become a unit
-and a contact table here.
+Hires 2015 (DANDI 000013) and Yu 2016 (DANDI 000005): a mouse finds a pole with its whiskers. Hires has one cell per
+file and no units table: spikes are a 0/1 signal ``acquisition/SpikeTrain`` with time stamps, touches likewise under
+``acquisition/behavior``. Yu has a units table; touches are 0/1 signals, one container per whisker under ``acquisition``
+(``principal_whisker_c2``, ``whisker_c1``). They become units and contact tables here.
 
-Yu 2016 (DANDI 000005): thalamus and layer 4, a few whiskers. Extracellular files have a units table. Touches are 0/1
-signals, one container per whisker under ``acquisition``: ``principal_whisker_c2``, ``whisker_c1``. They become contact
-tables here.
+Area2_Bump (DANDI 000127): macaque area 2 during reaches and bumps of the arm in one of their directions. ``trials``
+names both by ``cond_dir`` (degrees) and tells them apart by ``ctr_hold_bump``, joined to one label, ``passive-90``.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from brainbench.core.contracts import as_labels
 from brainbench.datasets.layouts.registry import RecordingLayout
 from brainbench.datasets.sessions import OBSERVED, SPIKES, Series, Session, SessionTable, ragged
-from brainbench.datasets.trials.conditions import Conditions
-from brainbench.datasets.trials.selection import Rule, Selection
+from brainbench.datasets.trials.selection import Conditions, Rule, Selection
 from brainbench.datasets.trials.windows import Window
 
 TRAIN = "acquisition/SpikeTrain"
@@ -123,5 +123,42 @@ YU = replace(
         "contacts: from the 0/1 signals touch_onset and touch_offset of every whisker; files of whole-cell recordings "
         "have no units and are refused",
         _TYPES,
+    ),
+)
+
+
+DIRECTIONS = tuple(str(angle) for angle in range(0, 360, 45))
+PASSIVE = "passive"
+
+
+def adapt_bumps(session: Session) -> Session:
+    """Add the columns ``movement`` (``active`` or ``passive``) and ``direction`` (degrees, 0 to 359)."""
+    table = session.tables.get("trials")
+    needed = ("ctr_hold_bump", "cond_dir")
+    if table is None or "movement" in table or any(name not in table for name in needed):
+        return session
+    bump = np.isin(np.char.lower(as_labels(table.column("ctr_hold_bump"))), ("true", "1"))
+    # Angles that differ by whole turns are one direction and must get one label.
+    angle = table.times("cond_dir") % 360
+    movement = np.where(bump, PASSIVE, "active")
+    return session.with_table(table.with_columns(movement=movement, direction=as_labels(angle)))
+
+
+AREA2_BUMP = RecordingLayout(
+    name="area2-bump",
+    title="reaches and bumps of the arm, units of macaque area 2 (DANDI 000127)",
+    citation="Chowdhury R. H., Glaser J. I., Miller L. E., eLife 9:e48198 (2020), doi:10.7554/eLife.48198",
+    conditions=Conditions("trials", ("movement", "direction")),
+    orders={"movement": ("active", PASSIVE), "direction": DIRECTIONS},
+    selection=Selection(name="area2-bump", trials=(Rule("result", allow=("R",), required=False),)),
+    window=Window("move_onset_time", offset=-0.1, length=0.6),
+    columns=("cond_dir", "ctr_hold_bump", "bump_time", "move_onset_time", "split"),
+    adapt=adapt_bumps,
+    touch="bump_time",
+    dandiset="000127",
+    remarks=(
+        "window: 100 ms before to 500 ms after move_onset_time, as in the Neural Latents Benchmark; needs that time",
+        "coverage: the training file holds several segments of the session, told by obs_intervals",
+        "the file of test trials has neither directions nor results and is refused",
     ),
 )
