@@ -70,6 +70,20 @@ class ModelResponses:
     """What simulated stimuli state of contacts, [K, W] by name."""
     seconds: float | None = None
     """Duration of the stimuli, over which the steps of every layer are spread evenly; None where unknown."""
+    stimulus_error: float | None = None
+    """Estimated error of the forces of simulated stimuli, as a share of them; None where unknown."""
+
+    @property
+    def doubts(self) -> tuple[str, ...]:
+        """What is to be known of the stimuli that every score of them rests on."""
+        from brainbench.stimuli.engines.error_estimates import LARGEST_ERROR
+
+        if self.stimulus_error is None or self.stimulus_error <= LARGEST_ERROR:
+            return ()
+        error, bound = self.stimulus_error, f"{LARGEST_ERROR:.0%}"
+        size = f"estimated error of {error:.0%}, above {bound}" if math.isfinite(error) else "error that cannot be told"
+        advice = "simulate them with a finer --fidelity, or with --fidelity auto=ERROR"
+        return (f"the forces of the stimuli have an {size}: {advice}",)
 
     def features(self, rows: list[int]) -> Mapping[str, NDArray[np.floating]]:
         """Return every layer's features [K, F] of the stimuli ``rows``, made when they are asked for."""
@@ -150,7 +164,8 @@ class ResolvedModel:
             model_input = steps.reshape(*steps.shape[:2], -1)
         seconds = None if simulated is None else _seconds(simulated)
         kinematics = {} if simulated is None else contact_kinematics(simulated.dataset)
-        return ModelResponses(card, labels, activations, options.time, model_input, origin, kinematics, seconds)
+        error = None if simulated is None else simulated.error
+        return ModelResponses(card, labels, activations, options.time, model_input, origin, kinematics, seconds, error)
 
 
 def follows_seed(model: Any) -> bool:

@@ -265,7 +265,8 @@ def _compare(inputs: ScoreInputs, *, baselines: bool) -> tuple[list[Score], Scor
     if baselines and presentation.control is not None:
         # That the times alone explain something is no doubt about the times.
         scores.append(_doubted(presentation.control, *recorded))
-    doubts, unfelt = brain.doubts, [label for row, label in enumerate(network.labels) if row not in inputs.rows]
+    doubts = (*network.doubts, *brain.doubts)
+    unfelt = [label for row, label in enumerate(network.labels) if row not in inputs.rows]
     if unfelt and options.match is None:
         names = listing(unfelt, limit=6, quoted=False)
         doubts += (f"{len(unfelt)} of {len(network.labels)} stimuli have no recordings and are left out: {names}",)

@@ -51,6 +51,24 @@ class Stimuli:
     """Names what was asked for; equal on every machine, while the last digits of a simulation, and with
     them ``content_hash``, depend on the processor. Equal to ``content_hash`` for arrays from a file."""
 
+    @property
+    def error(self) -> float | None:
+        """Estimated error of all forces or moments (the larger), as a share of them; None where none was estimated.
+
+        Root mean square over stimuli and whiskers, so that those count most that feel most.
+        """
+        if self.dataset is None or "error" not in self.dataset:
+            return None
+        errors = self.dataset["error"].values.astype(float)
+        wrench = np.nan_to_num(self.dataset["wrench"].values.astype(float))
+        shares = [0.0]
+        for part in (wrench[..., :3], wrench[..., 3:]):
+            power = np.mean(np.sum(part**2, axis=3), axis=1)
+            if power.any():
+                felt = np.where((power > 0) & ~np.isnan(errors), errors, 0.0)
+                shares.append(np.sqrt(np.average(felt**2, weights=power)))
+        return float(max(shares))
+
     def __repr__(self) -> str:
         shape = " × ".join(map(str, self.input.shape))
         return f"Stimuli({listing(self.labels, limit=6)}; input {shape}; hash {self.content_hash})"

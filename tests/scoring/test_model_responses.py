@@ -15,7 +15,7 @@ from brainbench.datasets.sessions import make_session
 from brainbench.models.registry import load_model
 from brainbench.scoring.model_responses import contact_kinematics, resolve_model
 from brainbench.scoring.options import ScoreOptions
-from brainbench.stimuli import Frames, Scene, WhiskerArray, simulate
+from brainbench.stimuli import Frames, Scene, Stimuli, WhiskerArray, simulate
 
 LABELS = ("a", "b", "c", "d", "e", "f")
 
@@ -115,6 +115,18 @@ def test_a_module_with_any_spec_is_plain():
 def test_a_module_in_half_precision_has_a_card():
     cards = [resolve_model(nn.Linear(3, 2).to(kind)).card for kind in (torch.bfloat16, torch.float16)]
     assert all(card.weights for card in cards)
+
+
+@pytest.mark.parametrize(
+    ("error", "words"),
+    [(0.23, "estimated error of 23%"), (np.inf, "error that cannot be told"), (0.09, ""), (None, "")],
+)
+def test_a_score_tells_the_error_of_its_stimuli(error, words, recordings, arrays, monkeypatch):
+    monkeypatch.setattr(Stimuli, "error", error)
+    score = brainbench.score(_Tiny(), recordings=recordings, stimuli=str(arrays), layer="fc")
+    reasons = [reason for reason in score.reasons if reason.startswith("the forces of the stimuli")]
+    assert score.status == "ok"
+    assert [words in reason for reason in reasons] == [True] * bool(words)
 
 
 def test_a_model_whose_input_does_not_fit_says_what_it_was_given(recordings: xr.Dataset, arrays: Path):

@@ -4,7 +4,7 @@ import pytest
 import xarray as xr
 
 from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError
-from brainbench.stimuli import load_stimuli, read_stimulus_set, to_grid, write_stimulus_set
+from brainbench.stimuli import Stimuli, load_stimuli, read_stimulus_set, to_grid, write_stimulus_set
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.scenes.recipes import get_recipe
 from brainbench.stimuli.simulation import simulate
@@ -34,6 +34,25 @@ def test_a_recipe_name_gives_labelled_input():
     assert repr(stimuli).startswith("Stimuli('convex-close', 'convex-medium'")
     assert "input 6 × 22 × 30 × 5 × 7" in repr(stimuli)
     assert stimuli.content_hash == stimuli.dataset.attrs["content_hash"]
+
+
+@pytest.mark.parametrize(
+    ("errors", "whole"),
+    [
+        (None, None),
+        ((0.1, 0.5, 9.0), np.hypot(0.1 * 3, 0.5 * 4) / 5),
+        ((np.nan, 0.5, 9.0), 0.4),
+        ((np.inf, 0, 0), np.inf),
+    ],
+)
+def test_the_error_of_all_forces_counts_whiskers_by_what_they_feel(errors, whole):
+    wrench = np.zeros((1, 4, 3, 6))
+    wrench[0, :, 0, 1], wrench[0, :, 1, 2] = 3.0, 4.0
+    variables = {"wrench": (("stimulus", "time", "whisker", "channel"), wrench)}
+    if errors is not None:
+        variables["error"] = (("stimulus", "whisker"), np.array([errors], dtype=float))
+    stimuli = Stimuli(("a",), np.zeros((1, 4, 1)), xr.Dataset(variables), "", "", "")
+    assert stimuli.error == (whole if whole is None else pytest.approx(whole))
 
 
 def test_a_scene_file_is_simulated(tmp_path):
