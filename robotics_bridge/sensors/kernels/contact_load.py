@@ -33,7 +33,7 @@ wp = warp()
 
 ROUNDS = 6
 """Times that weights lean over at most."""
-STEEPEST = 20.0
+STEEPEST = 10.0
 """Largest exponent of a weight."""
 TOUCH, BEHIND, NEAR = range(3)
 """Sources of carriers."""
@@ -424,11 +424,10 @@ def spread_kernel(kinds: frozenset[int], raycast: bool, noisy: bool, sticky: boo
                 carrier.way = push.normal
             if source != wp.static(TOUCH):
                 carrier.noisy = carrier.weight
-            elif carrier.facing > 0.0:
-                steep = wp.dot(push.lean, x - push.point)
-                if steep != 0.0:
-                    carrier.weight *= wp.exp(steep)
-                    carrier.noisy *= wp.exp(steep)
+            steep = wp.dot(push.lean, x - push.point)
+            if steep != 0.0 and carrier.weight + carrier.noisy > 0.0:
+                carrier.weight *= wp.exp(steep)
+                carrier.noisy *= wp.exp(steep)
         return carrier
 
     @wp.func
@@ -440,7 +439,7 @@ def spread_kernel(kinds: frozenset[int], raycast: bool, noisy: bool, sticky: boo
         if wp.static(noisy):
             store_planes(io.measured, env, n, 6, wp.spatial_vectorf())
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, launch_bounds=(128, 5))
     def spread(
         plan: SpreadPlan,
         probes: ProbeArrays,
@@ -497,142 +496,126 @@ def spread_kernel(kinds: frozenset[int], raycast: bool, noisy: bool, sticky: boo
                         span = plan.spans[sensor]
                         # What this sensor does not carry of the face.
                         rest = float(0.0)
-                        source = int(wp.static(TOUCH))
-                        node = face
-                        tilts = int(0)
-                        lean = wp.vec3f()
+                        fresh = ((written >> k) & 1) == 0
                         near = bool(False)
-                        while source <= wp.static(NEAR):
+                        source = int(wp.static(TOUCH))
+                        solved = bool(False)
+                        node = face
+                        rounds = int(0)
+                        lean = wp.vec3f()
+                        tilt = wp.vec3f()
+                        even = wp.vec3f()
+                        center = wp.vec3f()
+                        scale = float(0.0)
+                        while node >= 0:
                             push = ContactPush()
-                            push.point = faces.origin[face]
+                            push.point = wp.vec3f(sphere[0], sphere[1], sphere[2])
                             push.normal = faces.normal[face]
                             push.load = faces.load[face]
                             push.force = faces.force[face]
-                            push.lean = lean
-                            moment = faces.moment[face]
+                            moment = faces.moment[face] + wp.cross(faces.origin[face] - push.point, push.force)
                             if source == wp.static(NEAR):
                                 push = push_of(plan, state, friction, link, node)
                                 moment = wp.vec3f()
-                            # Sums over taxels: y, y m · n and whether any is near; columns y q, y a, y a × q; y a aᵀ
-                            # (a from the point).
+                            push.lean = lean
+                            # Sums over taxels: y, y m · n and whether any is near; columns y q, y a, y a × q; y a aᵀ,
+                            # with a from the point.
                             first = wp.vec3f()
                             second = wp.mat33f()
                             third = wp.mat33f()
-                            widest = float(0.0)
+                            most = float(0.0)
+                            total = wp.vec3f()
                             n = span[0] + lane
                             while n < span[1]:
-                                x = probes.position[n]
-                                if source == wp.static(TOUCH) and tilts == 0 and first[2] == 0.0:
-                                    if gap_to(sphere, x) <= plan.reach[n]:
-                                        first[2] = 1.0
+                                # Called at one place alone, so that a processor's compiler copies no structures.
                                 c = carrier_of(
                                     plan, probes, solids, pairs, faces, press, push, env, n, span[2], head, alone,
                                     face, source,
                                 )  # fmt: skip
-                                if c.weight > 0.0:
-                                    a = x - push.point
-                                    widest = wp.max(widest, wp.length(a))
-                                    first += c.weight * wp.vec3f(1.0, c.facing, 0.0)
-                                    second += c.weight * wp.matrix_from_cols(c.way, a, wp.cross(a, c.way))
-                                    third += c.weight * wp.outer(a, a)
+                                x = probes.position[n]
+                                if not solved:
+                                    if not near and first[2] == 0.0 and gap_to(sphere, x) <= plan.reach[n]:
+                                        first[2] = 1.0
+                                    if c.weight > 0.0:
+                                        a = x - push.point
+                                        most = wp.max(most, wp.length(a))
+                                        first += c.weight * wp.vec3f(1.0, c.facing, 0.0)
+                                        second += c.weight * wp.matrix_from_cols(c.way, a, wp.cross(a, c.way))
+                                        third += c.weight * wp.outer(a, a)
+                                elif c.weight + c.noisy > 0.0:
+                                    unit = scale * c.way + even + wp.cross(tilt, x - center)
+                                    total += c.weight * unit
+                                    reading = wrench_at(x, c.weight * unit)
+                                    if not fresh:
+                                        reading += load_planes(io.truth, env, n, 6)
+                                    store_planes(io.truth, env, n, 6, reading)
+                                    if wp.static(noisy):
+                                        reading = wrench_at(x, c.noisy * unit)
+                                        if not fresh:
+                                            reading += load_planes(io.measured, env, n, 6)
+                                        store_planes(io.measured, env, n, 6, reading)
+                                    faces.filled[env, n] = wp.uint8(1)
+                                elif fresh:
+                                    clear(faces, io, env, n)
                                 n += threads
-                            first = wp.tile_sum(wp.tile(first, preserve_type=True))[0]
-                            whole = first[0]
-                            if source == wp.static(TOUCH) and tilts == 0:
-                                near = first[2] > 0.0
-                            if whole > 0.0 and (near or source == wp.static(NEAR)):
-                                second = wp.tile_sum(wp.tile(second, preserve_type=True))[0]
-                                third = wp.tile_sum(wp.tile(third, preserve_type=True))[0]
-                                # Taxels that face away by more than 60° on average would be stretched beyond all
-                                # measure; b then carries what is missing.
-                                scale = push.load / wp.max(first[1], 0.5 * whole)
-                                field = wp.vec3f(second[0, 0], second[1, 0], second[2, 0])
-                                center = wp.vec3f(second[0, 1], second[1, 1], second[2, 1]) / whole
-                                turning = wp.vec3f(second[0, 2], second[1, 2], second[2, 2])
-                                even = (push.force - scale * field) / whole
-                                moment -= scale * turning + whole * wp.cross(center, even)
-                                extent = third[0, 0] + third[1, 1] + third[2, 2]
-                                third -= whole * wp.outer(center, center)
-                                trace = third[0, 0] + third[1, 1] + third[2, 2]
-                                # A little more on its diagonal lets a row of taxels, which bears no moment along it, be
-                                # solved; taxels at one place bear none, what rounding leaves of them is none.
-                                tilt = wp.vec3f()
-                                if trace > 1.0e-4 * extent:
-                                    inertia = 1.0001 * trace * wp.identity(n=3, dtype=wp.float32) - third
-                                    tilt = wp.inverse(inertia) @ moment
-                                center += push.point
-                                # How much a taxel would be pulled, in shares of the mean push.
-                                mean = push.load / whole
-                                widest = wp.tile_max(wp.tile(widest))[0] + wp.length(center - push.point)
-                                steepest = wp.length(tilt) * widest / mean
-                                # Most tilts pull none, however far it lies.
-                                if steepest > 1.0:
-                                    pull = float(0.0)
-                                    n = span[0] + lane
-                                    while n < span[1]:
-                                        c = carrier_of(
-                                            plan, probes, solids, pairs, faces, press, push, env, n, span[2], head,
-                                            alone, face, source,
-                                        )  # fmt: skip
-                                        if c.weight > 0.0:
-                                            turn = wp.cross(tilt, probes.position[n] - center)
-                                            pull = wp.max(pull, -wp.dot(turn, push.normal))
-                                        n += threads
-                                    steepest = wp.tile_max(wp.tile(pull))[0] / mean
-                                again = bool(False)
-                                if steepest > 1.0:
-                                    # What is beyond half of it moves into the weights: y e^(λ · r) for y (1 + λ · r).
-                                    lean += (1.0 - 0.5 / steepest) / mean * wp.cross(push.normal, tilt)
-                                    tilt /= steepest
-                                    tilts += 1
-                                    again = source == wp.static(TOUCH) and tilts < wp.static(ROUNDS)
-                                    steepest = wp.length(lean) * widest
-                                    if steepest > wp.static(STEEPEST):
-                                        lean *= wp.static(STEEPEST) / steepest
-                                if not again:
-                                    fresh = ((written >> k) & 1) == 0
-                                    total = wp.vec3f()
-                                    n = span[0] + lane
-                                    while n < span[1]:
-                                        c = carrier_of(
-                                            plan, probes, solids, pairs, faces, press, push, env, n, span[2], head,
-                                            alone, face, source,
-                                        )  # fmt: skip
-                                        x = probes.position[n]
-                                        if c.weight + c.noisy > 0.0:
-                                            unit = scale * c.way + even + wp.cross(tilt, x - center)
-                                            f = c.weight * unit
-                                            total += f
-                                            reading = wrench_at(x, f)
-                                            if not fresh:
-                                                reading += load_planes(io.truth, env, n, 6)
-                                            store_planes(io.truth, env, n, 6, reading)
-                                            if wp.static(noisy):
-                                                reading = wrench_at(x, c.noisy * unit)
-                                                if not fresh:
-                                                    reading += load_planes(io.measured, env, n, 6)
-                                                store_planes(io.measured, env, n, 6, reading)
-                                            faces.filled[env, n] = wp.uint8(1)
-                                        elif fresh:
-                                            clear(faces, io, env, n)
-                                        n += threads
-                                    written = written | (1 << k)
-                                    total = wp.tile_sum(wp.tile(total, preserve_type=True))[0]
-                                    gap = wp.length(push.force - total)
-                                    # Rounding of the sums is no loss.
-                                    if not (gap <= 1.0e-4 * wp.length(push.force)):
-                                        rest += gap
-                                    if source == wp.static(NEAR):
-                                        node = faces.follower[node]
-                                    else:
-                                        node = -1
-                            elif source == wp.static(NEAR):
-                                rest += wp.length(push.force)
-                                node = faces.follower[node]
+                            if not solved:
+                                first = wp.tile_sum(wp.tile(first, preserve_type=True))[0]
+                                whole = first[0]
+                                near = near or first[2] > 0.0
+                                if whole > 0.0 and (near or source == wp.static(NEAR)):
+                                    second = wp.tile_sum(wp.tile(second, preserve_type=True))[0]
+                                    third = wp.tile_sum(wp.tile(third, preserve_type=True))[0]
+                                    most = wp.tile_max(wp.tile(most))[0]
+                                    # Taxels that face away by more than 60° on average would be stretched beyond all
+                                    # measure; b then carries what is missing.
+                                    scale = push.load / wp.max(first[1], 0.5 * whole)
+                                    mean = push.load / whole
+                                    field = wp.vec3f(second[0, 0], second[1, 0], second[2, 0])
+                                    center = wp.vec3f(second[0, 1], second[1, 1], second[2, 1]) / whole
+                                    turning = wp.vec3f(second[0, 2], second[1, 2], second[2, 2])
+                                    even = (push.force - scale * field) / whole
+                                    moment -= scale * turning + whole * wp.cross(center, even)
+                                    # Shares of the weights and of their extent, lest squares of small numbers vanish.
+                                    moment /= whole
+                                    third /= whole
+                                    extent = third[0, 0] + third[1, 1] + third[2, 2]
+                                    third -= wp.outer(center, center)
+                                    trace = third[0, 0] + third[1, 1] + third[2, 2]
+                                    # A little more on its diagonal lets a row of taxels, which bears no moment along
+                                    # it, be solved; what rounding leaves of taxels at one place is none.
+                                    tilt = wp.vec3f()
+                                    if trace > 1.0e-4 * extent:
+                                        inertia = 1.0001 * wp.identity(n=3, dtype=wp.float32) - third / trace
+                                        tilt = wp.inverse(inertia) @ moment / trace
+                                    # No taxel is pulled, however far it lies: what is beyond half of that moves into
+                                    # the weights, y e^(λ · r) for y (1 + λ · r).
+                                    solved = True
+                                    far = most + wp.length(center)
+                                    steepest = wp.length(tilt) * far / mean
+                                    if steepest > 1.0:
+                                        lean += (1.0 - 0.5 / steepest) / mean * wp.cross(push.normal, tilt)
+                                        lean *= wp.min(wp.static(STEEPEST) / (far * wp.length(lean)), 1.0)
+                                        tilt /= steepest
+                                        rounds += 1
+                                        solved = rounds == wp.static(ROUNDS)
+                                    center += push.point
+                                elif source == wp.static(NEAR):
+                                    rest += wp.length(push.force)
+                                    node = faces.follower[node]
+                                else:
+                                    source = wp.where(near, source + 1, wp.static(NEAR))
                             else:
-                                source = wp.where(near, source + 1, wp.static(NEAR))
-                            if node < 0:
-                                source = wp.static(NEAR) + 1
+                                written = written | (1 << k)
+                                fresh = False
+                                total = wp.tile_sum(wp.tile(total, preserve_type=True))[0]
+                                gap = wp.length(push.force - total)
+                                # Rounding of the sums is no loss.
+                                if not (gap <= 1.0e-4 * wp.length(push.force)):
+                                    rest += gap
+                                solved = False
+                                rounds = 0
+                                lean = wp.vec3f()
+                                node = wp.where(source == wp.static(NEAR), faces.follower[node], -1)
                         # Sensors of a link need not all feel it.
                         if not (rest >= lack):
                             lack = rest

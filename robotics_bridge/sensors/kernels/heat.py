@@ -6,7 +6,7 @@ Letters: B environment, S sensor, N cell of all sensors, L link, M contacts kept
 from __future__ import annotations
 
 from brainbench.core.devices import warp
-from robotics_bridge.physics.kernels.state import StateArrays, in_scene
+from robotics_bridge.physics.kernels.state import StateArrays
 from robotics_bridge.sensors.kernels.readout import ReadoutArrays
 
 wp = warp()
@@ -74,11 +74,11 @@ class HeatArrays:
     link_of: wp.array(dtype=wp.int32)
     """[G] link of a geometry."""
     link_conductivity: wp.array(dtype=wp.float32)
-    """[L] (W/(m K))."""
+    """[L + 1], the last of flexes (W/(m K))."""
     link_diffusivity: wp.array(dtype=wp.float32)
-    """[L] (m²/s)."""
+    """[L + 1] (m²/s)."""
     link_temperature: wp.array2d(dtype=wp.float32)
-    """[B, L] (°C)."""
+    """[B, L + 1] (°C)."""
     number: wp.array2d(dtype=wp.int32)
     """[B, S] contacts of a grid."""
     listed: wp.array3d(dtype=wp.int32)
@@ -103,6 +103,14 @@ class HeatArrays:
     """1 in the first part of an update, in which fields begin where the environment was reset."""
 
 
+@wp.func
+def link_at(geometry: int, heat: HeatArrays) -> int:
+    """Return the link of a geometry, or the number that stands for flexes."""
+    if geometry < 0:
+        return heat.link_conductivity.shape[0] - 1
+    return heat.link_of[geometry]
+
+
 @wp.kernel
 def collect_contacts(state: StateArrays, heat: HeatArrays):
     """List the contacts of each sensor. Thread: contact [C]; their numbers were set to zero."""
@@ -111,10 +119,11 @@ def collect_contacts(state: StateArrays, heat: HeatArrays):
         return
     env = state.contact_env[c]
     pair = state.contact_geom[c]
-    if not in_scene(pair, heat.link_of.shape[0]):
+    # A state made by hand may hold numbers of no geometry; −1 stands for a flex.
+    if wp.min(pair) < -1 or wp.max(pair) >= heat.link_of.shape[0]:
         return
-    a = heat.link_of[pair[0]]
-    b = heat.link_of[pair[1]]
+    a = link_at(pair[0], heat)
+    b = link_at(pair[1], heat)
     for s in range(heat.sensors.shape[0]):
         link = heat.sensors[s].link
         if (a == link) != (b == link):
@@ -124,11 +133,11 @@ def collect_contacts(state: StateArrays, heat: HeatArrays):
 
 
 @wp.func
-def other_link(pair: wp.vec2i, link_of: wp.array(dtype=wp.int32), link: int) -> int:
+def other_link(pair: wp.vec2i, heat: HeatArrays, link: int) -> int:
     """Return the other link of a contact."""
-    a = link_of[pair[0]]
+    a = link_at(pair[0], heat)
     if a == link:
-        return link_of[pair[1]]
+        return link_at(pair[1], heat)
     return a
 
 
@@ -221,7 +230,7 @@ def conduct_contacts(measure: int, state: StateArrays, heat: HeatArrays, io: Rea
     grid = heat.sensors[s]
     frame = state.pose[env, grid.link]
     c = heat.listed[env, s, i]
-    other = other_link(state.contact_geom[c], heat.link_of, grid.link)
+    other = other_link(state.contact_geom[c], heat, grid.link)
     # The points that share the other link: their number, centre and mean normal.
     points = int(0)
     center = wp.vec3f(float(0.0), float(0.0), float(0.0))
@@ -230,7 +239,7 @@ def conduct_contacts(measure: int, state: StateArrays, heat: HeatArrays, io: Rea
     deepest = float(0.0)
     for j in range(count):
         d = heat.listed[env, s, j]
-        if other_link(state.contact_geom[d], heat.link_of, grid.link) == other:
+        if other_link(state.contact_geom[d], heat, grid.link) == other:
             points = points + 1
             center = center + state.contact_position[d]
             # Contacts may list the two geometries in either order; normals are turned to one side before they are
@@ -260,7 +269,7 @@ def conduct_contacts(measure: int, state: StateArrays, heat: HeatArrays, io: Rea
         own = float(0.0)
         for j in range(count):
             d = heat.listed[env, s, j]
-            if other_link(state.contact_geom[d], heat.link_of, grid.link) == other:
+            if other_link(state.contact_geom[d], heat, grid.link) == other:
                 p = state.contact_position[d] - center
                 x = wp.dot(p, u)
                 y = wp.dot(p, v)
@@ -270,7 +279,7 @@ def conduct_contacts(measure: int, state: StateArrays, heat: HeatArrays, io: Rea
                 ny = y
                 for k in range(count):
                     e = heat.listed[env, s, k]
-                    if k != j and other_link(state.contact_geom[e], heat.link_of, grid.link) == other:
+                    if k != j and other_link(state.contact_geom[e], heat, grid.link) == other:
                         q = state.contact_position[e] - center
                         qx = wp.dot(q, u)
                         qy = wp.dot(q, v)

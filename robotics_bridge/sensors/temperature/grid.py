@@ -51,7 +51,7 @@ class TemperatureGrid(Sensor):
     bodies: Mapping[str, ThermalBody] = field(default_factory=dict)
     """Link → what it is made of, for links that may touch this one; all others are ``unlisted``."""
     unlisted: ThermalBody = field(default_factory=ThermalBody)
-    """Material and temperature of every other link."""
+    """Material and temperature of every other link, and of flexes."""
     conduction: Literal["physical", "thesis"] = "physical"
     """``physical``: the cell (half its depth, and the spreading of a small spot), the interface and the touched body
     (a half-space that gave heat through the spot since the contact began) in series. ``thesis``: 4.38 and 4.39,
@@ -87,11 +87,6 @@ class TemperatureGrid(Sensor):
             check_kind(f"body {name!r}", body, ThermalBody, "ThermalBody(material, temperature)")
             material(body.material)
         material(self.material)
-
-    @property
-    def needs(self) -> tuple[str, str]:
-        """Materials and temperatures, which belong to links."""
-        return "a material and a temperature", "make it a rigid body"
 
     def layout(self) -> tuple[int, ...]:
         """Return the shape (nx, ny, nz) of the reading of one environment."""

@@ -55,7 +55,8 @@ class TemperatureRuntime(Runtime):
             scene.link_index(name)
         # Grids that know other bodies have another runtime, and are touched all the same.
         grids = [sensor for sensor in context.sensors if isinstance(sensor, TemperatureGrid)]
-        links = [_body(self._sensors[0], grids, name) for name in scene.links]
+        # Flexes, which are no links, come last.
+        links = [*(_body(self._sensors[0], grids, name) for name in scene.links), self._sensors[0].unlisted]
         materials = [material(body.material) for body in links]
         temperatures = np.tile([body.temperature for body in links], (context.num_envs, 1))
         shape, many = (context.num_envs, self.count), (context.num_envs, len(structures))
@@ -158,7 +159,7 @@ class TemperatureRuntime(Runtime):
 
 def link_temperature(suite: SensorSuite, name: str) -> torch.Tensor:
     """Return the temperatures [B, L] (°C) of the links that a grid may touch, a view to write to."""
-    return wp.to_torch(_runtime_of(suite, name).heat.link_temperature)
+    return wp.to_torch(_runtime_of(suite, name).heat.link_temperature)[:, : len(suite.scene.links)]
 
 
 def lost_contacts(suite: SensorSuite, name: str) -> torch.Tensor:
