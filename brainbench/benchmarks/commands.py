@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from brainbench.benchmarks.files import OPTIONS
+from brainbench.benchmarks.opening import OPTIONS
 from brainbench.cli.destinations import out_file_option
 from brainbench.cli.options import SCORE, SCORE_FLAGS, with_options
 from brainbench.cli.output import Output, facts, progress_bar, table_of
@@ -74,7 +74,7 @@ def pack(
     out: Annotated[Path, out_file_option("File to write, FILE.zip.")],
 ) -> Output:
     """Write a benchmark and all of its files into one .zip, which is all that a stranger needs."""
-    from brainbench.benchmarks.files import pack as pack_benchmark
+    from brainbench.benchmarks.opening import pack as pack_benchmark
     from brainbench.core.errors import UsageError
 
     if out.suffix != ".zip":
@@ -88,7 +88,7 @@ def pack(
 @app.command("list")
 def list_() -> Output:
     """List the benchmarks that have a name: those of installed packages, and those that you added."""
-    from brainbench.benchmarks.files import list_benchmarks
+    from brainbench.benchmarks.opening import list_benchmarks
 
     files = list_benchmarks()
     if not files:
@@ -99,7 +99,7 @@ def list_() -> Output:
 @app.command("add")
 def add(benchmark: NamedBenchmark) -> Output:
     """Keep a benchmark with its files in your settings, so that brainbench score knows it by its name."""
-    from brainbench.benchmarks.files import add as add_benchmark
+    from brainbench.benchmarks.opening import add as add_benchmark
 
     stated, path = add_benchmark(benchmark)
     text = f"{stated.name}  kept in {path}\n\nscore it: brainbench score MODEL --benchmark {stated.name}"

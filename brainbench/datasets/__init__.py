@@ -14,8 +14,7 @@ from brainbench.datasets.hdf5 import write_recordings
 from brainbench.datasets.inspection import inspect
 from brainbench.datasets.layouts.registry import RecordingLayout, fetch, register_layout
 from brainbench.datasets.recordings import open_recordings
-from brainbench.datasets.trials.selection import Conditions, Rule, Selection
-from brainbench.datasets.trials.windows import Window
+from brainbench.datasets.trials.selection import Conditions, Rule, Selection, Window
 from brainbench.datasets.whisking.dataset import WhiskingDataset
 
 __all__ = [

@@ -24,7 +24,7 @@ from brainbench.core.writing.hdf5 import create_hdf5
 from brainbench.datasets.hdf5 import columns_of, dead_link, write_array
 from brainbench.datasets.sessions import SPIKES, Series, Session, SessionTable, decode, neurodata_type, text
 from brainbench.datasets.trials.counting import LICKS, OTHER_NAMES
-from brainbench.datasets.trials.windows import CONTACTS
+from brainbench.datasets.trials.selection import CONTACTS
 
 if TYPE_CHECKING:
     import h5py

@@ -28,12 +28,10 @@ from brainbench.datasets.reading import (
     suitable_files,
 )
 from brainbench.datasets.sessions import Session
-from brainbench.datasets.trials.copies import Copies, joined_probes
 from brainbench.datasets.trials.counting import ReadingOptions, SessionCounts, count_session, no_units
-from brainbench.datasets.trials.selection import DEFAULT, Conditions, Selection
-from brainbench.datasets.trials.session_trials import join_sessions
+from brainbench.datasets.trials.selection import DEFAULT, WHOLE, Conditions, Selection, Window
+from brainbench.datasets.trials.session_trials import Copies, join_sessions, joined_probes
 from brainbench.datasets.trials.signals import response_series
-from brainbench.datasets.trials.windows import WHOLE, Window
 
 if TYPE_CHECKING:
     import xarray as xr

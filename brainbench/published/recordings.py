@@ -24,9 +24,8 @@ from brainbench.datasets.checks.findings import Finding, share
 from brainbench.datasets.layouts.registry import RecordingLayout
 from brainbench.datasets.ledger import Ledger
 from brainbench.datasets.trials.counting import UNIT_COLUMNS, ReadingOptions, SessionCounts, missing_column
-from brainbench.datasets.trials.selection import Conditions, Selection
+from brainbench.datasets.trials.selection import FIRST_CONTACT, Conditions, Selection, Window
 from brainbench.datasets.trials.session_trials import join_sessions
-from brainbench.datasets.trials.windows import FIRST_CONTACT, Window
 
 if TYPE_CHECKING:
     import xarray as xr

@@ -18,8 +18,7 @@ from brainbench.core.limits import Limit, Positive, Seed, limited
 if TYPE_CHECKING:
     import xarray as xr
 
-    from brainbench.datasets.trials.selection import Selection
-    from brainbench.datasets.trials.windows import Window
+    from brainbench.datasets.trials.selection import Selection, Window
     from brainbench.metrics import Metric
     from brainbench.stimuli import Fidelity, Stimuli
 

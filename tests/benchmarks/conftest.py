@@ -6,8 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from brainbench.benchmarks.files import Benchmark
-from brainbench.benchmarks.opening import make
+from brainbench.benchmarks.opening import Benchmark, make
 from brainbench.core.files import write_text
 from brainbench.scoring.options import ScoreOptions
 from tests.factories.scored_files import write_study

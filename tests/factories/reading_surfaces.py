@@ -22,8 +22,7 @@ from brainbench.core.files import read_mapping, write_json
 from brainbench.core.records import ResultRecord, record_identity
 from brainbench.core.runs.state import STATE
 from brainbench.datasets import export, open_recordings, write_recordings
-from brainbench.datasets.trials.selection import Selection
-from brainbench.datasets.trials.windows import Window
+from brainbench.datasets.trials.selection import Selection, Window
 from brainbench.datasets.whisking.dataset import WhiskingDataset
 from brainbench.geometry.mesh import load_mesh, save_mesh
 from brainbench.models.features import read_features, write_features

@@ -13,9 +13,8 @@ from brainbench.datasets.synthetic import PopulationDesign
 from brainbench.datasets.synthetic.populations import draw_sessions
 from brainbench.datasets.synthetic.truth import spike_session, trial_times
 from brainbench.datasets.trials.counting import UNIT_COLUMNS, ReadingOptions, SessionCounts, missing_column
-from brainbench.datasets.trials.selection import EVERYTHING, Conditions
+from brainbench.datasets.trials.selection import EVERYTHING, Conditions, Window
 from brainbench.datasets.trials.session_trials import join_sessions
-from brainbench.datasets.trials.windows import Window
 
 LABELS = ("convex-close", "convex-medium", "convex-far", "concave-close", "concave-medium", "concave-far")
 

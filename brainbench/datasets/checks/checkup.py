@@ -31,9 +31,9 @@ from brainbench.datasets.layouts.registry import RecordingLayout, counted_layout
 from brainbench.datasets.ledger import Ledger
 from brainbench.datasets.reading import Source, each_session, find_recordings, open_file
 from brainbench.datasets.sessions import Series, Session
-from brainbench.datasets.trials.copies import Copies
 from brainbench.datasets.trials.counting import no_units, read_spikes, time_fault
 from brainbench.datasets.trials.selection import Conditions, joined_labels, label_doubts
+from brainbench.datasets.trials.session_trials import Copies
 
 _NUMBER = re.compile(r"\d+(?:,\d{3})*(?:\.\d+)?")
 

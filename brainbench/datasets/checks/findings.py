@@ -22,10 +22,18 @@ from brainbench.core.errors import BrainbenchError, DataError, listing, nearest,
 from brainbench.core.statistics import presentation_order
 from brainbench.datasets.inspection import propose
 from brainbench.datasets.layouts.registry import RecordingLayout
+from brainbench.datasets.ledger import Ledger
 from brainbench.datasets.sessions import Session, SessionTable
-from brainbench.datasets.trials.counting import inside_observed_spans, recorded_span
-from brainbench.datasets.trials.selection import Conditions, joined_labels, label_doubts
-from brainbench.datasets.trials.windows import CONTACTS, FIRST_CONTACT, WHOLE, Window
+from brainbench.datasets.trials.counting import SpikeTrains, recorded_span
+from brainbench.datasets.trials.selection import (
+    CONTACTS,
+    FIRST_CONTACT,
+    WHOLE,
+    Conditions,
+    Window,
+    joined_labels,
+    label_doubts,
+)
 
 Severity = Literal["error", "warning", "note"]
 SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
@@ -322,12 +330,10 @@ def check_coverage(
         yield Finding("error", "coverage", message)
         return
     low, high = span
-    observed = inside_observed_spans(session.units, edges) if session.units is not None else None
-    if observed is not None:
-        # One unit is enough: others may have been lost before the trial.
-        outside = ~observed.any(axis=1)
-    else:
-        outside = ~((start >= low) & (stop <= high))
+    assert session.units is not None
+    # One unit is enough: others may have been lost before the trial.
+    outside = ~SpikeTrains(session.units, spikes).covered(edges, ledger := Ledger()).any(axis=1)
+    if ledger.notes:
         message = "no obs_intervals: the recorded span is taken from the first to the last spike of all units"
         yield Finding("note", "coverage", message, "A unit lost early cannot be told from a silent one.")
     values = {"first_spike": low, "last_spike": high, "trials": len(start), "outside": int(outside.sum())}

@@ -3,16 +3,16 @@
 A session is matched by the columns of its trials (``registry``) and then adapted by its layout, before it is counted.
 """
 
-from brainbench.datasets.layouts import adapted, registry, rodgers
+from brainbench.datasets.layouts import published, registry
 from brainbench.datasets.layouts.registry import register_layout
 
 for _layout in (
-    rodgers.LAYOUT,
-    rodgers.DISCRIMINATION,
-    rodgers.DETECTION,
-    adapted.YU,
-    adapted.HIRES,
-    adapted.AREA2_BUMP,
+    published.LAYOUT,
+    published.DISCRIMINATION,
+    published.DETECTION,
+    published.YU,
+    published.HIRES,
+    published.AREA2_BUMP,
     registry.SYNTHETIC,
 ):
     register_layout(_layout)

@@ -29,8 +29,7 @@ from brainbench.core.errors import (
 )
 from brainbench.core.plugins import load_entry_points, load_module
 from brainbench.datasets.sessions import Session
-from brainbench.datasets.trials.selection import DEFAULT, Conditions, Selection
-from brainbench.datasets.trials.windows import FIRST_CONTACT, Window
+from brainbench.datasets.trials.selection import DEFAULT, FIRST_CONTACT, Conditions, Selection, Window
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -22,8 +22,8 @@ from brainbench.core.errors import DataError, listing
 from brainbench.core.files import content_hash
 from brainbench.core.progress import Progress
 from brainbench.core.reading.ranges import check_number
-from brainbench.datasets.layouts import rodgers
-from brainbench.datasets.layouts.rodgers import TRACKED
+from brainbench.datasets.layouts import published
+from brainbench.datasets.layouts.published import TRACKED
 from brainbench.datasets.sessions import Series, Session, make_session
 from brainbench.datasets.synthetic.populations import PopulationDesign, ResponseGeometry, draw_counts, expected_rates
 from brainbench.datasets.synthetic.truth import (
@@ -285,7 +285,7 @@ def make_rodgers_demo(
     """
     check_number("The number of animals of the demo", animals, least=1, whole=True)
     stimuli = _in_vocabulary_order(check_stimulus_set(stimuli))
-    geometry = ResponseGeometry.from_activations(wrench_features(stimuli), rodgers.LABELS)
+    geometry = ResponseGeometry.from_activations(wrench_features(stimuli), published.LABELS)
     contact = stimuli["contact"].transpose("stimulus", "time", "whisker").values.astype(bool)
     names = tuple(str(name) for name in stimuli["whisker"].values)
     contacts = tracked_contacts(names, contact, float(np.median(np.diff(stimuli["time"].values))))
@@ -293,7 +293,7 @@ def make_rodgers_demo(
     plans = [[replace(plan, subject=subject) for plan in own] for subject, own in turns]
     # Stimuli that do not suit are told before a folder is made.
     for plan in (plan for own in plans for plan in own):
-        first_contacts(contacts, rodgers.LABELS, plan.lost_whisker)
+        first_contacts(contacts, published.LABELS, plan.lost_whisker)
 
     def draw() -> Iterator[tuple[Session, NDArray[np.float64]]]:
         done, total = 0, sum(map(len, plans))
@@ -346,9 +346,11 @@ def wrench_features(stimuli: xr.Dataset) -> NDArray[np.float64]:
     broken = [name for index, name in enumerate(names) if not np.isfinite(wrench[:, :, index]).all()]
     if broken:
         raise DataError(f"The stimuli hold no finite wrench for {listing(broken)}: simulate with a finer fidelity.")
-    tracked = [index for index, name in enumerate(names) if name in rodgers.TRACKED]
+    tracked = [index for index, name in enumerate(names) if name in published.TRACKED]
     if not tracked:
-        raise DataError(f"The stimuli have none of the tracked whiskers {listing(rodgers.TRACKED)}; simulate them too.")
+        raise DataError(
+            f"The stimuli have none of the tracked whiskers {listing(published.TRACKED)}; simulate them too."
+        )
     # Root mean square of each channel: divided by it, forces (N) and moments (N·m) are comparable.
     scale = np.sqrt(np.mean(wrench[:, :, tracked] ** 2, axis=(0, 1, 2)))
     if not np.any(scale > 0):
@@ -366,8 +368,8 @@ def wrench_features(stimuli: xr.Dataset) -> NDArray[np.float64]:
 
 def _in_vocabulary_order(stimuli: xr.Dataset) -> xr.Dataset:
     have = [str(label) for label in stimuli["stimulus"].values]
-    if sorted(have) != sorted(rodgers.LABELS):
-        raise DataError(f"The demo recordings need the stimuli {listing(rodgers.LABELS)}; these are {listing(have)}.")
+    if sorted(have) != sorted(published.LABELS):
+        raise DataError(f"The demo recordings need the stimuli {listing(published.LABELS)}; these are {listing(have)}.")
     if "contact" not in stimuli:
         raise DataError("The demo recordings need the stimuli's contact [stimulus, time, whisker]; these have none.")
-    return stimuli.isel(stimulus=[have.index(label) for label in rodgers.LABELS])
+    return stimuli.isel(stimulus=[have.index(label) for label in published.LABELS])

@@ -1,5 +1,5 @@
 """Counted trials from sessions of spike times or signals.
 
-``selection`` labels the trials and keeps some, ``windows`` say when to read; ``counting`` reads one session (spikes, or
-``signals``), ``copies`` joins probes, ``session_trials`` makes one data set and hands it to metrics.
+``selection`` says what is read: labels, rules and windows; ``counting`` reads one session (spikes, or ``signals``), and
+``session_trials`` joins probes and sessions to one data set and hands it to metrics.
 """

@@ -15,9 +15,8 @@ from brainbench.core.errors import DataError, UsageError, listing
 from brainbench.core.reading.ranges import check_number
 from brainbench.datasets.ledger import Ledger
 from brainbench.datasets.sessions import OBSERVED, SPIKES, Session, SessionTable
-from brainbench.datasets.trials.selection import Conditions, Selection, joined_labels, select_rows
+from brainbench.datasets.trials.selection import CONTACTS, Conditions, Selection, Window, joined_labels, select_rows
 from brainbench.datasets.trials.signals import VOLTAGES, Samples, response_series
-from brainbench.datasets.trials.windows import CONTACTS, Window
 
 COVARIATES = ("contacts", "licks", "choice")
 LICKS = "licks"
@@ -163,7 +162,9 @@ def count_session(
     # Trials by start and id, units by id: the order of rows in the file changes nothing.
     start, ids, unit_ids = table.times("start_time"), as_labels(table.ids()), as_labels(source.units.ids())
     rows = _sorted(keep, lambda row: (start[row], natural_key(ids[row])))
-    units = _sorted(chosen, lambda unit: (natural_key(unit_ids[unit]), *source.key(unit)))
+    # Equal ids (several probes) are told apart by number of spikes and first spike.
+    spikes = source.spikes if isinstance(source, SpikeTrains) else [np.zeros(0)] * len(unit_ids)
+    units = _sorted(chosen, lambda unit: (natural_key(unit_ids[unit]), len(spikes[unit]), spikes[unit][:1].tolist()))
     bounds = bin_bounds(edges[rows], options.bin, options.window.length, units=len(units))
     counts = source.respond(rows, units, bounds)
     counts, duration = mask_missing(counts, bounds, covered[np.ix_(rows, units)])
@@ -271,10 +272,6 @@ class SpikeTrains:
             note = f"{self.units.label}: no obs_intervals; recorded span taken from first to last spike"
             ledger.note(f"{note}, {low:.3f}–{high:.3f} s")
         return covered
-
-    def key(self, unit: int) -> tuple[Any, ...]:
-        """Equal ids (several probes) are told apart by number of spikes and first spike."""
-        return len(self.spikes[unit]), self.spikes[unit][:1].tolist()
 
     def respond(
         self, rows: NDArray[np.int64], units: NDArray[np.int64], bounds: NDArray[np.float64]

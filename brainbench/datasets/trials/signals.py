@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 from brainbench.core.errors import DataError, UsageError, listing, unknown_name
 from brainbench.datasets.ledger import Ledger
 from brainbench.datasets.sessions import Series, Session, SessionTable
-from brainbench.datasets.trials.selection import Selection
-from brainbench.datasets.trials.windows import WHOLE, Window
+from brainbench.datasets.trials.selection import WHOLE, Selection, Window
 
 Floats = NDArray[np.float64]
 VOLTAGES = "ElectricalSeries"
@@ -146,10 +145,6 @@ class Samples:
         begin, end = (edges if self.starts is None else edges - self.starts[:, None]).T
         inside = (begin >= self.times[0] - self.step) & (end <= self.times[-1] + self.step)
         return np.repeat((inside | math.isnan(self.step))[:, None], len(self.units), axis=1)
-
-    def key(self, unit: int) -> tuple[Any, ...]:
-        """Cells of one id stand as in the file."""
-        return (unit,)
 
     def respond(self, rows: NDArray[np.int64], units: NDArray[np.int64], bounds: Floats) -> NDArray[np.float32]:
         """Return mean × length of the frames in bins [begin, end) of trials; NaN frames are left out.

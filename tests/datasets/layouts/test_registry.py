@@ -19,8 +19,7 @@ from brainbench.datasets import (
     write_recordings,
 )
 from brainbench.datasets.layouts.registry import get_layout, list_layouts
-from brainbench.datasets.trials.selection import Conditions, Selection
-from brainbench.datasets.trials.windows import Window
+from brainbench.datasets.trials.selection import Conditions, Selection, Window
 from tests.factories.dandi_files import write_area2, write_hires, write_yu
 from tests.factories.recordings import make_simple_session
 

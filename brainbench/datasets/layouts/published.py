@@ -1,4 +1,9 @@
-"""Layouts of data sets that store spikes, touches or labels in their own way.
+"""Layouts of published data sets. Rodgers 2022 (DANDI 000231): mice recognise shapes with their whiskers.
+
+Two tasks share one layout. *Discrimination*: convex or concave, one side each. *Detection*: a shape of
+either kind on one side, ``nothing`` on the other. ``rodgers`` reads both as the published analysis
+pooled them, ``rodgers-discrimination`` and ``rodgers-detection`` read one; the last keeps ``nothing``
+as a seventh stimulus. ``get_layout("rodgers").describe()`` prints every rule.
 
 Hires 2015 (DANDI 000013) and Yu 2016 (DANDI 000005): a mouse finds a pole with its whiskers. Hires has one cell per
 file and no units table: spikes are a 0/1 signal ``acquisition/SpikeTrain`` with time stamps, touches likewise under
@@ -18,10 +23,127 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.contracts import as_labels
+from brainbench.core.errors import listing
 from brainbench.datasets.layouts.registry import RecordingLayout
 from brainbench.datasets.sessions import OBSERVED, SPIKES, Series, Session, SessionTable, ragged
-from brainbench.datasets.trials.selection import Conditions, Rule, Selection
-from brainbench.datasets.trials.windows import Window
+from brainbench.datasets.trials.selection import (
+    CONTACTS,
+    FIRST_CONTACT,
+    Conditions,
+    Rule,
+    Selection,
+    Window,
+    joined_labels,
+)
+
+TITLE = "object recognition by whiskers, barrel cortex units (DANDI 000231)"
+CITATION = "Rodgers C. C., Scientific Data 9:620 (2022), doi:10.1038/s41597-022-01728-1"
+
+CONDITIONS = Conditions("trials", ("stimulus", "servo_position"))
+ORDERS = {"stimulus": ("convex", "concave"), "servo_position": ("close", "medium", "far")}
+"""Fixed order of the vocabulary: convex-close, convex-medium, convex-far, concave-close, …"""
+
+SELECTION = Selection(
+    name="rodgers",
+    trials=(
+        Rule("stimulus", refuse=("nothing",)),
+        Rule("outcome", refuse=("spoil",)),
+        Rule("direct_delivery", refuse=("true",), required=False),
+        Rule("stim_is_random", refuse=("false",), required=False),
+        Rule("optogenetic", refuse=("true",), required=False),
+        Rule("ignore_trial", refuse=("true",), required=False),
+    ),
+)
+"""The trials that the data descriptor (its table 6) says to ignore, and the detection task's
+``nothing``. ``ignore_trial`` stands last, so that it counts only trials ruined in some other way."""
+
+WINDOW = Window(anchor=FIRST_CONTACT, stop="choice", fallback=Window(anchor="choice", offset=-1.0, length=1.0))
+"""First contact to choice, as in the published analysis; the last second before the choice where a
+session has no contact tables."""
+
+COLUMNS = ("stimulus", "servo_position", "outcome", "choice_time")
+
+REMARKS = (
+    "trials: a contact must last longer than zero to be the first; no contact before the choice removes the trial",
+    "trials: the window must lie inside the recorded span (obs_intervals, else the session's first to last spike)",
+    "clock: times are used as stored; the voltage series' starting_time is never subtracted",
+)
+
+NOTHING = "nothing"
+TRACKED = ("C0", "C1", "C2", "C3")
+"""Whiskers whose contacts were tracked; a session may lack the table of one that was lost."""
+LABELS = tuple(f"{shape}-{place}" for shape in ORDERS["stimulus"] for place in ORDERS["servo_position"])
+
+
+def task(session: Session) -> str:
+    """Return ``"detection"`` if any trial of the session was without a shape, else ``"discrimination"``."""
+    stimuli = as_labels(session.table(CONDITIONS.table).column("stimulus"))
+    return "detection" if NOTHING in stimuli.tolist() else "discrimination"
+
+
+def adapt(session: Session) -> Session:
+    """Add two columns to the trials: ``task``, and ``object`` (shape and position, or ``nothing``).
+
+    Where a shape would have been has no meaning on a trial without one, so all of those are alike. A
+    tracked whisker without contacts is named in the notes.
+    """
+    table = session.tables.get(CONDITIONS.table)
+    if table is None or any(name not in table for name in CONDITIONS.columns) or "task" in table:
+        return session
+    values = CONDITIONS.values(table)
+    objects = (
+        np.where(values[:, 0] == NOTHING, NOTHING, joined_labels(values)) if len(table) else np.zeros(0, dtype="U1")
+    )
+    trials = table.with_columns(task=np.full(len(table), task(session)), object=objects)
+    have = {match["whisker"] for match in map(CONTACTS.match, session.tables) if match}
+    lost = [name for name in TRACKED if name not in have]
+    note = f"{session.source}: no contact table of {listing(lost)}; the first contact is that of the other whiskers"
+    return session.with_table(trials, *([note] if have and lost else []))
+
+
+LAYOUT = RecordingLayout(
+    name="rodgers",
+    title=TITLE,
+    citation=CITATION,
+    conditions=CONDITIONS,
+    orders=ORDERS,
+    selection=SELECTION,
+    window=WINDOW,
+    columns=COLUMNS,
+    remarks=REMARKS,
+    adapt=adapt,
+    dandiset="000231",
+    assets="*ecephys*",
+    stimuli="rodgers",
+)
+DISCRIMINATION = replace(
+    LAYOUT,
+    columns=(),
+    name="rodgers-discrimination",
+    title=f"{TITLE}, sessions of the discrimination task",
+    selection=replace(
+        SELECTION, name="rodgers-discrimination", trials=(Rule("task", allow=("discrimination",)), *SELECTION.trials)
+    ),
+)
+DETECTION = replace(
+    LAYOUT,
+    columns=(),
+    name="rodgers-detection",
+    title=f"{TITLE}, sessions of the detection task, with 'nothing' as a stimulus",
+    conditions=Conditions("trials", ("object",)),
+    orders={**ORDERS, "object": (*LABELS, NOTHING)},
+    selection=replace(
+        SELECTION,
+        name="rodgers-detection",
+        trials=(Rule("task", allow=("detection",)), *(rule for rule in SELECTION.trials if rule.column != "stimulus")),
+    ),
+    window=Window(anchor="choice", offset=-1.0, length=1.0),
+    remarks=(
+        "window: up to the choice for every trial, because trials without a shape have no first contact",
+        *REMARKS[1:],
+    ),
+)
+
 
 TRAIN = "acquisition/SpikeTrain"
 ONSET, OFFSET = "touch_onset", "touch_offset"
@@ -29,7 +151,7 @@ _WHISKER = re.compile(rf"^(?P<prefix>acquisition/(?:principal_)?whisker_(?P<name
 WHISKER = "C2"
 """The files do not name the whisker; the paper recorded around the C2 column with one whisker left."""
 
-SELECTION = (Rule("type", refuse=("N/A",)), Rule("stim_present", refuse=("true",), required=False))
+POLE_RULES = (Rule("type", refuse=("N/A",)), Rule("stim_present", refuse=("true",), required=False))
 """Photostimulated trials are not the neuron's own answer to touch."""
 
 
@@ -97,7 +219,7 @@ HIRES = RecordingLayout(
     citation="Hires S. A., Gutnisky D. A. et al., eLife 4:e06619 (2015), doi:10.7554/eLife.06619",
     conditions=Conditions("trials", ("type",)),
     orders={},
-    selection=Selection(name="hires", trials=SELECTION),
+    selection=Selection(name="hires", trials=POLE_RULES),
     window=Window("pole_in_time", stop="pole_out_time"),
     columns=_POLE,
     adapt=adapt_hires,
@@ -114,7 +236,7 @@ YU = replace(
     title="pole localisation with a few whiskers, units of thalamus (VPM) and layer 4 (DANDI 000005)",
     citation="Yu J., Gutnisky D. A. et al., Nature Neuroscience 19:1647 (2016), doi:10.1038/nn.4412",
     orders={"type": ("Go", "Nogo")},
-    selection=Selection(name="yu", trials=SELECTION),
+    selection=Selection(name="yu", trials=POLE_RULES),
     columns=(*_POLE, "first_touch_time", "photo_stim_mode"),
     adapt=adapt_yu,
     touch="first_touch_time",
