@@ -23,7 +23,7 @@ BUDGETS = {
     "brainbench/stimuli": 26_400,  # the estimated error of every whisker
     "robotics_bridge": 24_800,  # newtons that no taxel has, trees of any hand, deadlines, replays, gel pictures
     "brainbench/models": 8_500,  # the proof that a layer is a response
-    "brainbench/datasets": 7_500,  # the balance of a reading, copies of sessions, signals, bands, baselines
+    "brainbench/datasets": 7_450,  # the balance of a reading, copies of sessions, signals, bands, baselines
     "brainbench/metrics": 5_400,  # the unique part
     "brainbench/cli": 4_950,  # check-submission, options of benchmarks
     "brainbench/core": 5_900,  # the sealed door, seals of the cache, the filter of foreign text, sealed plans
