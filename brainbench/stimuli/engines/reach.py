@@ -65,7 +65,7 @@ def reachable(
     With ``surfaces`` the surface of every obstacle that has one is taken, as by engines that collide meshes; otherwise
     its parts, and the surface only where there are none.
     """
-    limit = whisker.arc_length + max(whisker.base_radius, whisker.tip_radius)
+    limit = whisker.arc_length + whisker.thickest
     still = np.array([obstacle.motion is None for obstacle in obstacles], dtype=bool)
     bounds = np.array([obstacle.bounds for obstacle, stands in zip(obstacles, still, strict=True) if stands])
     apart = np.zeros(len(obstacles))

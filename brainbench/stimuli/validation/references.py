@@ -56,6 +56,10 @@ def point_load_deflection(whisker: Whisker, force: float, at: float) -> float:
             f"This closed form is for a straight whisker; this one has curvature {whisker.curvature:g} 1/m; "
             "use elastica, which takes any curvature."
         )
+    if whisker.radii or whisker.moduli:
+        raise UsageError(
+            "This closed form is for a cone of one material; use elastica, which takes tables along a whisker."
+        )
     stiffness = float(whisker.bending_stiffness(0.0))
     return force * at**3 / (3 * stiffness) * whisker.base_radius / float(whisker.radius(at))
 

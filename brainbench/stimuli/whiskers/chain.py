@@ -16,11 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.reading.ranges import check_number
-from brainbench.stimuli.whiskers.whisker import Whisker
+from brainbench.stimuli.whiskers.whisker import NODES, WEIGHTS, Whisker, quadrature
 
 # Ratio of the radii across a cell from which ``_compliance`` does without its parabola.
 _STEEPEST = 1.4
-_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,16 +117,18 @@ def build_chain(whisker: Whisker, links: int) -> Chain:
 def _compliance(whisker: Whisker, links: int) -> NDArray[np.float64]:
     """Return the compliance of each joint [N] (rad/(N·m)): the integral of M²/(E I), M² quadratic around each cell."""
     cell = whisker.arc_length / links
-    total = np.zeros(links + 1)
+    total, breaks = np.zeros(links + 1), whisker.breaks
     for i in range(links + 1):
         low, high = max(0.0, (i - 0.5) * cell), min(whisker.arc_length, (i + 0.5) * cell)
-        s = low + (high - low) / 2 * (_NODES + 1)
-        flexibility = (high - low) / 2 * _WEIGHTS / whisker.bending_stiffness(s)
+        s, weights = quadrature(low, high, breaks)
+        stiffness = whisker.bending_stiffness(s)
+        flexibility = weights / stiffness
         if i == links:
             # Next to the free tip the moment of a tip load falls to zero linearly.
             total[i - 1] += flexibility @ (s / cell - i) ** 2
             continue
-        if whisker.radius(low) > _STEEPEST * whisker.radius(high):
+        steep = whisker.radius(low) > _STEEPEST * whisker.radius(high)
+        if steep or (len(breaks) and stiffness.max() > _STEEPEST**4 * stiffness.min()):
             # Across such a steep cell a parabola would take more from a neighbour than that has; keep it whole, with
             # a moment that falls towards the tip as under loads spread along a cone.
             total[i] += flexibility @ ((whisker.arc_length - s) / (whisker.arc_length - i * cell)) ** 3
@@ -159,22 +160,20 @@ def _frusta(whisker: Whisker, nodes: NDArray, lengths: NDArray) -> tuple[NDArray
 
     The mass of each arc is kept whole and spread along its chord.
     """
-    low, high = nodes[:-1], nodes[1:]
-    masses = _integrate(whisker.linear_density, low, high)
-    first = _integrate(lambda s: whisker.linear_density(s) * (s - low[:, None]), low, high)
-    second = _integrate(lambda s: whisker.linear_density(s) * (s - low[:, None]) ** 2, low, high)
-    polar = _integrate(lambda s: whisker.linear_density(s) * whisker.radius(s) ** 2 / 4, low, high)
+    # Smooth pieces of the links: the integrands are polynomials of degree 5, and eight points integrate degree 15.
+    edges = np.union1d(nodes, whisker.breaks)
+    link, half = np.searchsorted(nodes, edges[:-1], side="right") - 1, np.diff(edges) / 2
+    s = edges[:-1, None] + half[:, None] * (NODES + 1)
+    density, along = whisker.linear_density(s), s - nodes[link][:, None]
+
+    def integrate(values: NDArray) -> NDArray:
+        return np.bincount(link, half * (values @ WEIGHTS))
+
+    masses, first, second = (integrate(density * along**power) for power in range(3))
+    polar = integrate(density * whisker.radius(s) ** 2 / 4)
     # Arc to chord: the mass of an arc is spread along a slightly shorter line.
-    ratio = lengths / (high - low)
+    ratio = lengths / np.diff(nodes)
     centres = first / masses * ratio
     # Parallel axes: from the joint to the centre of mass. A disc adds m r²/4 about a diameter, m r²/2 about its axis.
     transverse = (second - first**2 / masses) * ratio**2 + polar
     return masses, centres, np.stack([2 * polar, transverse], axis=-1)
-
-
-def _integrate(function, low: NDArray, high: NDArray) -> NDArray[np.float64]:  # noqa: ANN001
-    """Integrate a function of arc length over each interval [low, high] by Gauss-Legendre quadrature."""
-    # Exact: the integrands are polynomials of degree 5, and eight points integrate degree 15.
-    half = (high - low) / 2
-    s = low[:, None] + half[:, None] * (_NODES + 1)
-    return half * (function(s) @ _WEIGHTS)

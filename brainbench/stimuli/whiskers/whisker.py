@@ -6,6 +6,7 @@ plane with its concave side towards +y. Arc length s runs from 0 at the base to 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import Annotated
 
@@ -13,7 +14,7 @@ import numpy as np
 from numpy.polynomial import Polynomial
 from numpy.typing import ArrayLike, NDArray
 
-from brainbench.core.errors import UsageError
+from brainbench.core.errors import UsageError, brief
 from brainbench.core.limits import Limit, NotNegative, limited
 from brainbench.core.rotations import Length
 
@@ -23,6 +24,8 @@ LIGHTEST = 10.0
 """Density [kg/m³] below which a number looks like grams per cubic centimetre."""
 
 _Density = Annotated[float, Limit(least=LIGHTEST, unit="kg/m³")]
+NODES, WEIGHTS = np.polynomial.legendre.leggauss(8)
+"""Gauss-Legendre quadrature on [−1, 1]."""
 
 
 @dataclass(frozen=True)
@@ -30,8 +33,9 @@ _Density = Annotated[float, Limit(least=LIGHTEST, unit="kg/m³")]
 class Whisker:
     """Geometry and material of one whisker.
 
-    Radius and density vary linearly with arc length; the cross-section is a solid circle. The rest
-    shape is the parabola y = A x² (A = ``curvature``), measured along its arc.
+    Radius and density vary linearly with arc length, unless tables say how radius and Young's modulus run.
+    The cross-section is a solid circle. The rest shape is the parabola y = A x² (A = ``curvature``), measured along its
+    arc.
     """
 
     arc_length: Length
@@ -53,16 +57,55 @@ class Whisker:
     poisson_ratio: Annotated[float, Limit(above=-1, most=0.5)] = field(default=0.4, metadata={"later": True})
     """Poisson's ratio ν, above −1 and at most .5: the shear modulus is G = E/(2 (1 + ν)). Not measured on whiskers; .4
     is usual for polymers. Along its axis human hair twists more easily still: E = 3.9, G = .9 GPa (Robbins 2012)."""
+    radii: tuple[tuple[float, float], ...] = field(default=(), metadata={"later": True})
+    """Rows (arc length, radius) [m] from the base, at 0, to the tip, at ``arc_length``, linear in between: as measured,
+    with the end where a tip is cut. They take the place of ``base_radius`` and ``tip_radius``."""
+    moduli: tuple[tuple[float, float], ...] = field(default=(), metadata={"later": True})
+    """Rows (arc length [m], Young's modulus [Pa]) likewise, in place of ``young_modulus``, then that at the base."""
 
     def __post_init__(self) -> None:
+        for name, what, least in (("radii", "radius", 0.0), ("moduli", "Young's modulus", SOFTEST)):
+            rows = tuple((float(arc), float(value)) for arc, value in getattr(self, name))
+            object.__setattr__(self, name, rows)
+            if rows:
+                self._check_table(name, what, least)
+        if self.radii:
+            object.__setattr__(self, "base_radius", self.radii[0][1])
+            object.__setattr__(self, "tip_radius", self.radii[-1][1])
+        if self.moduli:
+            object.__setattr__(self, "young_modulus", self.moduli[0][1])
         if isinstance(self.density, (tuple, list)):
             object.__setattr__(self, "density", (float(self.density[0]), float(self.density[1])))
-        thickest = max(self.base_radius, self.tip_radius)
+        thickest = self.thickest
         if thickest > self.arc_length / 5:
             raise UsageError(
                 f"A whisker of arc length {self.arc_length:g} m with radius {thickest:g} m"
                 " is no slender rod (radius above a fifth of the length); all lengths are in metres."
             )
+
+    def _check_table(self, name: str, what: str, least: float) -> None:
+        arcs, values = np.transpose(getattr(self, name))
+        ascends = len(arcs) > 1 and (np.diff(arcs) > 0).all()
+        if not (ascends and arcs[0] == 0 and math.isclose(arcs[-1], self.arc_length, rel_tol=1e-9)):
+            raise UsageError(
+                f"{name} of a whisker are rows (arc length, {what}) whose arc lengths (m) ascend from 0 to that of the"
+                f" whisker, {self.arc_length:g}; received arc lengths {brief(arcs.tolist())}."
+            )
+        if not (values > least).all():
+            raise UsageError(
+                f"Every {what} in the {name} of a whisker is above {least:g}, in SI units; received"
+                f" {brief(values.tolist())}."
+            )
+
+    @property
+    def thickest(self) -> float:
+        """Largest radius [m]."""
+        return max(self.base_radius, self.tip_radius, *(radius for _, radius in self.radii))
+
+    @property
+    def breaks(self) -> NDArray[np.float64]:
+        """Arc lengths [m], ascending, at which a table bends, so that no polynomial holds on both sides."""
+        return np.unique([arc for rows in (self.radii, self.moduli) for arc, _ in rows[1:-1]])
 
     @property
     def densities(self) -> tuple[float, float]:
@@ -72,6 +115,9 @@ class Whisker:
     @property
     def mass(self) -> float:
         """Mass of the whole whisker [kg], the integral of ρ π r² (exact)."""
+        if self.radii:
+            s, weights = quadrature(0.0, self.arc_length, self.breaks)
+            return float(self.linear_density(s) @ weights)
         (low, high), slope = self.densities, self.tip_radius - self.base_radius
         # In powers of s/L.
         area = Polynomial([np.pi * self.base_radius**2, 2 * np.pi * self.base_radius * slope, np.pi * slope**2])
@@ -79,11 +125,14 @@ class Whisker:
 
     def radius(self, s: ArrayLike) -> NDArray[np.float64]:
         """Return the radius [m] at arc length ``s`` [m]."""
+        if self.radii:
+            return np.interp(s, *np.transpose(self.radii))
         return self.base_radius + (self.tip_radius - self.base_radius) * self._fraction(s)
 
     def bending_stiffness(self, s: ArrayLike) -> NDArray[np.float64]:
         """Return the flexural rigidity E I [N·m²] at arc length ``s`` [m], with the second moment I = π r⁴/4."""
-        return self.young_modulus * (np.pi * self.radius(s) ** 4 / 4)
+        modulus = np.interp(s, *np.transpose(self.moduli)) if self.moduli else self.young_modulus
+        return modulus * (np.pi * self.radius(s) ** 4 / 4)
 
     @property
     def torsion_ratio(self) -> float:
@@ -127,3 +176,10 @@ class Whisker:
 
     def _fraction(self, s: ArrayLike) -> NDArray[np.float64]:
         return np.asarray(s, dtype=float) / self.arc_length
+
+
+def quadrature(low: float, high: float, breaks: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return points and weights that integrate over [low, high] what is smooth between ``breaks`` (Gauss-Legendre)."""
+    edges = np.array([low, *breaks[(breaks > low) & (breaks < high)], high])
+    first, half = edges[:-1, None], np.diff(edges)[:, None] / 2
+    return (first + half * (NODES + 1)).ravel(), (half * WEIGHTS).ravel()

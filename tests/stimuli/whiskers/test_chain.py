@@ -9,6 +9,9 @@ from hypothesis import strategies as st
 from scipy.integrate import quad
 
 from brainbench.core.errors import UsageError
+from brainbench.stimuli.engines import get_engine
+from brainbench.stimuli.engines.fidelity import Fidelity
+from brainbench.stimuli.motion.jobs import Job, Load, StillFollicle
 from brainbench.stimuli.validation.references import natural_frequencies
 from brainbench.stimuli.whiskers.chain import build_chain
 from brainbench.stimuli.whiskers.whisker import Whisker
@@ -113,3 +116,48 @@ def test_every_second_joint_takes_over_the_twist_of_its_neighbours(links):
     # GJ = EI/(1 + ν); of an odd number of links half the last cell, next to the free tip, is left out.
     whole = np.sum(1 / chain.stiffness) - (links % 2) / 2 / chain.stiffness[-1]
     assert np.sum(1 / chain.torsion[1::2]) == pytest.approx(1.25 * whole, rel=1e-12)
+
+
+def test_a_chain_of_a_table_that_is_the_cone_is_the_chain_of_the_cone():
+    arcs = np.array([0.0, 0.37, 1.0]) * C2.arc_length
+    table = replace(C2, radii=np.stack([arcs, C2.radius(arcs)], axis=1).tolist())
+    for name in ("masses", "centres", "inertias", "stiffness", "radii"):
+        np.testing.assert_allclose(
+            getattr(build_chain(table, 11), name), getattr(build_chain(C2, 11), name), rtol=1e-12
+        )
+
+
+def _stepped():
+    """A beam of two cylinders, thick up to .4 of its length, and its deflection at the tip over the load there."""
+    length, thick, thin, joint = C2.arc_length, 5e-5, 3e-5, 0.4 * C2.arc_length
+    rows = [[0, thick], [joint, thick], [joint + 1e-9, thin], [length, thin]]
+    first, second = (C2.young_modulus * np.pi * radius**4 / 4 for radius in (thick, thin))
+    rest = length - joint
+    return replace(C2, curvature=0.0, radii=rows), (length**3 - rest**3) / (3 * first) + rest**3 / (3 * second)
+
+
+def test_a_stepped_beam_bends_as_its_closed_form_says_with_an_error_that_falls_with_the_square_of_the_links():
+    whisker, exact = _stepped()
+    errors = []
+    for links in (10, 20, 40):
+        chain = build_chain(whisker, links)
+        errors.append(abs(np.sum((whisker.arc_length - chain.nodes[:-1]) ** 2 / chain.stiffness) / exact - 1))
+    assert errors[0] < 0.006
+    assert errors[1] < errors[0] / 3
+    assert errors[2] < errors[1] / 3
+
+
+@pytest.mark.parametrize("backend", ["rod", "mujoco"])
+def test_engines_bend_a_stepped_beam_of_two_materials(backend):
+    whisker, _ = _stepped()
+    softer = [[0, C2.young_modulus], [0.6 * whisker.arc_length, C2.young_modulus / 2], [whisker.arc_length, 1e9]]
+    whisker = replace(whisker, moduli=softer, damping_ratio=0.5)
+    length = whisker.arc_length
+    breaks = [0.4 * length, 0.6 * length]
+    compliance = quad(lambda s: (length - s) ** 2 / whisker.bending_stiffness(s), 0, length, points=breaks, epsabs=0)[0]
+    force = 1e-3 * length / compliance
+    job = Job(whisker, StillFollicle(), (), np.array([0.2]), loads=(Load(length, (0.0, force, 0.0)),))
+    (trace,) = get_engine(backend).run([job], Fidelity(links=20), record_shape=True)
+    assert trace.link_positions is not None
+    assert trace.link_positions[0, -1, 1] == pytest.approx(1e-3 * length, rel=5e-3)
+    assert trace.wrench[0, 5] == pytest.approx(force * length, rel=1e-3)

@@ -1,6 +1,7 @@
 """One whisker's geometry against closed forms."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from hypothesis import strategies as st
 from brainbench.core.errors import UsageError
 from brainbench.core.files import content_hash, to_plain
 from brainbench.stimuli.whiskers.whisker import Whisker
+from tests.factories.whiskers import C2
 
 
 def _make_whisker(**changes):
@@ -83,3 +85,32 @@ def test_poissons_ratio_is_in_hashes_only_where_it_is_not_the_default():
 def test_impossible_values_are_refused_by_name(changes, message):
     with pytest.raises(UsageError, match=message):
         _make_whisker(**changes)
+
+
+@pytest.mark.parametrize(
+    ("name", "rows", "words"),
+    [
+        ("radii", [[0, 1e-5], [0.002, 2e-5]], "ascend from 0 to that of the whisker, 0.01"),
+        ("radii", [[0, 2e-5], [0.006, 2e-5], [0.005, 1e-5], [0.01, 1e-5]], "radii of a whisker are rows"),
+        ("radii", [[0, 2e-5], [0.01, 0.0]], "Every radius in the radii of a whisker is above 0"),
+        ("moduli", [[0.001, 3e9], [0.01, 3e9]], "ascend from 0"),
+        ("moduli", [[0, 3.3], [0.01, 2.9]], "Every Young's modulus in the moduli of a whisker is above 1000"),
+    ],
+)
+def test_tables_that_cannot_be_are_refused(name, rows, words):
+    with pytest.raises(UsageError, match=words):
+        replace(C2, arc_length=0.01, **{name: rows})
+
+
+def test_a_table_of_the_cone_is_the_cone_and_stands_for_both_its_radii():
+    arcs = np.array([0.0, 0.3, 0.7, 1.0]) * C2.arc_length
+    table = np.stack([arcs, C2.radius(arcs)], axis=1).tolist()
+    whisker = replace(C2, base_radius=1e-6, tip_radius=1e-6, radii=table, moduli=[[0, 2e9], [C2.arc_length, 4e9]])
+    s = np.linspace(0, C2.arc_length, 31)
+    np.testing.assert_allclose(whisker.radius(s), C2.radius(s), rtol=1e-14)
+    assert (whisker.base_radius, whisker.tip_radius) == (C2.base_radius, C2.tip_radius)
+    assert whisker.mass == pytest.approx(C2.mass, rel=1e-13)
+    np.testing.assert_allclose(
+        whisker.bending_stiffness(s) / C2.bending_stiffness(s), np.linspace(2e9, 4e9, 31) / C2.young_modulus, rtol=1e-13
+    )
+    assert hash(whisker) != hash(C2)
