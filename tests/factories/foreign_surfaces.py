@@ -20,8 +20,7 @@ from brainbench.models.training.checkpoints import find_folder
 from brainbench.models.user_models import add_user_model, read_user_models
 from brainbench.published.checkpoint_import import read_settings
 from brainbench.stimuli import Whisker
-from brainbench.stimuli.fitting.trials import Trial
-from brainbench.stimuli.fitting.wrenches import read_wrenches
+from brainbench.stimuli.fitting.trials import Trial, read_wrenches
 from brainbench.stimuli.motion.tracked import PlayOptions, load_angles
 from brainbench.stimuli.tracks.readers import TrackOptions, read_shapes
 from robotics_bridge import hands, tasks

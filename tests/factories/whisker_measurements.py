@@ -14,8 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from brainbench.core.contracts import CHANNELS
 from brainbench.core.errors import DataError
 from brainbench.stimuli.fitting.model import FitModel
-from brainbench.stimuli.fitting.options import FitOptions
-from brainbench.stimuli.fitting.parameters import FreeParameters
+from brainbench.stimuli.fitting.parameters import FitOptions, FreeParameters
 from brainbench.stimuli.fitting.trials import Trial
 from brainbench.stimuli.tracks.contract import new_shapes, new_wrenches
 from brainbench.stimuli.whiskers.chain import build_chain

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from brainbench.stimuli.fitting.design import DesignOptions, DesignResult
     from brainbench.stimuli.whiskers.whisker import Whisker
 
-_FIT = "brainbench.stimuli.fitting.options:FitOptions"
+_FIT = "brainbench.stimuli.fitting.parameters:FitOptions"
 _CONTACTS = "brainbench.stimuli.fitting.contacts:ContactOptions"
 _TRACK = "brainbench.stimuli.tracks.readers:TrackOptions"
 _OFFERED = (
@@ -82,7 +82,7 @@ def fit(
     ] = None,
 ) -> Output:
     """Estimate parameters of a whisker, with intervals, from traced shapes or base wrenches."""
-    from brainbench.stimuli.fitting.wrenches import read_wrenches
+    from brainbench.stimuli.fitting.trials import read_wrenches
     from brainbench.stimuli.tracks.readers import TrackOptions, holds_shapes, read_shapes
 
     if contacts:

@@ -17,11 +17,19 @@ from numpy.typing import NDArray
 from brainbench.core.errors import DataError, UsageError, check_each
 from brainbench.core.files import provenance
 from brainbench.core.records import Interval, Status
-from brainbench.stimuli.fitting.checks import check_residuals, check_wrenches, dead_channels, failed_words, other_sizes
 from brainbench.stimuli.fitting.model import FitModel, find_starts, scanned
-from brainbench.stimuli.fitting.options import FitOptions
-from brainbench.stimuli.fitting.parameters import PARAMETERS, PUBLISHED, FreeParameters, Prior
-from brainbench.stimuli.fitting.result import FitResult, FittedParameter, directions, unknown_parameters
+from brainbench.stimuli.fitting.parameters import PARAMETERS, PUBLISHED, FitOptions, FreeParameters, Prior
+from brainbench.stimuli.fitting.result import (
+    FitResult,
+    FittedParameter,
+    check_residuals,
+    check_wrenches,
+    dead_channels,
+    directions,
+    failed_words,
+    other_sizes,
+    unknown_parameters,
+)
 from brainbench.stimuli.fitting.trials import Trial
 
 Array = NDArray[np.float64]

@@ -17,8 +17,7 @@ from brainbench.core.errors import DataError
 from brainbench.stimuli.engines import get_engine
 from brainbench.stimuli.engines.fidelity import MOST_LINKS, Fidelity
 from brainbench.stimuli.fitting.gradients import GradientRun, Tangents
-from brainbench.stimuli.fitting.options import FitOptions
-from brainbench.stimuli.fitting.parameters import Condition, FreeParameters
+from brainbench.stimuli.fitting.parameters import Condition, FitOptions, FreeParameters
 from brainbench.stimuli.fitting.trials import Trial
 from brainbench.stimuli.motion.jobs import Job, Trace
 from brainbench.stimuli.validation import references

@@ -9,7 +9,7 @@
     species = "mouse"
     whiskers = "C1,C2"
     [array.replace.C2]           # optional: other whisker properties, SI units, by selection
-    young_modulus = 3.3e9
+    young_modulus = 3.3e9        # along the whisker: moduli = [[0, 3e9], [0.0153, 4.5e9]], radii likewise
 
     [head]                       # the array frame in the world; rotation about x, then y, then z
     position_mm = [0, 0, 0]

@@ -41,7 +41,7 @@ def test_a_ring_down_is_fitted_written_and_drawn(run, ringdown_file, tmp_path):
 
 @pytest.mark.slow
 def test_contacts_of_a_track_are_printed(run, tmp_path):
-    from brainbench.stimuli.fitting.curves import LoadedWhisker
+    from brainbench.stimuli.fitting.contacts import LoadedWhisker
 
     shape = LoadedWhisker(WHISKER).shapes(np.zeros((1, 3)), np.array([0.009]), np.array([8e-5]))
     path = write_points(tmp_path / "track.csv", np.repeat(shape.place[:, ::2], 3, axis=0))

@@ -14,6 +14,11 @@ from tests.factories.fitted_ringdown import KNOWN
 from tests.factories.whisker_measurements import blank_wrenches
 
 
+def test_profiles_follow_squares_alone():
+    with pytest.raises(UsageError, match=r"'huber'.*intervals = 'laplace'"):
+        FitOptions(intervals="profile", loss="huber")
+
+
 @pytest.mark.parametrize("name", [name for name in PARAMETERS if name != "deflection"])
 def test_every_parameter_is_set_and_read(name):
     trial = Trial.ringdown(KNOWN, blank_wrenches(np.arange(1, 9) * 1e-3), 1e-3)

@@ -60,6 +60,17 @@ def test_a_file_may_state_that_its_whiskers_do_not_twist_and_what_they_are_made_
         load_scene(_write(tmp_path, "twist = 0\n" + POLE))
 
 
+def test_a_file_holds_whiskers_as_they_were_measured_along_their_length(tmp_path):
+    rows = "arc_length = 0.02\nradii = [[0, 5e-5], [0.008, 3e-5], [0.02, 1e-5]]\nmoduli = [[0, 2e9], [0.02, 4e9]]"
+    near, _ = load_scene(_write(tmp_path, POLE.replace("young_modulus = 3.3e9", rows))).scenes
+    whisker = near.array["C2"].whisker
+    assert (whisker.base_radius, whisker.tip_radius, whisker.young_modulus) == (5e-5, 1e-5, 2e9)
+    assert whisker.radius(0.014) == pytest.approx(2e-5)
+    for wrong in ("[[0, 5e-5], [0.008, 3e-5]]", "[[0, 5e-5], [0.02, -1e-5]]", "[[0, 5e-5], [0.02]]"):
+        with pytest.raises(UsageError, match=r"pole\.toml: .*radii of a whisker"):
+            load_scene(_write(tmp_path, POLE.replace("young_modulus = 3.3e9", f"arc_length = 0.02\nradii = {wrong}")))
+
+
 def test_a_friction_below_zero_is_refused(tmp_path):
     with pytest.raises(UsageError, match=r"friction.*-1"):
         load_scene(_write(tmp_path, POLE.replace("friction = 0.3", "friction = -1")))
