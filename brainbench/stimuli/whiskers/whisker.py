@@ -126,12 +126,12 @@ class Whisker:
     def radius(self, s: ArrayLike) -> NDArray[np.float64]:
         """Return the radius [m] at arc length ``s`` [m]."""
         if self.radii:
-            return np.interp(s, *np.transpose(self.radii))
+            return _along(self.radii, s)
         return self.base_radius + (self.tip_radius - self.base_radius) * self._fraction(s)
 
     def bending_stiffness(self, s: ArrayLike) -> NDArray[np.float64]:
         """Return the flexural rigidity E I [N·m²] at arc length ``s`` [m], with the second moment I = π r⁴/4."""
-        modulus = np.interp(s, *np.transpose(self.moduli)) if self.moduli else self.young_modulus
+        modulus = _along(self.moduli, s) if self.moduli else self.young_modulus
         return modulus * (np.pi * self.radius(s) ** 4 / 4)
 
     @property
@@ -176,6 +176,11 @@ class Whisker:
 
     def _fraction(self, s: ArrayLike) -> NDArray[np.float64]:
         return np.asarray(s, dtype=float) / self.arc_length
+
+
+def _along(rows: tuple[tuple[float, float], ...], s: ArrayLike) -> NDArray[np.float64]:
+    """Return the values of a table at arc length ``s`` [m]."""
+    return np.asarray(np.interp(np.asarray(s, dtype=float), *np.transpose(rows)))
 
 
 def quadrature(low: float, high: float, breaks: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
