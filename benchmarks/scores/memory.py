@@ -6,6 +6,7 @@ python -m benchmarks.scores.memory --out memory [--write]
 from __future__ import annotations
 
 import json
+import math
 import os
 import resource
 import subprocess
@@ -13,6 +14,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -98,7 +100,38 @@ def explain_score(folder: Path) -> None:
     )  # fmt: skip
 
 
-JOBS: dict[str, Callable[[Path], None]] = {
+def score_many(folder: Path, stimuli: int) -> dict[str, float]:
+    """Score a network and its baselines by RSA against four animals of 50 units and 8 trials of each stimulus."""
+    import h5py
+    import torch
+    from torch import nn
+
+    from brainbench.datasets import write_recordings
+    from brainbench.datasets.sessions import make_session
+    from brainbench.scoring.scores import score_record
+
+    draw, names = np.random.default_rng(0), [f"s{index:04d}" for index in range(stimuli)]
+    frames = draw.normal(size=(stimuli, 3, 2, 2, 2)).astype(np.float32)
+    with h5py.File(folder / "stimuli.h5", "w") as file:
+        file["stimuli"], file["labels"] = frames, np.array(names, dtype=h5py.string_dtype())
+    for animal in range(4):
+        codes = draw.permutation(np.repeat(np.arange(stimuli), 8))
+        drive = np.maximum(frames.reshape(stimuli, -1) @ draw.normal(size=(24, 20)) / 5, 0) @ draw.random((20, 50))
+        counts, start = draw.poisson(drive[codes]), np.arange(len(codes)) * 1.0
+        times = [np.repeat(start, unit) + draw.uniform(0.05, 0.4, unit.sum()) for unit in counts.T]
+        spikes = [np.sort(np.r_[0.0, unit, float(len(codes))]) for unit in times]
+        trials = {"start_time": start, "stop_time": start + 0.5, "stimulus": np.array(names)[codes]}
+        session = make_session(f"m{animal}", "1", spikes, {"trials": trials})
+        write_recordings(folder / "data" / f"m{animal}.h5", session)
+    torch.manual_seed(0)
+    network = nn.Sequential(nn.Flatten(), *(nn.Sequential(nn.Linear(24, 24), nn.ReLU()) for _ in range(4)))
+    how = {"recordings": str(folder / "data"), "stimuli": str(folder / "stimuli.h5"), "conditions": "trials:stimulus"}
+    begin = time.process_time()
+    score_record(network, **how)
+    return {"processor": time.process_time() - begin}
+
+
+JOBS: dict[str, Callable[[Path], dict[str, float] | None]] = {
     "score (demo, small network)": score_demo,
     "score, time averaged": score_big,
     "score, every time step kept": lambda folder: score_big(folder, time="concatenate"),
@@ -110,6 +143,7 @@ JOBS: dict[str, Callable[[Path], None]] = {
     ),
     "score, every time step kept, windows of 2 s": lambda folder: score_big(folder, time="concatenate", seconds=2.0),
     "score over time": lambda folder: score_big(folder, over_time=True),
+    **{f"score and baselines, {count:,} stimuli": partial(score_many, stimuli=count) for count in (40, 160, 320, 1280)},
     "explain": explain_score,
     "stimuli sweep (192 sweeps)": generate_sweeps,
     "train (small, 256 sweeps)": train_small,
@@ -139,12 +173,16 @@ def main() -> None:
         return
     if chosen.job:
         with tempfile.TemporaryDirectory() as folder:
-            JOBS[chosen.job](Path(folder))
-        print(json.dumps({"gigabytes": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e9}))
+            more = JOBS[chosen.job](Path(folder)) or {}
+        print(json.dumps({"gigabytes": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e9} | more))
         return
     found = measure_once(chosen.out, JOBS, measure, known=chosen.known)
-    rows = [[name, f"{item['gigabytes']:.2f}", f"{item['seconds']:.0f}"] for name, item in found.items()]
-    text = f"{NOTE}\n\n{table(['job', 'largest memory [GB]', 'duration [s]'], rows)}"
+    rows = [
+        [name, f"{item['gigabytes']:.2f}", f"{item['seconds']:.0f}", f"{item.get('processor', math.nan):.3g}"]
+        for name, item in found.items()
+    ]
+    columns = ["job", "largest memory [GB]", "duration [s]", "processor time of the score [s]"]
+    text = f"{NOTE}\n\n{table(columns, [[cell.replace('nan', '–') for cell in row] for row in rows])}"
     publish(chosen, TITLE, text, "--out memory", subject="commands")
 
 

@@ -46,20 +46,23 @@ class UniquePart:
             real = isinstance(value, (int, float)) and not isinstance(value, bool)
             return float(value) if real and math.isfinite(value) else math.nan
 
+        def texts(value: Any) -> tuple[str, ...]:
+            return tuple(map(_text, value)) if isinstance(value, (list, tuple)) else ()
+
         span = stated.get("interval")
         low, high = span if isinstance(span, (list, tuple)) and len(span) == 2 else (math.nan, math.nan)
-        numbers = ("unique", "total", "shared", "controls_alone", "monte_carlo_error")
-        texts = {
-            name: tuple(map(_text, values)) if isinstance(values := stated.get(name), (list, tuple)) else ()
-            for name in ("reasons", "controls")
-        }
         return cls(
             status=_text(stated.get("status")),
-            layer=_text(stated.get("layer")) or None,
+            reasons=texts(stated.get("reasons")),
+            unique=number(stated.get("unique")),
             low=number(low),
             high=number(high),
-            **{name: number(stated.get(name)) for name in numbers},
-            **texts,
+            total=number(stated.get("total")),
+            shared=number(stated.get("shared")),
+            controls_alone=number(stated.get("controls_alone")),
+            controls=texts(stated.get("controls")),
+            layer=_text(stated.get("layer")) or None,
+            monte_carlo_error=number(stated.get("monte_carlo_error")),
         )
 
     @property

@@ -417,7 +417,8 @@ def _test(judged: LayerComparisons, rule: LayerRule, weights: Floats, seed: int)
     if count < SMALLEST_STIMULI:
         reason = f"{count} stimuli allow no p below {smallest:.3g}; at least {SMALLEST_STIMULI} are needed"
         return PermutationTest(math.nan, smallest, True, 0, math.nan, np.empty(0), reason), np.empty((0, 0))
-    step = max(1, _CHUNK_ELEMENTS // (len(judged.layers) * max(count * count, len(judged.animals))))
+    # Of many stimuli no more than one order is held at a time.
+    step = max(1, _CHUNK_ELEMENTS // (len(judged.layers) * max(min(count, 64) ** 2, len(judged.animals))))
     null, means = [], []
     for r in judged.under(partial(label_orders, count, seed, exact=exact, draws=draws, step=step)):
         null.append(rule.held(r) @ weights / len(weights))

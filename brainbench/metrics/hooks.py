@@ -24,6 +24,8 @@ from brainbench.metrics.stimulus_labels import response_matrix
 
 _SAFE_EXPONENT = 64
 """Features whose largest value lies outside 2^±64 are rescaled, so that no square overflows or vanishes."""
+_SPLIT_STIMULI, _FEWEST_SPLITS = 40, 20
+"""Stimuli up to which all split halves are taken, and the fewest of them."""
 
 
 class MetricHooks:
@@ -44,7 +46,8 @@ class MetricHooks:
     noise = "none"
     """Noise covariance that their RDMs are divided by."""
     splits = 300
-    """Random split halves of an animal's trials; more change a score by less than .001."""
+    """Random split halves of an animal's trials; more change a score by less than .001. Above 40 stimuli they are fewer
+    in proportion."""
     orders = 999
     """Random orders of the stimuli in a permutation test; all orders are taken where they are at most five times as
     many."""
@@ -69,7 +72,9 @@ class MetricHooks:
         Options are ``stimuli``, ``seed`` and ``splits`` of :func:`subject_rdm`.
         """
         how: dict[str, Any] = {"method": self.brain_method, "comparison": self.comparison, "noise": self.noise}
-        return subject_rdm(subject, blocks, n_stimuli, **{"splits": self.splits, **how, **options})
+        # Trials are split by stimulus, so the error that the number of splits leaves falls with that of stimuli too.
+        splits = max(min(self.splits, _FEWEST_SPLITS), self.splits * _SPLIT_STIMULI // max(n_stimuli, _SPLIT_STIMULI))
+        return subject_rdm(subject, blocks, n_stimuli, **{"splits": splits, **how, **options})
 
     def layer(self, features: ArrayLike) -> Floats:
         """Return what is compared of a layer's features [K, F]; a stimulus with a value that is not finite is NaN."""

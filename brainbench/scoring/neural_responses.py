@@ -15,7 +15,7 @@ import numpy as np
 from brainbench.core.contracts import join_labels, natural_key
 from brainbench.core.errors import DataError, UsageError, check_each, check_name, check_once, listing
 from brainbench.core.files import content_hash
-from brainbench.core.progress import Progress
+from brainbench.core.progress import Progress, track
 from brainbench.scoring.demo import DEMOS, HIDDEN_NETWORK, demo_identity, demo_recordings
 
 if TYPE_CHECKING:
@@ -175,12 +175,15 @@ class NeuralResponses:
         whole = given if averaged or options.units_reliability is None else self.trials(labels, averaged=True)
         return {name: reliable_units(own, len(labels), whole=whole[name], **how) for name, own in given.items()}
 
-    def animals(self, labels: tuple[str, ...], metric: Metric, options: ScoreOptions) -> tuple[Any, ...]:
+    def animals(
+        self, labels: tuple[str, ...], metric: Metric, options: ScoreOptions, *, progress: Progress | None = None
+    ) -> tuple[Any, ...]:
         """Prepare every animal by a metric over the labels ``kept``, in that order."""
         animals = []
         longest = self.dataset["duration"].values.max(axis=0)
         share = np.where(longest > (1 - 1e-6) * longest.max(), 1.0, longest / longest.max())
-        for subject, (chosen, note) in self.reliable_trials(labels, options, averaged=options.time == "mean").items():
+        sides = self.reliable_trials(labels, options, averaged=options.time == "mean")
+        for subject, (chosen, note) in track(list(sides.items()), "animals", progress):
             trials = tuple(replace(item, responses=_flat(item.responses, share)) for item in chosen)
             animal = metric.animal(subject, trials, len(labels), stimuli=labels, seed=options.seed)
             bins = max((item.responses.shape[1] for item in chosen), default=1)

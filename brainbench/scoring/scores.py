@@ -17,7 +17,7 @@ from brainbench.core.errors import UsageError, check_name, listing
 from brainbench.core.files import provenance, to_plain
 from brainbench.core.identity import SealedPlan
 from brainbench.core.plugins import require_optional
-from brainbench.core.progress import Progress, stages
+from brainbench.core.progress import Progress, stages, track
 from brainbench.core.provenance import Provenance
 from brainbench.core.records import ESTIMATOR_VERSION, ResultRecord, Score
 from brainbench.scoring.options import ScoreOptions
@@ -132,10 +132,11 @@ def score_record(
     if plan is not None:
         plan.check_stimuli((*labels, *pairs.values()))
     rows = [network.labels.index(label) for label in pairs.values()]
-    inputs = ScoreInputs(brain, network, metric, labels, rows, brain.animals(labels, metric, options), options)
+    animals = brain.animals(labels, metric, options, progress=progress)
+    inputs = ScoreInputs(brain, network, metric, labels, rows, animals, options)
     stage_done()
 
-    scores, between = _compare(inputs, baselines=baselines)
+    scores, between = _compare(inputs, baselines=baselines, progress=progress)
     stage_done()
     settings = {"estimator_version": ESTIMATOR_VERSION, "model": model if isinstance(model, str) else None}
     # Features with labels of their own were computed elsewhere, of stimuli unknown here.
@@ -229,7 +230,7 @@ def _check_inputs(resolved: ResolvedModel, brain: NeuralResponses, options: Scor
         ) from error
 
 
-def _compare(inputs: ScoreInputs, *, baselines: bool) -> tuple[list[Score], Score | None]:
+def _compare(inputs: ScoreInputs, *, baselines: bool, progress: Progress | None) -> tuple[list[Score], Score | None]:
     """Score the features of the model (the first) and, if asked, of baselines and the animals against one another.
 
     The published estimators take a published file as its authors' code does: zeros kept, the maximum over all layers.
@@ -249,7 +250,7 @@ def _compare(inputs: ScoreInputs, *, baselines: bool) -> tuple[list[Score], Scor
             more[network.card.name]["controls"] = {RAW_INPUT: raw["input"], **kinematics}
         scores = [
             inputs.metric.score(layers, inputs.animals, name=name, **more.get(name, {}), **how)
-            for name, layers in features.items()
+            for name, layers in track([*features.items()], "models", progress)
         ]
         between = inputs.metric.score_animals(inputs.animals, **how) if baselines else None
     presentation = presentation_of(

@@ -394,3 +394,15 @@ def test_a_doubted_score_has_a_doubted_unique_part():
     assert (undefined.status, undefined.reasons) == ("undefined", ("the score is undefined",))
     assert metric.score({"layer": hidden}, animals, name="net", stimuli=names).provenance.unique is None
     assert get_metric("cka").score({"layer": hidden}, animals, **how).provenance.unique is None
+
+
+def test_progress_names_animals_and_models_as_they_are_done(files):
+    stages = []
+    how = {"recordings": files["recordings"], "stimuli": files["arrays"], "conditions": "trials:texture"}
+    score_record(files["model"], progress=lambda done, total, what: stages.append((done, total, what)), **how)
+    assert [stage for stage in stages if stage[2] == "animals"] == [
+        (0, 2, "animals"),
+        (1, 2, "animals"),
+        (2, 2, "animals"),
+    ]
+    assert [done for done, total, what in stages if what == "models"] == [0, 1, 2, 3]

@@ -18,11 +18,13 @@ from brainbench.metrics.hooks import usable_features
 from brainbench.metrics.measures.metric import Metric
 from brainbench.metrics.measures.unique import unique_part
 from brainbench.metrics.rdms.comparison import (
+    LINEAR,
     WITHOUT,
+    SquareMoves,
     check_comparison,
-    compare_all,
     permuted_comparisons,
     products_without,
+    squares,
 )
 from brainbench.metrics.rdms.comparison import compare as compare_rdms
 from brainbench.metrics.rdms.dissimilarity import RDM_METHODS, rdm
@@ -32,7 +34,6 @@ from brainbench.metrics.reliability.noise_correction import ESTIMATORS, Correcte
 from brainbench.metrics.reliability.subject_rdm import SubjectRDM, is_flat
 from brainbench.metrics.score import score_layers
 
-_CHUNK_ELEMENTS = 1 << 22
 _ROUNDING = 1e-12
 _LEAST_WITHOUT = 0.25
 """Smallest reliability without a stimulus, as a share of that with all, which the jackknife divides by."""
@@ -97,21 +98,11 @@ class RSA(Metric):
 
     def compare_without(self, layers: Sequence[Floats], animals: Sequence[SubjectRDM]) -> Floats:
         """Return raw comparisons [K, L, A] without each stimulus in turn, of parts of the same RDMs."""
-        count = animals[0].count
-        if count <= 3:
-            return np.full((count, len(layers), len(animals)), np.nan)
         rdms, brain = np.stack(layers), np.stack([animal.rdm for animal in animals])
-        if self.comparison in WITHOUT and np.isfinite(rdms).all() and np.isfinite(brain).all():
-            return np.moveaxis(_comparisons_without(rdms, brain, self.comparison), -1, 0)
-        rest = np.array([np.delete(np.arange(count), stimulus) for stimulus in range(count)])
-        pairs = permuted_pairs(rest, count)
-        step = max(1, _CHUNK_ELEMENTS // (count * count * (len(rdms) + len(brain))))
-        return np.concatenate(
-            [
-                compare_all(*(side[:, part].swapaxes(0, 1).copy() for side in (rdms, brain)), method=self.comparison)
-                for part in (pairs[start : start + step] for start in range(0, count, step))
-            ]
-        )
+        complete = np.isfinite(rdms).all() and np.isfinite(brain).all()
+        if self.comparison not in WITHOUT or animals[0].count <= 3 or not complete:
+            return super().compare_without(layers, animals)
+        return np.moveaxis(_comparisons_without(rdms, brain, self.comparison), -1, 0)
 
     def correction(self, animal: SubjectRDM, estimator: str) -> Corrected:
         """Return the factor of the estimator; it is linear in the comparison, so that of a comparison of 1."""
@@ -151,10 +142,9 @@ class RSA(Metric):
         """Return the factor for both sides (thesis, equation 3.4): the others' mean RDM is noisy too."""
         # Halves are averaged split by split, so every animal must have them.
         splits = min(len(one.halves) for one in others)
-        halves = np.mean([one.halves[:splits] for one in others], axis=0)
+        halves = sum(one.halves[:splits] for one in others) / len(others)
         if estimator == "default":
-            r = compare_rdms(halves[:, 0], halves[:, 1], method=self.comparison)
-            mean = replace(others[0], rdm=self.partner(animal, others), halves=halves, split_half_r=r, comparison="")
+            mean = replace(others[0], rdm=self.partner(animal, others), halves=halves, comparison="")
             return correction_by(animal.reliability_by(self.comparison), mean.reliability_by(self.comparison))
         return noise_corrected(
             1.0,
@@ -165,14 +155,10 @@ class RSA(Metric):
 
     def agreement_null(self, animals: Sequence[SubjectRDM], factors: Floats, orders: Ints) -> Floats:
         """Return the mean corrected agreement [N] with every animal's stimuli in an order of its own [N, A, K]."""
+        if self.comparison not in LINEAR:
+            return super().agreement_null(animals, factors, orders)
         rdms = np.stack([animal.rdm for animal in animals])
-        step, agreements = max(1, _CHUNK_ELEMENTS // rdms.size), []
-        for start in range(0, len(orders), step):
-            moved = np.take_along_axis(rdms[None], permuted_pairs(orders[start : start + step]), axis=-1)
-            # All leave-one-out means from one sum over animals.
-            others = (moved.sum(axis=1, keepdims=True) - moved) / (len(rdms) - 1)
-            agreements.append(compare_rdms(moved, others, method=self.comparison) @ factors / len(factors))
-        return np.concatenate(agreements)
+        return _linear_agreement(squares(LINEAR[self.comparison](rdms), self.comparison), factors, orders)
 
     def unique(
         self,
@@ -193,6 +179,25 @@ class RSA(Metric):
         # Boards and audits tell metrics apart by these words.
         noise = "" if self.noise == "none" else f" divided by noise ({self.noise})"
         return f"RSA: {'/'.join(methods)} RDM{noise}, {self.comparison} comparison"
+
+
+def _linear_agreement(matrices: Floats, factors: Floats, orders: Ints) -> Floats:
+    """Return the mean corrected agreement [N] of matrices [A, K, K], each in an order of its own [N, A, K].
+
+    Products of a matrix with the sum of the others are sums of products of two.
+    """
+    moves, agreements = SquareMoves(matrices.shape[-1]), np.empty(len(orders))
+    weights = moves.fixed(np.ones((1, *matrices.shape[1:])))
+    sources, rows = [moves.source(part[None]) for part in matrices], np.empty((len(matrices), weights.size))
+    for index, each in enumerate(orders):
+        for row, source, order in zip(rows, sources, each, strict=True):
+            row[:] = moves.moved(source, order)[:, 0]
+        products = (rows * weights) @ rows.T
+        size = np.diagonal(products)
+        crossed = products.sum(axis=1) - size
+        others = products.sum() - 2 * products.sum(axis=1) + size
+        agreements[index] = np.mean(crossed / np.sqrt(size * others) * factors)
+    return agreements
 
 
 def _comparisons_without(layers: Floats, animals: Floats, comparison: str) -> Floats:

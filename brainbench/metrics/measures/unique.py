@@ -30,7 +30,8 @@ FEWEST_STIMULI = 10
 SPLITS = 24
 """Random halves of the stimuli; the error that their number leaves is stated."""
 _SWEEPS, _TOLERANCE = 100, 1e-8
-_MOST_TRIAL_SPLITS = 40
+_TRIAL_SPLITS, _FEWEST_TRIAL_SPLITS, _FEW_STIMULI = 40, 4, 40
+"""Splits of the trials for each half of up to 40 stimuli, of more in proportion fewer, and the fewest."""
 _LEAST_SHARE = 0.25
 """Smallest reliability of halves, as a share of that of all stimuli, which is divided by."""
 _PARTS = ("both", "controls", "network", "equal")
@@ -121,7 +122,8 @@ def _problem(layers: Mapping[str, Floats], controls: Mapping[str, Floats], count
 
 def _factor(animal: SubjectRDM, factor: float, halves: Sequence[Ints], comparison: str) -> float:
     """Return the correction of comparisons over halves of the stimuli, from halves of the trials, pooled over all."""
-    trials = animal.halves[:_MOST_TRIAL_SPLITS]
+    most = max(_FEWEST_TRIAL_SPLITS, _TRIAL_SPLITS * _FEW_STIMULI // max(animal.count, _FEW_STIMULI))
+    trials = animal.halves[:most]
     if not len(trials):
         return factor
     # Unbiased distances: the share of the square that is no noise. Others: Spearman and Brown of the mean comparison.

@@ -6,6 +6,7 @@ product. Definitions equal scipy's and rsatoolbox 0.3.2's.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -24,6 +25,9 @@ _CONSTANT = 64 * np.finfo(np.float64).eps
 _OF_PAIRS = ("pearson", "spearman", "rho-a", "cosine")
 """Comparisons of vectors of pairs; those of whitened vectors compare whole matrices."""
 _OF_MATRICES = ("whitened-cosine", "whitened-pearson")
+
+_FEW_STIMULI, _BLOCK_ELEMENTS = 64, 1 << 24
+"""Up to so many stimuli all orders of a chunk are compared at once; numbers of layers' matrices that are held."""
 
 _SIGN_LIMIT = 128
 """Above this many pairs Kendall's tau sorts (P log P) instead of comparing all pairs of pairs (P²)."""
@@ -84,7 +88,7 @@ def permuted_comparisons(
     Ranks, means and lengths of an RDM do not feel the order of its stimuli, so what most comparisons multiply is made
     once and every order only moves it: one gather and one matrix product, on the processor or on a torch device.
     Kendall's tau, whose vectors are of pairs of pairs, is compared order by order by numpy. Animals are RDMs [A, P];
-    without a device numpy computes.
+    without a device numpy computes, many stimuli order by order and in blocks of layers.
     """
     complete = bool(np.isfinite(layers).all() and np.isfinite(brain).all())
     if not complete or method not in (*_OF_PAIRS, *_OF_MATRICES):
@@ -93,6 +97,9 @@ def permuted_comparisons(
             yield compare_all(permuted, brain, method=method).reshape(len(orders), len(layers), len(brain))
         return
     count = stimulus_count(layers.shape[-1])
+    if device is None and count > _FEW_STIMULI:
+        yield from _permuted_squares(layers, brain, chunks, method)
+        return
     left, right = place(features(layers, method), device), place(features(brain, method), device).T
     for orders in chunks:
         moved = library(left).from_numpy(np.array(orders)).to(left.device) if is_tensor(left) else orders
@@ -106,6 +113,64 @@ def permuted_comparisons(
         yield fetch((permuted @ right).swapaxes(0, 1))
 
 
+def _permuted_squares(layers: Floats, brain: Floats, chunks: Iterator[Ints], method: str) -> Iterator[Floats]:
+    """Do what :func:`permuted_comparisons` does, order by order and without more than a block of layers in memory."""
+    count = stimulus_count(layers.shape[-1])
+    moves, size = SquareMoves(count), max(1, _BLOCK_ELEMENTS // count**2)
+    animals = squares(features(brain, method), method)
+    blocks = [layers[start : start + size] for start in range(0, len(layers), size)]
+    # What would not fit is made anew for each chunk of orders.
+    first = squares(features(blocks[0], method), method)
+    for orders in chunks:
+        parts = []
+        for index, block in enumerate(blocks):
+            left = first if index == 0 else squares(features(block, method), method)
+            # ⟨PMPᵀ, B⟩ = ⟨M, PᵀBP⟩: the side of fewer matrices is moved.
+            forth = len(left) <= len(animals)
+            fixed, source = (moves.fixed(animals), left) if forth else (moves.fixed(left), animals)
+            source, turns = moves.source(source), orders if forth else np.argsort(orders, axis=1)
+            values = np.stack([fixed @ moves.moved(source, order) for order in turns])
+            parts.append(values.swapaxes(1, 2) if forth else values)
+        yield np.concatenate(parts, axis=1)
+
+
+class SquareMoves:
+    """Inner products of symmetric matrices [N, K, K] whose rows and columns move together: of one triangle each."""
+
+    def __init__(self, count: int) -> None:
+        self._count = count
+        self._rows, self._cols = np.triu_indices(count)
+        # Memory that is taken anew for every order would cost more than the move.
+        self._index, self._moved = np.empty((2, len(self._rows)), dtype=np.int64), np.empty((len(self._rows), 0))
+
+    def fixed(self, matrices: Floats) -> Floats:
+        """Return one triangle [N, K(K + 1)/2] of matrices; what stands in both counts twice."""
+        weights = np.where(self._rows == self._cols, 1.0, 2.0)
+        return matrices[:, self._rows, self._cols] * weights
+
+    def source(self, matrices: Floats) -> Floats:
+        """Return the numbers [K², N] of matrices, from which :meth:`moved` takes."""
+        return np.ascontiguousarray(matrices.reshape(len(matrices), -1).T)
+
+    def moved(self, source: Floats, order: Ints) -> Floats:
+        """Return one triangle [K(K + 1)/2, N] with the stimuli in an order, until the next call."""
+        if self._moved.shape[1] != source.shape[1]:
+            self._moved = np.empty((len(self._rows), source.shape[1]))
+        index, columns = self._index
+        np.take(order * self._count, self._rows, out=index, mode="clip")
+        index += np.take(order, self._cols, out=columns, mode="clip")
+        return source.take(index, axis=0, out=self._moved, mode="clip")
+
+
+def squares(vectors: Floats, method: str) -> Floats:
+    """Return matrices [..., K, K] with the inner products of a comparison's vectors, of pairs or of whole matrices."""
+    if method in _OF_MATRICES:
+        count = math.isqrt(vectors.shape[-1])
+        return vectors.reshape(*vectors.shape[:-1], count, count)
+    # Every pair stands in a matrix twice.
+    return square(vectors) * math.sqrt(0.5)
+
+
 def products(a: Floats, b: Floats, method: str) -> Floats:
     """Return the inner products [...] of RDMs [..., P] that a comparison divides by both lengths; of all but ranks."""
     return np.einsum("...p,...p->...", LINEAR[method](a), LINEAR[method](b))
@@ -115,16 +180,24 @@ def products_without(a: Floats, b: Floats, method: str) -> Floats:
     """Return the inner products [..., N, A, K] of every ``a`` [..., N, P] with every ``b`` [..., A, P] by one of
     :data:`WITHOUT`, without each stimulus in turn."""
     if method == "cosine":
-        left, right = square(a), square(b)
-        rows = np.einsum("...nik,...aik->...nak", left, right)
+        rows = _row_products(square(a), square(b))
         return rows.sum(axis=-1, keepdims=True) / 2 - rows
     left, right = (_second_moment(rdms).reshape(square(rdms).shape) for rdms in (a, b))
-    rows = np.einsum("...nik,...aik->...nak", left, right)
-    squares = np.einsum("...nkk,...akk->...nak", left, right)
+    rows = _row_products(left, right)
+    diagonals = np.einsum("...nkk,...akk->...nak", left, right)
     # Rows of a centred matrix add up to 0, so those of what is left add up to −M_ik, and all of it to M_kk: centring
     # the rest anew takes no second pass.
     rest = rows.shape[-1] - 1
-    return rows.sum(axis=-1, keepdims=True) - 2 * rows + squares - 2 * (rows - squares) / rest + squares / rest**2
+    total = rows.sum(axis=-1, keepdims=True)
+    return total - 2 * rows + diagonals - 2 * (rows - diagonals) / rest + diagonals / rest**2
+
+
+def _row_products(left: Floats, right: Floats) -> Floats:
+    """Return the inner products [..., N, A, K] of the rows of symmetric matrices [..., N, K, K] and [..., A, K, K]."""
+    if left.shape[-1] <= _FEW_STIMULI:
+        return np.einsum("...nik,...aik->...nak", left, right)
+    # Row by row one matrix product, which BLAS computes.
+    return np.moveaxis(np.moveaxis(left, -2, -3) @ np.moveaxis(right, -2, -3).swapaxes(-1, -2), -3, -1)
 
 
 def features(rdms: Floats, method: str) -> Floats:

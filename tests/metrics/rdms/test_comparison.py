@@ -10,7 +10,14 @@ from scipy import stats
 
 from brainbench.core.errors import UsageError
 from brainbench.metrics import compare
-from brainbench.metrics.rdms.comparison import COMPARISONS, compare_all, products, products_without
+from brainbench.metrics.rdms import comparison
+from brainbench.metrics.rdms.comparison import (
+    COMPARISONS,
+    compare_all,
+    permuted_comparisons,
+    products,
+    products_without,
+)
 from brainbench.metrics.rdms.pairs import permuted_pairs
 from tests.factories.rsatoolbox_names import THEIRS
 
@@ -132,3 +139,18 @@ def test_products_without_a_stimulus_follow_from_those_of_all(method):
         pairs = permuted_pairs(np.delete(np.arange(count), stimulus)[None], count)[0]
         expected = products(left[:, None, pairs], right[None, :, pairs], method)
         np.testing.assert_allclose(found[..., stimulus], expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("method", ["pearson", "spearman", "cosine", "whitened-cosine", "whitened-pearson"])
+@pytest.mark.parametrize(("layers", "block"), [(2, 1 << 24), (5, 1 << 24), (5, 2 * 81)])
+def test_many_stimuli_in_blocks_give_what_few_give_at_once(method, layers, block, monkeypatch):
+    rng = np.random.default_rng(0)
+    sides = _make_rdms(layers, 9, 1), _make_rdms(3, 9, 2)
+    chunks = [rng.permuted(np.tile(np.arange(9), (4, 1)), axis=1) for _ in range(2)]
+    expected = list(permuted_comparisons(*sides, iter(chunks), method))
+    without = [products_without(*sides, name) for name in ("cosine", "whitened-cosine")]
+    monkeypatch.setattr(comparison, "_FEW_STIMULI", 1)
+    monkeypatch.setattr(comparison, "_BLOCK_ELEMENTS", block)
+    np.testing.assert_allclose(list(permuted_comparisons(*sides, iter(chunks), method)), expected, atol=1e-12)
+    for name, values in zip(("cosine", "whitened-cosine"), without, strict=True):
+        np.testing.assert_allclose(products_without(*sides, name), values, rtol=1e-10)
