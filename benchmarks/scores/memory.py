@@ -125,7 +125,11 @@ def score_many(folder: Path, stimuli: int) -> dict[str, float]:
         write_recordings(folder / "data" / f"m{animal}.h5", session)
     torch.manual_seed(0)
     network = nn.Sequential(nn.Flatten(), *(nn.Sequential(nn.Linear(24, 24), nn.ReLU()) for _ in range(4)))
-    how = {"recordings": str(folder / "data"), "stimuli": str(folder / "stimuli.h5"), "conditions": "trials:stimulus"}
+    how: dict[str, Any] = {
+        "recordings": str(folder / "data"),
+        "stimuli": str(folder / "stimuli.h5"),
+        "conditions": "trials:stimulus",
+    }
     begin = time.process_time()
     score_record(network, **how)
     return {"processor": time.process_time() - begin}

@@ -104,6 +104,10 @@ def _rows(score: Score) -> Iterator[list[str]]:
     if math.isfinite(score.reliability):
         reliability = spanned(score.reliability, score.reliability_interval, most=1.0)
         yield ["reliability", reliability, "of the animals' RDMs, from halves of their trials, mean"]
+    if effective := score.provenance.statistics.get("effective"):
+        units = f"{effective['units']:.3g} units in an animal (median)" if "units" in effective else ""
+        animals = f"{effective['animals']:.2g} of {effective['of_animals']} animals" if "animals" in effective else ""
+        yield ["effective number", "", ", ".join(filter(None, (units, animals)))]
     if math.isfinite(score.p):
         yield ["permutation p", _p(score.p), f"{score.p_method}; smallest possible {_p(score.p_smallest)}"]
     if score.layer is not None:

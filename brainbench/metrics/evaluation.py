@@ -9,7 +9,8 @@ Other animals saw the same few stimuli, so what they share by luck is not held o
 .41 on average against animals of one geometry and six stimuli. The permutation p-value does account for it, because the
 rules here broadcast over leading axes and a test repeats the whole choice inside every permutation; the mean score
 under permutation is a score's ``chance``. A layer that has no value for some stimuli is compared over the rest, in
-every order alike.
+every order alike, but chosen only where no layer has them all: over fewer stimuli it reaches more by luck, which every
+layer would have to beat.
 """
 
 from __future__ import annotations
@@ -166,9 +167,13 @@ class LayerRule:
     """The layer, where it is given."""
     factors: Floats | None = None
     """[A] weights of the animals, where the maximum of the corrected mean is taken."""
+    competing: Ints | None = None
+    """Layers among which is chosen: those that have a value for the same stimuli. None for all."""
 
     def choose(self, r: Floats) -> Ints:
         """Return the layer [..., A] for each animal."""
+        if self.competing is not None and self.kind in ("others", "halves", "maximum"):
+            return self.competing[replace(self, competing=None).choose(r[..., self.competing, :])]
         if self.kind == "others":
             return choose_on_others(r)
         if self.kind == "halves":
@@ -331,6 +336,8 @@ class LayerEvaluation:
     test: PermutationTest
     layer_null: Floats
     """[N, L] mean of every layer under the orders of the stimuli; empty without a test."""
+    competing: Ints
+    """Layers among which was chosen."""
 
 
 def defined_layers(metric: MetricHooks, layers: Mapping[str, Floats]) -> list[str]:
@@ -372,19 +379,21 @@ def evaluate(
             if not parts:
                 return None, names, ()
             votes = _Votes.of_halves(compared, parts, factor)
-    rule, weights, chosen = votes.rule, votes.weights, votes.rule.choose(votes.r)
+    competing = complete_layers(compared.defined)
+    rule, weights = replace(votes.rule, competing=competing), votes.weights
+    chosen = rule.choose(votes.r)
     chosen_r = rule.held(votes.r)
     values = chosen_r * weights
     # The layers of the data serve without a stimulus too: where the choice jumps between layers that are nearly alike,
     # a jackknife that repeats it measures the jumps instead of the stimuli.
-    single = rule is HALVES or estimator != "default"
+    single = rule.kind == "halves" or estimator != "default"
     factors_without = weights if single else metric.factors_without(votes.compared.animals, weights)
     without = (take_layers(votes.compared.without_each(), chosen) * factors_without).mean(axis=-1)
     test, null = _test(votes.permuted, rule, weights[: len(votes.permuted.animals)], seed)
-    if rule is HALVES:
+    if rule.kind == "halves":
         values, chosen_r = values.mean(keepdims=True), chosen_r.mean(keepdims=True)
         chosen = np.array([most_chosen(chosen)])
-    evaluation = LayerEvaluation(rule, values, chosen_r, chosen, r * factors, r, without, test, null)
+    evaluation = LayerEvaluation(rule, values, chosen_r, chosen, r * factors, r, without, test, null, competing)
     return evaluation, names, _partly(compared, names)
 
 
@@ -439,9 +448,16 @@ def attainable_value(metric: MetricHooks, animals: Animals, result: LayerEvaluat
     return value, ""
 
 
+def complete_layers(defined: np.ndarray) -> Ints:
+    """Return the layers that have a value for the most stimuli, for the same ones where none has all, from [L, K]."""
+    most = defined[int(np.argmax(defined.sum(axis=1)))]
+    return np.flatnonzero((defined == most).all(axis=1))
+
+
 def _partly(compared: LayerComparisons, names: Sequence[str]) -> tuple[str, ...]:
     counts = [(name, (~known).sum(), len(known)) for name, known in zip(names, compared.defined, strict=True)]
     lacking = [f"{name} ({number} of {count})" for name, number, count in counts if number]
     if not lacking:
         return ()
-    return (f"layers without a value for some stimuli, compared over the others: {', '.join(lacking)}",)
+    text = "layers without a value for some stimuli, compared over the others and chosen only where no layer has them"
+    return (f"{text}: {', '.join(lacking)}",)

@@ -46,8 +46,8 @@ class MetricHooks:
     noise = "none"
     """Noise covariance that their RDMs are divided by."""
     splits = 300
-    """Random split halves of an animal's trials; more change a score by less than .001. Above 40 stimuli they are fewer
-    in proportion."""
+    """Random split halves of an animal's trials; more change a score by less than .001. Trials are split by stimulus:
+    the error that their number leaves falls with that of stimuli too, so above 40 they are fewer in proportion."""
     orders = 999
     """Random orders of the stimuli in a permutation test; all orders are taken where they are at most five times as
     many."""
@@ -72,7 +72,6 @@ class MetricHooks:
         Options are ``stimuli``, ``seed`` and ``splits`` of :func:`subject_rdm`.
         """
         how: dict[str, Any] = {"method": self.brain_method, "comparison": self.comparison, "noise": self.noise}
-        # Trials are split by stimulus, so the error that the number of splits leaves falls with that of stimuli too.
         splits = max(min(self.splits, _FEWEST_SPLITS), self.splits * _SPLIT_STIMULI // max(n_stimuli, _SPLIT_STIMULI))
         return subject_rdm(subject, blocks, n_stimuli, **{"splits": splits, **how, **options})
 

@@ -135,7 +135,8 @@ def score_layers(
             stated["statistics"] = {"unique": part.stated}
         return Score(value=math.nan, layers=empty, subjects=parts, provenance=Provenance.of(stated), **about), None
     means = result.layer_values.mean(axis=1)
-    best, chosen = first_best(means[:, None]).item(), most_chosen(result.chosen)
+    best = int(result.competing[first_best(means[result.competing, None]).item()])
+    chosen = most_chosen(result.chosen)
     layer, scored = layers[defined[chosen]], [animals.subjects[i] for i in animals.scored]
     attainable, hopeless = attainable_value(metric, animals, result, seed)
     if hopeless:
@@ -149,7 +150,7 @@ def score_layers(
         **metric.statistics(metric.take(layer, animals.order), animals.sorted, seed),
     }
     if result.layer_null.size:
-        tests = zip(defined, *(p.tolist() for p in layer_p(result.layer_null)), strict=True)
+        tests = zip(defined, *(p.tolist() for p in layer_p(result.layer_null, result.competing)), strict=True)
         statistics["layer_tests"] = [{"layer": name, "p": p, "p_corrected": corrected} for name, p, corrected in tests]
     if beyond:
         how = {"attainable": attainable, "committed": committed, "seed": seed}
@@ -163,7 +164,7 @@ def score_layers(
         r=float(result.r.mean()),
         interval=two_factor_interval(value, result.values, result.without),
         p=result.test.p,
-        p_method=result.test.summary(1 if result.rule.kind in ("fixed", "each") else len(defined), repeated),
+        p_method=result.test.summary(1 if result.rule.kind in ("fixed", "each") else len(result.competing), repeated),
         layer=defined[chosen],
         layer_rule=result.rule.words,
         best_layer=defined[best],

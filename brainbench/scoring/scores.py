@@ -20,6 +20,7 @@ from brainbench.core.plugins import require_optional
 from brainbench.core.progress import Progress, stages, track
 from brainbench.core.provenance import Provenance
 from brainbench.core.records import ESTIMATOR_VERSION, ResultRecord, Score
+from brainbench.scoring.influence import influence_of
 from brainbench.scoring.options import ScoreOptions
 from brainbench.scoring.presentation import presentation_of
 
@@ -260,7 +261,8 @@ def _compare(inputs: ScoreInputs, *, baselines: bool, progress: Progress | None)
     recorded = brain.label_doubt, spikes if brain.dependent else ""
     scores = [_doubted(score, presentation.doubt, *recorded) for score in scores]
     stated = scores[0].provenance
-    statistics = {**stated.statistics, **presentation.statistics}
+    effective, remarks = influence_of(scores[0], inputs.metric, inputs.animals)
+    statistics = {**stated.statistics, **presentation.statistics, **effective}
     scores[0] = held_parts(replace(scores[0], provenance=replace(stated, statistics=statistics)))
     between = between and _doubted(between, presentation.doubt, *recorded)
     if baselines and presentation.control is not None:
@@ -272,6 +274,7 @@ def _compare(inputs: ScoreInputs, *, baselines: bool, progress: Progress | None)
         names = listing(unfelt, limit=6, quoted=False)
         doubts += (f"{len(unfelt)} of {len(network.labels)} stimuli have no recordings and are left out: {names}",)
     scores = [replace(score, reasons=(*score.reasons, *doubts)) for score in scores]
+    scores[0] = replace(scores[0], reasons=(*scores[0].reasons, *remarks))
     return scores, between and replace(between, reasons=(*between.reasons, *doubts))
 
 

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from brainbench.core.contracts import Trials
 from brainbench.core.errors import UsageError
-from brainbench.metrics import rdm
+from brainbench.metrics import get_metric, rdm
 from brainbench.metrics.evaluation import HALVES, choose_on_others, first_best, held_out, most_chosen
 from brainbench.metrics.measures.rsa import score_rdms
 from brainbench.metrics.reliability.subject_rdm import subject_rdm
@@ -165,3 +166,27 @@ def test_without_shared_stimuli_held_out_choice_is_unbiased_and_the_maximum_is_n
         maximum.append(r.mean(axis=1).max())
     assert abs(np.mean(held)) < 4 * np.std(held) / np.sqrt(400)
     assert np.mean(maximum) > 0.15
+
+
+def test_a_layer_that_lacks_stimuli_lowers_the_power_of_no_other_and_is_chosen_only_among_its_like():
+    rng = np.random.default_rng(0)
+    hidden, names, labels = rng.normal(size=(16, 4)), [f"s{place}" for place in range(16)], np.repeat(np.arange(16), 6)
+    metric, animals = get_metric("rsa"), []
+    for animal in range(4):
+        responses = (hidden @ rng.normal(size=(4, 30)))[labels] + 2 * rng.normal(size=(96, 30))
+        keys = [f"{animal}/{trial}" for trial in range(96)]
+        animals.append(metric.animal(f"m{animal}", [Trials(responses, labels, keys)], 16, splits=40))
+
+    def score(**layers: np.ndarray):
+        return metric.score(layers, animals, name="net", stimuli=names)
+
+    weak, partial = hidden @ rng.normal(size=(4, 2)), {f"p{place}": rng.normal(size=(16, 3)) for place in range(20)}
+    partial = {name: np.where(np.arange(16)[:, None] < 8, values, np.nan) for name, values in partial.items()}
+    alone, beside = score(weak=weak), score(weak=weak, **partial)
+    assert (beside.p, beside.value, beside.chance) == (alone.p, alone.value, alone.chance)
+    assert (beside.layer, beside.best_layer, beside.interval) == ("weak", "weak", alone.interval)
+    assert "chosen only where no layer has them" in beside.reasons[0]
+    tests = {test["layer"]: test for test in beside.provenance.statistics["layer_tests"]}
+    assert tests["weak"]["p_corrected"] == tests["weak"]["p"]
+    true = np.where(np.arange(16)[:, None] < 8, hidden, np.nan)
+    assert score(true=true, **partial).layer == "true"

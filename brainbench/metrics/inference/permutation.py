@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -135,48 +135,33 @@ def permutation_test(
     elif not (np.isfinite(model).all() and np.isfinite(brain).all()):
         reason = "an RDM has missing pairs, so its stimuli cannot be permuted"
     else:
-        # The given order comes first, so the observed statistic went through the same arithmetic.
-        how = {"method": method, "seed": seed, "device": device}
-        null = permuted_values(model[None], brain, lambda r: r[:, 0].mean(axis=-1), **how)
+        # Sorted, random orders do not depend on how the stimuli were listed: entry n of two models is the same order.
+        # The given one comes first, so the observed statistic went through the same arithmetic.
+        pairs = permuted_pairs(canonical_order(brain)[None])[0]
+        chunks = label_orders(stimuli, seed, step=max(1, _CHUNK_ELEMENTS // len(model)))
+        sides = model[None, pairs], brain[:, pairs]
+        comparisons = permuted_comparisons(*sides, chunks, method, device=find_device(device))
+        null = np.concatenate([r[:, 0].mean(axis=-1) for r in comparisons])
         if np.isfinite(null[0]):
             return make_test(null, exact=exact, smallest=smallest)
         reason = "the comparison is undefined (a constant RDM)"
     return PermutationTest(math.nan, smallest, exact, count, math.nan, null, reason)
 
 
-def permuted_values(
-    layers: Floats,
-    brain: Floats,
-    statistic: Callable[[Floats], Floats],
-    *,
-    method: str = "pearson",
-    seed: int = 0,
-    device: Any = None,
-) -> Floats:
-    """Return a statistic [N, ...] of comparisons [N, L, A] under every order of the stimuli, the given one first.
-
-    Orders depend on the brain's RDMs and the seed alone, so entry n of two models is the same permutation. What a
-    statistic chooses on the data (a layer) must be chosen inside it, or p is too small.
-    """
-    # Sorted, random orders do not depend on how the stimuli were listed.
-    pairs = permuted_pairs(canonical_order(brain)[None])[0]
-    layers, brain = layers[:, pairs], brain[:, pairs]
-    # Chunks bound the permuted RDMs [N, L, P]; of each only the statistics are kept.
-    step = max(1, _CHUNK_ELEMENTS // layers.size)
-    chunks = label_orders(stimulus_count(layers.shape[-1]), seed, step=step)
-    comparisons = permuted_comparisons(layers, brain, chunks, method, device=find_device(device))
-    return np.concatenate([statistic(r) for r in comparisons])
-
-
-def layer_p(null: Floats) -> tuple[Floats, Floats]:
+def layer_p(null: Floats, competing: Ints | None = None) -> tuple[Floats, Floats]:
     """Return each layer's p [L], alone and corrected by the largest of all layers, from statistics [N, L].
+
+    The largest is that of the ``competing`` layers, where a layer is one of them: others are of fewer stimuli.
 
     The first row is the observed one; the correction is the maximum statistic (Nichols & Holmes 2002).
     """
     # The maximum over layers in each permutation keeps the family-wise error, however layers depend on one another.
     # A layer without a value under some order leaves the maximum to the others.
     defined = np.where(np.isfinite(null), null, -np.inf)
-    return tail_p(null), tail_p(defined.max(axis=1, keepdims=True), null[0])
+    corrected = tail_p(defined.max(axis=1, keepdims=True), null[0])
+    if competing is not None:
+        corrected[competing] = tail_p(defined[:, competing].max(axis=1, keepdims=True), null[0, competing])
+    return tail_p(null), corrected
 
 
 def most_exact(draws: int) -> int:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import reduce
 from typing import Any
 
 import numpy as np
@@ -99,8 +100,7 @@ class RSA(Metric):
     def compare_without(self, layers: Sequence[Floats], animals: Sequence[SubjectRDM]) -> Floats:
         """Return raw comparisons [K, L, A] without each stimulus in turn, of parts of the same RDMs."""
         rdms, brain = np.stack(layers), np.stack([animal.rdm for animal in animals])
-        complete = np.isfinite(rdms).all() and np.isfinite(brain).all()
-        if self.comparison not in WITHOUT or animals[0].count <= 3 or not complete:
+        if self.comparison not in WITHOUT or animals[0].count <= 3 or not np.isfinite(np.vstack([rdms, brain])).all():
             return super().compare_without(layers, animals)
         return np.moveaxis(_comparisons_without(rdms, brain, self.comparison), -1, 0)
 
@@ -142,7 +142,7 @@ class RSA(Metric):
         """Return the factor for both sides (thesis, equation 3.4): the others' mean RDM is noisy too."""
         # Halves are averaged split by split, so every animal must have them.
         splits = min(len(one.halves) for one in others)
-        halves = sum(one.halves[:splits] for one in others) / len(others)
+        halves = reduce(np.add, [one.halves[:splits] for one in others]) / len(others)
         if estimator == "default":
             mean = replace(others[0], rdm=self.partner(animal, others), halves=halves, comparison="")
             return correction_by(animal.reliability_by(self.comparison), mean.reliability_by(self.comparison))
