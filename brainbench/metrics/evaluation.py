@@ -379,7 +379,8 @@ def evaluate(
             if not parts:
                 return None, names, ()
             votes = _Votes.of_halves(compared, parts, factor)
-    competing = complete_layers(compared.defined)
+    # Those with a value for the most stimuli, for the same ones where none has all.
+    competing = np.flatnonzero((compared.defined == max(compared.defined, key=np.sum)).all(axis=1))
     rule, weights = replace(votes.rule, competing=competing), votes.weights
     chosen = rule.choose(votes.r)
     chosen_r = rule.held(votes.r)
@@ -446,12 +447,6 @@ def attainable_value(metric: MetricHooks, animals: Animals, result: LayerEvaluat
     if null.size and not value > (reached := float(np.quantile(null, 0.95))):
         return math.nan, f"no scale: a perfect model would score {value:.2f}, which chance reaches ({reached:.2f})"
     return value, ""
-
-
-def complete_layers(defined: np.ndarray) -> Ints:
-    """Return the layers that have a value for the most stimuli, for the same ones where none has all, from [L, K]."""
-    most = defined[int(np.argmax(defined.sum(axis=1)))]
-    return np.flatnonzero((defined == most).all(axis=1))
 
 
 def _partly(compared: LayerComparisons, names: Sequence[str]) -> tuple[str, ...]:

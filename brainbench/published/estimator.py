@@ -21,10 +21,10 @@ from numpy.typing import ArrayLike, NDArray
 from brainbench.core.provenance import Provenance
 from brainbench.core.records import LayerScore, Score, SubjectScore
 from brainbench.metrics.evaluation import recorded_rdm
-from brainbench.metrics.inference.permutation import EXACT_STIMULI, make_test, permuted_values
-from brainbench.metrics.rdms.comparison import compare
+from brainbench.metrics.inference.permutation import EXACT_STIMULI, canonical_order, label_orders, make_test
+from brainbench.metrics.rdms.comparison import compare, permuted_comparisons
 from brainbench.metrics.rdms.dissimilarity import correlation_distances
-from brainbench.metrics.rdms.pairs import Floats
+from brainbench.metrics.rdms.pairs import Floats, permuted_pairs
 from brainbench.metrics.reliability.noise_correction import THESIS_FILTER, noise_corrected
 from brainbench.published.recordings import read_arrays
 
@@ -150,7 +150,10 @@ def score_published(
     raw = compare(layers[:, None], brain[None])
     values = raw * factors
     best, place = np.unravel_index(int(values.argmax()), values.shape)
-    null = permuted_values(layers, brain, lambda r: (r * factors).max(axis=(-2, -1)), seed=0)
+    # Sorted by the brain, orders do not depend on how stimuli were listed.
+    pairs, orders = permuted_pairs(canonical_order(brain)[None])[0], label_orders(len(stimuli), 0, step=1024)
+    r = np.concatenate(list(permuted_comparisons(layers[:, pairs], brain[:, pairs], orders, "pearson")))
+    null = (r * factors).max(axis=(-2, -1))
     test = make_test(null, exact=len(stimuli) <= EXACT_STIMULI)
     return Score(
         value=float(values.max()),

@@ -1,4 +1,4 @@
-"""What carries a score: how many units and animals share it, and what each stimulus adds.
+"""What carries a score: how many units and animals share it.
 
 An effective number is (Σw)²/Σw² of shares w: as many as there are where all weigh the same, 1 where one has all.
 """
@@ -40,8 +40,7 @@ def unit_shares(animal: Any, *, by_noise: bool = False) -> NDArray[np.float64]:
 
 def influence_of(score: Score, metric: Any, animals: Sequence[Any]) -> tuple[dict[str, Any], tuple[str, ...]]:
     """Return the effective numbers of units (median over animals) and of animals, and a remark where one decides."""
-    numbers, remarks, scored = [], [], [part for part in score.subjects if part.status != "undefined"]
-    loud = []
+    numbers, loud, remarks = [], [], []
     for animal in animals:
         # In bins a unit is several features, which nobody tells apart here.
         if animal.problem is not None or animal.patterns.shape[1] != animal.units or animal.units < 2:
@@ -54,8 +53,8 @@ def influence_of(score: Score, metric: Any, animals: Sequence[Any]) -> tuple[dic
     stated: dict[str, Any] = {"units": float(np.median(numbers)), "units_least": min(numbers)} if numbers else {}
     if loud:
         remarks.append(f"one unit decides in {len(loud)} of {len(animals)} animals ({max(loud)[1]})")
-    if any(part.status == "ok" for part in scored):
-        scored = [part for part in scored if part.status == "ok"]
+    every = [part for part in score.subjects if part.status != "undefined"]
+    scored = [part for part in every if part.status == "ok"] or every
     heights = np.maximum([score.on_scale(part.value) for part in scored], 0.0)
     if np.isfinite(heights).all() and heights.any():
         stated |= {"animals": effective_number(heights), "of_animals": len(scored)}
@@ -64,9 +63,3 @@ def influence_of(score: Score, metric: Any, animals: Sequence[Any]) -> tuple[dic
             share = heights[first] / heights.sum()
             remarks.append(f"one animal decides: {scored[first].subject} has {share:.0%} of the score")
     return {"effective": stated} if stated else {}, tuple(remarks)
-
-
-def stimulus_contributions(score: Score) -> dict[str, float]:
-    """Return by how much the score, on the common scale, is higher with each stimulus than without it, by label."""
-    without = [score.on_scale(value) for value in score.without_stimulus]
-    return {name: score.scaled - value for name, value in zip(score.stimuli, without, strict=False)}

@@ -1,4 +1,4 @@
-"""What carries a score: units, animals and stimuli."""
+"""What carries a score: units and animals."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 from brainbench.core.contracts import Trials
 from brainbench.core.records import Score, SubjectScore
 from brainbench.metrics import get_metric
-from brainbench.scoring.influence import effective_number, influence_of, stimulus_contributions, unit_shares
+from brainbench.scoring.influence import effective_number, influence_of, unit_shares
 
 
 def _make_animals(*, loud: float = 1.0, units: int = 30, number: int = 3):
@@ -63,8 +63,3 @@ def test_an_animal_that_has_more_than_half_of_a_score_is_named():
     assert stated["effective"]["animals"] == pytest.approx(effective_number([0.9, 0.1, 0.1]))
     assert influence_of(score(0.5, 0.4, 0.5), get_metric("rsa"), [])[1] == ()
     assert influence_of(score(0.9, 0.1, 0.1, p=0.4), get_metric("rsa"), [])[1] == ()
-
-
-def test_contributions_are_differences_to_the_scores_without_a_stimulus():
-    score = Score("net", 0.5, "ok", chance=0.1, attainable=0.9, stimuli=("a", "b"), without_stimulus=(0.5, 0.3))
-    assert stimulus_contributions(score) == pytest.approx({"a": 0.0, "b": 0.25})
