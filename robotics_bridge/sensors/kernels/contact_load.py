@@ -593,11 +593,12 @@ def spread_kernel(kinds: frozenset[int], raycast: bool, noisy: bool, sticky: boo
                                     far = most + wp.length(center)
                                     steepest = wp.length(tilt) * far / mean
                                     if steepest > 1.0:
-                                        lean += (1.0 - 0.5 / steepest) / mean * wp.cross(push.normal, tilt)
-                                        lean *= wp.min(wp.static(STEEPEST) / (far * wp.length(lean)), 1.0)
                                         tilt /= steepest
                                         rounds += 1
                                         solved = rounds == wp.static(ROUNDS)
+                                        if not solved:
+                                            lean += (steepest - 0.5) / mean * wp.cross(push.normal, tilt)
+                                            lean *= wp.min(wp.static(STEEPEST) / (far * wp.length(lean)), 1.0)
                                     center += push.point
                                 elif source == wp.static(NEAR):
                                     rest += wp.length(push.force)

@@ -107,6 +107,17 @@ def test_a_face_larger_than_the_patch_is_felt_by_the_taxels_under_it() -> None:
     assert _missing(suite) == 0
 
 
+def test_two_taxels_take_the_whole_of_a_load_whose_moment_they_cannot_bear() -> None:
+    """A ball beside the line through them: the sum is right, and nothing is missing."""
+    engine = _engine(_free("ball", "0 .003 .0205", 'type="sphere" size=".01" mass=".1"'), steps=1)
+    pair = Probes.grid(2, 1, size=(0.02, 0.01), center=(0.004, 0, 0.01), radius=0.004)
+    engine.step(40)
+    total, suite = _read(engine, pair)
+    np.testing.assert_allclose(total[:3], _on(engine)[:3], rtol=1e-4, atol=1e-5)
+    assert abs(total[2]) > 0.5
+    assert _missing(suite) == 0
+
+
 def test_a_block_on_a_card_and_two_balls_in_one_place_are_felt() -> None:
     card = _free("card", "0 0 .01048", 'type="box" size=".03 .03 .00038" mass=".005"')
     engine = _engine(card + _free("block", "0 0 .0311", 'type="box" size=".02 .02 .02" mass="2"'))
