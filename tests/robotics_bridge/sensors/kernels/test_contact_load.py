@@ -108,8 +108,8 @@ def test_a_face_larger_than_the_patch_is_felt_by_the_taxels_under_it() -> None:
 
 
 def test_two_taxels_take_the_whole_of_a_load_whose_moment_they_cannot_bear() -> None:
-    """A ball beside the line through them: the sum is right, and nothing is missing."""
-    engine = _engine(_free("ball", "0 .003 .0205", 'type="sphere" size=".01" mass=".1"'), steps=1)
+    """A ball beyond the end of their row: the sum is right, and nothing is missing."""
+    engine = _engine(_free("ball", ".014 0 .0205", 'type="sphere" size=".01" mass=".1"'), steps=1)
     pair = Probes.grid(2, 1, size=(0.02, 0.01), center=(0.004, 0, 0.01), radius=0.004)
     engine.step(40)
     total, suite = _read(engine, pair)
