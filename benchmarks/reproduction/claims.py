@@ -158,19 +158,13 @@ def published_claims() -> list[PublishedClaim]:
 
 
 def judge_accuracy(campaign: Campaign, error: float | None = None) -> list[Judgement]:
-    """Judge the claims on accuracy and training, and those that no record can test.
+    """Judge the claims on accuracy and training.
 
     ``error`` is what :func:`allowed_error` gives for more claims than these.
     """
     tests = {test.claim.key: test for test in accuracy_tests(campaign)}
     error = allowed_error(list(tests.values())) if error is None else error
-    judgements = []
-    for claim in published_claims():
-        if claim.key in tests:
-            judgements.append(judged(tests[claim.key], error))
-        elif claim.measure == "none":
-            judgements.append(Judgement(claim, None, _UNTESTABLE, _UNTESTABLE, claim.reason))
-    return judgements
+    return [judged(tests[claim.key], error) for claim in published_claims() if claim.key in tests]
 
 
 def accuracy_tests(campaign: Campaign) -> list[TestedClaim]:

@@ -21,10 +21,11 @@ from benchmarks.reproduction.claims import (
 )
 from benchmarks.reproduction.contrasts import Effect, Matched, Observed, contrast
 from benchmarks.reproduction.measures import Measured, accuracies, fits, observed, published_accuracy
+from benchmarks.reproduction.touch import RULE, part_two, stimuli_table, write_pages
 from brainbench.core.files import write_text
 from brainbench.core.statistics import is_finite, wilson_interval
 from leaderboards.figures.charts import board_figures
-from leaderboards.figures.svg import standalone
+from leaderboards.figures.svg import Drawing, standalone
 from leaderboards.site.score_page import escape_markdown
 from leaderboards.text import SYNTHETIC, number, plural, span
 
@@ -76,9 +77,12 @@ def write_page(campaign: Campaign, out: Path) -> tuple[list[Path], list[Judgemen
         "seeds": _table(ranked, _seed_rows(campaign), ranked[2:3]),
         "networks": _table(named, _network_rows(campaign), named[3:-1]),
         "figures": figures,
+        "stimuli": stimuli_table(),
+        "touch": part_two(),
+        "touch_rule": RULE,
     }
     text = Template(Path(__file__).with_name("page.md").read_text(encoding="utf-8")).substitute(values)
-    return [write_text(out / PAGE, text), *images], [*accuracy, *fit[0]]
+    return [write_text(out / PAGE, text), *images, *write_pages(out, _for_dark)], [*accuracy, *fit[0]]
 
 
 def _table(columns: Sequence[str], rows: Iterable[Sequence[str]], right: Sequence[str] = ()) -> str:
@@ -95,9 +99,13 @@ def _figures(campaign: Campaign, out: Path) -> tuple[str, list[Path]]:
             absent.append(f"{title}: {escape_markdown(figure.lacking)}.")
             continue
         file = f"{_FIGURES}/{figure.key}.svg"
-        files.append(write_text(out / file, standalone(figure.drawing).replace("</style>", f"{_DARK}</style>", 1)))
+        files.append(write_text(out / file, _for_dark(figure.drawing)))
         shown.append(f"![{title}]({file})\n\n*{title}.* {escape_markdown(figure.caption)}")
     return "\n\n".join([*shown, *([f"Not drawn: {' '.join(absent)}"] if absent else [])]), files
+
+
+def _for_dark(drawing: Drawing) -> str:
+    return standalone(drawing).replace("</style>", f"{_DARK}</style>", 1)
 
 
 def _trained(campaign: Campaign) -> str:

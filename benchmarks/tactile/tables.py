@@ -74,27 +74,12 @@ def _scaling(rows: Rows) -> tuple[str, str]:
     return "Tactile scaling", table(["axis", "value", "environments", "ms / update"], cells)
 
 
-def _peer(rows: Rows) -> tuple[str, str]:
-    cells = []
-    for r in rows:
-        alone = ["–"] * 3
-        if r["case"] != "none":
-            alone = [f"{r['ours_alone_us']:.1f}", f"{r['genesis_alone_us']:.0f}"]
-            alone.append(f"{r['genesis_alone_us'] / r['ours_alone_us']:.0f} ×")
-        whole = [f"{r['ours_us']:.0f}", f"{r['genesis_us']:.0f}", f"{r['genesis_us'] / r['ours_us']:.1f} ×"]
-        cells.append([r["case"], *whole, *alone])
-    columns = ["sensor", "step and sensor, ours", "Genesis 1.4.5", "ratio", "sensor alone, ours", "Genesis", "ratio"]
-    note = "Processor µs per environment and step (all threads), 64 environments, 100 taxels, 500 points."
-    return "Tactile sensors on the processor beside Genesis", f"{note}\n\n{table(columns, cells)}"
-
-
 _LAYOUTS = {
     "check": _check,
     "sensors": _sensors,
     "step": _step,
     "published": _published,
     "scaling": _scaling,
-    "peer": _peer,
 }
 
 

@@ -5,7 +5,6 @@
     python -m benchmarks.tactile.throughput --device cuda --part step         # whole step against the engine alone
     python -m benchmarks.tactile.throughput --device cuda --part published    # configurations of thesis figure 4.4
     python -m benchmarks.tactile.throughput --device cuda --part scaling      # taxels, environments, triangles, points
-    python -m benchmarks.tactile.throughput --device cpu --part peer --genesis-python VENV/bin/python
 
 Every case is printed, and with ``--out FILE`` appended as a JSON line, as soon as it is measured. A machine whose
 Warp has no processor compiler takes along what it needs of one: ``--write-input FILE`` here, ``--input FILE`` there.
@@ -17,7 +16,6 @@ from __future__ import annotations
 import argparse
 import json
 import statistics
-import subprocess
 import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -219,45 +217,12 @@ def part_scaling(options: argparse.Namespace) -> Iterable[Row]:
             yield case("points (elastomer)", points, scene, sensors("elastomer", 100, points), some)
 
 
-def part_peer(options: argparse.Namespace) -> Iterable[Row]:
-    """The same scene beside Genesis on the processor, in turns; other work does not lengthen processor time."""
-    envs, steps = 64, 40
-    script = Path(__file__).with_name("genesis.py")
-
-    def genesis(name: str) -> float:
-        command = [options.genesis_python, str(script), "--envs", str(envs), "--steps", "30", "--sensor", name]
-        done = subprocess.run(command, capture_output=True, text=True, check=True)
-        return float(json.loads(done.stdout.strip().splitlines()[-1])["processor_us"])
-
-    engine = engine_of(envs, "cpu")
-    engine.step(options.settle)
-    start = time.process_time()
-    for _ in range(steps):
-        engine.step()
-    alone = (time.process_time() - start) / steps / envs * 1e6
-    bare = genesis("none")
-    yield {"case": "none", "ours_us": alone, "genesis_us": bare}
-    for name in options.only or CLASSES[:-1]:
-        suite = SensorSuite(engine.scene, sensors(name), num_envs=envs)
-        seconds = []
-        for _ in range(steps):
-            engine.step()
-            start = time.process_time()
-            suite.update(engine.state, engine.timestep)
-            seconds.append(time.process_time() - start)
-        own = statistics.median(seconds[3:]) / envs * 1e6
-        theirs = genesis(name)
-        row = {"case": name, "ours_us": alone + own, "genesis_us": theirs}
-        yield row | {"ours_alone_us": own, "genesis_alone_us": theirs - bare}
-
-
 PARTS = {
     "check": part_check,
     "sensors": part_sensors,
     "step": part_step,
     "published": part_published,
     "scaling": part_scaling,
-    "peer": part_peer,
 }
 
 
@@ -283,8 +248,7 @@ def main() -> None:
     parser.add_argument("--env-list", type=int, nargs="+")
     parser.add_argument("--taxels", type=int, nargs="+", default=[100, 1000, 10_000])
     parser.add_argument("--settle", type=int, default=200, help="steps before anything is measured")
-    parser.add_argument("--genesis-python", help="interpreter of an environment with genesis-world 1.4.5")
-    parser.add_argument("--only", nargs="+", choices=CLASSES[:-1], help="classes of --part sensors, scaling and peer")
+    parser.add_argument("--only", nargs="+", choices=CLASSES[:-1], help="classes of --part sensors and scaling")
     parser.add_argument("--write-input", type=Path)
     parser.add_argument("--input", type=Path)
     parser.add_argument("--from", type=Path, nargs="+", dest="records")
@@ -305,7 +269,7 @@ def main() -> None:
     options.brought = read_input(options.input) if options.input else None
     where = pick_device(options.device)
     options.name = where.name if where.is_cuda else "2 shared cores"
-    chosen = [name for name in PARTS if name != "peer"] if options.part == "all" else [options.part]
+    chosen = list(PARTS) if options.part == "all" else [options.part]
     for part in chosen:
         print(f"# {part} on {options.name}", flush=True)
         start = time.perf_counter()
