@@ -104,7 +104,8 @@ def judge_claim(claim: Mapping[str, Any], types: Sequence[str], arms: Arms, leve
     effects = {" less ".join(map(in_words, pair)): difference(arms, [pair], level) for pair in pairs}
     weakest = min(effects, key=lambda name: effects[name].value)
     verdicts = [judge(effect, 1) for effect in effects.values()]
-    verdict: Verdict = next((each for each in ("does not hold", "undecided") if each in verdicts), "holds")
+    worst: tuple[Verdict, ...] = ("does not hold", "undecided")
+    verdict = next((each for each in worst if each in verdicts), "holds")
     return Judged(effects[weakest], verdict, weakest)
 
 
