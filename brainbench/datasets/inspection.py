@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from brainbench.core.contracts import as_labels, natural_key
 from brainbench.core.errors import BrainbenchError, DataError
 from brainbench.core.progress import Progress, track
-from brainbench.core.reading.filters import MissingFilterError
+from brainbench.core.reading.hdf5 import MissingFilterError
 from brainbench.datasets import hdf5
 from brainbench.datasets.layouts.registry import RecordingLayout, counted_layout
 from brainbench.datasets.ledger import Ledger, balance_line

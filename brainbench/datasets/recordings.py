@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 from brainbench.core.contracts import check_recordings
 from brainbench.core.errors import DataError, UsageError, check_each, listing, unknown_name
 from brainbench.core.progress import Progress, track
-from brainbench.core.reading.filters import MissingFilterError
+from brainbench.core.reading.hdf5 import MissingFilterError
 from brainbench.datasets import hdf5
 from brainbench.datasets.inspection import propose
 from brainbench.datasets.layouts.registry import RecordingLayout, counted_layout, list_layouts

@@ -1,12 +1,21 @@
-"""Files that a library parses in compiled code: a process with limits reads them first, and hands back plain arrays."""
+"""Foreign bytes that compiled code parses: a process with limits does it, and hands back words or plain arrays.
+
+The process starts with the first file and forks one for each: what loops, crashes or takes all memory ends that alone.
+"""
 
 from __future__ import annotations
 
+import atexit
+import contextlib
 import importlib
+import json
 import os
+import signal
 import subprocess
 import sys
 import tempfile
+import threading
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +27,13 @@ from brainbench.core.reading.archives import read_npz
 from brainbench.core.reading.regular import check_file, readable
 
 SECONDS = 60.0
-"""Time for a file."""
+"""Time for a file, by default."""
 MEMORY = 8 << 30
 """Address space [bytes]; compiled libraries reserve much more than they use."""
-_REFUSED = 3
+MOST_WRITTEN = 16 << 30
+"""Bytes that a file which is written may have."""
+CRASHED = "is damaged: the library that reads it crashed or did not come back; copy it again"
+"""What is said after the name of a file with which the process ended."""
 
 
 def read_apart(function: str, path: str | os.PathLike[str], kind: str) -> dict[str, NDArray[Any]]:
@@ -29,32 +41,123 @@ def read_apart(function: str, path: str | os.PathLike[str], kind: str) -> dict[s
 
     ``kind`` is what the file shall be, in words.
     """
-    file, name = check_file(path, kind).absolute(), brief(os.fspath(path))
+    file = check_file(path, kind).absolute()
     with tempfile.TemporaryDirectory(prefix="brainbench-") as folder:
         arrays = Path(folder) / "arrays.npz"
-        words = [sys.executable, "-P", "-m", __name__, function, os.fspath(file), os.fspath(arrays)]
-        try:
-            done = subprocess.run(words, stdin=subprocess.DEVNULL, capture_output=True, timeout=SECONDS, check=False)
-        except subprocess.TimeoutExpired:
-            raise DataError(f"{name} is damaged: to read it took over {SECONDS:g} s.") from None
-        if done.returncode == _REFUSED:
-            raise DataError(done.stdout.decode(errors="replace"))
-        if done.returncode:
-            raise DataError(f"{name} is no {kind}, or damaged: the library that reads it crashed; copy it again.")
+        fault = call_apart(f"{__name__}:save_arrays", [function, os.fspath(file), os.fspath(arrays)], SECONDS)
+        if fault != "":
+            raise DataError(fault or f"{brief(os.fspath(path))} {CRASHED}.")
         return dict(read_npz(arrays, kind))
 
 
-if __name__ == "__main__":
-    target, source, result = sys.argv[1:]
-    module, _, attribute = target.partition(":")
-    read = getattr(importlib.import_module(module), attribute)
-    if sys.platform != "win32":
-        import resource
-
-        resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
+def save_arrays(function: str, source: str, arrays: str) -> str:
+    """Write the arrays that a function reads of a file into another one; return what is wrong, in words."""
     try:
         with readable(source, "file of its kind"):
-            np.savez(result, **read(source))
+            np.savez(arrays, **_load(function)(source))
     except BrainbenchError as error:
-        sys.stdout.write(str(error))
-        sys.exit(_REFUSED)
+        return str(error)
+    return ""
+
+
+def call_apart(function: str, arguments: Sequence[Any], seconds: float) -> Any:
+    """Return what ``module:function`` returns in another process, as JSON; None where that ended or took longer."""
+    with _Worker.lock:
+        process = _Worker.running()
+        watch = threading.Timer(seconds + 3, process.kill)
+        watch.start()
+        try:
+            process.stdin.write(json.dumps([function, *arguments, seconds]) + "\n")  # type: ignore[union-attr]
+            process.stdin.flush()  # type: ignore[union-attr]
+            answer = process.stdout.readline()  # type: ignore[union-attr]
+        except OSError:
+            answer = ""
+        finally:
+            watch.cancel()
+        if not answer:
+            _Worker.process = None
+            _Worker.end(process)
+        return json.loads(answer or "null")
+
+
+class _Worker:
+    """The process that forks; it ends with this one."""
+
+    process: subprocess.Popen[str] | None = None
+    lock = threading.Lock()
+    _owner = 0
+
+    @classmethod
+    def running(cls) -> subprocess.Popen[str]:
+        # A forked process must not share the pipe of its parent.
+        if cls.process is None or cls._owner != os.getpid() or cls.process.poll() is not None:
+            paths = os.pathsep.join(filter(None, sys.path))
+            pipe = subprocess.PIPE
+            cls.process = subprocess.Popen(
+                [sys.executable, "-P", "-m", __name__], stdin=pipe, stdout=pipe, stderr=subprocess.DEVNULL, text=True,
+                env={**os.environ, "PYTHONPATH": paths},
+            )  # fmt: skip
+            # Its start on a busy machine is no fault of the file.
+            cls.process.stdout.readline()  # type: ignore[union-attr]
+            cls._owner = os.getpid()
+            atexit.register(cls.end, cls.process)
+        return cls.process
+
+    @staticmethod
+    def end(process: subprocess.Popen[str]) -> None:
+        process.kill()
+        for stream in (process.stdin, process.stdout):
+            with contextlib.suppress(OSError):
+                stream.close()  # type: ignore[union-attr]
+        process.wait()
+
+
+def _load(function: str) -> Any:
+    module, _, attribute = function.partition(":")
+    return getattr(importlib.import_module(module), attribute)
+
+
+def _answer(request: str) -> str:
+    function, *arguments, _ = json.loads(request)
+    return json.dumps(_load(function)(*arguments)) + "\n"
+
+
+def _bound(seconds: float) -> None:
+    """Set limits to what this process takes: the signal ends it even within a loop of a library."""
+    import resource
+
+    signal.setitimer(signal.ITIMER_REAL, max(seconds, 1e-3))
+    resource.setrlimit(resource.RLIMIT_FSIZE, (MOST_WRITTEN, MOST_WRITTEN))
+    files = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
+    resource.setrlimit(resource.RLIMIT_NOFILE, (files, files))
+    with contextlib.suppress(ValueError, OSError):  # systems without
+        resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
+
+
+def _serve() -> None:
+    """Answer requests, each a line of JSON, with lines of JSON; libraries that print write nowhere."""
+    import h5py  # noqa: F401 - once, for all processes that are forked below
+
+    with contextlib.suppress(ImportError):
+        import hdf5plugin  # noqa: F401 # pyright: ignore[reportMissingImports] - brings filters along
+
+    with os.fdopen(os.dup(1), "w") as answers:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+        answers.write("ready\n")
+        answers.flush()
+        for line in sys.stdin:
+            if not hasattr(os, "fork"):
+                answers.write(_answer(line))
+            elif (child := os.fork()) == 0:
+                # Damage can spoil a library's memory: a file has a process to itself, which tells of it when it ends.
+                _bound(json.loads(line)[-1])
+                answers.write(_answer(line))
+                answers.flush()
+                os._exit(0)
+            elif os.waitpid(child, 0)[1]:
+                answers.write("null\n")
+            answers.flush()
+
+
+if __name__ == "__main__":
+    _serve()

@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-import atexit
 import contextlib
-import json
 import os
-import subprocess
-import sys
 import tempfile
-import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from brainbench.core.errors import DataError, brief
-from brainbench.core.reading.filters import naming_filters
+from brainbench.core.reading.apart import CRASHED, call_apart
+from brainbench.core.reading.hdf5_worker import lacking_filters
 from brainbench.core.reading.regular import check_file, readable
 
 if TYPE_CHECKING:
@@ -27,6 +23,13 @@ RATE = 10 << 20
 """Bytes per second at which even a slow disk is looked through."""
 LINKED_VARIABLE = "BRAINBENCH_ALLOW_LINKED"
 """Environment variable with folders, as in PATH, that HDF5 files may link into; ``--allow-linked`` sets it."""
+WALK = "brainbench.core.reading.hdf5_worker:fault_of"
+FILTERS = {32001: "Blosc", 32004: "LZ4", 32008: "bitshuffle", 32013: "ZFP", 32015: "Zstandard", 32026: "Blosc2"}
+"""Registered filters of HDF5 that laboratories use."""
+
+
+class MissingFilterError(DataError):
+    """An array is compressed by a filter that this installation lacks."""
 
 
 @contextlib.contextmanager
@@ -55,7 +58,8 @@ def open_hdf5(path: str | os.PathLike[str], kind: str = "HDF5 file", hint: str =
             folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="brainbench-"))
             allowed = [name for name in os.environ.get(LINKED_VARIABLE, "").split(os.pathsep) if name]
             request, seconds = [str(place), allowed, f"{folder}/{place.name}"], SECONDS + state[2] / RATE
-            fault, linked = _Worker.ask(request, seconds + (600 if allowed else 0))
+            answer = call_apart(WALK, request, seconds + (600 if allowed else 0))
+            fault, linked = answer or (CRASHED, False)
             if fault:
                 raise DataError(f"{brief(os.fspath(path))} {fault}.{hint and ' ' + hint}")
             if linked:
@@ -69,8 +73,19 @@ def open_hdf5(path: str | os.PathLike[str], kind: str = "HDF5 file", hint: str =
             raise DataError(f"{brief(os.fspath(path))} changed while it was read; wait until it is complete.")
         with contextlib.suppress(ImportError):
             import hdf5plugin  # noqa: F401 # pyright: ignore[reportMissingImports] - brings filters along
-        stack.enter_context(naming_filters(file, path))
-        yield file
+        try:
+            yield file
+        except OSError as error:
+            if (need := file.visititems(_need)) is None:
+                raise
+            raise MissingFilterError(f"{brief(os.fspath(path))} {need}: pip install hdf5plugin.") from error
+
+
+def _need(name: str, node: Any) -> str | None:
+    if not hasattr(node, "dtype") or not (codes := lacking_filters(node)):
+        return None
+    title = f" ({FILTERS[codes[0]]})" if codes[0] in FILTERS else ""
+    return f"needs the HDF5 filter {codes[0]}{title} to read {brief(name)}"
 
 
 def trust_hdf5(path: Path) -> None:
@@ -85,54 +100,3 @@ def _state(path: Path, handle: int | None = None) -> tuple[str, int, int, int, i
 
 
 _TRUSTED: set[tuple[str, int, int, int, int, int]] = set()
-
-
-class _Worker:
-    """The process that looks through files; it starts with the first file and ends with this process."""
-
-    _process: subprocess.Popen[str] | None = None
-    _owner = 0
-    _lock = threading.Lock()
-
-    @classmethod
-    def ask(cls, request: list[Any], seconds: float) -> tuple[str, bool]:
-        """Return the fault of a file, also where the process died or took longer, and whether there is a copy of it."""
-        with cls._lock:
-            process = cls._running()
-            watch = threading.Timer(seconds, process.kill)
-            watch.start()
-            try:
-                process.stdin.write(json.dumps(request) + "\n")  # type: ignore[union-attr]
-                process.stdin.flush()  # type: ignore[union-attr]
-                answer = process.stdout.readline()  # type: ignore[union-attr]
-            except OSError:
-                answer = ""
-            finally:
-                watch.cancel()
-            if answer:
-                fault, linked = json.loads(answer)
-                return fault, linked
-            cls._process = None
-            cls._end(process)
-            return "is damaged: the HDF5 library crashed or did not come back; copy it again", False
-
-    @classmethod
-    def _running(cls) -> subprocess.Popen[str]:
-        # A forked process must not share the pipe of its parent.
-        if cls._process is None or cls._owner != os.getpid() or cls._process.poll() is not None:
-            words = [sys.executable, "-P", os.fspath(Path(__file__).with_name("hdf5_worker.py"))]
-            pipe = subprocess.PIPE
-            cls._process = subprocess.Popen(words, stdin=pipe, stdout=pipe, stderr=subprocess.DEVNULL, text=True)
-            # Its start on a busy machine is no fault of the file.
-            cls._process.stdout.readline()  # type: ignore[union-attr]
-            cls._owner = os.getpid()
-            atexit.register(cls._end, cls._process)
-        return cls._process
-
-    @staticmethod
-    def _end(process: subprocess.Popen[str]) -> None:
-        process.kill()
-        for stream in (process.stdin, process.stdout):
-            with contextlib.suppress(OSError):
-                stream.close()  # type: ignore[union-attr]
-        process.wait()

@@ -4,20 +4,16 @@ A file is plain when all its bytes are its own. What links to others or is made 
 by hop and never by the library: each hop is a regular file in a folder that may be read from, and has the part that is
 asked for. All of it is written, as plain arrays, into a copy that is read in its place.
 
-Run by path, without this package: a line of JSON with path, folders and place of a copy comes in, one with the fault or
-``""`` and whether there is a copy goes out.
+It runs in another process (:mod:`brainbench.core.reading.apart`).
 """
 
 from __future__ import annotations
 
-import contextlib
-import json
 import math
 import os
 import shutil
 import signal
 import stat
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -29,8 +25,6 @@ SMALL = 1 << 20
 """Bytes of an array that is read as a whole, since its numbers may lead elsewhere (texts of any length)."""
 MOST_HOPS = 32
 """Links that follow one another."""
-MOST_COPY = 16 << 30
-"""Bytes that a copy may take on disk."""
 
 
 class Refused(Exception):
@@ -127,7 +121,7 @@ def _array(node: Any, name: str) -> None:
         raise Refused(
             f"is damaged ({name[:80]!r} declares {list(node.shape)}, {declared:,} bytes, and stores {stored:,})"
         )
-    if away or _lacks_filter(node):
+    if away or lacking_filters(node):
         return  # No damage: whoever reads it is told.
     if declared <= SMALL:
         try:
@@ -138,11 +132,13 @@ def _array(node: Any, name: str) -> None:
         node.id.get_num_chunks()
 
 
-def _lacks_filter(node: Any) -> bool:
-    from h5py import h5z  # pyright: ignore[reportAttributeAccessIssue]
+def lacking_filters(node: Any) -> list[int]:
+    """Return the numbers of the filters that an array needs and this installation lacks."""
+    from h5py import h5z  # pyright: ignore[reportAttributeAccessIssue] - compiled
 
     create = node.id.get_create_plist()
-    return not all(h5z.filter_avail(create.get_filter(place)[0]) for place in range(create.get_nfilters()))
+    codes = [create.get_filter(place)[0] for place in range(create.get_nfilters())]
+    return [code for code in codes if not h5z.filter_avail(code)]
 
 
 class _Copy:
@@ -338,44 +334,3 @@ def _why(path: str, text: str) -> str:
     if "signature not found" in text:
         return "is not an HDF5 file"
     return f"cannot be read, it seems damaged ({text}); copy it again"
-
-
-def answer(request: str) -> None:
-    """Write what is to be said of a request as a line of JSON."""
-    sys.stdout.write(json.dumps(fault_of(*json.loads(request))) + "\n")
-    sys.stdout.flush()
-
-
-def _bound(request: str) -> None:
-    """Set limits to what this process takes: the signal ends it even within a loop of the library."""
-    import resource
-
-    path, folders, _ = json.loads(request)
-    # Who allows a folder by name means large sets too.
-    signal.alarm(5 + Path(path).stat().st_size // (10 << 20) + (600 if folders else 0))
-    resource.setrlimit(resource.RLIMIT_FSIZE, (MOST_COPY, MOST_COPY))
-    files = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
-    resource.setrlimit(resource.RLIMIT_NOFILE, (files, files))
-    with contextlib.suppress(ValueError, OSError):  # systems without
-        resource.setrlimit(resource.RLIMIT_AS, (4 * MOST_MEMORY, 4 * MOST_MEMORY))
-
-
-if __name__ == "__main__":
-    import h5py  # noqa: F401 - once, for all processes that are forked below
-
-    with contextlib.suppress(ImportError):
-        import hdf5plugin  # noqa: F401 # pyright: ignore[reportMissingImports] - brings filters along
-
-    sys.stdout.write("ready\n")
-    sys.stdout.flush()
-    for line in sys.stdin:
-        if not hasattr(os, "fork"):
-            answer(line)
-        elif (child := os.fork()) == 0:
-            # Damage can spoil the library's memory: a file has a process to itself, which tells of it when it ends.
-            _bound(line)
-            answer(line)
-            sys.exit()
-        elif os.waitpid(child, 0)[1]:
-            sys.stdout.write(json.dumps(["is damaged: the HDF5 library crashed or did not come back", False]) + "\n")
-            sys.stdout.flush()

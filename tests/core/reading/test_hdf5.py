@@ -28,7 +28,6 @@ def test_a_good_file_is_opened_and_failures_inside_name_it(tmp_path):
 
 def test_a_file_that_the_library_never_returns_from_is_refused_and_the_next_one_is_read(tmp_path, monkeypatch):
     slow, good = _write(tmp_path / "slow.h5"), _write(tmp_path / "good.h5")
-    ask = hdf5._Worker.ask
     # No time at all: the worker is stopped as it is when the library loops for ever.
     monkeypatch.setattr(hdf5, "SECONDS", -1e6)
     began = time.monotonic()
@@ -36,14 +35,33 @@ def test_a_file_that_the_library_never_returns_from_is_refused_and_the_next_one_
         pass
     assert time.monotonic() - began < 5
     monkeypatch.undo()
-    assert ask([str(good), [], ""], 60.0) == ("", False)
+    with hdf5.open_hdf5(good) as file:
+        assert list(file) == ["a"]
+
+
+@pytest.mark.parametrize("size", [100, 200_000])
+@pytest.mark.parametrize(("code", "words"), [(32001, r"32001 \(Blosc\)"), (32015, "Zstandard"), (32999, "32999 to")])
+def test_a_missing_filter_is_named_with_its_package_and_hinders_nothing_else(tmp_path, code, words, size):
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["plain"] = np.arange(3)
+        create = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+        create.set_chunk((size,))
+        create.set_filter(code, h5py.h5z.FLAG_OPTIONAL, (2, 2, 8, 8 * size))
+        space = h5py.h5s.create_simple((size,))
+        packed = h5py.h5d.create(file.id, b"packed", h5py.h5t.IEEE_F64LE, space, create)
+        packed.write_direct_chunk((0,), np.random.default_rng(0).bytes(8 * size), 0)
+    with hdf5.open_hdf5(tmp_path / "a.h5") as file:
+        assert file["plain"][...].tolist() == [0, 1, 2]
+    message = rf"a.h5.*{words}.*'packed': pip install hdf5plugin"
+    with pytest.raises(hdf5.MissingFilterError, match=message), hdf5.open_hdf5(tmp_path / "a.h5") as file:
+        file["packed"][...]
 
 
 def test_a_file_of_ours_whose_hash_was_checked_is_opened_at_once(tmp_path, monkeypatch):
     path = _write(tmp_path / "a.h5")
     seal_file(path)
     read_entry(path, "file", Path.stat)
-    monkeypatch.setattr(hdf5._Worker, "ask", lambda *_: ("was looked through", False))
+    monkeypatch.setattr(hdf5, "call_apart", lambda *_: ("was looked through", False))
     with hdf5.open_hdf5(path) as file:
         assert list(file) == ["a"]
     # Other bytes, or another file under the name, are looked through again.
@@ -54,14 +72,14 @@ def test_a_file_of_ours_whose_hash_was_checked_is_opened_at_once(tmp_path, monke
 
 
 def test_a_file_that_is_replaced_between_its_walk_and_its_opening_is_refused(tmp_path, monkeypatch):
-    path, ask = _write(tmp_path / "a.h5"), hdf5._Worker.ask
+    path, ask = _write(tmp_path / "a.h5"), hdf5.call_apart
 
     def swap(*request):
         answer = ask(*request)
         _write(tmp_path / "b.h5").replace(path)
         return answer
 
-    monkeypatch.setattr(hdf5._Worker, "ask", swap)
+    monkeypatch.setattr(hdf5, "call_apart", swap)
     with pytest.raises(DataError, match="changed while"), hdf5.open_hdf5(path):
         pass
 

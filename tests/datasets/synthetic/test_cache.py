@@ -87,5 +87,5 @@ def test_no_folder_is_left_after_a_failure(cache):
 def test_files_whose_hash_was_just_checked_are_opened_at_once(monkeypatch):
     ensure()
     made = ensure()
-    monkeypatch.setattr(hdf5._Worker, "ask", lambda *_: pytest.fail("was looked through by another process"))
+    monkeypatch.setattr(hdf5, "call_apart", lambda *_: pytest.fail("was looked through by another process"))
     assert open_recordings(made).sizes["trial"] > 0
