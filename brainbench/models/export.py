@@ -6,14 +6,22 @@ normaliser is inside. Beside it stands a JSON contract: channels, units, frame, 
 
 from __future__ import annotations
 
+import hashlib
 import logging
+import math
+import os
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from brainbench.core.errors import DataError, check_name, needing
+import numpy as np
+
+from brainbench.core.errors import DataError, brief, check_name, needing
+from brainbench.core.reading.apart import CRASHED, SECONDS, call_apart
+from brainbench.core.reading.regular import check_file, reason
+from brainbench.core.reading.tensors import check_finite
 
 if TYPE_CHECKING:
     from torch import nn
@@ -22,6 +30,10 @@ SUFFIXES = {"onnx": ".onnx", "torch": ".pt2"}
 """Formats and their suffixes: ONNX, and an exported PyTorch program."""
 INPUTS, OUTPUTS = ("obs", "h_in"), ("features", "h_out")
 OPSET = 18
+MOST_ONNX = 2 << 30
+"""Bytes of an ONNX file, which Protocol Buffers allow."""
+MOST_INPUT = 1 << 26
+"""Numbers of one input."""
 TOLERANCE = 1e-4
 """Largest difference between the file and the network, relative to the largest feature."""
 _STEPS = 8
@@ -120,14 +132,69 @@ def _write(step: Any, path: Path, format: str) -> None:
 
 
 def onnx_session(path: str | Path, threads: int | None = None) -> Any:
-    """Return ONNX Runtime's session of a file on the CPU, with its own choice of threads if None."""
+    """Return ONNX Runtime's session of a file on the CPU, with its own choice of threads if None.
+
+    Another process with limits computes a step of zeros with it first: damage ends that one.
+    """
+    file = check_file(path, "ONNX file", most=MOST_ONNX)
+    name = brief(os.fspath(path))
+    fault, digest = call_apart(f"{__name__}:try_onnx", [os.fspath(file.absolute())], SECONDS) or (CRASHED, "")
+    if fault:
+        raise DataError(f"{name} {fault}.")
+    # What was tried and no other bytes; without a folder, so that it names no files beside it.
+    content = file.read_bytes()
+    if hashlib.sha256(content).hexdigest() != digest:
+        raise DataError(f"{name} changed while it was read; wait until it is complete.")
+    return _session(content, threads)
+
+
+def try_onnx(path: str) -> tuple[str, str]:
+    """Return what is wrong with an ONNX file, in words that follow its name, and the hash of its bytes."""
+    import onnx
+
+    content = Path(path).read_bytes()
+    try:
+        model = onnx.load_from_string(content)
+        # Weights in other files are refused: a network is one file, and it must not make us open others.
+        tensors = list(_tensors(model))
+        if any(tensor.external_data for tensor in tensors):
+            return "keeps weights in other files; export it again", ""
+        check_finite({tensor.name: onnx.numpy_helper.to_array(tensor) for tensor in tensors}, path)
+        session = _session(content, 1)
+        # A side without a number is the batch.
+        shapes = {
+            value.name: [side if isinstance(side, int) else 1 for side in value.shape] for value in session.get_inputs()
+        }
+        for name, shape in shapes.items():
+            if not 0 <= math.prod(shape) <= MOST_INPUT:
+                return f"takes {math.prod(shape):,} numbers as {brief(name)}; at most {MOST_INPUT:,} are allowed", ""
+        session.run(None, {name: np.zeros(shape, np.float32) for name, shape in shapes.items()})
+    except DataError as error:
+        return f"cannot be used: {error}".removesuffix("."), ""
+    except Exception as error:  # noqa: BLE001 - ONNX and ONNX Runtime have no common public base of errors
+        return f"cannot be read as ONNX ({reason(error)})", ""
+    return "", hashlib.sha256(content).hexdigest()
+
+
+def _session(content: bytes, threads: int | None) -> Any:
     import onnxruntime
 
     options = onnxruntime.SessionOptions()
     options.log_severity_level = 3
     if threads is not None:
         options.intra_op_num_threads = options.inter_op_num_threads = threads
-    return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+    return onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
+
+
+def _tensors(message: Any) -> Iterator[Any]:
+    """Yield all tensors of an ONNX message: weights, constants of nodes, and those of branches and functions."""
+    if message.DESCRIPTOR.name == "TensorProto":
+        yield message
+        return
+    for field, value in message.ListFields():
+        if field.message_type is not None:
+            for part in (value,) if hasattr(value, "DESCRIPTOR") else value:
+                yield from _tensors(part)
 
 
 def read_onnx(path: str | Path, *, threads: int | None = None) -> Callable[[Any, Any], tuple[Any, Any]]:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,8 +17,6 @@ import torch
 
 from brainbench.core.errors import BrainbenchError, DataError
 from brainbench.core.files import atomic_path, file_hash, provenance, write_json
-from brainbench.core.reading.regular import check_file
-from brainbench.core.reading.tensors import check_finite
 from brainbench.models.activations import evaluating
 from brainbench.models.export import onnx_session, require_onnx
 from robotics_bridge.policies.contract import MOST_NUMBERS, check_contract
@@ -29,8 +27,6 @@ if TYPE_CHECKING:
 
 Runner = Callable[[Mapping[str, "NDArray[np.float32]"], bool], "NDArray[np.float32]"]
 """(groups of one row [n…], forget first) → actions [A]."""
-MOST_POLICY = 2 << 30
-"""Bytes of a policy's file, which Protocol Buffers allow."""
 
 
 def read_policy(
@@ -44,7 +40,6 @@ def read_policy(
         actions: A; not checked if None.
     """
     require_onnx()
-    check_file(path, "policy", most=MOST_POLICY)
     try:
         run: Runner = _OnnxRunner(path, shapes, threads)
         # A step of zeros shows here, and not with a hand in motion, what a file computes.
@@ -63,13 +58,6 @@ def read_policy(
 
 class _OnnxRunner:
     def __init__(self, path: str | Path, shapes: Mapping[str, tuple[int, ...]], threads: int | None) -> None:
-        import onnx
-
-        # Weights in other files are refused: a policy is one file, and it must not make us open others.
-        tensors = list(_tensors(onnx.load(str(path), load_external_data=False)))
-        if any(item.external_data for item in tensors):
-            raise DataError(f"{str(path)!r} keeps weights in other files; export the policy again.")
-        check_finite({item.name: onnx.numpy_helper.to_array(item) for item in tensors}, str(path))
         self.session = onnx_session(path, threads)
         inputs = {item.name: item.shape for item in self.session.get_inputs()}
         if missing := sorted({*shapes, "h_in"} - set(inputs)):
@@ -88,17 +76,6 @@ class _OnnxRunner:
         feed = {name: np.asarray(obs[name], np.float32)[None] for name in self.names}
         actions, self.state = self.session.run(["actions", "h_out"], {**feed, "h_in": self.state})
         return np.asarray(actions)[0]
-
-
-def _tensors(message: Any) -> Iterator[Any]:
-    """Yield all tensors of an ONNX message: weights, constants of nodes, and those of branches and functions."""
-    if message.DESCRIPTOR.name == "TensorProto":
-        yield message
-        return
-    for field, value in message.ListFields():
-        if field.message_type is not None:
-            for part in (value,) if hasattr(value, "DESCRIPTOR") else value:
-                yield from _tensors(part)
 
 
 TOLERANCE = 1e-4
