@@ -9,9 +9,11 @@ too few animals or stimuli.
 from __future__ import annotations
 
 import math
+from bisect import bisect, insort
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from operator import itemgetter
 from typing import Any
 
 from brainbench.core.errors import listing
@@ -132,11 +134,18 @@ def _rank(entries: list[Entry], baselines: Sequence[Baseline], lacks: str) -> li
     candidates = [replace(entry, unranked_because=_unranked(entry, lacks)) for entry in entries]
     able = [entry for entry in candidates if not entry.unranked_because]
     groups: list[list[Entry]] = []
+    places: list[tuple[float, int]] = []
     # The shortest name stands for a computation: an encoder before its variants with an attender.
     for entry in sorted(able, key=lambda entry: (len(entry.name), entry.name)):
-        close = (group for group in groups if math.isclose(group[0].value, entry.value, abs_tol=1e-5))
+        value, reach = entry.value, 1e-5 + 1e-8 * abs(entry.value)
+        near = places[bisect(places, (value - reach, -1)) : bisect(places, (value + reach, len(groups)))]
+        close = (groups[place] for number, place in sorted(near, key=itemgetter(1)) if _is_close(number, value))
         same = next((group for group in close if same_computation(group[0], entry)), None)
-        groups.append([entry]) if same is None else same.append(entry)
+        if same is None:
+            insort(places, (value, len(groups)))
+            groups.append([entry])
+        else:
+            same.append(entry)
     samples = [group[0].sample for group in groups]
     raw = next((item.score for item in baselines if item.name == RAW_INPUT and math.isfinite(item.score.scaled)), None)
     above = told_apart([*samples, *([Sample.of([raw])] if raw is not None else [])])
@@ -153,6 +162,10 @@ def _rank(entries: list[Entry], baselines: Sequence[Baseline], lacks: str) -> li
             copied = "" if entry is group[0] else group[0].name
             ranked.append(replace(entry, first=first, last=last, same_as=copied, **flags))
     return ranked
+
+
+def _is_close(left: float, right: float) -> bool:
+    return math.isclose(left, right, abs_tol=1e-5)
 
 
 def _unranked(entry: Entry, lacks: str) -> str:

@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from brainbench.core.identity import unusual_settings
 from brainbench.core.records import Interval
@@ -137,10 +136,13 @@ def _combined(errors: Sequence[Sequence[Any]], groups: Sequence[Sequence[int]]) 
 def _ranks(models: Sequence[Sequence[Entry]]) -> list[tuple[int | None, int | None]]:
     """Return the best and the worst rank of each model by paired tests over all benchmarks."""
     tests = [differences([entries[place].sample for entries in models]) for place in range(len(models[0]))]
-    difference: NDArray[np.float64] = np.mean([test[0] for test in tests], axis=0)
     groups = min(map(dependent, models), key=len)
-    error, freedom = _combined([test[1:] for test in tests], groups)
-    above = apart(difference, error, freedom)
+
+    def row(place: int) -> tuple[Any, Any, Any]:
+        parts = [test(place) for test in tests]
+        return np.mean([part[0] for part in parts], axis=0), *_combined([part[1:] for part in parts], groups)
+
+    above = apart(len(models), row)
     for place, entries in enumerate(models):
         above[:, place] &= any(entry.above_chance for entry in entries)
     return [*rank_ranges(above)] if above.any() else [(None, None)] * len(models)

@@ -9,7 +9,7 @@ own variance. A standing says in words what a score is worth. Letters: N models,
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -76,29 +76,40 @@ class Sample:
         return Interval(self.value - half, self.value + half, LEVEL, f"t over {over}")
 
 
+Row = Callable[[int], "tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]"]
+"""Model i → differences i − j, their standard errors and degrees of freedom, each of the models j > i."""
+
+
 def told_apart(samples: Sequence[Sample]) -> NDArray[np.bool_]:
     """Return [N, N] for each pair whether model j is told apart above model i."""
-    return apart(*differences(samples)) if samples else np.zeros((0, 0), dtype=bool)
+    return apart(len(samples), differences(samples)) if samples else np.zeros((0, 0), dtype=bool)
 
 
-def apart(
-    difference: NDArray[np.float64], error: NDArray[np.float64], freedom: NDArray[np.float64]
-) -> NDArray[np.bool_]:
-    """Return [N, N] for each difference i − j, with standard error and degrees of freedom, whether j is above i.
+def apart(count: int, row: Row) -> NDArray[np.bool_]:
+    """Return [N, N] for each difference i − j whether j is above i; NaN is not tested.
 
-    NaN is not tested. The false discovery rate over all pairs is :data:`FALSE_DISCOVERY_RATE` (Benjamini & Hochberg
-    1995). Of models of one seed each the test is that of :func:`brainbench.core.statistics.compare_scores`.
+    The false discovery rate over all pairs is :data:`FALSE_DISCOVERY_RATE` (Benjamini & Hochberg 1995). Of models of
+    one seed each the test is that of :func:`brainbench.core.statistics.compare_scores`. Of thousands of models only the
+    p of each pair is kept, negative where the difference is.
     """
     from scipy.special import stdtr
-    from scipy.stats import false_discovery_control
 
-    t = np.divide(np.abs(difference), error, out=np.where(difference == 0, 0.0, math.inf), where=error > 0)
-    p = np.where(np.isnan(difference), math.nan, 2 * stdtr(np.where(error > 0, freedom, 1.0), -t))
-    pairs = np.triu(np.isfinite(p), 1)
-    adjusted = np.ones_like(p)
-    if pairs.any():
-        adjusted[pairs] = false_discovery_control(p[pairs])
-    return (np.minimum(adjusted, adjusted.T) <= FALSE_DISCOVERY_RATE) & (difference < 0)
+    rows: list[NDArray[np.float64]] = []
+    for place in range(count):
+        difference, error, freedom = row(place)
+        t = np.divide(np.abs(difference), error, out=np.where(difference == 0, 0.0, math.inf), where=error > 0)
+        p = np.where(np.isnan(difference), math.nan, 2 * stdtr(np.where(error > 0, freedom, 1.0), -t))
+        rows.append(np.where(difference < 0, -p, p))
+    pairs, limit, passed = sum(int(np.isfinite(p).sum()) for p in rows), FALSE_DISCOVERY_RATE, -1
+    # The largest k with k values of p up to k/pairs of the rate: from above, each step takes those that are too large.
+    while pairs and passed != (passed := sum(int((np.abs(p) <= limit).sum()) for p in rows)):
+        limit = FALSE_DISCOVERY_RATE * passed / pairs
+    above = np.zeros((count, count), dtype=bool)
+    for place, p in enumerate(rows):
+        close = np.abs(p) <= limit
+        above[place, place + 1 :] = close & np.signbit(p)
+        above[place + 1 :, place] = close & ~np.signbit(p)
+    return above
 
 
 def rank_ranges(above: NDArray[np.bool_]) -> list[tuple[int, int]]:
@@ -128,8 +139,8 @@ def lacking(animals: int, stimuli: int) -> str:
     return " and ".join(f"at least {fewest} {what} (here {n})" for what, fewest, n in rules if n < fewest)
 
 
-def differences(samples: Sequence[Sample]) -> tuple[NDArray[np.float64], ...]:
-    """Return differences i − j, their standard errors and degrees of freedom, each [N, N]; NaN: not tested."""
+def differences(samples: Sequence[Sample]) -> Row:
+    """Return the differences of each model to those after it; NaN: not tested."""
     names = sorted({name for sample in samples for name in sample.animals})
     size = max(len(sample.without_stimulus) for sample in samples)
     table = np.array([[sample.animals.get(name, math.nan) for name in names] for sample in samples])
@@ -138,20 +149,22 @@ def differences(samples: Sequence[Sample]) -> tuple[NDArray[np.float64], ...]:
     for row, sample in zip(left_out, samples, strict=True):
         if len(sample.without_stimulus) == size:
             row[:] = sample.without_stimulus
-    difference, errors, freedoms = (np.full((len(samples), len(samples)), math.nan) for _ in range(3))
     variances = np.array([sample.seed_variance for sample in samples])
-    for i in range(len(samples)):
-        animals, stimuli = table[i] - table, left_out[i] - left_out
+
+    def row_of(place: int) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        after = slice(place + 1, None)
+        animals, stimuli = table[place] - table[after], left_out[place] - left_out[after]
         enough = np.isfinite(animals).sum(axis=1) >= FEWEST_ANIMALS
         enough &= np.isfinite(stimuli).sum(axis=1) >= FEWEST_STIMULI
-        enough[i] = False
-        if not enough.any():
-            continue
-        mean = np.nanmean(animals[enough], axis=1)
-        error, freedom = two_factor_error(animals[enough], stimuli[enough])
-        error, freedom = _with_seeds(error, freedom, [variances[i], variances[enough].T])
-        difference[i, enough], errors[i, enough], freedoms[i, enough] = mean, error, freedom
-    return difference, errors, freedoms
+        difference, errors, freedoms = (np.full(len(enough), math.nan) for _ in range(3))
+        if enough.any():
+            mean = np.nanmean(animals[enough], axis=1)
+            error, freedom = two_factor_error(animals[enough], stimuli[enough])
+            error, freedom = _with_seeds(error, freedom, [variances[place], variances[after][enough].T])
+            difference[enough], errors[enough], freedoms[enough] = mean, error, freedom
+        return difference, errors, freedoms
+
+    return row_of
 
 
 def _with_seeds(error: NDArray[np.float64], freedom: NDArray[np.float64], seeds: Sequence[Any]) -> tuple:

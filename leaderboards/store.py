@@ -8,16 +8,20 @@ edits; it is no signature against someone who renames the file as well.
 
 from __future__ import annotations
 
+import hashlib
 import os
+from array import array
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
+
+import msgspec
 
 from brainbench.core.errors import DataError, DataFileNotFoundError
 from brainbench.core.files import write_text
 from brainbench.core.reading.texts import parse_json, read_text
-from brainbench.core.records import ResultRecord, record_identity
+from brainbench.core.records import ResultRecord, Score, record_identity
 
 SCHEMA_PATH = Path(__file__).with_name("record.schema.json")
 """The published JSON Schema (draft 2020-12) of one record file, shipped with the package."""
@@ -32,6 +36,27 @@ class StoredRecord:
     record: ResultRecord | None
     problem: str | None = None
     """One sentence; None exactly when ``record`` can be used."""
+    digest: str = ""
+    """SHA-256 of the file's text where ``record`` is :func:`lightened`; empty where it is whole."""
+
+    @property
+    def text(self) -> str:
+        """Content of the file, the same as when the record was read."""
+        if not self.digest:
+            return f"{self.record.to_json()}\n" if self.record else ""
+        text = read_text(self.path, "result record")
+        if _digest(text) != self.digest:
+            raise DataError(f"{self.path.name!r} changed while it was read; wait until it is complete.")
+        return text
+
+    @property
+    def whole(self) -> ResultRecord | None:
+        """The record with all that it holds, read from the file again where it is lightened."""
+        if not self.digest or self.record is None:
+            return self.record
+        record = msgspec.json.decode(self.text, type=ResultRecord)
+        record.__dict__["identity"] = self.record.identity
+        return record
 
 
 def write_record(record: ResultRecord, folder: str | os.PathLike[str]) -> Path:
@@ -61,8 +86,13 @@ def read_record(path: str | os.PathLike[str]) -> ResultRecord:
     Raises:
         DataFileNotFoundError: there is no such file.
     """
-    path = Path(path)
-    record, data = _parse(read_text(path, "result record"), path)
+    return _read(Path(path))[0]
+
+
+def _read(path: Path) -> tuple[ResultRecord, str]:
+    """Return the record of a file and the hash of its text."""
+    text = read_text(path, "result record")
+    record, data = _parse(text, path)
     # The hash is that of what the file says: a field that an earlier writer did not know is not in it.
     identity = record_identity(data)
     digest = path.stem.rpartition("--")[2]
@@ -71,7 +101,38 @@ def read_record(path: str | os.PathLike[str]) -> ResultRecord:
             f"{path.name!r} was edited or renamed: its content has the hash {identity}, its name says "
             f"{digest!r}; restore the original file or score the model again."
         )
-    return record
+    record.__dict__["identity"] = identity  # cached, since to find it again takes as long as all else
+    return record, _digest(text)
+
+
+def _digest(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def lightened(record: ResultRecord, shared: dict[object, Any]) -> ResultRecord:
+    """Return a record without what boards do not show: RDMs, but for a compact one of the model, and its diagram.
+
+    Of thousands of records the others are gigabytes. ``shared`` holds what is equal in several of them.
+    """
+
+    def light(score: Score) -> Score:
+        return replace(score, model_rdm=(), brain_rdm=(), stimuli=shared.setdefault(score.stimuli, score.stimuli))
+
+    def baseline(score: Score) -> Score:
+        small = replace(light(score), layers=(), provenance={})
+        return shared.setdefault(msgspec.msgpack.encode(small), small)
+
+    score = light(record.score)
+    object.__setattr__(score, "model_rdm", array("f", record.score.model_rdm))
+    small = replace(
+        record,
+        score=score,
+        animal_to_animal=record.animal_to_animal and baseline(record.animal_to_animal),
+        baselines={name: baseline(part) for name, part in record.baselines.items()},
+        card=record.card and replace(record.card, graph=None),
+    )
+    small.__dict__["identity"] = record.identity
+    return small
 
 
 def record_files(folder: Path) -> list[Path]:
@@ -80,11 +141,14 @@ def record_files(folder: Path) -> list[Path]:
     return sorted(path for path in folder.rglob("*.json") if not path.name.startswith("."))
 
 
-def read_records(source: str | os.PathLike[str] | Iterable[str | os.PathLike[str]]) -> list[StoredRecord]:
+def read_records(
+    source: str | os.PathLike[str] | Iterable[str | os.PathLike[str]], *, light: bool = False
+) -> list[StoredRecord]:
     """Read every record of a folder (with its sub-folders), a file, or a list of either.
 
     A file that cannot be used comes back with its problem in words instead of ending the whole
-    reading. Files in two places with the same content count once. Sorted by path.
+    reading. Files in two places with the same content count once. Sorted by path. ``light`` records
+    are :func:`lightened`, for boards of thousands.
 
     Raises:
         DataFileNotFoundError: a path does not exist, or nothing was found at all.
@@ -99,13 +163,16 @@ def read_records(source: str | os.PathLike[str] | Iterable[str | os.PathLike[str
         places = ", ".join(repr(os.fspath(item)) for item in sources) or "the empty list of files"
         raise DataFileNotFoundError(f"No result records (*.json) in {places}; {MAKE_ONE}")
     stored: dict[str, StoredRecord] = {}
+    shared: dict[object, Any] = {}
     for path in sorted(set(paths)):
         try:
-            record = read_record(path)
+            record, digest = _read(path)
         except DataError as error:
             stored[os.fspath(path)] = StoredRecord(path, None, str(error))
-        else:
-            stored.setdefault(record.identity, StoredRecord(path, record))
+            continue
+        if record.identity not in stored:
+            small = StoredRecord(path, lightened(record, shared), digest=digest) if light else None
+            stored[record.identity] = small or StoredRecord(path, record)
     return list(stored.values())
 
 

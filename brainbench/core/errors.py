@@ -90,6 +90,8 @@ def visible(text: object) -> str:
 
 def visible_lines(text: str, *, styled: bool = False) -> str:
     """Return a text of several lines without control characters; those of style stay where the terminal has some."""
+    if text.isprintable():  # no control, mark of direction or end of line is
+        return text
     return _UNSAFE_IN_LINES.sub(
         lambda match: match[0] if styled and match["style"] else "".join(map(_escaped, match[0])), text
     )

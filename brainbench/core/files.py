@@ -87,11 +87,18 @@ def writable(target: str | os.PathLike[str]) -> Iterator[None]:
         raise FileWriteError(f"{brief(os.fspath(target))} cannot be written ({os.strerror(error.errno)}).") from error
 
 
+def sync_file(path: Path) -> None:
+    """Wait until a file's content is on disk."""
+    with path.open("rb") as stream:
+        os.fsync(stream.fileno())
+
+
 @contextlib.contextmanager
-def atomic_path(target: str | os.PathLike[str]) -> Iterator[Path]:
+def atomic_path(target: str | os.PathLike[str], *, sync: bool = True) -> Iterator[Path]:
     """Yield a temporary path beside ``target`` that replaces it on success and vanishes on error.
 
-    The temporary name keeps the target's suffix, so libraries that choose a format by suffix work.
+    The temporary name keeps the target's suffix, so libraries that choose a format by suffix work. Without ``sync`` the
+    caller sees to it that the content is on disk: of many files at once.
 
     Raises:
         FileWriteError: the folder cannot be made or written, or the disk is full.
@@ -105,8 +112,8 @@ def atomic_path(target: str | os.PathLike[str]) -> Iterator[Path]:
             # Made by hand: tempfile's files are private, and to read the umask is not safe among threads.
             os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
             yield temporary
-            with temporary.open("rb") as stream:
-                os.fsync(stream.fileno())
+            if sync:
+                sync_file(temporary)
             temporary.replace(target)
     finally:
         if temporary != target:
@@ -125,7 +132,7 @@ def to_plain(value: Any) -> Any:
     A field that came later than files and hashes which exist (its metadata say ``later=True``) appears only where it
     is used, so that those stay what they are: where it differs from its default, or from ``before`` in the metadata.
     """
-    # Most of a record are the numbers of its RDMs: they come first.
+    # Most of a record are the numbers of its RDMs.
     if type(value) is float:
         return value if math.isfinite(value) else None
     if value is None or type(value) in (str, int, bool):
@@ -139,6 +146,8 @@ def to_plain(value: Any) -> Any:
             if not (field.metadata.get("later") and _is_unused(getattr(value, field.name), field))
         }
     if isinstance(value, (list, tuple)):
+        if value and type(value[0]) is float and {*map(type, value)} == {float}:
+            return [number if math.isfinite(number) else None for number in value]
         return [to_plain(item) for item in value]
     if isinstance(value, (set, frozenset)):
         return sorted(to_plain(item) for item in value)

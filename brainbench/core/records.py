@@ -10,7 +10,7 @@ import re
 import unicodedata
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, get_args
 
 import msgspec
@@ -51,12 +51,19 @@ class _NullIsNaN:
     """Base of the dataclasses here that hold numbers."""
 
     def __post_init__(self) -> None:
-        for slot in fields(self):  # pyright: ignore[reportArgumentType]  # every subclass is a dataclass
-            value = getattr(self, slot.name)
-            if slot.type in ("Number", "Share") and value is None:
-                object.__setattr__(self, slot.name, math.nan)
-            elif slot.type == "tuple[Number, ...]" and isinstance(value, tuple) and None in value:
-                object.__setattr__(self, slot.name, tuple(math.nan if one is None else one for one in value))
+        for name, alone in _numbers(type(self)):
+            value = getattr(self, name)
+            if alone and value is None:
+                object.__setattr__(self, name, math.nan)
+            elif not alone and isinstance(value, tuple) and None in value:
+                object.__setattr__(self, name, tuple(math.nan if one is None else one for one in value))
+
+
+@cache
+def _numbers(kind: Any) -> list[tuple[str, bool]]:
+    """Return the names of a dataclass' numbers, true, and tuples of numbers, false."""
+    alone = {"Number": True, "Share": True, "tuple[Number, ...]": False}
+    return [(slot.name, alone[str(slot.type)]) for slot in fields(kind) if slot.type in alone]
 
 
 @dataclass(frozen=True)
@@ -478,22 +485,30 @@ def _convert(kind: type, data: Any) -> Any:
     return built
 
 
+@cache
+def _names(kind: Any) -> tuple[str, ...]:
+    """Return the names of a dataclass' fields; none for another type, or for provenance, which takes any."""
+    return tuple(item.name for item in fields(kind)) if is_dataclass(kind) and kind is not Provenance else ()
+
+
 def _check_rest(data: Any, built: Any, place: str) -> None:
     """Refuse fields that a dataclass does not have, which msgspec leaves out without a word, and infinity."""
-    if is_dataclass(built) and not isinstance(built, Provenance):
-        names = [item.name for item in fields(built)]
+    if names := _names(type(built)):
         for name, value in data.items():
             if name not in names:
                 raise DataError(f"{place or 'the record'} has no field {name!r}; it has {listing(names, limit=40)}.")
-            _check_rest(value, getattr(built, name), f"{place}.{name}".lstrip("."))
+            inner = getattr(built, name)
+            if inner is not None and type(inner) not in (str, int, bool):
+                _check_rest(value, inner, f"{place}.{name}".lstrip("."))
     elif isinstance(built, tuple):
-        # Most of a record are the numbers of its RDMs: no place is named for each.
-        for index, (value, inner) in enumerate(zip(data, built, strict=True)):
-            if type(inner) is not float or math.isinf(inner):
+        # Most of a record are the numbers of its RDMs: none of these is looked at alone.
+        if built and (type(built[0]) is not float or math.inf in built or -math.inf in built):
+            for index, (value, inner) in enumerate(zip(data, built, strict=True)):
                 _check_rest(value, inner, f"{place}[{index}]")
-    elif isinstance(built, float) and math.isinf(built):
-        raise DataError(f"{place} is {built}; expected a number or null.")
-    elif isinstance(built, Mapping):
+    elif isinstance(built, float):
+        if math.isinf(built):
+            raise DataError(f"{place} is {built}; expected a number or null.")
+    elif isinstance(built, Mapping) and not isinstance(built, Provenance):
         for name, inner in built.items():
             _check_rest(data[name], inner, f"{place}.{name}")
 
@@ -540,5 +555,5 @@ def _out_of_range(score: Score) -> str | None:
     numbers = [score.value, score.r, score.chance, score.attainable, score.best_layer_value, *score.without_stimulus]
     numbers += [*score.model_rdm, *score.brain_rdm, *(one.value for one in (*score.subjects, *score.layers))]
     numbers += [end for one in intervals if one for end in (one.low, one.high)]
-    largest = max((abs(number) for number in numbers if math.isfinite(number)), default=0.0)
+    largest = max(map(abs, filter(math.isfinite, numbers)), default=0.0)
     return f"a number is as large as {largest}" if largest > _LARGEST else None

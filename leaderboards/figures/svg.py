@@ -8,7 +8,7 @@ of its own.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from html import escape
 
@@ -69,16 +69,7 @@ class Drawing:
 
     def mark(self, x: float, y: float, shape: str, kind: str, tip: str = "", size: float = 4.5) -> None:
         """Draw a point: ``dot``, ``square``, ``diamond``, ``up``, ``down`` or ``cross``."""
-        s = size
-        shapes = {
-            "dot": f"M{_n(x - s)} {_n(y)}a{s} {s} 0 1 0 {2 * s} 0a{s} {s} 0 1 0 {-2 * s} 0z",
-            "square": f"M{_n(x - s)} {_n(y - s)}h{2 * s}v{2 * s}h{-2 * s}z",
-            "diamond": f"M{_n(x)} {_n(y - 1.3 * s)}l{1.3 * s} {1.3 * s}l{-1.3 * s} {1.3 * s}l{-1.3 * s} {-1.3 * s}z",
-            "up": f"M{_n(x)} {_n(y - 1.2 * s)}l{1.2 * s} {2.1 * s}h{-2.4 * s}z",
-            "down": f"M{_n(x)} {_n(y + 1.2 * s)}l{1.2 * s} {-2.1 * s}h{-2.4 * s}z",
-            "cross": f"M{_n(x - s)} {_n(y - s)}l{2 * s} {2 * s}m0 {-2 * s}l{-2 * s} {2 * s}",
-        }
-        self.parts.append(f'<path d="{shapes[shape]}"{_class(kind)}{_end("path", tip)}')
+        self.parts.append(f'<path d="{_SHAPES[shape](x, y, size)}"{_class(kind)}{_end("path", tip)}')
 
     def render(self, *, style: str = "") -> str:
         """Return the SVG element."""
@@ -92,6 +83,19 @@ class Drawing:
     def __html__(self) -> str:
         """Return the element for a template, which escapes nothing in it."""
         return self.render()
+
+
+_SHAPES: dict[str, Callable[[float, float, float], str]] = {
+    "dot": lambda x, y, s: f"M{_n(x - s)} {_n(y)}a{s} {s} 0 1 0 {2 * s} 0a{s} {s} 0 1 0 {-2 * s} 0z",
+    "square": lambda x, y, s: f"M{_n(x - s)} {_n(y - s)}h{2 * s}v{2 * s}h{-2 * s}z",
+    "diamond": lambda x, y, s: (
+        f"M{_n(x)} {_n(y - 1.3 * s)}l{1.3 * s} {1.3 * s}l{-1.3 * s} {1.3 * s}l{-1.3 * s} {-1.3 * s}z"
+    ),
+    "up": lambda x, y, s: f"M{_n(x)} {_n(y - 1.2 * s)}l{1.2 * s} {2.1 * s}h{-2.4 * s}z",
+    "down": lambda x, y, s: f"M{_n(x)} {_n(y + 1.2 * s)}l{1.2 * s} {-2.1 * s}h{-2.4 * s}z",
+    "cross": lambda x, y, s: f"M{_n(x - s)} {_n(y - s)}l{2 * s} {2 * s}m0 {-2 * s}l{-2 * s} {2 * s}",
+}
+"""Commands of the path of a point at x, y of a size."""
 
 
 def standalone(drawing: Drawing) -> str:

@@ -12,16 +12,18 @@ that was killed.
 from __future__ import annotations
 
 import hashlib
-import io
 import os
+import shutil
+import tempfile
 import zipfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
+from typing import BinaryIO
 
 from brainbench.core.errors import BrainbenchError, DataError, UsageError
-from brainbench.core.files import atomic_path, file_hash, read_json, to_json, writable, write_json
+from brainbench.core.files import atomic_path, file_hash, read_json, sync_file, to_json, writable, write_json
 from brainbench.core.reading.values import typed_values
 from brainbench.core.records import ResultRecord
 from brainbench.core.writing.locks import lock_folder
@@ -38,10 +40,14 @@ from leaderboards.store import MAKE_ONE, SCHEMA_PATH, StoredRecord, record_text
 MANIFEST = "build-manifest.json"
 _Hashes = dict[str, list[str]]
 """Path in the site → the hashes that a build may have given it."""
+_Content = str | bytes | BinaryIO
+"""Content of a file of the site; a large one as a stream."""
+_MANY = 100
+"""Files that are brought to disk together rather than one by one."""
 
 
 @contextmanager
-def rebuilt(root: Path) -> Iterator[Callable[[str, str | bytes], Path]]:
+def rebuilt(root: Path) -> Iterator[Callable[[str, _Content], Path]]:
     """Yield a function that takes a file of the new site: its path there and its content.
 
     The new files appear together when the block ends, the one given first last; after an error the old site is
@@ -54,15 +60,28 @@ def rebuilt(root: Path) -> Iterator[Callable[[str, str | bytes], Path]]:
             sweep(Path(folder))
         _write_manifest(root, listed)
         new: _Hashes = {}
+        staged: list[Path] = []
         with ExitStack() as stack:
 
-            def stage(name: str, content: str | bytes) -> Path:
-                data = content.encode() if isinstance(content, str) else content
-                stack.enter_context(atomic_path(root / name)).write_bytes(data)
-                new[name] = [hashlib.sha256(data).hexdigest()]
+            def stage(name: str, content: _Content) -> Path:
+                temporary = stack.enter_context(atomic_path(root / name, sync=False))
+                if isinstance(content, (str, bytes)):
+                    data = content.encode() if isinstance(content, str) else content
+                    temporary.write_bytes(data)
+                    new[name] = [hashlib.sha256(data).hexdigest()]
+                else:
+                    with temporary.open("wb") as stream:
+                        shutil.copyfileobj(content, stream)
+                    new[name] = [file_hash(temporary, length=64)]
+                staged.append(temporary)
                 return root / name
 
             yield stage
+            if len(staged) > _MANY and hasattr(os, "sync"):
+                os.sync()
+            else:
+                for temporary in staged:
+                    sync_file(temporary)
             both = {name: listed.get(name, []) + new.get(name, []) for name in listed.keys() | new.keys()}
             _write_manifest(root, both)
         for name in present - new.keys():
@@ -175,8 +194,11 @@ def _write(stored: Sequence[StoredRecord], root: Path, title: str) -> None:
             stage(name, content)
 
 
-def _pages(stored: Sequence[StoredRecord], title: str) -> Iterator[tuple[str, str | bytes]]:
-    """Yield each file of the site with its content, the first page first."""
+def _pages(stored: Sequence[StoredRecord], title: str) -> Iterator[tuple[str, _Content]]:
+    """Yield each file of the site with its content, the first page first.
+
+    One after the other: those of thousands of records are gigabytes.
+    """
     boards = rank([item.record for item in stored if item.record is not None], remarks(stored))
     synthetic = any(board.synthetic for board in boards)
     benchmarks, means = means_over(boards)
@@ -210,22 +232,24 @@ def _pages(stored: Sequence[StoredRecord], title: str) -> Iterator[tuple[str, st
         sections.append({"label": board_label(board), "figures": figures})
     about = {"title": "Figures", "synthetic": synthetic, "here": "figures", "root": ""}
     yield "figures.html", render("board_figures.html.j2", boards=sections, **about)
+    files = {item.record.identity: item for item in stored if item.record is not None}
     for entry in (entry for board in boards for entry in board.entries):
-        yield f"models/{entry.page}", model_page(entry)
-    records = {record.file_name: record for board in boards for entry in board.entries for record in entry.records}
-    stream = io.BytesIO()
-    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED, compresslevel=9) as archive:
-        # One after the other: the texts of thousands of records are gigabytes. Their names are those of their content,
-        # so that unpacking into a folder merges them.
-        for name, record in sorted(records.items()):
-            text = record.to_json() + "\n"  # it was read from a file, or checked by _stored
-            entry = zipfile.ZipInfo(name)  # its fixed date of 1980 keeps the bytes equal
-            entry.compress_type = zipfile.ZIP_DEFLATED
-            archive.writestr(entry, text)
-            yield f"records/{name}", text
+        whole = (files[record.identity].whole for record in entry.records)
+        yield f"models/{entry.page}", model_page(replace(entry, records=tuple(filter(None, whole))))
+    with tempfile.TemporaryFile() as stream:
+        with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+            # Their names are those of their content, so that unpacking into a folder merges them.
+            for name, item in sorted((item.record.file_name, item) for item in files.values() if item.record):
+                entry = zipfile.ZipInfo(name)  # its fixed date of 1980 keeps the bytes equal
+                entry.compress_type = zipfile.ZIP_DEFLATED
+                archive.writestr(entry, text := item.text)
+                yield f"records/{name}", text
+        stream.seek(0)
+        yield "data/records.zip", stream
     rows = [row for board in boards for row in table_rows(board)]
-    data = (table_csv(rows), to_json(rows) + "\n", stream.getvalue(), SCHEMA_PATH.read_bytes())
-    yield from zip(DOWNLOADS, data, strict=True)
+    yield "data/leaderboard.csv", table_csv(rows)
+    yield "data/leaderboard.json", to_json(rows) + "\n"
+    yield "data/record.schema.json", SCHEMA_PATH.read_bytes()
     if benchmarks:
         yield "data/benchmarks.json", to_json({"benchmarks": benchmarks, "models": means}) + "\n"
 

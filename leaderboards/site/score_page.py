@@ -41,14 +41,17 @@ def render(template: str, **values: Any) -> str:
     The policy names our style and script by their hash, so even markup that slipped past the
     escaping could not run, load or send anything.
     """
-    style = (_TEMPLATES / "page.css").read_text(encoding="utf-8")
-    script = (_TEMPLATES / "page.js").read_text(encoding="utf-8")
+    return _environment().get_template(template).render(**values, **_policy())
+
+
+@cache
+def _policy() -> dict[str, Any]:
+    style, script = ((_TEMPLATES / name).read_text(encoding="utf-8") for name in ("page.css", "page.js"))
     policy = (
         f"default-src 'none'; img-src data:; style-src '{_source_hash(style)}'; script-src '{_source_hash(script)}'; "
         "base-uri 'none'; form-action 'none'"
     )
-    page = _environment().get_template(template)
-    return page.render(**values, policy=policy, style=Markup(style), script=Markup(script))
+    return {"policy": policy, "style": Markup(style), "script": Markup(script)}
 
 
 def render_markdown(template: str, **values: Any) -> str:

@@ -31,7 +31,7 @@ def build(
     from leaderboards.site.build import build_leaderboard
     from leaderboards.store import read_records
 
-    stored = read_records(records or [RECORDS])
+    stored = read_records(records or [RECORDS], light=True)
     with progress_bar("building the pages"):
         page = build_leaderboard(stored, out, title=title)
     problems = _problems(stored)

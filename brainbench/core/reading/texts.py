@@ -125,9 +125,12 @@ def _check(value: Any, name: str, place: tuple[str | int, ...]) -> None:
         if isinstance(value, Mapping):
             for key in value:
                 _encode(str(key), name, place)
+        elif value and type(value[0]) is float and {*map(type, value)} == {float} and math.isfinite(sum(value)):
+            return  # Most of a large file are numbers in order.
         for key, inner in value.items() if isinstance(value, Mapping) else enumerate(value):
-            # Most of a large file are numbers in order.
-            if type(inner) is not float or not math.isfinite(inner):
+            kind = type(inner)
+            plain = inner is None or kind is bool or (kind is float and math.isfinite(inner))
+            if not (plain or (kind is str and inner.isascii())):
                 _check(inner, name, (*place, key))
 
 
