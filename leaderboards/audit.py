@@ -45,12 +45,13 @@ def remarks(stored: Iterable[StoredRecord]) -> dict[str, tuple[str, ...]]:
         if (note := plan_note(record)) and not note.startswith("follows"):
             doubts[record.identity].append(f"plan: {note}")
         groups[ScoreIdentity.of(record)].append(record)
-    names: dict[str, set[str]] = defaultdict(set)
-    for name in {record.score.name for record in usable}:
-        names[look_alike(name)].add(name)
+    names: dict[tuple[str, str], set[str]] = defaultdict(set)
+    for what, name in {pair for record in usable for pair in names_of(record)}:
+        names[what, look_alike(name)].add(name)
     for record in usable:
-        rivals = sorted(names[look_alike(record.score.name)] - {record.score.name})
-        doubts[record.identity] += [f"look-alike: its name reads like {rival!a}" for rival in rivals[:MOST_NAMED]]
+        for what, name in names_of(record):
+            rivals = sorted(names[what, look_alike(name)] - {name})[:MOST_NAMED]
+            doubts[record.identity] += [f"look-alike: its {what} reads like {rival!a}" for rival in rivals]
     for group in groups.values():
         for record in group:
             # A few are enough to find out, and a set of many contradicting records stays readable.
@@ -60,6 +61,12 @@ def remarks(stored: Iterable[StoredRecord]) -> dict[str, tuple[str, ...]]:
                     f"{rival.identity}; find out which with: brainbench leaderboard verify"
                 )
     return {identity: tuple(sentences) for identity, sentences in doubts.items() if sentences}
+
+
+def names_of(record: ResultRecord) -> list[tuple[str, str]]:
+    """Return what a record names that others may name too, each with what it is."""
+    names = [("name", record.score.name), ("benchmark", record.score.provenance.benchmark_name)]
+    return [(what, name) for what, name in names if name]
 
 
 def conflicting(record: ResultRecord, others: Iterable[ResultRecord]) -> Iterator[ResultRecord]:

@@ -16,7 +16,7 @@ from dataclasses import dataclass, field, replace
 from operator import itemgetter
 from typing import Any
 
-from brainbench.core.errors import listing
+from brainbench.core.errors import listing, visible_name
 from brainbench.core.records import ResultRecord, Score
 from leaderboards.entries import Entry, fold_seeds, same_computation
 from leaderboards.ranking import DOUBTFUL, Sample, lacking, rank_ranges, told_apart
@@ -123,7 +123,7 @@ def _board(key: tuple[Any, ...], records: list[ResultRecord], remarks: Mapping[s
         truth=next((truth for truth in truths if isinstance(truth, str)), ""),
         entries=tuple(sorted(entries, key=lambda entry: entry.order)),
         baselines=baselines,
-        benchmark=_most_common(stated) if stated else "",
+        benchmark=visible_name(_most_common(stated)) if stated else "",
         citations=tuple(dict.fromkeys(work for origin in origins for work in origin.citations))[:MOST_CITED],
         lacks=lacks,
     )

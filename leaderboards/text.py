@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
 from typing import Any
 
-from brainbench.core.errors import listing, visible
+from brainbench.core.errors import listing, visible, visible_name
 from brainbench.core.records import Interval, ModelCard, ResultRecord, Score
 from leaderboards.ranking import not_repeatable
 
@@ -123,7 +123,7 @@ def p_sentence(score: Score) -> str:
 
 def methods(records: Sequence[ResultRecord]) -> str:
     """Return a paragraph for a paper's methods section, made only of what the records of one board state."""
-    score, names = records[0].score, list(dict.fromkeys(record.score.name for record in records))
+    score, names = records[0].score, list(dict.fromkeys(visible_name(record.score.name) for record in records))
     origin, many = score.provenance, f"{plural(len(names), 'model')} ({plural(len(records), 'record')}) were"
     text = (
         f"{many if len(names) > 1 else f'The model {names[0]} was'} compared with {origin.recordings_name} "
@@ -191,7 +191,7 @@ def ways_to_get(record: ResultRecord) -> list[str]:
     ['brainbench score s4-small --weights-seed 2', 'brainbench.load_model("s4-small", seed=2)']
     """
     card, name = record.card, record.score.name
-    if card is None or not_repeatable(record) or card.family == "policy":
+    if card is None or not_repeatable(record) or card.family == "policy" or visible_name(name) != name:
         return []
     drawn = card.seed if card.seed and card.objective in (None, "untrained") else 0
     flag, argument = (f" --weights-seed {drawn}", f", seed={drawn}") if drawn else ("", "")

@@ -97,30 +97,54 @@ def visible_lines(text: str, *, styled: bool = False) -> str:
     )
 
 
+_TWINS = {
+    ord(twin): plain
+    for plain, twins in {
+        "a": "аαɑᎪ", "b": "вβɓʙᏴ", "c": "сϲɕᏟ", "d": "ԁɖᎠ", "e": "еҽεᎬ", "f": "ϝ", "g": "ԍցɡᏀ", "h": "һհнʜᎻ",
+        "i": "іїιɩıᎥ", "j": "јյȷᎫ", "k": "кκᏦ", "l": "ӏլʟᏞ1", "m": "мᎷ", "n": "пηոɴƞ", "o": "оοσօ0", "p": "рρᏢ",
+        "q": "ԛգզ", "r": "гʀᏒ", "s": "ѕꜱᏚ", "t": "тτտƭᎢ", "u": "цυսʊμ", "v": "ѵνʋᏙ", "w": "ԝωᏔᎳ", "x": "хχ",
+        "y": "уүγʏᎩ", "z": "ζᏃ", "3": "зӡ",
+    }.items()
+    for twin in twins
+}  # fmt: skip
+"""Letters of other alphabets, by number, and the plain one that each looks like."""
+_ALIKE = frozenset({"GREEK", "CYRILLIC", "ARMENIAN", "CHEROKEE", "COPTIC", "LISU"})
+"""Scripts with letters like Latin ones; in a name that has such too they are shown as escapes."""
+_BLANK = "\u115f\u1160"
+"""Letters without any ink."""
+
+
 def visible_name(name: str) -> str:
     """Return a name such that two which differ look different: what looks like a plain character is an escape.
 
-    >>> visible_name("s4\\u2010small"), visible_name("s4-small")
-    ('s4\\\\u2010small', 's4-small')
+    >>> visible_name("s4\\u2010small"), visible_name("\\u0455ma11"), visible_name("s4-small")
+    ('s4\\\\u2010small', '\\\\u0455ma11', 's4-small')
     """
-    return visible("".join(mark if _is_plain(mark) else _escaped(mark) for mark in name))
+    mixed = any(map(str.isalpha, filter(str.isascii, name)))
+    return visible("".join(mark if _is_plain(mark, mixed=mixed) else _escaped(mark) for mark in name))
 
 
 def look_alike(name: str) -> str:
     """Return what a name looks like: equal for names that a reader cannot tell apart.
 
-    >>> look_alike("S4\\u2010small ") == look_alike("s4-small")
+    >>> look_alike("S4\\u2010\\u0455mall ") == look_alike("s4-small")
     True
     """
-    folded = unicodedata.normalize("NFKC", name).casefold()
+    folded = unicodedata.normalize("NFKD", unicodedata.normalize("NFKC", name).casefold())
     marks = ("-" if unicodedata.category(mark) == "Pd" or mark in "_\u2212" else mark for mark in folded)
-    return "".join(mark for mark in marks if unicodedata.category(mark)[0] not in "ZC")
+    return "".join(
+        mark for mark in marks if unicodedata.category(mark)[0] not in "ZCM" and mark not in _BLANK
+    ).translate(_TWINS)
 
 
-def _is_plain(mark: str) -> bool:
+def _is_plain(mark: str, *, mixed: bool) -> bool:
     if mark.isascii():
         return True
-    return unicodedata.normalize("NFKC", mark) == mark and unicodedata.category(mark)[0] not in "ZCPS"
+    # The twins are compared in small letters; Cherokee ones fold to large ones.
+    twin = any(ord(letter) in _TWINS for letter in (mark, mark.casefold()))
+    twin |= mixed and unicodedata.name(mark, "").partition(" ")[0] in _ALIKE
+    plain = unicodedata.normalize("NFKC", mark) == mark and unicodedata.category(mark)[0] not in "ZCPSM"
+    return plain and not twin and mark not in _BLANK
 
 
 def _escaped(mark: str) -> str:

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from brainbench.core.errors import visible_name
 from brainbench.core.records import GraphNode, Interval, ModelGraph, ResultRecord, Score
 from leaderboards.figures.svg import (
     ChartPoint,
@@ -253,7 +254,7 @@ _Reading = Callable[[Score], tuple[Callable[[float], float], Interval | None]]
 
 def _chart(record: ResultRecord, label: str, name: str, reading: _Reading, band: Interval | None) -> Drawing:
     """Draw one row per score; ``name`` is the field of scores and animals that is drawn."""
-    marks = [(record.score.name, "c1", "dot", record.score)]
+    marks = [(visible_name(record.score.name), "c1", "dot", record.score)]
     marks += [("animal-to-animal", "c7", "square", record.animal_to_animal)] if record.animal_to_animal else []
     marks += [(key, "c0", "diamond", score) for key, score in record.baselines.items()]
     rows, values = [], []
@@ -290,5 +291,5 @@ def layers(records: Sequence[ResultRecord]) -> Drawing | None:
             points.append(ChartPoint(mean, kind if chosen else f"{kind} open", tip, 4))
         rows.append(ChartRow(cut(layer.layer, 22), points, interval, kind, "end title" if chosen else "end"))
     scale = score_scale([layer.value for one in seeds for layer in one], [row.interval for row in rows], 132, 470)
-    words = f"Score of {len(score.layers)} layers of {score.name}"
+    words = f"Score of {len(score.layers)} layers of {visible_name(score.name)}"
     return row_chart(words, rows, scale, "score in the metric's own unit", step=20, width=_WIDTH)

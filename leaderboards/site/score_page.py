@@ -20,7 +20,7 @@ from typing import Any
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
-from brainbench.core.errors import visible, visible_lines
+from brainbench.core.errors import visible, visible_lines, visible_name
 from brainbench.core.files import to_plain, write_text
 from brainbench.core.records import ResultRecord
 from brainbench.core.statistics import compare_scores
@@ -161,11 +161,13 @@ def _score_view(record: ResultRecord) -> dict[str, Any]:
     score, card = record.score, record.card
     raw_input = record.baselines.get(RAW_INPUT)
     above = raw_input is not None and compare_scores(score, raw_input).verdict == "Above"
-    rows = [("model", score.name, score), ("animals", "animal-to-animal", record.animal_to_animal)]
+    name = visible_name(score.name)
+    rows = [("model", name, score), ("animals", "animal-to-animal", record.animal_to_animal)]
     rows += [("baseline", name, item) for name, item in record.baselines.items()]
     pairs = list(zip(combinations(score.stimuli, 2), score.model_rdm, score.brain_rdm, strict=False))
     return {
-        "title": f"{score.name}: brainbench score",
+        "name": name,
+        "title": f"{name}: brainbench score",
         "record": record,
         "standing": standing_of(score, above_raw=above),
         "scaled": math.isfinite(score.scaled),
@@ -188,5 +190,5 @@ def _score_view(record: ResultRecord) -> dict[str, Any]:
         "card": text.card_rows(card) if card else [],
         "provenance": text.provenance_rows(score.provenance),
         "file_name": record.file_name,
-        "graph": diagram(card.graph, score.name) if card and card.graph else None,
+        "graph": diagram(card.graph, name) if card and card.graph else None,
     }

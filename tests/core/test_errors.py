@@ -72,12 +72,28 @@ def test_styles_stay_where_a_terminal_has_some():
 
 
 @pytest.mark.parametrize(
-    "rival", ["s4\u2010small", "s4\u2212small", "s4-small ", "s4-\u200bsmall", "\uff534-small", "S4_small"]
-)
+    "rival",
+    [
+        "s4\u2010small", "s4\u2212small", "s4-small ", "s4-\u200bsmall", "\uff534-small", "S4_small", "s4-sm\u0430ll",
+        "\u0405\u0034-small", "s4-sma\u04cfl", "s4-sm\u03b1ll", "s4-s\u034fmall", "s4-\u1160small",
+        "s4-smalⅼ", "\u13da4-small",
+    ],
+)  # fmt: skip
 def test_names_that_read_alike_are_equal_when_compared_and_differ_when_shown(rival):
     assert look_alike(rival) == look_alike("s4-small")
     assert visible_name(rival) != visible_name("s4-small") == "s4-small"
     assert visible_name(rival).isascii()
+
+
+def test_names_in_another_script_are_shown_as_they_are_unless_they_mix_or_pretend():
+    for name in ("東京-s4", "модель", "Zürich", "नेट", "réseau"):
+        assert look_alike(name) != look_alike("s4-small")
+    assert visible_name("東京-s4") == "東京-s4"
+    assert visible_name("Zürich") == "Zürich"
+    assert visible_name("ждфю") == "ждфю"
+    assert visible_name("s4-ж") == "s4-\\u0436"
+    assert visible_name("\u0440\u0435\u0442").isascii()  # all of its letters are twins of p, e and t
+    assert look_alike("Zu\u0308rich") == look_alike("Zürich") == look_alike("Zurich")
 
 
 def test_a_long_message_keeps_its_beginning_and_what_to_do():

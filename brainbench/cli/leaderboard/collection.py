@@ -14,7 +14,7 @@ from brainbench.core.files import to_json
 from brainbench.core.identity import ScoreIdentity
 from brainbench.core.records import ResultRecord
 from brainbench.scoring.jobs import ScoringJob, asked_settings, missing
-from leaderboards.audit import conflicting, remarks
+from leaderboards.audit import conflicting, names_of, remarks
 from leaderboards.store import StoredRecord, read_records, record_files, write_record
 
 
@@ -29,21 +29,27 @@ def given_files(sources: list[Path]) -> list[Path]:
 
 
 def take_in(paths: list[Path], to: Path, *, keep_both: bool) -> list[dict[str, Any]]:
-    """Take in files one after the other; what one brought counts for the next."""
+    """Take in files one after the other; what one brought counts for the next.
+
+    No name may read like another one that is there, or like a network of the registry.
+    """
+    from brainbench.models import list_models
+
     present: dict[ScoreIdentity, dict[str, ResultRecord]] = defaultdict(dict)
-    names: dict[str, str] = {}
+    names = {("name", look_alike(name)): name for name in list_models()}
     for record in (record for _, record in (_present(to) if paths else [])):
         present[ScoreIdentity.of(record)][record.identity] = record
-        names.setdefault(look_alike(record.score.name), record.score.name)
+        for what, name in names_of(record):
+            names.setdefault((what, look_alike(name)), name)
     done = []
     for path in paths:
         (stored,) = read_records(path)
         record, state = stored.record, {}
         if record is not None and not keep_both:
-            rival = names.setdefault(look_alike(record.score.name), record.score.name)
-            if rival != record.score.name:
-                note = f": its name {record.score.name!a} reads like {rival!a}, which is there"
-                state = {"state": "refused", "model": record.score.name, "note": note}
+            for what, name in names_of(record):
+                if (rival := names.setdefault((what, look_alike(name)), name)) != name:
+                    note = f": its {what} {name!a} reads like {rival!a}, which is there"
+                    state = {"state": "refused", "model": record.score.name, "note": note}
         state = state or _take_in_one(stored, to, present, keep_both=keep_both)
         done.append({"record": path.name} | state)
     return done

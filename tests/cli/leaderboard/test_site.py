@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 from leaderboards.store import read_record, write_record
@@ -91,6 +92,23 @@ def test_text_of_others_is_data_wherever_it_is_shown(run, tmp_path):
     outputs += [path.read_text() for path in files]
     for text in outputs:
         assert not set(text) & set("\x1b\x07\u202e")
+
+
+def test_a_name_that_reads_like_one_of_the_registry_or_a_benchmark_is_refused(run, tmp_path):
+    write_record(make_record("s4-sm\u0430ll"), tmp_path / "twin")
+    for name in ("touch", "t\u043euch"):
+        record = make_record(f"mine-{len(name.encode())}")
+        origin = replace(record.score.provenance, benchmark={"name": name})
+        write_record(replace(record, score=replace(record.score, provenance=origin)), tmp_path / "twin")
+    added = run("leaderboard", "add", str(tmp_path / "twin"), "--to", str(tmp_path / "board"))
+    assert added.status == 1
+    assert r"its name 's4-sm\u0430ll' reads like 's4-small'" in added.out
+    assert "reads like 'touch'" in added.out or r"reads like 't\u043euch'" in added.out
+    run("leaderboard", "build", str(tmp_path / "twin"), "--out", str(tmp_path / "site"))
+    shown = (tmp_path / "site" / "data" / "leaderboard.csv").read_text()
+    assert r"s4-sm\u0430ll" in shown
+    for text in (shown, *(path.read_text() for path in (tmp_path / "site").glob("*.html"))):
+        assert "\u0430" not in text
 
 
 def test_names_that_read_alike_are_refused_or_marked(run, tmp_path):
