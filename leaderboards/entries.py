@@ -34,7 +34,7 @@ class Entry:
     records: tuple[ResultRecord, ...]
     """Its records, by seed."""
     page: str
-    """File name of its page on a site; it stays when a seed is added."""
+    """File name of its page on a site; it stays when a seed is added. Empty for none."""
     notes: tuple[str, ...] = ()
     first: int | None = None
     """Best rank that the tests leave open, from 1; None when it is not ranked."""

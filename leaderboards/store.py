@@ -11,7 +11,7 @@ from __future__ import annotations
 import hashlib
 import os
 from array import array
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -110,25 +110,34 @@ def _digest(text: str) -> str:
 
 
 def lightened(record: ResultRecord, shared: dict[object, Any]) -> ResultRecord:
-    """Return a record without what boards do not show: RDMs, but for a compact one of the model, and its diagram.
+    """Return a record without what boards do not show: diagrams, and the RDMs of baselines but the raw input.
 
-    Of thousands of records the others are gigabytes. ``shared`` holds what is equal in several of them.
+    The RDMs that stay are compact: those of thousands of records are gigabytes. ``shared`` holds what is equal in
+    several of them.
     """
 
-    def light(score: Score) -> Score:
-        return replace(score, model_rdm=(), brain_rdm=(), stimuli=shared.setdefault(score.stimuli, score.stimuli))
+    def packed(numbers: Sequence[float]) -> array[float]:
+        values = array("d", numbers)
+        return shared.setdefault(values.tobytes(), values)
 
-    def baseline(score: Score) -> Score:
-        small = replace(light(score), layers=(), provenance={})
-        return shared.setdefault(msgspec.msgpack.encode(small), small)
+    def light(score: Score, **rdms: Sequence[float]) -> Score:
+        small = replace(
+            score, model_rdm=(), brain_rdm=(), stimuli=shared.setdefault(score.stimuli, score.stimuli),
+            **({} if score is record.score else {"layers": (), "provenance": {}}),
+        )  # fmt: skip
+        key = None if score is record.score else (msgspec.msgpack.encode(small), *map(tuple, rdms.values()))
+        for name, rdm in rdms.items():
+            object.__setattr__(small, name, packed(rdm))
+        return small if key is None else shared.setdefault(key, small)
 
-    score = light(record.score)
-    object.__setattr__(score, "model_rdm", array("f", record.score.model_rdm))
     small = replace(
         record,
-        score=score,
-        animal_to_animal=record.animal_to_animal and baseline(record.animal_to_animal),
-        baselines={name: baseline(part) for name, part in record.baselines.items()},
+        score=light(record.score, model_rdm=record.score.model_rdm, brain_rdm=record.score.brain_rdm),
+        animal_to_animal=record.animal_to_animal and light(record.animal_to_animal),
+        baselines={
+            name: light(part, **({"model_rdm": part.model_rdm} if name == "raw input" else {}))
+            for name, part in record.baselines.items()
+        },
         card=record.card and replace(record.card, graph=None),
     )
     small.__dict__["identity"] = record.identity

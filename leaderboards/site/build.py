@@ -131,6 +131,8 @@ def _write_manifest(root: Path, hashes: _Hashes) -> None:
 
 PAGE = 50
 """Rows of the table shown at once."""
+MODEL_PAGES = 1000
+"""Models of a board that have a page of their own, the best first; a site of one record makes that of any other."""
 DOWNLOADS = {
     "data/leaderboard.csv": "Table (CSV)",
     "data/leaderboard.json": "Table (JSON)",
@@ -200,6 +202,9 @@ def _pages(stored: Sequence[StoredRecord], title: str) -> Iterator[tuple[str, _C
     One after the other: those of thousands of records are gigabytes.
     """
     boards = rank([item.record for item in stored if item.record is not None], remarks(stored))
+    for place, board in enumerate(boards):
+        rest = (replace(entry, page="") for entry in board.entries[MODEL_PAGES:])
+        boards[place] = replace(board, entries=(*board.entries[:MODEL_PAGES], *rest))
     synthetic = any(board.synthetic for board in boards)
     benchmarks, means = means_over(boards)
     columns = [page_board(str(place), board) for place, board in enumerate(boards, start=1)]
@@ -233,16 +238,16 @@ def _pages(stored: Sequence[StoredRecord], title: str) -> Iterator[tuple[str, _C
     about = {"title": "Figures", "synthetic": synthetic, "here": "figures", "root": ""}
     yield "figures.html", render("board_figures.html.j2", boards=sections, **about)
     files = {item.record.identity: item for item in stored if item.record is not None}
-    for entry in (entry for board in boards for entry in board.entries):
+    for entry in (entry for board in boards for entry in board.entries if entry.page):
         whole = (files[record.identity].whole for record in entry.records)
         yield f"models/{entry.page}", model_page(replace(entry, records=tuple(filter(None, whole))))
     with tempfile.TemporaryFile() as stream:
         with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
             # Their names are those of their content, so that unpacking into a folder merges them.
-            for name, item in sorted((item.record.file_name, item) for item in files.values() if item.record):
+            for name, file in sorted((file.record.file_name, file) for file in files.values() if file.record):
                 entry = zipfile.ZipInfo(name)  # its fixed date of 1980 keeps the bytes equal
                 entry.compress_type = zipfile.ZIP_DEFLATED
-                archive.writestr(entry, text := item.text)
+                archive.writestr(entry, text := file.text)
                 yield f"records/{name}", text
         stream.seek(0)
         yield "data/records.zip", stream

@@ -132,11 +132,11 @@ def _entry_row(entry: Entry) -> dict[str, Any]:
     low, high = interval_ends(entry.interval) or (None, None)
     # Where there are several seeds, what one of them states does not stand for all.
     alone = {"low": None, "high": None} if entry.seeds > 1 else {"seed": card.seed, "weights": card.weights}
-    names = ("name", "scaled", "unique", "standing", "p", "spread", "value", "r", "seeds", "page")
+    names = ("name", "scaled", "unique", "standing", "p", "spread", "value", "r", "seeds")
     return {
         **_score_row(score), **{name: getattr(card, name) for name in _CARD},
         **{name: getattr(entry, name) for name in names},
-        **{name: getattr(entry, name) or None for name in ("same_as", "unranked_because", "layer")},
+        **{name: getattr(entry, name) or None for name in ("same_as", "unranked_because", "layer", "page")},
         "kind": "model", "rank_first": entry.first, "rank_last": entry.last, "scaled_low": low, "scaled_high": high,
         "notes": "; ".join(entry.notes) or None, "version": score.provenance.version or None,
         "get": "; ".join(ways_to_get(entry.records[0])),

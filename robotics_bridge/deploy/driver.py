@@ -72,7 +72,11 @@ class Driver(Protocol):
         ...
 
     def send(self, targets: NDArray[np.float64]) -> None:
-        """Ask the position drives for targets [J] (rad)."""
+        """Ask the position drives for targets [J] (rad).
+
+        Where it also takes ``report`` and ``allowed``, the command carries what it was decided from: the report, and
+        how long after it (s, by the hand's clock) the targets may be followed.
+        """
         ...
 
     def stop(self) -> None:

@@ -6,11 +6,12 @@ Limits, finiteness and age are checked where a command is sent, after all that c
 from __future__ import annotations
 
 import contextlib
+import inspect
 import math
 import threading
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -151,6 +152,7 @@ class SafeLink:
     def __init__(self, driver: Driver, limits: SafetyLimits, clock: Clock, step: float) -> None:
         self._driver, self._limits, self._clock, self._step = driver, limits, clock, step
         self._offset = ClockOffset()
+        self._carries = {"report", "allowed"} <= {*inspect.signature(driver.send).parameters}
         self._before: NDArray[np.float64] | None = None
         self._turn = threading.Lock()
         self._due = math.inf
@@ -189,7 +191,8 @@ class SafeLink:
                     f"a command came {1e3 * age:.0f} ms after the report it was decided from (allowed "
                     f"{1e3 * timeout:.0f} ms)"
                 )
-            self._driver.send(targets)
+            origin: dict[str, Any] = {"report": command.reading, "allowed": timeout} if self._carries else {}
+            self._driver.send(targets, **origin)
             self._before, self._due = np.array(targets), now + self._step + SILENCE
         return None
 

@@ -130,7 +130,7 @@ def _check(value: Any, name: str, place: tuple[str | int, ...]) -> None:
         for key, inner in value.items() if isinstance(value, Mapping) else enumerate(value):
             kind = type(inner)
             plain = inner is None or kind is bool or (kind is float and math.isfinite(inner))
-            if not (plain or (kind is str and inner.isascii())):
+            if not (plain or (isinstance(inner, str) and inner.isascii())):
                 _check(inner, name, (*place, key))
 
 

@@ -1,14 +1,17 @@
 """Datagrams between a controller and a hand: their layout, and the keys that authenticate them.
 
-A frame is one datagram, little-endian. Header: 4 bytes ``BBH2``, kind, joints J, fingers F, 0 (u8 each), sequence
+A frame is one datagram, little-endian. Header: 4 bytes ``BBH3``, kind, joints J, fingers F, 0 (u8 each), sequence
 (u32), time of the sender's clock (f64, s). A state carries positions f32[J], velocities f32[J] and pressures f32[F·3];
-a command f32[J] targets; a greeting the controller's nonce (16 bytes), a welcome the controller's and the hand's.
+a command the number of the report that it was decided from (u32), the time of the hand's clock until which it holds
+(f64, s; infinite for none) and f32[J] targets; a greeting the controller's nonce (16 bytes), a welcome the controller's
+and the hand's.
 HMAC-SHA256 (RFC 2104) of all of it ends the frame, 32 bytes.
 """
 
 from __future__ import annotations
 
 import hmac
+import math
 import os
 import secrets
 import struct
@@ -22,7 +25,8 @@ from numpy.typing import ArrayLike, NDArray
 from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError
 from robotics_bridge.deploy.safety import ClockOffset
 
-MAGIC = b"BBH2"
+MAGIC = b"BBH3"
+"""Version of the frames; either end drops those of another one. In ``BBH2`` commands were targets alone."""
 HELLO, WELCOME, START, STATE, COMMAND, STOP = range(1, 7)
 """Kinds: the controller asks for a session, the hand offers one, the controller takes it; then states and commands."""
 LARGEST = 8192
@@ -33,6 +37,8 @@ NONCE, KEY = 16, 32
 """Bytes of a nonce and of a key."""
 _HEADER = struct.Struct("<4sBBBxId")
 _TAG = 32
+_ORIGIN = struct.Struct("<Id")
+"""What a command comes from: number of its report, time until which it holds."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +61,17 @@ class Frame:
     @property
     def values(self) -> NDArray[np.float64]:
         """Positions (rad), velocities (rad/s) and pressures of a state, targets (rad) of a command, in this order."""
-        return np.frombuffer(self.body, dtype="<f4").astype(np.float64)
+        return np.frombuffer(self.body, "<f4", offset=_ORIGIN.size * (self.kind == COMMAND)).astype(np.float64)
+
+    @property
+    def origin(self) -> tuple[int, float]:
+        """Number of the report that a command was decided from, and the time (s, of the hand) until which it holds."""
+        return _ORIGIN.unpack_from(self.body)
+
+
+def pack_command(targets: ArrayLike, report: int = 0, until: float = math.inf) -> bytes:
+    """Return targets (rad) as the body of a command."""
+    return _ORIGIN.pack(report & 0xFFFFFFFF, until) + pack_values(targets)
 
 
 def pack_values(values: ArrayLike) -> bytes:
@@ -78,7 +94,13 @@ def decode(data: bytes, key: bytes) -> Frame | None:
     if not hmac.compare_digest(hmac.digest(key, signed, "sha256"), tag):
         return None
     magic, kind, joints, fingers, sequence, time = _HEADER.unpack_from(signed)
-    sizes = {HELLO: NONCE, WELCOME: 2 * NONCE, START: 0, STATE: 4 * (2 * joints + 3 * fingers), COMMAND: 4 * joints}
+    sizes = {
+        HELLO: NONCE,
+        WELCOME: 2 * NONCE,
+        START: 0,
+        STATE: 4 * (2 * joints + 3 * fingers),
+        COMMAND: _ORIGIN.size + 4 * joints,
+    }
     size = {**sizes, STOP: 0}.get(kind)
     if magic != MAGIC or len(signed) - _HEADER.size != size or not np.isfinite(time):
         return None

@@ -154,15 +154,19 @@ class UdpDriver:
         self._newest = HandReading(frame.sequence, frame.time, now, position, velocity, pressure.reshape(fingers, 3))
         return True
 
-    def send(self, targets: NDArray[np.float64]) -> None:
-        """Ask the position drives for targets [J] (rad)."""
-        body = frames.pack_values(targets) if np.shape(targets) == (len(self.joints),) else b""
+    def send(self, targets: NDArray[np.float64], report: HandReading | None = None, allowed: float = math.inf) -> None:
+        """Ask the position drives for targets [J] (rad).
+
+        The hand follows them until its own clock is ``allowed`` seconds beyond the report that they were decided from.
+        """
+        fits = np.shape(targets) == (len(self.joints),)
         # As they would be sent: a large double is infinite as a float.
-        if not (body and np.isfinite(np.frombuffer(body, "<f4")).all()):
+        if not (fits and np.isfinite(np.frombuffer(frames.pack_values(targets), "<f4")).all()):
             self.stop()
             raise UsageError(f"A command is {len(self.joints)} finite targets (rad); received {str(targets)[:80]}.")
         if not self._stopped:
-            self._command(frames.COMMAND, body)
+            origin = () if report is None else (report.sequence, report.time + allowed)
+            self._command(frames.COMMAND, frames.pack_command(targets, *origin))
 
     def stop(self) -> None:
         """Hold where the hand is, and refuse targets until it is connected anew."""
@@ -300,4 +304,4 @@ class HandLink:
         # A comparison with NaN is false.
         if frame.kind != frames.COMMAND or verdict != "new" or not (np.abs(frame.values) <= FARTHEST).all():
             return None
-        return frame.values
+        return frame.values if now <= frame.origin[1] else None

@@ -16,7 +16,7 @@ from brainbench.core.errors import BrainbenchError, DataError, UsageError
 from leaderboards import build_leaderboard, read_records, write_record
 from leaderboards.site.build import MANIFEST
 from tests.factories.html_page import HOSTILE, Page, poisoned
-from tests.factories.records import draw_board
+from tests.factories.records import draw_board, make_record
 from tests.factories.sweep_batches import files_of
 
 
@@ -279,3 +279,26 @@ def test_filters_sorting_columns_and_seeds_are_kept_in_the_address(make_record, 
     assert "1 of 3 models" in again.locator("#status").inner_text()
     again.fill("#q", "nothing like this")
     assert "No model fits" in again.locator("#ranking tbody").inner_text()
+
+
+def test_a_light_reading_gives_the_same_site_and_a_large_board_pages_of_its_best(tmp_path, monkeypatch):
+    for number in range(4):
+        write_record(make_record(f"model-{number}", 0.4 + number / 10), tmp_path / "store")
+    whole = build_leaderboard(read_records(tmp_path / "store"), tmp_path / "whole").parent
+    light = read_records(tmp_path / "store", light=True)
+    assert not any(item.record.baselines["random features"].model_rdm for item in light)
+    assert light[0].record.score.brain_rdm is light[1].record.score.brain_rdm
+    site = build_leaderboard(light, tmp_path / "light").parent
+    files = {path.relative_to(site): path.read_bytes() for path in site.rglob("*") if path.is_file()}
+    assert files == {path.relative_to(whole): path.read_bytes() for path in whole.rglob("*") if path.is_file()}
+    monkeypatch.setattr("leaderboards.site.build.MODEL_PAGES", 3)
+    few = build_leaderboard(light, tmp_path / "few").parent
+    assert len(list((few / "models").iterdir())) == 3
+    pages = [
+        row["page"] for row in json.loads((few / "data" / "leaderboard.json").read_text()) if row["kind"] == "model"
+    ]
+    assert (len(pages), pages.count(None)) == (4, 1)
+    path = light[0].path
+    path.write_text(path.read_text().replace("model-0", "model-X"))
+    with pytest.raises(DataError, match="changed while it was read"):
+        build_leaderboard(light, tmp_path / "few")

@@ -50,12 +50,16 @@ def test_frames_survive_the_way_and_every_change_is_noticed(joints, fingers, dat
 
 
 def test_a_frame_ends_with_the_standard_hmac_of_the_rest() -> None:
-    sent = encode(Frame(frames.COMMAND, 1, 0, 1 << 32, 2.0, pack_values([0.5])), KEY)
+    sent = encode(Frame(frames.COMMAND, 1, 0, 1 << 32, 2.0, frames.pack_command([0.5], 7, 2.25)), KEY)
     # RFC 2104 by its definition: H(key ⊕ opad ‖ H(key ⊕ ipad ‖ text)).
     padded = KEY.ljust(64, b"\0")
     inner = hashlib.sha256(bytes(byte ^ 0x36 for byte in padded) + sent[:-32]).digest()
     assert sent[-32:] == hashlib.sha256(bytes(byte ^ 0x5C for byte in padded) + inner).digest()
     assert sent[8:12] == bytes(4)  # the number goes on from 0
+    frame = decode(sent, KEY)
+    assert (frame.origin, frame.values.tolist()) == ((7, 2.25), [0.5])
+    # Ends of an earlier version get no answer.
+    assert decode(sent.replace(b"BBH3", b"BBH2")[:-32], KEY) is None
 
 
 @pytest.mark.parametrize("time", [np.nan, np.inf])

@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 
 from brainbench.core.errors import UsageError
-from robotics_bridge.deploy.controller import Controller
+from robotics_bridge.deploy.controller import Clock, Controller
 from robotics_bridge.deploy.links import frames
 from robotics_bridge.deploy.links.frames import Frame, new_key
 from robotics_bridge.deploy.links.simulated_hand import Faults, SimulatedHand, serve, simulated_hand
 from robotics_bridge.deploy.links.udp import HandLink, UdpDriver
-from robotics_bridge.deploy.safety import SafetyLimits
+from robotics_bridge.deploy.safety import Command, SafeLink, SafetyLimits
 from robotics_bridge.policies.contract import PolicyContract
 
 JOINTS, FINGERS, KEY = ("a", "b"), ("thumb",), new_key()
@@ -114,8 +114,8 @@ def test_losses_delays_and_overtaking_are_survived(faults) -> None:
     [
         (Faults(absurd=0.5), "beyond its limits"),
         (Faults(nan=0.5), "no numbers"),
-        (Faults(silent_after=0.3), "ms old"),
-        (Faults(frozen_after=0.3), "ms old"),
+        (Faults(silent_after=0.3), "ms old|ms after the report"),
+        (Faults(frozen_after=0.3), "ms old|ms after the report"),
         (Faults(delay=0.4, delay_after=0.3), "ms old|ms after the report"),
     ],
 )
@@ -273,8 +273,8 @@ def test_genuine_commands_are_followed_and_reports_are_read(wire) -> None:
 
 def test_forged_truncated_and_oversized_commands_move_nothing(wire) -> None:
     genuine = wire.capture(0.5)
-    forged = frames.encode(Frame(frames.COMMAND, J, 0, 9, time.monotonic(), frames.pack_values([1, 1])), new_key())
-    with_master = frames.encode(Frame(frames.COMMAND, J, 0, 9, time.monotonic(), frames.pack_values([1, 1])), KEY)
+    forged = frames.encode(Frame(frames.COMMAND, J, 0, 9, time.monotonic(), frames.pack_command([1, 1])), new_key())
+    with_master = frames.encode(Frame(frames.COMMAND, J, 0, 9, time.monotonic(), frames.pack_command([1, 1])), KEY)
     changed = bytearray(genuine)
     changed[-40] ^= 1
     bad = [forged, with_master, bytes(changed), b"", genuine[:-1], genuine[:20], genuine + b"\0", genuine * 40]
@@ -389,10 +389,33 @@ def test_commands_without_finite_targets_stop_the_hand_at_either_end(wire, value
     assert wire.told() is None
     assert wire.hand.stopped
     again = wire.connect()
-    body = frames.pack_values(np.array([0.0, np.nan]))
+    body = frames.pack_command(np.array([0.0, np.nan]))
     again._command(frames.COMMAND, body)
     wire.pass_on()
     assert wire.told() is None
+
+
+def test_a_command_is_followed_until_the_hand_is_too_far_beyond_its_report(wire) -> None:
+    wire.report()
+    reading = wire.driver.read()
+    for allowed, followed in ((0.1, True), (-0.001, False), (np.nan, False)):
+        wire.driver.send(np.full(J, 0.3), report=reading, allowed=allowed)
+        wire.pass_on()
+        assert (wire.told() is not None) == followed
+    # The hand's own clock counts, not the way.
+    wire.driver.send(np.full(J, 0.3), report=reading, allowed=0.1)
+    wire.pass_on()
+    assert wire.told(later=0.2) is None
+
+
+def test_a_safe_link_tells_the_hand_what_a_command_comes_from(wire) -> None:
+    wire.report()
+    link = SafeLink(wire.driver, SafetyLimits(np.full(J, -1.0), np.full(J, 1.0), np.full(J, 9.0)), Clock(), 0.05)
+    reading = link.read()
+    assert link.send(Command(reading.position, reading, link.deadline(reading))) is None
+    wire.pass_on()
+    frame = frames.decode(wire.seen[-1], wire.driver._send_key)
+    assert frame.origin == (reading.sequence, reading.time + link._limits.timeout)
 
 
 @pytest.mark.parametrize("shape", [(0,), (1,), (3,), (2, 2), (100_000,)])
