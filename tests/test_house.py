@@ -22,12 +22,12 @@ MOST_LINES = 700
 BUDGETS = {
     "brainbench/stimuli": 26_400,  # the estimated error of every whisker
     "robotics_bridge": 24_800,  # newtons that no taxel has, trees of any hand, deadlines, replays, gel pictures
-    "brainbench/models": 8_500,  # the proof that a layer is a response
+    "brainbench/models": 8_540,  # the proof that a layer is a response, ONNX files tried apart
     "brainbench/datasets": 7_450,  # the balance of a reading, copies of sessions, signals, bands, baselines
     "brainbench/metrics": 5_400,  # the unique part
-    "brainbench/cli": 4_950,  # check-submission, options of benchmarks
+    "brainbench/cli": 4_960,  # check-submission, options of benchmarks, names of the registry
     "brainbench/core": 5_900,  # the sealed door, seals of the cache, the filter of foreign text, sealed plans
-    "leaderboards": 3_700,  # benchmarks and citations on boards, means over benchmarks, boards of areas
+    "leaderboards": 3_850,  # boards of 10,000 records, benchmarks and citations, means over benchmarks, boards of areas
     "brainbench/scoring": 4_280,  # presentation time, plans, boards of areas and layers, controls of the unique part
     "brainbench/geometry": 1_050,
     "brainbench/published": 2_700,
@@ -37,7 +37,7 @@ BUDGETS = {
 }
 """Folder → lines of Python that it may have: as the rooms stand, with two per cent to move in. Who adds a capability
 pays in the same folder, or raises the number in the commit that needs it, with the reason."""
-MOST_PRODUCT_LINES, MOST_PRODUCT_MODULES = 96_300, 516
+MOST_PRODUCT_LINES, MOST_PRODUCT_MODULES = 96_750, 516
 VAGUE = frozenset(
     re.findall(r"\w+", "found told own kept known asked one other item shown made named taken usual"),
 )

@@ -165,8 +165,8 @@ class UdpDriver:
             self.stop()
             raise UsageError(f"A command is {len(self.joints)} finite targets (rad); received {str(targets)[:80]}.")
         if not self._stopped:
-            origin = () if report is None else (report.sequence, report.time + allowed)
-            self._command(frames.COMMAND, frames.pack_command(targets, *origin))
+            number, until = (0, math.inf) if report is None else (report.sequence, report.time + allowed)
+            self._command(frames.COMMAND, frames.pack_command(targets, number, until))
 
     def stop(self) -> None:
         """Hold where the hand is, and refuse targets until it is connected anew."""
