@@ -150,7 +150,7 @@ class SweepTable:
     split: NDArray[np.str_]
     """One of :data:`~brainbench.stimuli.sweeps.plan.SPLITS`."""
     conditions: Mapping[str, NDArray[np.float64]]
-    """Speed, height, rotation, distance and size, as in :class:`~brainbench.stimuli.sweeps.grid.Sweep`."""
+    """Speed, height, rotation, distance and size, as in :class:`~brainbench.stimuli.sweeps.sweep_scenes.Sweep`."""
     classes: tuple[str, ...]
     times: NDArray[np.float64]
     """Times of the frames [s]."""

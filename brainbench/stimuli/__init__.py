@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from brainbench.stimuli.simulation import simulate
     from brainbench.stimuli.sources import Stimuli, load_stimuli
     from brainbench.stimuli.stimulus_set import read_stimulus_set, to_grid, write_stimulus_set
-    from brainbench.stimuli.sweeps.grid import SweepGrid
+    from brainbench.stimuli.sweeps.sweep_scenes import SweepGrid
     from brainbench.stimuli.validation import references
     from brainbench.stimuli.whiskers.array import WhiskerArray
     from brainbench.stimuli.whiskers.whisker import Whisker

@@ -8,9 +8,8 @@ import math
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.objects.collections import resolve_objects
 from brainbench.stimuli.scenes.frames import Frames
-from brainbench.stimuli.sweeps.grid import SweepGrid
 from brainbench.stimuli.sweeps.plan import GenerationPlan, GenerationSettings
-from brainbench.stimuli.sweeps.sweep_scenes import GRIDS, SweepScenes
+from brainbench.stimuli.sweeps.sweep_scenes import GRIDS, SweepGrid, SweepScenes
 
 GRID = dataclasses.replace(
     GRIDS["thesis-low"],

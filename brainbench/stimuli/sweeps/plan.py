@@ -22,7 +22,7 @@ from brainbench.core.version import __version__
 from brainbench.stimuli.engines import PHYSICS_VERSION, get_engine
 from brainbench.stimuli.engines.fidelity import DEFAULT_ENGINE, Fidelity
 from brainbench.stimuli.objects.collections import NamedObject
-from brainbench.stimuli.sweeps.grid import SweepGrid
+from brainbench.stimuli.sweeps.sweep_scenes import SweepGrid
 from brainbench.stimuli.whiskers.array import WhiskerArray
 
 SPLITS = ("train", "validation", "test")

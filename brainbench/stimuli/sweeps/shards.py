@@ -25,9 +25,8 @@ from brainbench.stimuli.explain import Explanation
 from brainbench.stimuli.objects.collections import NamedObject
 from brainbench.stimuli.objects.solid import Solid
 from brainbench.stimuli.simulation import simulate_uncached
-from brainbench.stimuli.sweeps.grid import Sweep, SweepGrid
 from brainbench.stimuli.sweeps.plan import GenerationSettings, PlannedShard, ShardTask
-from brainbench.stimuli.sweeps.sweep_scenes import SweepScenes
+from brainbench.stimuli.sweeps.sweep_scenes import Sweep, SweepGrid, SweepScenes
 from brainbench.stimuli.whiskers.array import WhiskerArray
 
 _TOGETHER = 16

@@ -6,19 +6,211 @@ asked for.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any, overload
+from dataclasses import dataclass, field
+from typing import Annotated, Any, Literal, overload
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brainbench.core.errors import UsageError, listing, repeats
-from brainbench.core.rotations import euler_matrix
-from brainbench.stimuli.objects.solid import Solid
+from brainbench.core.files import content_hash
+from brainbench.core.limits import Count, Limit, Positive, Seed, check_value, limited
+from brainbench.core.rotations import Angle, euler_matrix
+from brainbench.stimuli.motion.trajectories import Still, Translation
+from brainbench.stimuli.objects.obstacle import Obstacle
+from brainbench.stimuli.objects.solid import PlacedObject, Solid
 from brainbench.stimuli.scenes.frames import Frames
 from brainbench.stimuli.scenes.scene import Head, Scene
-from brainbench.stimuli.sweeps.grid import Span, SweepGrid
 from brainbench.stimuli.whiskers.array import WhiskerArray
+
+_HEAD_ONSET = 0.01
+"""Smooth start [s] of a travelling head, whose whiskers would feel a jump of velocity as a blow."""
+
+
+@dataclass(frozen=True)
+@limited(of="{} of a span")
+class Span:
+    """Values low, low + step, …, high, of which every draw takes one, all equally likely."""
+
+    low: float
+    high: float
+    step: Positive
+
+    def __post_init__(self) -> None:
+        if self.low > self.high:
+            raise UsageError(f"A span ascends from low to high; received {self!r}.")
+
+    @property
+    def count(self) -> int:
+        """Number of values."""
+        # A step that is no binary fraction must not lose the last value.
+        return math.floor((self.high - self.low) / self.step + 1e-9) + 1
+
+    def draw(self, generator: np.random.Generator) -> float:
+        """Return one value."""
+        return self.low + self.step * int(generator.integers(self.count))
+
+
+_Several = Limit(shortest=1)
+_Numbers = Annotated[tuple[float, ...], _Several]
+_PositiveNumbers = Annotated[tuple[Positive, ...], _Several]
+_Angles = Annotated[tuple[Angle, ...], _Several]
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """One pass of one object."""
+
+    speed: float
+    """Speed of the pass [m/s]."""
+    height: float
+    """Height z of the object's origin [m, world]."""
+    rotation: float
+    """Angle of the object about the world's z axis [rad]."""
+    distance: float
+    """Lowest x of the turned object [m, world]."""
+    size: float
+    """Bounding-box diagonal of the object before it is turned [m]."""
+    draw: int = 0
+    """Number of the draw of the sampled quantities that this sweep belongs to."""
+
+    @property
+    def label(self) -> str:
+        """Conditions in mm, degrees and mm/s, in the manner of the released folders: ``n0_h-5_d5_t30_v30_s40``."""
+        lengths = {"h": self.height, "d": self.distance, "v": self.speed, "s": self.size}
+        values = {key: value * 1e3 for key, value in lengths.items()} | {"t": math.degrees(self.rotation)}
+        return "_".join([f"n{self.draw}", *(f"{key}{round(values[key], 6) + 0.0:g}" for key in "hdtvs")])
+
+
+@dataclass(frozen=True)
+@limited(of="{} of a sweep grid")
+class SweepGrid:
+    """A frozen set of sweep conditions; lists are combined, spans are sampled once per draw and object."""
+
+    speed: _PositiveNumbers | Span = (0.030,)
+    """[m/s]"""
+    height: _Numbers | Span = (0.0,)
+    """[m]"""
+    rotation: _Angles | Span = (0.0,)
+    """[rad]"""
+    distance: _Numbers | Span = (0.005,)
+    """[m]"""
+    size: _PositiveNumbers | Span = (0.040,)
+    """[m]"""
+    turns: _Angles = (0.0,)
+    """Angles [rad] added to each rotation."""
+    draws: Count = 1
+    """Number of times that the spans are sampled."""
+    heights_per_draw: Count | None = None
+    """Number of the listed heights that each draw uses, in rotation, so that all are used alike; None for all."""
+    seed: Seed = 0
+    """Seed of the draws; each object has draws of its own, named by seed and object name."""
+    start: Annotated[float, Limit(unit="m")] = 0.016
+    """Start of the object along y [m]; see ``placing``."""
+    placing: Literal["clear", "released"] = "clear"
+    """``clear``: the face that leads has y = ``start`` at t = 0, in front of the whiskers. ``released``: the origin
+    lies at start + (lowest y of the turned object), as the published simulator computes it; large objects then
+    start *inside* the array, and what the whiskers feel is no brushing."""
+    mover: Literal["object", "head"] = "object"
+    """``object``: it travels towards −y past a still array. ``head``: the array travels towards +y past a still
+    object; the relative motion is the same, with a smooth start of 10 ms."""
+    species: str = "mouse"
+    head: Head = field(default_factory=Head)
+    """Pose of the array; its motion must be :class:`Still`."""
+    frames: Frames = field(default_factory=Frames)
+    published: str = ""
+    """Published numbers of this grid, printed beside our counts."""
+
+    def __post_init__(self) -> None:
+        for name in ("speed", "height", "rotation", "distance", "size", "turns"):
+            values = getattr(self, name)
+            if not isinstance(values, Span):
+                object.__setattr__(self, name, tuple(map(float, values)))
+            elif name in ("speed", "size", "rotation"):
+                limit = _Angles if name == "rotation" else _PositiveNumbers
+                check_value(f"{name} of a sweep grid", (values.low, values.high), limit)
+        if self.heights_per_draw is not None and (
+            isinstance(self.height, Span) or not 1 <= self.heights_per_draw <= len(self.height)
+        ):
+            raise UsageError(
+                f"heights_per_draw must lie between 1 and the number of listed heights; got {self.heights_per_draw!r}."
+            )
+        if not isinstance(self.head.motion, Still):
+            raise UsageError("The head of a sweep grid stands still at first; choose mover='head' to let it travel.")
+
+    @property
+    def count(self) -> int:
+        """Sweeps per object."""
+        heights = self.heights_per_draw or _choices(self.height)
+        others = (self.speed, self.rotation, self.distance, self.size)
+        return self.draws * heights * len(self.turns) * math.prod(map(_choices, others))
+
+    def sweeps(self, name: str = "") -> tuple[Sweep, ...]:
+        """Return the sweeps of the object called ``name``, [count], equal on every machine.
+
+        The name matters only where something is sampled.
+        """
+        generator = np.random.default_rng(int(content_hash(["sweeps", self.seed, name]), 16))
+        sweeps = []
+        for draw in range(self.draws):
+            # The order of the draws belongs to the grid: another order would give other sweeps for the same seed.
+            speed, rotation, distance, size = (
+                _values(values, generator) for values in (self.speed, self.rotation, self.distance, self.size)
+            )
+            heights = self._heights(draw, generator)
+            combined = itertools.product(heights, rotation, self.turns, distance, speed, size)
+            sweeps += [Sweep(v, h, r + turn, d, s, draw) for h, r, turn, d, v, s in combined]
+        return tuple(sweeps)
+
+    def scene(
+        self, solid: Solid, sweep: Sweep, *, label: str | None = None, array: WhiskerArray | None = None
+    ) -> Scene:
+        """Return one sweep as a scene, ready for :func:`brainbench.stimuli.simulate`.
+
+        The solid is scaled about its origin to ``sweep.size``. The label is the object's name and the conditions when
+        None, the array the right side of the grid's species.
+        """
+        scaled = solid.to_diagonal(sweep.size)
+        angles = (0.0, 0.0, sweep.rotation)
+        low = _turned_bounds(scaled, euler_matrix(angles))[0]
+        # Objects travel towards −y, so their lowest y leads.
+        y = self.start - low[1] if self.placing == "clear" else self.start + low[1]
+        forward = Translation((0.0, sweep.speed, 0.0), _HEAD_ONSET)
+        backward = Translation((0.0, -sweep.speed, 0.0), 0.0)
+        moves = self.mover == "object"
+        placed = PlacedObject(
+            scaled, (sweep.distance - float(low[0]), float(y), sweep.height), angles, backward if moves else Still()
+        )
+        head = self.head if moves else Head(self.head.position, self.head.rotation, forward)
+        chosen = WhiskerArray.of(self.species) if array is None else array
+        name = f"{solid.name}/{sweep.label}" if label is None else label
+        return Scene(name, chosen, (placed,), Still(), head, self.frames)
+
+    def _heights(self, draw: int, generator: np.random.Generator) -> tuple[float, ...]:
+        values = _values(self.height, generator)
+        if self.heights_per_draw is None:
+            return values
+        # Each draw goes on where the last one stopped.
+        first = draw * self.heights_per_draw
+        return tuple(values[(first + i) % len(values)] for i in range(self.heights_per_draw))
+
+
+def _choices(values: Sequence[float] | Span) -> int:
+    return 1 if isinstance(values, Span) else len(values)
+
+
+def _values(values: tuple[float, ...] | Span, generator: np.random.Generator) -> tuple[float, ...]:
+    return (values.draw(generator),) if isinstance(values, Span) else values
+
+
+def _turned_bounds(solid: Solid, rotation: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return lowest and highest corner [2, 3] (m) of the solid turned about its origin."""
+    if solid.mesh is not None:
+        return solid.mesh.transformed(rotation).bounds
+    return Obstacle(solid.parts, surface=solid.surface).moved(rotation, np.zeros(3)).bounds
 
 
 class SweepScenes(Sequence[Scene]):

@@ -7,7 +7,7 @@ from brainbench.stimuli.motion.recorded import Recorded, Trajectory
 from brainbench.stimuli.motion.trajectories import Still, Translation
 from brainbench.stimuli.objects.solid import PlacedObject, sphere
 from brainbench.stimuli.scenes.scene import Frames, Head, Scene
-from brainbench.stimuli.sweeps.grid import Span, SweepGrid
+from brainbench.stimuli.sweeps.sweep_scenes import Span, SweepGrid
 from brainbench.stimuli.whiskers.array import WhiskerArray
 
 PAIR = WhiskerArray.mouse(whiskers="C1,C2")

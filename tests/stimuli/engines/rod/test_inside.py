@@ -15,9 +15,8 @@ from brainbench.stimuli.motion.jobs import Job, StillFollicle
 from brainbench.stimuli.objects.obstacle import Box, Capsule, ConvexPart, Cylinder, Obstacle, Sphere
 from brainbench.stimuli.objects.procedural import make
 from brainbench.stimuli.objects.solid import shape_solid
-from brainbench.stimuli.sweeps.grid import SweepGrid
 from brainbench.stimuli.sweeps.shards import simulate_sweeps
-from brainbench.stimuli.sweeps.sweep_scenes import SweepScenes
+from brainbench.stimuli.sweeps.sweep_scenes import SweepGrid, SweepScenes
 from tests.factories.whiskers import C2
 
 pytest.importorskip("warp")

@@ -19,8 +19,7 @@ from brainbench.stimuli.engines.rod import launch, slices, sweeps
 from brainbench.stimuli.engines.rod.launch import ON_AN_IDLE_GPU, ONE_BY_ONE, first_simulation, tries_ahead
 from brainbench.stimuli.engines.rod.sweeps import SweepLauncher
 from brainbench.stimuli.objects.collections import resolve_objects
-from brainbench.stimuli.sweeps.grid import SweepGrid
-from brainbench.stimuli.sweeps.sweep_scenes import GRIDS, SweepScenes
+from brainbench.stimuli.sweeps.sweep_scenes import GRIDS, SweepGrid, SweepScenes
 
 GRID = SweepGrid(speed=(0.06,), rotation=(0.0, 0.4), distance=(0.005,), size=(0.04,))
 COARSE = Fidelity(links=10, time_step=1e-3)

@@ -7,8 +7,7 @@ from brainbench.core.errors import UsageError
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.rod.sweeps import SweepLauncher
 from brainbench.stimuli.objects.collections import resolve_objects
-from brainbench.stimuli.sweeps.grid import SweepGrid
-from brainbench.stimuli.sweeps.sweep_scenes import GRIDS, SweepScenes
+from brainbench.stimuli.sweeps.sweep_scenes import GRIDS, SweepGrid, SweepScenes
 
 pytest.importorskip("warp")
 
