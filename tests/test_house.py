@@ -37,7 +37,8 @@ BUDGETS = {
 }
 """Folder → lines of Python that it may have: as the rooms stand, with two per cent to move in. Who adds a capability
 pays in the same folder, or raises the number in the commit that needs it, with the reason."""
-MOST_PRODUCT_LINES, MOST_PRODUCT_MODULES = 96_750, 516
+MOST_PRODUCT_LINES, MOST_PRODUCT_MODULES = 96_800, 495
+"""Lines grew last by responses of any kind, errors of sweeps, boards of 10,000 records and ONNX files tried apart."""
 VAGUE = frozenset(
     re.findall(r"\w+", "found told own kept known asked one other item shown made named taken usual"),
 )

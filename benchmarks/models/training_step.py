@@ -27,7 +27,6 @@ from unittest import mock
 import numpy as np
 import torch
 
-from benchmarks.models.recorded_optimizer import make_capturable
 from benchmarks.report import publish, script_parser, table
 from brainbench.core.devices import record_step
 from brainbench.models.activations import evaluating
@@ -39,6 +38,16 @@ from brainbench.models.streaming import StreamingStep
 from brainbench.models.training.optimizers import compiled, fuse
 
 STEPS = 22
+
+
+def make_capturable(optimizer: torch.optim.Optimizer, rate: torch.Tensor) -> None:
+    """Let an optimiser read its learning rate from a tensor [] on its device, and keep its counters there."""
+    for group in optimizer.param_groups:
+        group["lr"] = rate
+        if "fused" in group:
+            group["fused"], group["foreach"] = True, False
+        if "capturable" in group:
+            group["capturable"] = rate.is_cuda
 
 
 def plain() -> Any:
