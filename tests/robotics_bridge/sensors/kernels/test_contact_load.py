@@ -7,7 +7,9 @@ import pytest
 
 from brainbench.core.devices import warp
 from brainbench.core.errors import UsageError
+from robotics_bridge import hands
 from robotics_bridge.envs.kernels.contact_forces import add_contact_forces
+from robotics_bridge.hands.scenes import closing, holding
 from robotics_bridge.physics import MujocoEngine
 from robotics_bridge.sensors import (
     ContactAudio,
@@ -116,6 +118,22 @@ def test_two_taxels_take_the_whole_of_a_load_whose_moment_they_cannot_bear() -> 
     np.testing.assert_allclose(total[:3], _on(engine)[:3], rtol=1e-4, atol=1e-5)
     assert abs(total[2]) > 0.5
     assert _missing(suite) == 0
+
+
+def test_a_hand_that_closes_around_a_ball_misses_nothing_at_any_step() -> None:
+    """Fingers meet the ball with few taxels at their rims, which cannot bear the moment of what pushes them."""
+    hand = hands.load("xhand1")
+    engine, closed = MujocoEngine(holding(hand, radius=0.028, reach=0.9), 1), closing(hand, 0.72)
+    taxels = {link: KinematicTaxel(link=link, probes=probes) for link, probes in hand.layout("med", "hand").items()}
+    suite = SensorSuite(engine.scene, taxels, num_envs=1)
+    lost = []
+    for step in range(260):
+        engine.set(ctrl=closed * min(step / 200, 1.0))
+        engine.step()
+        suite.update(engine.state, engine.timestep)
+        lost.append(float(suite.missing.max()))
+    assert max(lost) == 0
+    assert sum(float(suite.read(link)[0].reshape(-1, 6)[:, :3].norm(dim=1).sum()) for link in taxels) > 10
 
 
 def test_a_block_on_a_card_and_two_balls_in_one_place_are_felt() -> None:
