@@ -37,10 +37,14 @@ def test_the_scene_files_of_the_stimuli_page_are_valid(tmp_path: Path):
     from brainbench.stimuli import load_scene
     from tests.factories.whisker_tracks import bent_shapes, write_points
 
-    poles, trials = (tmp_path / name for name in ("pole.toml", "trials.toml"))
-    for path, block in zip((poles, trials), _blocks("docs/stimuli.md", "toml"), strict=True):
+    poles, measured, trials = (tmp_path / name for name in ("pole.toml", "measured.toml", "trials.toml"))
+    scene_file, tables, filmed = _blocks("docs/stimuli.md", "toml")
+    for path, block in ((poles, scene_file), (measured, scene_file + tables), (trials, filmed)):
         path.write_text(block)
     assert [scene.label for scene in load_scene(poles).scenes] == ["near", "far"]
+    array = load_scene(measured).scenes[0].array
+    assert array["C2"].whisker.radius(0.005) == pytest.approx(31e-6)
+    assert array["C1"].whisker == load_scene(poles).scenes[0].array["C1"].whisker
     (tmp_path / "tracks").mkdir()
     for trial in ("1", "2"):
         table = write_points(tmp_path / "tracks" / f"{trial}.csv", bent_shapes(frames=500))
