@@ -240,8 +240,14 @@ def whisker_value(whisker: Whisker, name: str) -> float:
 
 
 def with_values(whisker: Whisker, given: Mapping[str, float]) -> Whisker:
-    """Return a whisker with other values of parameters of :data:`WHISKER`."""
+    """Return a whisker with other values of parameters of :data:`WHISKER`; tables along it keep their shape."""
     changes: dict[str, Any] = dict(given)
+    stretch = given.get("arc_length", whisker.arc_length) / whisker.arc_length
+    for table, ends in (("radii", ("base_radius", "tip_radius")), ("moduli", ("young_modulus", "young_modulus"))):
+        if (rows := np.array(getattr(whisker, table))).size and not given.keys().isdisjoint({"arc_length", *ends}):
+            low, high = (given[name] / getattr(whisker, name) if name in given else 1.0 for name in ends)
+            factors = low + (high - low) * rows[:, 0] / whisker.arc_length
+            changes[table] = tuple(zip(stretch * rows[:, 0], factors * rows[:, 1], strict=True))
     if "density" in given and isinstance(whisker.density, tuple):
         low, high = whisker.densities
         changes["density"] = (given["density"], given["density"] * high / low)

@@ -9,7 +9,7 @@ import pytest
 
 from brainbench.core.errors import UsageError
 from brainbench.stimuli.fitting.gradients import JobParameters
-from brainbench.stimuli.fitting.gradients.parameters import move_obstacle
+from brainbench.stimuli.fitting.gradients.parameters import move_obstacle, with_values
 from brainbench.stimuli.motion.jobs import Job, StillFollicle
 from brainbench.stimuli.objects.obstacle import Capsule, Obstacle, Sphere
 from tests.factories.gradients import WHISKER, Swing, gradient_errors, touching_job
@@ -30,6 +30,20 @@ def test_a_shifted_motion_keeps_its_turn_and_its_shortest_period():
     np.testing.assert_array_equal(place, Slide()(times)[0] + [1e-3, 0.0, -2e-3])
     np.testing.assert_array_equal(turn, Slide()(times)[1])
     assert moved.motion.finest == Slide.finest
+
+
+@pytest.mark.parametrize(
+    "values",
+    [{"young_modulus": 5e9}, {"base_radius": 4e-5}, {"tip_radius": 9e-6, "base_radius": 6e-5}, {"arc_length": 0.012}],
+)
+def test_tables_along_a_whisker_follow_its_parameters(values):
+    """Tables that say what the cone says stay those of the cone."""
+    arcs = np.linspace(0, WHISKER.arc_length, 4)
+    radii, moduli = zip(arcs, WHISKER.radius(arcs), strict=True), [(arc, WHISKER.young_modulus) for arc in arcs]
+    table, cone = with_values(replace(WHISKER, radii=(*radii,), moduli=moduli), values), with_values(WHISKER, values)
+    # Between its ends a table keeps its shape, where a cone stays a cone.
+    places = cone.arc_length * (np.array([0.0, 1.0]) if "base_radius" in values else np.linspace(0, 1, 9))
+    np.testing.assert_allclose(table.bending_stiffness(places), cone.bending_stiffness(places), rtol=1e-12)
 
 
 def test_an_obstacle_turns_about_its_middle():
@@ -75,6 +89,15 @@ def test_objects_that_differ_in_friction_are_refused(name):
 def test_density_keeps_the_proportion_of_the_tip():
     job = replace(BALL, whisker=replace(WHISKER, density=(1000.0, 1500.0)))
     assert _build(job, density=1100.0).whisker.density == pytest.approx((1100.0, 1650.0))
+
+
+def test_parameters_of_tables_are_differentiated():
+    arcs = np.linspace(0, WHISKER.arc_length, 4)
+    radii = tuple(zip(arcs, WHISKER.radius(arcs) * [1, 1.1, 0.9, 1], strict=True))
+    whisker = replace(WHISKER, radii=radii, moduli=tuple(zip(arcs, (3e9, 4e9, 4e9, 5e9), strict=True)))
+    job = replace(touching_job(Sphere((11e-3, 2.4e-3, 0.0), 1e-3)), whisker=whisker)
+    errors, _ = gradient_errors(job, ("young_modulus", "base_radius", "tip_radius", "arc_length"))
+    assert errors.max() < 1e-5
 
 
 def test_an_object_is_shifted_and_turned_about_its_middle():
