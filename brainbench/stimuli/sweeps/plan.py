@@ -5,6 +5,7 @@ Nothing is built or simulated.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
@@ -101,7 +102,8 @@ class GenerationSettings:
     """Sweeps per shard; by backend and device when None."""
     errors: Annotated[float, Limit(least=0, most=1)] = 0.05
     """Share of the sweeps whose whiskers get an estimated error, drawn at random, one of each object at least; 0 for
-    none, 1 for all. Each such whisker in contact is simulated twice more, with 2 and 1.5 times the work."""
+    none, 1 for all (of other engines than ``rod`` always all). Each such whisker in contact is simulated twice more,
+    with 2 and 1.5 times the work."""
     retry: Count = 5
     """Whiskers that cannot be trusted are simulated again with steps divided by this, and those left by twice this
     (backend ``rod``); 1 leaves them as they are."""
@@ -284,7 +286,9 @@ class GenerationPlan:
         settings = self.settings
         generator = np.random.default_rng(int(content_hash(["errors", settings.seed]), 16))
         draws = np.where(self.chosen, generator.random(self.chosen.shape), 2.0)
-        drawn = (draws < settings.errors) | (draws == draws.min(axis=1, keepdims=True))
+        # Whiskers of other engines are judged by their errors alone, so that all sweeps need them.
+        share = settings.errors if settings.backend == DEFAULT_ENGINE else math.ceil(settings.errors)
+        drawn = (draws < share) | (draws == draws.min(axis=1, keepdims=True))
         return self.chosen & drawn & (settings.errors > 0)
 
     @cached_property

@@ -119,6 +119,16 @@ def test_a_sample_is_a_random_fraction_and_a_limit_the_first_sweeps():
     np.testing.assert_array_equal(full.splits, sampled.splits)
 
 
+@pytest.mark.parametrize(
+    ("backend", "errors", "share"),
+    [("rod", 0.6, 0.6), ("rod", 1.0, 1.0), ("rod", 0.0, 0), ("mujoco", 0.1, 1), ("mujoco", 0.0, 0)],
+)
+def test_errors_are_estimated_of_a_sample_and_of_other_engines_whiskers_all(backend, errors, share):
+    plan = small_plan(("brick:100",), backend=backend, errors=errors)
+    assert plan.estimated.mean() == pytest.approx(share, abs=0.06)
+    assert plan.estimated.any(axis=1).all() == (errors > 0)
+
+
 def test_the_published_grids_are_planned_quickly_and_small():
     objects = resolve_objects(["procedural-24:40"])
     plan = GenerationPlan(
