@@ -6,8 +6,9 @@ import numpy as np
 
 from brainbench.core.contracts import Trials
 from brainbench.metrics import rdm
+from brainbench.metrics.measures.rsa import score_rdms
 from brainbench.metrics.reliability.noise_correction import spearman_brown
-from brainbench.metrics.reliability.subject_rdm import SubjectRDM
+from brainbench.metrics.reliability.subject_rdm import SubjectRDM, subject_rdm
 
 STIMULI = ("convex-close", "convex-medium", "convex-far", "concave-close", "concave-medium", "concave-far")
 
@@ -38,3 +39,22 @@ def make_subject(name, brain_rdm, reliability=0.9, splits=20, seed=0, **extra):
 def make_rdm(rng, stimuli=6, units=12):
     """The RDM of unrelated patterns."""
     return rdm(rng.normal(size=(stimuli, units)))
+
+
+def make_animals(latent, count=6, noise=2.0, seed=100, splits=60):
+    """Animals whose units are tuned at random to one latent geometry."""
+    return [
+        subject_rdm(f"m{i}", [make_block(latent, seed=seed + i, noise=noise)], len(latent), splits=splits)
+        for i in range(count)
+    ]
+
+
+def make_layers(latent, count=4, seed=50):
+    """RDMs of layers, each nearer to the latent geometry than the one before."""
+    rng = np.random.default_rng(seed)
+    return {f"conv{i}": rdm(np.c_[latent * i, rng.normal(size=(len(latent), 6))]) for i in range(count)}
+
+
+def score_of(layers, subjects, **options):
+    """The score of a model of such layers."""
+    return score_rdms(layers, subjects, name="model", stimuli=STIMULI, **options)

@@ -10,35 +10,28 @@ from scipy import stats
 
 from brainbench.core.contracts import Trials
 from brainbench.core.errors import UsageError
-from brainbench.metrics import get_metric, rdm
+from brainbench.metrics import get_metric
 from brainbench.metrics.evaluation import HALVES, choose_on_others, first_best, held_out, most_chosen
 from brainbench.metrics.measures.rsa import score_rdms
 from brainbench.metrics.reliability.subject_rdm import subject_rdm
-from tests.factories.animals import STIMULI, make_block, make_latent, make_rdm, make_subject
-
-
-def _make_animals(latent, count=6, noise=2.0, seed=100, splits=60):
-    return [
-        subject_rdm(f"m{i}", [make_block(latent, seed=seed + i, noise=noise)], len(latent), splits=splits)
-        for i in range(count)
-    ]
-
-
-def _make_layers(latent, count=4, seed=50):
-    rng = np.random.default_rng(seed)
-    return {f"conv{i}": rdm(np.c_[latent * i, rng.normal(size=(len(latent), 6))]) for i in range(count)}
-
-
-def _score(layers, subjects, **options):
-    return score_rdms(layers, subjects, name="model", stimuli=STIMULI, **options)
+from tests.factories.animals import (
+    STIMULI,
+    make_animals,
+    make_block,
+    make_latent,
+    make_layers,
+    make_rdm,
+    make_subject,
+    score_of,
+)
 
 
 def test_unreliable_animals_do_not_vote_and_are_named():
     latent = make_latent(5)
-    layers, good = _make_layers(latent), _make_animals(latent, 4)
+    layers, good = make_layers(latent), make_animals(latent, 4)
     rng = np.random.default_rng(0)
     noisy = make_subject("z", make_rdm(rng), reliability=0.2)
-    score, without = _score(layers, [*good, noisy]), _score(layers, good)
+    score, without = score_of(layers, [*good, noisy]), score_of(layers, good)
     assert score.value == pytest.approx(without.value, abs=1e-15)
     assert score.p == without.p
     assert score.status == "ok"
@@ -52,7 +45,7 @@ def test_unreliable_animals_do_not_vote_and_are_named():
 def test_the_mean_reliability_of_the_study_decides_not_that_of_single_animals(reliabilities, status):
     rng = np.random.default_rng(6)
     animals = [make_subject(f"m{i}", make_rdm(rng), reliability=r, seed=i) for i, r in enumerate(reliabilities)]
-    score = _score({"a": make_rdm(rng)}, animals)
+    score = score_of({"a": make_rdm(rng)}, animals)
     assert score.status == status
     assert [subject.status for subject in score.subjects] == [status] * 3
     assert ("reliability, 0.45, is below 0.5" in "; ".join(score.reasons)) == (status == "unreliable")
@@ -61,7 +54,7 @@ def test_the_mean_reliability_of_the_study_decides_not_that_of_single_animals(re
 def test_when_no_animal_is_reliable_the_value_is_reported_as_unreliable():
     rng = np.random.default_rng(6)
     animals = [make_subject(f"m{i}", make_rdm(rng), reliability=0.3, seed=i) for i in range(3)]
-    score = _score({"a": make_rdm(rng), "b": make_rdm(rng)}, animals)
+    score = score_of({"a": make_rdm(rng), "b": make_rdm(rng)}, animals)
     assert score.status == "unreliable"
     assert score.reasons[0] == "no animal is reliable"
     assert math.isfinite(score.value)
@@ -70,11 +63,11 @@ def test_when_no_animal_is_reliable_the_value_is_reported_as_unreliable():
 def test_animals_without_a_stimulus_are_left_out_in_words():
     latent = make_latent(7)
     lacking = subject_rdm("a0", [make_block(latent, gap=(2,))], 6, stimuli=STIMULI)
-    score = _score(_make_layers(latent), [lacking, *_make_animals(latent, 3)])
+    score = score_of(make_layers(latent), [lacking, *make_animals(latent, 3)])
     assert score.status == "ok"
     assert "animal a0 left out: no trials of 'convex-far'" in score.reasons
     assert score.subjects[0].status == "undefined"
-    alone = _score(_make_layers(latent), [lacking])
+    alone = score_of(make_layers(latent), [lacking])
     assert alone.status == "undefined"
     assert alone.reasons == ("no animal can be used", "animal a0 left out: no trials of 'convex-far'")
     assert math.isnan(alone.value)
@@ -83,11 +76,11 @@ def test_animals_without_a_stimulus_are_left_out_in_words():
 
 def test_an_animal_given_twice_or_with_other_stimuli_is_refused():
     latent = make_latent(16)
-    (animal,) = _make_animals(latent, 1)
+    (animal,) = make_animals(latent, 1)
     with pytest.raises(UsageError, match="Subject 'm0' appears twice"):
-        _score(_make_layers(latent), [animal, animal])
+        score_of(make_layers(latent), [animal, animal])
     with pytest.raises(UsageError, match="'m0' has an RDM of 5"):
-        _score(_make_layers(latent), _make_animals(make_latent(16, stimuli=5), 1))
+        score_of(make_layers(latent), make_animals(make_latent(16, stimuli=5), 1))
 
 
 def test_each_animal_gets_the_layer_that_is_best_on_the_others():

@@ -22,29 +22,22 @@ from brainbench.metrics.rdms.pairs import permuted_pairs
 from brainbench.metrics.reliability.noise_correction import spearman_brown
 from brainbench.metrics.reliability.subject_rdm import subject_rdm
 from brainbench.metrics.score import held_to_scale, interval_reasons
-from tests.factories.animals import STIMULI, make_block, make_latent, make_rdm, make_subject
-
-
-def _make_animals(latent, count=6, noise=2.0, seed=100, splits=60):
-    return [
-        subject_rdm(f"m{i}", [make_block(latent, seed=seed + i, noise=noise)], len(latent), splits=splits)
-        for i in range(count)
-    ]
-
-
-def _make_layers(latent, count=4, seed=50):
-    rng = np.random.default_rng(seed)
-    return {f"conv{i}": rdm(np.c_[latent * i, rng.normal(size=(len(latent), 6))]) for i in range(count)}
-
-
-def _score(layers, subjects, **options):
-    return score_rdms(layers, subjects, name="model", stimuli=STIMULI, **options)
+from tests.factories.animals import (
+    STIMULI,
+    make_animals,
+    make_block,
+    make_latent,
+    make_layers,
+    make_rdm,
+    make_subject,
+    score_of,
+)
 
 
 def test_the_score_is_the_mean_over_animals_of_the_held_out_corrected_comparison():
     latent = make_latent(1)
-    layers, animals = _make_layers(latent), _make_animals(latent)
-    score = _score(layers, animals)
+    layers, animals = make_layers(latent), make_animals(latent)
+    score = score_of(layers, animals)
     r = compare(np.stack(list(layers.values()))[:, None], np.stack([animal.rdm for animal in animals]))
     values = []
     for index, animal in enumerate(animals):
@@ -82,7 +75,7 @@ def test_the_score_is_the_mean_over_animals_of_the_held_out_corrected_comparison
 def test_the_optimistic_maximum_stands_beside_the_score():
     rng = np.random.default_rng(2)
     animals = [make_subject(f"m{i}", make_rdm(rng), seed=i) for i in range(5)]
-    score = _score({f"l{i}": make_rdm(rng) for i in range(30)}, animals)
+    score = score_of({f"l{i}": make_rdm(rng) for i in range(30)}, animals)
     assert score.best_layer_value == max(layer.value for layer in score.layers)
     assert score.best_layer_value > score.value + 0.05
     assert [layer.layer for layer in score.layers] == [f"l{i}" for i in range(30)]
@@ -93,7 +86,7 @@ def test_the_chance_level_after_choosing_a_layer_stands_in_the_method():
     shared = make_rdm(rng)
     animals = [make_subject(f"m{i}", shared + 0.05 * rng.normal(size=15), seed=i) for i in range(4)]
     layers = {f"l{i}": make_rdm(rng) for i in range(10)}
-    many, one = _score(layers, animals), _score({"l0": layers["l0"]}, animals)
+    many, one = score_of(layers, animals), score_of({"l0": layers["l0"]}, animals)
     assert one.p_method.endswith("all 720 orders; one layer; mean score under permutation 0.00")
     chance = float(many.p_method.rpartition(" ")[2])
     assert "layer chosen anew in each" in many.p_method
@@ -102,9 +95,9 @@ def test_the_chance_level_after_choosing_a_layer_stands_in_the_method():
 
 def test_one_layer_needs_no_choice():
     latent = make_latent(3)
-    animals = _make_animals(latent)
-    layer = _make_layers(latent)["conv3"]
-    score = _score({"only": layer}, animals)
+    animals = make_animals(latent)
+    layer = make_layers(latent)["conv3"]
+    score = score_of({"only": layer}, animals)
     assert score.layer_rule == "only layer"
     assert score.value == pytest.approx(score.best_layer_value)
     assert score.r == pytest.approx(np.mean([float(compare(layer, animal.rdm)) for animal in animals]))
@@ -115,7 +108,7 @@ def test_one_layer_needs_no_choice():
 def test_the_order_of_animals_sessions_trials_units_and_stimuli_is_irrelevant(seed, estimator, animals):
     rng = np.random.default_rng(seed)
     latent = make_latent(seed)
-    layers = _make_layers(latent, 3)
+    layers = make_layers(latent, 3)
     blocks = [[make_block(latent, seed=seed % 89 + 10 * i + j, repeats=4) for j in range(2)] for i in range(animals)]
     order = rng.permutation(6)
     pairs = permuted_pairs(order[None])[0]
@@ -130,7 +123,7 @@ def test_the_order_of_animals_sessions_trials_units_and_stimuli_is_irrelevant(se
         subject_rdm(f"m{i}", [shuffled(block) for block in blocks[i][::-1]], 6, splits=20)
         for i in rng.permutation(animals)
     ]
-    expected = _score(layers, first, estimator=estimator)
+    expected = score_of(layers, first, estimator=estimator)
     found = score_rdms(
         {name: layer[pairs] for name, layer in layers.items()},
         second,
@@ -148,7 +141,7 @@ def test_the_order_of_animals_sessions_trials_units_and_stimuli_is_irrelevant(se
 def test_many_stimuli_use_random_permutations_that_do_not_depend_on_their_order():
     latent = make_latent(4, stimuli=10)
     names = [f"s{k}" for k in range(10)]
-    animals, layers = _make_animals(latent, 3, noise=6.0), {"a": make_rdm(np.random.default_rng(0), 10)}
+    animals, layers = make_animals(latent, 3, noise=6.0), {"a": make_rdm(np.random.default_rng(0), 10)}
     order = np.random.default_rng(1).permutation(10)
     pairs = permuted_pairs(order[None])[0]
     moved = [dataclasses.replace(animal, rdm=animal.rdm[pairs], halves=animal.halves[..., pairs]) for animal in animals]
@@ -160,13 +153,13 @@ def test_many_stimuli_use_random_permutations_that_do_not_depend_on_their_order(
 
 def test_a_broken_layer_is_never_chosen_and_broken_models_are_undefined():
     latent = make_latent(8)
-    layers, animals = _make_layers(latent), _make_animals(latent, 4)
+    layers, animals = make_layers(latent), make_animals(latent, 4)
     broken = {"nan": np.full(15, np.nan), **layers, "flat": np.full(15, 0.3)}
-    score = _score(broken, animals)
-    assert score.value == pytest.approx(_score(layers, animals).value, abs=1e-15)
+    score = score_of(broken, animals)
+    assert score.value == pytest.approx(score_of(layers, animals).value, abs=1e-15)
     assert {layer.layer for layer in score.layers if layer.status == "undefined"} == {"nan", "flat"}
     assert any("never chosen: nan, flat" in reason for reason in score.reasons)
-    nothing = _score({"nan": np.full(15, np.nan), "flat": np.full(15, 0.3)}, animals)
+    nothing = score_of({"nan": np.full(15, np.nan), "flat": np.full(15, 0.3)}, animals)
     assert nothing.status == "undefined"
     assert nothing.reasons[0] == "activations of every layer are constant or not finite"
     assert nothing.summary().startswith("model: undefined (activations of every layer")
@@ -175,9 +168,9 @@ def test_a_broken_layer_is_never_chosen_and_broken_models_are_undefined():
 
 def test_one_animal_chooses_on_one_half_and_is_scored_on_the_other():
     latent = make_latent(9)
-    (animal,) = _make_animals(latent, 1)
-    layers = _make_layers(latent)
-    score = _score(layers, [animal])
+    (animal,) = make_animals(latent, 1)
+    layers = make_layers(latent)
+    score = score_of(layers, [animal])
     stack = np.stack(list(layers.values()))
     held = []
     for first, second in animal.halves:
@@ -196,22 +189,22 @@ def test_one_animal_chooses_on_one_half_and_is_scored_on_the_other():
 
 def test_splits_whose_halves_have_no_rdm_do_not_choose():
     latent = make_latent(9)
-    (animal,) = _make_animals(latent, 1)
+    (animal,) = make_animals(latent, 1)
     halves = animal.halves.copy()
     halves[::3, 0] = np.nan
-    layers = _make_layers(latent)
+    layers = make_layers(latent)
     kept = dataclasses.replace(animal, halves=np.delete(animal.halves, np.s_[::3], axis=0))
-    found = _score(layers, [dataclasses.replace(animal, halves=halves)])
-    assert found.value == pytest.approx(_score(layers, [kept]).value, abs=1e-15)
+    found = score_of(layers, [dataclasses.replace(animal, halves=halves)])
+    assert found.value == pytest.approx(score_of(layers, [kept]).value, abs=1e-15)
     halves[:] = np.nan
-    nothing = _score(layers, [dataclasses.replace(animal, halves=halves)])
+    nothing = score_of(layers, [dataclasses.replace(animal, halves=halves)])
     assert nothing.status == "undefined"
     assert "no layer can be chosen" in nothing.reasons[0]
 
 
 def test_few_animals_or_stimuli_say_how_many_are_needed():
     latent = make_latent(10)
-    score = _score(_make_layers(latent), _make_animals(latent, 3))
+    score = score_of(make_layers(latent), make_animals(latent, 3))
     assert score.status == "ok"
     needed = "too few to tell models apart: 3 animals, at least 4 are needed; 6 stimuli, at least 10 are needed"
     assert needed in score.reasons
@@ -220,8 +213,8 @@ def test_few_animals_or_stimuli_say_how_many_are_needed():
 @pytest.mark.parametrize("estimator", ["thesis", "thesis-input"])
 def test_the_published_estimators_take_the_maximum_over_layers_and_say_so(estimator):
     latent = make_latent(11)
-    layers, animals = _make_layers(latent), _make_animals(latent, 4)
-    score = _score(layers, animals, estimator=estimator)
+    layers, animals = make_layers(latent), make_animals(latent, 4)
+    score = score_of(layers, animals, estimator=estimator)
     by_layer = [
         np.mean(
             [
@@ -239,15 +232,15 @@ def test_the_published_estimators_take_the_maximum_over_layers_and_say_so(estima
 
 def test_three_stimuli_have_a_value_but_no_p_and_two_have_nothing():
     latent = make_latent(12, stimuli=3)
-    animals = _make_animals(latent, 3, noise=0.5)
-    score = score_rdms(_make_layers(latent), animals, name="x", stimuli=["a", "b", "c"])
+    animals = make_animals(latent, 3, noise=0.5)
+    score = score_rdms(make_layers(latent), animals, name="x", stimuli=["a", "b", "c"])
     assert score.status == "unreliable"
     assert math.isfinite(score.value)
     assert math.isnan(score.p)
     assert score.p_smallest == pytest.approx(1 / 6)
     assert "3 stimuli allow no p below 0.167; at least 4 are needed" in score.reasons
     latent = make_latent(12, stimuli=2)
-    two = score_rdms({"a": [0.4]}, _make_animals(latent, 2), name="x", stimuli=["a", "b"])
+    two = score_rdms({"a": [0.4]}, make_animals(latent, 2), name="x", stimuli=["a", "b"])
     assert (two.status, two.p_smallest) == ("undefined", 1.0)
     assert two.reasons[0].startswith("2 stimuli are too few")
 
@@ -255,8 +248,8 @@ def test_three_stimuli_have_a_value_but_no_p_and_two_have_nothing():
 @pytest.mark.parametrize("method", ["spearman", "cosine", "tau-a", "whitened-pearson"])
 def test_other_comparisons_use_their_own_split_halves(method):
     latent = make_latent(13)
-    animals = _make_animals(latent, 3)
-    score = _score(_make_layers(latent), animals, compare=method)
+    animals = make_animals(latent, 3)
+    score = score_of(make_layers(latent), animals, compare=method)
     halves = animals[0].halves
     r = compare(halves[:, 0], halves[:, 1], method=method)
     assert score.subjects[0].reliability == pytest.approx(2 * r.mean() / (1 + r.mean()))
@@ -266,7 +259,7 @@ def test_other_comparisons_use_their_own_split_halves(method):
 def test_a_score_survives_json():
     latent = make_latent(14)
     animals = [subject_rdm(f"m{i}", [make_block(latent, seed=i)], 6, splits=60) for i in range(2)]
-    score = _score(_make_layers(latent), animals)
+    score = score_of(make_layers(latent), animals)
     assert len(score.without_stimulus) == 6
     assert Score.from_json(score.to_json()) == score
 
@@ -284,7 +277,7 @@ def test_a_score_survives_json():
 )
 def test_misuse_is_told_in_a_sentence(change, message):
     latent = make_latent(15)
-    arguments = {"layer_rdms": _make_layers(latent), "subjects": _make_animals(latent, 2), "stimuli": STIMULI}
+    arguments = {"layer_rdms": make_layers(latent), "subjects": make_animals(latent, 2), "stimuli": STIMULI}
     with pytest.raises(UsageError, match=message):
         score_rdms(name="x", **{**arguments, **change})
 
