@@ -16,9 +16,9 @@ import os
 import re
 import unicodedata
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -151,6 +151,12 @@ class Trials:
     names they are drawn from the trials' content. Either way the order of trials, sessions and units is irrelevant."""
     covariates: Mapping[str, Any] = field(default_factory=dict, repr=False)
     """Further measurements of every trial, such as contacts or licks: name → [R], NaN where unknown."""
+    times: Any = None
+    """[R] begin of each trial on its session's clock [s]; None where it is not known."""
+    session: str = ""
+    """Name of the session. Sessions are in the natural order of their names, where it matters."""
+    columns: Mapping[str, Any] = field(default_factory=dict, repr=False)
+    """What is known of every unit, such as its area: name → [U] texts, empty where unknown."""
 
     def take(self, rows: Any) -> Trials:
         """Return the trials that an index or mask [R] names, in its order."""
@@ -158,12 +164,19 @@ class Trials:
         if np.array_equal(index, np.arange(len(self.labels))):
             # Long recordings in narrow bins are not copied for nothing.
             return self
-        return Trials(
-            np.asarray(self.responses)[index],
-            np.asarray(self.labels)[index],
-            None if self.keys is None else tuple(self.keys[int(row)] for row in index),
-            {name: np.asarray(values)[index] for name, values in self.covariates.items()},
+        return replace(
+            self,
+            responses=np.asarray(self.responses)[index],
+            labels=np.asarray(self.labels)[index],
+            keys=None if self.keys is None else tuple(self.keys[int(row)] for row in index),
+            covariates={name: np.asarray(values)[index] for name, values in self.covariates.items()},
+            times=None if self.times is None else np.asarray(self.times)[index],
         )
+
+    def choose(self, units: Any) -> Self:
+        """Return the trials with the units that an index or mask [U] names."""
+        columns = {name: np.asarray(values)[units] for name, values in self.columns.items()}
+        return replace(self, responses=np.asarray(self.responses)[..., units], columns=columns)
 
 
 MISSING_WORDS = ("nan", "nat")

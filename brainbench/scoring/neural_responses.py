@@ -184,7 +184,7 @@ class NeuralResponses:
         share = np.where(longest > (1 - 1e-6) * longest.max(), 1.0, longest / longest.max())
         sides = self.reliable_trials(labels, options, averaged=options.time == "mean")
         for subject, (chosen, note) in track(list(sides.items()), "animals", progress):
-            trials = tuple(replace(item, responses=_flat(item.responses, share)) for item in chosen)
+            trials = tuple(_flat(session, share) for session in chosen)
             animal = metric.animal(subject, trials, len(labels), stimuli=labels, seed=options.seed)
             bins = max((item.responses.shape[1] for item in chosen), default=1)
             animal = replace(animal, units=-(-animal.units // bins))
@@ -230,14 +230,16 @@ def open_neural_responses(recordings: Any, *, progress: Progress | None, **selec
     return NeuralResponses(open_recordings(recordings, **selection, progress=progress), name)
 
 
-def _flat(responses: NDArray[np.float64], share: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return responses [R, T, U] as [R, T·U]: bins are features like units, each with its share of a whole bin [T]."""
+def _flat(session: Trials, share: NDArray[np.float64]) -> Trials:
+    """Return trials [R, T, U] as [R, T·U]: bins are features like units, each with its share of a whole bin [T]."""
+    responses = session.responses
     trials, bins, units = responses.shape
     if bins > 1 and (share < 1).any():
         # Squared distances add up over time; the rates of a bin that every window cuts short are mostly noise.
         responses = responses * np.sqrt(share)[:, None]
     # Without a trial (all had labels that were dropped) numpy cannot tell the second size.
-    return responses.reshape(trials, bins * units)
+    columns = {name: np.tile(values, bins) for name, values in session.columns.items()}
+    return replace(session, responses=responses.reshape(trials, bins * units), columns=columns)
 
 
 def short_name(source: str | os.PathLike[str]) -> str:

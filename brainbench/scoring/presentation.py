@@ -1,15 +1,16 @@
-"""Stimulus against time: the order of presentation in each session, and the times as a control beside the raw input.
+"""Stimulus against time: order of presentation, drift, and the times as a control beside the raw input.
 
 Where stimuli were presented in blocks, slow changes of rates tell them apart without any tuning, alike in random halves
 of the trials and in all animals that had the same order. So the times of presentation are scored as if they were a
 model, with every animal's own times. Where stimulus and time are confounded in some session, a score counts only if
-the times explain nothing.
+the times explain nothing. Where responses drift within sessions, random halves agree better than halves by time do, and
+a score counts only if the reliability of these reaches the gate too.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
@@ -21,7 +22,8 @@ from brainbench.core.statistics import PresentationOrder, presentation_order
 
 if TYPE_CHECKING:
     from brainbench.metrics import Metric
-    from brainbench.scoring.neural_responses import NeuralResponses
+    from brainbench.metrics.reliability.drift import Drift
+    from brainbench.metrics.reliability.subject_rdm import SubjectRDM
 
 CONTROL = "presentation time"
 """Name of the control among the baselines of a record."""
@@ -37,10 +39,40 @@ class Presentation:
     """By session."""
     control: Score | None = None
     """Score of the times; None where some animal's are not known, or a metric has no layers of single animals."""
+    within: Drift | None = None
+    """Drift within sessions; None where no times are known."""
+    between: Drift | None = None
+    """Drift between sessions; None where no animal has enough of them."""
 
     @property
-    def doubt(self) -> str:
-        """Reason why scores say little of tuning; empty where they do."""
+    def doubts(self) -> tuple[str, ...]:
+        """Reasons why scores say little of tuning."""
+        doubts = [self._confounded]
+        if self.within is not None and self.within.present and not self.within.reliable:
+            doubts.append(f"{self._drifts}: what random halves share is not all tuning")
+        return tuple(filter(None, doubts))
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """Drift that a reader of scores has to know of, where it is no doubt."""
+        remarks = []
+        if self.within is not None and self.within.present and self.within.reliable:
+            remarks.append(self._drifts)
+        if self.between is not None and self.between.present:
+            share = f"the earlier and the later half of them share {self.between.by_time:.0%} of what any two share"
+            remarks.append(f"responses drift between sessions: {share} (p = {self.between.p:.2g})")
+        return tuple(remarks)
+
+    @property
+    def _drifts(self) -> str:
+        assert self.within is not None
+        times = f"halves by time have a reliability of {self.within.by_time:.2f}"
+        return (
+            f"responses drift within sessions: {times}, random ones {self.within.random:.2f} (p = {self.within.p:.2g})"
+        )
+
+    @property
+    def _confounded(self) -> str:
         blocked = [order for order in self.orders.values() if order.confounded]
         if not blocked or (self.control is not None and self.control.p > CHANCE_LEVEL):
             return ""
@@ -53,73 +85,54 @@ class Presentation:
     @property
     def statistics(self) -> dict[str, Any]:
         """What a record keeps of the orders: the largest share, by session where there are few."""
+        drift = {"within": self.within, "between": self.between}
+        stated_drift = {name: part.stated for name, part in drift.items() if part is not None}
+        drifts = {"drift": stated_drift} if stated_drift else {}
         if not self.orders:
-            return {}
+            return drifts
         worst = max(self.orders.values(), key=lambda order: order.share - order.expected)
         sessions = sum(order.confounded for order in self.orders.values())
         stated = {"sessions": len(self.orders), "confounded": sessions}
-        return {"presentation": {**stated, "share": worst.share, "expected": worst.expected, "p": worst.p}}
+        stated |= {"share": worst.share, "expected": worst.expected, "p": worst.p}
+        return {"presentation": stated, **drifts}
 
 
 def presentation_of(
-    brain: NeuralResponses, metric: Metric, animals: Sequence[Any], labels: Sequence[str], *, control: bool, seed: int
+    metric: Metric, animals: Sequence[Any], labels: Sequence[str], *, control: bool, seed: int
 ) -> Presentation:
-    """Return the orders of presentation; the control is scored if it is asked for or if they are confounded."""
+    """Return the orders of presentation and drift; the control is scored if asked for, or if time is confounded."""
     from brainbench.metrics.hooks import MetricHooks
+    from brainbench.metrics.reliability.drift import drift_between, drift_within
+    from brainbench.metrics.reliability.subject_rdm import SubjectRDM
 
-    times = dict(_sessions(brain, labels))
+    prepared = [animal for animal in animals if isinstance(animal, SubjectRDM) and animal.problem is None]
     orders = {
-        f"{subject} {session}": order
-        for (subject, session), (start, codes) in times.items()
-        if (order := presentation_order(start, codes)) is not None
+        f"{animal.subject} {session}": order
+        for animal in prepared
+        for session, trials in animal.presented.items()
+        if (order := presentation_order(*trials)) is not None
     }
-    result = Presentation(orders)
+    result = Presentation(orders, None, drift_within(prepared), drift_between(prepared, seed=seed))
     comparable = isinstance(metric, MetricHooks) and not metric.of_model_alone
     if comparable and (control or any(order.confounded for order in orders.values())):
-        return replace(result, control=_control(metric, animals, labels, times, seed))
+        return replace(result, control=_control(metric, animals, labels, seed))
     return result
 
 
-def _sessions(
-    brain: NeuralResponses, labels: Sequence[str]
-) -> Iterator[tuple[tuple[str, str], tuple[NDArray[Any], NDArray[Any]]]]:
-    """Yield the begin [R] of the trials of every session and the places [R] of their stimuli; only of known times."""
-    data = brain.dataset
-    if "window_start" not in data.coords:
-        return
-    start = np.asarray(data["window_start"].values, dtype=np.float64)
-    place = {label: index for index, label in enumerate(labels)}
-    codes = np.array([place.get(label, -1) for label in data["stimulus"].values.astype(str).tolist()])
-    names = list(zip(*(data[name].values.astype(str).tolist() for name in ("subject", "session")), strict=True))
-    for name in dict.fromkeys(names):
-        rows = np.array([each == name for each in names]) & (codes >= 0) & np.isfinite(start)
-        if rows.any():
-            yield name, (start[rows], codes[rows])
-
-
-def _control(
-    metric: Metric,
-    animals: Sequence[Any],
-    labels: Sequence[str],
-    times: dict[tuple[str, str], tuple[NDArray[Any], NDArray[Any]]],
-    seed: int,
-) -> Score | None:
+def _control(metric: Metric, animals: Sequence[SubjectRDM], labels: Sequence[str], seed: int) -> Score | None:
     """Score the mean times of each animal's stimuli, sessions side by side, as its own layer."""
     from brainbench.metrics.score import score_layers
 
-    count = len(labels)
     layers: dict[str, Any] = {}
     for animal in animals:
-        columns = [
-            _mean_places(*trials, count)
-            for (subject, _), trials in times.items()
-            if subject == animal.subject and len(np.unique(trials[1])) == count
-        ]
-        if not columns:
+        if animal.problem is not None:
+            continue
+        if not animal.presented:
             return None
-        layers[animal.subject] = metric.layer(np.stack(columns, axis=1))
+        places = [_mean_places(*trials, len(labels)) for trials in animal.presented.values()]
+        layers[animal.subject] = metric.layer(np.stack(places, axis=1))
     how: dict[str, Any] = {"stimuli": labels, "seed": seed, "each": True}
-    return score_layers(metric, layers, animals, name=CONTROL, **how)[0]
+    return score_layers(metric, layers, animals, name=CONTROL, **how)[0] if layers else None
 
 
 def _mean_places(start: NDArray[Any], codes: NDArray[Any], count: int) -> NDArray[np.float64]:

@@ -254,17 +254,15 @@ def _compare(inputs: ScoreInputs, *, baselines: bool, progress: Progress | None)
             for name, layers in track([*features.items()], "models", progress)
         ]
         between = inputs.metric.score_animals(inputs.animals, **how) if baselines else None
-    presentation = presentation_of(
-        brain, inputs.metric, inputs.animals, inputs.labels, control=baselines, seed=options.seed
-    )
+    presentation = presentation_of(inputs.metric, inputs.animals, inputs.labels, control=baselines, seed=options.seed)
     spikes = "many trials share spikes with another one of their stimulus, which makes noise look reliable"
     recorded = brain.label_doubt, spikes if brain.dependent else ""
-    scores = [_doubted(score, presentation.doubt, *recorded) for score in scores]
+    scores = [_doubted(score, *presentation.doubts, *recorded) for score in scores]
     stated = scores[0].provenance
     effective, remarks = influence_of(scores[0], inputs.metric, inputs.animals)
     statistics = {**stated.statistics, **presentation.statistics, **effective}
     scores[0] = held_parts(replace(scores[0], provenance=replace(stated, statistics=statistics)))
-    between = between and _doubted(between, presentation.doubt, *recorded)
+    between = between and _doubted(between, *presentation.doubts, *recorded)
     if baselines and presentation.control is not None:
         # That the times alone explain something is no doubt about the times.
         scores.append(_doubted(presentation.control, *recorded))
@@ -274,7 +272,7 @@ def _compare(inputs: ScoreInputs, *, baselines: bool, progress: Progress | None)
         names = listing(unfelt, limit=6, quoted=False)
         doubts += (f"{len(unfelt)} of {len(network.labels)} stimuli have no recordings and are left out: {names}",)
     scores = [replace(score, reasons=(*score.reasons, *doubts)) for score in scores]
-    scores[0] = replace(scores[0], reasons=(*scores[0].reasons, *remarks))
+    scores[0] = replace(scores[0], reasons=(*scores[0].reasons, *remarks, *presentation.remarks))
     return scores, between and replace(between, reasons=(*between.reasons, *doubts))
 
 

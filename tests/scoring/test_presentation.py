@@ -15,17 +15,27 @@ STIMULI, TRIALS, UNITS = 12, 8, 30
 NAMES = tuple(f"s{index:02d}" for index in range(STIMULI))
 
 
-def _make_recordings(*, blocked, tuning=0.0, animals=4, times=True):
-    """Counts of neurons whose rates drift over the session, tuned to a shared geometry by ``tuning``."""
+def _make_recordings(*, blocked, tuning=0.0, animals=4, times=True, blocks=1, turn=0.0):
+    """Counts of neurons whose rates drift over the session, tuned to a shared geometry by ``tuning``.
+
+    Each stimulus has ``blocks`` runs of trials; by the end of the session the tuning is to another geometry, by
+    ``turn`` of a right angle.
+    """
     rng, parts = np.random.default_rng(0), []
-    geometry = rng.normal(size=(STIMULI, 4))
+    geometry, later = rng.normal(size=(STIMULI, 4)), np.random.default_rng(7).normal(size=(STIMULI, 4))
     counts = np.full((animals, STIMULI * TRIALS, 1, animals * UNITS), np.nan)
     for animal in range(animals):
         labels = np.repeat(np.arange(STIMULI), TRIALS)
+        if blocks > 1:
+            runs = [np.random.default_rng(place).permutation(STIMULI) for place in range(blocks)]
+            labels = np.repeat(np.concatenate(runs), TRIALS // blocks)
         labels = labels if blocked else rng.permutation(labels)
         time = np.linspace(-1, 1, len(labels))[:, None]
         drift = 0.35 * np.concatenate([time, time**2], axis=1) @ rng.normal(size=(2, UNITS))
-        rate = 20 * np.exp(drift + tuning * (geometry @ rng.normal(size=(4, UNITS)))[labels])
+        angle = np.pi / 2 * turn * (time + 1) / 2
+        weights = rng.normal(size=(4, UNITS))
+        tuned = np.cos(angle) * (geometry @ weights)[labels] + np.sin(angle) * (later @ weights)[labels]
+        rate = 20 * np.exp(drift + tuning * tuned)
         counts[animal, :, 0, animal * UNITS : (animal + 1) * UNITS] = rng.poisson(rate)
         parts.append(labels)
     trials, units = np.repeat(np.arange(animals), STIMULI * TRIALS), np.repeat(np.arange(animals), UNITS)
@@ -109,3 +119,23 @@ def test_blocks_whose_times_explain_nothing_are_believed_and_unknown_times_make_
     assert record.score.status == "ok"
     unknown, _ = _make_recordings(blocked=True, times=False)
     assert CONTROL not in _score(tmp_path, _rank(), unknown).baselines
+
+
+def test_runs_of_each_stimulus_under_drift_are_reliable_in_random_halves_alone(tmp_path):
+    # Four runs each, as in many experiments: the label explains nothing of the times, and random halves share the runs.
+    recordings, geometry = _make_recordings(blocked=True, blocks=4)
+    score = _score(tmp_path, geometry, recordings).score
+    statistics = score.provenance.statistics
+    assert statistics["presentation"]["confounded"] == 0
+    assert statistics["drift"]["within"]["random"] > 0.9 > 0.4 > statistics["drift"]["within"]["by_time"]
+    assert score.status == "unreliable"
+    assert score.reasons[0].startswith("responses drift within sessions: halves by time have a reliability of 0.19")
+
+
+def test_tuning_that_turns_within_a_session_is_a_remark_where_both_halves_are_reliable(tmp_path):
+    recordings, geometry = _make_recordings(blocked=False, tuning=0.2, turn=1.0)
+    score = _score(tmp_path, geometry, recordings).score
+    assert score.status == "ok"
+    assert sum("drift within sessions" in reason for reason in score.reasons) == 1
+    steady = _make_recordings(blocked=False, tuning=0.2)[0]
+    assert not any("drift" in reason for reason in _score(tmp_path, geometry, steady).score.reasons)

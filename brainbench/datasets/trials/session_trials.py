@@ -19,7 +19,7 @@ from brainbench.core.errors import DataError, check_name, listing
 from brainbench.core.files import content_hash, hash_arrays
 from brainbench.datasets.ledger import Ledger
 from brainbench.datasets.sessions import Session
-from brainbench.datasets.trials.counting import COVARIATES, UNIT_COLUMNS, ReadingOptions, SessionCounts
+from brainbench.datasets.trials.counting import COVARIATES, GROUPS, UNIT_COLUMNS, ReadingOptions, SessionCounts
 from brainbench.datasets.trials.selection import check_values, label_doubts, natural_vocabulary
 
 if TYPE_CHECKING:
@@ -98,6 +98,7 @@ def trials_by_subject(dataset: xr.Dataset, *, averaged: bool = False) -> dict[st
         dataset[name].values.astype(str) for name in ("trial_id", "subject", "session", "unit_subject", "unit_session")
     )
     covariates = [name for name in COVARIATES if name in dataset.coords]
+    groups = {name: dataset[name].values.astype(str) for name in GROUPS if name in dataset.coords}
     start = dataset["window_start"].values if "window_start" in dataset.coords else np.full(len(labels), np.nan)
     by_subject: dict[str, list[Trials]] = {}
     before: dict[str, list[tuple[NDArray[np.int64], Sequence[str]]]] = {}
@@ -137,6 +138,9 @@ def trials_by_subject(dataset: xr.Dataset, *, averaged: bool = False) -> dict[st
                 labels=labels[rows],
                 keys=unique,
                 covariates={name: dataset[name].values[rows].astype(np.float64) for name in covariates},
+                times=start[rows].astype(np.float64) if np.isfinite(start[rows]).all() else None,
+                session=session,
+                columns={name: values[columns][units] for name, values in groups.items()},
             )
         )
     return {subject: tuple(items) for subject, items in by_subject.items()}

@@ -12,7 +12,6 @@ to find, so report it with the score.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -212,12 +211,23 @@ def members(random: Hashes) -> Floats:
 
 def split_members(session: SortedTrials, count: int, index: Ints, seed: int) -> Floats:
     """Return 1 for the trials [S, R] in the first half of their stimulus, in the splits ``index`` [S]."""
-    random, first = draws(session.hashes, index, seed), np.empty((len(index), len(session.labels)))
-    sizes = np.bincount(session.labels, minlength=count)[session.labels]
+    return first_halves(draws(session.hashes, index, seed), session.labels, count)
+
+
+def time_members(session: SortedTrials, count: int) -> Floats:
+    """Return 1 for the earlier trials [1, R] of each stimulus; an odd trial goes to either half by its hash."""
+    places = np.argsort(np.argsort(session.times, kind="stable")).astype(np.uint64)
+    return first_halves((places[None] << np.uint64(1)) | (session.hashes & np.uint64(1)), session.labels, count)
+
+
+def first_halves(random: Hashes, labels: Ints, count: int) -> Floats:
+    """Return 1 for the lower half of the numbers [S, R] of each stimulus' trials."""
+    first = np.empty(random.shape)
+    sizes = np.bincount(labels, minlength=count)[labels]
     # Trials are sorted by stimulus; stimuli with as many trials are drawn in one call.
     for size in np.unique(sizes):
         rows = np.flatnonzero(sizes == size)
-        first[:, rows] = members(random[:, rows].reshape(len(index), -1, size)).reshape(len(index), -1)
+        first[:, rows] = members(random[:, rows].reshape(len(random), -1, size)).reshape(len(random), -1)
     return first
 
 
@@ -295,7 +305,7 @@ def reliable_units(
     for block, value in zip(blocks, values, strict=True):
         good = value >= least
         if good.any():
-            reliable.append(replace(block, responses=np.asarray(block.responses)[..., good]))
+            reliable.append(block.choose(good))
     every = sum(len(value) for value in values)
     left = sum(int((~(value >= least)).sum()) for value in values)
     return tuple(reliable), f"{left} of {every} units left out: reliability of their tuning below {least:g}"

@@ -106,20 +106,34 @@ class SortedTrials(Trials):
 
     @classmethod
     def sort(
-        cls, responses: Floats, labels: Ints, hashes: Hashes, *, rows: Ints | None = None, units: Any = slice(None)
+        cls,
+        responses: Floats,
+        labels: Ints,
+        hashes: Hashes,
+        *,
+        rows: Ints | None = None,
+        units: Any = slice(None),
+        block: Trials | None = None,
     ) -> SortedTrials:
         """Sort trials by stimulus and hash, so that the order in which they came is forgotten.
 
         ``rows`` [R] are the trials of ``responses`` [R′, U′] that are taken (all by default) and ``units`` an index or
-        mask of its units; ``labels`` and ``hashes`` [R] are those of the trials taken.
+        mask of its units; ``labels`` and ``hashes`` [R] are those of the trials taken. Times, columns and the name of
+        the session are those of the ``block``.
         """
         # Sorted by content, sums are formed in one order, so results do not change with the order of trials.
         order = np.lexsort((hashes, labels))
         values = np.empty((len(order), responses[:1, units].shape[1]))
         # Row by row, so that nothing but the result is large.
-        for place, row in enumerate(order if rows is None else rows[order]):
+        trials = order if rows is None else rows[order]
+        for place, row in enumerate(trials):
             values[place] = responses[row, units]
-        return cls(values, labels[order], hashes=hashes[order])
+        stated: dict[str, Any] = {}
+        if block is not None:
+            columns = {name: np.asarray(texts)[units] for name, texts in block.columns.items()}
+            times = None if block.times is None else np.asarray(block.times, dtype=np.float64)[trials]
+            stated = {"times": times, "session": block.session, "columns": columns}
+        return cls(values, labels[order], hashes=hashes[order], **stated)
 
     @cached_property
     def complete(self) -> bool:
@@ -180,7 +194,8 @@ def usable_sessions(
         dropped += int((~splittable).sum())
         if splittable.any():
             columns = slice(None) if splittable.all() else splittable
-            sessions.append(SortedTrials.sort(responses, codes, hashes, rows=np.flatnonzero(recorded), units=columns))
+            how: dict[str, Any] = {"rows": np.flatnonzero(recorded), "units": columns, "block": block}
+            sessions.append(SortedTrials.sort(responses, codes, hashes, **how))
         else:
             lacking.append(f"no unit recorded in {least} trials of every stimulus")
     notes = [f"{len(lacking)} of {len(blocks)} sessions left out: {'; '.join(sorted(set(lacking)))}"] if lacking else []
@@ -260,7 +275,8 @@ def whitened(session: SortedTrials, count: int, noise: str) -> tuple[SortedTrial
     note = f"{lost} units or bins left out: without noise or not in every trial" if lost else ""
     if not usable.any():
         return None, "no unit has noise to divide by"
-    responses = session.responses if usable.all() else session.responses[:, usable]
+    session = session if usable.all() else session.choose(usable)
+    responses = session.responses
     if noise == "diag":
         # ν = trials − stimuli, per unit; for Gaussian noise E[σ²/σ̂²] = ν/(ν − 2).
         freedom = number[usable] - count

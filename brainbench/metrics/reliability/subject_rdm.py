@@ -15,11 +15,12 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.contracts import Trials
+from brainbench.core.contracts import Trials, natural_key
 from brainbench.core.errors import DataError, UsageError, check_name
 from brainbench.core.reading.ranges import check_number
 from brainbench.core.records import Interval
@@ -28,13 +29,16 @@ from brainbench.metrics.rdms.comparison import LINEAR, WITHOUT, check_comparison
 from brainbench.metrics.rdms.dissimilarity import RDM_METHODS
 from brainbench.metrics.rdms.noise import NOISE_METHODS
 from brainbench.metrics.rdms.pairs import Floats, Ints, permuted_pairs, stimulus_count
-from brainbench.metrics.reliability.halves import SplitRDMs, half_rdms
+from brainbench.metrics.reliability.halves import SplitRDMs, half_rdms, time_members
 from brainbench.metrics.reliability.noise_correction import spearman_brown
 from brainbench.metrics.reliability.sessions import SortedTrials, shifted_sessions, usable_sessions, whitened_sessions
 from brainbench.metrics.stimulus_labels import membership, stimulus_means
 
 SPLITS = 1000
 """Random split halves per animal."""
+
+FEWEST_SESSIONS = 3
+"""Sessions of an animal from which their order can be told from chance."""
 
 _CHUNK_BYTES = 1 << 24
 _HALVES_BYTES = 1 << 26
@@ -79,6 +83,14 @@ class SubjectRDM:
     """[K, U] mean responses over trials, units of all sessions joined; empty where only the RDM is known."""
     noise: Floats = field(default_factory=lambda: np.empty((0, 0)), repr=False)
     """[K, U] variance of those means, from the spread over trials."""
+    columns: Mapping[str, NDArray] = field(default_factory=dict, repr=False)
+    """What is known of each unit, such as its area: name → [U] texts, empty where unknown."""
+    presented: Mapping[str, tuple[Floats, Ints]] = field(default_factory=dict, repr=False)
+    """Session → times [R] and stimuli [R] of its trials, in the order of sessions; those without times are left out."""
+    by_time: float = math.nan
+    """Comparison of the RDMs of the earlier and the later half of each session's trials; NaN without times."""
+    between: Floats = field(default_factory=lambda: np.empty((0, 0)), repr=False)
+    """[S, S] comparisons of the RDMs of single sessions, in order; empty below :data:`FEWEST_SESSIONS`."""
     nuisances: Mapping[str, Floats] = field(default_factory=dict, repr=False)
     """Name → RDM [P] of what else was measured in the trials; see :mod:`brainbench.metrics.measures.nuisance`."""
 
@@ -181,6 +193,7 @@ def subject_rdm(
         sessions = shifted_sessions(sessions, n_stimuli, by_unit=distance != "correlation")
     rdm = SplitRDMs(sessions, n_stimuli, distance).whole()
     halves, r, signal = _split_halves(sessions, n_stimuli, distance, comparison, splits, seed, rdm)
+    signal |= _in_time(sessions, n_stimuli, distance, comparison)
     animal = replace(empty, rdm=rdm, split_half_r=r, halves=halves, patterns=patterns, noise=variances, **signal)
     finite = r[np.isfinite(r)]
     if not np.isfinite(rdm).all() or not finite.size:
@@ -233,6 +246,29 @@ def _split_halves(
         with np.errstate(invalid="ignore", divide="ignore"):
             parts["signal_without"] = without / products_without(whole[None], whole[None], comparison)[0, 0]
     return halves, r, parts
+
+
+def _in_time(sessions: list[SortedTrials], count: int, method: str, comparison: str) -> dict[str, Any]:
+    """Return what an animal keeps of times: of its trials, the agreement of halves by time, and of its sessions."""
+    ordered = sorted(sessions, key=lambda session: natural_key(session.session))
+    named = {session.session or str(place): session for place, session in enumerate(ordered)}
+    names = {name for session in sessions for name in session.columns}
+    stated: dict[str, Any] = {
+        "presented": {name: (part.times, part.labels) for name, part in named.items() if part.times is not None},
+        "columns": {
+            name: np.concatenate([s.columns.get(name, np.full(s.responses.shape[1], "")) for s in sessions])
+            for name in sorted(names)
+        },
+    }
+    if all(session.times is not None for session in sessions):
+        first, second = SplitRDMs(sessions, count, method).halves([time_members(each, count) for each in sessions])
+        stated["by_time"] = float(compare(first, second, method=comparison)[0])
+    if len(ordered) >= FEWEST_SESSIONS:
+        rdms = np.stack([SplitRDMs([each], count, method).whole() for each in ordered])
+        # A session whose units are silent for some stimulus has no RDM of its own, and says nothing.
+        rdms = rdms[~is_flat(rdms)]
+        stated["between"] = compare(rdms[:, None], rdms[None], method=comparison)
+    return stated
 
 
 def _signal(first: Floats, second: Floats, whole: Floats, method: str, comparison: str) -> Floats:
