@@ -24,9 +24,9 @@ BUDGETS = {
     "robotics_bridge": 24_800,  # newtons that no taxel has, trees of any hand, deadlines, replays, gel pictures
     "brainbench/models": 8_540,  # the proof that a layer is a response, ONNX files tried apart
     "brainbench/datasets": 7_450,  # the balance of a reading, copies of sessions, signals, bands, baselines
-    "brainbench/metrics": 5_400,  # the unique part
+    "brainbench/metrics": 5_650,  # the unique part, drift over time, matching of units
     "brainbench/cli": 4_960,  # check-submission, options of benchmarks, names of the registry
-    "brainbench/core": 5_900,  # the sealed door, seals of the cache, the filter of foreign text, sealed plans
+    "brainbench/core": 5_910,  # times and areas of trials, the sealed door, seals of the cache, sealed plans
     "leaderboards": 3_850,  # boards of 10,000 records, benchmarks and citations, means over benchmarks, boards of areas
     "brainbench/scoring": 4_280,  # presentation time, plans, boards of areas and layers, controls of the unique part
     "brainbench/geometry": 1_050,

@@ -251,10 +251,10 @@ def _split_halves(
 def _in_time(sessions: list[SortedTrials], count: int, method: str, comparison: str) -> dict[str, Any]:
     """Return what an animal keeps of times: of its trials, the agreement of halves by time, and of its sessions."""
     ordered = sorted(sessions, key=lambda session: natural_key(session.session))
-    named = {session.session or str(place): session for place, session in enumerate(ordered)}
+    by_name = {session.session or str(place): session for place, session in enumerate(ordered)}
     names = {name for session in sessions for name in session.columns}
     stated: dict[str, Any] = {
-        "presented": {name: (part.times, part.labels) for name, part in named.items() if part.times is not None},
+        "presented": {name: (part.times, part.labels) for name, part in by_name.items() if part.times is not None},
         "columns": {
             name: np.concatenate([s.columns.get(name, np.full(s.responses.shape[1], "")) for s in sessions])
             for name in sorted(names)
