@@ -166,10 +166,20 @@ def option_fields(kind: str) -> Mapping[str, OptionField]:
         said = after.value.value if isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant) else ""
         options[node.target.id] = OptionField(
             annotation=names.evaluated(node.annotation),
-            default=node.value.value if isinstance(node.value, ast.Constant) else None,
+            default=_plain_default(node.value, names),
             help=_plain(str(said)),
         )
     return options
+
+
+def _plain_default(node: ast.expr | None, names: _SourceNames) -> Any:
+    """Return a default that the command line can show; None for those that only the class itself can make."""
+    if not isinstance(node, ast.Constant | ast.Name | ast.Call):
+        return None
+    if isinstance(node, ast.Call) and ast.unparse(node.func) != "Path":
+        return None
+    default = names.evaluated(node)
+    return default if isinstance(default, _KINDS) else None
 
 
 def with_options(
@@ -178,6 +188,7 @@ def with_options(
     *,
     parameter: str = "options",
     flags: Mapping[str, tuple[str, ...]] | None = None,
+    defaults: Mapping[str, Any] | None = None,
     build: bool = True,
     given: bool = False,
     help: str | None = None,
@@ -189,21 +200,26 @@ def with_options(
         names: Fields that have a flag; all of them by default.
         parameter: The parameter of the command.
         flags: Flags of a field, where they are not its name with hyphens.
+        defaults: Defaults of this command, where they are not those of the dataclass.
         build: Hand over the dataclass; else a mapping of its fields.
         given: Hand over a mapping of the values that were given; no flag has a default then.
         help: One help for all of them, in place of their docstrings.
     """
     stated = option_fields(kind)
     module, _, wanted = kind.partition(":")
-    parameters = []
+    parameters, fields_of = [], {}
     for name in stated if names is None else names:
-        field, default = stated[name], None if given else stated[name].default
+        field, default = stated[name], None if given else (defaults or {}).get(name, stated[name].default)
         if help is not None:
             field = replace(field, help=help)
-        parameters.append(field.parameter(name, (flags or {}).get(name, ()), default))
+        words = (flags or {}).get(name, ())
+        # Called by its flag, an option does not clash with a field of this name of another dataclass.
+        variable = words[0].removeprefix("--").replace("-", "_") if words else name
+        fields_of[variable] = name
+        parameters.append(field.parameter(variable, words, default))
 
     def make(values: dict[str, Any]) -> Any:
-        options = {name: stated[name].value(name, value) for name, value in values.items()}
+        options = {fields_of[flag]: stated[fields_of[flag]].value(flag, value) for flag, value in values.items()}
         # Defaults that are tuples are not read from the source; the dataclass has them.
         options = {n: value for n, value in options.items() if not (stated[n].several and value is None)}
         if given:

@@ -18,9 +18,10 @@ class DecompositionSettings:
     """Method and limits by which a mesh is cut; a value outside its range is a :class:`UsageError`."""
 
     method: Literal["coacd", "vhacd"] = "coacd"
-    """``coacd`` (Wei et al. 2022) or ``vhacd`` (Mamou 2016, as PyBullet carries it; what the thesis used)."""
+    """Method of a decomposition: ``coacd`` (Wei et al. 2022) or ``vhacd`` (Mamou 2016, as PyBullet carries it; what
+    the thesis used)."""
     threshold: Annotated[float, Limit(least=0.01, most=1)] = 0.05
-    """Concavity that may remain, relative to the size of the mesh: .01 is fine; CoACD only."""
+    """Concavity that a decomposition may leave, relative to the size of the mesh: .01 is fine; CoACD only."""
     most_pieces: Count | None = None
     """Largest number of pieces; None for as many as the threshold asks for; CoACD only."""
     seed: Seed = 0

@@ -33,9 +33,9 @@ class EnvOptions:
     """Options of the simulation of a task, and of what is observed; a value that is not valid is a UsageError."""
 
     num_envs: Annotated[int, Limit(least=1, most=MOST_ENVS)] = 1
-    """Environments B."""
+    """Environments B at once."""
     device: str = "cpu"
-    """``cpu``, ``cuda`` or ``cuda:1``."""
+    """``cpu``, or ``cuda`` (``cuda:1``) for MuJoCo Warp."""
     engine: Literal["mujoco", "warp"] | None = None
     """``mujoco`` (C MuJoCo) or ``warp`` (MuJoCo Warp); by default the one for the device."""
     observe: str = "none"

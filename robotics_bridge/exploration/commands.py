@@ -10,6 +10,7 @@ import typer
 from brainbench.cli.destinations import out_file_option
 from brainbench.cli.options import with_options
 from brainbench.cli.output import Output, progress_bar, table_of
+from brainbench.cli.policy.options import ENV, HandOption
 from brainbench.cli.requirements import needs
 
 if TYPE_CHECKING:
@@ -20,12 +21,7 @@ _DISTANCES = {"close": 0.0, "medium": 4e-4, "far": 8e-4}
 
 
 @needs(cache=True)
-@with_options(
-    "robotics_bridge.envs.simulation:EnvOptions",
-    ("placement", "resolution", "noisy", "seed"),
-    parameter="touch",
-    build=False,
-)
+@with_options(ENV, ("placement", "resolution", "noisy", "seed"), parameter="touch", build=False)
 def hand(
     touch: dict[str, Any],
     out: Annotated[Path | None, out_file_option("Stimulus-set file to write (.h5).")] = None,
@@ -40,7 +36,7 @@ def hand(
         list[str] | None,
         typer.Option(help="lateral_motion, static_pressure, enclosure, contour_following; all by default."),
     ] = None,
-    robot: Annotated[str, typer.Option("--hand", help="xhand1, sharpa, or a URDF or MJCF file.")] = "xhand1",
+    hand: HandOption = "xhand1",
     diagonal: Annotated[float, typer.Option(help="Size of shapes and meshes (mm).")] = 55.0,
     unit: Annotated[str | None, typer.Option(help="Length unit of mesh files.")] = None,
     frames: Annotated[int, typer.Option(help="Frames of 9 ms; a multiple of 5.")] = 110,
@@ -61,7 +57,7 @@ def hand(
     explored = [item for text in objects or ["primitives"] for item in objects_of(text, diagonal * 1e-3, unit)]
     with progress_bar() as progress:
         recording = record_exploration(
-            explored, tuple(procedure or PROCEDURES), hand=robot, frames=frames, progress=progress, **touch
+            explored, tuple(procedure or PROCEDURES), hand=hand, frames=frames, progress=progress, **touch
         )
     calibration = recording.calibration()
     dataset = recording.dataset(calibration)

@@ -1,8 +1,20 @@
+import inspect
 from dataclasses import fields, replace
 
 import pytest
 
-from brainbench.cli.options import SCORE, SCORE_FLAGS, as_flags, numbers, option_fields, part_of, refuse, typed_options
+from brainbench.cli.options import (
+    SCORE,
+    SCORE_FLAGS,
+    as_flags,
+    numbers,
+    option_fields,
+    part_of,
+    refuse,
+    typed_options,
+    with_options,
+)
+from brainbench.cli.output import Output
 from brainbench.core.errors import UsageError
 from brainbench.scoring import ScoreOptions
 
@@ -20,6 +32,24 @@ def test_options_are_written_as_flags():
 def test_typed_flags_are_told_from_defaults():
     words = ["score", "zhuang", "-r", "data", "--seed=0", "--no-normalize", "--out", "x", "--json"]
     assert typed_options(words) == ["recordings", "normalize", "seed"]
+
+
+def test_fields_of_one_name_stand_side_by_side_under_their_flags():
+    encoder = "robotics_bridge.policies.encoders.arms:EncoderConfig"
+
+    @with_options(SCORE, ("seed",), build=False)
+    @with_options(
+        encoder, ("seed", "name"), parameter="drawn", flags={"seed": ("--draw",)}, defaults={"seed": 5}, build=False
+    )
+    def command(options: dict, drawn: dict) -> Output:
+        return Output(options, str(drawn))
+
+    assert [(name, item.default) for name, item in inspect.signature(command).parameters.items()] == [
+        ("seed", 0), ("draw", 5), ("name", "auto"),
+    ]  # fmt: skip
+    assert command(seed=1, draw=2, name="mlp") == Output({"seed": 1}, "{'seed': 2, 'name': 'mlp'}")
+    with pytest.raises(UsageError, match="--draw must be"):
+        command(seed=1, draw=-1, name="mlp")
 
 
 def test_numbers_are_written_with_commas_or_as_a_size():

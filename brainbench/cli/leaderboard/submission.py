@@ -12,6 +12,8 @@ from typing import Annotated, Any
 
 import typer
 
+from brainbench.cli.leaderboard.verify import REPETITION, Repetition, verdicts
+from brainbench.cli.options import with_options
 from brainbench.cli.output import Output
 from brainbench.core.errors import DataError, UsageError, brief, look_alike, visible
 
@@ -40,17 +42,14 @@ class ChangedFile:
     """Name of its content."""
 
 
+@with_options(REPETITION, ("score", "held_out", "secret"), parameter="how")
 def check_submission(
     base: Annotated[str, typer.Argument(help="Commit of the board that the submission is for.")],
     head: Annotated[str, typer.Argument(help="Commit of the submission; of it only records are read, as data.")],
+    how: Repetition,
     results: Annotated[str, typer.Option(help="Folder of the board's records in the repository.")] = (
         "leaderboards/results"
     ),
-    score: Annotated[bool, typer.Option("--score/--no-score", help="Score the models of new records again.")] = True,
-    held_out: Annotated[
-        str, typer.Option("--held-out", help="Published commitment; also score on what it holds back.")
-    ] = "",
-    secret: Annotated[Path, typer.Option(help="Folder of the held-out recordings.")] = Path("held-out-secret"),
 ) -> Output:
     """Check what a submission changes: it may add records to the board's folder, and nothing else.
 
@@ -58,14 +57,9 @@ def check_submission(
     folder, are refused, whatever git calls the change. New records are then verified as by leaderboard verify; nothing
     of the submission is run, and no file that a record names is opened. Exit status 1 if anything is refused.
     """
-    from brainbench.cli.leaderboard.verify import Repetition, verdicts
-    from leaderboards.held_out import Commitment
     from leaderboards.store import read_records
 
-    commitment = None
-    if held_out:
-        commitment = Commitment.read(held_out)
-        commitment.open(secret)
+    commitment = how.commitment()
     before, after = (_commit(name) for name in (base, head))
     folder = PurePosixPath(results)
     changes = list(changed_files(_git("merge-base", before, after).decode().strip(), after))
@@ -81,7 +75,7 @@ def check_submission(
             for file, path in zip(added, files, strict=True):
                 path.parent.mkdir()
                 path.write_bytes(_git("cat-file", "blob", file.blob))
-            checked = verdicts(read_records(files), Repetition(score=score), commitment, secret)
+            checked = verdicts(read_records(files), how, commitment)
     failure = typer.Exit(1) if refused else checked.failure
     data: dict[str, Any] = {"refused": refused, "records": checked.data}
     return Output(data, "\n".join([*text, checked.text]), failure=failure)

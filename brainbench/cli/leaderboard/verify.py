@@ -35,16 +35,30 @@ class Repetition:
     """Numbers that differ by no more are equal."""
     trust_code: bool = False
     """Also run code and weights that do not come with this package."""
+    held_out: str | None = None
+    """Published commitment; also score on what it holds back."""
+    secret: Path = Path("held-out-secret")
+    """Folder of the held-out recordings."""
+
+    def commitment(self) -> Commitment | None:
+        """Return the commitment, if there is one; one that is not usable, or a secret, is told before any score."""
+        from leaderboards.held_out import Commitment
+
+        # An empty text too is none: workflows pass on a variable that a board may lack.
+        if not self.held_out:
+            return None
+        commitment = Commitment.read(Path(self.held_out))
+        commitment.open(self.secret)
+        return commitment
 
 
-@with_options("brainbench.cli.leaderboard.verify:Repetition", parameter="how", flags=SCORE_FLAGS)
+REPETITION = "brainbench.cli.leaderboard.verify:Repetition"
+
+
+@with_options(REPETITION, parameter="how", flags=SCORE_FLAGS)
 def verify(
     records: Annotated[list[Path], typer.Argument(help="Record files or folders of them.")],
     how: Repetition,
-    held_out: Annotated[
-        Path | None, typer.Option("--held-out", help="Published commitment; also score on what it holds back.")
-    ] = None,
-    secret: Annotated[Path, typer.Option(help="Folder of the held-out recordings.")] = Path("held-out-secret"),
 ) -> Output:
     """Check records: the file against its hash, the records against one another, the numbers against a repetition.
 
@@ -52,22 +66,13 @@ def verify(
     could do anything, and could read the answer, and a path in it could be that of any file. Exit status 1 if a file
     was edited, a repetition gives something else or cannot be made; what differs is printed.
     """
-    from leaderboards.held_out import Commitment
     from leaderboards.store import read_records
 
-    # A commitment or a secret that is not usable is told before anything is scored.
-    commitment = None if held_out is None else Commitment.read(held_out)
-    if commitment is not None:
-        commitment.open(secret)
-    return verdicts(read_records(records), how, commitment, secret)
+    commitment = how.commitment()
+    return verdicts(read_records(records), how, commitment)
 
 
-def verdicts(
-    stored: Sequence[StoredRecord],
-    how: Repetition,
-    commitment: Commitment | None = None,
-    secret: Path | None = None,
-) -> Output:
+def verdicts(stored: Sequence[StoredRecord], how: Repetition, commitment: Commitment | None = None) -> Output:
     """Return what is found about records, with exit status 1 where one is refused, differs or is not repeated."""
     from brainbench.cli.leaderboard.held_out import score_held_out
     from leaderboards.audit import differences, remarks
@@ -84,9 +89,9 @@ def verdicts(
                     changes = differences(entry.record, again, tolerance=how.tolerance)
                     result |= {"verdict": "differs" if changes else "confirmed", "differences": changes}
                     result |= {"value": again.score.value}
-                if commitment is not None and secret is not None and result["verdict"] in ("intact", "confirmed"):
+                if commitment is not None and result["verdict"] in ("intact", "confirmed"):
                     refuse_foreign_code(entry.record, trusted=how.trust_code)
-                    result |= score_held_out(entry.record, commitment, secret)
+                    result |= score_held_out(entry.record, commitment, how.secret)
             except BrainbenchError as error:
                 result |= {"verdict": "not repeated", "problem": str(error)}
         results.append(result)

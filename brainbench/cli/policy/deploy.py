@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from brainbench.cli.destinations import out_file
+from brainbench.cli.options import with_options
 from brainbench.cli.output import Output, progress_bar
 
 if TYPE_CHECKING:
@@ -43,8 +44,10 @@ def export(
     return Output(written, text)
 
 
+@with_options("robotics_bridge.deploy.safety:SafetyLimits", ("timeout", "pressure"), parameter="limits", build=False)
 def deploy(
     policy: Annotated[Path, typer.Argument(help="A file of brainbench policy export; its contract lies beside it.")],
+    limits: dict[str, Any],
     driver: Annotated[
         str,
         typer.Option(
@@ -60,8 +63,6 @@ def deploy(
         list[str] | None,
         typer.Option("--input", help="Constant for what the hand cannot measure: NAME=NUMBER or NAME=NUMBER,…"),
     ] = None,
-    timeout: Annotated[float, typer.Option(help="Oldest report to act upon (s).")] = 0.1,
-    pressure: Annotated[float, typer.Option(help="Largest force of a finger tip, in the maker's unit.")] = 30.0,
     shadow: Annotated[
         bool, typer.Option("--shadow", help="Simulate touch beside the hand, for what it does not measure.")
     ] = False,
@@ -100,7 +101,7 @@ def deploy(
     with opened as link:
         fallback = shadow_touch(contract, link.joints) if shadow_touch is not None else given.pop("tactile", None)
         controller = deployed.controller(
-            link, limits={"timeout": timeout, "pressure": pressure}, sources=given, fallback=fallback,
+            link, limits=limits, sources=given, fallback=fallback,
             threads=threads, record=None if recorder is None else recorder.begin(link.joints, link.fingers),
         )  # fmt: skip
         with realtime() if ahead else contextlib.nullcontext():

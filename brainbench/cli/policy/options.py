@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from brainbench.cli.options import filled_from
+from brainbench.cli.options import filled_from, option
 from brainbench.cli.output import Output
 
 if TYPE_CHECKING:
@@ -18,10 +18,9 @@ if TYPE_CHECKING:
 
 TaskArgument = Annotated[str, typer.Argument(help="A task: in_palm_rotate, in_hand_repose, screwdriver, hot_ball.")]
 HandOption = Annotated[str, typer.Option(help="xhand1, sharpa, or a URDF or MJCF file.")]
-EnvsOption = Annotated[int, typer.Option("--envs", help="Environments at once.")]
-DeviceOption = Annotated[str, typer.Option(help="cpu, or cuda for MuJoCo Warp.")]
 TaskFileOption = Annotated[Path | None, typer.Option(help="Python file that registers a task of your own.")]
-ENV = "robotics_bridge.envs.simulation:EnvOptions"
+ENV, ENVS_FLAG = "robotics_bridge.envs.simulation:EnvOptions", {"num_envs": ("--envs",)}
+DeviceOption = Annotated[str, option(ENV, "device")]
 TOUCH = ("observe", "placement", "resolution", "noisy")
 """Fields of the options of an environment that a student fixes."""
 

@@ -11,7 +11,7 @@ import typer
 from brainbench.cli.destinations import out_file, out_file_option
 from brainbench.cli.options import with_options
 from brainbench.cli.output import Output, facts, progress_bar, table_of
-from brainbench.cli.policy.options import ENV, TOUCH, DeviceOption, EnvsOption, World, agent_of, in_world, touch_of
+from brainbench.cli.policy.options import ENV, ENVS_FLAG, TOUCH, World, agent_of, in_world, touch_of
 
 
 def list_tasks() -> Output:
@@ -120,17 +120,18 @@ def play(
     return Output(result, f"{env.task.text}\n\n{facts(lines)}")
 
 
+# As in our records: every object of in_palm_rotate twice.
+@with_options(ENV, ("num_envs", "device"), flags=ENVS_FLAG, defaults={"num_envs": 34}, build=False)
 @in_world
 def evaluate(
     world: World,
+    options: dict[str, Any],
     agents: Annotated[
         list[str] | None,
         typer.Argument(help="Shipped policies, or folders of teachers or students; zero and random always run."),
     ] = None,
     episodes: Annotated[int, typer.Option(help="Per agent and seed.")] = 100,
     seeds: Annotated[int, typer.Option(help="Evaluation seeds.")] = 3,
-    envs: EnvsOption = 34,  # as in our records: every object of in_palm_rotate twice
-    device: DeviceOption = "cpu",
     out: Annotated[Path | None, out_file_option("Write the result as JSON here too.")] = None,
 ) -> Output:
     """Compare agents over whole episodes: success rate with its 95 % interval, and what it does not tell.
@@ -146,8 +147,7 @@ def evaluate(
 
     check_number("--seeds", seeds, least=1)
     world.check(agents or [])
-    touch = touch_of(list(agents or []))
-    env = world.make(agents or (), num_envs=envs, device=device, **touch)
+    env = world.make(agents or (), **options, **touch_of(agents or []))
     contacts = contacts_name(env.task.contacts)
     names = ["zero", "random", *(name for name in agents or [] if name not in ("zero", "random"))]
     # All are read before the first one runs: an unfit last one would else be told after minutes.

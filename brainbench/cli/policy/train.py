@@ -12,7 +12,16 @@ import typer
 from brainbench.cli.destinations import out_folder, out_folder_option
 from brainbench.cli.options import part_of, with_options
 from brainbench.cli.output import Output, facts, progress_bar, table, table_of
-from brainbench.cli.policy.options import DeviceOption, TaskArgument, TaskFileOption, World, in_world, read_task_file
+from brainbench.cli.policy.options import (
+    ENV,
+    ENVS_FLAG,
+    DeviceOption,
+    TaskArgument,
+    TaskFileOption,
+    World,
+    in_world,
+    read_task_file,
+)
 
 
 @with_options(
@@ -23,19 +32,24 @@ from brainbench.cli.policy.options import DeviceOption, TaskArgument, TaskFileOp
     "robotics_bridge.tasks.settings:TeacherSettings",
     ("num_envs", "steps_per_env", "rnd_weight", "initial_std"),
     parameter="changes",
-    flags={"num_envs": ("--envs",), "steps_per_env": ("--steps",), "rnd_weight": ("--curiosity",)},
+    flags=ENVS_FLAG | {"steps_per_env": ("--steps",), "rnd_weight": ("--curiosity",)},
     given=True,
+)
+@with_options(
+    ENV,
+    ("observe", "placement", "resolution", "device"),
+    parameter="simulation",
+    flags={"observe": ("--touch",)},
+    defaults={"observe": "agg_bool"},
+    build=False,
 )
 @in_world
 def train(
     world: World,
     options: Any,
     changes: dict[str, Any],
+    simulation: dict[str, Any],
     out: Annotated[Path | None, out_folder_option("Folder of the run; started again, it goes on.")] = None,
-    touch: Annotated[str, typer.Option(help="Tactile observation type of touch.")] = "agg_bool",
-    placement: Annotated[str, typer.Option(help="Place of the taxels: hand, fingers, tips or palm.")] = "hand",
-    resolution: Annotated[str, typer.Option(help="Number of taxels: low, med or high.")] = "med",
-    device: DeviceOption = "cpu",
 ) -> Output:
     """Train the teacher of a task by PPO, or go on with a run.
 
@@ -45,9 +59,10 @@ def train(
     """
     from robotics_bridge.policies.training import teacher
 
-    changes = {"num_envs": 8192 if device != "cpu" else 64} | changes
-    senses = {"observe": touch, "placement": placement, "resolution": resolution} if "touch" in options.observe else {}
-    env = world.make(num_envs=changes["num_envs"], device=device, seed=options.seed, **senses)
+    changes = {"num_envs": 8192 if simulation["device"] != "cpu" else 64} | changes
+    if "touch" not in options.observe:
+        simulation = {"device": simulation["device"]}
+    env = world.make(num_envs=changes["num_envs"], seed=options.seed, **simulation)
     settings = replace(env.task.teacher, **changes)
     run = out or Path("runs") / f"{world.task}-{env.hand.name}-{options.seed}"
     with progress_bar() as progress:
@@ -62,38 +77,34 @@ def train(
 
 
 DISTILL = "robotics_bridge.policies.training.distill_config:DistillConfig"
-DISTILL_FLAGS = {"variant": ("--config",), "num_envs": ("--envs",)}
+DISTILL_FLAGS = ENVS_FLAG | {"variant": ("--config",)}
 OFFERED = (
-    "observe", "placement", "resolution", "noisy", "contacts", "embedder", "hand", "variant", "num_envs", "iterations",
-    "learning_rate", "epochs", "hidden", "teacher_share", "teacher_iterations", "aggregate", "precision",
+    "encoder", "observe", "placement", "resolution", "noisy", "contacts", "embedder", "hand", "variant", "num_envs",
+    "iterations", "learning_rate", "epochs", "hidden", "teacher_share", "teacher_iterations", "aggregate", "precision",
     "save_interval", "seed", "start",
 )  # fmt: skip
 """Fields of a student's configuration that have a flag of their name."""
 
 
 @with_options(DISTILL, OFFERED, flags=DISTILL_FLAGS, build=False)
+@with_options(
+    "robotics_bridge.policies.encoders.arms:EncoderConfig",
+    ("learning", "time", "seed", "pretrained", "units"),
+    parameter="of_encoder",
+    flags={"seed": ("--draw",)},
+    given=True,
+)
 def distill(
     task: TaskArgument,
     teacher: Annotated[Path, typer.Option(help="A shipped teacher, or a folder of brainbench policy train.")],
     options: dict[str, Any],
+    of_encoder: dict[str, Any],
     out: Annotated[
         Path | None, typer.Option(callback=out_folder, help="Folder of the run; by default students/<what it is>.")
-    ] = None,
-    encoder: Annotated[
-        str, typer.Option(help="mlp, rnn, tactile_cnn, tactile_convrnn, …, or a model's name; auto as published.")
-    ] = "auto",
-    learning: Annotated[str | None, typer.Option(help="Of a model: frozen or finetuned. [default: frozen]")] = None,
-    time: Annotated[
-        str | None, typer.Option(help="Of a model: native or resampled to its own 9 ms. [default: native]")
     ] = None,
     unroll: Annotated[
         str | None, typer.Option(help="Of a graph model: full answers at once, biological after a step per layer.")
     ] = None,
-    draw: Annotated[
-        int | None, typer.Option(help="Seed of an untrained model or reservoir; by default that of the student.")
-    ] = None,
-    pretrained: Annotated[Path | None, typer.Option(help="Weights of a tagged model.")] = None,
-    units: Annotated[int | None, typer.Option(help="Units of the encoder rnn. [default: 64]")] = None,
     episodes: Annotated[int, typer.Option(help="Of the evaluation, per seed; 0 for none.")] = 100,
     device: DeviceOption = "cpu",
     stop_after: Annotated[float | None, typer.Option(help="Save, stop and evaluate after so many seconds.")] = None,
@@ -105,15 +116,12 @@ def distill(
     from robotics_bridge.policies.training.distill_config import DistillConfig
     from robotics_bridge.policies.training.students import train_student
 
-    given = {
-        "learning": learning, "time": time, "seed": draw, "units": units, "pretrained": pretrained and str(pretrained),
-        "options": unroll and {"unroll": unroll},
-    }  # fmt: skip
     # The learning of a network is stated in the names and tables of students.
-    settings: dict[str, Any] = {} if encoder in (AUTO, *ARMS) else {"learning": "frozen", "time": "native"}
-    settings |= {name: value for name, value in given.items() if value is not None}
+    network = options["encoder"] not in (AUTO, *ARMS)
+    settings = {"learning": "frozen", "time": "native"} | of_encoder if network else of_encoder
+    settings |= {} if unroll is None else {"options": {"unroll": unroll}}
     read_task_file(task_file)
-    config = DistillConfig(task=task, teacher=str(teacher), encoder=encoder, encoder_settings=settings, **options)
+    config = DistillConfig(task=task, teacher=str(teacher), encoder_settings=settings, **options)
     folder = out or Path("students") / config.name
     with progress_bar() as progress:
         student = train_student(

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from brainbench.cli.destinations import out_file
-from brainbench.cli.options import refuse
+from brainbench.cli.options import refuse, with_options
 from brainbench.cli.output import Output, facts, progress_bar, table
 
 if TYPE_CHECKING:
@@ -18,7 +18,9 @@ if TYPE_CHECKING:
 _MILLI = 1e3
 
 
+@with_options("brainbench.geometry.pieces:DecompositionSettings", ("method", "threshold"), parameter="settings")
 def objects(
+    settings: Any,
     source: Annotated[
         str | None, typer.Argument(help="A shape family, a mesh file or a ShapeNet folder; all families without.")
     ] = None,
@@ -32,8 +34,6 @@ def objects(
         str | None,
         typer.Option(help="What whiskers touch: exact, hull, pieces or decomposition; default as in scene files."),
     ] = None,
-    method: Annotated[str, typer.Option(help="Of a decomposition: coacd or vhacd.")] = "coacd",
-    threshold: Annotated[float, typer.Option(help="Concavity that a decomposition may leave, 0.01 to 1.")] = 0.05,
     ids: Annotated[Path | None, typer.Option(help="For a ShapeNet folder: file of synset/model names.")] = None,
     categories: Annotated[Path | None, typer.Option(help="For a ShapeNet folder: CSV or JSON of labels.")] = None,
     export: Annotated[
@@ -41,9 +41,8 @@ def objects(
     ] = None,
 ) -> Output:
     """List the shape families, or describe one object: its size, its faults, and what whiskers touch of it."""
-    from brainbench.geometry import DecompositionSettings, save_mesh
+    from brainbench.geometry import save_mesh
 
-    settings = DecompositionSettings(method=method, threshold=threshold)  # type: ignore[arg-type]
     diagonal = None if diagonal_mm is None else diagonal_mm / _MILLI
     if source is None or Path(source).is_dir():
         single = {"--unit": unit, "--diagonal-mm": diagonal_mm, "--collision": collision, "--export": export}

@@ -8,18 +8,19 @@ from typing import Annotated, Any
 import typer
 
 from brainbench.cli.destinations import out_folder_option
+from brainbench.cli.options import with_options
 from brainbench.cli.output import Output, table, table_of, tracked
-from brainbench.cli.policy.options import HandOption
+from brainbench.cli.policy.options import ENV, ENVS_FLAG, DeviceOption, HandOption
 from brainbench.core.errors import UsageError
 
 _HAND_FILES = (".urdf", ".xml", ".mjcf")
 
 
+@with_options(ENV, ("resolution", "noisy"), defaults={"resolution": "high"}, build=False)
 def demo(
+    options: dict[str, Any],
     out: Annotated[Path, out_folder_option("Folder for the pictures.")] = Path("tactile-demo"),
     hand: HandOption = "xhand1",
-    resolution: Annotated[str, typer.Option(help="low, med or high.")] = "high",
-    noisy: Annotated[bool, typer.Option("--noisy", help="Draw measured readings with the published noise.")] = False,
 ) -> Output:
     """Let a hand close around a warm ball and draw what it feels.
 
@@ -29,8 +30,8 @@ def demo(
     from brainbench.cli.tactile import scenes
 
     jobs = {
-        "forces": lambda path: scenes.forces(path, hand, resolution, noisy=noisy),
-        "markers": lambda path: scenes.markers(path, noisy=noisy),
+        "forces": lambda path: scenes.forces(path, hand, **options),
+        "markers": lambda path: scenes.markers(path, noisy=options["noisy"]),
         "temperature": lambda path: scenes.temperature(path, hand),
         "sound": scenes.sound,
     }
@@ -84,13 +85,12 @@ def layouts(
     return Output(data, text)
 
 
+@with_options(ENV, ("num_envs", "device"), parameter="batch", flags=ENVS_FLAG, defaults={"num_envs": 256}, build=False)
+@with_options(ENV, ("resolution", "placement", "noisy"), build=False)
 def bench(
+    batch: dict[str, Any],
+    options: dict[str, Any],
     hand: HandOption = "xhand1",
-    resolution: Annotated[str, typer.Option(help="low, med or high.")] = "med",
-    placement: Annotated[str, typer.Option(help="hand, fingers, tips or palm.")] = "hand",
-    envs: Annotated[int, typer.Option(help="Environments.")] = 256,
-    device: Annotated[str, typer.Option(help="cpu or cuda.")] = "cpu",
-    noisy: Annotated[bool, typer.Option("--noisy", help="With the published noise of each sensor.")] = False,
     repeats: Annotated[int, typer.Option(help="Timed updates; the median counts.")] = 20,
 ) -> Output:
     """Time one update of each sensor class on a hand that holds a ball, with the memory per environment.
@@ -100,15 +100,15 @@ def bench(
     from brainbench.cli.tactile import scenes
     from brainbench.core.reading.ranges import check_number
 
-    for name, number in (("--envs", envs), ("--repeats", repeats)):
-        check_number(name, number, least=1)
+    check_number("--repeats", repeats, least=1)
+    envs, device = batch["num_envs"], batch["device"]
     grip = scenes.Grip(hand, envs=envs, device=device)
     grip.run(60)
     results = [
-        scenes.time_class(grip, name, resolution, placement, noisy=noisy, repeats=repeats)
+        scenes.time_class(grip, name, **options, repeats=repeats)
         for name in tracked(list(scenes.CLASSES), "timing sensors")
     ]
-    noise = ", published noise" if noisy else ""
+    noise = ", published noise" if options["noisy"] else ""
     columns = {
         "sensor": "{0[sensor]}",
         ">probes": "{0[probes]}",
@@ -117,13 +117,14 @@ def bench(
         ">readings/s": lambda row: f"{envs / row['seconds']:,.0f}",
         ">bytes/environment": "{0[state_bytes]:,}",
     }
-    text = table_of(f"{hand}, {resolution} {placement}, {envs} environments on {device}{noise}", results, columns)
+    layout = f"{options['resolution']} {options['placement']}"
+    text = table_of(f"{hand}, {layout}, {envs} environments on {device}{noise}", results, columns)
     return Output({"results": results, "envs": envs, "device": device}, text)
 
 
 def check(
     folder: Annotated[Path | None, typer.Argument(help="Folder of hand files (URDF, MJCF), or one; searched.")] = None,
-    device: Annotated[str, typer.Option(help="cpu or cuda.")] = "cpu",
+    device: DeviceOption = "cpu",
     out: Annotated[Path, out_folder_option("Folder for the pictures of hands.")] = Path("tactile-check"),
 ) -> Output:
     """Compare sensors with closed forms, or the hands of a folder with the engine; exit status 1 if one is off.

@@ -58,11 +58,11 @@ class EncoderConfig:
     units: _Width = _HIDDEN
     """Units of the LSTM of the arm ``rnn``."""
     time: Time = "native"
-    """Clock of a network (:mod:`~robotics_bridge.policies.encoders.front_end`)."""
+    """Clock of a network: ``native``, or ``resampled`` to its own 9 ms."""
     learning: Learning = "frozen"
     """Learning of a network: ``frozen`` or ``finetuned``."""
     seed: Seed = 0
-    """Seed of an untrained network or of a reservoir."""
+    """Seed of an untrained network or of a reservoir; by default that of the student."""
     pretrained: str | None = None
     """Weights of a network with a tag."""
     options: Mapping[str, Any] = field(default_factory=dict)

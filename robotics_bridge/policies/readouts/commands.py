@@ -10,24 +10,26 @@ import typer
 from brainbench.cli.destinations import out_file, out_file_option
 from brainbench.cli.options import with_options
 from brainbench.cli.output import Output, progress_bar, table_of
-from brainbench.cli.policy.options import DeviceOption, EnvsOption, World, agent_of, in_world, touch_of
+from brainbench.cli.policy.options import ENV, ENVS_FLAG, World, agent_of, in_world, touch_of
 
 
 @with_options(
     "robotics_bridge.policies.readouts.probe:ProbeOptions",
     ("seconds", "reservoirs", "untrained", "place", "draws", "seed"),
 )
+@with_options(
+    ENV, ("num_envs", "device"), parameter="simulation", flags=ENVS_FLAG, defaults={"num_envs": 48}, build=False
+)
 @in_world
 def probe(
     world: World,
     options: Any,
+    simulation: dict[str, Any],
     agent: Annotated[str, typer.Option(help="Policy that acts: a shipped teacher, or a run's folder.")],
     arm: Annotated[list[str] | None, typer.Option(help="Only this arm; once for each.")] = None,
     network: Annotated[
         list[str] | None, typer.Option(help="One more network: a model, local-dir:FOLDER, …; once for each.")
     ] = None,
-    envs: EnvsOption = 48,
-    device: DeviceOption = "cpu",
     layout: Annotated[
         Path | None, typer.Option(callback=out_file, help="Write the taxels that --place chose here, as a probe file.")
     ] = None,
@@ -53,9 +55,9 @@ def probe(
     world.check([agent])
     touch = touch_of([agent])  # A student acts on what it feels; one that feels nothing is asked what it could feel.
     touch = touch if touch.get("observe", "none") != "none" else {"observe": "force_torque"}
-    env = world.make([agent], num_envs=envs, device=device, seed=options.seed, **touch)
+    env = world.make([agent], seed=options.seed, **simulation, **touch)
     result: dict[str, Any] = {"task": world.task, "config": world.config, "change": world.change or [], "agent": agent}
-    result |= {"contacts": contacts_name(env.task.contacts), "environments": envs, "seconds": options.seconds}
+    result |= {"contacts": contacts_name(env.task.contacts), "environments": env.num_envs, "seconds": options.seconds}
     result["noisy"] = env.options.noisy
     with progress_bar() as progress:
         policy = agent_of(agent, env)

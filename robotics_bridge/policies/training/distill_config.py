@@ -60,7 +60,8 @@ class DistillConfig:
     contacts: Literal["firm", "published"] | None = None
     """Contact model, ``firm`` or ``published``; by default that in which the teacher was trained."""
     encoder: str = AUTO
-    """Tactile encoder: an arm of :data:`~robotics_bridge.policies.encoders.arms.ARMS`, or a network's name."""
+    """Tactile encoder: ``mlp``, ``rnn``, ``tactile_cnn``, ``tactile_convrnn``, … (an arm of
+    :data:`~robotics_bridge.policies.encoders.arms.ARMS`), or a network's name; ``auto`` as published."""
     encoder_settings: Mapping[str, Any] = field(default_factory=dict)
     """Further fields of :class:`~robotics_bridge.policies.encoders.arms.EncoderConfig`: time, learning, seed, …"""
     embedder: Literal["none", "mlp", "lstm"] = "mlp"
