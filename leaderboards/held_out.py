@@ -15,11 +15,10 @@ from typing import Any, Literal
 import msgspec
 
 from brainbench.core.errors import DataError
-from brainbench.core.files import file_hash, read_json
+from brainbench.core.files import file_hash, read_json, write_private
 from brainbench.core.limits import Count
 from brainbench.core.reading.texts import read_text
 from brainbench.core.reading.values import typed_values
-from brainbench.core.writing.private import write_private
 
 DATA, SALT = "held-out.h5", "salt.txt"
 """Files of the secret folder."""

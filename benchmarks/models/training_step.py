@@ -30,11 +30,10 @@ import torch
 from benchmarks.report import publish, script_parser, table
 from brainbench.core.devices import record_step
 from brainbench.models.activations import evaluating
-from brainbench.models.export import export_model, read_onnx
+from brainbench.models.export import StreamingStep, export_model, read_onnx
 from brainbench.models.ops import dispatch
 from brainbench.models.ops.layers import packed
 from brainbench.models.registry import describe_model, load_model
-from brainbench.models.streaming import StreamingStep
 from brainbench.models.training.optimizers import compiled, fuse
 
 STEPS = 22

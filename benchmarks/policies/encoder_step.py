@@ -18,7 +18,7 @@ import torch
 
 from benchmarks.report import publish, script_parser, table
 from brainbench import load_model
-from brainbench.models.streaming import StreamingStep
+from brainbench.models.export import StreamingStep
 
 MODELS = ("zhuang-small", "zhuang-intersection-ln-small", "zhuang-intersection-ln")
 GOALS = {"zhuang-intersection-ln-small": 3.0, "zhuang-intersection-ln": 40.0}

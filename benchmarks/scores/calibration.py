@@ -25,7 +25,7 @@ from benchmarks.report import publish, script_parser, table
 from benchmarks.scores import simulated_boards
 from benchmarks.scores.simulated_boards import BIN, BOARDS, RULES, NoisyStudy, Study
 from brainbench.core.contracts import Trials
-from brainbench.core.figures.style import COLORS, INK, PALE, panels, save_figure
+from brainbench.core.figures import COLORS, INK, PALE, panels, save_figure
 from brainbench.core.files import write_text
 from brainbench.core.runs.jobs import run_jobs
 from brainbench.metrics import compare, get_metric, noise_ceiling, rdm

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.report import table
-from brainbench.core.figures.style import COLORS, PALE, panels, save_figure
+from brainbench.core.figures import COLORS, PALE, panels, save_figure
 
 Rows = Sequence[dict[str, Any]]
 AXES = ("taxels", "environments", "triangles (raycast)", "triangles (sdf)", "points (proximity)", "points (elastomer)")

@@ -21,7 +21,7 @@ from benchmarks.report import publish, script_parser, table
 from brainbench.stimuli import Fidelity, Frames, Scene, simulate
 from brainbench.stimuli.objects.collections import resolve_objects
 from brainbench.stimuli.sweeps.sweep_scenes import GRIDS, SweepScenes
-from tests.factories.friction_reference import differences
+from tests.stimuli.engines.rod.test_friction import differences
 
 SHAPES = "ellipsoid-1,brick-2,torus-3,cone-1,bumpy-1,cylinder-1,superquadric-1,pyramid-1,vase-1,wedge-1"
 ACCURATE = Fidelity.preset("accurate")

@@ -25,7 +25,7 @@ from brainbench.stimuli.validation import bench_tests, references
 from brainbench.stimuli.validation.bench_tests import ringdown
 from brainbench.stimuli.whiskers.array import WhiskerArray
 from brainbench.stimuli.whiskers.whisker import Whisker
-from tests.factories.shaken_base import shaken_base
+from tests.stimuli.validation.test_shaken_base import shaken_base
 
 PARTS = ("plane", "out-of-plane", "fast-bases")
 ARCS = (0.3, 0.5, 0.7, 0.8)

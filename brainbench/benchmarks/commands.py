@@ -8,8 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from brainbench.benchmarks.opening import OPTIONS
-from brainbench.cli.destinations import out_file_option
-from brainbench.cli.options import SCORE, SCORE_FLAGS, with_options
+from brainbench.cli.options import SCORE, SCORE_FLAGS, out_file_option, with_options
 from brainbench.cli.output import Output, facts, progress_bar, table_of
 from brainbench.cli.requirements import needs
 

@@ -8,10 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from brainbench.cli.destinations import beside, out_folder_option
-from brainbench.cli.options import SCORE, option, with_options
+from brainbench.cli.options import SCORE, beside, option, out_folder_option, with_options
 from brainbench.cli.output import Output, progress_bar, table, table_of
-from brainbench.cli.score_text import left_out
+from brainbench.cli.score import left_out
 
 if TYPE_CHECKING:
     import numpy as np

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from brainbench.cli.destinations import out_folder_option
-from brainbench.cli.options import part_of, with_options
+from brainbench.cli.options import out_folder_option, part_of, with_options
 from brainbench.cli.output import Output, progress_bar, table_of
 from brainbench.core.errors import DataError, UsageError
 from brainbench.core.files import read_mapping

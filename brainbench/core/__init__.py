@@ -1,7 +1,7 @@
 """Foundations of every package, lowest first; nothing here imports another package of ours.
 
 :mod:`~brainbench.core.errors` · :mod:`~brainbench.core.files` (atomic writes, hashes, cache) ·
-:mod:`~brainbench.core.limits` and :mod:`~brainbench.core.overrides` (options) · :mod:`~brainbench.core.plugins`
+:mod:`~brainbench.core.limits` and :mod:`~brainbench.core.limits` (options) · :mod:`~brainbench.core.plugins`
 (objects of users, optional folders) · :mod:`~brainbench.core.contracts` (what packages exchange),
 :mod:`~brainbench.core.records` (scores), :mod:`~brainbench.core.identity` (what makes two of them the same) ·
 :mod:`~brainbench.core.statistics`, :mod:`~brainbench.core.rotations`, :mod:`~brainbench.core.tradeoffs` ·

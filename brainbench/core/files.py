@@ -1,4 +1,8 @@
-"""Files on disk: atomic writes, the cache folder, content hashes and provenance."""
+"""Files on disk: whole or not at all, locked folders, the cache, private files, content hashes and provenance.
+
+A temporary file is ``.STEM-TOKEN.SUFFIX``; the token's 16 hexadecimal digits say who writes it, so that what killed
+processes left is swept: 4 of the machine, 6 of the process and 6 at random.
+"""
 
 from __future__ import annotations
 
@@ -6,20 +10,122 @@ import contextlib
 import errno
 import functools
 import hashlib
+import io
 import json
+import logging
 import math
 import os
+import platform
+import re
+import secrets
+import shutil
 from collections.abc import Iterator, Mapping
 from dataclasses import Field, fields, is_dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from brainbench.core.errors import FileWriteError, UsageError, brief
+from brainbench.core.errors import DataError, FileWriteError, UsageError, brief
 from brainbench.core.reading.texts import read_json, read_mapping  # noqa: F401 - also imported from here
-from brainbench.core.writing.temporaries import temporary_path
 
 if TYPE_CHECKING:
+    import h5py
+    import torch
     from numpy.typing import ArrayLike, NDArray
+
+_TEMPORARY = re.compile(r"\..+-(?P<machine>[0-9a-f]{4})(?P<process>[0-9a-f]{6})[0-9a-f]{6}(\.[^.]*)?")
+
+
+def temporary_path(target: Path) -> Path:
+    """Return a new name beside ``target``, with its suffix; what dead processes left in the folder is removed."""
+    _sweep_once(target.parent, os.getpid())
+    token = f"{_machine()}{os.getpid() % 0x1000000:06x}{secrets.token_hex(3)}"
+    return target.with_name(f".{target.stem[:200]}-{token}{target.suffix}")
+
+
+def is_temporary(name: str) -> bool:
+    """Return whether a file of this name is one that is being written, or was when its process was killed."""
+    return _TEMPORARY.fullmatch(name) is not None
+
+
+@lru_cache(maxsize=1024)
+def _sweep_once(folder: Path, process: int) -> None:
+    # To list a folder of thousands of records for each of them would take minutes.
+    del process
+    sweep(folder)
+
+
+def sweep(folder: Path) -> None:
+    """Remove from a folder what processes of this machine left that run no more."""
+    if os.name != "posix":
+        return
+    with contextlib.suppress(OSError):
+        for entry in os.scandir(folder):
+            match = _TEMPORARY.fullmatch(entry.name)
+            if match is None or match["machine"] != _machine() or _runs(int(match["process"], 16)):
+                continue
+            if entry.is_dir(follow_symlinks=False):
+                shutil.rmtree(entry.path, ignore_errors=True)
+            else:
+                with contextlib.suppress(OSError):
+                    Path(entry.path).unlink()
+
+
+@lru_cache(maxsize=1)
+def _machine() -> str:
+    """Return four digits of this machine; a container has process numbers of its own and counts as another one."""
+    space = ""
+    with contextlib.suppress(OSError):
+        space = str(Path("/proc/self/ns/pid").readlink())
+    return hashlib.sha256(f"{platform.node()} {space}".encode()).hexdigest()[:4]
+
+
+def _runs(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except OSError:
+        return True
+    return True
+
+
+try:
+    import fcntl
+except ImportError:  # no such locks on this system
+    fcntl = None
+
+_LOG = logging.getLogger(__name__)
+
+
+@contextlib.contextmanager
+def lock_folder(folder: Path, *, wait: bool = True) -> Iterator[bool]:
+    """Hold a lock on a folder, which the system releases when this process ends in whatever way.
+
+    Args:
+        folder: made if it is missing.
+        wait: for another process that holds it, rather than refuse.
+
+    Yields:
+        False where there are no such locks (Windows; some network file systems, which are warned of).
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    if fcntl is None:
+        yield False
+        return
+    handle, held = os.open(folder, os.O_RDONLY), False
+    try:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+            held = True
+        except BlockingIOError as error:
+            raise UsageError(f"Another process is writing {brief(str(folder))}; wait for it, or end it.") from error
+        except OSError as error:
+            _LOG.warning("%s cannot be locked (%s); start no second run there", folder, error)
+        yield held
+    finally:
+        os.close(handle)
+
 
 CACHE_VARIABLE = "BRAINBENCH_CACHE"
 """Environment variable that overrides the platform's cache folder."""
@@ -301,3 +407,100 @@ def provenance(**extra: Any) -> dict[str, Any]:
         "time": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         **extra,
     }
+
+
+def private_folder(path: Path) -> Path:
+    """Return a folder that only its user can enter, made if it is missing."""
+    path.mkdir(parents=True, exist_ok=True, mode=0o700)
+    path.chmod(0o700)
+    return path
+
+
+def write_private(path: Path, content: bytes, *, replace: bool = True) -> None:
+    """Write a file that only its user can read, as a whole, into a folder that only its user can enter.
+
+    Without ``replace`` a file that is there stays, also one that another process writes at the same time.
+    """
+    private_folder(path.parent)
+    temporary = temporary_path(path)
+    try:
+        with os.fdopen(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600), "wb") as stream:
+            stream.write(content)
+            stream.flush()
+            os.fsync(stream.fileno())
+        if replace:
+            temporary.replace(path)
+        elif not os.path.lexists(path):
+            _link(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _link(temporary: Path, path: Path) -> None:
+    try:
+        os.link(temporary, path)
+    except FileExistsError:
+        return
+    except OSError:  # a file system without hard links
+        temporary.replace(path)
+
+
+class _Disk(io.FileIO):
+    """A file that notes why it cannot be written and says nothing: the library prints and crashes over a full disk."""
+
+    fault: OSError | None = None
+
+    def write(self, data: Any) -> int:
+        rest = memoryview(data).cast("B")
+        size = len(rest)
+        try:
+            while len(rest) and self.fault is None:
+                rest = rest[super().write(rest) :]
+        except OSError as error:
+            self.fault = error
+        return size
+
+    def truncate(self, size: int | None = None) -> int:
+        try:
+            return super().truncate(size)
+        except OSError as error:
+            self.fault = self.fault or error
+            return size or 0
+
+
+@contextlib.contextmanager
+def create_hdf5(path: str | os.PathLike[str], **options: Any) -> Iterator[h5py.File]:
+    """Yield a new HDF5 file that replaces ``path`` when the block ends; ``options`` are those of ``h5py.File``.
+
+    Raises:
+        FileWriteError: the folder cannot be written, or the disk is full.
+    """
+    import h5py
+
+    with atomic_path(path) as temporary, _Disk(temporary, "r+") as disk:
+        try:
+            with h5py.File(disk, "w", **options) as file:
+                yield file
+        except ValueError as error:
+            if "embedded NULL" not in str(error):
+                raise
+            name = brief(os.fspath(path))
+            raise DataError(f"{name} cannot hold a text with the character NUL; take it out of the names.") from error
+        finally:
+            if disk.fault is not None:
+                raise disk.fault
+
+
+def write_tensors(path: str | os.PathLike[str], tensors: Mapping[str, torch.Tensor], **metadata: str) -> None:
+    """Write tensors of any device to one safetensors file, replaced as a whole.
+
+    Raises:
+        FileWriteError: the folder cannot be made or written, or the disk is full.
+    """
+    from safetensors.torch import save
+
+    stored = {name: value.detach().cpu().contiguous().clone() for name, value in tensors.items()}
+    # Not by save_file: it writes to a temporary file of its own, which stays where it is killed, and no one else may
+    # read what it makes.
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(save(stored, metadata=metadata or None))

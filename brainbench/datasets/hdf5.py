@@ -49,9 +49,8 @@ import numpy as np
 
 from brainbench.core.contracts import check_counts
 from brainbench.core.errors import DataError, UsageError, brief, listing
-from brainbench.core.files import to_json
+from brainbench.core.files import create_hdf5, to_json
 from brainbench.core.reading.texts import parse_json
-from brainbench.core.writing.hdf5 import create_hdf5
 from brainbench.datasets.sessions import SPIKES, LostColumn, Series, Session, SessionTable, decode, text
 
 if TYPE_CHECKING:

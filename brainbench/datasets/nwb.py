@@ -20,7 +20,7 @@ import numpy as np
 
 from brainbench.core.contracts import as_labels
 from brainbench.core.errors import DataError
-from brainbench.core.writing.hdf5 import create_hdf5
+from brainbench.core.files import create_hdf5
 from brainbench.datasets.hdf5 import columns_of, dead_link, write_array
 from brainbench.datasets.sessions import SPIKES, Series, Session, SessionTable, decode, neurodata_type, text
 from brainbench.datasets.trials.counting import LICKS, OTHER_NAMES

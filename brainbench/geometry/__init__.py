@@ -6,9 +6,20 @@ A mesh is loaded (``mesh``), repaired (``mesh_repair``), and cut into convex ``p
 
 from __future__ import annotations
 
-from brainbench.geometry.distance import Deviation, deviation, hausdorff, winding_number
-from brainbench.geometry.mesh import UNITS, Diagnosis, Mesh, convex_hull, load_mesh, save_mesh
-from brainbench.geometry.mesh_repair import Repair, repair
+from brainbench.geometry.mesh import (
+    UNITS,
+    Deviation,
+    Diagnosis,
+    Mesh,
+    Repair,
+    convex_hull,
+    deviation,
+    hausdorff,
+    load_mesh,
+    repair,
+    save_mesh,
+    winding_number,
+)
 from brainbench.geometry.pieces import Decomposition, DecompositionSettings, decompose
 
 __all__ = [

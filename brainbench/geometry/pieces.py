@@ -8,8 +8,7 @@ from typing import Annotated, Any, Literal
 from brainbench.core.errors import UsageError
 from brainbench.core.limits import Count, Limit, Positive, Seed, limited
 from brainbench.core.plugins import require_optional
-from brainbench.geometry.distance import Deviation
-from brainbench.geometry.mesh import Mesh
+from brainbench.geometry.mesh import Deviation, Mesh
 
 
 @dataclass(frozen=True)

@@ -130,7 +130,7 @@ def extract(
     import torch
 
     from brainbench.models import proof
-    from brainbench.models.ops.parameters import check_weights
+    from brainbench.models.ops.layers import check_weights
 
     given = getattr(stimuli, "input", stimuli)
     values: Any = given if isinstance(given, torch.Tensor) else np.asanyarray(given)

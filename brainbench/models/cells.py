@@ -23,8 +23,7 @@ from brainbench.core.errors import UsageError
 from brainbench.core.reading.ranges import check_number
 from brainbench.models.ops import dispatch
 from brainbench.models.ops.dispatch import DeferredNormGrad
-from brainbench.models.ops.layers import ChannelNorm, Conv2d
-from brainbench.models.ops.parameters import load_named
+from brainbench.models.ops.layers import ChannelNorm, Conv2d, load_named
 
 __all__ = ["GRU", "LSTM", "UGRNN", "IntersectionRNN", "TimeDecay"]
 

@@ -35,7 +35,7 @@ def write_features(path: str | Path, labels: Sequence[str], activations: Mapping
     """Write activations ([K, F] or [K, T, F] per layer) in the layout above, atomically."""
     import h5py
 
-    from brainbench.core.writing.hdf5 import create_hdf5
+    from brainbench.core.files import create_hdf5
 
     for layer, values in activations.items():
         _check_shape(layer, np.shape(values), len(labels), str(path))

@@ -18,8 +18,7 @@ from brainbench.core.errors import UsageError, check_each, check_name
 from brainbench.core.reading.ranges import check_number
 from brainbench.models.graph.spec import UNROLLS, Unroll
 from brainbench.models.graph.temporal_graph import TemporalGraph
-from brainbench.models.heads import AllStepsDecoder, make_decoder
-from brainbench.models.parts import Attender, Encoder
+from brainbench.models.parts import AllStepsDecoder, Attender, Encoder, make_decoder
 
 FORCE_SCALE = 1e-4
 """N that become 1: the order of a whisker's base force in contact."""

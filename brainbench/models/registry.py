@@ -141,7 +141,7 @@ class LocatedModel:
 
     def build(self, seed: int = 0, **options: Any) -> nn.Module:
         """Build the model with its weights, in evaluation mode; untrained weights follow from the seed alone."""
-        from brainbench.models.ops.parameters import seeded
+        from brainbench.models.ops.layers import seeded
 
         if self.weights is None and self.architecture.tag is not None:
             raise UsageError(
@@ -163,7 +163,7 @@ class LocatedModel:
         """Build the model without allocating its weights, to count them."""
         import torch
 
-        from brainbench.models.ops.parameters import seeded
+        from brainbench.models.ops.layers import seeded
 
         with seeded(0):
             try:

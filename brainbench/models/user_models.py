@@ -68,7 +68,7 @@ def load_user_model(target: str, *, seed: int = 0) -> nn.Module:
     ``name`` is a class or function without required arguments, or a ready module. The file's own folder
     can be imported from while it loads. Random weights follow from the seed (CPU generator).
     """
-    from brainbench.models.ops.parameters import seeded
+    from brainbench.models.ops.layers import seeded
 
     with seeded(seed):
         return build_user_model(target).eval()

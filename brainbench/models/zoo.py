@@ -75,9 +75,9 @@ def build(
 
     ``unroll`` is for a Zhuang encoder.
     """
-    from brainbench.models.heads import make_decoder
     from brainbench.models.network import EncoderAttenderDecoder
     from brainbench.models.ops.layers import draw_silent_biases
+    from brainbench.models.parts import make_decoder
 
     encoder = _encoder(architecture)
     attender = _attender(architecture, encoder.features)

@@ -25,10 +25,10 @@ from brainbench.models.architecture import Architecture
 from brainbench.models.encoders import S4Encoder
 from brainbench.models.graph.temporal_graph import TemporalGraph
 from brainbench.models.graph.tnn_import import read_graph
-from brainbench.models.heads import CLASSES, AllStepsDecoder
 from brainbench.models.network import PUBLISHED_FORCE_SCALE, EncoderAttenderDecoder, Normaliser
-from brainbench.models.ops.parameters import check_named, copy_named
+from brainbench.models.ops.layers import check_named, copy_named
 from brainbench.models.ops.state_space import StateSpace
+from brainbench.models.parts import CLASSES, AllStepsDecoder
 from brainbench.models.registry import load_model
 from brainbench.models.training.checkpoints import CONFIG, WEIGHTS, save_checkpoint
 
@@ -131,7 +131,7 @@ class Recognised:
 
     architecture: str
     decoder: str | None
-    """Name of :data:`brainbench.models.heads.DECODERS`; None in a file without one."""
+    """Name of :data:`brainbench.models.parts.DECODERS`; None in a file without one."""
     classes: int
     objective: str | None
     """Objective of its training; None where the file does not tell."""

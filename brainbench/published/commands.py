@@ -11,11 +11,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from brainbench.cli.destinations import beside, out_folder_option
-from brainbench.cli.options import refuse
+from brainbench.cli.options import beside, out_folder_option, refuse
 from brainbench.cli.output import Output, facts, progress_bar
 from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, listing
-from brainbench.core.writing.temporaries import temporary_path
+from brainbench.core.files import temporary_path
 
 if TYPE_CHECKING:
     import xarray as xr

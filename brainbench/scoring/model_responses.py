@@ -194,7 +194,7 @@ def resolve_model(model: Any, *, seed: int = 0) -> ResolvedModel:
         return ResolvedModel(card, None, features.activations, features.labels, {"features": path.name})
     import torch
 
-    from brainbench.models.ops.parameters import check_weights, weights_hash
+    from brainbench.models.ops.layers import check_weights, weights_hash
     from brainbench.models.proof import unwrapped
     from brainbench.models.registry import locate_model
     from brainbench.models.training.checkpoints import CONFIG, PREFIXES

@@ -13,10 +13,9 @@ from numpy.typing import NDArray
 
 from brainbench.core.contracts import CHANNELS, GRID_SHAPE, check_stimulus_set
 from brainbench.core.errors import DataError, UsageError, check_name, listing
-from brainbench.core.files import content_hash, to_json
+from brainbench.core.files import content_hash, create_hdf5, to_json
 from brainbench.core.reading.hdf5 import open_hdf5
 from brainbench.core.version import __version__
-from brainbench.core.writing.hdf5 import create_hdf5
 from brainbench.stimuli.scenes.frames import Axes
 from brainbench.stimuli.whiskers.array import ROWS
 

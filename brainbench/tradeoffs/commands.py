@@ -10,8 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
-from brainbench.cli.destinations import out_file, out_file_option, picture_file
-from brainbench.cli.options import items, numbers, with_options
+from brainbench.cli.options import items, numbers, out_file, out_file_option, picture_file, with_options
 from brainbench.cli.output import Output, progress_bar, table_of
 from brainbench.cli.requirements import PICTURES_IF_PLOT, needs
 from brainbench.stimuli.engines.fidelity import DEFAULT_ENGINE

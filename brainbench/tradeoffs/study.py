@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from brainbench.core.errors import DataError
-from brainbench.core.figures.style import COLORS, panels, plain_log_ticks, save_figure
+from brainbench.core.figures import COLORS, panels, plain_log_ticks, save_figure
 from brainbench.core.files import read_json, write_json, write_text
 from brainbench.core.progress import Progress, track
 from brainbench.core.tradeoffs import TradeoffPoint, pareto_front

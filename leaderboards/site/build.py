@@ -23,11 +23,20 @@ from pathlib import Path
 from typing import BinaryIO
 
 from brainbench.core.errors import BrainbenchError, DataError, UsageError
-from brainbench.core.files import atomic_path, file_hash, read_json, sync_file, to_json, writable, write_json
+from brainbench.core.files import (
+    atomic_path,
+    file_hash,
+    is_temporary,
+    lock_folder,
+    read_json,
+    sweep,
+    sync_file,
+    to_json,
+    writable,
+    write_json,
+)
 from brainbench.core.reading.values import typed_values
 from brainbench.core.records import ResultRecord
-from brainbench.core.writing.locks import lock_folder
-from brainbench.core.writing.temporaries import is_temporary, sweep
 from leaderboards import text as words
 from leaderboards.audit import remarks
 from leaderboards.boards import Board, conclusions, rank

@@ -13,7 +13,7 @@ import torch
 
 from brainbench.core.devices import warp
 from brainbench.core.rotations import conjugate, from_xyzw, rotate
-from robotics_bridge.envs.kernels.contact_forces import add_contact_forces
+from robotics_bridge.envs.kernels.actuation import add_contact_forces
 from robotics_bridge.envs.simulation import EnvOptions, Simulation
 from robotics_bridge.hands import Hand
 from robotics_bridge.hands.observations import (

@@ -15,12 +15,12 @@ from brainbench.core.devices import CudaGraphStep, warp_recorder
 from brainbench.core.errors import UsageError, check_kind
 from brainbench.core.reading.ranges import check_number
 from robotics_bridge import hands
-from robotics_bridge.envs.reset import EpisodeReset
 from robotics_bridge.envs.simulation import EnvOptions
 from robotics_bridge.envs.state import EnvState
 from robotics_bridge.envs.step import (
     STATISTICS,
     ActionMap,
+    EpisodeReset,
     StepResult,
     apply_action,
     compute_step,

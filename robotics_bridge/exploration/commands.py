@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from brainbench.cli.destinations import out_file_option
-from brainbench.cli.options import with_options
+from brainbench.cli.options import out_file_option, with_options
 from brainbench.cli.output import Output, progress_bar, table_of
 from brainbench.cli.policy.options import ENV, HandOption
 from brainbench.cli.requirements import needs

@@ -143,7 +143,7 @@ def press(hand: Hand, layout: Layout) -> dict[str, tuple[np.ndarray, np.ndarray,
 
 def draw(hand: Hand, layout: Layout, path: Path) -> None:
     """Draw the taxels of a hand at rest over the corners of its links, from the side of the palm and from beside."""
-    from brainbench.core.figures.style import panels, save_figure
+    from brainbench.core.figures import panels, save_figure
     from robotics_bridge.hands.surface import link_points
 
     model, data = hand.model, mujoco.MjData(hand.model)

@@ -8,7 +8,7 @@ from importlib import import_module
 from typing import Any
 
 from brainbench.core.errors import DataError, UsageError, check_name, unknown_name
-from brainbench.core.overrides import kind_of, read_pairs, read_value, with_changes
+from brainbench.core.limits import kind_of, read_pairs, read_value, with_changes
 from brainbench.core.plugins import foreign_code
 from robotics_bridge.tasks.settings import CONTACTS
 from robotics_bridge.tasks.task import ACTION_LIMIT, Ending, Reward, Task

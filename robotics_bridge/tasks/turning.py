@@ -3,7 +3,7 @@
 in_palm_rotate: thumb and middle finger roll a block on the open palm, quarter turn by quarter turn. in_hand_repose: the
 whole hand turns a block to orientations given one after the other, each with a deadline. screwdriver: fingers spin an
 upright screwdriver about its axis, its tip on the table; episodes start from sampled grasps
-(:mod:`robotics_bridge.envs.reset`).
+(:mod:`robotics_bridge.envs.step`).
 
 Values of ``published`` are those of the thesis (tables 4.4, 4.5, 4.7–4.9) and, where it is silent, of the settings
 released with it (neuroagents-lab/tactile-genesis).

@@ -1,3 +1,5 @@
+from __future__ import annotations
+
 import json
 
 import torch
@@ -5,6 +7,15 @@ import torch
 from brainbench.models import registry
 from brainbench.models.registry import load_model
 from tests.factories.published_files import lightning_state
+
+
+def test_a_card_says_what_the_weights_are(run):
+    def shown(name):
+        return " ".join(run("models", "show", name).out.split())
+
+    assert "weights trained: simclr" in shown("zhuang-small.simclr")
+    assert "weights untrained" in shown("zhuang-small")
+    assert "brainbench train zhuang-gru --objective simclr" in shown("zhuang-gru.simclr")
 
 
 def test_models_are_listed_with_size_cost_and_published_objectives(run):

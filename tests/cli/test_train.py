@@ -8,7 +8,7 @@ import pytest
 
 from brainbench.datasets.whisking.dataset import Shard, WhiskingDataset
 from brainbench.models.training import config, trainer
-from brainbench.models.training.augmentation import Augmentation
+from brainbench.models.training.batches import Augmentation
 from brainbench.stimuli.sweeps.generation import generate
 from tests.factories.sweep_batches import small_plan
 

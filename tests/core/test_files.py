@@ -1,17 +1,87 @@
+from __future__ import annotations
+
 import hashlib
 import json
 import math
 import multiprocessing
+import os
+import resource
+import signal
+import stat
+import subprocess
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
+import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from safetensors import safe_open
 
 from brainbench.core import files
-from brainbench.core.errors import DataError, DataFileNotFoundError
+from brainbench.core.errors import DataError, DataFileNotFoundError, FileWriteError
+from brainbench.core.files import (
+    create_hdf5,
+    lock_folder,
+    private_folder,
+    temporary_path,
+    write_private,
+    write_tensors,
+    write_text,
+)
+from brainbench.core.reading.tensors import read_tensors
+
+KILLED = """
+import os, signal, sys
+from pathlib import Path
+from brainbench.core.files import temporary_path
+left = temporary_path(Path(sys.argv[1]) / "x.json")
+left.write_text("{ half")
+folder = temporary_path(Path(sys.argv[1]) / "run")
+(folder / "inner").mkdir(parents=True)
+os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def test_what_a_killed_process_left_goes_with_the_next_file_written_there(tmp_path: Path):
+    (tmp_path / ".notes-0123456789abcdef.txt").write_text("somebody's own")
+    mine = temporary_path(tmp_path / "mine.json")
+    mine.write_text("being written")
+    subprocess.run([sys.executable, "-c", KILLED, tmp_path], check=False)
+    assert len(list(tmp_path.iterdir())) == 4
+    subprocess.run(
+        [
+            sys.executable,
+            "-c",
+            f"from brainbench.core.files import write_text; write_text({str(tmp_path / 'y')!r}, 'y')",
+        ],
+        check=True,
+    )
+    assert {path.name for path in tmp_path.iterdir()} == {".notes-0123456789abcdef.txt", mine.name, "y"}
+
+
+def test_a_long_name_leaves_room_for_the_token(tmp_path: Path):
+    write_text(tmp_path / ("n" * 240 + ".json"), "x")
+    assert [path.name for path in tmp_path.iterdir()] == ["n" * 240 + ".json"]
+
+
+def test_a_locked_folder_is_refused_or_waited_for(tmp_path):
+    code = (
+        "import pathlib, sys; from brainbench.core.files import lock_folder\n"
+        "with lock_folder(pathlib.Path(sys.argv[1]), wait=sys.argv[2] == 'wait') as held: print(held)"
+    )
+    words = [sys.executable, "-c", code, str(tmp_path)]
+    with lock_folder(tmp_path) as held:
+        assert held
+        refused = subprocess.run([*words, "refuse"], capture_output=True, text=True, check=False)
+        assert (refused.returncode, tmp_path.name in refused.stderr) == (1, True)
+        waiting = subprocess.Popen([*words, "wait"], stdout=subprocess.PIPE, text=True)
+        with pytest.raises(subprocess.TimeoutExpired):
+            waiting.wait(2)
+    assert waiting.communicate(timeout=30)[0] == "True\n"
 
 
 @dataclass(frozen=True)
@@ -154,3 +224,111 @@ def test_all_files_or_none(tmp_path):
     assert not (tmp_path / "a.txt").exists()
     paths = files.write_together({tmp_path / "a.txt": "new", tmp_path / "c.txt": b"too"})
     assert [path.name for path in paths] == ["a.txt", "c.txt"]
+
+
+def _mode(path) -> str:
+    return oct(stat.S_IMODE(path.stat().st_mode))
+
+
+@pytest.mark.parametrize("mask", [0o000, 0o022, 0o077])
+def test_whatever_the_umask_nobody_else_can_read(tmp_path, mask):
+    before = os.umask(mask)
+    try:
+        write_private(tmp_path / "deep" / "key", b"secret")
+    finally:
+        os.umask(before)
+    assert (_mode(tmp_path / "deep"), _mode(tmp_path / "deep" / "key")) == ("0o700", "0o600")
+    assert (tmp_path / "deep" / "key").read_bytes() == b"secret"
+
+
+def test_a_folder_that_others_can_enter_is_closed(tmp_path):
+    (tmp_path / "open").mkdir(mode=0o755)
+    assert _mode(private_folder(tmp_path / "open")) == "0o700"
+
+
+def test_a_file_is_replaced_only_where_that_is_wanted(tmp_path):
+    path = tmp_path / "key"
+    write_private(path, b"first")
+    write_private(path, b"second", replace=False)
+    assert path.read_bytes() == b"first"
+    write_private(path, b"third")
+    assert path.read_bytes() == b"third"
+    assert [file.name for file in tmp_path.iterdir()] == ["key"]
+
+
+def test_a_file_system_without_links_serves_too(tmp_path, monkeypatch):
+    def refuse(*_):
+        raise PermissionError
+
+    monkeypatch.setattr(os, "link", refuse)
+    write_private(tmp_path / "key", b"first", replace=False)
+    assert (tmp_path / "key").read_bytes() == b"first"
+
+
+@pytest.fixture
+def little_room():
+    """Let files of this process take 100 kB at most, as on a full disk."""
+    handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, limits[1]))
+    yield
+    resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    signal.signal(signal.SIGXFSZ, handler)
+
+
+def test_a_file_is_there_as_a_whole(tmp_path):
+    with create_hdf5(tmp_path / "a.h5", track_order=True) as file:
+        file["b"], file["a"] = np.arange(3), np.arange(200_000.0)
+        assert not (tmp_path / "a.h5").exists()
+    with h5py.File(tmp_path / "a.h5") as file:
+        assert [*file] == ["b", "a"]
+        assert file["a"][-1] == 199_999
+
+
+def _write(path, count):
+    values = np.random.default_rng(0).normal(size=20_000 // count + 400)
+    with create_hdf5(path) as file:
+        for number in range(count):
+            file.create_dataset(str(number), data=values, chunks=True)
+
+
+@pytest.mark.parametrize("count", [1, 3, 10, 100, 1000])
+def test_a_full_disk_is_told_in_our_words_alone(tmp_path, little_room, capfd, count):
+    with pytest.raises(FileWriteError, match=r"a\.h5"):
+        _write(tmp_path / "a.h5", count)
+    assert capfd.readouterr() == ("", "")
+    assert [*tmp_path.iterdir()] == []
+
+
+def test_nul_in_a_text_is_refused_in_words(tmp_path):
+    with pytest.raises(DataError, match="NUL"), create_hdf5(tmp_path / "a.h5") as file:
+        file.create_dataset("a", data=["a\0b"], dtype=h5py.string_dtype())
+    assert [*tmp_path.iterdir()] == []
+
+
+TENSORS = {"a": torch.arange(6.0).reshape(2, 3).T, "b": torch.tensor([1.5], dtype=torch.float16)}
+
+
+def test_tensors_come_back_with_what_is_said_of_them(tmp_path):
+    write_tensors(tmp_path / "x.safetensors", TENSORS, step="3")
+    found = read_tensors(tmp_path / "x.safetensors")
+    assert found["b"].dtype == torch.float16
+    assert all(torch.equal(found[name], value) for name, value in TENSORS.items())
+    with safe_open(tmp_path / "x.safetensors", "pt") as file:
+        assert file.metadata() == {"step": "3"}
+
+
+def test_the_file_is_as_open_to_others_as_any_other(tmp_path):
+    umask = os.umask(0)
+    os.umask(umask)
+    write_tensors(tmp_path / "x.safetensors", TENSORS)
+    assert (tmp_path / "x.safetensors").stat().st_mode & 0o777 == 0o666 & ~umask
+
+
+def test_what_fails_in_the_middle_leaves_the_old_file_alone(tmp_path, monkeypatch):
+    write_tensors(tmp_path / "x.safetensors", TENSORS)
+    monkeypatch.setattr("brainbench.core.files.os.fsync", lambda stream: (_ for _ in ()).throw(RuntimeError("stop")))
+    with pytest.raises(RuntimeError, match="stop"):
+        write_tensors(tmp_path / "x.safetensors", {"a": torch.zeros(1)})
+    assert [path.name for path in tmp_path.iterdir()] == ["x.safetensors"]
+    assert len(read_tensors(tmp_path / "x.safetensors")) == 2

@@ -10,8 +10,7 @@ from typing import Any
 import torch
 from tensordict import TensorDict
 
-from brainbench.core.files import read_json, to_plain, write_json
-from brainbench.core.writing.tensors import write_tensors
+from brainbench.core.files import read_json, to_plain, write_json, write_tensors
 from robotics_bridge import hands
 from robotics_bridge.policies.export import export_policy
 from robotics_bridge.policies.shipped import FOLDER

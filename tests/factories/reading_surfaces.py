@@ -20,7 +20,7 @@ from brainbench.core.contracts import read_match
 from brainbench.core.errors import DataError
 from brainbench.core.files import read_mapping, write_json
 from brainbench.core.records import ResultRecord, record_identity
-from brainbench.core.runs.state import STATE
+from brainbench.core.runs.folder import STATE
 from brainbench.datasets import export, open_recordings, write_recordings
 from brainbench.datasets.trials.selection import Selection, Window
 from brainbench.datasets.whisking.dataset import WhiskingDataset

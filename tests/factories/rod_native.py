@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from brainbench.geometry.distance import point_triangle_distance
+from brainbench.geometry.mesh import point_triangle_distance
 from brainbench.stimuli.engines.rod.limits import WIDE
 
 NONE_LEFT = 2**31 - 1

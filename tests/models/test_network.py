@@ -10,8 +10,8 @@ from brainbench.core.errors import UsageError
 from brainbench.models.attenders import GPTAttender
 from brainbench.models.encoders import zhuang_graph
 from brainbench.models.graph.temporal_graph import TemporalGraph
-from brainbench.models.heads import make_decoder
 from brainbench.models.network import EncoderAttenderDecoder, Normaliser
+from brainbench.models.parts import make_decoder
 from tests.factories.training_sweeps import SCALE, random_sweeps
 
 

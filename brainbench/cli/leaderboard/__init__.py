@@ -2,13 +2,13 @@
 
 import typer
 
-from brainbench.cli.leaderboard import add, held_out, site, submission, verify
+from brainbench.cli.leaderboard import add, held_out, site, verify
 
 app = typer.Typer(no_args_is_help=True, help="Collect result records, check them, and show them as a leaderboard.")
 for _command in (
     add.add,
     verify.verify,
-    submission.check_submission,
+    verify.check_submission,
     held_out.hold_out,
     site.diff,
     site.build,

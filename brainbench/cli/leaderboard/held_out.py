@@ -9,13 +9,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from brainbench.cli.destinations import out_folder, out_folder_option
-from brainbench.cli.options import SCORE, with_options
+from brainbench.cli.options import SCORE, out_folder, out_folder_option, with_options
 from brainbench.cli.output import Output, progress_bar
 from brainbench.core.errors import UsageError
-from brainbench.core.files import content_hash, write_json
+from brainbench.core.files import content_hash, private_folder, write_json
 from brainbench.core.reading.ranges import check_number
-from brainbench.core.writing.private import private_folder
 
 if TYPE_CHECKING:
     import xarray as xr

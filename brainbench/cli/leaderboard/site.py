@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from brainbench.cli.destinations import out_file_option, out_folder_option
+from brainbench.cli.options import out_file_option, out_folder_option
 from brainbench.cli.output import Output, progress_bar, table_of
 from brainbench.core.errors import visible
 

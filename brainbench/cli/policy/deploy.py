@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from brainbench.cli.destinations import out_file
-from brainbench.cli.options import with_options
+from brainbench.cli.options import out_file, with_options
 from brainbench.cli.output import Output, progress_bar
 
 if TYPE_CHECKING:
@@ -127,7 +126,7 @@ def deploy(
 def _inputs(deployed: DeployedPolicy, words: list[str]) -> dict[str, Any]:
     """Return group → its constant, as --input gives them."""
     from brainbench.core.errors import check_each
-    from brainbench.core.overrides import read_pairs, read_value
+    from brainbench.core.limits import read_pairs, read_value
     from robotics_bridge.deploy.session import constant
 
     wanted = [name for name in deployed.contract.inputs if name != "proprio"]

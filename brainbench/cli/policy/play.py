@@ -8,8 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from brainbench.cli.destinations import out_file, out_file_option
-from brainbench.cli.options import with_options
+from brainbench.cli.options import out_file, out_file_option, with_options
 from brainbench.cli.output import Output, facts, progress_bar, table_of
 from brainbench.cli.policy.options import ENV, ENVS_FLAG, TOUCH, World, agent_of, in_world, touch_of
 
@@ -64,7 +63,7 @@ def play(
     width: Annotated[int, typer.Option(help="Of a frame [pixels].")] = 480,
 ) -> Output:
     """Run an agent in one environment of a task and show what happens, as numbers and as a film."""
-    from brainbench.core.figures.style import check_format
+    from brainbench.core.figures import check_format
     from brainbench.core.reading.ranges import check_number
     from robotics_bridge.tasks.settings import contacts_name
 
@@ -73,7 +72,7 @@ def play(
     world.check([agent])
     if video is not None:
         check_format(video, (".mp4", ".gif"))
-        from brainbench.cli.policy.pictures import Stage, write_video
+        from brainbench.cli.tactile.scenes import Stage, write_video
     # After the checks of names, which need no torch.
     from robotics_bridge.policies.evaluate import forget
 

@@ -9,8 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
-from brainbench.cli.destinations import out_folder, out_folder_option
-from brainbench.cli.options import part_of, with_options
+from brainbench.cli.options import out_folder, out_folder_option, part_of, with_options
 from brainbench.cli.output import Output, facts, progress_bar, table, table_of
 from brainbench.cli.policy.options import (
     ENV,
@@ -159,8 +158,7 @@ def sweep(
     Start it once on each GPU, with the same folder: every process takes the next student that none has.
     """
     from brainbench.core.errors import UsageError
-    from brainbench.core.files import read_json
-    from brainbench.core.writing.locks import lock_folder
+    from brainbench.core.files import lock_folder, read_json
     from robotics_bridge.policies.training.distill_config import PUBLISHED, read_sweep
     from robotics_bridge.policies.training.students import EVALUATION, is_done, success_of, train_student
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import typer
 
 from brainbench.cli.output import list_without_command
-from brainbench.cli.stimuli import draw, objects, scenes, simulate, sweep
+from brainbench.cli.stimuli import draw, scenes, simulate
 
 app = typer.Typer(help="Simulate whiskers on objects; look at scenes and forces.")
 app.command("list")(scenes.list_)
@@ -16,10 +16,10 @@ list_without_command(app, scenes.list_)
 for _command in (
     scenes.show,
     simulate.simulate,
-    sweep.sweep,
+    simulate.sweep,
     simulate.separability,
     draw.render,
     draw.plot,
-    objects.objects,
+    scenes.objects,
 ):
     app.command(_command.__name__)(_command)

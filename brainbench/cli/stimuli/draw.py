@@ -7,8 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from brainbench.cli.destinations import out_file_option
-from brainbench.cli.options import numbers, refuse, with_options
+from brainbench.cli.options import numbers, out_file_option, refuse, with_options
 from brainbench.cli.output import Output, progress_bar
 from brainbench.cli.stimuli import scenes
 from brainbench.cli.stimuli.scenes import BackendOption, FidelityOption, StimulusOption, WhiskersOption
@@ -22,7 +21,7 @@ from brainbench.stimuli.engines.fidelity import DEFAULT_ENGINE
     flags={"frames_per_second": ("--fps",)},
     build=False,
 )
-@with_options("brainbench.stimuli.figures.camera:Camera", ("projection",), parameter="lens", build=False)
+@with_options("brainbench.stimuli.figures.surfaces:Camera", ("projection",), parameter="lens", build=False)
 def render(
     style: dict[str, Any],
     lens: dict[str, Any],
@@ -49,10 +48,10 @@ def render(
     backend: BackendOption = DEFAULT_ENGINE,
 ) -> Output:
     """Draw a scene: whiskers bent by its objects, as a picture or a film; no display is needed."""
-    from brainbench.core.figures.style import check_format
+    from brainbench.core.figures import check_format
     from brainbench.stimuli.figures import scenes as drawing
-    from brainbench.stimuli.figures.camera import Camera
     from brainbench.stimuli.figures.pictures import Style
+    from brainbench.stimuli.figures.surfaces import Camera
 
     suffix = check_format(out, drawing.FORMATS)
     scene = scenes.choose_scene(scenes.open_recipe(source, whiskers), stimulus)
@@ -102,7 +101,7 @@ def plot(
     import math
 
     from brainbench.core.errors import check_name
-    from brainbench.core.figures.style import check_format
+    from brainbench.core.figures import check_format
     from brainbench.stimuli.figures.traces import FORMATS, QUANTITIES
     from brainbench.stimuli.figures.traces import plot as draw
     from brainbench.stimuli.sources import load_stimulus_set

@@ -7,8 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from brainbench.cli.destinations import out_folder_option
-from brainbench.cli.options import with_options
+from brainbench.cli.options import out_folder_option, with_options
 from brainbench.cli.output import Output, table, table_of, tracked
 from brainbench.cli.policy.options import ENV, ENVS_FLAG, DeviceOption, HandOption
 from brainbench.core.errors import UsageError

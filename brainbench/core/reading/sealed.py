@@ -24,10 +24,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.errors import DataError
-from brainbench.core.files import atomic_path, content_hash, file_hash, library_versions, settings_dir
+from brainbench.core.files import atomic_path, content_hash, file_hash, library_versions, settings_dir, write_private
 from brainbench.core.reading.archives import read_npz
 from brainbench.core.reading.hdf5 import trust_hdf5
-from brainbench.core.writing.private import write_private
 
 T = TypeVar("T")
 KEY_VARIABLE = "BRAINBENCH_CACHE_KEY"

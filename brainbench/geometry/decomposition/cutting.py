@@ -19,8 +19,7 @@ import numpy as np
 from brainbench.core.errors import DataError, missing_dependency
 from brainbench.core.files import cache_dir, content_hash
 from brainbench.core.reading.sealed import read_sealed, write_sealed
-from brainbench.geometry.distance import Deviation, deviation, hausdorff
-from brainbench.geometry.mesh import Mesh, convex_hull
+from brainbench.geometry.mesh import Deviation, Mesh, convex_hull, deviation, hausdorff
 from brainbench.geometry.pieces import Decomposition, DecompositionSettings
 
 _LOG = logging.getLogger(__name__)

@@ -51,8 +51,7 @@ def save_checkpoint(
     """
     import torch
 
-    from brainbench.core.files import write_json, write_text
-    from brainbench.core.writing.tensors import write_tensors
+    from brainbench.core.files import write_json, write_tensors, write_text
 
     check_name("precision of weights", dtype, DTYPES)
     kind = getattr(torch, dtype)
@@ -112,7 +111,7 @@ def load_weights(model: nn.Module, path: str | os.PathLike[str], *, what: str) -
         DataFileNotFoundError: there is no such file.
     """
     from brainbench.core.reading.tensors import read_tensors
-    from brainbench.models.ops.parameters import load_named
+    from brainbench.models.ops.layers import load_named
 
     state = read_tensors(path, f"file of weights for {what!r} (safetensors)")
     load_named(model.state_dict(), state, what=f"the model {what!r}")

@@ -42,9 +42,9 @@ class TrainingConfig:
     batch_size: Annotated[int, Limit(least=2, most=2**31 - 1)] = BATCH_SIZE
     """Sweeps per optimiser step, over all processes."""
     decoder: str = "linear"
-    """One of :data:`~brainbench.models.heads.DECODERS`."""
+    """One of :data:`~brainbench.models.parts.DECODERS`."""
     augmentation: Literal["none", "physical", "thesis", "image"] = "physical"
-    """``none``, ``physical``, ``thesis`` or ``image`` (:mod:`brainbench.models.training.augmentation`)."""
+    """``none``, ``physical``, ``thesis`` or ``image`` (:class:`~brainbench.models.training.batches.Augmentation`)."""
     masking: Annotated[float, Limit(least=0, below=1)] = 0.0
     """Share of masked time steps (published with 0.75)."""
     precision: Literal["auto", "float32", "bf16"] = "auto"

@@ -13,7 +13,7 @@ from torch import nn
 from torch.nn import functional
 
 from brainbench.core.errors import UsageError, check_name
-from brainbench.models.heads import AutoencoderHead, SimCLRHead, SimSiamHead
+from brainbench.models.parts import AutoencoderHead, SimCLRHead, SimSiamHead
 
 TEMPERATURE = 0.1
 RECONSTRUCTION_WEIGHT = 0.5

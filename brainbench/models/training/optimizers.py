@@ -21,7 +21,7 @@ from brainbench.core.reading.ranges import check_number
 from brainbench.models.attenders import GPTBlock, MambaBlock
 from brainbench.models.cells import Cell, GatedCell
 from brainbench.models.encoders import BasicBlock, S4Block
-from brainbench.models.ops.parameters import copy_named
+from brainbench.models.ops.layers import copy_named
 from brainbench.models.recipes import OPTIMIZERS, SCHEDULES
 
 MOMENTUM = 0.9

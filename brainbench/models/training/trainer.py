@@ -22,28 +22,30 @@ import torch
 from torch import nn
 
 from brainbench.core.errors import DataError, UsageError
-from brainbench.core.files import read_mapping, write_json
+from brainbench.core.files import read_mapping, write_json, write_tensors
 from brainbench.core.progress import Progress
 from brainbench.core.reading.regular import readable
-from brainbench.core.runs.folder import RESTART, RUN, RunEnd, claim, mark
-from brainbench.core.runs.log import RunLog
-from brainbench.core.runs.state import (
+from brainbench.core.runs.folder import (
+    RESTART,
+    RUN,
     STATE,
+    RunEnd,
+    Stop,
+    claim,
     learner_state,
     load_state,
+    mark,
+    occupied,
     random_state,
     restore_learner,
     save_state,
     set_random_state,
 )
-from brainbench.core.runs.stopping import Stop, occupied
-from brainbench.core.writing.tensors import write_tensors
+from brainbench.core.runs.log import RunLog
 from brainbench.models.activations import evaluating
-from brainbench.models.ops.parameters import seeded
+from brainbench.models.ops.layers import seeded
 from brainbench.models.registry import load_model
-from brainbench.models.training.augmentation import MOUSE, Augmentation
-from brainbench.models.training.batches import Batches, BatchOptions, Data, Processes, processes
-from brainbench.models.training.card import checkpoint_info, describe_twin, difference, draw_twin, model_card
+from brainbench.models.training.batches import MOUSE, Augmentation, Batches, BatchOptions, Data, Processes, processes
 from brainbench.models.training.checkpoints import WEIGHTS, load_weights, save_checkpoint
 from brainbench.models.training.config import TrainingConfig, config_warnings
 from brainbench.models.training.evaluation import (
@@ -51,8 +53,13 @@ from brainbench.models.training.evaluation import (
     TWIN,
     Evaluation,
     baselines,
+    checkpoint_info,
+    describe_twin,
+    difference,
+    draw_twin,
     evaluate,
     fit_probe,
+    model_card,
     sweeps_hash,
 )
 from brainbench.models.training.objectives import make_learner

@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from brainbench.cli.destinations import out_folder_option
-from brainbench.cli.options import SCORE, SchedulerOption, WorkersOption, option, with_options
+from brainbench.cli.options import SCORE, SchedulerOption, WorkersOption, option, out_folder_option, with_options
 from brainbench.cli.output import Output, progress_bar, table_of
 from brainbench.cli.requirements import Requirement, needs
 from brainbench.core.errors import UsageError

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from brainbench.core.figures.style import INK, PALE, check_format, new_figure, save_figure
+from brainbench.core.figures import INK, PALE, check_format, new_figure, save_figure
 from brainbench.core.records import Interval
 from brainbench.core.statistics import FEWEST_ANIMALS, FEWEST_STIMULI, wilson_interval
 from brainbench.metrics.rdms.pairs import Floats, Ints

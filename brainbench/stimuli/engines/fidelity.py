@@ -13,8 +13,7 @@ from importlib import resources
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from brainbench.core.errors import UsageError, brief, check_name
-from brainbench.core.limits import Limit, Positive, limited
-from brainbench.core.overrides import read_pairs, read_value, with_changes
+from brainbench.core.limits import Limit, Positive, limited, read_pairs, read_value, with_changes
 from brainbench.core.reading.ranges import check_number
 from brainbench.core.tradeoffs import TradeoffPoint, cheapest
 from brainbench.stimuli.whiskers.chain import Chain

@@ -11,11 +11,12 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.figures.style import DOTS_PER_INCH, INK, PALE, new_figure, save_figure
+from brainbench.core.figures import DOTS_PER_INCH, INK, PALE, new_figure, save_figure
 from brainbench.core.limits import Limit, Positive, Share, limited
-from brainbench.stimuli.figures.camera import Camera, Lens
 from brainbench.stimuli.figures.surfaces import (
+    Camera,
     DrawnSurface,
+    Lens,
     Triangles,
     VisibleSurface,
     ball,

@@ -14,14 +14,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.errors import DataError, UsageError, listing, needing
-from brainbench.core.figures.style import check_format
+from brainbench.core.figures import check_format
 from brainbench.core.files import atomic_path
 from brainbench.core.progress import Progress, track
 from brainbench.stimuli.engines.fidelity import DEFAULT_ENGINE, Fidelity
 from brainbench.stimuli.engines.protocol import WhiskerEngine
 from brainbench.stimuli.engines.units import MILLI
-from brainbench.stimuli.figures.camera import Camera
 from brainbench.stimuli.figures.pictures import Annotation, Picture, Style
+from brainbench.stimuli.figures.surfaces import Camera
 from brainbench.stimuli.motion.trajectories import Whisking
 from brainbench.stimuli.scenes.scene import Scene
 from brainbench.stimuli.whisker_shapes import record

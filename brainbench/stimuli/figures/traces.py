@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from brainbench.core.contracts import CHANNELS, GRID_SHAPE, check_stimulus_set
 from brainbench.core.errors import UsageError, check_name, choose_name
-from brainbench.core.figures.style import INK, PALE, check_format, new_figure, save_figure
+from brainbench.core.figures import INK, PALE, check_format, new_figure, save_figure
 from brainbench.stimuli.figures.pictures import round_up
 from brainbench.stimuli.whiskers.array import ROWS
 

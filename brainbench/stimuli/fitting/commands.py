@@ -8,13 +8,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from brainbench.cli.destinations import out_file, picture_file
-from brainbench.cli.options import changed, items, option, refuse, with_options
+from brainbench.cli.options import changed, items, option, out_file, picture_file, refuse, with_options
 from brainbench.cli.output import Output, progress_bar, table_of
 from brainbench.cli.stimuli import scenes
 from brainbench.cli.stimuli.scenes import BackendOption, StimulusOption, WhiskersOption
 from brainbench.core.errors import UsageError, brief
-from brainbench.core.overrides import read_pairs, read_value
+from brainbench.core.limits import read_pairs, read_value
 from brainbench.core.plugins import OptionalPart
 from brainbench.stimuli.engines.fidelity import DEFAULT_ENGINE
 

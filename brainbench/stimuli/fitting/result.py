@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from brainbench.core.contracts import CHANNELS
 from brainbench.core.errors import DataError, listing
-from brainbench.core.figures.style import COLORS, INK, PALE, panels, save_figure
+from brainbench.core.figures import COLORS, INK, PALE, panels, save_figure
 from brainbench.core.records import Interval, Status
 from brainbench.stimuli.fitting.contacts import PER_LINK
 from brainbench.stimuli.fitting.model import Readings

@@ -18,13 +18,11 @@ from numpy.typing import NDArray
 
 from brainbench.core.contracts import SWEEPS_FORMAT, SWEEPS_SCHEMA
 from brainbench.core.errors import DataError, UsageError
-from brainbench.core.files import content_hash, provenance, write_json
+from brainbench.core.files import content_hash, is_temporary, lock_folder, provenance, write_json
 from brainbench.core.progress import Progress
 from brainbench.core.reading.hdf5 import open_hdf5
 from brainbench.core.reading.ranges import check_number
 from brainbench.core.runs.folder import begin_run
-from brainbench.core.writing.locks import lock_folder
-from brainbench.core.writing.temporaries import is_temporary
 from brainbench.stimuli.engines import get_engine
 from brainbench.stimuli.engines.error_estimates import LARGEST_ERROR
 from brainbench.stimuli.sweeps import running

@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 
 from brainbench.core.contracts import CHANNELS, SWEEPS_FORMAT, SWEEPS_SCHEMA
 from brainbench.core.errors import DataError, UsageError
-from brainbench.core.files import atomic_path, content_hash, hash_arrays, to_json
-from brainbench.core.writing.hdf5 import create_hdf5
+from brainbench.core.files import atomic_path, content_hash, create_hdf5, hash_arrays, to_json
 from brainbench.stimuli.engines import get_engine
 from brainbench.stimuli.engines.fidelity import DEFAULT_ENGINE, Fidelity
 from brainbench.stimuli.engines.protocol import SweepBatch, WhiskerEngine, describe_unstable, join_batches

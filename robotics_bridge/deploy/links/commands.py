@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from brainbench.cli.destinations import out_file_option
+from brainbench.cli.options import out_file_option
 from brainbench.cli.output import Output, table_of
 from brainbench.cli.policy.options import HandOption
 

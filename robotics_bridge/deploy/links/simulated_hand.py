@@ -17,8 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.errors import DataError, UsageError
-from brainbench.core.limits import Limit, Seed, Share, limited
-from brainbench.core.overrides import read_pairs, with_changes
+from brainbench.core.limits import Limit, Seed, Share, limited, read_pairs, with_changes
 from brainbench.core.reading.ranges import check_number
 from robotics_bridge import hands
 from robotics_bridge.deploy.driver import DriverRequest, HandReading

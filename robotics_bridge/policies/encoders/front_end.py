@@ -22,9 +22,9 @@ from torch import nn
 from brainbench.core.contracts import CHANNELS, GRID_SHAPE, SUB_STEP_SECONDS
 from brainbench.core.errors import DataError, UsageError, check_name
 from brainbench.core.limits import Positive, limited
+from brainbench.models.export import StreamingStep
 from brainbench.models.network import FORCE_SCALE, MOMENT_SCALE, EncoderAttenderDecoder
 from brainbench.models.registry import load_model
-from brainbench.models.streaming import StreamingStep
 from robotics_bridge.policies.encoders.taxel_grid import TaxelGrid
 
 _TOUCHING = 1e-3

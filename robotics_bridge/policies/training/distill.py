@@ -25,22 +25,24 @@ from torch import nn
 
 from brainbench.core.devices import WARM_UP, CudaGraphStep, Graph, torch_recorder
 from brainbench.core.errors import needing
-from brainbench.core.files import file_hash, provenance
+from brainbench.core.files import file_hash, provenance, write_tensors
 from brainbench.core.progress import Progress
 from brainbench.core.reading.regular import readable
-from brainbench.core.runs.folder import RESTART, RunEnd, claim
-from brainbench.core.runs.log import RunLog
-from brainbench.core.runs.state import (
+from brainbench.core.runs.folder import (
+    RESTART,
     STATE,
+    RunEnd,
+    Stop,
+    claim,
     learner_state,
     load_state,
+    occupied,
     random_state,
     restore_learner,
     save_state,
     set_random_state,
 )
-from brainbench.core.runs.stopping import Stop, occupied
-from brainbench.core.writing.tensors import write_tensors
+from brainbench.core.runs.log import RunLog
 from robotics_bridge.hands.layouts import check_probes, is_probe_file
 from robotics_bridge.policies.encoders.arms import elu_perceptron
 from robotics_bridge.policies.evaluate import Policy

@@ -15,7 +15,7 @@ from brainbench.core.errors import DataError
 from brainbench.core.files import read_mapping
 from brainbench.core.reading.regular import readable
 from brainbench.core.reading.tensors import read_tensors
-from brainbench.core.runs.state import odd_shape
+from brainbench.core.runs.folder import odd_shape
 from robotics_bridge.hands.layouts import check_probes
 from robotics_bridge.policies.contract import JOINTS, Groups, from_json, shapes_of
 from robotics_bridge.policies.encoders.arms import EncoderConfig

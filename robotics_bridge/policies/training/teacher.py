@@ -20,16 +20,25 @@ from typing import TYPE_CHECKING, Any, cast
 import torch
 
 from brainbench.core.errors import BrainbenchError, DataError, DataFileNotFoundError, UsageError, check_name, needing
-from brainbench.core.files import file_hash, provenance, read_mapping, to_plain, write_json
+from brainbench.core.files import file_hash, provenance, read_mapping, to_plain, write_json, write_tensors
 from brainbench.core.limits import Count, Positive, Seed, limited
 from brainbench.core.progress import Progress
 from brainbench.core.reading.regular import readable
 from brainbench.core.reading.tensors import check_finite
-from brainbench.core.runs.folder import RESTART, RunEnd, claim
+from brainbench.core.runs.folder import (
+    RESTART,
+    STATE,
+    RunEnd,
+    Stop,
+    claim,
+    load_state,
+    occupied,
+    odd_shape,
+    random_state,
+    save_state,
+    set_random_state,
+)
 from brainbench.core.runs.log import RunLog, check_sinks
-from brainbench.core.runs.state import STATE, load_state, odd_shape, random_state, save_state, set_random_state
-from brainbench.core.runs.stopping import Stop, occupied
-from brainbench.core.writing.tensors import write_tensors
 from robotics_bridge.envs.rsl_rl import RslRlEnv
 from robotics_bridge.policies.contract import from_json
 from robotics_bridge.policies.evaluate import Policy

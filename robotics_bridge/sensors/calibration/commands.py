@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from brainbench.cli.destinations import out_file_option
+from brainbench.cli.options import out_file_option
 from brainbench.cli.output import Output, table_of
 from brainbench.core.reading.ranges import check_number
 

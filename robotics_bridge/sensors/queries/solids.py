@@ -16,8 +16,7 @@ from brainbench.core.files import cache_dir
 from brainbench.core.reading.ranges import check_number
 from brainbench.core.reading.sealed import read_sealed, write_sealed
 from brainbench.geometry import Mesh
-from brainbench.geometry.distance import sample_surface
-from brainbench.geometry.mesh_repair import repair
+from brainbench.geometry.mesh import repair, sample_surface
 from robotics_bridge.physics.scene import KINDS, Geometry, TouchScene
 from robotics_bridge.sensors.kernels import distance
 from robotics_bridge.sensors.kernels.distance import OTHER, THIN, WALL, SolidArrays, measure_walls

@@ -1,11 +1,19 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
+import subprocess
+from dataclasses import replace
 from pathlib import Path
 
+import pytest
+import yaml
+
+from brainbench.core.files import to_json
 from brainbench.core.records import ResultRecord
-from leaderboards.store import read_record
+from leaderboards.store import read_record, write_record
+from tests.factories.records import make_record
 
 
 def test_a_record_is_added_known_and_confirmed_by_scoring_again(run, scored, tmp_path):
@@ -59,3 +67,199 @@ def test_recordings_elsewhere_must_be_given_to_repeat_a_score(run, scored):
     result = run("leaderboard", "verify", str(path), "--trust-code")
     assert result.status == 1
     assert "give them with --recordings PATH" in result.out
+
+
+RESULTS = "leaderboards/results"
+WORKFLOW = Path(__file__).parents[3] / ".github" / "workflows" / "submission.yml"
+
+
+def _git(*words: str) -> None:
+    settings = ("-c", "user.name=x", "-c", "user.email=x@example.org", "-c", "commit.gpgsign=false")
+    subprocess.run(["git", *settings, *words], check=True, capture_output=True)
+
+
+@pytest.fixture
+def board(tmp_path, monkeypatch) -> Path:
+    """The folder of records in a repository with two of them, on a branch for a submission."""
+    root = tmp_path / "repository"
+    root.mkdir()
+    monkeypatch.chdir(root)
+    _git("init", "-q", "-b", "main")
+    for name in ("first", "second"):
+        write_record(make_record(name), root / RESULTS)
+    (root / "README.md").write_text("a board")
+    _git("add", ".")
+    _git("commit", "-qm", "base")
+    _git("checkout", "-qb", "pull")
+    return root / RESULTS
+
+
+def _add(board: Path) -> None:
+    write_record(make_record("third"), board)
+
+
+def _rename(board: Path) -> None:
+    path = next(board.glob("first*"))
+    path.rename(board / "renamed.json")
+
+
+def _rename_and_edit(board: Path) -> None:
+    path = next(board.glob("first*"))
+    (board / "renamed.json").write_text(path.read_text().replace("0.523", "0.99"))
+    path.unlink()
+
+
+def _edit(board: Path) -> None:
+    path = next(board.glob("first*"))
+    path.write_text(path.read_text().replace("0.523", "0.99"))
+
+
+def _delete(board: Path) -> None:
+    next(board.glob("first*")).unlink()
+
+
+def _become_a_link(board: Path) -> None:
+    path = next(board.glob("first*"))
+    path.unlink()
+    path.symlink_to("/etc/passwd")
+
+
+def _add_a_link(board: Path) -> None:
+    (board / "link--0123456789abcdef.json").symlink_to(next(board.glob("first*")).name)
+
+
+def _add_two_of_one_name(board: Path) -> None:
+    record = make_record("third")
+    for folder in ("a", "z"):
+        write_record(record, board / folder)
+
+
+def _copy_into_a_folder(board: Path) -> None:
+    (board / "deep").mkdir()
+    shutil.copy(next(board.glob("first*")), board / "deep")
+
+
+def _add_a_look_alike(board: Path) -> None:
+    path = next(board.glob("first*"))
+    shutil.copy(path, board / path.name.replace("--", "\u2010-"))
+
+
+def _add_a_name_that_acts(board: Path) -> None:
+    (board / "x\n::error::y.json").write_text("{}")
+
+
+def _add_an_executable(board: Path) -> None:
+    path = write_record(make_record("third"), board)
+    path.chmod(0o755)
+
+
+def _add_another_file(board: Path) -> None:
+    (board / "notes.txt").write_text("x")
+
+
+def _change_a_file_outside(board: Path) -> None:
+    (board.parents[1] / "README.md").write_text("edited")
+
+
+def _add_a_hidden_file(board: Path) -> None:
+    shutil.copy(next(board.glob("first*")), board / ".hidden.json")
+
+
+def _add_another_repository(board: Path) -> None:
+    inner = board / "inner"
+    inner.mkdir()
+    subprocess.run(["git", "init", "-q", inner], check=True)
+    (inner / "x").write_text("x")
+    _git("-C", str(inner), "add", ".")
+    _git("-C", str(inner), "commit", "-qm", "inner")
+
+
+def _submitted(run, board: Path, *changes, score: bool = False):
+    for change in changes:
+        change(board)
+    _git("add", "-A", ".")
+    _git("commit", "-qm", "submission")
+    return run("leaderboard", "check-submission", "main", "pull", *([] if score else ["--no-score"]))
+
+
+def test_a_new_record_is_checked_and_named(run, board):
+    result = _submitted(run, board, _add)
+    assert result.status == 0, result.out + result.err
+    assert "third--" in result.out
+    assert "intact" in result.out
+
+
+REFUSED = {
+    _rename: "is deleted", _rename_and_edit: "is deleted", _edit: "is changed", _delete: "is deleted",
+    _become_a_link: "another type", _add_a_link: "is a link", _add_two_of_one_name: "the name of another record",
+    _copy_into_a_folder: "the name of another record", _add_a_look_alike: "other characters",
+    _add_a_name_that_acts: "other characters", _add_an_executable: "is executable",
+    _add_another_file: "is no record file", _change_a_file_outside: "is outside of",
+    _add_a_hidden_file: "no record file",    _add_another_repository: "is another repository",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("change", "words"), REFUSED.items(), ids=lambda value: getattr(value, "__name__", None))
+def test_all_else_is_refused_also_beside_a_good_record(run, board, change, words):
+    result = _submitted(run, board, change, *([_add] if "third" not in change.__code__.co_consts else []))
+    assert result.status == 1
+    assert words in result.out
+    assert not any(line.startswith("::") for line in result.out.splitlines())
+
+
+def test_an_edited_record_under_a_new_name_is_refused_by_its_hash(run, board):
+    result = _submitted(run, board, _rename_and_edit)
+    assert "renamed.json\n  refused: " in result.out
+
+
+def test_what_a_record_names_is_not_opened(run, board, tmp_path):
+    private = tmp_path / "private.toml"
+    private.write_text("PRIVATE_LINE")
+    record = make_record("zhuang-small")
+    stated = dict(record.score.provenance)
+    stated["settings"] = {"model": "zhuang-small", "metric": "rsa", "stimuli": os.fspath(private)}
+    write_record(replace(record, score=replace(record.score, provenance=stated)), board)
+    result = _submitted(run, board, score=True)
+    assert result.status == 1
+    assert "not repeated" in result.out
+    assert "--stimuli" in result.out
+    assert "PRIVATE_LINE" not in result.out + result.err
+
+
+def test_commits_that_are_not_there_or_options_are_one_sentence(run, board):
+    for name in ("no-such", "--output=/tmp/x"):
+        result = run("leaderboard", "check-submission", "--", "main", name)
+        assert (result.status, "There is no commit" in result.err) == (2, True)
+
+
+def test_a_submission_without_changes_has_no_new_record(run, board):
+    result = run("leaderboard", "check-submission", "main", "pull")
+    assert (result.status, result.out.strip()) == (0, "no new record")
+
+
+def test_too_many_records_are_refused_at_once(run, board, monkeypatch):
+    monkeypatch.setattr("brainbench.cli.leaderboard.verify.MOST_RECORDS", 1)
+    assert "at most 1 at once" in _submitted(run, board, _add, _add_another_file).out
+
+
+def test_the_workflow_is_this_command(tmp_path):
+    text = WORKFLOW.read_text()
+    workflow = yaml.safe_load(text)
+    (job,) = workflow["jobs"].values()
+    runs = [step["run"] for step in job["steps"] if "run" in step]
+    assert runs[-1].startswith("brainbench leaderboard check-submission HEAD FETCH_HEAD")
+    assert not any("git diff" in run or "git show" in run for run in runs)
+    actions = [step["uses"] for step in job["steps"] if "uses" in step]
+    assert all(len(action.partition("@")[2]) == 40 for action in actions)
+    assert [step["with"]["persist-credentials"] for step in job["steps"] if "checkout" in step.get("uses", "")] == [
+        False
+    ]
+    # Nothing of the pull request stands inside a shell command.
+    assert "${{" not in "".join(runs)
+    # The secret is fetched before anything of the submission is there.
+    names = [step.get("name", "") for step in job["steps"]]
+    assert names.index("Fetch the submission") > [bool("HELD_OUT_URL" in str(step)) for step in job["steps"]].index(
+        True
+    )
+    assert workflow["permissions"] == {"contents": "read"}
+    assert to_json(workflow["jobs"]).count("secrets.HELD_OUT_URL }}") == 1

@@ -8,8 +8,7 @@ from typer.testing import CliRunner
 
 from brainbench.cli import app
 from brainbench.core.errors import UsageError
-from brainbench.core.files import read_json
-from brainbench.core.writing.locks import lock_folder
+from brainbench.core.files import lock_folder, read_json
 from robotics_bridge import hands
 from robotics_bridge.hands.layouts import write_probes
 from tests.factories.policy_commands import run_policy

@@ -28,10 +28,10 @@ def device(monkeypatch: pytest.MonkeyPatch) -> Iterator[torch.device]:
 @pytest.fixture
 def single(device: torch.device, monkeypatch: pytest.MonkeyPatch) -> torch.device:
     """The kernels in single precision, in which they can be compared closely."""
-    from brainbench.models.ops import convolution, dispatch
+    from brainbench.models.ops import dispatch
 
     monkeypatch.setattr(dispatch, "usable", lambda x: not x.is_meta)
-    monkeypatch.setattr(convolution, "HALF", torch.float32)
+    monkeypatch.setattr(dispatch, "HALF", torch.float32)
     monkeypatch.setattr(dispatch, "HALF", torch.float32)
     if device.type == "cuda":
         monkeypatch.setattr(torch.backends.cuda.matmul, "allow_tf32", False)

@@ -9,7 +9,7 @@ import torch
 from brainbench.core.errors import DataError, UsageError
 from brainbench.core.runs.folder import claim
 from brainbench.models.registry import load_model
-from brainbench.models.training.augmentation import reverse_time
+from brainbench.models.training.batches import reverse_time
 from brainbench.models.training.config import TrainingConfig, best_run, config_warnings, sweep_runs
 from brainbench.models.training.trainer import train
 from tests.factories.training_sweeps import sweeps, tiny

@@ -11,7 +11,7 @@ from brainbench.core.errors import UsageError
 from brainbench.core.runs.log import read_log
 from brainbench.models import load_model
 from brainbench.models.cells import CELLS
-from brainbench.models.ops.parameters import copy_named
+from brainbench.models.ops.layers import copy_named
 from brainbench.models.recipes import OPTIMIZERS
 from brainbench.models.training import optimizers
 from brainbench.models.training.config import TrainingConfig

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from brainbench.cli.score_text import score_text
+from brainbench.cli.score import score_text
 from brainbench.core.errors import DataError, UsageError
 from brainbench.core.files import to_plain
 from brainbench.core.records import ResultRecord

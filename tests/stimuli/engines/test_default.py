@@ -4,7 +4,7 @@ import inspect
 
 import pytest
 
-from brainbench.cli.stimuli import draw, sweep
+from brainbench.cli.stimuli import draw, simulate
 from brainbench.cli.stimuli import simulate as simulate_command
 from brainbench.stimuli import load_stimuli, simulation, whisker_shapes
 from brainbench.stimuli.engines import fidelity, get_engine, list_engines
@@ -20,7 +20,7 @@ ASKED = (
     bench_tests.peg, bench_tests.point_load, bench_tests.ringdown, bench_tests.slip_off, out_of_plane.load_aside,
     out_of_plane.push_aside, fidelity.measured,
     fidelity.Fidelity.auto, GenerationSettings, draw.render, draw.plot,
-    simulate_command.simulate, sweep.sweep,
+    simulate_command.simulate, simulate.sweep,
 )  # fmt: skip
 
 

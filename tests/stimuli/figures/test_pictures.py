@@ -6,9 +6,9 @@ import pytest
 
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.figures import scenes as module
-from brainbench.stimuli.figures.camera import Camera
 from brainbench.stimuli.figures.pictures import Picture, Style
 from brainbench.stimuli.figures.scenes import render
+from brainbench.stimuli.figures.surfaces import Camera
 from brainbench.stimuli.motion.trajectories import Still
 from brainbench.stimuli.objects.solid import PlacedObject, cylinder
 from brainbench.stimuli.scenes.scene import Frames, Scene

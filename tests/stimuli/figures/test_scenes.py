@@ -7,9 +7,9 @@ import pytest
 
 from brainbench.core.errors import MissingDependencyError, UsageError
 from brainbench.stimuli.engines.fidelity import Fidelity
-from brainbench.stimuli.figures.camera import Camera
 from brainbench.stimuli.figures.pictures import Picture, Style
 from brainbench.stimuli.figures.scenes import film_times, render, still_time
+from brainbench.stimuli.figures.surfaces import Camera
 from brainbench.stimuli.motion.trajectories import Still, Translation, Whisking
 from brainbench.stimuli.objects.solid import PlacedObject, box, cylinder
 from brainbench.stimuli.scenes.recipes import get_recipe

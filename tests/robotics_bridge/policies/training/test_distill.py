@@ -14,7 +14,7 @@ import torch
 from torch import nn
 
 from brainbench.core.errors import DataError, MissingDependencyError, UsageError
-from brainbench.core.writing.locks import lock_folder
+from brainbench.core.files import lock_folder
 from robotics_bridge import hands
 from robotics_bridge.hands.layouts import write_probes
 from robotics_bridge.policies.evaluate import Policy

@@ -18,7 +18,7 @@ import pytest
 import torch
 
 from brainbench.core.errors import BrainbenchError, DataError, UsageError
-from brainbench.core.runs.state import STATE, load_state
+from brainbench.core.runs.folder import STATE, load_state
 from robotics_bridge import tasks
 from robotics_bridge.envs import Env
 from robotics_bridge.policies.evaluate import Policy, evaluate

@@ -8,7 +8,7 @@ import pytest
 from brainbench.core.devices import warp
 from brainbench.core.errors import UsageError
 from robotics_bridge import hands
-from robotics_bridge.envs.kernels.contact_forces import add_contact_forces
+from robotics_bridge.envs.kernels.actuation import add_contact_forces
 from robotics_bridge.hands.scenes import closing, holding
 from robotics_bridge.physics import MujocoEngine
 from robotics_bridge.sensors import (

@@ -7,7 +7,7 @@ import pytest
 
 from brainbench.core.rotations import base_rotation
 from brainbench.geometry import Mesh, winding_number
-from brainbench.geometry.distance import point_triangle_distance
+from brainbench.geometry.mesh import point_triangle_distance
 from brainbench.stimuli.engines import get_engine
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.rod.engine import RodEngine

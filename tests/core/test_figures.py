@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from brainbench.core.errors import UsageError
-from brainbench.core.figures.style import INK, check_format, new_figure, panels, plain_log_ticks, save_figure
+from brainbench.core.figures import INK, check_format, new_figure, panels, plain_log_ticks, save_figure
 
 
 @pytest.mark.parametrize("suffix", ["png", "svg", "pdf"])

@@ -1,1 +1,0 @@
-"""Figures: ``style`` holds the look that all charts share."""
