@@ -255,17 +255,20 @@ def _subject(animals: Animals, index: int, value: float, r: float, layer: str | 
 def _splits_error(values: Floats, subjects: Sequence[Any], comparison: str) -> float:
     """Return the standard error of the mean score over animals from the finite number of random splits.
 
-    Splits are independent draws given the trials, so the mean split-half correlation h has standard
-    error s/√S, and value ∝ √((1 + h)/2h) turns it into value · se / (2h(1 + h)).
+    Splits are independent draws given the trials, so their mean h has the standard error s/√S. Values are over √h
+    where h is the reliability itself, as of unbiased distances, and over √(2h/(1 + h)) where h is a correlation of
+    halves; the delta method makes value · se / 2h of the one and value · se / (2h(1 + h)) of the other.
     """
     errors = []
     for value, subject in zip(values, subjects, strict=True):
-        r = subject.split_half_by(comparison)
-        finite = r[np.isfinite(r)]
+        signal = subject.signal_by(comparison)
+        splits = signal if signal.size else subject.split_half_by(comparison)
+        finite = splits[np.isfinite(splits)]
         h = float(finite.mean()) if finite.size else math.nan
         spread = float(finite.std(ddof=1)) / math.sqrt(finite.size) if finite.size > 1 else math.nan
-        # Delta method: the derivative of ln √((1 + h)/2h) is −1/(2h(1 + h)).
-        errors.append(float(value) * spread / (2 * h * (1 + h)))
+        # A reliability is held at 1, where nothing is divided.
+        slope = (0.0 if h >= 1 else 1 / (2 * h)) if signal.size else 1 / (2 * h * (1 + h))
+        errors.append(float(value) * spread * slope)
     # Splits of different animals are independent, so squared errors add up in the mean over animals.
     return math.sqrt(sum(error**2 for error in errors)) / len(errors)
 

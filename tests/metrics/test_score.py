@@ -16,6 +16,7 @@ from brainbench.core.errors import UsageError
 from brainbench.core.records import Interval, Score
 from brainbench.core.statistics import t_interval, two_factor_error, two_factor_interval
 from brainbench.metrics import compare, noise_ceiling, noise_corrected, rdm
+from brainbench.metrics.measures.metric import get_metric
 from brainbench.metrics.measures.rsa import RSA, score_rdms
 from brainbench.metrics.rdms.comparison import compare_all
 from brainbench.metrics.rdms.pairs import permuted_pairs
@@ -469,3 +470,17 @@ def test_an_agreement_refuses_what_it_cannot_take():
         score_animals([])
     with pytest.raises(UsageError, match="6 stimuli; 2 are scored"):
         score_animals(_make_agreeing_animals(2), stimuli=["a", "b"])
+
+
+@pytest.mark.parametrize("metric", ["rsa", "rsa-correlation"])
+def test_the_error_of_random_splits_is_what_values_scatter_by_over_seeds(metric):
+    latent, measure = make_latent(stimuli=8), get_metric(metric)
+    blocks = [make_block(latent, seed=seed, noise=3.0) for seed in range(3)]
+    features, values, errors = {"layer": latent}, [], []
+    for seed in range(30):
+        animals = [measure.animal(f"m{i}", [block], 8, seed=seed, splits=20) for i, block in enumerate(blocks)]
+        score = measure.score(features, animals, name="model", stimuli=list("abcdefgh"))
+        values.append(score.value)
+        error = score.provenance.statistics["monte_carlo_error"]
+        errors.append(error["value"])
+    assert np.mean(errors) == pytest.approx(np.std(values, ddof=1), rel=0.35)
