@@ -193,7 +193,8 @@ STANDINGS = tuple(MEANINGS)
 DOUBTFUL: tuple[Standing, ...] = ("unreliable", "undefined")
 """Standings of scores that no conclusion is drawn from."""
 BUILT_IN_METRICS = (
-    "rsa", "rsa-correlation", "rsa-crossnobis", "rsa-partial", "cka", "decoding", "procrustes", "ridge"
+    "rsa", "rsa-correlation", "rsa-crossnobis", "rsa-partial", "cka", "decoding", "procrustes", "ridge",
+    "soft-matching", "one-to-one",
 )  # fmt: skip
 """Names of the metrics that come with the package (this package cannot import them)."""
 

@@ -74,7 +74,7 @@ class Run:
         return [found[place] for place in range(len(jobs))]
 
 
-NULL_METRICS = ("rsa", "rsa-correlation", "rsa-crossnobis", "cka", "procrustes", "ridge")
+NULL_METRICS = ("rsa", "rsa-correlation", "rsa-crossnobis", "cka", "procrustes", "ridge", "soft-matching", "one-to-one")
 """All but decoding, of which one study takes a minute."""
 
 

@@ -81,8 +81,8 @@ class ScoreOptions:
     estimator: str = "default"
     """default, thesis or thesis-input (as published)."""
     metric: str | Metric = "rsa"
-    """rsa, rsa-correlation, rsa-crossnobis, rsa-partial, cka, decoding, ridge, procrustes, or FILE.py:CLASS of your
-    own."""
+    """rsa, rsa-correlation, rsa-crossnobis, rsa-partial, cka, decoding, ridge, procrustes, soft-matching, one-to-one,
+    or FILE.py:CLASS of your own."""
     units_reliability: Annotated[float, Limit(above=-1, below=1)] | None = None
     """Leave out units whose tuning is less reliable than this (published: .5); a choice made on the scored data."""
     normalize: bool = True

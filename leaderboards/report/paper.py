@@ -65,7 +65,12 @@ _ARCHITECTURES = {
     "Radford, Wu": "radford2019",
 }
 _OBJECTIVES = {"simclr": "chen2020", "simsiam": "chen2021"}
-_METRICS = {"crossnobis": "walther2016", "cka": "kornblith2019", "procrustes": "williams2021"}
+_METRICS = {
+    "crossnobis": "walther2016",
+    "cka": "kornblith2019",
+    "procrustes": "williams2021",
+    "soft-matching": "khosla2023",
+}
 
 
 def references(records: Iterable[ResultRecord]) -> list[Reference]:

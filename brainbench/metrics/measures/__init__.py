@@ -1,4 +1,4 @@
-"""The registered metrics: RSA, CKA, Procrustes, ridge encoding, decoding and partial RSA.
+"""The registered metrics: RSA, CKA, Procrustes, ridge encoding, matched units, decoding and partial RSA.
 
 ``metric`` says what a metric is and finds one by name; ``patterns`` has the base of those that compare a model's
 features with animals' mean responses. Ours are registered here, in the order in which they are listed.
@@ -7,6 +7,7 @@ features with animals' mean responses. Ours are registered here, in the order in
 from __future__ import annotations
 
 from brainbench.metrics.measures.decoding import LabelDecoding
+from brainbench.metrics.measures.matching import OneToOne, SoftMatching
 from brainbench.metrics.measures.metric import register_metric
 from brainbench.metrics.measures.nuisance import PartialRSA
 from brainbench.metrics.measures.patterns import LinearCKA, Procrustes, RidgeEncoding
@@ -35,5 +36,7 @@ for measure in (
         noise="diag",
     ),
     PartialRSA(),
+    SoftMatching(),
+    OneToOne(),
 ):
     register_metric(measure)
