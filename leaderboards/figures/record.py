@@ -222,6 +222,61 @@ def _ends(interval: Mapping[str, Any] | None) -> tuple[float, ...]:
     return ends if all(map(math.isfinite, ends)) else ()
 
 
+_MOST_STIMULI = 24
+"""Stimuli that are drawn: those that add most to a score, and those that take most from it."""
+
+
+def stimulus_parts(score: Score) -> Drawing | None:
+    """Draw by how much a score falls without each stimulus, most first; None where that is not stated."""
+    pairs = zip(score.stimuli, score.without_stimulus, strict=False)
+    falls = [(score.on_scale(score.value) - score.on_scale(without), name) for name, without in pairs]
+    falls = sorted(((fall, name) for fall, name in falls if math.isfinite(fall)), reverse=True)
+    if len(falls) < 2:
+        return None
+    left_out = len(falls) - _MOST_STIMULI
+    if left_out > 0:
+        falls = [*falls[: _MOST_STIMULI // 2], *falls[-_MOST_STIMULI // 2 :]]
+    rows = [
+        ChartRow(
+            cut_name(name, 20),
+            [ChartPoint(fall, "c1" if fall > 0 else "c2", f"{name}: {fall:+.4f}", 3.5)],
+            Interval(min(fall, 0.0), max(fall, 0.0)),
+            "c1" if fall > 0 else "c2",
+        )
+        for fall, name in falls
+    ]
+    words = f"the score falls by, without each stimulus{f' ({left_out} in between not drawn)' if left_out > 0 else ''}"
+    scale = scale_of([fall for fall, _ in falls], _START, _WIDTH - 20)
+    return row_chart(f"{words}, {len(rows)} stimuli", rows, scale, words, step=15, width=_WIDTH)
+
+
+def unit_parts(statistics: Mapping[str, Any]) -> Drawing | None:
+    """Draw how alike units and their matched features are, by animal and by group; None where no units are matched."""
+    try:
+        units, rows, values = statistics["units"], [], []
+        for animal, parts in list(units["animals"].items())[:_MOST_LAYERS]:
+            part = [_number(value) for value in parts]
+            finite = [value for value in part if math.isfinite(value)]
+            points = [ChartPoint(value, "c1 faint", size=2) for value in finite]
+            mean = math.fsum(finite) / len(finite) if finite else math.nan
+            points.append(ChartPoint(mean, "c1", f"{animal}: {number(mean)}, {len(part)} units"))
+            rows.append(ChartRow(cut_name(animal, 20), points))
+            values += finite
+        for column, groups in units.get("groups", {}).items():
+            for name, group in list(groups.items())[:_MOST_LAYERS]:
+                low, high = map(_number, group["interval"] or (math.nan, math.nan))
+                interval = Interval(low, high) if math.isfinite(low + high) else None
+                tip = f"{name}: {number(_number(group['value']))}, {group['units']} units, {group['animals']} animals"
+                point = ChartPoint(_number(group["value"]), "c3", tip, shape="diamond")
+                label = f"{str(column).replace('_', ' ')} {name}"
+                rows.append(ChartRow(cut_name(label, 20), [point], interval, "c3"))
+        words = "correlation of each unit with its match"
+        return row_chart(f"{words}, {len(rows)} rows", rows, scale_of(values, _START, _WIDTH - 20), words, width=_WIDTH)
+    except (KeyError, TypeError, ValueError, AttributeError):
+        # As above: anyone may have written it.
+        return None
+
+
 PARTS = {"encoder": "c1", "attender": "c2", "decoder": "c3"}
 """Colour class of each part of a network."""
 _WIDTH, _START = 490.0, 150.0

@@ -29,7 +29,16 @@ from leaderboards import text as words
 from leaderboards.boards import RAW_INPUT
 from leaderboards.entries import Entry
 from leaderboards.figures.rdms import colour_stops, rdm_picture
-from leaderboards.figures.record import beside, diagram, draw_time_course, layer_order, layers, raw
+from leaderboards.figures.record import (
+    beside,
+    diagram,
+    draw_time_course,
+    layer_order,
+    layers,
+    raw,
+    stimulus_parts,
+    unit_parts,
+)
 from leaderboards.ranking import MEANINGS, lacking, not_repeatable, standing_of
 
 _TEMPLATES = Path(__file__).parents[1] / "templates"
@@ -183,6 +192,7 @@ def _score_view(record: ResultRecord) -> dict[str, Any]:
         "brain_rdm": rdm_picture(score.brain_rdm, score.stimuli),
         "pairs": pairs if len(pairs) <= _MOST_PAIRS else [],
         "groups": text.group_rows(score.provenance.statistics),
+        "parts": [part for part in (stimulus_parts(score), unit_parts(score.provenance.statistics)) if part],
         "time_course": draw_time_course(score.provenance.statistics),
         "comparisons": comparisons(record),
         "methods": text.methods([record]),

@@ -1,8 +1,11 @@
-"""The drawing of a score over time."""
+"""The drawings of one model: its score over time, and what stimuli and units add to it."""
 
 from __future__ import annotations
 
-from leaderboards.figures.record import draw_time_course
+from dataclasses import replace
+
+from leaderboards.figures.record import draw_time_course, stimulus_parts, unit_parts
+from tests.factories.records import make_record
 
 
 def _course(**changes):
@@ -33,3 +36,27 @@ def test_records_without_a_usable_score_over_time_have_no_drawing():
     assert draw_time_course({"time_course": 3}) is None
     assert draw_time_course(_course(points=[])) is None
     assert draw_time_course(_course(largest_lag="far")) is None
+
+
+def _units(**changes):
+    groups = {"layer": {"L<4>": {"value": 0.6, "interval": [0.5, 0.7], "units": 20, "animals": 2}}}
+    return {"units": {"animals": {"m0": [0.5, None, 0.7], "m1": [0.2]}, "groups": groups} | changes}
+
+
+def test_units_are_drawn_by_animal_and_by_group_and_what_is_no_statistic_is_not():
+    text = unit_parts(_units()).render()
+    assert "<title>m0: 0.600, 3 units" in text
+    assert "L&lt;4&gt;: 0.600, 20 units, 2 animals" in text
+    assert "layer L&lt;4&gt;" in text
+    for broken in ({}, {"units": 3}, _units(animals=[1]), _units(groups={"layer": 3}), _units(animals={"m": ["x"]})):
+        assert unit_parts(broken) is None
+
+
+def test_stimuli_that_add_most_come_first_and_those_in_between_are_counted():
+    names = tuple(f"s{index:02d}" for index in range(30))
+    without = tuple(0.5 - 0.01 * (index - 10) for index in range(30))
+    score = replace(make_record("net", 0.5).score, stimuli=names, without_stimulus=without, chance=0.0, attainable=1.0)
+    text = stimulus_parts(score).render()
+    assert text.index("s29: +0.19") < text.index("s18: +0.08") < text.index("s00: -0.10")
+    assert "(6 in between not drawn)" in text
+    assert stimulus_parts(replace(score, without_stimulus=())) is None
