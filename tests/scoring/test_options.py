@@ -7,6 +7,7 @@ import typer.main
 
 import brainbench
 from brainbench.cli import app
+from brainbench.cli.options import SCORE_FLAGS
 from brainbench.core.errors import UsageError
 from brainbench.core.files import to_plain
 from brainbench.scoring import ScoreOptions
@@ -30,7 +31,8 @@ ELSEWHERE = {
 @pytest.mark.parametrize("name", NAMES)
 def test_an_option_is_a_flag_with_help_a_keyword_and_a_setting(name: str):
     command = typer.main.get_command(app).commands["score"]  # pyright: ignore[reportAttributeAccessIssue]
-    flag = next(item for item in command.params if item.name == name)
+    variable = SCORE_FLAGS.get(name, (name,))[0].removeprefix("--").replace("-", "_")
+    flag = next(item for item in command.params if item.name == variable)
     assert flag.help
     default = getattr(ScoreOptions(), name)
     assert flag.default == default

@@ -333,7 +333,8 @@ def _start(script, out, *prefix):
     return subprocess.Popen([sys.executable, *prefix, str(script), str(out)], env=environment, text=True)
 
 
-@pytest.mark.parametrize("kills", [1, pytest.param(5, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("kills", [1, 5])
 def test_a_run_killed_at_any_moment_ends_with_the_weights_of_an_unbroken_one(kills, tmp_path, monkeypatch):
     script = tmp_path / "script.py"
     script.write_text(SCRIPT)
