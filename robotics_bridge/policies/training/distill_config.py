@@ -29,7 +29,7 @@ from robotics_bridge.tasks.settings import LearningRate, Loss, StudentSettings, 
 _HIDDEN = (512, 256, 128)
 _SHARED = ("hand", "observe", "placement", "resolution")
 """Fields of an encoder that are those of its student."""
-FELT = ("placement", "resolution", "noisy", "encoder", "encoder_settings")
+FELT = ("placement", "resolution", "noisy", "law", "encoder", "encoder_settings")
 """Fields of a student's touch, which one without touch does not have."""
 _Times = Annotated[int, Limit(least=0)]
 
@@ -59,6 +59,8 @@ class DistillConfig:
     """Taxels with the published noise (table 4.12)."""
     contacts: Literal["firm", "published"] | None = None
     """Contact model, ``firm`` or ``published``; by default that in which the teacher was trained."""
+    law: Literal["task", "published"] = "task"
+    """Forces of force taxels: the task's own (the engine's, with static friction), or the ``published`` law of depths."""
     encoder: str = AUTO
     """Tactile encoder: ``mlp``, ``rnn``, ``tactile_cnn``, ``tactile_convrnn``, … (an arm of
     :data:`~robotics_bridge.policies.encoders.arms.ARMS`), or a network's name; ``auto`` as published."""
@@ -170,6 +172,7 @@ class DistillConfig:
             ]
         parts += self._unusual
         parts += [] if self.contacts in (None, "firm") else [self.contacts]
+        parts += [] if self.law == "task" else [f"{self.law}-law"]
         parts.append(f"seed{self.seed}")
         drawn = self.encoder_settings.get("pretrained") or self.encoder_settings.get("seed", self.seed)
         parts += [f"draw-{re.sub(r'[^A-Za-z0-9]+', '-', str(drawn)).strip('-')}"] if drawn != self.seed else []
