@@ -1,6 +1,7 @@
 """A student as it is evaluated and as it is deployed, in the same episodes of its task, on C MuJoCo.
 
     python -m benchmarks.policies.deployment [--student in_palm_rotate.student] [--envs 102] [--seeds 3] [--write]
+    python -m benchmarks.policies.deployment --student FOLDER … --faulty --write    # hands that lag, drop and drift
 
 Deployed: exported to ONNX, and run by the control loop of ``policy deploy`` with its contract, checks and limits, one
 loop a hand. The hands are those of the task: their reports hold joints and finger forces, and touch is that of their
@@ -12,7 +13,7 @@ from __future__ import annotations
 
 import tempfile
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from threading import Barrier
@@ -37,19 +38,56 @@ from robotics_bridge.policies.training.student_files import load_student
 from robotics_bridge.tasks.task import Task
 
 
+@dataclass(frozen=True)
+class Faults:
+    """What is wrong with the reports of a hand."""
+
+    lag: int = 0
+    """Control steps by which a report is late."""
+    drop: float = 0.0
+    """Share of reports that are lost; the last one stands."""
+    drift: float = 0.0
+    """How far readings of joints and of finger forces have drifted at the end of an episode, either way (rad, N)."""
+
+
+TITLE = "Evaluation and deployment of a student"
+FAULTY = {
+    "deployed": Faults(), "one step late": Faults(lag=1), "two steps late": Faults(lag=2),
+    "a fifth of the reports lost": Faults(drop=0.2), "drift to ±.1 rad and N": Faults(drift=0.1),
+    "one late, a fifth lost, drift": Faults(1, 0.2, 0.1),
+}  # fmt: skip
+
+
 class Hands(Clock):
     """The hands of a batch of environments, and the time of their control loops.
 
     A loop that sleeps waits for the others; then all environments advance by one control step.
     """
 
-    def __init__(self, env: Env) -> None:
-        self.env, self.steps = env, 0
+    def __init__(self, env: Env, faults: Faults = Faults(), seed: int = 0) -> None:
+        self.env, self.steps, self.faults = env, 0, faults
+        self.random = np.random.default_rng(seed)
+        self.reports: list[tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]] = []
+        """Joint positions, velocities and finger forces of all environments, of the first step and those since."""
+        joints, fingers = len(env.joint_names), len(env.hand.fingers)
+        self.drift = [self.random.uniform(-1, 1, (env.num_envs, *shape)) for shape in ((joints,), (fingers, 3))]
+        self.lost = self.random.random((env.max_episode_length + 1, env.num_envs)) < faults.drop
+        self.lost[0] = False
         self.actions = torch.zeros(env.num_envs, env.num_actions)
         self.open = torch.ones(env.num_envs, dtype=torch.bool)
         """[B] environments in their first episode."""
         self.found = {name: torch.zeros(env.num_envs) for name in ("metric", "goals", "dropped")}
         self._barrier = Barrier(env.num_envs, action=self._advance)
+        self._report()
+
+    def _report(self) -> None:
+        proprio, count = self.env.observations["proprio"].double().numpy(), len(self.env.joint_names)
+        force = self.env.state.contacts.tip_force.double().numpy()
+        amount = self.faults.drift * self.steps / self.env.max_episode_length
+        position, force = (
+            values + amount * way for values, way in zip((proprio[:, :count], force), self.drift, strict=True)
+        )
+        self.reports.append((position, proprio[:, count : 2 * count] / VELOCITY, force))
 
     def __call__(self) -> float:
         return self.steps * self.env.step_dt
@@ -60,6 +98,7 @@ class Hands(Clock):
     def _advance(self) -> None:
         _, _, terminated, truncated, info = self.env.step(self.actions)
         self.steps += 1
+        self._report()
         ended = (terminated | truncated) & self.open
         for name in ("metric", "goals", "dropped"):
             self.found[name][ended] = info[name][ended].float()
@@ -77,12 +116,16 @@ class HandOfTask:
         self._map, self._calibration = env.action_map, PressureCalibration()
 
     def read(self) -> HandReading:
-        env, count, now = self.hands.env, len(self.joints), self.hands()
-        proprio = env.observations["proprio"][self.row].double().numpy()
-        force = env.state.contacts.tip_force[self.row].double().numpy()
+        hands, row = self.hands, self.row
+        arrived = hands.steps
+        while hands.lost[arrived, row]:
+            arrived -= 1
+        number = max(arrived - hands.faults.lag, 0)
+        position, velocity, force = (values[row] for values in hands.reports[number])
+        step = hands.env.step_dt
         return HandReading(
-            sequence=self.hands.steps, time=now, arrived=now, position=proprio[:count].copy(),
-            velocity=proprio[count : 2 * count] / VELOCITY, pressure=self._calibration.pressure(self.fingers, force),
+            sequence=arrived, time=number * step, arrived=arrived * step, position=position.copy(), velocity=velocity,
+            pressure=self._calibration.pressure(self.fingers, force),
         )  # fmt: skip
 
     def send(self, targets: NDArray[np.float64]) -> None:
@@ -100,7 +143,7 @@ class HandOfTask:
 
 
 def deploy(
-    deployed: DeployedPolicy, env: Env, seed: int, *, limited: bool
+    deployed: DeployedPolicy, env: Env, seed: int, *, limited: bool = True, faults: Faults = Faults()
 ) -> tuple[dict[str, torch.Tensor], list[Report]]:
     """Return what became of the first episode of each environment, and the report of each loop.
 
@@ -109,10 +152,11 @@ def deploy(
         env: its environment.
         seed: of the starts.
         limited: keep the limit on the speed of targets, as ``policy deploy`` does.
+        faults: of the hands' reports.
     """
     env.seed(seed)
     env.reset()
-    hands = Hands(env)
+    hands = Hands(env, faults, seed)
     steps = env.max_episode_length
 
     def control(row: int) -> Report:
@@ -132,36 +176,43 @@ def deploy(
 
 def main() -> None:
     parser = script_parser(__doc__, notes=True)
-    parser.add_argument("--student", default="in_palm_rotate.student")
+    parser.add_argument("--student", nargs="+", default=["in_palm_rotate.student"])
+    parser.add_argument("--faulty", action="store_true", help="hands that lag, drop and drift")
     parser.add_argument("--envs", type=int, default=102)
     parser.add_argument("--seeds", type=int, default=3)
     options = parser.parse_args()
-    student, described = load_student(options.student)
-    config = described["distill"]
-    task = with_contacts_of(tasks.load(config["task"], config["variant"]), [options.student])
-    make = partial(
-        tasks.make, num_envs=options.envs, hand=config["hand"], observe=config["observe"],
-        placement=config["placement"], resolution=config["resolution"],
-    )  # fmt: skip
-    seeds = range(options.seeds)
-    ways: dict[str, dict[str, Any]] = {}
-    for name, limited in (("evaluated", True), ("evaluated, speed of targets not limited", False)):
-        env = make(replace(task, rated_speed=limited))
-        found = evaluate(env, Policy(student), episodes=options.envs, seed=seeds)
-        ways[name] = {"metric": found.metric, "goals": found.goals, "dropped": found.dropped}
-    env = make(task)
-    reports: list[Report] = []
-    with tempfile.TemporaryDirectory() as folder:
-        target = Path(folder) / "policy.onnx"
-        deployed = read_deployed(export_policy(student, target, deployment=described["deployment"]).path)
-        for name, limited in (("deployed", True), ("deployed, speed of targets not limited", False)):
-            runs = [deploy(deployed, env, seed, limited=limited) for seed in seeds]
-            ways[name] = {key: torch.cat([found[key] for found, _ in runs]).tolist() for key in runs[0][0]}
-            reports += [report for _, own in runs for report in own] if limited else []
-    text = (
-        body(options.student, task, ways, reports) + f" What the policy reads: {', '.join(deployed.contract.inputs)}."
-    )
-    publish(options, "Evaluation and deployment of a student", text)
+    texts = []
+    for name in options.student:
+        student, described = load_student(name)
+        config, seeds = described["distill"], range(options.seeds)
+        task = with_contacts_of(tasks.load(config["task"], config["variant"]), [name])
+        make = partial(
+            tasks.make, num_envs=options.envs, hand=config["hand"], observe=config["observe"],
+            placement=config["placement"], resolution=config["resolution"],
+        )  # fmt: skip
+        ways: dict[str, dict[str, Any]] = {}
+        free = "" if options.faulty else ", speed of targets not limited"
+        for limited in (True, False) if free else (True,):
+            env = make(replace(task, rated_speed=limited))
+            found = evaluate(env, Policy(student), episodes=options.envs, seed=seeds)
+            ways["evaluated" + (free if not limited else "")] = {
+                "metric": found.metric, "goals": found.goals, "dropped": found.dropped,
+            }  # fmt: skip
+        env = make(task)
+        reports: list[Report] = []
+        cases = [(way, {"faults": faults}) for way, faults in FAULTY.items()]
+        with tempfile.TemporaryDirectory() as folder:
+            target = Path(folder) / "policy.onnx"
+            deployed = read_deployed(export_policy(student, target, deployment=described["deployment"]).path)
+            for way, settings in cases if options.faulty else [cases[0], (f"deployed{free}", {"limited": False})]:
+                runs = [deploy(deployed, env, seed, **settings) for seed in seeds]
+                ways[way] = {key: torch.cat([found[key] for found, _ in runs]).tolist() for key in runs[0][0]}
+                reports += [report for _, own in runs for report in own] if way == "deployed" else []
+        label = f"{config['observe']} at the {config['placement']}" if options.faulty else name
+        text = body(label, task, ways, reports)
+        texts.append(f"{text} What the policy reads: {', '.join(deployed.contract.inputs)}.")
+    title = "Deployed students on hands that lag, drop and drift" if options.faulty else TITLE
+    publish(options, title, "\n\n".join(texts))
 
 
 def body(student: str, task: Task, ways: dict[str, dict[str, Any]], reports: list[Report]) -> str:

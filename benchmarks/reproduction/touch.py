@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
 from statistics import fmean
@@ -30,6 +30,8 @@ from leaderboards.text import number, span
 RECORDS = Path(__file__).parents[1] / "policies" / "records"
 EQUAL, PUBLISHED = "students-placement-and-type.json", "students-published-encoders.json"
 """Students of equal size of all types; students with the published encoder of each type."""
+LATER = "students-noise-resolution-law.json"
+"""Students of equal size with noise, another resolution or the published law."""
 SURE, EARLY = "new", "seen"
 """Groups of types: students trained after the claims were written, and before."""
 KINDS = {
@@ -38,19 +40,21 @@ KINDS = {
     "proximity": "proximity", "center_of_pressure": "centres of pressure",
 }  # fmt: skip
 PLACES = {"hand": "whole hand", "tips": "finger tips"}
+VARIANTS = {"noisy": "with noise", "low": "90 taxels", "high": "667 taxels", "law": "published law"}
 TOUCH_PAGE, FIGURE = "which-touch.md", "images/what-reproduces/students.svg"
 RULE = (
     "Differences of success; the intervals hold together for all claims and groups (Bonferroni). A claim holds where "
-    "its interval lies above zero, one of several pairs where all do (the nearest is shown). The verdict is that of "
-    "types whose students were trained after the claims had been written; exploratory are those judged on others."
+    'its interval lies above zero (above minus the amount where it says "no more than"), one of several pairs where '
+    "all do (the nearest is shown). The verdict is that of students trained after the claims had been written; "
+    "exploratory are those judged on others."
 )
 Arms = Mapping[str, Sequence[float]]
 
 
-def arms_of(record: Mapping[str, Any]) -> dict[str, list[float]]:
+def arms_of(*records: Mapping[str, Any]) -> dict[str, list[float]]:
     """Return success by arm, a value for each seed; the teacher has one."""
-    arms: dict[str, list[float]] = {"teacher": [record["teacher"]]}
-    for row in record["students"]:
+    arms: dict[str, list[float]] = {"teacher": [records[0]["teacher"]]}
+    for row in (row for record in records for row in record["students"]):
         arms.setdefault(row["arm"], []).append(row["success"])
     return arms
 
@@ -58,8 +62,10 @@ def arms_of(record: Mapping[str, Any]) -> dict[str, list[float]]:
 def pairs_of(claim: Mapping[str, Any], types: Sequence[str], arms: Arms) -> list[list[str]]:
     """Return the pairs of a claim for the types of a group, those whose arms were trained."""
     chosen = [kind for kind in types if kind in claim.get("of", types)]
-    filled = [[name.format(kind) for name in pair] for pair in claim.get("pairs", ()) for kind in chosen]
-    return [pair for pair in filled if set(pair) <= arms.keys() and len(set(pair)) == len(pair)]
+    filled = dict.fromkeys(
+        tuple(name.format(kind) for name in pair) for pair in claim.get("pairs", ()) for kind in chosen
+    )
+    return [[*pair] for pair in filled if set(pair) <= arms.keys() and len(set(pair)) == len(pair)]
 
 
 def difference(arms: Arms, pairs: Sequence[Sequence[str]], level: float) -> Effect:
@@ -99,8 +105,9 @@ def judge_claim(claim: Mapping[str, Any], types: Sequence[str], arms: Arms, leve
     if not pairs:
         return None
     if claim["rule"] == "mean":
-        effect = difference(arms, pairs, level)
-        return Judged(effect, judge(effect, 1))
+        effect, margin = difference(arms, pairs, level), claim.get("margin", 0.0)
+        bounds = replace(effect.interval, low=effect.interval.low + margin, high=effect.interval.high + margin)
+        return Judged(effect, judge(replace(effect, value=effect.value + margin, interval=bounds), 1))
     effects = {" less ".join(map(in_words, pair)): difference(arms, [pair], level) for pair in pairs}
     weakest = min(effects, key=lambda name: effects[name].value)
     verdicts = [judge(effect, 1) for effect in effects.values()]
@@ -118,13 +125,17 @@ def record_of(name: str) -> dict[str, Any]:
 def claim_rows() -> tuple[list[str], list[list[str]]]:
     """Return columns and rows of the claims: on types trained after they were written, before, with other encoders."""
     document = read_json(Path(__file__).with_name("touch.json"))
-    groups, equal, published = document["groups"], arms_of(record_of(EQUAL)), arms_of(record_of(PUBLISHED))
-    everything = [kind for kinds in groups.values() for kind in kinds]
-    sets = ((groups[SURE], equal), (groups[EARLY], equal), (everything, published))
-    tested = [
-        (claim, kinds, arms) for claim in document["claims"] for kinds, arms in sets if pairs_of(claim, kinds, arms)
-    ]
-    level = 1 - 0.05 / len(tested)
+    groups, published = document["groups"], arms_of(record_of(PUBLISHED))
+    equal = arms_of(record_of(EQUAL), record_of(LATER))
+    everything = [*groups[SURE], *groups[EARLY]]
+
+    def sets_of(claim: Mapping[str, Any]) -> tuple[tuple[Sequence[str], Arms], ...]:
+        if "group" in claim:
+            return ((groups[claim["group"]], equal), ((), equal), ((), published))
+        return ((groups[SURE], equal), (groups[EARLY], equal), (everything, published))
+
+    tested = sum(bool(pairs_of(claim, *kinds)) for claim in document["claims"] for kinds in sets_of(claim))
+    level = 1 - 0.05 / tested
     rows = []
     for claim in document["claims"]:
         words = f"{claim['claim']} ({claim['source']})"
@@ -132,10 +143,10 @@ def claim_rows() -> tuple[list[str], list[list[str]]]:
             ours, verdict = looked_up(claim)
             rows.append([words, ours, "–", "–", verdict])
             continue
-        judged = [judge_claim(claim, kinds, arms, level) for kinds, arms in sets]
+        judged = [judge_claim(claim, *kinds, level) for kinds in sets_of(claim)]
         verdict = f"not tested, it would take: {claim['reason']}" if "reason" in claim else _verdict(judged)
         rows.append([words, *map(_words, judged), verdict])
-    head = ["claim", "new types, equal size", "first types, equal size", "published encoders", "verdict"]
+    head = ["claim", "types trained after it was written", "types trained before", "published encoders", "verdict"]
     return head, rows
 
 
@@ -166,10 +177,17 @@ def _words(judged: Judged | None) -> str:
 
 def in_words(arm: str) -> str:
     """Return an arm as a reader would say it."""
-    kind, _, place = arm.rpartition(" ")
+    kind, *words = arm.split(" ")
     if kind not in KINDS:
         return {"none": "no touch", "none, memory": "no touch, with memory"}.get(arm, arm)
-    return f"{KINDS[kind]}, {PLACES[place]}"
+    return ", ".join([KINDS[kind], PLACES[words[0]], *(VARIANTS[word] for word in words[1:])])
+
+
+def compared() -> dict[str, Any]:
+    """Return the students of :data:`LATER` with those of equal size that they are compared with."""
+    later, equal = record_of(LATER), record_of(EQUAL)
+    plain = {row["arm"].rpartition(" ")[0] for row in later["students"]} | {"none, memory"}
+    return {**later, "students": [*later["students"], *(row for row in equal["students"] if row["arm"] in plain)]}
 
 
 def ranked(record: Mapping[str, Any]) -> dict[str, Effect]:
@@ -256,19 +274,23 @@ def stimuli_table() -> str:
 
 def write_pages(out: Path, decorate: Callable[[Drawing], str] = standalone) -> list[Path]:
     """Write the page "Which touch should my hand have?" and figure 4.6 into a folder; return the files."""
-    records = [record_of(EQUAL), record_of(PUBLISHED)]
+    records = [record_of(EQUAL), compared(), record_of(PUBLISHED)]
     template = Template(Path(__file__).with_name("which-touch.md").read_text(encoding="utf-8"))
-    text = template.substitute(students=student_table(records[0]), published=student_table(records[1]))
+    students, later, published = map(student_table, records)
+    text = template.substitute(students=students, later=later, published=published)
     return [write_text(out / TOUCH_PAGE, text), write_text(out / FIGURE, decorate(figure(records)))]
 
 
 def main() -> None:
     options = script_parser(__doc__).parse_args()
-    records = [record_of(EQUAL), record_of(PUBLISHED)]
+    records, more = [record_of(EQUAL), record_of(PUBLISHED)], compared()
     head, rows = claim_rows()
-    command = f"Students: `{records[0]['command']}`, {records[0]['where']}; {records[0]['notes']}"
+    parts = [
+        f"{start}: `{record['command']}`, {record['where']}; {record['notes']}\n\n{student_table(record)}"
+        for start, record in (("Students", records[0]), ("Noise, resolution and law", more))
+    ]
     orders = f"Order of the arms by success in training:\n\n{order_table(records)}"
-    body = "\n\n".join([command, student_table(records[0]), table(head, rows), RULE, orders])
+    body = "\n\n".join([*parts, table(head, rows), RULE, orders])
     publish(options, "Students by what they feel", body, subject="policies", where="records, no simulation")
 
 

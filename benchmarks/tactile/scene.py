@@ -95,7 +95,7 @@ def sensors(name: str, count: int = 100, points: int = 500, noise: Noise | None 
         "distance": lambda: SurfaceDistanceProbe(**common),
         "contact": lambda: ContactProbe(**common),
         "depth": lambda: ContactDepthProbe(**common),
-        "kinematic": lambda: KinematicTaxel(**common),
+        "kinematic": lambda: KinematicTaxel(**common, total="law"),
         "proximity": lambda: ProximityTaxel(**common, points=points),
         "elastomer": lambda: ElastomerTaxel(**common, points=points),
         "temperature": temperature,

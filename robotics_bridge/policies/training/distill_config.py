@@ -60,7 +60,7 @@ class DistillConfig:
     contacts: Literal["firm", "published"] | None = None
     """Contact model, ``firm`` or ``published``; by default that in which the teacher was trained."""
     law: Literal["task", "published"] = "task"
-    """Forces of force taxels: the task's own (the engine's, with static friction), or the ``published`` law of depths."""
+    """Forces of force taxels: the task's own (the engine's, static friction), or the ``published`` law of depths."""
     encoder: str = AUTO
     """Tactile encoder: ``mlp``, ``rnn``, ``tactile_cnn``, ``tactile_convrnn``, … (an arm of
     :data:`~robotics_bridge.policies.encoders.arms.ARMS`), or a network's name; ``auto`` as published."""

@@ -23,7 +23,6 @@ from robotics_bridge.policies.training.distill import DistillResult, distill
 from robotics_bridge.policies.training.distill_config import DistillConfig
 from robotics_bridge.policies.training.student_files import CONFIG, load_student
 from robotics_bridge.policies.training.teacher import load_teacher
-from robotics_bridge.sensors.taxels.sensors import PUBLISHED_TWIST
 from robotics_bridge.tasks.settings import CONTACTS, contacts_name
 
 _log = logging.getLogger(__name__)
@@ -94,7 +93,7 @@ def train_student(
     elif config.variant != "published":
         task = with_contacts_of(task, [config.teacher])
     if config.law == "published":
-        task = replace(task, taxel_twist=PUBLISHED_TWIST)
+        task = replace(task, taxel_twist=tasks.load(config.task, "published").taxel_twist)
     if config.tactile is not None and config.tactile.time == "resampled" and task.solver.timestep != CONTROL_SUB_STEP:
         raise UsageError(
             f"time='resampled' is for readings every {CONTROL_SUB_STEP:g} s; those of {config.task!r} come every "
