@@ -8,15 +8,22 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from brainbench.cli.options import SCORE, beside, option, out_folder_option, with_options
-from brainbench.cli.output import Output, progress_bar, table, table_of
+from brainbench.cli.options import SCORE, beside, option, out_file_option, out_folder_option, with_options
+from brainbench.cli.output import Output, facts, progress_bar, table, table_of
+from brainbench.cli.requirements import needs
 from brainbench.cli.score import left_out
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
     import numpy as np
     from numpy.typing import NDArray
 
+    from brainbench.datasets import StoredRDMs
+    from brainbench.metrics.measures.rsa import RSA
     from brainbench.metrics.reliability.subject_rdm import SubjectRDM
+
+Metric = Annotated[str, typer.Option(help="RSA metric of the RDMs; 'rsa' is that of scores.")]
 
 _LARGEST_SHOWN = 12
 """RDMs of more conditions are only written as JSON."""
@@ -32,6 +39,8 @@ def inspect(
     """Show what a file holds and which --conditions could label its trials."""
     from brainbench.datasets import inspect as inspect_file
 
+    if (stored := _stored(path)) is not None:
+        return Output(stored, f"{path} (rsatoolbox)\n{_described(stored)}\n{facts(_contents(stored))}")
     files = _found(path)
     with progress_bar() as progress:
         inspection = inspect_file(files, strict=strict, progress=progress)
@@ -45,21 +54,29 @@ def rdm(
     options: Any = None,
     pool: Annotated[str, typer.Option(help="One RDM per 'subject', per 'session', or of 'all' together.")] = "subject",
     seed: Annotated[int, typer.Option(help="Seed of the split halves.")] = 0,
-    metric: Annotated[str, typer.Option(help="RSA metric of the RDMs; 'rsa' is that of scores.")] = "rsa-correlation",
+    metric: Metric = "rsa-correlation",
+    out: Annotated[Path | None, out_file_option("File to write too, as rsatoolbox reads it (.h5).")] = None,
 ) -> Output:
-    """Compute every animal's RDM and its split-half reliability."""
+    """Compute every animal's RDM and its split-half reliability; or show the RDMs in a file of rsatoolbox."""
     from dataclasses import replace
 
+    import numpy as np
+
     from brainbench.core.errors import UsageError
+    from brainbench.datasets import StoredRDMs, write_rdms
     from brainbench.datasets.trials.session_trials import pooled
-    from brainbench.metrics import get_metric
-    from brainbench.metrics.measures.rsa import RSA
     from brainbench.scoring.neural_responses import open_neural_responses
     from brainbench.scoring.options import ScoreOptions
 
-    measure = get_metric(metric)
-    if not isinstance(measure, RSA):
-        raise UsageError(f"The metric {metric!r} has no RDM of animals; choose 'rsa' or another metric of RDMs.")
+    measure = _of_rdms(metric)
+    if out is not None and out.suffix.lower() not in (".h5", ".hdf5"):
+        raise UsageError(
+            f"--out is a file that ends in .h5, from which rsatoolbox tells its kind; received {out.name!r}."
+        )
+    if (stored := _stored(source)) is not None:
+        if out is not None or any(options.values()):
+            raise UsageError(f"{source} holds RDMs and no trials; leave out what chooses trials, and --out.")
+        return Output(stored, _described(stored) + _matrices("RDM", stored.stimuli, stored.names, stored.values))
     with progress_bar() as progress:
         brain = open_neural_responses(source, **options, progress=progress)
     brain = replace(brain, dataset=pooled(brain.dataset, pool))
@@ -80,10 +97,111 @@ def rdm(
         },
     )
     text += "".join(f"\n{line}" for line in (*left_out(brain.origin), *(f"Note: {doubt}." for doubt in brain.doubts)))
-    if len(labels) <= _LARGEST_SHOWN:
-        for animal in animals:
-            text += "\n\n" + _matrix(f"RDM of animal {animal.subject}", labels, animal.rdm)
+    names, rdms = [item.subject for item in animals], [item.rdm for item in animals]
+    text += _matrices("RDM of animal", labels, names, rdms)
+    if out is not None:
+        about = {name: str(brain.dataset.attrs[name]) for name in ("conditions", "window", "content_hash")}
+        about |= {"recordings": brain.source, "responses": str(brain.dataset.attrs.get("measure", "spikes"))}
+        more = {name: [getattr(item, name) for item in animals] for name in ("units", "trials", "reliability")}
+        write_rdms(out, StoredRDMs(np.stack(rdms), labels, tuple(names), measure.brain_method, more, about))
+        text += f"\n\nWritten: {out}"
     return Output(data, text)
+
+
+@app.command("compare")
+@needs(cache=True)
+@with_options(SCORE, ("stimuli", "match"), build=False)
+def compare(
+    rdms: Annotated[str, typer.Argument(help="A file of RDMs, as rsatoolbox and recordings rdm --out write it.")],
+    model: Annotated[str, typer.Argument(help="A model as brainbench score takes it, or another file of RDMs.")],
+    options: Any = None,
+    metric: Metric = "rsa-correlation",
+    seed: Annotated[int, typer.Option(help="Seed of untrained weights.")] = 0,
+) -> Output:
+    """Compare RDMs of a file with those of a model's layers, or of another file, as they are.
+
+    A file of RDMs has no trials, so nothing is corrected for noise and nothing is tested: that is a score's part.
+    """
+    import numpy as np
+
+    from brainbench.core.contracts import join_labels
+    from brainbench.core.errors import DataError, UsageError, listing
+    from brainbench.metrics.rdms.comparison import compare as compare_rdms
+    from brainbench.scoring.model_responses import resolve_model
+    from brainbench.scoring.options import ScoreOptions
+
+    measure, stored = _of_rdms(metric), _stored(rdms)
+    if stored is None:
+        raise UsageError(
+            f"{rdms} is no file of RDMs; recordings rdm {rdms} --out FILE.h5 writes one, score needs none."
+        )
+    if (side := _stored(model)) is not None:
+        pairs = join_labels(stored.stimuli, side.stimuli, options["match"])
+        order = np.array([side.stimuli.index(partner) for partner in pairs.values()])
+        layers = {name: measure.take(values, order) for name, values in zip(side.names, side.values, strict=True)}
+    else:
+        with progress_bar() as progress:
+            resolved = resolve_model(model, seed=seed)
+            responses = resolved.respond(ScoreOptions(stimuli=options["stimuli"], seed=seed), progress=progress)
+        pairs = join_labels(stored.stimuli, responses.labels, options["match"])
+        features = responses.features([responses.labels.index(partner) for partner in pairs.values()])
+        layers = {name: measure.layer(values) for name, values in features.items()}
+    if len(pairs) < measure.fewest:
+        raise DataError(
+            f"{rdms} and {model} have {listing(pairs)} in common; a comparison needs {measure.fewest} stimuli."
+        )
+    rows = np.array([stored.stimuli.index(label) for label in pairs])
+    brain = np.stack([measure.take(values, rows) for values in stored.values])
+    values = compare_rdms(np.stack([*layers.values()])[:, None], brain, method=measure.comparison)
+    title = f"{measure.comparison} of {len(pairs)} stimuli, {_described(stored)}"
+    columns = {"": "{0[0]}", **{f">{name}": f"{{0[1][{place}]:.3f}}" for place, name in enumerate(stored.names)}}
+    text = table_of(title, list(zip(layers, values.tolist(), strict=True)), columns)
+    text += f"\n{_UNCORRECTED}"
+    data = {"comparison": measure.comparison, "stimuli": pairs, "rdms": stored.names, "noise": "unknown"}
+    return Output({**data, "values": dict(zip(layers, values.tolist(), strict=True))}, text)
+
+
+_UNCORRECTED = (
+    "Nothing is corrected for noise or tested, since a file of RDMs has no trials; the largest of many layers is no "
+    "finding."
+)
+
+
+def _of_rdms(metric: str) -> RSA:
+    from brainbench.core.errors import UsageError
+    from brainbench.metrics import get_metric
+    from brainbench.metrics.measures.rsa import RSA
+
+    measure = get_metric(metric)
+    if not isinstance(measure, RSA):
+        raise UsageError(f"The metric {metric!r} has no RDM of animals; choose 'rsa' or another metric of RDMs.")
+    return measure
+
+
+def _stored(source: str) -> StoredRDMs | None:
+    """Return the RDMs that a file of rsatoolbox holds; None of whatever is no such file."""
+    from brainbench.datasets import read_rdms
+
+    path = Path(source)
+    return read_rdms(path) if path.suffix.lower() in (".h5", ".hdf5") and path.is_file() else None
+
+
+def _contents(stored: StoredRDMs) -> dict[str, object]:
+    from brainbench.core.errors import listing
+
+    return {
+        "stimuli": listing(stored.stimuli, limit=12, quoted=False),
+        "RDMs": listing(stored.names, limit=12, quoted=False),
+        **{name: listing(map(str, values), limit=12, quoted=False) for name, values in stored.columns.items()},
+        "! no trials": "noise cannot be estimated, so there is no score; recordings compare shows them beside a model",
+    }
+
+
+def _described(stored: StoredRDMs) -> str:
+    about = "".join(f"; {name} {value}" for name, value in stored.about.items())
+    notes = f"\nNote: {stored.note}." if stored.note else ""
+    title = f"{len(stored.names)} RDM{'s' * (len(stored.names) > 1)} of {len(stored.stimuli)} stimuli"
+    return f"{title} ({stored.measure or 'measure unknown'}{about}){notes}"
 
 
 @app.command("check")
@@ -119,13 +237,17 @@ def export(
         Path, typer.Argument(callback=beside, help="*.h5 (any number of sessions), *.nwb (one), or a folder of NWB.")
     ],
     select: Annotated[str | None, option(SCORE, "select")] = None,
+    format: Annotated[
+        str | None,
+        typer.Option(help="'brainbench', 'nwb', or 'temporaldata' for torch_brain; by default the ending's."),
+    ] = None,
 ) -> Output:
     """Write a small copy without raw data: spike times and tables. Scores of the copy are identical."""
     from brainbench.datasets import export as export_files
 
     sources = _found(source)
     with progress_bar("copying the recordings"):
-        files = export_files(sources, target, select=select)
+        files = export_files(sources, target, select=select, format=format)
     columns = {"file": "{0}", ">": lambda path: f"{path.stat().st_size / 1e6:.2f} MB"}
     return Output({"files": files}, table_of("", files, columns))
 
@@ -164,12 +286,16 @@ def _verdict(animal: SubjectRDM) -> str:
     return "; ".join((verdict, *animal.notes))
 
 
-def _matrix(title: str, labels: tuple[str, ...], rdm: NDArray[np.float64]) -> str:
-    """Show an upper triangle [P] as a square of numbers."""
+def _matrices(title: str, labels: Sequence[str], names: Iterable[str], rdms: Iterable[NDArray[np.float64]]) -> str:
+    """Show upper triangles [P] as squares of numbers, if they are small."""
     from scipy.spatial.distance import squareform
 
-    rows = [[label, *(f"{value:.3f}" for value in line)] for label, line in zip(labels, squareform(rdm), strict=True)]
-    return table(title, ["", *labels], rows, right=tuple(range(1, len(labels) + 1)))
+    texts = []
+    for name, rdm in zip(names, rdms, strict=True) if len(labels) <= _LARGEST_SHOWN else ():
+        rows = [[label, *(f"{value:.3f}" for value in row)] for label, row in zip(labels, squareform(rdm), strict=True)]
+        right = tuple(range(1, len(labels) + 1))
+        texts.append("\n\n" + table(f"{title} {name}", ["", *labels], rows, right=right))
+    return "".join(texts)
 
 
 @app.command("recipe")

@@ -87,8 +87,8 @@ CACHED = (
 )  # fmt: skip
 """Commands that keep what they compute in the cache."""
 FOREIGN = (
-    "score", "recordings inspect", "recordings rdm", "recordings check", "recordings export", "stimuli show",
-    "stimuli plot", "stimuli render", "stimuli separability", "stimuli fit", "power",
+    "score", "recordings inspect", "recordings rdm", "recordings compare", "recordings check", "recordings export",
+    "stimuli show", "stimuli plot", "stimuli render", "stimuli separability", "stimuli fit", "power",
 )  # fmt: skip
 """Commands that read HDF5 files of others."""
 

@@ -16,8 +16,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.errors import DataError, UsageError, check_each
-from brainbench.datasets.hdf5 import write_recordings
+from brainbench.core.errors import DataError, UsageError, check_each, check_name, listing
+from brainbench.datasets.hdf5 import RESPONSE, write_recordings
+from brainbench.datasets.inspection import time_faults
 from brainbench.datasets.ledger import Ledger
 from brainbench.datasets.nwb import write_nwb
 from brainbench.datasets.reading import (
@@ -32,31 +33,42 @@ from brainbench.datasets.sessions import (
     OBSERVED,
     SPIKES,
     LostColumn,
+    Series,
     Session,
     SessionTable,
     decode,
     neurodata_type,
     ragged,
 )
+from brainbench.datasets.temporaldata import write_temporaldata
 from brainbench.datasets.trials.counting import LICKS, lick_times, no_units, read_spikes, recorded_span
 from brainbench.datasets.trials.selection import EVERYTHING, Selection, check_values, select_rows
 
 _LOG = logging.getLogger(__name__)
 
 
-def export(source: Source, target: str | os.PathLike[str], *, select: Selection | str | None = None) -> list[Path]:
+def export(
+    source: Source, target: str | os.PathLike[str], *, select: Selection | str | None = None, format: str | None = None
+) -> list[Path]:
     """Copy recordings without raw data.
 
     Args:
         source: as in :func:`~brainbench.datasets.open_recordings`.
-        target: ``*.h5`` (our layout; any number of sessions), ``*.nwb`` (one session), or a folder, which
-            gets one NWB file per session.
+        target: a folder, which gets one file per session, or a file: ``*.h5`` or ``*.nwb``.
         select: subjects, trials and units to copy; all by default. Rules are applied to the table that
             the layout names, else to ``trials``.
+        format: ``brainbench`` (our layout, any number of sessions in a file; the one of ``*.h5``), ``nwb`` (the one of
+            folders), or ``temporaldata``, whose files torch_brain reads and which holds signals too.
 
     Returns:
         The files that were written.
     """
+    target = Path(target)
+    ending = target.suffix.lower()
+    kind = format or ("brainbench" if ending in (".h5", ".hdf5") else "nwb")
+    check_name("format", kind, _FORMATS)
+    if ending and ending not in (endings := _FORMATS[kind]):
+        raise UsageError(f"Files of {kind} end in {listing(endings)}, or name a folder; received {target.name!r}.")
     ledger = Ledger()
     layout, paths = find_recordings(source, ledger)
     paths = suitable_files(paths, ledger)
@@ -66,64 +78,86 @@ def export(source: Source, target: str | os.PathLike[str], *, select: Selection 
         with open_file(path) as file:
             for session, session_layout in each_session(file, path, layout):
                 subjects.add(session.subject)
-                if not session.has_spikes:
+                if not session.has_spikes and not (signals := _signals(session, kind)):
                     ledger.leave("sessions", no_units(session), lost=True)
                 elif session.subject in (chosen.subjects or subjects):
                     ledgers.append(Ledger())
                     table = session_layout.conditions.table if session_layout else "trials"
+                    if not session.has_spikes:
+                        session = replace(session, units=None, populations=signals)
                     sessions.append(subset(session, chosen, table, ledgers[-1]))
+                    for fault in time_faults(session):
+                        _LOG.warning("%s: %s", session.source, fault)
     check_each("subject", chosen.subjects, sorted(subjects))
     check_values(ledgers)
     for reason in ledger.skipped:
         _LOG.warning("Not copied: %s", reason)
     if not sessions:
-        raise DataError(f"None of the {len(paths)} files of {source} holds units with spike times; nothing to copy.")
-    target = Path(target)
-    together = target.suffix in (".h5", ".hdf5")
-    if target.suffix == ".nwb" and len(sessions) > 1:
-        raise UsageError(f"An NWB file holds one session, these are {len(sessions)}; name a folder or an .h5 file.")
-    if target.suffix and not together and target.suffix != ".nwb":
-        raise UsageError(f"Recordings are written to .nwb, .h5 or a folder; received {target.name!r}.")
-    places = [target if target.suffix else target / name for name in _file_names(sessions)]
+        more = "" if kind == "temporaldata" else "; temporaldata holds signals too (--format temporaldata)"
+        raise DataError(f"None of the {len(paths)} files of {source} holds units with spike times{more}.")
+    if ending and kind != "brainbench" and len(sessions) > 1:
+        raise UsageError(f"A file of {kind} holds one session, these are {len(sessions)}; name a folder.")
+    places = [target] if ending else [target / name for name in _file_names(sessions, _FORMATS[kind][0])]
     if lost := {place.resolve() for place in places} & {path.resolve() for path in paths}:
         raise UsageError(f"The copy would take the place of its source {str(min(lost))!r}; name another target.")
-    if together:
-        return [write_recordings(target, sessions)]
-    return [write_nwb(place, session) for place, session in zip(places, sessions, strict=True)]
+    if kind == "brainbench":
+        return [write_recordings(places[0], sessions)] if ending else list(map(write_recordings, places, sessions))
+    return list(map(write_nwb if kind == "nwb" else write_temporaldata, places, sessions))
+
+
+_FORMATS = {"brainbench": (".h5", ".hdf5"), "nwb": (".nwb",), "temporaldata": (".h5", ".hdf5")}
+"""Formats of copies, and how their files end."""
+
+
+def _signals(session: Session, kind: str) -> dict[str, Series]:
+    """Return the signals of a session that a format holds: in our layout responses by trial, in NWB none."""
+    signals = {place: item for place, item in session.populations.items() if isinstance(item, Series)}
+    by_trial = {RESPONSE: signals[RESPONSE]} if RESPONSE in signals else {}
+    return {"nwb": {}, "brainbench": by_trial}.get(kind, signals)
 
 
 def subset(
     session: Session, selection: Selection = EVERYTHING, table: str = "trials", ledger: Ledger | None = None
 ) -> Session:
-    """Read a session into memory: spikes, tables and plain columns of the rows that a selection keeps.
+    """Read a session into memory: spikes, else signals, tables and plain columns of the rows that a selection keeps.
 
     ``ledger`` takes what the rules removed and met.
     """
-    units = session.units
-    if units is None:
-        raise DataError(f"{session.source} has no units table; there are no spikes to copy.")
     ledger = ledger or Ledger()
+    tables: dict[str, SessionTable] = {}
+    populations: dict[str, Series] = {}
+    passing = {name: np.ones(len(original), dtype=bool) for name, original in session.tables.items()}
+    if table in passing:
+        passing[table] = select_rows(session.tables[table], selection.trials, "trials", ledger)
+    for name, original in session.tables.items():
+        tables[name] = SessionTable(name, _plain(original, passing[name]), original.where)
+    if LICKS not in tables and (licks := lick_times(session)) is not None:
+        tables[LICKS] = SessionTable(LICKS, {"start_time": licks, "stop_time": licks}, session.source)
+    units = None if session.units is None else _units(session.units, selection, ledger)
+    for place, series in session.populations.items() if units is None else ():
+        values = np.asarray(series.data[...])
+        values = values if values.ndim > 1 else values[:, None]
+        cells = SessionTable("units", {"id": np.arange(values.shape[-1]), **series.columns}, session.source)
+        columns = select_rows(cells, selection.units, "units", ledger)
+        values = values[passing[series.table]] if series.table else values
+        stamps = None if series.timestamps is None else np.asarray(series.timestamps[...])
+        more = {"timestamps": stamps, "columns": _plain(cells, columns)}
+        populations[place] = replace(series, name=place, data=values[..., columns], **more)
+    return replace(session, units=units, tables=tables, series={}, populations=populations)
+
+
+def _units(units: SessionTable, selection: Selection, ledger: Ledger) -> SessionTable:
     spikes = read_spikes(units, ledger.notes)
     chosen = select_rows(units, selection.units, "units", ledger)
     chosen &= np.array([len(times) for times in spikes]) >= selection.min_spikes
     if not chosen.any():
-        raise DataError(f"No unit of {session.source} passes {'; '.join(selection.lines())}; nothing to copy.")
+        raise DataError(f"No unit of {units.label} passes {'; '.join(selection.lines())}; nothing to copy.")
     columns = _plain(units, chosen)
     columns |= ragged(SPIKES, [times for times, keep in zip(spikes, chosen, strict=True) if keep])
     if not chosen.all() and OBSERVED not in columns and (span := recorded_span(spikes)) is not None:
         # The span was that of all units; the copy must not shrink it to that of those it holds.
         columns |= ragged(OBSERVED, [np.array([span])] * int(chosen.sum()))
-    tables = {}
-    for name, original in session.tables.items():
-        rows = (
-            select_rows(original, selection.trials, "trials", ledger)
-            if name == table
-            else np.ones(len(original), dtype=bool)
-        )
-        tables[name] = SessionTable(name, _plain(original, rows), original.where)
-    if LICKS not in tables and (licks := lick_times(session)) is not None:
-        tables[LICKS] = SessionTable(LICKS, {"start_time": licks, "stop_time": licks}, session.source)
-    return replace(session, units=SessionTable("units", columns, units.where), tables=tables, series={})
+    return SessionTable("units", columns, units.where)
 
 
 def _plain(table: SessionTable, rows: NDArray[np.bool_]) -> dict[str, NDArray[Any]]:
@@ -153,13 +187,13 @@ def _plain(table: SessionTable, rows: NDArray[np.bool_]) -> dict[str, NDArray[An
     return columns
 
 
-def _file_names(sessions: list[Session]) -> list[str]:
+def _file_names(sessions: list[Session], ending: str) -> list[str]:
     """Return a name for each file; equal ones, as of the probes of one session, are numbered."""
     names: list[str] = []
     for session in sessions:
         subject, name = (re.sub(r"[^A-Za-z0-9]+", "-", part) for part in (session.subject, session.session))
         stem, number = f"sub-{subject}_ses-{name}", 1
-        while (name := f"{stem}{f'_probe-{number}' * (number > 1)}.nwb") in names:
+        while (name := f"{stem}{f'_probe-{number}' * (number > 1)}{ending}") in names:
             number += 1
         names.append(name)
     return names

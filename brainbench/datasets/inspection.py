@@ -257,7 +257,7 @@ def _summary(session: Session, usable: bool, ledger: Ledger) -> SessionSummary:
         ledger.leave("units", units.problem, units.units, lost=True) if units.problem else ledger.take(
             "units", units.units
         )
-    missing += _time_faults(session)
+    missing += time_faults(session)
     if not session.tables:
         missing.append("no interval tables: nothing says when which stimulus was presented")
     elif not usable:
@@ -300,7 +300,7 @@ def _units(session: Session) -> UnitsSummary | None:
     )
 
 
-def _time_faults(session: Session) -> list[str]:
+def time_faults(session: Session) -> list[str]:
     """Return what speaks against seconds of one clock, once for all tables."""
     with contextlib.suppress(BrainbenchError):  # of spikes, which is told already
         if session.units is not None and session.has_spikes:

@@ -54,9 +54,9 @@ def read_nwb(file: h5py.File, path: Path) -> Session:
     notes: list[str] = []
     subject = _string(file, "general/subject/subject_id")
     if not subject:
-        subject = _entity(path, "sub")
+        subject = named_by_file(path, "sub")
         notes.append(f"{path.name}: no subject_id; the subject {subject!r} was taken from the file name")
-    session = _string(file, "general/session_id") or _entity(path, "ses")
+    session = _string(file, "general/session_id") or named_by_file(path, "ses")
     description = _string(file, "session_description")
     keywords = file.get("general/keywords")
     tables, units, signals = _tables(file, path)
@@ -264,7 +264,8 @@ def _words(dataset: Any, *, lower: bool = True) -> list[str]:
     return [str(item).lower() if lower else str(item) for item in values]
 
 
-def _entity(path: Path, entity: str) -> str:
+def named_by_file(path: Path, entity: str) -> str:
+    """Return the part of a file's name that stands for an animal (``sub``) or a session (``ses``), else the stem."""
     match = re.search(rf"(?:^|_){entity}-([^_.]+)", path.name)
     return match.group(1) if match else path.stem
 

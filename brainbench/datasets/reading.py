@@ -18,7 +18,7 @@ from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError,
 from brainbench.core.plugins import load_optional
 from brainbench.core.reading.hdf5 import open_hdf5
 from brainbench.core.reading.regular import check_file
-from brainbench.datasets import hdf5, nwb
+from brainbench.datasets import hdf5, nwb, rdm_files, temporaldata
 from brainbench.datasets.layouts.registry import (
     ENTRY_POINTS,
     detect_layout,
@@ -107,7 +107,7 @@ def open_file(path: Path) -> AbstractContextManager[h5py.File]:
             f"{path} is an .npz file: published recordings are opened one at a time and without a layout, to be "
             "inspected, checked and scored; they hold no spike times to join or copy."
         )
-    return open_hdf5(path, "recording", "brainbench reads NWB 2.x and its own HDF5 layout.")
+    return open_hdf5(path, "recording", "brainbench reads NWB 2.x, temporaldata and its own HDF5 layout.")
 
 
 def suitable_files(paths: Sequence[Path], ledger: Ledger) -> list[Path]:
@@ -142,7 +142,8 @@ def each_session(
     :func:`open_file`, which names the file if reading fails.
     """
     _check_kind(file, path)
-    for session in hdf5.read_sessions(file, path) if hdf5.is_ours(file) else [nwb.read_nwb(file, path)]:
+    read = temporaldata.read_temporaldata if temporaldata.is_temporaldata(file) else nwb.read_nwb
+    for session in hdf5.read_sessions(file, path) if hdf5.is_ours(file) else [read(file, path)]:
         session_layout = layout or detect_layout(session)
         yield (session if session_layout is None else session_layout.adapted(session)), session_layout
 
@@ -151,11 +152,16 @@ def _check_kind(file: h5py.File, path: Path) -> None:
     """Raise DataError unless an open file holds sessions of spike times, by its kind."""
     if hdf5.holds_counts(file, path):
         raise DataError(f"{path} holds counted responses, not sessions of spike times; open it alone.")
-    if hdf5.is_ours(file) or nwb.is_nwb(file):
+    if hdf5.is_ours(file) or nwb.is_nwb(file) or temporaldata.is_temporaldata(file):
         return
+    if rdm_files.is_rdms(file):
+        raise DataError(
+            f"{path} holds RDMs without trials, whose noise nobody can estimate, so no score on it would be honest; "
+            f"compare them with a model as they are: brainbench recordings compare {path} MODEL."
+        )
     inside = ", ".join(list(file)[:8]) or "nothing"
     raise DataError(
-        f"{path} is HDF5 but neither NWB nor the {hdf5.FORMAT} layout: it holds {inside}. "
+        f"{path} is HDF5 but neither NWB nor temporaldata nor the {hdf5.FORMAT} layout: it holds {inside}. "
         f"`brainbench.datasets.write_recordings` writes the layout."
     )
 

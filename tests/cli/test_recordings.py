@@ -4,11 +4,13 @@ import json
 
 import numpy as np
 import pytest
+import rsatoolbox
 
-from brainbench.datasets import write_recordings
+from brainbench.datasets import read_rdms, write_recordings
 from brainbench.datasets.sessions import make_session
 from brainbench.datasets.synthetic import ResponseGeometry, write_files
-from brainbench.metrics import get_metric
+from brainbench.metrics import compare, get_metric, rdm
+from brainbench.models.features import read_features, write_features
 from brainbench.scoring.neural_responses import open_neural_responses
 from brainbench.scoring.options import ScoreOptions
 from tests.factories.published_recordings import make_zero_filled, write_published
@@ -78,6 +80,64 @@ def test_the_reliability_of_scores_is_shown_before_scoring(run, folder):
     refused = run("recordings", "rdm", str(folder), "--conditions", "trials:stimulus", "--metric", "cka")
     assert refused.status == 2
     assert "'cka'" in refused.err
+
+
+@pytest.fixture
+def rdms(run, folder, tmp_path):
+    """RDMs of the animals, as the command writes them, and a model's features."""
+    run("recordings", "rdm", str(folder), "--conditions", "trials:stimulus", "--out", str(tmp_path / "rdms.h5"))
+    layers = {name: np.random.default_rng(seed).normal(size=(6, 5)) for seed, name in enumerate(("first", "second"))}
+    write_features(tmp_path / "model.h5", read_rdms(tmp_path / "rdms.h5").stimuli[::-1], layers)
+    return tmp_path
+
+
+def test_rdms_are_written_for_rsatoolbox_and_shown_from_its_files(run, folder, rdms):
+    animals = json.loads(run("recordings", "rdm", str(folder), "--conditions", "trials:stimulus", "--json").out)
+    theirs = rsatoolbox.rdm.load_rdm(str(rdms / "rdms.h5"))
+    np.testing.assert_array_equal(theirs.dissimilarities, [animal["rdm"] for animal in animals["animals"]])
+    assert theirs.descriptors["content_hash"] == animals["recordings"]["content_hash"]
+    assert str(folder.parent) not in str(theirs.descriptors)
+    assert "noise cannot be estimated" in run("recordings", "inspect", str(rdms / "rdms.h5")).out
+    shown = run("recordings", "rdm", str(rdms / "rdms.h5")).out
+    assert shown.startswith("2 RDMs of 6 stimuli (correlation; ")
+    assert f"RDM {theirs.rdm_descriptors['subject'][0]}" in shown
+    refused = run("recordings", "rdm", str(rdms / "rdms.h5"), "--conditions", "trials:stimulus")
+    assert "leave out what chooses trials" in refused.err
+
+
+def test_rdms_of_a_file_are_compared_with_a_model_and_never_scored(run, rdms, tmp_path):
+    files = str(rdms / "rdms.h5"), str(rdms / "model.h5")
+    data = json.loads(run("recordings", "compare", *files, "--json").out)
+    assert data["noise"] == "unknown"
+    features = {
+        layer: values[::-1].reshape(6, -1) for layer, values in read_features(rdms / "model.h5").activations.items()
+    }
+    stored = read_rdms(files[0])
+    for layer, values in data["values"].items():
+        # Stimuli are paired by name, so the order of rows means nothing.
+        expected = compare(rdm(features[layer]), stored.values)
+        np.testing.assert_allclose(values, expected, atol=1e-12)
+    table = run("recordings", "compare", *files).out
+    assert "Nothing is corrected for noise or tested" in table
+    itself = json.loads(run("recordings", "compare", files[0], files[0], "--json").out)["values"]
+    np.testing.assert_allclose([itself[name][place] for place, name in enumerate(stored.names)], 1)
+    refused = run("score", files[1], "--recordings", files[0])
+    assert refused.status == 1
+    assert "no score on it would be honest" in refused.err
+    assert "is no file of RDMs" in run("recordings", "compare", files[1], files[0]).err
+    (tmp_path / "match.csv").write_text("".join(f"{label},\n" for label in stored.stimuli[:4]))
+    few = run("recordings", "compare", *files, "--match", str(tmp_path / "match.csv"))
+    assert "have 's5', 's6' in common; a comparison needs 3 stimuli" in few.err
+
+
+def test_a_copy_for_torch_brain_scores_the_same(run, folder, tmp_path):
+    assert run("recordings", "export", str(folder), str(tmp_path / "copy"), "--format", "temporaldata").status == 0
+    options = ("--conditions", "trials:stimulus", "--json")
+    first, second = (json.loads(run("recordings", "rdm", str(place), *options).out) for place in (folder, tmp_path))
+    assert first["animals"] == second["animals"]
+    wrong = run("recordings", "export", str(folder), str(tmp_path / "a.nwb"), "--format", "temporaldata")
+    assert "Files of temporaldata end in '.h5', '.hdf5'" in wrong.err
+    assert "did you mean 'temporaldata'" in run("recordings", "export", str(folder), "x", "--format", "temporal").err
 
 
 @pytest.mark.slow

@@ -39,6 +39,7 @@ WORDS = {
     "tactile bench": (),
     "train": ("no-such-model", "--data", "none"),
     "score": ("no-such-model",),
+    "recordings compare": ("none.h5", "no-such-model"),
     "power": (),
     "benchmark make": ("--recordings", "none", "--out", "lab.toml"),
     "benchmark check": ("none",),

@@ -193,7 +193,9 @@ def check_tables(session: Session) -> Iterator[Finding]:
             yield Finding("error", "tables", table.fault)
             continue
         yield from _damaged(table)
-        if "start_time" in table and len(table):
+        if "start_time" not in table:
+            yield Finding("error", "tables", f"{table.label} has no start_time: nothing says when its rows began")
+        elif len(table):
             yield from _times(table)
     trials = session.tables.get("trials")
     if trials is not None and not trials.fault and "start_time" in trials and "stop_time" in trials and len(trials):

@@ -297,7 +297,7 @@ class SpikeTrains:
         for unit, times in enumerate(used):
             key = covered[:, unit].tobytes()
             if key not in bounds_of:
-                bounds_of[key] = np.array(_merged(edges[covered[:, unit]])).reshape(-1)
+                bounds_of[key] = np.array(merged(edges[covered[:, unit]])).reshape(-1)
             place = np.searchsorted(bounds_of[key], times, side="right")
             inside += int((place % 2 == 1).sum())
             outside += int((place % 2 == 0).sum())
@@ -458,13 +458,13 @@ def inside_observed_spans(units: SessionTable, edges: NDArray[np.float64]) -> ND
     for unit, unit_spans in enumerate(units.spans()):
         key = unit_spans.tobytes()
         if key not in inside_of:
-            fits = [(edges[:, 0] >= low) & (edges[:, 1] <= high) for low, high in _merged(unit_spans)]
+            fits = [(edges[:, 0] >= low) & (edges[:, 1] <= high) for low, high in merged(unit_spans)]
             inside_of[key] = np.any(fits, axis=0) if fits else inside[:, unit]
         inside[:, unit] = inside_of[key]
     return inside
 
 
-def _merged(spans: NDArray[np.float64]) -> list[tuple[float, float]]:
+def merged(spans: NDArray[np.float64]) -> list[tuple[float, float]]:
     """Join the spans [n, 2] (s) that touch or overlap."""
     merged: list[tuple[float, float]] = []
     # What ends before it begins, or at no known time, holds nothing; NaN would also undo the order.

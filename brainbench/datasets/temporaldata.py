@@ -1,0 +1,321 @@
+"""Recordings in files of ``temporaldata``, which ``torch_brain`` trains on: read as sessions, and written from any.
+
+Every group states its class in the attribute ``object``. Spikes are an ``IrregularTimeSeries`` with ``unit_index``,
+whose units are the rows of the ``ArrayDict`` called ``units`` beside it and whose ``domain`` is the recorded time;
+tables are ``Interval``, signals are columns [time, cell] of series, and ``Data`` holds others. Copies hold in addition
+``obs_intervals``, the spans of single units where they differ, and ``<signal>_cells``, what is known of its columns.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Iterator
+from dataclasses import replace
+from datetime import datetime
+from pathlib import Path, PurePosixPath
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from brainbench.core.errors import DataError, brief
+from brainbench.core.writing.hdf5 import create_hdf5
+from brainbench.datasets.hdf5 import columns_of, dead_link
+from brainbench.datasets.nwb import named_by_file
+from brainbench.datasets.sessions import OBSERVED, SPIKES, Series, Session, SessionTable, decode, ragged, text
+from brainbench.datasets.trials.counting import merged
+
+if TYPE_CHECKING:
+    import h5py
+
+IRREGULAR, REGULAR = "IrregularTimeSeries", "RegularTimeSeries"
+_CLASSES = ("Data", "ArrayDict", "Interval", IRREGULAR, REGULAR)
+_TIMES = {"start": "start_time", "end": "stop_time"}
+"""Columns of every interval → their names here."""
+_DEEPEST = 5
+"""Levels of groups that are searched: links may run in circles."""
+
+
+def is_temporaldata(file: h5py.File) -> bool:
+    """Return whether an open HDF5 file was written by temporaldata."""
+    return text(file.attrs.get("object", "")) == "Data" and "absolute_start" in file.attrs
+
+
+def read_temporaldata(file: h5py.File, path: Path) -> Session:
+    """Describe the session in an open file; tables and signals are read later, while it stays open."""
+    parts: dict[str, tuple[str, Any]] = {}
+    tables: dict[str, SessionTable] = {}
+    for place, kind, group in _walk(file, path):
+        if isinstance(group, SessionTable):
+            tables[place] = group
+        else:
+            parts[place] = kind, group
+    groups = {place: group for place, (_, group) in parts.items()}
+    dicts = {place: columns_of(groups[place], path) for place, (kind, _) in parts.items() if kind == "ArrayDict"}
+    units: dict[str, SessionTable] = {}
+    signals, others = dict[str, Series](), dict[str, Series]()
+    for place, (kind, group) in parts.items():
+        if kind == "Interval" and place.rpartition("/")[2] != "domain" and place != OBSERVED:
+            columns = {_TIMES.get(name, name): values for name, values in columns_of(group, path).items()}
+            for name in [name for name in columns if f"{name}_cells" in dicts]:
+                data, times = columns.pop(name), dicts.get(f"{name}_samples", {}).get("time")
+                more = {"unit": text(data.attrs.get("unit", "")), "table": place, "columns": dicts[f"{name}_cells"]}
+                signals[name] = Series(name, "samples", data, times, **more)
+            tables[place] = SessionTable(place, columns, str(path))
+        elif kind == IRREGULAR and "unit_index" in group:
+            units[place] = _units(group, place, dicts, groups.get(OBSERVED), path)
+        elif kind in (IRREGULAR, REGULAR):
+            for series in _series(group, place, kind, path):
+                # Columns that a table describes are cells; all else is behaviour.
+                cells = _cells_of(series, dicts)
+                (others if cells is None else signals)[series.name] = series if cells is None else cells
+    stated = {name: text(groups[name].attrs.get("id", "")).strip() for name in ("subject", "session") if name in groups}
+    subject = stated.get("subject") or named_by_file(path, "sub")
+    start = text(groups["session"].attrs.get("recording_date", "")) if "session" in groups else ""
+    note = f"{path.name}: no id of a subject; the subject {subject!r} was taken from the file name"
+    return Session(
+        subject=subject,
+        session=stated.get("session") or named_by_file(path, "ses"),
+        units=units.get("spikes") or (next(iter(units.values())) if len(units) == 1 else None),
+        tables=tables,
+        source=str(path),
+        start=start if _is_time(start) else "",
+        format="temporaldata",
+        synthetic=bool(file.attrs.get("synthetic", False)),
+        notes=() if stated.get("subject") else (note,),
+        series=others,
+        stimuli=text(file.attrs.get("stimuli", "")),
+        guessed=not stated.get("subject") and subject == path.stem,
+        populations={**units, **signals},
+    )
+
+
+def _walk(parent: h5py.Group, path: Path, place: str = "") -> Iterator[tuple[str, str, Any]]:
+    """Yield place, class and group of every object, and each dead link as a table that says so."""
+    import h5py
+
+    for name in map(str, parent):
+        here = f"{place}/{name}" if place else name
+        if (reason := dead_link(parent, name, path)) is not None:
+            yield here, "", SessionTable(here, {}, str(path), reason)
+        elif isinstance(group := parent[name], h5py.Group):
+            kind = text(group.attrs.get("object", ""))
+            if kind not in _CLASSES:
+                reason = f"{here} of {path} is of the class {brief(kind)}, which is none of {', '.join(_CLASSES)}."
+                yield here, "", SessionTable(here, {}, str(path), reason)
+                continue
+            yield here, kind, group
+            if kind == "Data" and here.count("/") < _DEEPEST:
+                yield from _walk(group, path, here)
+
+
+def _units(group: Any, place: str, dicts: dict[str, dict[str, Any]], observed: Any, path: Path) -> SessionTable:
+    """Return units with their spike times; what is wrong with them is said by the table."""
+    where = f"{place} of {path}"
+    around = place.rpartition("/")[0]
+    columns = next((dicts[name] for name in (f"{around}/units".lstrip("/"), "units") if name in dicts), {})
+    try:
+        times, index = (np.asarray(group[name][...]).ravel() for name in ("timestamps", "unit_index"))
+        number = max((len(values) for values in columns.values()), default=int(index.max(initial=-1)) + 1)
+        if index.dtype.kind not in "iu" or len(index) != len(times):
+            raise DataError(f"{where} has {len(times)} timestamps and {len(index)} unit_index ({index.dtype}).")
+        if len(index) and not 0 <= int(index.min()) <= int(index.max()) < number:
+            wrong = int(((index < 0) | (index >= number)).sum())
+            raise DataError(f"{wrong} of {len(index)} spikes of {where} have the index of none of the {number} units.")
+        spikes = [times[rows] for rows in _rows_of(index, number)]
+        spans = None
+        if observed is not None and "unit_index" in observed:
+            begin_end = np.stack([observed["start"][...], observed["end"][...]], axis=1)
+            spans = [begin_end[rows] for rows in _rows_of(observed["unit_index"][...], number)]
+        elif "domain" in group:
+            spans = [np.stack([group[f"domain/{name}"][...] for name in ("start", "end")], axis=1)] * number
+        columns = {**columns, **ragged(SPIKES, spikes)} | ({} if spans is None else ragged(OBSERVED, spans))
+    except KeyError as error:
+        return SessionTable("units", {}, str(path), f"{where} lacks a part: {error.args[0]}.")
+    except DataError as error:
+        return SessionTable("units", {}, str(path), str(error))
+    return SessionTable("units", {"id": np.arange(number), **columns}, str(path))
+
+
+def _rows_of(index: NDArray[Any], number: int) -> list[NDArray[np.intp]]:
+    """Return the rows of each unit, in the order of the file."""
+    order = np.argsort(index, kind="stable")
+    return np.split(order, np.cumsum(np.bincount(index.astype(np.int64), minlength=number))[:-1]) if number else []
+
+
+def _series(group: Any, place: str, kind: str, path: Path) -> Iterator[Series]:
+    """Yield the columns of a series of samples as signals, called by their group and their own name."""
+    columns = columns_of(group, path)
+    rate = float(group.attrs.get("sampling_rate", math.nan))
+    start = float(group["domain/start"][0]) if "domain/start" in group and len(group["domain/start"]) else 0.0
+    stamps = columns.pop("timestamps", None)
+    columns.pop("timestamp_indices_1s", None)
+    if stamps is not None and not columns:
+        columns = {"": stamps}
+    for name, data in columns.items():
+        unit, sort = (text(data.attrs.get(key, "")) for key in ("unit", "kind"))
+        factor: Any = data.attrs.get("conversion", 1.0)
+        name = place if name in ("", place.rpartition("/")[2]) else f"{place}/{name}"
+        yield Series(name, sort or kind, data, stamps, start, rate, unit, factor)
+
+
+def _cells_of(series: Series, dicts: dict[str, dict[str, Any]]) -> Series | None:
+    """Return a signal with what its file tells of each column; None where nothing describes them."""
+    shape = series.data.shape
+    for name in (f"{series.name}_cells", *dicts):
+        columns = dicts.get(name, {})
+        if len(shape) == 2 and columns and {len(values) for values in columns.values()} == {shape[1]}:
+            return replace(series, columns=columns)
+    return None
+
+
+def _is_time(value: str) -> bool:
+    try:
+        datetime.fromisoformat(value)
+    except ValueError:
+        return False
+    return True
+
+
+def write_temporaldata(path: str | os.PathLike[str], session: Session) -> Path:
+    """Write one session: its spikes, else its signals, with its tables, as ``temporaldata.Data.load`` reads them."""
+    with create_hdf5(path) as file:
+        _object(file, "Data")
+        file.attrs.update({"synthetic": session.synthetic, "stimuli": session.stimuli})
+        about = {"brainset": "brainbench", "subject": session.subject, "session": session.session}
+        for name, identity in about.items():
+            _group(file, name, "Data").attrs["id"] = identity
+        if session.start:
+            file["session"].attrs["recording_date"] = session.start
+        spans = [_write_spikes(file, session)] if session.units is not None else []
+        for name, table in session.tables.items():
+            if not {"start_time", "stop_time"} <= {*table.columns}:
+                raise DataError(f"{table.label} has no start_time and stop_time, which temporaldata needs.")
+            spans.append(_write_table(_group(file, name, "Interval"), table, session))
+        if session.units is None:
+            spans += [_write_signal(file, item) for item in session.populations.values() if isinstance(item, Series)]
+        edges = np.concatenate([span for span in spans if len(span)] or [np.zeros((1, 2))])
+        places = (PurePosixPath(name) for name in {**session.tables, **session.populations})
+        # Whatever holds others needs the time over which these are known.
+        for parent in {parent.as_posix() for place in places for parent in place.parents} | {"."}:
+            if parent in file:
+                _interval(file[parent], "domain", np.array([[edges[:, 0].min(), edges[:, 1].max()]]))
+    return Path(path)
+
+
+def _write_spikes(file: h5py.File, session: Session) -> NDArray[np.float64]:
+    """Write spikes in the order of time, their units, and the recorded time; returns the spans [n, 2] of it (s)."""
+    assert session.units is not None
+    units, group = session.units, _group(file, "spikes", IRREGULAR)
+    rows, spans = units.rows(SPIKES), units.spans() if OBSERVED in units else []
+    index = np.repeat(np.arange(len(rows)), [len(times) for times in rows])
+    times = np.concatenate([*rows, np.zeros(0)])
+    order = np.argsort(times, kind="stable")
+    _columns(group, {"timestamps": times[order], "unit_index": index[order]}, timekeys=["timestamps"])
+    if not spans:
+        spans = [np.array([[times.min(), times.max()]] if len(times) else [[0.0, 0.0]])]
+    every = np.concatenate(spans)
+    edges = np.array(merged(every) or [[0.0, 0.0]])
+    if not all(np.array_equal(span, spans[0]) for span in spans):
+        numbers = np.repeat(np.arange(len(spans)), [len(span) for span in spans])
+        by_start = np.argsort(every[:, 0], kind="stable")
+        _interval(file, OBSERVED, every[by_start], unit_index=numbers[by_start])
+    _grid(group, times[order], edges)
+    plain = {name: units.column(name) for name in units.columns if name not in units.index}
+    _columns(_group(file, "units", "ArrayDict"), {"id": units.ids(), **plain})
+    return edges
+
+
+def _write_table(group: h5py.Group, table: SessionTable, session: Session) -> NDArray[np.float64]:
+    """Write an interval table in the order of time, with the responses to its rows; returns its spans [n, 2] (s)."""
+    edges = np.stack([table.times("start_time"), table.times("stop_time")], axis=1)
+    if not np.isfinite(edges).all():
+        raise DataError(f"{table.label} has rows without start_time or stop_time, which temporaldata cannot hold.")
+    order = np.lexsort(edges.T[::-1])
+    columns = {name: table.column(name) for name in table.columns if name not in table.index}
+    columns = {"id": table.ids()} | {
+        next((key for key, ours in _TIMES.items() if ours == name), name): values for name, values in columns.items()
+    }
+    times = [name for name in columns if name in _TIMES or name.endswith("_time")]
+    times = [name for name in times if columns[name].dtype.kind == "f"]
+    _columns(group, {name: values[order] for name, values in columns.items()}, timekeys=times)
+    for item in session.populations.values() if session.units is None else ():
+        if isinstance(item, Series) and item.table == table.name:
+            group.create_dataset(item.name, data=np.asarray(item.data[...])[order]).attrs["unit"] = item.unit
+            if item.timestamps is not None:
+                _columns(_group(group.file, f"{item.name}_samples", "ArrayDict"), {"time": item.timestamps[...]})
+            _columns(_group(group.file, f"{item.name}_cells", "ArrayDict"), _plain(item))
+    return edges
+
+
+def _write_signal(file: h5py.File, series: Series) -> NDArray[np.float64]:
+    """Write a signal of cells with what is known of these; returns the span [1, 2] (s) of its frames."""
+    if series.table:
+        return np.zeros((0, 2))
+    regular = series.timestamps is None
+    group = _group(file, series.name, REGULAR if regular else IRREGULAR)
+    values, name = np.asarray(series.data[...]), series.name.rpartition("/")[2]
+    data = group.create_dataset(name, data=values if values.ndim > 1 else values[:, None])
+    data.attrs.update({"unit": series.unit, "kind": series.kind, "conversion": series.conversion})
+    if regular:
+        group.attrs["sampling_rate"] = series.rate
+        edges = np.array([[series.start, series.start + (len(values) - 1) / series.rate]])
+        _interval(group, "domain", edges)
+    else:
+        times = np.asarray(series.timestamps[...], dtype=np.float64)
+        _columns(group, {"timestamps": times}, timekeys=["timestamps"])
+        edges = times[[[0, -1]]]
+        _grid(group, times, edges)
+    _columns(_group(file, f"{series.name}_cells", "ArrayDict"), _plain(series))
+    return edges
+
+
+def _plain(series: Series) -> dict[str, NDArray[Any]]:
+    """Return what is known of each column of a signal, their numbers at least."""
+    number = series.data.shape[-1] if len(series.data.shape) > 1 else 1
+    return {"id": np.arange(number), **{name: decode(values[...]) for name, values in series.columns.items()}}
+
+
+def _grid(group: h5py.Group, times: NDArray[np.float64], edges: NDArray[np.float64]) -> None:
+    """Write the recorded time of a series, and the place of each of its seconds, by which parts of it are read."""
+    _interval(group, "domain", edges)
+    seconds = np.arange(edges[0, 0], edges[-1, 1] + 1.0, 1.0)
+    group.create_dataset("timestamp_indices_1s", data=np.searchsorted(times, seconds))
+
+
+def _interval(file: h5py.Group, name: str, edges: NDArray[np.float64], **columns: NDArray[Any]) -> None:
+    columns = {"start": edges[:, 0], "end": edges[:, 1], **columns}
+    _columns(_group(file, name, "Interval"), columns, timekeys=["start", "end"])
+
+
+def _group(file: h5py.Group, place: str, kind: str) -> h5py.Group:
+    """Make the group of an object, and those around it."""
+    parent, _, name = place.rpartition("/")
+    around = file if not parent else file[parent] if parent in file else _group(file, parent, "Data")
+    return _object(around.create_group(name), kind)
+
+
+def _object(group: Any, kind: str) -> Any:
+    group.attrs.update({"object": kind} | ({"absolute_start": 0.0} if kind == "Data" else {}))
+    return group
+
+
+def _columns(group: h5py.Group, columns: dict[str, Any], timekeys: list[str] | None = None) -> None:
+    """Write columns; texts must be ASCII, which is all that temporaldata holds."""
+    texts = []
+    for name, values in columns.items():
+        array = np.asarray(values)
+        if array.dtype.kind == "U":
+            texts.append(name)
+            try:
+                array = array.astype("S")
+            except UnicodeEncodeError as error:
+                raise DataError(
+                    f"{brief(error.object)} of the column {name!r} is no ASCII text, which is all that temporaldata "
+                    "holds; copy to .h5 or NWB, or rename it."
+                ) from error
+        group.create_dataset(name, data=array)
+    group.attrs["_unicode_keys"] = np.array(texts, dtype="S")
+    if timekeys is not None:
+        group.attrs["timekeys"] = np.array(timekeys, dtype="S")

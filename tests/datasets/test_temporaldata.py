@@ -1,0 +1,164 @@
+import h5py
+import numpy as np
+import pytest
+import xarray as xr
+
+from brainbench.core.errors import DataError
+from brainbench.datasets import check, export, inspect, open_recordings, write_recordings
+from brainbench.datasets.sessions import make_session
+from brainbench.datasets.temporaldata import write_temporaldata
+from tests.factories.recordings import make_simple_session
+from tests.factories.temporaldata_files import put, write_lab_file
+
+
+def counted(path, **options):
+    return open_recordings(path, conditions="trials:stimulus", **options)
+
+
+def same(left, right):
+    xr.testing.assert_identical(left.drop_attrs(), right.drop_attrs())
+    assert left.attrs["content_hash"] == right.attrs["content_hash"]
+
+
+def test_spikes_of_each_unit_are_counted_in_the_windows_of_intervals(tmp_path):
+    path = write_lab_file(tmp_path / "a.h5")
+    recordings = counted(path)
+    with h5py.File(path) as file:
+        times, index, start = (file[name][...] for name in ("spikes/timestamps", "spikes/unit_index", "trials/start"))
+    expected = [
+        [((times[index == unit] >= t) & (times[index == unit] < t + 0.5)).sum() for unit in range(4)] for t in start
+    ]
+    np.testing.assert_array_equal(recordings["counts"].values[:, 0], expected)
+    assert recordings["unit_id"].values.tolist() == list("abcd")
+    assert set(recordings["area"].values.tolist()) == {"S1"}
+    assert (recordings["subject"].values[0], recordings["session"].values[0]) == ("m1", "session-1")
+    assert "licks" in recordings.coords
+    assert recordings.attrs["ledger"]["spikes"]["found"] == 480
+
+
+@pytest.mark.parametrize("traces", [30.0, "irregular"])
+def test_columns_that_a_table_describes_are_cells_and_behaviour_is_none(tmp_path, traces):
+    path = write_lab_file(tmp_path / "a.h5", spikes=False, traces=traces)
+    recordings = counted(path, window="start..+0.5 minus start-0.3..start")
+    assert recordings.sizes["unit"] == 7
+    assert set(recordings["area"].values.tolist()) == {"S1"}
+    assert recordings.attrs["measure"].startswith("calcium_traces/df_over_f")
+    (session,) = inspect(path).sessions
+    assert {item.name for item in session.acquired} >= {"running/position", "running/speed"}
+
+
+def observed():
+    """Units of which one was lost for a while, trials in no order, contacts, texts and missing times."""
+    session = make_simple_session(
+        columns={"choice_time": np.where(np.arange(12) % 4, 1.5 + 2 * np.arange(12.0), np.nan)},
+        tables={"contacts_by_whisker_C1": {"start_time": np.arange(1.1, 20), "stop_time": np.arange(1.2, 20)}},
+        unit_columns={"depth": [100.0, 400.0, 500.0], "area": ["S1", "M1", "M1"]},
+        observed=[np.array([[0.0, 30.0]]), np.array([[0.0, 9.0], [15.0, 30.0]]), np.array([[0.0, 30.0]])],
+        start="2026-01-01T12:00:00+00:00",
+        stimuli="objects",
+        synthetic=True,
+    )
+    trials = session.tables["trials"]
+    for name in trials.data:
+        trials.data[name] = trials.data[name][::-1]
+    return session
+
+
+def responses():
+    table = {"start_time": np.arange(30.0), "stop_time": np.arange(30.0) + 0.5, "stimulus": list("abc") * 10}
+    values = np.random.default_rng(0).normal(size=(30, 5, 4))
+    more = {"time": np.arange(5) * 0.1, "unit": "dF/F", "unit_columns": {"area": ["S1", "S1", "M1", "M1"]}}
+    return make_session("m1", "1", None, {"trials": table}, response=values, **more)
+
+
+@pytest.mark.parametrize("session", [make_simple_session, observed, responses])
+@pytest.mark.parametrize("select", [None, "stimulus=a|b"])
+def test_a_copy_of_any_session_is_counted_to_the_same_numbers(tmp_path, session, select):
+    path = write_recordings(tmp_path / "a.h5", session())
+    (copy,) = export(path, tmp_path / "b.h5", format="temporaldata", select=select)
+    same(counted(path, select=select), counted(copy))
+    (again,) = export(copy, tmp_path / "c.h5", format="temporaldata")
+    same(counted(copy), counted(again))
+
+
+def test_signals_are_copied_where_there_are_no_spikes(tmp_path):
+    for traces in (30.0, "irregular"):
+        path = write_lab_file(tmp_path / f"{traces}.h5", spikes=False, traces=traces)
+        (copy,) = export(path, tmp_path / f"{traces} copy.h5", format="temporaldata")
+        same(counted(path), counted(copy))
+    with pytest.raises(DataError, match="temporaldata holds signals too"):
+        export(path, tmp_path / "folder")
+
+
+def test_whatever_holds_times_states_over_which_they_are_known(tmp_path):
+    """``temporaldata`` refuses a group with intervals or series and without a domain."""
+    session = make_simple_session(tables={"behavior/pokes": {"start_time": [1.0, 3.0], "stop_time": [2.0, 4.0]}})
+    with h5py.File(write_temporaldata(tmp_path / "a.h5", session)) as file:
+        for place in (file, file["behavior"]):
+            assert place.attrs["object"] == "Data"
+            assert file["behavior/domain/end"][0] == place["domain/end"][0] == 26.0
+        assert [text.decode() for text in file["trials"].attrs["_unicode_keys"]] == ["stimulus"]
+        assert {*file["trials"].attrs["timekeys"]} == {b"start", b"end"}
+        assert np.all(np.diff(file["spikes/timestamps"]) >= 0)
+        grid = np.searchsorted(file["spikes/timestamps"], np.arange(0.0, 27.0))
+        np.testing.assert_array_equal(file["spikes/timestamp_indices_1s"], grid)
+
+
+def index(values):
+    def edit(file):
+        del file["spikes/unit_index"]
+        file["spikes/unit_index"] = values
+
+    return edit
+
+
+def without(place):
+    def edit(file):
+        del file[place]
+
+    return edit
+
+
+def linked(file):
+    del file["trials"]
+    file["trials"] = h5py.SoftLink("/elsewhere")
+
+
+BROKEN = {
+    "units that are not there": (index(np.full(480, 4)), "480 of 480 spikes .* none of the 4 units"),
+    "an index of numbers": (index(np.zeros(480)), "unit_index"),
+    "a short index": (index(np.zeros(3, int)), "480 timestamps and 3 unit_index"),
+    "no timestamps": (without("spikes/timestamps"), "lacks a part: .*timestamps"),
+    "a dead link": (linked, "trials of .* is a link to '/elsewhere', which is not there"),
+    "no start": (without("trials/start"), "no start_time"),
+    "no spikes": (without("spikes"), "no units table with spike_times"),
+}
+
+
+@pytest.mark.parametrize("name", BROKEN)
+def test_a_broken_file_is_one_sentence(tmp_path, name):
+    edit, expected = BROKEN[name]
+    with h5py.File(write_lab_file(tmp_path / "a.h5"), "a") as file:
+        edit(file)
+    with pytest.raises(DataError, match=expected):
+        counted(tmp_path / "a.h5")
+    assert check(tmp_path / "a.h5").verdict == "error"
+
+
+def test_a_class_that_nobody_knows_is_left_out_by_name(tmp_path):
+    with h5py.File(write_lab_file(tmp_path / "a.h5"), "a") as file:
+        put(file, "video", "MovieSeries")
+    (entry,) = (entry for entry in counted(tmp_path / "a.h5").attrs["ledger"]["tables"]["left_out"] if entry["lost"])
+    assert "'MovieSeries'" in entry["reason"]
+    with pytest.raises(DataError, match="MovieSeries"):
+        counted(tmp_path / "a.h5", strict=True)
+
+
+def test_what_temporaldata_cannot_hold_is_refused(tmp_path):
+    with pytest.raises(DataError, match=r"'é' of the column 'stimulus' is no ASCII text"):
+        write_temporaldata(tmp_path / "a.h5", make_simple_session(columns={"stimulus": ["é", "b", "c"] * 4}))
+    session = make_simple_session()
+    del session.tables["trials"].data["stop_time"]
+    with pytest.raises(DataError, match="no start_time and stop_time"):
+        write_temporaldata(tmp_path / "a.h5", session)
+    assert [*tmp_path.iterdir()] == []
