@@ -23,9 +23,9 @@ BUDGETS = {
     "brainbench/stimuli": 26_400,  # the estimated error of every whisker
     "robotics_bridge": 24_800,  # newtons that no taxel has, trees of any hand, deadlines, replays, gel pictures
     "brainbench/models": 8_540,  # the proof that a layer is a response, ONNX files tried apart
-    "brainbench/datasets": 7_450,  # the balance of a reading, copies of sessions, signals, bands, baselines
+    "brainbench/datasets": 7_990,  # the balance of a reading, signals; files of torch_brain and rsatoolbox, both ways
     "brainbench/metrics": 5_650,  # the unique part, drift over time, matching of units
-    "brainbench/cli": 4_960,  # check-submission, options of benchmarks, names of the registry
+    "brainbench/cli": 5_100,  # check-submission, options of benchmarks, names of the registry, RDMs of others compared
     "brainbench/core": 5_910,  # times and areas of trials, the sealed door, seals of the cache, sealed plans
     "leaderboards": 3_910,  # boards of 10,000 records, benchmarks and citations, means over benchmarks,
     # boards of areas, what stimuli and units add to a score, for readers of a report

@@ -61,9 +61,10 @@ def check(benchmark: NamedBenchmark) -> Output:
     with progress_bar() as progress:
         stated, findings = check_benchmark(benchmark, progress)
     wrong = any(finding.severity == "error" for finding in findings)
-    lines = [_text(stated), "", *(f"{finding.severity:5}  {finding.what}" for finding in findings)]
+    lines = [_text(stated), "", *(f"{item.severity:5}  {item.message}  {item.advice}".rstrip() for item in findings)]
     lines += [] if wrong else ["All files, recordings and numbers are as it states."]
-    data = {"benchmark": stated.plain, "hash": stated.identity, "findings": findings}
+    stated_findings = [{"severity": finding.severity, "what": finding.message} for finding in findings]
+    data = {"benchmark": stated.plain, "hash": stated.identity, "findings": stated_findings}
     return Output(data, "\n".join(lines), failure=typer.Exit(1) if wrong else None)
 
 

@@ -39,6 +39,7 @@ from brainbench.core.reading.regular import check_file, readable
 from brainbench.core.reading.texts import parse_toml, read_text, read_toml
 from brainbench.core.reading.values import typed_values
 from brainbench.core.records import ResultRecord
+from brainbench.datasets.checks.findings import Finding
 from brainbench.datasets.layouts.registry import list_layouts
 from brainbench.datasets.reading import find_files, find_recordings
 from brainbench.metrics import get_metric
@@ -566,32 +567,26 @@ def _measure(options: ScoreOptions, progress: Progress | None) -> tuple[str, Cei
     return digest, Ceilings(len(animals), len(paired), *(x if math.isfinite(x) else None for x in numbers))
 
 
-@dataclass(frozen=True)
-class Fault:
-    """One thing that is wrong with a benchmark, or that it lacks."""
-
-    severity: str
-    """``error`` or ``note``."""
-    what: str
-
-
-def check(source: str, progress: Progress | None = None) -> tuple[Benchmark, list[Fault]]:
+def check(source: str, progress: Progress | None = None) -> tuple[Benchmark, list[Finding]]:
     """Return a benchmark whose every file is as it states, and what is wrong with or missing in what else it states."""
     benchmark, folder = open_benchmark(source)
     digest, ceiling = _measure(options_of(benchmark, folder), progress)
     return benchmark, [*_findings(benchmark, digest, ceiling)]
 
 
-def _findings(benchmark: Benchmark, digest: str, ceiling: Ceilings | None) -> Iterator[Fault]:
+def _findings(benchmark: Benchmark, digest: str, ceiling: Ceilings | None) -> Iterator[Finding]:
     if digest != (stated := benchmark.recordings.content_hash):
-        yield Fault("error", f"what is read of the recordings has the hash {digest}, and {stated} is stated")
+        yield Finding(
+            "error", "recordings", f"what is read of the recordings has the hash {digest}, and {stated} is stated"
+        )
     for name, number in vars(ceiling).items() if ceiling and benchmark.ceiling else ():
         before = getattr(benchmark.ceiling, name)
         if (number is None) != (before is None) or abs((number or 0) - (before or 0)) > TOLERANCE:
-            yield Fault("error", f"{name} of the ceiling is {number} here, and {before} is stated")
+            yield Finding("error", "ceiling", f"{name} of the ceiling is {number} here, and {before} is stated")
     if (held := benchmark.held_out) is not None and held.recordings == stated:
-        yield Fault("error", "what is held back is of these very recordings: give the public part of them")
+        message = "what is held back is of these very recordings"
+        yield Finding("error", "held out", message, "Give the public part of them.")
     for name, what in ADVISED.items():
         table, _, entry = name.rpartition(".")
         if not getattr(getattr(benchmark, table) if table else benchmark, entry):
-            yield Fault("note", f"{name} is empty: {what}")
+            yield Finding("note", name, f"{name} is empty: {what}")

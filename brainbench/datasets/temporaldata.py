@@ -12,7 +12,6 @@ import math
 import os
 from collections.abc import Iterator
 from dataclasses import replace
-from datetime import datetime
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any
 
@@ -25,6 +24,7 @@ from brainbench.datasets.hdf5 import columns_of, dead_link
 from brainbench.datasets.nwb import named_by_file
 from brainbench.datasets.sessions import OBSERVED, SPIKES, Series, Session, SessionTable, decode, ragged, text
 from brainbench.datasets.trials.counting import merged
+from brainbench.datasets.trials.signals import frame_times
 
 if TYPE_CHECKING:
     import h5py
@@ -35,6 +35,8 @@ _TIMES = {"start": "start_time", "end": "stop_time"}
 """Columns of every interval → their names here."""
 _DEEPEST = 5
 """Levels of groups that are searched: links may run in circles."""
+_LONGEST = 1e7
+"""Seconds of a session, each of which gets an entry; more are other units of time."""
 
 
 def is_temporaldata(file: h5py.File) -> bool:
@@ -44,18 +46,13 @@ def is_temporaldata(file: h5py.File) -> bool:
 
 def read_temporaldata(file: h5py.File, path: Path) -> Session:
     """Describe the session in an open file; tables and signals are read later, while it stays open."""
-    parts: dict[str, tuple[str, Any]] = {}
-    tables: dict[str, SessionTable] = {}
-    for place, kind, group in _walk(file, path):
-        if isinstance(group, SessionTable):
-            tables[place] = group
-        else:
-            parts[place] = kind, group
-    groups = {place: group for place, (_, group) in parts.items()}
-    dicts = {place: columns_of(groups[place], path) for place, (kind, _) in parts.items() if kind == "ArrayDict"}
-    units: dict[str, SessionTable] = {}
+    units, tables, groups = dict[str, SessionTable](), dict[str, SessionTable](), dict[str, Any]()
     signals, others = dict[str, Series](), dict[str, Series]()
-    for place, (kind, group) in parts.items():
+    for place, group in _walk(file, path):
+        (tables if isinstance(group, SessionTable) else groups)[place] = group
+    dicts = {place: columns_of(group, path) for place, group in groups.items() if _class(group) == "ArrayDict"}
+    for place, group in groups.items():
+        kind = _class(group)
         if kind == "Interval" and place.rpartition("/")[2] != "domain" and place != OBSERVED:
             columns = {_TIMES.get(name, name): values for name, values in columns_of(group, path).items()}
             for name in [name for name in columns if f"{name}_cells" in dicts]:
@@ -66,46 +63,48 @@ def read_temporaldata(file: h5py.File, path: Path) -> Session:
         elif kind == IRREGULAR and "unit_index" in group:
             units[place] = _units(group, place, dicts, groups.get(OBSERVED), path)
         elif kind in (IRREGULAR, REGULAR):
-            for series in _series(group, place, kind, path):
+            for series in _series(group, place, path):
                 # Columns that a table describes are cells; all else is behaviour.
-                cells = _cells_of(series, dicts)
-                (others if cells is None else signals)[series.name] = series if cells is None else cells
-    stated = {name: text(groups[name].attrs.get("id", "")).strip() for name in ("subject", "session") if name in groups}
-    subject = stated.get("subject") or named_by_file(path, "sub")
-    start = text(groups["session"].attrs.get("recording_date", "")) if "session" in groups else ""
-    note = f"{path.name}: no id of a subject; the subject {subject!r} was taken from the file name"
+                columns = _cells_of(series, dicts)
+                (signals if columns else others)[series.name] = replace(series, columns=columns)
+    about = {name: getattr(groups.get(name), "attrs", {}) for name in ("subject", "session")}
+    subject, session = (text(attributes.get("id", "")).strip() for attributes in about.values())
+    name = subject or named_by_file(path, "sub")
+    note = f"{path.name}: no id of a subject; the subject {name!r} was taken from the file name"
     return Session(
-        subject=subject,
-        session=stated.get("session") or named_by_file(path, "ses"),
+        subject=name,
+        session=session or named_by_file(path, "ses"),
         units=units.get("spikes") or (next(iter(units.values())) if len(units) == 1 else None),
         tables=tables,
         source=str(path),
-        start=start if _is_time(start) else "",
+        start=text(about["session"].get("recording_date", "")),
         format="temporaldata",
         synthetic=bool(file.attrs.get("synthetic", False)),
-        notes=() if stated.get("subject") else (note,),
+        notes=() if subject else (note,),
         series=others,
         stimuli=text(file.attrs.get("stimuli", "")),
-        guessed=not stated.get("subject") and subject == path.stem,
+        guessed=not subject and name == path.stem,
         populations={**units, **signals},
     )
 
 
-def _walk(parent: h5py.Group, path: Path, place: str = "") -> Iterator[tuple[str, str, Any]]:
-    """Yield place, class and group of every object, and each dead link as a table that says so."""
+def _class(group: Any) -> str:
+    return text(group.attrs.get("object", ""))
+
+
+def _walk(parent: h5py.Group, path: Path, place: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield the group of every object by its place, and what cannot be read as a table that says why."""
     import h5py
 
     for name in map(str, parent):
         here = f"{place}/{name}" if place else name
         if (reason := dead_link(parent, name, path)) is not None:
-            yield here, "", SessionTable(here, {}, str(path), reason)
+            yield here, SessionTable(here, {}, str(path), reason)
         elif isinstance(group := parent[name], h5py.Group):
-            kind = text(group.attrs.get("object", ""))
-            if kind not in _CLASSES:
+            if (kind := _class(group)) not in _CLASSES:
                 reason = f"{here} of {path} is of the class {brief(kind)}, which is none of {', '.join(_CLASSES)}."
-                yield here, "", SessionTable(here, {}, str(path), reason)
-                continue
-            yield here, kind, group
+                group = SessionTable(here, {}, str(path), reason)
+            yield here, group
             if kind == "Data" and here.count("/") < _DEEPEST:
                 yield from _walk(group, path, here)
 
@@ -144,38 +143,25 @@ def _rows_of(index: NDArray[Any], number: int) -> list[NDArray[np.intp]]:
     return np.split(order, np.cumsum(np.bincount(index.astype(np.int64), minlength=number))[:-1]) if number else []
 
 
-def _series(group: Any, place: str, kind: str, path: Path) -> Iterator[Series]:
+def _series(group: Any, place: str, path: Path) -> Iterator[Series]:
     """Yield the columns of a series of samples as signals, called by their group and their own name."""
     columns = columns_of(group, path)
     rate = float(group.attrs.get("sampling_rate", math.nan))
     start = float(group["domain/start"][0]) if "domain/start" in group and len(group["domain/start"]) else 0.0
     stamps = columns.pop("timestamps", None)
     columns.pop("timestamp_indices_1s", None)
-    if stamps is not None and not columns:
-        columns = {"": stamps}
-    for name, data in columns.items():
-        unit, sort = (text(data.attrs.get(key, "")) for key in ("unit", "kind"))
-        factor: Any = data.attrs.get("conversion", 1.0)
-        name = place if name in ("", place.rpartition("/")[2]) else f"{place}/{name}"
-        yield Series(name, sort or kind, data, stamps, start, rate, unit, factor)
+    for name, data in (columns or {place: stamps}).items():
+        unit, kind = (text(data.attrs.get(key, "")) for key in ("unit", "kind"))
+        name = place if name in (place, place.rpartition("/")[2]) else f"{place}/{name}"
+        conversion = data.attrs.get("conversion", 1.0)
+        yield Series(name, kind or _class(group), data, stamps, start, rate, unit, conversion)
 
 
-def _cells_of(series: Series, dicts: dict[str, dict[str, Any]]) -> Series | None:
-    """Return a signal with what its file tells of each column; None where nothing describes them."""
-    shape = series.data.shape
-    for name in (f"{series.name}_cells", *dicts):
-        columns = dicts.get(name, {})
-        if len(shape) == 2 and columns and {len(values) for values in columns.values()} == {shape[1]}:
-            return replace(series, columns=columns)
-    return None
-
-
-def _is_time(value: str) -> bool:
-    try:
-        datetime.fromisoformat(value)
-    except ValueError:
-        return False
-    return True
+def _cells_of(series: Series, dicts: dict[str, dict[str, Any]]) -> dict[str, Any]:
+    """Return what the file tells of each column of a signal; nothing where no table has so many rows."""
+    tables = (dicts.get(name, {}) for name in (f"{series.name}_cells", *dicts))
+    fits = (table for table in tables if {len(values) for values in table.values()} == {*series.data.shape[1:]})
+    return next(fits, {}) if len(series.data.shape) == 2 else {}
 
 
 def write_temporaldata(path: str | os.PathLike[str], session: Session) -> Path:
@@ -190,11 +176,10 @@ def write_temporaldata(path: str | os.PathLike[str], session: Session) -> Path:
             file["session"].attrs["recording_date"] = session.start
         spans = [_write_spikes(file, session)] if session.units is not None else []
         for name, table in session.tables.items():
-            if not {"start_time", "stop_time"} <= {*table.columns}:
-                raise DataError(f"{table.label} has no start_time and stop_time, which temporaldata needs.")
             spans.append(_write_table(_group(file, name, "Interval"), table, session))
         if session.units is None:
-            spans += [_write_signal(file, item) for item in session.populations.values() if isinstance(item, Series)]
+            signals = (item for item in session.populations.values() if isinstance(item, Series) and not item.table)
+            spans += [_write_signal(file, series) for series in signals]
         edges = np.concatenate([span for span in spans if len(span)] or [np.zeros((1, 2))])
         places = (PurePosixPath(name) for name in {**session.tables, **session.populations})
         # Whatever holds others needs the time over which these are known.
@@ -212,7 +197,7 @@ def _write_spikes(file: h5py.File, session: Session) -> NDArray[np.float64]:
     index = np.repeat(np.arange(len(rows)), [len(times) for times in rows])
     times = np.concatenate([*rows, np.zeros(0)])
     order = np.argsort(times, kind="stable")
-    _columns(group, {"timestamps": times[order], "unit_index": index[order]}, timekeys=["timestamps"])
+    _columns(group, {"timestamps": times[order], "unit_index": index[order]}, ["timestamps"])
     if not spans:
         spans = [np.array([[times.min(), times.max()]] if len(times) else [[0.0, 0.0]])]
     every = np.concatenate(spans)
@@ -229,44 +214,32 @@ def _write_spikes(file: h5py.File, session: Session) -> NDArray[np.float64]:
 
 def _write_table(group: h5py.Group, table: SessionTable, session: Session) -> NDArray[np.float64]:
     """Write an interval table in the order of time, with the responses to its rows; returns its spans [n, 2] (s)."""
-    edges = np.stack([table.times("start_time"), table.times("stop_time")], axis=1)
+    edges = [table.times(name) if name in table else np.full(len(table), np.nan) for name in _TIMES.values()]
+    edges = np.stack(edges, axis=1)
     if not np.isfinite(edges).all():
         raise DataError(f"{table.label} has rows without start_time or stop_time, which temporaldata cannot hold.")
     order = np.lexsort(edges.T[::-1])
-    columns = {name: table.column(name) for name in table.columns if name not in table.index}
-    columns = {"id": table.ids()} | {
-        next((key for key, ours in _TIMES.items() if ours == name), name): values for name, values in columns.items()
-    }
-    times = [name for name in columns if name in _TIMES or name.endswith("_time")]
-    times = [name for name in times if columns[name].dtype.kind == "f"]
-    _columns(group, {name: values[order] for name, values in columns.items()}, timekeys=times)
+    names = {ours: theirs for theirs, ours in _TIMES.items()}
+    columns = {names.get(name, name): table.column(name) for name in table.columns if name not in table.index}
+    times = [name for name in columns if name in _TIMES or (name.endswith("_time") and columns[name].dtype.kind == "f")]
+    _columns(group, {name: values[order] for name, values in {"id": table.ids(), **columns}.items()}, times)
     for item in session.populations.values() if session.units is None else ():
         if isinstance(item, Series) and item.table == table.name:
             group.create_dataset(item.name, data=np.asarray(item.data[...])[order]).attrs["unit"] = item.unit
+            _columns(_group(group.file, f"{item.name}_cells", "ArrayDict"), _plain(item))
             if item.timestamps is not None:
                 _columns(_group(group.file, f"{item.name}_samples", "ArrayDict"), {"time": item.timestamps[...]})
-            _columns(_group(group.file, f"{item.name}_cells", "ArrayDict"), _plain(item))
     return edges
 
 
 def _write_signal(file: h5py.File, series: Series) -> NDArray[np.float64]:
     """Write a signal of cells with what is known of these; returns the span [1, 2] (s) of its frames."""
-    if series.table:
-        return np.zeros((0, 2))
-    regular = series.timestamps is None
-    group = _group(file, series.name, REGULAR if regular else IRREGULAR)
-    values, name = np.asarray(series.data[...]), series.name.rpartition("/")[2]
+    group, values, times = _group(file, series.name, IRREGULAR), np.asarray(series.data[...]), frame_times(series)
+    name = series.name.rpartition("/")[2]
     data = group.create_dataset(name, data=values if values.ndim > 1 else values[:, None])
     data.attrs.update({"unit": series.unit, "kind": series.kind, "conversion": series.conversion})
-    if regular:
-        group.attrs["sampling_rate"] = series.rate
-        edges = np.array([[series.start, series.start + (len(values) - 1) / series.rate]])
-        _interval(group, "domain", edges)
-    else:
-        times = np.asarray(series.timestamps[...], dtype=np.float64)
-        _columns(group, {"timestamps": times}, timekeys=["timestamps"])
-        edges = times[[[0, -1]]]
-        _grid(group, times, edges)
+    _columns(group, {"timestamps": times}, ["timestamps"])
+    _grid(group, times, edges := times[[[0, -1]]])
     _columns(_group(file, f"{series.name}_cells", "ArrayDict"), _plain(series))
     return edges
 
@@ -280,13 +253,15 @@ def _plain(series: Series) -> dict[str, NDArray[Any]]:
 def _grid(group: h5py.Group, times: NDArray[np.float64], edges: NDArray[np.float64]) -> None:
     """Write the recorded time of a series, and the place of each of its seconds, by which parts of it are read."""
     _interval(group, "domain", edges)
+    if (length := edges[-1, 1] - edges[0, 0]) > _LONGEST:
+        raise DataError(f"The times of {(group.name or '').strip('/')} span {length:g}, so they are no seconds.")
     seconds = np.arange(edges[0, 0], edges[-1, 1] + 1.0, 1.0)
     group.create_dataset("timestamp_indices_1s", data=np.searchsorted(times, seconds))
 
 
 def _interval(file: h5py.Group, name: str, edges: NDArray[np.float64], **columns: NDArray[Any]) -> None:
     columns = {"start": edges[:, 0], "end": edges[:, 1], **columns}
-    _columns(_group(file, name, "Interval"), columns, timekeys=["start", "end"])
+    _columns(_group(file, name, "Interval"), columns, ["start", "end"])
 
 
 def _group(file: h5py.Group, place: str, kind: str) -> h5py.Group:

@@ -355,14 +355,14 @@ def test_a_benchmark_states_what_is_not_the_default_and_the_hash_of_each_file(la
 def test_check_names_what_others_will_miss_and_nothing_wrong(laboratory):
     findings = check(str(laboratory[0] / "lab.toml"))[1]
     assert {finding.severity for finding in findings} == {"note"}
-    assert [finding.what.split()[0] for finding in findings] == ["contact", "recordings.source", "recordings.licence"]
+    assert [finding.message.split()[0] for finding in findings] == ["contact", "recordings.source", "recordings.licence"]
 
 
 def test_check_finds_numbers_that_are_not_those_of_the_recordings(lab, laboratory):
     benchmark = laboratory[1]
     wrong = replace(benchmark, ceiling=replace(benchmark.ceiling, reliability=0.5))
     (lab / "lab.toml").write_text(wrong.to_toml())
-    errors = [finding.what for finding in check(str(lab / "lab.toml"))[1] if finding.severity == "error"]
+    errors = [finding.message for finding in check(str(lab / "lab.toml"))[1] if finding.severity == "error"]
     assert len(errors) == 1
     assert re.match(r"reliability of the ceiling is 0\.9\d+ here, and 0\.5 is stated", errors[0])
 

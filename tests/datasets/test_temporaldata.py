@@ -159,6 +159,6 @@ def test_what_temporaldata_cannot_hold_is_refused(tmp_path):
         write_temporaldata(tmp_path / "a.h5", make_simple_session(columns={"stimulus": ["é", "b", "c"] * 4}))
     session = make_simple_session()
     del session.tables["trials"].data["stop_time"]
-    with pytest.raises(DataError, match="no start_time and stop_time"):
+    with pytest.raises(DataError, match="rows without start_time or stop_time"):
         write_temporaldata(tmp_path / "a.h5", session)
     assert [*tmp_path.iterdir()] == []

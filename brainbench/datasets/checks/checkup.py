@@ -31,8 +31,8 @@ from brainbench.datasets.layouts.registry import RecordingLayout, counted_layout
 from brainbench.datasets.ledger import Ledger
 from brainbench.datasets.reading import Source, each_session, find_recordings, open_file
 from brainbench.datasets.sessions import Series, Session
-from brainbench.datasets.trials.counting import no_units, read_spikes, time_fault
-from brainbench.datasets.trials.selection import Conditions, joined_labels, label_doubts
+from brainbench.datasets.trials.counting import ReadingOptions, count_session, no_units, read_spikes, time_fault
+from brainbench.datasets.trials.selection import DEFAULT, WHOLE, Conditions, joined_labels, label_doubts
 from brainbench.datasets.trials.session_trials import Copies
 
 _NUMBER = re.compile(r"\d+(?:,\d{3})*(?:\.\d+)?")
@@ -169,7 +169,9 @@ def check_session(
     yield from check_tables(session)
     yield from check_labels(session, layout, conditions)
     if not session.has_spikes or session.units is None:
-        yield Finding("note", "units", f"holds signals and no spikes ({some(signals)}); only tables are checked")
+        yield Finding("note", "units", f"holds signals and no spikes ({some(signals)}); tables and drift are checked")
+        if conditions is not None:
+            yield from _check_signal(session, conditions, layout)
         return
     table = session.tables.get(conditions.table if conditions else "trials")
     with contextlib.suppress(BrainbenchError):
@@ -197,3 +199,17 @@ def check_session(
     yield from check_spikes(session, spikes)
     yield from check_coverage(session, spikes, layout, conditions)
     yield from check_clock(session, spikes, layout)
+
+
+def _check_signal(session: Session, conditions: Conditions, layout: RecordingLayout | None) -> Iterator[Finding]:
+    """Yield what is said of the signal of a session whose trials are read: time base, frame rate, drift."""
+    rules = (layout.selection, layout.window) if layout else (DEFAULT, WHOLE)
+    try:
+        part = count_session(session, ReadingOptions(conditions, None, *rules))
+    except BrainbenchError as error:
+        yield Finding(
+            "error", "signals", str(error), "Or name another signal or window: --window 'FROM..TO of SIGNAL'."
+        )
+        return
+    for doubt in part.ledger.doubts:
+        yield Finding("warning", "signals", doubt)

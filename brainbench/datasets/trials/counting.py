@@ -217,7 +217,8 @@ def _windows(
     parts = [edges]
     if (baseline := options.window.baseline) is not None:
         parts.append(baseline.edges(session, table, ledger.notes))
-        keep = ledger.apply(keep, parts[1][:, 1] > parts[1][:, 0], "trials", f"no event for the baseline {baseline}")
+        keep = ledger.apply(keep, np.isfinite(parts[1]).all(axis=1), "trials", f"no event for the baseline {baseline}")
+        keep = ledger.apply(keep, ~(parts[1][:, 1] <= parts[1][:, 0]), "trials", f"baseline {baseline} of no length")
     invalid = session.tables.get("invalid_times")
     if invalid is not None:
         begin, end = invalid.times("start_time"), invalid.times("stop_time")

@@ -451,8 +451,6 @@ def joined_probes(parts: Sequence[SessionCounts], doubts: list[str]) -> list[Ses
 
 def _same_trials(part: SessionCounts, earlier: SessionCounts) -> dict[int, int] | None:
     """Return the trials of a part that are those of an earlier one; None where fewer than half are."""
-    from brainbench.datasets.trials.session_trials import same_trials
-
     if not part.labels or not earlier.labels:
         return {}
     sides = [(item.edges[:, 0], np.array(item.labels)) for item in (part, earlier)]

@@ -205,13 +205,18 @@ class Samples:
         return power
 
     def enter(self, units: NDArray[np.int64], bounds: Floats, counts: NDArray[np.float32], to: Ledger) -> None:
-        """Doubt responses that fade over the session."""
-        if self.band is None and (doubt := fading(counts / np.diff(bounds, axis=1)[:, :, None])):
+        """Doubt responses of any kind that drift over the session."""
+        rates = counts / np.diff(bounds, axis=1)[:, :, None]
+        imaged = self.band is None and self.series.unit != "spikes"
+        if doubt := fading(rates, BLEACHING if imaged else "as where electrodes or arousal change"):
             to.doubts.append(f"{self.name}: {doubt}")
 
 
-def fading(means: NDArray[np.floating[Any]]) -> str:
-    """Return a doubt where the responses [R, T, U] of trials in order of time drift, as where an indicator bleaches."""
+BLEACHING = "as where an indicator bleaches; take ΔF/F of a running baseline"
+
+
+def fading(means: NDArray[np.floating[Any]], cause: str = BLEACHING) -> str:
+    """Return a doubt where the responses [R, T, U] of trials in order of time drift, with the likely cause."""
     finite = np.isfinite(means)
     number = finite.sum(axis=(1, 2))
     course = np.where(finite, means, 0.0).sum(axis=(1, 2), dtype=np.float64)[number > 0] / number[number > 0]
@@ -221,8 +226,8 @@ def fading(means: NDArray[np.floating[Any]]) -> str:
     if r * r < DRIFT:
         return ""
     return (
-        f"the mean over cells {'rises' if r > 0 else 'falls'} over the session (time explains {r * r:.0%} of its "
-        "variance), as where an indicator bleaches; take ΔF/F of a running baseline"
+        f"the mean over units {'rises' if r > 0 else 'falls'} over the session (time explains {r * r:.0%} of its "
+        f"variance), {cause}"
     )
 
 

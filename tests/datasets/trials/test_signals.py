@@ -114,6 +114,21 @@ def test_responses_that_fade_over_the_session_are_doubted():
     assert "falls over the session" in fading(steady - 0.05 * np.arange(40, dtype=np.float32)[:, None, None])
 
 
+@pytest.mark.parametrize(("unit", "cause"), [("dF/F", "bleaches"), ("mV", "bleaches"), ("spikes", "electrodes")])
+def test_drift_is_told_of_responses_of_any_unit_by_every_command(tmp_path, unit, cause):
+    table = {"start_time": np.arange(30.0), "stop_time": np.arange(30.0) + 0.5, "stimulus": list("abc") * 10}
+    values = np.random.default_rng(0).poisson(5, (30, 1, 4)) + np.arange(30)[:, None, None]
+    path = write_recordings(
+        tmp_path / "a.h5", make_session("m", "1", None, {"trials": table}, response=values, unit=unit)
+    )
+    (doubt,) = (
+        doubt for doubt in open_recordings(path, conditions="trials:stimulus").attrs["doubts"] if "rises" in doubt
+    )
+    assert cause in doubt
+    checkup = check(path, conditions="trials:stimulus")
+    assert (checkup.verdict, doubt in {finding.message for finding in checkup.findings}) == ("warning", True)
+
+
 def test_the_mean_of_a_baseline_is_taken_away_from_signals_and_rates(tmp_path):
     data = np.random.default_rng(0).normal(size=(70, 3))
     opened, values = means(imaged(tmp_path / "a.nwb", data), window="start+0.5..+0.4 minus start..+0.5")
@@ -138,7 +153,7 @@ def test_trials_without_their_baseline_are_left_out(tmp_path):
     path = imaged(tmp_path / "a.nwb", np.random.default_rng(0).normal(size=(70, 3)))
     opened, _ = means(path, window="start..stop minus start-0.5..start")
     assert opened.attrs["removed"]["trials: outside the recorded span"] == 1
-    with pytest.raises(DataError, match=r"no event for the baseline start\.\.start removed 6"):
+    with pytest.raises(DataError, match=r"baseline start\.\.start of no length removed 6"):
         means(path, window="start..stop minus start..start")
 
 
