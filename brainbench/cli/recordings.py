@@ -40,7 +40,7 @@ def inspect(
     from brainbench.datasets import inspect as inspect_file
 
     if (stored := _stored(path)) is not None:
-        return Output(stored, f"{path} (rsatoolbox)\n{_described(stored)}\n{facts(_contents(stored))}")
+        return Output(stored, f"{path} (rsatoolbox)\n{_described(stored)}\n{facts(stored.contents)}")
     files = _found(path)
     with progress_bar() as progress:
         inspection = inspect_file(files, strict=strict, progress=progress)
@@ -184,17 +184,6 @@ def _stored(source: str) -> StoredRDMs | None:
 
     path = Path(source)
     return read_rdms(path) if path.suffix.lower() in (".h5", ".hdf5") and path.is_file() else None
-
-
-def _contents(stored: StoredRDMs) -> dict[str, object]:
-    from brainbench.core.errors import listing
-
-    return {
-        "stimuli": listing(stored.stimuli, limit=12, quoted=False),
-        "RDMs": listing(stored.names, limit=12, quoted=False),
-        **{name: listing(map(str, values), limit=12, quoted=False) for name, values in stored.columns.items()},
-        "! no trials": "noise cannot be estimated, so there is no score; recordings compare shows them beside a model",
-    }
 
 
 def _described(stored: StoredRDMs) -> str:

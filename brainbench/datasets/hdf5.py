@@ -1,31 +1,7 @@
 """Our own HDF5 layout for recordings, version 1: spike times, samples by trial, or responses already counted.
 
-The root carries the attributes ``format`` = "brainbench-recordings", ``version`` = 1 and ``kind``.
-
-``kind`` = "spikes": one file, any number of sessions; names in <> are free::
-
-    /sessions/<name>            attributes subject, session, start (ISO 8601 or ""), synthetic (bool),
-                                stimuli (optional: recipe of the stimuli)
-        units/                  one row per unit
-            spike_times         float64 [spikes], s, ascending within a unit; units one after another
-            spike_times_index   int64 [units], end of each unit in spike_times; the index of another column
-                                has the attribute neurodata_type = "VectorIndex"
-            id                  optional, [units]
-            obs_intervals       optional, float64 [spans, 2], s, with obs_intervals_index
-            <column>            optional, [units]: depth (µm), layer, inhibitory, …
-        tables/<table>/         one row per trial
-            start_time          float64 [rows], s; stop_time likewise, optional
-            id                  optional, [rows]
-            <column>            [rows]: numbers, booleans or UTF-8 text
-
-``kind`` = "responses": the same, with responses in place of spike times::
-
-    /sessions/<name>/
-        response                [trial, time, unit] numbers, NaN where missing; attributes unit ("dF/F", "spikes" for
-                                counts, …) and table (of its trials, "trials" by default)
-        time                    float64 [time], s from the start_time of the trial, ascending, begin of each sample;
-                                without it there is one sample, that of the whole trial
-        units/, tables/         as above, without spike_times
+The root carries the attributes ``format`` = "brainbench-recordings", ``version`` = 1 and ``kind``. Kinds "spikes" and
+"responses" hold any number of sessions with their tables (docs/recordings.md, "Our own HDF5 layout").
 
 ``kind`` = "counts": one recordings data set (:func:`brainbench.core.contracts.check_recordings`)::
 
@@ -46,6 +22,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brainbench.core.contracts import check_counts
 from brainbench.core.errors import DataError, UsageError, brief, listing
@@ -245,6 +222,18 @@ def write_array(group: h5py.Group, name: str, values: Any) -> h5py.Dataset:
         return group.create_dataset(name, data=array.astype(object), dtype=h5py.string_dtype())
     packed = {"compression": "gzip", "shuffle": True} if array.size > 1000 else {}
     return group.create_dataset(name, data=array, **packed)
+
+
+def as_ascii(values: Any, name: str, holder: str) -> NDArray[Any]:
+    """Return texts as ASCII bytes, and all else as it is; other texts are refused, since ``holder`` has no place."""
+    array = np.asarray(values)
+    try:
+        return array.astype("S") if array.dtype.kind == "U" else array
+    except UnicodeEncodeError as error:
+        raise DataError(
+            f"{brief(error.object)} of {name!r} is no ASCII text, which is all that {holder} holds; rename it, or "
+            "choose another format."
+        ) from error
 
 
 def _need(group: h5py.Group, name: str, path: Path) -> Any:

@@ -15,9 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.contracts import as_labels
-from brainbench.core.errors import DataError, brief, listing, repeats
+from brainbench.core.errors import DataError, listing, repeats
 from brainbench.core.reading.hdf5 import open_hdf5
 from brainbench.core.writing.hdf5 import create_hdf5
+from brainbench.datasets.hdf5 import as_ascii
 from brainbench.datasets.sessions import decode, text
 
 if TYPE_CHECKING:
@@ -45,6 +46,13 @@ class StoredRDMs:
     note: str = ""
     """How the stimuli were named, where the file leaves a choice."""
 
+    @property
+    def contents(self) -> dict[str, str]:
+        """What the file holds, in short."""
+        lists = {"stimuli": self.stimuli, "RDMs": self.names, **self.columns}
+        texts = {name: listing(map(str, values), limit=12, quoted=False) for name, values in lists.items()}
+        return texts | {"! no trials": "noise cannot be estimated, so there is no score; recordings compare needs none"}
+
 
 def is_rdms(file: h5py.File) -> bool:
     """Return whether an open HDF5 file holds RDMs of rsatoolbox."""
@@ -58,7 +66,8 @@ def read_rdms(path: str | os.PathLike[str]) -> StoredRDMs | None:
     with open_hdf5(path, "file of RDMs") as file:
         if not is_rdms(file):
             return None
-        values: Any = np.asarray(decode(_array(file, "dissimilarities", path)))
+        node: Any = file["dissimilarities"]
+        values = np.asarray(node[...]) if hasattr(node, "dtype") else np.zeros(0)
         if values.ndim != 2 or values.dtype.kind not in "fiu" or not values.size:
             raise DataError(f"{path} has dissimilarities of the shape {list(values.shape)}; expected [RDMs, pairs].")
         patterns, rdms = (_descriptors(file[f"{name}_descriptors"]) for name in ("pattern", "rdm"))
@@ -92,26 +101,9 @@ def write_rdms(path: str | os.PathLike[str], rdms: StoredRDMs) -> Path:
         for place, columns in groups.items():
             group = file.create_group(place)
             for name, entries in columns.items():
-                group[name] = _ascii(np.asarray(entries), name)
+                group[name] = as_ascii(entries, name, "a file of rsatoolbox")
         file.create_group("descriptors").attrs.update(rdms.about)
     return Path(path)
-
-
-def _ascii(values: NDArray[Any], name: str) -> NDArray[Any]:
-    try:
-        return values.astype("S") if values.dtype.kind == "U" else values
-    except UnicodeEncodeError as error:
-        raise DataError(
-            f"{brief(error.object)} of the {name} is no ASCII text, which is all that files of rsatoolbox hold; rename "
-            "it, or take the RDMs from --json."
-        ) from error
-
-
-def _array(group: Any, name: str, path: str | os.PathLike[str]) -> Any:
-    node = group[name]
-    if not hasattr(node, "dtype"):
-        raise DataError(f"{name} of {path} is no array, so this is no file of RDMs of rsatoolbox.")
-    return node[...]
 
 
 def _descriptors(group: Any) -> dict[str, list[Any]]:

@@ -244,21 +244,27 @@ class Series:
         """Size of the samples, uncompressed."""
         return float(np.prod(self.data.shape, dtype=np.float64) * self.data.dtype.itemsize / 1e9)
 
-    def active_times(self) -> NDArray[np.float64]:
-        """Return the times (s, ascending) of the samples of a 0/1 signal that are 1."""
-        values = np.asarray(self.data[...]).ravel()
-        where = np.flatnonzero(values > 0.5)
-        present = values[np.isfinite(values)]
-        if len(present) and not np.isin(present, (0, 1)).all():
-            raise DataError(f"The series {self.name} should hold zeros and ones; it reaches {present.max():g}.")
+    def times(self, *, ordered: bool = True) -> NDArray[np.float64]:
+        """Return the times (s) of the samples, checked; those of samples by trial count from its start."""
+        number = self.data.shape[1 if self.table else 0]
         if self.timestamps is None:
             if not self.rate > 0:
                 raise DataError(f"The series {self.name} has neither timestamps nor a rate; its samples have no time.")
-            return self.start + where / self.rate
-        times = np.asarray(self.timestamps[...], dtype=np.float64)
-        if len(times) != len(values):
-            raise DataError(f"The series {self.name} has {len(times)} timestamps for {len(values)} samples.")
-        return np.sort(times[where])
+            return self.start + np.arange(number) / self.rate
+        times = np.asarray(self.timestamps[...], dtype=np.float64).ravel()
+        if len(times) != number:
+            raise DataError(f"The series {self.name} has {len(times)} timestamps for {number} samples.")
+        if ordered and not (np.isfinite(times).all() and (np.diff(times) > 0).all()):
+            raise DataError(f"The timestamps of {self.name} are not finite and increasing; its samples have no order.")
+        return times
+
+    def active_times(self) -> NDArray[np.float64]:
+        """Return the times (s, ascending) of the samples of a 0/1 signal that are 1."""
+        values = np.asarray(self.data[...]).ravel()
+        present = values[np.isfinite(values)]
+        if len(present) and not np.isin(present, (0, 1)).all():
+            raise DataError(f"The series {self.name} should hold zeros and ones; it reaches {present.max():g}.")
+        return np.sort(self.times(ordered=False)[values > 0.5])
 
 
 @dataclass(frozen=True)

@@ -20,11 +20,10 @@ from numpy.typing import NDArray
 
 from brainbench.core.errors import DataError, brief
 from brainbench.core.writing.hdf5 import create_hdf5
-from brainbench.datasets.hdf5 import columns_of, dead_link
+from brainbench.datasets.hdf5 import as_ascii, columns_of, dead_link
 from brainbench.datasets.nwb import named_by_file
 from brainbench.datasets.sessions import OBSERVED, SPIKES, Series, Session, SessionTable, decode, ragged, text
 from brainbench.datasets.trials.counting import merged
-from brainbench.datasets.trials.signals import frame_times
 
 if TYPE_CHECKING:
     import h5py
@@ -223,18 +222,18 @@ def _write_table(group: h5py.Group, table: SessionTable, session: Session) -> ND
     columns = {names.get(name, name): table.column(name) for name in table.columns if name not in table.index}
     times = [name for name in columns if name in _TIMES or (name.endswith("_time") and columns[name].dtype.kind == "f")]
     _columns(group, {name: values[order] for name, values in {"id": table.ids(), **columns}.items()}, times)
-    for item in session.populations.values() if session.units is None else ():
-        if isinstance(item, Series) and item.table == table.name:
-            group.create_dataset(item.name, data=np.asarray(item.data[...])[order]).attrs["unit"] = item.unit
-            _columns(_group(group.file, f"{item.name}_cells", "ArrayDict"), _plain(item))
-            if item.timestamps is not None:
-                _columns(_group(group.file, f"{item.name}_samples", "ArrayDict"), {"time": item.timestamps[...]})
+    for series in session.populations.values() if session.units is None else ():
+        if isinstance(series, Series) and series.table == table.name:
+            group.create_dataset(series.name, data=np.asarray(series.data[...])[order]).attrs["unit"] = series.unit
+            _columns(_group(group.file, f"{series.name}_cells", "ArrayDict"), _plain(series))
+            if series.timestamps is not None:
+                _columns(_group(group.file, f"{series.name}_samples", "ArrayDict"), {"time": series.timestamps[...]})
     return edges
 
 
 def _write_signal(file: h5py.File, series: Series) -> NDArray[np.float64]:
     """Write a signal of cells with what is known of these; returns the span [1, 2] (s) of its frames."""
-    group, values, times = _group(file, series.name, IRREGULAR), np.asarray(series.data[...]), frame_times(series)
+    group, values, times = _group(file, series.name, IRREGULAR), np.asarray(series.data[...]), series.times()
     name = series.name.rpartition("/")[2]
     data = group.create_dataset(name, data=values if values.ndim > 1 else values[:, None])
     data.attrs.update({"unit": series.unit, "kind": series.kind, "conversion": series.conversion})
@@ -277,20 +276,10 @@ def _object(group: Any, kind: str) -> Any:
 
 
 def _columns(group: h5py.Group, columns: dict[str, Any], timekeys: list[str] | None = None) -> None:
-    """Write columns; texts must be ASCII, which is all that temporaldata holds."""
-    texts = []
+    """Write columns, and which of them are texts or times."""
     for name, values in columns.items():
-        array = np.asarray(values)
-        if array.dtype.kind == "U":
-            texts.append(name)
-            try:
-                array = array.astype("S")
-            except UnicodeEncodeError as error:
-                raise DataError(
-                    f"{brief(error.object)} of the column {name!r} is no ASCII text, which is all that temporaldata "
-                    "holds; copy to .h5 or NWB, or rename it."
-                ) from error
-        group.create_dataset(name, data=array)
+        group.create_dataset(name, data=as_ascii(values, name, "temporaldata"))
+    texts = [name for name, values in columns.items() if np.asarray(values).dtype.kind == "U"]
     group.attrs["_unicode_keys"] = np.array(texts, dtype="S")
     if timekeys is not None:
         group.attrs["timekeys"] = np.array(timekeys, dtype="S")

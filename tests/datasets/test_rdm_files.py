@@ -67,7 +67,7 @@ BROKEN = {
     "five pairs": (replaced("dissimilarities", np.ones((2, 5))), "5 dissimilarities .* no pairs"),
     "squares": (replaced("dissimilarities", np.ones((2, 4, 4))), r"shape \[2, 4, 4\]"),
     "texts": (replaced("dissimilarities", np.array([[b"a"] * 6])), "shape"),
-    "a group": (replaced("dissimilarities", None), "no array"),
+    "a group": (replaced("dissimilarities", None), "shape"),
     "infinite": (replaced("dissimilarities", np.full((2, 6), np.inf)), "infinite"),
     "names of three": (
         replaced("pattern_descriptors/stimulus", np.array([b"a", b"b", b"c"])),
@@ -92,5 +92,5 @@ def test_other_files_hold_no_rdms_and_rdms_are_no_recordings(tmp_path):
     write_rdms(tmp_path / "a.h5", stored())
     with pytest.raises(DataError, match="RDMs without trials, whose noise nobody can estimate"):
         open_recordings(tmp_path / "a.h5")
-    with pytest.raises(DataError, match="'é' of the stimulus is no ASCII text"):
+    with pytest.raises(DataError, match="'é' of 'stimulus' is no ASCII text"):
         write_rdms(tmp_path / "b.h5", StoredRDMs(np.ones((1, 3)), ("é", "b", "c"), ("m",)))

@@ -155,7 +155,7 @@ def test_a_class_that_nobody_knows_is_left_out_by_name(tmp_path):
 
 
 def test_what_temporaldata_cannot_hold_is_refused(tmp_path):
-    with pytest.raises(DataError, match=r"'é' of the column 'stimulus' is no ASCII text"):
+    with pytest.raises(DataError, match=r"'é' of 'stimulus' is no ASCII text"):
         write_temporaldata(tmp_path / "a.h5", make_simple_session(columns={"stimulus": ["é", "b", "c"] * 4}))
     session = make_simple_session()
     del session.tables["trials"].data["stop_time"]

@@ -48,7 +48,7 @@ class Finding:
 
     severity: Severity
     check: str
-    """Name: file, units, spikes, signals, duplicates, refractory, silent, tables, times, labels, order, coverage, clock."""
+    """Name, such as file, units, signals, duplicates, silent, tables, times, labels, order, coverage or clock."""
     message: str
     """The fault, in numbers."""
     advice: str = ""

@@ -63,21 +63,6 @@ def _names(places: Iterable[str]) -> list[str]:
     return sorted({name for place in places for name in place.split("/")[-2:]})
 
 
-def frame_times(series: Series) -> Floats:
-    """Return the times (s) of the frames of a signal, checked; those of samples by trial count from its start."""
-    number = series.data.shape[1 if series.table else 0]
-    if series.timestamps is None:
-        if not series.rate > 0:
-            raise DataError(f"The series {series.name} has neither timestamps nor a rate; its frames have no time.")
-        return series.start + np.arange(number) / series.rate
-    times = np.asarray(series.timestamps[...], dtype=np.float64).ravel()
-    if len(times) != number:
-        raise DataError(f"The series {series.name} has {len(times)} timestamps for {number} frames.")
-    if not (np.isfinite(times).all() and (np.diff(times) > 0).all()):
-        raise DataError(f"The timestamps of {series.name} are not finite and increasing; its frames have no order.")
-    return times
-
-
 @dataclass(frozen=True)
 class Samples:
     """Units whose signal is sampled; their responses are means, of which negative ones are values too."""
@@ -101,7 +86,7 @@ class Samples:
         if len(cells) != (shape[-1] if len(shape) > 1 else 1):
             raise DataError(f"{name} has the shape {shape}, and {len(cells)} units are named.")
         if not series.table:
-            samples = cls(cells, series, frame_times(series), name, band=window.band)
+            samples = cls(cells, series, series.times(), name, band=window.band)
             if samples.band is not None and not 2 * samples.band[1] * samples.step < 1:
                 raise DataError(
                     f"{name} has {1 / samples.step:.6g} samples/s, and a band of voltages ends below half of that; "
@@ -118,7 +103,7 @@ class Samples:
                 f"{name} says no time of its {shape[1]} samples of a trial, which have no windows or bins then: "
                 "'time' (s from the start of the trial) is missing beside it, or one sample is read without a window."
             )
-        times = np.zeros(1) if series.timestamps is None else frame_times(series)
+        times = np.zeros(1) if series.timestamps is None else series.times()
         return cls(cells, series, times, name, table.times("start_time"))
 
     @property

@@ -67,7 +67,7 @@ def test_frames_that_are_nan_are_left_out(tmp_path):
         ({"rate": None}, "neither timestamps nor a rate"),
         ({"rate": 1.0}, r"a frame every 1 s, and windows or bins are as short as 0\.5 s"),
         ({"stamps": np.zeros(70)}, "not finite and increasing"),
-        ({"stamps": np.arange(5.0)}, "5 timestamps for 70 frames"),
+        ({"stamps": np.arange(5.0)}, "5 timestamps for 70 samples"),
     ],
 )
 def test_frames_without_a_time_base_are_refused(tmp_path, options, words):
