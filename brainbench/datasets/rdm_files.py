@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from brainbench.core.contracts import as_labels
 from brainbench.core.errors import DataError, listing, repeats
+from brainbench.core.files import create_hdf5
 from brainbench.core.reading.hdf5 import open_hdf5
-from brainbench.core.writing.hdf5 import create_hdf5
 from brainbench.datasets.hdf5 import as_ascii
 from brainbench.datasets.sessions import decode, text
 

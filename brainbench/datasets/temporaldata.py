@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.errors import DataError, brief
-from brainbench.core.writing.hdf5 import create_hdf5
+from brainbench.core.files import create_hdf5
 from brainbench.datasets.hdf5 import as_ascii, columns_of, dead_link
 from brainbench.datasets.nwb import named_by_file
 from brainbench.datasets.sessions import OBSERVED, SPIKES, Series, Session, SessionTable, decode, ragged, text

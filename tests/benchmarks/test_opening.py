@@ -355,7 +355,11 @@ def test_a_benchmark_states_what_is_not_the_default_and_the_hash_of_each_file(la
 def test_check_names_what_others_will_miss_and_nothing_wrong(laboratory):
     findings = check(str(laboratory[0] / "lab.toml"))[1]
     assert {finding.severity for finding in findings} == {"note"}
-    assert [finding.message.split()[0] for finding in findings] == ["contact", "recordings.source", "recordings.licence"]
+    assert [finding.message.split()[0] for finding in findings] == [
+        "contact",
+        "recordings.source",
+        "recordings.licence",
+    ]
 
 
 def test_check_finds_numbers_that_are_not_those_of_the_recordings(lab, laboratory):
