@@ -15,19 +15,8 @@ FOLDER = Path(__file__).parent / "trained"
 """A run's folder per policy, with a model card."""
 SENSING = "policy"
 """Folder in a teacher's run with the policy as a student's, where it trained on what a hand measures."""
-RETIRED = {
-    "in_palm_rotate.careful": "in_palm_rotate.teacher",
-    "in_palm_rotate.firm": "in_palm_rotate.teacher",
-    "in_palm_rotate.force-torque-hand": "in_palm_rotate.student",
-}
-"""Policy that used to ship → the one that took its place."""
-
-
-def hint(name: str) -> str:
-    """Return what to do instead where there is no policy of a name."""
-    if name in RETIRED:
-        return f"{name!r} is no longer shipped; {RETIRED[name]!r} took its place."
-    return "Or give the folder of a training run."
+HINT = "Or give the folder of a training run."
+"""What to do instead where there is no policy of a name."""
 
 
 def list_policies(kind: str, task: str | None = None) -> list[str]:
@@ -54,5 +43,5 @@ def policy_path(kind: str, name: str | os.PathLike[str]) -> Path:
     path = Path(name)
     if path.exists():
         return path
-    check_name(kind, str(name), list_policies(kind), hint=hint(str(name)))
+    check_name(kind, str(name), list_policies(kind), hint=HINT)
     return FOLDER / str(name)

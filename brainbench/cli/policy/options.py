@@ -48,7 +48,7 @@ class World:
         choices = (*shipped.AGENTS, *shipped.list_policies("teacher"), *shipped.list_policies("student"))
         for name in agents:
             if name not in choices and not Path(name).exists():
-                raise unknown_name("agent", name, choices, hint=shipped.hint(name))
+                raise unknown_name("agent", name, choices, hint=shipped.HINT)
 
     def make(self, agents: Iterable[str] = (), **options: Any) -> Env:
         """Return its environment; a task of the user's own is read first, then changed.

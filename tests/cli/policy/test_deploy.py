@@ -88,5 +88,3 @@ def test_a_student_plays_with_its_own_touch_and_is_exported(tmp_path: Path) -> N
     # What a hand measures or is told is all that it reads: nothing but touch is asked for.
     assert list(deployed.contract.inputs) == ["proprio", "command", "tactile"]
     assert list(deployed.require({"tactile"})) == ["tactile"]
-    with pytest.raises(UsageError, match=r"no longer shipped; 'in_palm_rotate\.student'"):
-        run_policy("play", "in_palm_rotate", "--agent", "in_palm_rotate.force-torque-hand")

@@ -14,7 +14,7 @@ from robotics_bridge import tasks
 from robotics_bridge.policies.evaluate import Policy, evaluate
 from robotics_bridge.policies.export import export_policy
 from robotics_bridge.policies.fit import with_contacts_of
-from robotics_bridge.policies.shipped import FOLDER, RETIRED, list_policies, policy_path
+from robotics_bridge.policies.shipped import FOLDER, list_policies, policy_path
 from robotics_bridge.policies.training.student_files import load_student
 from robotics_bridge.policies.training.teacher import Trainer, load_teacher
 from robotics_bridge.tasks.task import MEASURED
@@ -62,13 +62,6 @@ def test_a_name_stands_for_its_folder_and_paths_for_themselves(tmp_path: Path) -
     assert policy_path("teacher", tmp_path) == tmp_path
     with pytest.raises(UsageError, match=r"'in_palm_rotate\.teacher'.*folder"):
         policy_path("teacher", "in_palm_rotate.teachr")
-
-
-@pytest.mark.parametrize(("name", "instead"), RETIRED.items())
-def test_a_retired_name_says_what_took_its_place(name: str, instead: str) -> None:
-    (kind,) = (kind for kind in ("teacher", "student") if instead in list_policies(kind))
-    with pytest.raises(UsageError, match=rf"'{name}' is no longer shipped; '{instead}' took its place"):
-        policy_path(kind, name)
 
 
 def test_learning_goes_on_from_a_shipped_teacher() -> None:
