@@ -439,7 +439,7 @@ def spread_kernel(kinds: frozenset[int], raycast: bool, noisy: bool, sticky: boo
         if wp.static(noisy):
             store_planes(io.measured, env, n, 6, wp.spatial_vectorf())
 
-    @wp.kernel(module="unique", enable_backward=False, launch_bounds=(128, 5))
+    @wp.kernel(module="unique", enable_backward=False)
     def spread(
         plan: SpreadPlan,
         probes: ProbeArrays,
