@@ -217,8 +217,7 @@ class _Placed:
 
     board: str
     name: str
-    state: str
-    """Value, standing and rank in print."""
+    state: str  # value, standing and rank in print
     record: ResultRecord
 
     def change(self, kind: Kind, before: str, after: str, causes: tuple[str, ...] = ()) -> Change:

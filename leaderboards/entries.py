@@ -23,8 +23,7 @@ from brainbench.core.statistics import is_finite
 from leaderboards.ranking import CHANCE_LEVEL, STANDINGS, Sample, Standing, not_repeatable, rank_in_print, standing_of
 
 UNTRAINED = "untrained"
-_SAME = 1e-6
-"""Largest difference of values, and of RDMs scaled to length 1, of one computation (float32 sums differ)."""
+_SAME = 1e-6  # largest difference of values, and of RDMs scaled to length 1, of one computation (float32 sums differ)
 
 
 @dataclass(frozen=True)

@@ -34,7 +34,7 @@ from brainbench.models.export import StreamingStep, export_model, read_onnx
 from brainbench.models.ops import dispatch
 from brainbench.models.ops.layers import packed
 from brainbench.models.registry import describe_model, load_model
-from brainbench.models.training.optimizers import compiled, fuse
+from brainbench.models.training.objectives import compiled, fuse
 
 STEPS = 22
 

@@ -13,8 +13,7 @@ import os
 import sys
 from typing import Any
 
-INTERRUPTED = 130
-"""Exit status after Ctrl-C, as shells count it: 128 and the number of the signal."""
+INTERRUPTED = 130  # exit status after Ctrl-C, as shells count it: 128 and the number of the signal
 GO_ON = (
     "interrupted; no file was left half-written. Give the same command again: what it had finished (simulations, "
     "checkpoints, shards of a data set) is kept and not made again."

@@ -28,10 +28,8 @@ COMMANDS = {
     "leaderboard": "Collect result records, check them, and show them as a leaderboard.",
 }
 """Command or group of commands → its line in the help."""
-ELSEWHERE = {"export": "models"}
-"""Command → its module, where that is called otherwise."""
-OPTIONAL = "brainbench.commands"
-"""Entry points of optional commands: ``power``, or ``stimuli.fit`` inside a group."""
+ELSEWHERE = {"export": "models"}  # command → its module, where that is called otherwise
+OPTIONAL = "brainbench.commands"  # entry points of optional commands: `power`, or `stimuli.fit` inside a group
 OPTIONAL_PANEL = "Optional commands, each in a folder that can be taken off"
 _LOG = logging.getLogger(__name__)
 

@@ -25,7 +25,7 @@ def model_card(name: str, model: ModelDescription, recipe: PublishedTraining | N
     ``recipe`` says how it was trained in the published study, where its weights are not here; ``twin`` is a sentence
     about the untrained twin of trained weights.
     """
-    from brainbench.models.user_models import FAMILY
+    from brainbench.models.registry import FAMILY
 
     rows: dict[str, object] = {}
     if model.trained is not None:
@@ -79,7 +79,7 @@ def _accuracy(evaluation: Mapping[str, Any]) -> str:
 
 
 def _tagged(name: str) -> Iterator[str]:
-    from brainbench.models.architecture import Architecture
+    from brainbench.models.recipes import Architecture
     from brainbench.models.training.checkpoints import shipped
 
     return (tagged for tagged in shipped() if Architecture.parse(tagged).untrained == name)
@@ -93,11 +93,9 @@ def list_(pattern: Annotated[str, typer.Argument(help="Shell pattern, e.g. '*-ln
     """List the models by name, with their sizes and what their weights are (also: brainbench models)."""
     from fnmatch import fnmatchcase
 
-    from brainbench.models.architecture import Architecture
-    from brainbench.models.recipes import list_recipes
-    from brainbench.models.registry import describe_model, list_models
+    from brainbench.models.recipes import Architecture, list_recipes
+    from brainbench.models.registry import FAMILY, describe_model, list_models
     from brainbench.models.training.checkpoints import shipped
-    from brainbench.models.user_models import FAMILY
 
     here = shipped()
     names = [*list_models(pattern), *(name for name in here if fnmatchcase(name, pattern))]
@@ -181,8 +179,7 @@ def add(
     name: Annotated[str, typer.Option(help="What to call it on the command line.")],
 ) -> Output:
     """Give a model of your own a name; it is kept in your settings, and the code stays where it is."""
-    from brainbench.models.registry import list_models
-    from brainbench.models.user_models import add_user_model, settings_file
+    from brainbench.models.registry import add_user_model, list_models, settings_file
 
     model = add_user_model(target, name, names=list_models())
     rows = {"model": model.name, "code": model.target, "kept in": settings_file()}
@@ -194,7 +191,7 @@ def remove(
     name: Annotated[str, typer.Argument(help="A name that brainbench models add was given.")],
 ) -> Output:
     """Take the name of a model of your own away; its code stays."""
-    from brainbench.models.user_models import remove_user_model
+    from brainbench.models.registry import remove_user_model
 
     model = remove_user_model(name)
     return Output(model, f"{model.name} is no longer a name of {model.target}; the code was not touched.")

@@ -12,14 +12,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from brainbench.cli import options
-from brainbench.cli.options import SCORE, SCORE_FLAGS, out_folder_option, typed_options, with_options
+from brainbench.cli.options import SCORE, SCORE_FLAGS, out_folder_option, report_file, typed_options, with_options
 from brainbench.cli.output import Output, progress_bar, table, table_of
 from brainbench.core.errors import UsageError
 from brainbench.core.identity import plan_note
 from brainbench.core.records import Interval, ResultRecord, Score, spanned
-from brainbench.core.statistics import compare_scores
-from brainbench.models.activations import ReadReport
 
 if TYPE_CHECKING:
     from brainbench.scoring.options import ScoreOptions
@@ -45,6 +42,7 @@ def score_text(record: ResultRecord) -> str:
 
 def _headline(record: ResultRecord) -> Iterator[str]:
     """Yield what was scored, its unique part, whether it is told apart from raw input, the score, and its limits."""
+    from brainbench.models.activations import ReadReport
     from leaderboards.ranking import CHANCE_LEVEL
     from leaderboards.text import unique_sentence
 
@@ -84,6 +82,7 @@ def _weights(record: ResultRecord) -> str:
 
 def _against_raw_input(record: ResultRecord) -> str:
     """Say whether a score is told apart from that of the raw input, by the test that boards use."""
+    from brainbench.core.statistics import compare_scores
     from leaderboards.ranking import lacking
 
     score, raw = record.score, record.baselines.get(RAW_INPUT)
@@ -273,11 +272,11 @@ def score(
     ],
     options: ScoreOptions,
     out: Annotated[Path, out_folder_option("Folder of record and report.")] = Path("brainbench-results"),
-    report_file: Annotated[
+    report: Annotated[
         Path | None,
         typer.Option(
             "--report",
-            callback=options.report_file,
+            callback=report_file,
             help="Also write a report for a paper: FILE.md, FILE.html or FILE.pdf.",
         ),
     ] = None,
@@ -292,7 +291,7 @@ def score(
         from brainbench.core.plugins import require_optional
         from brainbench.scoring.scores import PARTS
 
-        if options != replace(type(options)(), explain=True) or report_file is not None:
+        if options != replace(type(options)(), explain=True) or report is not None:
             raise UsageError("A file of stored splits is explained by itself; leave out all options but --json.")
         steps = to_plain(require_optional(PARTS, "explain_file", "part of a score")(model))
         return Output({"estimator_walk": steps}, walk_text(steps))
@@ -308,13 +307,13 @@ def score(
             record, note = score_record(model, options, command=command, progress=progress, **typed), ""
         keep(record, cached)
     path = write_record(record, out)
-    report = write_report(record, path.with_suffix(".html"))
-    data: dict[str, Any] = {"record": record, "record_path": path, "report_path": report}
-    text = f"{score_text(record)}\n\nrecord  {path}{note}\nreport  {report}"
-    if report_file is not None:
+    page = write_report(record, path.with_suffix(".html"))
+    data: dict[str, Any] = {"record": record, "record_path": path, "report_path": page}
+    text = f"{score_text(record)}\n\nrecord  {path}{note}\nreport  {page}"
+    if report is not None:
         from leaderboards.report.paper import write_paper
 
-        data["paper_paths"] = write_paper([record], report_file, title=f"{record.score.name}: brainbench score")
+        data["paper_paths"] = write_paper([record], report, title=f"{record.score.name}: brainbench score")
         text += f"\npaper   {', '.join(map(str, data['paper_paths'][:2]))}"
     return Output(data, text)
 

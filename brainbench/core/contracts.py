@@ -31,19 +31,15 @@ if TYPE_CHECKING:
 CHANNELS = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
 """Order of the six channels of a base wrench: forces in N, then moments in N·m."""
 
-GRID_SHAPE = (5, 7)
-"""Rows A–E and columns 0–6 of the whisker grid; whisker (row, col) sits at flat index row·7 + col."""
+GRID_SHAPE = (5, 7)  # rows A–E and columns 0–6 of the whisker grid; whisker (row, col) sits at flat index row·7 + col
 
-SUB_STEPS, SUB_STEP_SECONDS = 5, 0.009
-"""Frames within a time step of the networks, and the time between frames [s]."""
+SUB_STEPS, SUB_STEP_SECONDS = 5, 0.009  # frames within a time step of the networks, and the time between frames [s]
 
-LONGEST_LABEL = 200
-"""Characters of the name of a stimulus or whisker; names become those of files."""
+LONGEST_LABEL = 200  # characters of the name of a stimulus or whisker; names become those of files
 
 SWEEPS_FORMAT = "brainbench-sweeps"
 """Attribute ``format`` of every shard and manifest of a data set of sweeps (``docs/datasets.md``)."""
-SWEEPS_SCHEMA = 1
-"""Version of that layout."""
+SWEEPS_SCHEMA = 1  # version of that layout
 
 
 def check_stimulus_set(dataset: xr.Dataset) -> xr.Dataset:
@@ -179,13 +175,11 @@ class Trials:
         return replace(self, responses=np.asarray(self.responses)[..., units], columns=columns)
 
 
-MISSING_WORDS = ("nan", "nat")
-"""Texts, in lower case, that programs write where a value is missing."""
+MISSING_WORDS = ("nan", "nat")  # texts, in lower case, that programs write where a value is missing
 DOUBTFUL_WORDS = ("none", "na", "n/a", "null", "<na>")
 """Texts, in lower case, that may mean a missing value, or a condition."""
 _DECIMAL = re.compile(r"-?(?:0|[1-9]\d{0,11})\.\d{1,12}")
-_DIGITS = {2: 3, 4: 7}
-"""Digits that a number of so many bytes keeps through arithmetic; 12 for all others."""
+_DIGITS = {2: 3, 4: 7}  # digits that a number of so many bytes keeps through arithmetic; 12 for all others
 
 
 def as_labels(values: Any) -> NDArray[np.str_]:

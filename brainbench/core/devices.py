@@ -153,8 +153,7 @@ def to_struct(kind: Any, values: Mapping[str, np.ndarray], device: Any) -> Any:
 
 
 _LOG = logging.getLogger(__name__)
-WARM_UP = 3
-"""Runs before a recording: they choose algorithms, fill caches and allocate."""
+WARM_UP = 3  # runs before a recording: they choose algorithms, fill caches and allocate
 
 
 class Graph(Protocol):

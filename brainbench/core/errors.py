@@ -110,8 +110,7 @@ _TWINS = {
 """Letters of other alphabets, by number, and the plain one that each looks like."""
 _ALIKE = frozenset({"GREEK", "CYRILLIC", "ARMENIAN", "CHEROKEE", "COPTIC", "LISU"})
 """Scripts with letters like Latin ones; in a name that has such too they are shown as escapes."""
-_BLANK = "\u115f\u1160"
-"""Letters without any ink."""
+_BLANK = "\u115f\u1160"  # letters without any ink
 
 
 def visible_name(name: str) -> str:

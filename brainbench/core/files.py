@@ -127,10 +127,8 @@ def lock_folder(folder: Path, *, wait: bool = True) -> Iterator[bool]:
         os.close(handle)
 
 
-CACHE_VARIABLE = "BRAINBENCH_CACHE"
-"""Environment variable that overrides the platform's cache folder."""
-CONFIG_VARIABLE = "BRAINBENCH_CONFIG"
-"""Environment variable that overrides the platform's folder of settings."""
+CACHE_VARIABLE = "BRAINBENCH_CACHE"  # environment variable that overrides the platform's cache folder
+CONFIG_VARIABLE = "BRAINBENCH_CONFIG"  # environment variable that overrides the platform's folder of settings
 LIBRARIES = ("numpy", "scipy", "xarray", "h5py", "torch", "warp-lang", "mujoco-core")
 """Distributions on whose version the last digits of a result depend."""
 _UNWRITABLE = (
@@ -295,10 +293,8 @@ def write_json(path: str | os.PathLike[str], value: Any) -> Path:
     return write_text(path, to_json(value) + "\n")
 
 
-BITS = 34
-"""Bits of a number that count in a portable hash, about ten digits: the last ones differ between processors."""
-SMALLEST = 1e-12
-"""Numbers below it (SI) are zero: what a rotation by 90° leaves of it is 6e-17 here and 0 there."""
+BITS = 34  # bits of a number that count in a portable hash, about ten digits: the last ones differ between processors
+SMALLEST = 1e-12  # numbers below it (SI) are zero: what a rotation by 90° leaves of it is 6e-17 here and 0 there
 
 
 def without_last_digits(values: ArrayLike) -> NDArray[Any]:

@@ -34,8 +34,7 @@ SETTINGS: Mapping[str, Any] = {
 """Settings that change numbers and stand in no hash, with their defaults: records leave out what they do not know."""
 OF_MODELS = ("readout", "normalize", "layers", "layer")
 """Those that make another score of the same network on the same board."""
-_NAMED = 4
-"""Most stimuli that a sentence names."""
+_NAMED = 4  # most stimuli that a sentence names
 
 
 @dataclass(frozen=True)

@@ -33,8 +33,7 @@ from brainbench.core.reading.regular import reason
 _LOG = logging.getLogger(__name__)
 _beside: dict[str, Path] = {}
 """Modules that the last file imported from its own folder. The next file may mean others by these names."""
-_files: dict[Path, tuple[Path, ...]] = {}
-"""File of a user → that file, and those of its folder that it imported."""
+_files: dict[Path, tuple[Path, ...]] = {}  # file of a user → that file, and those of its folder that it imported
 
 
 def load_object(target: str, kind: str) -> Any:

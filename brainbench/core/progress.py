@@ -6,8 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from itertools import count
 from typing import TypeVar
 
-Progress = Callable[[int, int, str], None]
-"""Called with the steps done, the steps in all, and what is being done."""
+Progress = Callable[[int, int, str], None]  # called with the steps done, the steps in all, and what is being done
 
 PREPARATION = "brainbench-prepare"
 """Name of threads that make ready what a job will wait for, such as a compiler; nothing is lost when they end."""

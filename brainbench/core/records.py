@@ -25,15 +25,13 @@ Status = Literal["ok", "unreliable", "undefined"]
 """``ok``: can be trusted; ``unreliable``: computed, but the data are too noisy or too few to trust
 it; ``undefined``: no number exists. The reason stands in words beside it."""
 
-RECORD_SCHEMA: Literal[2] = 2
-"""Version of the result-record JSON layout."""
+RECORD_SCHEMA: Literal[2] = 2  # version of the result-record JSON layout
 
 ESTIMATOR_VERSION = 3
 """Raised whenever the same recordings and activations would get another number from the default estimator."""
 
 _ROUNDING = 1e-6
-_LARGEST = 1e100
-"""Largest absolute number of a score: squares and sums of such are still finite."""
+_LARGEST = 1e100  # largest absolute number of a score: squares and sums of such are still finite
 _ORDERS = re.compile(r"(?P<all>all )?\b(?P<number>\d[\d,]{0,18}) (?:random orders|orders|times)")
 """Number of orders that a test took, in the words of its method."""
 

@@ -19,8 +19,7 @@ if TYPE_CHECKING:
     import torch
     from numpy.typing import ArrayLike, NDArray
 
-TURN = 2 * math.pi
-"""A full turn [rad]: poses with larger angles are taken for degrees and refused."""
+TURN = 2 * math.pi  # a full turn [rad]: poses with larger angles are taken for degrees and refused
 
 Length = Annotated[float, Limit(above=0, unit="m")]
 Coordinate = Annotated[float, Limit(unit="m")]

@@ -13,8 +13,7 @@ from brainbench.core.errors import DataError, UsageError
 from brainbench.core.reading.ranges import check_number
 from brainbench.core.records import Interval, Score
 
-LEVEL = 0.95
-"""Confidence level of all intervals."""
+LEVEL = 0.95  # confidence level of all intervals
 
 
 def t_interval(values: ArrayLike, *, over: str = "values") -> Interval | None:
@@ -35,10 +34,8 @@ def t_interval(values: ArrayLike, *, over: str = "values") -> Interval | None:
     return Interval(mean - half, mean + half, LEVEL, f"t over {len(array)} {over}")
 
 
-FEWEST_ANIMALS = 4
-"""Fewest animals over which a difference of models is tested."""
-FEWEST_STIMULI = 10
-"""Fewest stimuli over which a difference of models is tested."""
+FEWEST_ANIMALS = 4  # fewest animals over which a difference of models is tested
+FEWEST_STIMULI = 10  # fewest stimuli over which a difference of models is tested
 
 
 def two_factor_error(
@@ -112,8 +109,7 @@ def wilson_interval(successes: float, count: int, *, over: str = "trials", level
 
 CONFOUNDED = 0.1
 """Share of the variance of trial times, beyond that of shuffled labels, from which label and time are confounded."""
-_CONFOUNDED_P = 1e-4
-"""Recordings have up to some hundred sessions, of which none may be suspected by chance."""
+_CONFOUNDED_P = 1e-4  # recordings have up to some hundred sessions, of which none may be suspected by chance
 
 
 @dataclass(frozen=True)

@@ -114,14 +114,11 @@ class _Reader:
     """The layout that the source named; else the one by which the first session was recognised."""
     layout_given: bool
     ledger: Ledger
-    lenient: bool = False
-    """Skip what cannot be used of one file, because others may have it."""
-    options: ReadingOptions | None = None
-    """Made for the first session and kept for all others."""
+    lenient: bool = False  # skip what cannot be used of one file, because others may have it
+    options: ReadingOptions | None = None  # made for the first session and kept for all others
     counted: list[SessionCounts] = field(default_factory=list)
     copies: Copies = field(default_factory=Copies)
-    first: str = ""
-    """Source of the session for which the options were made."""
+    first: str = ""  # source of the session for which the options were made
     other_tables: dict[str, str] = field(default_factory=dict)
     """Why each session without the table of the conditions is left out, by one of the tables that it has."""
     subjects: dict[str, str] = field(default_factory=dict)

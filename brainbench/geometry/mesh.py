@@ -25,10 +25,8 @@ from brainbench.core.reading.regular import MOST_PART, check_file, part_of, read
 if TYPE_CHECKING:
     import trimesh
 
-MERGE = 1e-6
-"""Vertices of an open mesh that lie closer than this part of its diagonal are taken for one."""
-CRACK = 1e-3
-"""Largest part of the surface that a triangle closing a crack may have."""
+MERGE = 1e-6  # vertices of an open mesh that lie closer than this part of its diagonal are taken for one
+CRACK = 1e-3  # largest part of the surface that a triangle closing a crack may have
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,8 +175,7 @@ UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "in": 0.0254}
 """Length units of mesh files in metres."""
 
 
-WRITABLE = (".obj", ".stl", ".ply", ".glb", ".off")
-"""Mesh formats that :func:`save_mesh` writes; :func:`load_mesh` reads more."""
+WRITABLE = (".obj", ".stl", ".ply", ".glb", ".off")  # mesh formats that save_mesh writes; load_mesh reads more
 
 
 @dataclass(frozen=True)
@@ -496,8 +493,7 @@ def save_mesh(path: str | os.PathLike[str], mesh: Mesh, *, unit: str) -> Path:
     return path
 
 
-SAMPLES = 4000
-"""Points that are looked at in each direction."""
+SAMPLES = 4000  # points that are looked at in each direction
 _NEIGHBOURS = 24
 _SPOTS = 20_000
 _BLOCK = 4_000_000

@@ -313,8 +313,7 @@ class LayerComparisons:
 
 
 _CHUNK_ELEMENTS = 1 << 22
-_HALVES_IN_PERMUTATIONS = 100
-"""Splits of a single animal that every permutation repeats; more only cost time."""
+_HALVES_IN_PERMUTATIONS = 100  # splits of a single animal that every permutation repeats; more only cost time
 
 
 @dataclass(frozen=True)
@@ -404,12 +403,9 @@ class _Votes:
 
     rule: LayerRule
     compared: LayerComparisons
-    r: Floats
-    """[L, A] its comparisons of the stimuli as they are."""
-    permuted: LayerComparisons
-    """The part that every permutation repeats."""
-    weights: Floats
-    """[A] factors of the comparisons."""
+    r: Floats  # [L, A] its comparisons of the stimuli as they are
+    permuted: LayerComparisons  # the part that every permutation repeats
+    weights: Floats  # [A] factors of the comparisons
 
     @classmethod
     def of_halves(cls, compared: LayerComparisons, halves: Sequence[SubjectRDM], factor: float) -> _Votes:

@@ -14,8 +14,7 @@ from brainbench.metrics.rdms.pairs import Floats, Ints
 
 _SLICE_ELEMENTS = 1 << 20
 
-_OFFSET = 1e3
-"""Ratio of means to their spread over stimuli above which sums are taken about a value within the data."""
+_OFFSET = 1e3  # ratio of means to their spread over stimuli above which sums are taken about a value within the data
 
 
 def stimulus_codes(labels: ArrayLike, count: int | None = None) -> tuple[Ints, tuple[str, ...]]:

@@ -1,6 +1,6 @@
 """Artificial networks of touch: what turns a whisker array's forces and torques into activations.
 
-A name (:mod:`~brainbench.models.architecture`) is looked up in the :mod:`~brainbench.models.registry`, which builds an
+A name (:mod:`~brainbench.models.recipes`) is looked up in the :mod:`~brainbench.models.registry`, which builds an
 encoder (often a temporal graph of cells), an attender and a decoder into a :mod:`~brainbench.models.network`; its
 :mod:`~brainbench.models.activations` are what is compared with brains. Importing this package imports no framework.
 """
@@ -14,8 +14,7 @@ from brainbench.models import zoo
 
 if TYPE_CHECKING:
     from brainbench.models.activations import extract
-    from brainbench.models.registry import describe_model, list_models, load_model, register_model
-    from brainbench.models.user_models import load_user_model
+    from brainbench.models.registry import describe_model, list_models, load_model, load_user_model, register_model
 
 __all__ = ["describe_model", "extract", "list_models", "load_model", "load_user_model", "register_model"]
 

@@ -34,14 +34,10 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 
-READOUTS = "brainbench.readouts"
-"""Entry points of ways to read layers other than the default."""
-OUTPUT = "output"
-"""Layer name of a user model's own output."""
-MEMORY = 2.0
-"""Memory for activations [GiB], by default."""
-_SAMPLED = 7
-"""Stimuli in a batch of the second run, unlike the 16 of the first."""
+READOUTS = "brainbench.readouts"  # entry points of ways to read layers other than the default
+OUTPUT = "output"  # layer name of a user model's own output
+MEMORY = 2.0  # memory for activations [GiB], by default
+_SAMPLED = 7  # stimuli in a batch of the second run, unlike the 16 of the first
 
 
 @dataclass(frozen=True)
@@ -305,13 +301,11 @@ class _Rooms:
     def __init__(self, count: int, folder: Any, memory: int, reduce: Callable[[np.ndarray], np.ndarray] | None) -> None:
         self.count, self.folder, self.memory, self.reduce = count, folder, memory, reduce
         self.result, self.used, self.spill = Activations(), 0, None
-        self.sizes: dict[str, int] = {}
-        """Number of activations of each layer, before they are reduced."""
+        self.sizes: dict[str, int] = {}  # number of activations of each layer, before they are reduced
         self.written: dict[str, np.ndarray] = {}
         self.not_read: dict[str, str] = {}
         self.called: set[str] = set()
-        self.order: dict[str, int] = {}
-        """Place of each layer's module among the modules."""
+        self.order: dict[str, int] = {}  # place of each layer's module among the modules
 
     def write(self, name: str, rows: np.ndarray, place: slice) -> None:
         """Write the activations [B, T, F] of some stimuli."""
@@ -417,8 +411,7 @@ class _Place:
     layer: str
     layout: Layout
     step: int | None = None
-    moved: bool = True
-    """Whether rows of unequal probes differed; if not, those of the stimuli have to."""
+    moved: bool = True  # whether rows of unequal probes differed; if not, those of the stimuli have to
 
 
 class _HookedReader:
@@ -439,10 +432,8 @@ class _HookedReader:
             run.notes.append("parts that run in TorchScript cannot be read: give the module that was scripted")
         self.places: dict[tuple[str, int], _Place] = {}
         self.calls: dict[str, int] = {}
-        self.size = 1
-        """Bytes of all layers for a stimulus."""
-        self.fill = 1
-        """Stimuli that a batch has at least; more where a model takes no others."""
+        self.size = 1  # bytes of all layers for a stimulus
+        self.fill = 1  # stimuli that a batch has at least; more where a model takes no others
 
     def _modules(self, model: nn.Module) -> dict[str, nn.Module]:
         from brainbench.models import proof

@@ -183,8 +183,7 @@ class MambaMemory(NamedTuple):
     """[B, inner, states] of the state space."""
 
 
-MambaState = tuple[MambaMemory, ...]
-"""One memory per block."""
+MambaState = tuple[MambaMemory, ...]  # one memory per block
 
 
 class MambaBlock(nn.Module):

@@ -27,11 +27,9 @@ from brainbench.models.ops.layers import ChannelNorm, Conv2d, load_named
 
 __all__ = ["GRU", "LSTM", "UGRNN", "IntersectionRNN", "TimeDecay"]
 
-FORGET_BIAS = 1.0
-"""Added inside the sigmoid of every gate that keeps the old state."""
+FORGET_BIAS = 1.0  # added inside the sigmoid of every gate that keeps the old state
 
-Projected = tuple[torch.Tensor, ...]
-"""One step of the result of :meth:`Cell.project`."""
+Projected = tuple[torch.Tensor, ...]  # one step of the result of project
 
 CellStep = tuple[torch.Tensor, torch.Tensor]
 """An output y [B, out, H, W] and the next state [B, state channels, H, W]."""

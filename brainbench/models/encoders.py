@@ -22,8 +22,7 @@ from brainbench.models.ops.layers import RECTIFIER_GAIN, Conv2d, Linear
 from brainbench.models.ops.state_space import StateSpace, System
 from brainbench.models.parts import check_sweep, run_layers
 
-INPUT_SHAPE = (30, 5, 7)
-"""Five sub-steps of six channels (sub-step-major) on the whisker grid."""
+INPUT_SHAPE = (30, 5, 7)  # five sub-steps of six channels (sub-step-major) on the whisker grid
 
 _FEEDBACK = ((3, 2), (4, 2), (4, 3), (5, 3), (5, 4), (6, 4), (6, 5))
 _FULL = (96, 128, 256, 384, 384, 256)

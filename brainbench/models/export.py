@@ -228,16 +228,12 @@ def _part_of(part: Any, unroll: Any) -> Any:
     return _Part(part, lambda state: [], lambda parts: ())
 
 
-SUFFIXES = {"onnx": ".onnx", "torch": ".pt2"}
-"""Formats and their suffixes: ONNX, and an exported PyTorch program."""
+SUFFIXES = {"onnx": ".onnx", "torch": ".pt2"}  # formats and their suffixes: ONNX, and an exported PyTorch program
 INPUTS, OUTPUTS = ("obs", "h_in"), ("features", "h_out")
 OPSET = 18
-MOST_ONNX = 2 << 30
-"""Bytes of an ONNX file, which Protocol Buffers allow."""
-MOST_INPUT = 1 << 26
-"""Numbers of one input."""
-TOLERANCE = 1e-4
-"""Largest difference between the file and the network, relative to the largest feature."""
+MOST_ONNX = 2 << 30  # bytes of an ONNX file, which Protocol Buffers allow
+MOST_INPUT = 1 << 26  # numbers of one input
+TOLERANCE = 1e-4  # largest difference between the file and the network, relative to the largest feature
 _STEPS = 8
 
 
@@ -423,8 +419,7 @@ def read_torch(path: str | Path) -> Callable[[Any, Any], tuple[Any, Any]]:
     return run
 
 
-READERS = {"onnx": read_onnx, "torch": read_torch}
-"""Readers of exported files, by format."""
+READERS = {"onnx": read_onnx, "torch": read_torch}  # readers of exported files, by format
 
 
 def _difference(step: Any, run: Callable[[Any, Any], tuple[Any, Any]]) -> float:

@@ -20,12 +20,9 @@ from brainbench.models.graph.spec import UNROLLS, Unroll
 from brainbench.models.graph.temporal_graph import TemporalGraph
 from brainbench.models.parts import AllStepsDecoder, Attender, Encoder, make_decoder
 
-FORCE_SCALE = 1e-4
-"""N that become 1: the order of a whisker's base force in contact."""
-MOMENT_SCALE = 1e-6
-"""N·m that become 1."""
-PUBLISHED_FORCE_SCALE = 1e-3
-"""N that become 1 in the published networks, which saw mN and µN·m."""
+FORCE_SCALE = 1e-4  # N that become 1: the order of a whisker's base force in contact
+MOMENT_SCALE = 1e-6  # N·m that become 1
+PUBLISHED_FORCE_SCALE = 1e-3  # N that become 1 in the published networks, which saw mN and µN·m
 
 
 class Normaliser(nn.Module):

@@ -104,8 +104,7 @@ def wanted(layers: tuple[str, ...], returned: bool | Collection[str]) -> Collect
     return returned
 
 
-CLASSES = 117
-"""Object categories of the whisking data set (Zhuang et al. 2017)."""
+CLASSES = 117  # Object categories of the whisking data set (Zhuang et al. 2017).
 
 
 class AllStepsDecoder(nn.Module):

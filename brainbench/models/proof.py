@@ -32,10 +32,8 @@ FIRST, SECOND = (BASE, LATE, SHIFTED, PAIR, PAIR_SHIFTED), (PAIR, None, BASE)
 NO_AXIS = "no axis of it follows the stimuli"
 UNMOVED = "does not move with the stimuli"
 DEPENDENT = "its rows depend on the batch: on other stimuli, their place, chance or what ran before"
-SHIFT = 0.7
-"""Change by a shift that the shift explains leaves less than this of what it is without it."""
-_BLOCKS = 256
-"""Numbers that stand for a row where two runs are compared."""
+SHIFT = 0.7  # change by a shift that the shift explains leaves less than this of what it is without it
+_BLOCKS = 256  # numbers that stand for a row where two runs are compared
 
 
 @dataclass(frozen=True)

@@ -10,8 +10,8 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, cast
 
 from brainbench.core.records import GraphEdge, GraphNode, ModelGraph
-from brainbench.models.architecture import Architecture
 from brainbench.models.graph.spec import Convolution, Dense, Node
+from brainbench.models.recipes import Architecture
 from brainbench.models.registry import register_model
 
 if TYPE_CHECKING:

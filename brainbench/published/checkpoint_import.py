@@ -21,7 +21,6 @@ from brainbench.core.files import cache_dir, content_hash, file_hash, provenance
 from brainbench.core.reading.sealed import is_sealed, seal_file
 from brainbench.core.reading.tensors import check_stored, read_checkpoint, read_tensors
 from brainbench.core.reading.texts import read_mapping
-from brainbench.models.architecture import Architecture
 from brainbench.models.encoders import S4Encoder
 from brainbench.models.graph.temporal_graph import TemporalGraph
 from brainbench.models.graph.tnn_import import read_graph
@@ -29,6 +28,7 @@ from brainbench.models.network import PUBLISHED_FORCE_SCALE, EncoderAttenderDeco
 from brainbench.models.ops.layers import check_named, copy_named
 from brainbench.models.ops.state_space import StateSpace
 from brainbench.models.parts import CLASSES, AllStepsDecoder
+from brainbench.models.recipes import Architecture
 from brainbench.models.registry import load_model
 from brainbench.models.training.checkpoints import CONFIG, WEIGHTS, save_checkpoint
 

@@ -60,8 +60,7 @@ if TYPE_CHECKING:
 FRAME_STATUSES = ("ok", "missing", "too large", "unwritten", "repeated")
 """Texts of ``frame_status``, 0 to 4. ``unwritten``: row 0 of a simulator that stores a row before it computes it, even
 where the numbers look right. ``repeated``: equal to the frame before, as a published cleaning fills gaps."""
-_DOUBTFUL = ("missing", "too large")
-"""Statuses of frames that make the whole whisker ``unstable``."""
+_DOUBTFUL = ("missing", "too large")  # statuses of frames that make the whole whisker `unstable`
 _SIDES = {"R": "right", "L": "left"}
 
 
@@ -267,10 +266,8 @@ FRAMES = 110
 EMPTY_CELLS = (5, 6, 12, 13, 34)
 CELLS = np.setdiff1d(np.arange(GRID_SHAPE[0] * GRID_SHAPE[1]), EMPTY_CELLS)
 """[30] flat cell of each whisker: A0–A4, B0–B4, C0–C6, D0–D6, E0–E5."""
-LARGEST = 1000.0
-"""Magnitude [mN, µN·m] above which the published cleaning trusts no value."""
-SCALE = np.repeat([1e-3, 1e-6], 3)
-"""N and N·m per mN and µN·m, by channel."""
+LARGEST = 1000.0  # magnitude [mN, µN·m] above which the published cleaning trusts no value
+SCALE = np.repeat([1e-3, 1e-6], 3)  # N and N·m per mN and µN·m, by channel
 RATES: Mapping[int, tuple[str, ...]] = {1000: ("h", "d", "t"), 110: ("h", "to", "t", "v", "s")}
 """Fields with the conditions, by simulated rate [Hz]."""
 FRAME_TIMES = {1000: (0.001, 0.009), 110: (0.0, 1 / 110)}
@@ -284,8 +281,7 @@ FAULTS = {
     "unwritten": "of row 0 at 110 Hz come from memory that nothing has written",
 }
 """Known faults of values → what they are."""
-DOUBTFUL = ("too large", "missing")
-"""Faults of values that are not used."""
+DOUBTFUL = ("too large", "missing")  # faults of values that are not used
 
 
 @dataclass(frozen=True, eq=False)
@@ -373,8 +369,7 @@ _LOG = logging.getLogger(__name__)
 
 MOST_CLASSES = 10_000
 _VERSION = 1
-_TOGETHER = 2048
-"""Files listed between two entries in the cache: what a killed run loses."""
+_TOGETHER = 2048  # files listed between two entries in the cache: what a killed run loses
 
 
 class Listed(NamedTuple):

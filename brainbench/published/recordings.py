@@ -30,12 +30,9 @@ from brainbench.datasets.trials.session_trials import join_sessions
 if TYPE_CHECKING:
     import xarray as xr
 
-STRAY = "allow_pickle"
-"""Entry without meaning: numpy before 2.2 stored this keyword of ``savez`` as an array."""
-SLOTS = tuple(f"slot-{number}" for number in range(1, 7))
-"""Places along axis 1, in the order of the file."""
-MOST_RATE = 1e6
-"""Spikes per second beyond those of any neuron, even in the shortest window."""
+STRAY = "allow_pickle"  # entry without meaning: numpy before 2.2 stored this keyword of `savez` as an array
+SLOTS = tuple(f"slot-{number}" for number in range(1, 7))  # places along axis 1, in the order of the file
+MOST_RATE = 1e6  # spikes per second beyond those of any neuron, even in the shortest window
 RATES = f"rates [trials, {len(SLOTS)}, units]"
 SILENT = "no rate above 0 in any slot, so the stimulus cannot be known"
 
@@ -176,12 +173,9 @@ def _session_counts(session: ZeroFilledSession, path: Path) -> SessionCounts:
     )
 
 
-_FEW = 4
-"""Trials of every stimulus that unbiased distances need."""
-_DRAWS = 100
-"""Draws of each kind of chance that agreement is held against."""
-_FEWEST_UNITS = 3
-"""Units from which a correlation distance says anything."""
+_FEW = 4  # trials of every stimulus that unbiased distances need
+_DRAWS = 100  # draws of each kind of chance that agreement is held against
+_FEWEST_UNITS = 3  # units from which a correlation distance says anything
 _ORDERS = np.array(list(permutations(range(len(SLOTS)))))
 
 

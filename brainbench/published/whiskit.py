@@ -39,8 +39,7 @@ from brainbench.stimuli.whiskers.array import ROWS, MountedWhisker, WhiskerArray
 if TYPE_CHECKING:
     import xarray as xr
 
-BENDS = 20
-"""Links in WHISKiT's table of bends."""
+BENDS = 20  # links in WHISKiT's table of bends
 DIALECTS = ("sense-lab", "thesis")
 
 _MILLI = 1e3
@@ -228,8 +227,7 @@ released ``process_raw_dataset.py --process_values`` does: of 1000 rows 1, 10, â
 _NAMES = [f"{side}{row}{col}" for side in "RL" for row in ROWS for col in range(GRID_SHAPE[1])]
 _ROWS = {1000: Frames(first=0.0, interval=0.001, count=1000), 110: Frames(first=0.0, interval=1 / 110, count=110)}
 """Frames of a run by its number of rows, as the study ran them: one second at 1000 or 110 Hz."""
-_KEPT = Frames(first=0.001, interval=0.009, count=110)
-"""Frames that the published cleaning keeps of 1000."""
+_KEPT = Frames(first=0.001, interval=0.009, count=110)  # frames that the published cleaning keeps of 1000
 
 
 @dataclass(frozen=True, eq=False)

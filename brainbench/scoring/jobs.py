@@ -64,7 +64,7 @@ def find_models(patterns: Sequence[str]) -> list[str]:
     A name that is no pattern may also be a file or a folder, and is then taken as it is. A pattern without a dot
     means architectures, one with a dot trained models: ``*-small`` and ``*-small.*``.
     """
-    from brainbench.models.architecture import Architecture, is_path
+    from brainbench.models.recipes import Architecture, is_path
     from brainbench.models.registry import list_models
     from brainbench.models.training.checkpoints import shipped
 

@@ -173,7 +173,7 @@ def follows_seed(model: Any) -> bool:
 
     Trained weights, activations and models in memory are what they are.
     """
-    from brainbench.models.architecture import Architecture, is_path
+    from brainbench.models.recipes import Architecture, is_path
     from brainbench.models.training.checkpoints import PREFIXES
 
     if not isinstance(model, str) or model.startswith(PREFIXES) or Path(model).suffix.lower() in (".h5", ".hdf5"):
@@ -196,9 +196,8 @@ def resolve_model(model: Any, *, seed: int = 0) -> ResolvedModel:
 
     from brainbench.models.ops.layers import check_weights, weights_hash
     from brainbench.models.proof import unwrapped
-    from brainbench.models.registry import locate_model
+    from brainbench.models.registry import load_user_model, locate_model
     from brainbench.models.training.checkpoints import CONFIG, PREFIXES
-    from brainbench.models.user_models import load_user_model
     from brainbench.models.zoo import graph_of
 
     model = unwrapped(model)

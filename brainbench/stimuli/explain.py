@@ -28,8 +28,7 @@ ATTRIBUTE = "explanation"
 """Attribute of a stimulus set that holds the explanation as JSON."""
 SECONDS = "seconds"
 """Key of a stimulus set's ``encoding`` under which this process keeps what took how long."""
-_PASSING = ("seconds", "source")
-"""Fields that are not kept."""
+_PASSING = ("seconds", "source")  # fields that are not kept
 
 
 @dataclass(frozen=True)

@@ -22,8 +22,7 @@ from brainbench.models.network import EncoderAttenderDecoder
 from brainbench.models.registry import load_model
 from brainbench.tradeoffs.study import Row, Study
 
-REPEATS = 5
-"""Sweeps that are timed, after one that is not."""
+REPEATS = 5  # sweeps that are timed, after one that is not
 
 
 @dataclass(frozen=True)

@@ -27,8 +27,7 @@ from brainbench.tradeoffs.study import Row, Study
 SPLITS = (10, 30, 100, 300, 1000, 3000)
 PERMUTATIONS = (100, 500, 1999, 10_000)
 _STIMULI = 12
-_NOISE = 3.0
-"""Standard deviation of trial noise, beside tuning of variance 4."""
+_NOISE = 3.0  # standard deviation of trial noise, beside tuning of variance 4
 
 
 @dataclass(frozen=True)

@@ -36,10 +36,8 @@ from robotics_bridge.sensors.taxels.sensors import KinematicTaxel, ProximityTaxe
 RESOLUTIONS = (16, 32, 64, 128)
 POINTS = (250, 500, 1000, 2000, 4000, 16_000)
 TAXELS = (5, 10, 20, 40, 80)
-HEIGHTS = {"mesh": 0.010, "primitive": 0.017}
-"""Height (m) above the pad at which the torus and the sphere touch it."""
-WITHOUT_CELLS = {"mesh": "raycast", "primitive": "sdf"}
-"""Query of the parts that need no distance field."""
+HEIGHTS = {"mesh": 0.010, "primitive": 0.017}  # height (m) above the pad at which the torus and the sphere touch it
+WITHOUT_CELLS = {"mesh": "raycast", "primitive": "sdf"}  # query of the parts that need no distance field
 _POSES = 12
 _CYLINDER = Geometry(name="o", link="object", kind="cylinder", size=(0.008, 0.012))
 _PAD = Geometry(name="pad", link="hand", kind="box", size=(0.03, 0.03, 0.005))

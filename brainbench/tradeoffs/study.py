@@ -16,8 +16,7 @@ from brainbench.core.files import read_json, write_json, write_text
 from brainbench.core.progress import Progress, track
 from brainbench.core.tradeoffs import TradeoffPoint, pareto_front
 
-Row = dict[str, Any]
-"""A measured setting: its settings, and what they gave."""
+Row = dict[str, Any]  # a measured setting: its settings, and what they gave
 
 
 @dataclass(frozen=True)

@@ -46,23 +46,20 @@ from brainbench.stimuli.whiskers.array import WhiskerArray
 from brainbench.stimuli.whiskers.whisker import Whisker
 from brainbench.tradeoffs.study import Panel, Row, Study, front
 
-PROTOCOL = 5
-"""Counts up when the experiments change, so that points of different experiments never share a table."""
+PROTOCOL = 5  # counts up when the experiments change, so that points of different experiments never share a table
 PEGS = ((0.3, 0.05), (0.5, 0.1), (0.5, 0.2), (0.7, 0.2), (0.8, 0.02))
 """Centre-line points (a/L, d/L) of the static tests."""
 LINKS = (6, 8, 10, 14, 20, 30)
 TIME_STEPS = ((5e-4, 6.0), (2e-4, 10.0), (1e-4, 25.0), (5e-5, 60.0), (5e-5, 120.0), (2e-5, 250.0))
 """Time step [s] with the least steps per period of the first mode, which short whiskers need."""
-CONTACT_TOLERANCES = (1e-6, None)
-"""Tolerances of contact forces; None for few iterations."""
+CONTACT_TOLERANCES = (1e-6, None)  # tolerances of contact forces; None for few iterations
 COLLISIONS = ("exact", "decomposition-0.02", "decomposition-0.1", "hull")
 """Collision geometries of the concave object; a decomposition with its threshold."""
 SHARES = {0.5: "error_50", 0.9: "error_90", 0.95: "error_95"}
 """Shares of whiskers, and the column of the table with the relative error that they stay below."""
 ERROR = SHARES[0.9]
 """Column that settings are ranked by."""
-SEED = 0
-"""Scenes of the table; others are held out."""
+SEED = 0  # scenes of the table; others are held out
 
 
 @dataclass(frozen=True)

@@ -40,8 +40,7 @@ from leaderboards.figures.svg import (
 from leaderboards.ranking import DOUBTFUL
 from leaderboards.text import number, span
 
-_LEAST_VARIANCE = 1e-100
-"""Products of two smaller ones would be zero in floating point."""
+_LEAST_VARIANCE = 1e-100  # products of two smaller ones would be zero in floating point
 _SHAPES = {"supervised": "square", "simclr": "cross", "simsiam": "up", "ae": "down", "untrained": "dot"}
 
 
@@ -174,8 +173,7 @@ def _trusted(entry: Entry) -> bool:
 _Told = Callable[[Entry], str]
 
 
-_PANELS = 4
-"""Panels side by side in the figure of layers."""
+_PANELS = 4  # panels side by side in the figure of layers
 _PANEL_NAME = 23
 """Characters of a name above a panel: bold letters of 10.5 pixels take about 6.7 each, the panel leaves 158."""
 

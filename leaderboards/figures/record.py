@@ -31,8 +31,7 @@ _CLASSES = {"input": "c0", "encoder": "c1", "attender": "c2", "decoder": "c3"}
 @dataclass(frozen=True)
 class _Box:
     node: GraphNode
-    names: tuple[str, ...]
-    """The layers drawn as this box."""
+    names: tuple[str, ...]  # the layers drawn as this box
 
 
 def diagram(graph: ModelGraph, title: str) -> Drawing:

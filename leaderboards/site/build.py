@@ -47,12 +47,9 @@ from leaderboards.site.table import COLUMNS, board_label, page_board, table_csv,
 from leaderboards.store import MAKE_ONE, SCHEMA_PATH, StoredRecord, record_text
 
 MANIFEST = "build-manifest.json"
-_Hashes = dict[str, list[str]]
-"""Path in the site → the hashes that a build may have given it."""
-_Content = str | bytes | BinaryIO
-"""Content of a file of the site; a large one as a stream."""
-_MANY = 100
-"""Files that are brought to disk together rather than one by one."""
+_Hashes = dict[str, list[str]]  # path in the site → the hashes that a build may have given it
+_Content = str | bytes | BinaryIO  # content of a file of the site; a large one as a stream
+_MANY = 100  # files that are brought to disk together rather than one by one
 
 
 @contextmanager

@@ -111,8 +111,7 @@ def _source_hash(text: str) -> str:
     return "sha256-" + base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
 
 
-_MOST_PAIRS = 100
-"""An RDM with more pairs than this is shown as a picture only; its numbers are in the record."""
+_MOST_PAIRS = 100  # an RDM with more pairs than this is shown as a picture only; its numbers are in the record
 
 
 def write_report(record: ResultRecord, path: str | os.PathLike[str]) -> Path:

@@ -1,4 +1,4 @@
-"""The native environment: many copies of a task stepped together, as torch tensors on one device.
+"""The native environment: many copies of a task stepped together, as torch tensors on one device; for rsl_rl too.
 
 Letters: B environment, A action, J joint, L tactile link.
 """
@@ -7,12 +7,12 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 
 from brainbench.core.devices import CudaGraphStep, warp_recorder
-from brainbench.core.errors import UsageError, check_kind
+from brainbench.core.errors import UsageError, check_kind, needing
 from brainbench.core.reading.ranges import check_number
 from robotics_bridge import hands
 from robotics_bridge.envs.simulation import EnvOptions
@@ -30,8 +30,10 @@ from robotics_bridge.envs.step import (
 from robotics_bridge.tasks.registry import load
 from robotics_bridge.tasks.task import Task
 
-_NOISE_SEED = "noise_seed"
-"""Name in kept states of the seed of tactile noise."""
+if TYPE_CHECKING:
+    from tensordict import TensorDict
+
+_NOISE_SEED = "noise_seed"  # name in kept states of the seed of tactile noise
 _ADVICE = (
     "Terms and the state of a task may not copy from the processor or wait for it (brainbench.core.rotations.constant "
     "keeps constants on the device); change them, or make the environment with graphs=False."
@@ -242,3 +244,48 @@ class Env:
             state.task_state.restored()
         state.started = True
         state.observations = {name: value.to(state.device) for name, value in under("observations.").items()}
+
+
+class RslRlEnv:
+    """The environment as rsl_rl's runners and algorithms call it, without a state of its own.
+
+    RND reads ``env.unwrapped.step_dt``, so ``unwrapped`` is the native environment.
+    """
+
+    def __init__(self, env: Env) -> None:
+        with needing("tensordict", extra="policies", purpose="Learning with rsl_rl"):
+            import tensordict  # noqa: F401
+        self.unwrapped = env
+        """The native environment."""
+        self.num_envs, self.num_actions, self.device = env.num_envs, env.num_actions, env.device
+        self.max_episode_length = env.max_episode_length
+        self.cfg: dict[str, Any] = {"task": env.task.name, "hand": env.hand.name, "observe": env.options.observe}
+        """Facts that rsl_rl's logger keeps."""
+
+    @property
+    def episode_length_buf(self) -> torch.Tensor:
+        """Control steps [B] of the running episodes."""
+        return self.unwrapped.episode_length_buf
+
+    @episode_length_buf.setter
+    def episode_length_buf(self, value: torch.Tensor) -> None:
+        # rsl_rl assigns a new tensor to start episodes at random ages.
+        self.unwrapped.episode_length_buf = value
+
+    def get_observations(self) -> TensorDict:
+        """Return the present observations, group → [B, ...]."""
+        from tensordict import TensorDict
+
+        groups = {name: value.clone() for name, value in self.unwrapped.observations.items()}
+        return TensorDict(groups, batch_size=[self.num_envs], device=self.device)  # type: ignore[arg-type]
+
+    def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict[str, Any]]:
+        """Advance; returns observations, reward [B], done [B] and ``time_outs``, ``log``, ``info``."""
+        _, reward, terminated, truncated, info = self.unwrapped.step(actions)
+        extras = {"time_outs": truncated, "log": info["log"], "info": info}
+        return self.get_observations(), reward, terminated | truncated, extras
+
+    def reset(self) -> tuple[TensorDict, dict[str, Any]]:
+        """Start new episodes everywhere (rsl_rl itself never calls this)."""
+        self.unwrapped.reset()
+        return self.get_observations(), {}

@@ -15,8 +15,7 @@ from torch import nn
 from brainbench.core.devices import warp
 from brainbench.core.errors import UsageError
 from brainbench.core.rotations import angle_of, conjugate, from_xyzw, multiply, rotate, twist_and_swing, twist_of
-from robotics_bridge.envs.contacts import Contacts, TactileObservation
-from robotics_bridge.envs.simulation import Actuators, EnvOptions, Simulation
+from robotics_bridge.envs.simulation import Actuators, Contacts, EnvOptions, Simulation, TactileObservation
 from robotics_bridge.hands import Hand
 from robotics_bridge.hands.tree import coupled
 from robotics_bridge.tasks.scenes import TaskModel, build
@@ -230,7 +229,7 @@ class EnvState:
         self.goals = GoalState(task, self.num_envs, self.device, round_about)
         self.touch: TactileObservation | None = None
         if options.observe != "none":
-            from robotics_bridge.envs.contacts import TactileObservation
+            from robotics_bridge.envs.simulation import TactileObservation
 
             self.touch = TactileObservation(self.model, hand, self.simulation, options, task)
         self._index()

@@ -27,8 +27,7 @@ from robotics_bridge.tasks.scenes import TaskModel
 from robotics_bridge.tasks.task import Solver, Task
 from robotics_bridge.tasks.terms import StepContext
 
-VELOCITY = 0.2
-"""Factor on velocities of joints and on angular velocities of the object (released settings)."""
+VELOCITY = 0.2  # factor on velocities of joints and on angular velocities of the object (released settings)
 
 
 def observe(state: EnvState) -> dict[str, torch.Tensor]:
@@ -106,8 +105,7 @@ _GROUPS: dict[str, Callable[[EnvState], torch.Tensor]] = {
 
 StepResult = tuple[dict[str, torch.Tensor], torch.Tensor, torch.Tensor, torch.Tensor, dict[str, Any]]
 
-_DIVERGED_SPEED = 1e4
-"""Speed (m/s or rad/s) beyond which an environment counts as diverged."""
+_DIVERGED_SPEED = 1e4  # speed (m/s or rad/s) beyond which an environment counts as diverged
 
 
 @dataclass(frozen=True, eq=False)
@@ -314,10 +312,8 @@ class GraspSampling:
     """Candidates per shape before giving up."""
 
 
-_VERSION = 1
-"""Raised whenever the same settings would sample other grasps."""
-SETTINGS = {"xhand1": GraspSampling(), "sharpa": GraspSampling(near=0.01)}
-"""By hand; others take those of xhand1."""
+_VERSION = 1  # raised whenever the same settings would sample other grasps
+SETTINGS = {"xhand1": GraspSampling(), "sharpa": GraspSampling(near=0.01)}  # by hand; others take those of xhand1
 
 
 def grasps_for(task: Task, hand: Hand, model: TaskModel, *, seed: int = 0) -> dict[str, NDArray[np.float64]]:

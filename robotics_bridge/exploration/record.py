@@ -50,8 +50,7 @@ class Pose:
 
 
 _ABOVE, _PRESSED, _LIGHT = 0.008, -0.002, -0.001
-STEP = 1e-3
-"""Seconds past the end of a procedure at which its pose is known, for forward differences there."""
+STEP = 1e-3  # seconds past the end of a procedure at which its pose is known, for forward differences there
 
 
 def _ramp(time: float, start: float, end: float) -> float:
@@ -95,13 +94,11 @@ PROCEDURES: Mapping[str, Callable[[float], Pose]] = {
 """Name → movement over one second: time from 0 to 1 s → pose; UsageError for another time."""
 
 
-_STEPS = 2
-"""Physics steps per frame."""
+_STEPS = 2  # physics steps per frame
 TWIST = 1.6e-5
 """Torsional friction of a taxel (N·m·s): that of a patch of 4 mm with the published k_t, stated since data depend on
 it."""
-_DENSE = 2e5
-"""Density of explored objects (kg/m³): contacts must not move what is held."""
+_DENSE = 2e5  # density of explored objects (kg/m³): contacts must not move what is held
 
 
 @dataclass(frozen=True, eq=False)

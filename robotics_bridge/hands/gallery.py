@@ -17,12 +17,9 @@ from robotics_bridge.hands.layouts import Layout, active_count
 
 mujoco = mujoco_module()
 
-_RADIUS = 6e-3
-"""Radius of the balls that press (m)."""
-_DEPTH = 3e-4
-"""Depth to which they press (m)."""
-_AWAY = 10.0
-"""Where a ball waits (m)."""
+_RADIUS = 6e-3  # radius of the balls that press (m)
+_DEPTH = 3e-4  # depth to which they press (m)
+_AWAY = 10.0  # where a ball waits (m)
 WRONG = 0.01
 """Part of a load that taxels may lack without a word."""
 
@@ -92,7 +89,7 @@ def press(hand: Hand, layout: Layout) -> dict[str, tuple[np.ndarray, np.ndarray,
 
     Links that the ball cannot touch, such as those behind another, are left out.
     """
-    from robotics_bridge.physics.cpu import MujocoEngine
+    from robotics_bridge.physics.engines import MujocoEngine
     from robotics_bridge.sensors import KinematicTaxel, SensorSuite
 
     spec, data = hand.mjspec(), mujoco.MjData(hand.model)

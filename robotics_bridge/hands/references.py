@@ -18,10 +18,8 @@ from brainbench.core.reading.texts import read_text
 KIND = "hand file (URDF or MJCF)"
 _NAMES = {"name", "class", "childclass", "joint", "body", "link", "geom", "site", "mesh", "material", "file"}
 """Attributes of URDF and MJCF that hold words."""
-_LARGEST = 1e15
-"""Magnitude of numbers in a hand's file that no hand has."""
-_DEEPEST = 32
-"""Includes within one another."""
+_LARGEST = 1e15  # magnitude of numbers in a hand's file that no hand has
+_DEEPEST = 32  # includes within one another
 _FOLDERS = ("meshdir", "texturedir", "assetdir")
 MOST_SAMPLES = 1 << 24
 """Samples of a height field or picture."""

@@ -135,14 +135,11 @@ def _nearest(model: Any, geoms: list[int], origin: NDArray, direction: NDArray) 
     return best
 
 
-_CROSSED = 0.012
-"""Joints nearer to each other (m) act on a link together."""
-_SNAP = 0.9
-"""Cosine from which a direction counts as that of an axis of its link: jaws have flat faces."""
+_CROSSED = 0.012  # joints nearer to each other (m) act on a link together
+_SNAP = 0.9  # cosine from which a direction counts as that of an axis of its link: jaws have flat faces
 _JAWS = 0.4
 """Length of the mean direction of finger tips up to which they go towards each other: .8 and more of hands."""
-_APART = -0.5
-"""Cosine to the other tips below which a tip goes away from them."""
+_APART = -0.5  # cosine to the other tips below which a tip goes away from them
 
 
 def palmar_directions(model: Any, palm: str, fingers: Mapping[str, tuple[str, ...]]) -> dict[str, np.ndarray]:

@@ -6,8 +6,7 @@
 
 from __future__ import annotations
 
-from robotics_bridge.physics.cpu import MujocoEngine
-from robotics_bridge.physics.gpu import MujocoWarpEngine
+from robotics_bridge.physics.engines import MujocoEngine, MujocoWarpEngine
 from robotics_bridge.physics.scene import KINDS, Geometry, TouchScene, compile_variants
 from robotics_bridge.physics.state import HandState
 

@@ -26,8 +26,7 @@ KINDS = ("plane", "sphere", "capsule", "ellipsoid", "cylinder", "box", "mesh", "
 _MUJOCO_KINDS = {0: "plane", 2: "sphere", 3: "capsule", 4: "ellipsoid", 5: "cylinder", 6: "box", 7: "mesh"}
 _SIZES = {"plane": 0, "sphere": 1, "capsule": 2, "ellipsoid": 3, "cylinder": 2, "box": 3, "mesh": 0, "other": 0}
 
-LONGEST_STEP = 0.1
-"""Longest time step of an engine (s); contacts of hands need a hundredth of it."""
+LONGEST_STEP = 0.1  # longest time step of an engine (s); contacts of hands need a hundredth of it
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -22,8 +22,7 @@ from robotics_bridge.physics.kernels.state import StateArrays
 
 _CONTACT = {"distance": 0.0, "force": float("nan"), "position": 0.0, "normal": 0.0, "friction": 0.0}
 """Quantities of a contact, and their values where nobody tells them."""
-MOST_ENVS = 1_000_000
-"""Most environments at once; more is a slip of the keys that would fill the memory."""
+MOST_ENVS = 1_000_000  # most environments at once; more is a slip of the keys that would fill the memory
 
 
 @dataclass(eq=False)
@@ -176,8 +175,7 @@ def _tensor(values: Any) -> torch.Tensor:
     return values if isinstance(values, torch.Tensor) else torch.from_numpy(np.array(values, dtype=np.float32))
 
 
-EnvIds = Sequence[int] | np.ndarray | torch.Tensor
-"""Numbers of environments, or a mask [B] bool."""
+EnvIds = Sequence[int] | np.ndarray | torch.Tensor  # numbers of environments, or a mask [B] bool
 
 
 def select_envs(env_ids: EnvIds | None, num_envs: int, device: torch.device | str) -> torch.Tensor:

@@ -21,10 +21,8 @@ from brainbench.core.files import read_mapping, to_json
 from robotics_bridge.hands.observations import OBSERVATIONS
 from robotics_bridge.tasks.settings import CONTACTS, ContactModel
 
-JOINTS = 255
-"""Most joints; a frame counts them in one byte."""
-MOST_NUMBERS = 10_000_000
-"""Most numbers of all observations, and of a policy's memory."""
+JOINTS = 255  # most joints; a frame counts them in one byte
+MOST_NUMBERS = 10_000_000  # most numbers of all observations, and of a policy's memory
 Name = Annotated[str, Meta(min_length=1, max_length=4096)]
 Names = Annotated[tuple[Name, ...], Meta(min_length=1, max_length=JOINTS)]
 Sizes = Annotated[tuple[Annotated[int, Meta(ge=1, le=MOST_NUMBERS)], ...], Meta(min_length=1, max_length=3)]
@@ -68,14 +66,11 @@ def shapes_of(groups: Groups, where: str, place: str) -> dict[str, tuple[int, ..
 
 RATE = (1.0, 1000.0)
 """Control steps per second [Hz]."""
-MOST_TWIST = 100.0
-"""N·m·s."""
+MOST_TWIST = 100.0  # N·m·s
 REQUIRED = ("action_map", "contacts", "frozen", "hand", "joints", "rate", "twist")
 """What ``deployment`` must say before a hand can run the policy."""
-_Angle = Annotated[float, Meta(ge=-4 * math.pi, le=4 * math.pi)]
-"""Position of a joint (rad)."""
-_Scale = Annotated[float, Meta(ge=-10, le=10)]
-"""Radians per unit of action; 0 is not allowed."""
+_Angle = Annotated[float, Meta(ge=-4 * math.pi, le=4 * math.pi)]  # position of a joint (rad)
+_Scale = Annotated[float, Meta(ge=-10, le=10)]  # radians per unit of action; 0 is not allowed
 
 
 class TrainedMap(msgspec.Struct, frozen=True):

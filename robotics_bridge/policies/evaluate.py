@@ -17,12 +17,10 @@ from brainbench.core.statistics import wilson_interval
 from robotics_bridge.envs.env import Env
 from robotics_bridge.policies.shipped import AGENTS
 
-Acting = Callable[[Mapping[str, torch.Tensor]], torch.Tensor]
-"""Observations by group → actions [B, A]."""
+Acting = Callable[[Mapping[str, torch.Tensor]], torch.Tensor]  # observations by group → actions [B, A]
 QUANTITIES = ("metric", "returns", "lengths", "goals", "turn_rate", "seconds", "dropped")
 """Quantities of each episode beside its success."""
-_Z = 1.959964
-"""Normal quantile of a 95 % interval: episodes are many."""
+_Z = 1.959964  # normal quantile of a 95 % interval: episodes are many
 
 
 @dataclass(frozen=True)

@@ -78,10 +78,8 @@ class _OnnxRunner:
         return np.asarray(actions)[0]
 
 
-TOLERANCE = 1e-4
-"""Largest difference of an action between file and policy, relative to the largest action."""
-STEPS = 60
-"""Steps of the comparison; rows are reset on the way."""
+TOLERANCE = 1e-4  # largest difference of an action between file and policy, relative to the largest action
+STEPS = 60  # steps of the comparison; rows are reset on the way
 
 
 @dataclass(frozen=True)

@@ -19,10 +19,8 @@ if TYPE_CHECKING:
     from robotics_bridge.envs.env import Env
 
 _LOG = logging.getLogger(__name__)
-_RATE = 40.0
-"""Control steps per second of teachers that do not state it."""
-_SAME_ANGLE = 1e-4
-"""Difference of two positions that is rounding [rad]."""
+_RATE = 40.0  # control steps per second of teachers that do not state it
+_SAME_ANGLE = 1e-4  # difference of two positions that is rounding [rad]
 
 
 def with_contacts_of(task: Task, policies: Iterable[str]) -> Task:

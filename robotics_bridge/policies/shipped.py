@@ -9,8 +9,7 @@ from typing import Any
 from brainbench.core.errors import check_name
 from brainbench.core.files import read_json, read_mapping
 
-AGENTS = ("zero", "random")
-"""Agents that every trained one is held against."""
+AGENTS = ("zero", "random")  # agents that every trained one is held against
 FOLDER = Path(__file__).parent / "trained"
 """A run's folder per policy, with a model card."""
 SENSING = "policy"

@@ -20,8 +20,7 @@ from torch import nn
 from brainbench.core.errors import UsageError, check_name
 from robotics_bridge.policies.encoders.arms import EncoderConfig, Stepped, TactileEncoder, elu_perceptron
 
-_LEAST = 1e-2
-"""Added to the deviations, as rsl_rl does."""
+_LEAST = 1e-2  # added to the deviations, as rsl_rl does
 
 
 class ObservationNormaliser(nn.Module):
@@ -94,11 +93,9 @@ else:
     except ImportError:  # who only plays a trained student needs no package for training
         from robotics_bridge.policies.student import ActingModel as MLPModel
 
-TACTILE = "tactile"
-"""Name of the group of readings."""
+TACTILE = "tactile"  # name of the group of readings
 EMBEDDERS = ("none", "mlp", "lstm")
-_EMBEDDING, _WIDTHS, _LSTM = 64, (512, 256, 128), 128
-"""Of flat groups (thesis, section 4.3.4)."""
+_EMBEDDING, _WIDTHS, _LSTM = 64, (512, 256, 128), 128  # of flat groups (thesis, section 4.3.4)
 
 
 class GroupEncoder(nn.Module):

@@ -24,8 +24,7 @@ if TYPE_CHECKING:
 
 AFFERENTS = {"SA-I": (0.0, 5.0), "FA-I": (5.0, 50.0), "FA-II": (40.0, 400.0)}
 """Lower and upper edge [Hz] of the bands of table 2.1; 0 passes static signals."""
-_ORDER = 2
-"""Order of the Butterworth filter at each edge."""
+_ORDER = 2  # order of the Butterworth filter at each edge
 
 
 def band_sections(name: str, rate: float) -> np.ndarray:

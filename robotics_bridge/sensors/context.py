@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 from brainbench.core.devices import warp
 from robotics_bridge.sensors.noise.model import Noise
 
-_MOST = 512
-"""Packed launches that are kept."""
+_MOST = 512  # packed launches that are kept
 
 
 def memory_of(arrays: Iterable[Any], num_envs: int) -> int:

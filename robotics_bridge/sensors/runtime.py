@@ -177,8 +177,7 @@ class ProbeRuntime(Runtime):
         self.context.launch(kernel, (self.context.num_envs, self.count), *inputs)
 
 
-_SHARED = 32
-"""Probes that one thread of a processor takes in turn."""
+_SHARED = 32  # probes that one thread of a processor takes in turn
 _SHARED_CUDA = {CLEAN: (8, 6144), FUSED: (1, 6144), STAGED: (8, 3072)}
 """The same on a GPU by mode: at most, and probes of a multiprocessor for each of them (measured on an H100)."""
 

@@ -193,8 +193,7 @@ class SensorSuite:
         self._resets_view = wp.to_torch(self._resets)
         # An update as a CUDA graph, for one state and time step (s).
         self._recorded: tuple[Callable[[], None], HandState, float] | None = None
-        self._pose: Any = None
-        """Poses of the last update; None before the first."""
+        self._pose: Any = None  # poses of the last update; None before the first
         self._warned = self._lacked = False
         self._by_depth = [name for name, sensor in self.sensors.items() if sensor.ignores_load]
 

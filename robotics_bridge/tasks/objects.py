@@ -102,8 +102,7 @@ def ball(radius: float) -> ObjectShape:
     )
 
 
-_UPRIGHT_Y = (math.sqrt(0.5), -math.sqrt(0.5), 0.0, 0.0)
-"""Turns the z axis of a primitive onto the body's y axis."""
+_UPRIGHT_Y = (math.sqrt(0.5), -math.sqrt(0.5), 0.0, 0.0)  # turns the z axis of a primitive onto the body's y axis
 
 
 def screwdriver(length: float, handle_length: float, handle_radius: float, shaft_radius: float) -> ObjectShape:

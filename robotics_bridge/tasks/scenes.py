@@ -24,14 +24,10 @@ from robotics_bridge.tasks.task import Pose, Task
 mujoco = mujoco_module()
 
 _log = logging.getLogger(__name__)
-_INSIDE = 5e-3
-"""Depth of an object in the hand at the start that is told (m)."""
-_EFFORT = 2.0
-"""Effort of a hinge for which the hand's file names none (N·m)."""
-_PALM_TOP = 0.4975
-"""Height of an upturned palm below objects that start at 0.5 m."""
-_ROUNDED = 1e-3
-"""How far beyond a limit a position that a task states may lie (rad or m)."""
+_INSIDE = 5e-3  # depth of an object in the hand at the start that is told (m)
+_EFFORT = 2.0  # effort of a hinge for which the hand's file names none (N·m)
+_PALM_TOP = 0.4975  # height of an upturned palm below objects that start at 0.5 m
+_ROUNDED = 1e-3  # how far beyond a limit a position that a task states may lie (rad or m)
 _TIPS = {
     "right_hand_thumb_rota_link2": (0.0, 0.042, 0.007), "right_hand_index_rota_link2": (0.008, 0.0, 0.035),
     "right_hand_mid_link2": (0.008, 0.0, 0.035), "right_hand_ring_link2": (0.008, 0.0, 0.035),

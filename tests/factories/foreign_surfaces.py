@@ -16,8 +16,8 @@ import pandas
 from brainbench.cli.policy.options import read_task_file
 from brainbench.core.errors import DataError, visible
 from brainbench.core.files import read_mapping
+from brainbench.models.registry import add_user_model, read_user_models
 from brainbench.models.training.checkpoints import find_folder
-from brainbench.models.user_models import add_user_model, read_user_models
 from brainbench.published.checkpoint_import import read_settings
 from brainbench.stimuli import Whisker
 from brainbench.stimuli.fitting.trials import Trial, read_wrenches

@@ -21,7 +21,7 @@ from brainbench.published.checkpoint_import import (
     recognise,
 )
 from brainbench.published.conversion import SweepFile, open_sweep_tree, read_sweep
-from brainbench.published.walk import explain_file
+from brainbench.published.estimator import explain_file
 from tests.factories.published_files import lightning_state
 from tests.factories.published_recordings import make_zero_filled, write_published
 from tests.factories.published_sweeps import write_sweep

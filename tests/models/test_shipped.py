@@ -6,7 +6,7 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from brainbench.models.architecture import Architecture
+from brainbench.models.recipes import Architecture
 from brainbench.models.registry import describe_model, load_model
 from brainbench.models.training.batches import BatchOptions
 from brainbench.models.training.checkpoints import CARD, WEIGHTS, read_config, shipped

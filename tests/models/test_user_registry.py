@@ -6,8 +6,15 @@ import torch
 
 from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError
 from brainbench.models import registry
-from brainbench.models.registry import describe_model, list_models, load_model
-from brainbench.models.user_models import add_user_model, read_user_models, remove_user_model, settings_file
+from brainbench.models.registry import (
+    add_user_model,
+    describe_model,
+    list_models,
+    load_model,
+    read_user_models,
+    remove_user_model,
+    settings_file,
+)
 
 CODE = "from torch import nn\n\n\ndef make():\n    return nn.Linear(4, 2)\n"
 

@@ -13,10 +13,10 @@ from safetensors.torch import save_file
 
 from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError
 from brainbench.models.activations import extract
-from brainbench.models.architecture import Architecture
 from brainbench.models.encoders import S4Encoder
 from brainbench.models.network import Normaliser
 from brainbench.models.ops.state_space import StateSpace
+from brainbench.models.recipes import Architecture
 from brainbench.models.registry import describe_model, load_model
 from brainbench.models.zoo import build
 from brainbench.published.checkpoint_import import (

@@ -2,14 +2,14 @@
 
 import typer
 
-from brainbench.cli.leaderboard import add, held_out, site, verify
+from brainbench.cli.leaderboard import add, site, verify
 
 app = typer.Typer(no_args_is_help=True, help="Collect result records, check them, and show them as a leaderboard.")
 for _command in (
     add.add,
     verify.verify,
     verify.check_submission,
-    held_out.hold_out,
+    verify.hold_out,
     site.diff,
     site.build,
     site.report,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 from collections import defaultdict
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -14,10 +14,11 @@ from brainbench.cli.output import Output, progress_bar
 from brainbench.core.errors import DataFileNotFoundError, UsageError, look_alike, visible
 from brainbench.core.files import to_json
 from brainbench.core.identity import ScoreIdentity
-from brainbench.core.records import ResultRecord
-from brainbench.scoring.jobs import ScoringJob, asked_settings, missing
-from leaderboards.audit import conflicting, names_of, remarks
 from leaderboards.store import StoredRecord, read_records, record_files, write_record
+
+if TYPE_CHECKING:
+    from brainbench.core.records import ResultRecord
+    from brainbench.scoring.jobs import ScoringJob
 
 
 def given_files(sources: list[Path]) -> list[Path]:
@@ -36,6 +37,7 @@ def take_in(paths: list[Path], to: Path, *, keep_both: bool) -> list[dict[str, A
     No name may read like another one that is there, or like a network of the registry.
     """
     from brainbench.models import list_models
+    from leaderboards.audit import names_of
 
     present: dict[ScoreIdentity, dict[str, ResultRecord]] = defaultdict(dict)
     names = {("name", look_alike(name)): name for name in list_models()}
@@ -60,6 +62,8 @@ def take_in(paths: list[Path], to: Path, *, keep_both: bool) -> list[dict[str, A
 def _take_in_one(
     stored: StoredRecord, to: Path, present: dict[ScoreIdentity, dict[str, ResultRecord]], *, keep_both: bool
 ) -> dict[str, Any]:
+    from leaderboards.audit import conflicting, remarks
+
     record = stored.record
     if record is None:
         return {"state": "refused", "model": None, "note": f": {stored.problem}"}
@@ -88,6 +92,8 @@ def _present(to: Path) -> list[tuple[Path, ResultRecord]]:
 
 def _question(record: ResultRecord) -> str:
     """Return what two records share when they answer the same question, the old one with what has since changed."""
+    from brainbench.scoring.jobs import asked_settings
+
     origin = record.score.provenance
     titles = [origin.recordings.get(name) for name in ("source", "title")]
     # The source is the last part of a path: folders of one name are told apart by their animals.
@@ -109,6 +115,7 @@ def score_jobs(
 ) -> list[dict[str, Any]]:
     """Score what a folder does not hold yet into it; with ``prune`` remove what a new score replaces."""
     from brainbench.core.runs.jobs import run_jobs
+    from brainbench.scoring.jobs import missing
 
     if not jobs:
         return []

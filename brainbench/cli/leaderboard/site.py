@@ -15,8 +15,7 @@ from brainbench.core.errors import visible
 if TYPE_CHECKING:
     from leaderboards.store import StoredRecord
 
-RECORDS = Path("brainbench-results")
-"""Folder that is read where none is named."""
+RECORDS = Path("brainbench-results")  # folder that is read where none is named
 
 
 def build(

@@ -49,7 +49,7 @@ def render(
 ) -> Output:
     """Draw a scene: whiskers bent by its objects, as a picture or a film; no display is needed."""
     from brainbench.core.figures import check_format
-    from brainbench.stimuli.figures import scenes as drawing
+    from brainbench.stimuli.figures import pictures as drawing
     from brainbench.stimuli.figures.pictures import Style
     from brainbench.stimuli.figures.surfaces import Camera
 

@@ -34,8 +34,7 @@ FidelityOption = Annotated[
 BackendOption = Annotated[str, typer.Option(help="Physics engine: rod (our own), mujoco, or bullet.")]
 StimulusOption = Annotated[str | None, typer.Option("--stimulus", "-s", help="Its label, where there are several.")]
 
-_SHOWN = 20
-"""Scenes that are printed in full; any number is written as JSON."""
+_SHOWN = 20  # scenes that are printed in full; any number is written as JSON
 
 
 def open_recipe(source: str, whiskers: str) -> Recipe:

@@ -21,8 +21,7 @@ from brainbench.core.devices import warp
 from brainbench.core.errors import check_name
 from brainbench.core.figures import COLORS, new_figure, panels, save_figure
 from brainbench.core.rotations import to_matrices
-from brainbench.stimuli.figures.pictures import Style
-from brainbench.stimuli.figures.scenes import write_film
+from brainbench.stimuli.figures.pictures import Style, write_film
 from brainbench.stimuli.figures.surfaces import (
     Camera,
     Lens,
@@ -49,8 +48,7 @@ if TYPE_CHECKING:
 
 SIZE = (1100, 900)
 SKIN, OBJECT = (0.80, 0.82, 0.86), (0.95, 0.75, 0.45)
-SAMPLES = 2
-"""Samples of a pixel along each axis."""
+SAMPLES = 2  # samples of a pixel along each axis
 
 
 def link_rotation(pose: NDArray[np.float64]) -> NDArray[np.float64]:

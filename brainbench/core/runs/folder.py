@@ -28,8 +28,7 @@ if TYPE_CHECKING:
 
 RUN, CONFIG = "run.json", "config.json"
 RESTART = "Delete it to start anew."
-EARLIER_STATE = "resume.safetensors"
-"""State of a teacher before all runs had one format."""
+EARLIER_STATE = "resume.safetensors"  # state of a teacher before all runs had one format
 
 
 @dataclass(frozen=True)

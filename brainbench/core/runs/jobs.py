@@ -15,12 +15,10 @@ from typing import Any
 from brainbench.core.errors import DataError, UsageError, needing
 from brainbench.core.reading.ranges import check_number
 
-TIMEOUT = 30
-"""Seconds that the scheduler of a cluster may take to answer."""
+TIMEOUT = 30  # seconds that the scheduler of a cluster may take to answer
 STOPPING = threading.Event()
 """Set while threads of this process should end early, because another one failed or the user interrupted."""
-QUEUED = 4
-"""Jobs that wait at the scheduler for each thread of the cluster."""
+QUEUED = 4  # jobs that wait at the scheduler for each thread of the cluster
 
 
 def run_jobs(

@@ -112,8 +112,7 @@ class RecordingLayout:
 
 
 _LAYOUTS: dict[str, RecordingLayout] = {}
-_loaded: list[str] = []
-"""Groups of entry points that were loaded: once, on first use."""
+_loaded: list[str] = []  # groups of entry points that were loaded: once, on first use
 
 
 def register_layout(layout: RecordingLayout) -> RecordingLayout:

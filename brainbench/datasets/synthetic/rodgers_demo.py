@@ -40,8 +40,7 @@ if TYPE_CHECKING:
 
 CHOICE = (0.80, 0.97)
 """Earliest and latest choice, s after the shape comes into reach."""
-_REACH = 1.0
-"""From trial start to the first frame of the stimulus, s."""
+_REACH = 1.0  # from trial start to the first frame of the stimulus, s
 _LAYERS = ((130, "1"), (450, "2/3"), (600, "4"), (950, "5"), (1300, "6"))
 
 COLUMNS = {
@@ -264,8 +263,7 @@ _ANIMALS = (
     (SessionPlan("demo04", "01", 40, 220, modulation=0.12),),
 )
 """The animals; the last is hard to read on purpose."""
-_COMPRESSION = 1.0
-"""Half-saturation of an afferent, in root mean squares of its channel."""
+_COMPRESSION = 1.0  # half-saturation of an afferent, in root mean squares of its channel
 
 
 def make_rodgers_demo(

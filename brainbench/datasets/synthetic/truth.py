@@ -154,8 +154,7 @@ def _complete(folder: Path) -> bool:
     return True
 
 
-_EXACT = 2e-4
-"""Largest error of the modulation that calibration leaves, on the studies it draws."""
+_EXACT = 2e-4  # largest error of the modulation that calibration leaves, on the studies it draws
 
 
 def measure_ceiling(
@@ -240,10 +239,8 @@ def _pearson(first: NDArray[np.float64], second: NDArray[np.float64]) -> float:
 
 _LATENCY, _JITTER = 0.012, 0.003
 """Onset response after contact, s."""
-_ONSET = 0.15
-"""Share of the spikes in a window that belong to the onset response."""
-_DEAD = 0.002
-"""Refractory time, s."""
+_ONSET = 0.15  # share of the spikes in a window that belong to the onset response
+_DEAD = 0.002  # refractory time, s
 
 
 def spike_trains(
@@ -301,15 +298,13 @@ def _place_spikes(
     return begin[which] + position[order] + rank * dead
 
 
-_BEFORE = 0.5
-"""From trial start to contact, s."""
+_BEFORE = 0.5  # from trial start to contact, s
 _AFTER = (0.25, 1.25)
 """Least and most time from the end of the window to the end of the trial, s: no two trials are alike in
 length, so that a shifted clock cannot hide behind a regular rhythm."""
 REST = 0.5
 """Rate between windows, as a share of a unit's mean rate."""
-_TOUCH = 0.05
-"""Duration of a contact, s."""
+_TOUCH = 0.05  # duration of a contact, s
 
 
 def write_files(

@@ -36,8 +36,7 @@ if TYPE_CHECKING:
 
 FOLDERS = {"train": "train", "validate": "validation", "validation": "validation", "val": "validation", "test": "test"}
 """Folders of the published study's sweeps → split."""
-_STATISTICS = 1
-"""Raised whenever the same sweeps would get other statistics."""
+_STATISTICS = 1  # raised whenever the same sweeps would get other statistics
 _UNUSABLE = 2
 _AGAIN = "Remove it and give the command that made the data set again."
 

@@ -35,8 +35,7 @@ _OUT_OF_MEMORY = ("bad_alloc", "MemoryError", "Unable to allocate", "allocate me
 REDUCTION = 5
 """A mesh of too many triangles is simplified to the limit over this: CoACD's time grows with their number."""
 
-_VERSION = 1
-"""Raised when results of this module change, so that cached ones are made again."""
+_VERSION = 1  # raised when results of this module change, so that cached ones are made again
 
 
 def cut(mesh: Mesh, settings: DecompositionSettings) -> Decomposition:

@@ -119,8 +119,7 @@ class Decoder:
 @dataclass(frozen=True)
 class _Fold:
     stimulus: int
-    train: Floats
-    """[R′, D] rows in the span of the training rows, which is all that a penalised fit can use."""
+    train: Floats  # [R′, D] rows in the span of the training rows, which is all that a penalised fit can use
     test: Floats
 
 

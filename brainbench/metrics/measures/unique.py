@@ -32,8 +32,7 @@ SPLITS = 24
 _SWEEPS, _TOLERANCE = 100, 1e-8
 _TRIAL_SPLITS, _FEWEST_TRIAL_SPLITS, _FEW_STIMULI = 40, 4, 40
 """Splits of the trials for each half of up to 40 stimuli, of more in proportion fewer, and the fewest."""
-_LEAST_SHARE = 0.25
-"""Smallest reliability of halves, as a share of that of all stimuli, which is divided by."""
+_LEAST_SHARE = 0.25  # smallest reliability of halves, as a share of that of all stimuli, which is divided by
 _PARTS = ("both", "controls", "network", "equal")
 """Sums that are compared: controls and layer, controls, layer; each with equal distances, and these alone."""
 

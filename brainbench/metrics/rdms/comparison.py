@@ -29,8 +29,7 @@ _OF_MATRICES = ("whitened-cosine", "whitened-pearson")
 _FEW_STIMULI, _BLOCK_ELEMENTS = 64, 1 << 24
 """Up to so many stimuli all orders of a chunk are compared at once; numbers of layers' matrices that are held."""
 
-_SIGN_LIMIT = 128
-"""Above this many pairs Kendall's tau sorts (P log P) instead of comparing all pairs of pairs (P²)."""
+_SIGN_LIMIT = 128  # above this many pairs Kendall's tau sorts (P log P) instead of comparing all pairs of pairs (P²)
 
 
 def compare(a: ArrayLike, b: ArrayLike, *, method: str = "pearson") -> Floats:

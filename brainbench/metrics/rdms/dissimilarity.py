@@ -156,8 +156,7 @@ POISSON_PRIOR_MEAN = 1.0
 POISSON_PRIOR_WEIGHT = 0.1
 """Gamma prior that keeps the logarithm of a silent unit finite (rsatoolbox's defaults)."""
 
-_ASYMMETRY = 1e-6
-"""Largest difference across the diagonal of a noise precision, as a share of its largest number."""
+_ASYMMETRY = 1e-6  # largest difference across the diagonal of a noise precision, as a share of its largest number
 
 
 @dataclass(frozen=True)
@@ -169,8 +168,7 @@ class _Responses:
     codes: Ints | None
     folds: ArrayLike | None
     precision: ArrayLike | str | None
-    device: Any
-    """Torch device, or None for numpy."""
+    device: Any  # torch device, or None for numpy
 
     @property
     def missing(self) -> bool:

@@ -100,8 +100,7 @@ def rdm_stack(rdms: ArrayLike | Sequence[ArrayLike], what: str) -> Floats:
     return array
 
 
-_LARGEST_LABELLED = 24
-"""Stimuli up to which names are written; above, the cells alone are drawn."""
+_LARGEST_LABELLED = 24  # stimuli up to which names are written; above, the cells alone are drawn
 _LARGEST_DRAWN = 120
 _SIDE, _WIDE = 300, 26
 """Side of the matrix, and of the smallest cell that holds a number, in pixels."""

@@ -31,11 +31,9 @@ from brainbench.metrics.reliability.noise_correction import spearman_brown
 from brainbench.metrics.reliability.sessions import Hashes, SortedTrials, draws, trial_hashes
 from brainbench.metrics.stimulus_labels import labelled_trials
 
-_CHUNK_BYTES = 1 << 20
-"""Sums of one chunk of splits stay in the processor's cache."""
+_CHUNK_BYTES = 1 << 20  # sums of one chunk of splits stay in the processor's cache
 
-_PATTERN_BYTES = 1 << 26
-"""Mean patterns of one chunk of splits, where they are formed."""
+_PATTERN_BYTES = 1 << 26  # mean patterns of one chunk of splits, where they are formed
 
 _COMMON = 1e-3
 """Products of trials lose digits when less than this share of a pattern's square is left after taking

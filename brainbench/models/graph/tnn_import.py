@@ -24,8 +24,7 @@ _MEMORIES = {
     "LSTMCell": "lstm",
 }
 _REQUIRED = object()
-_LARGEST = 10**6
-"""Largest number of channels, features, rows or columns."""
+_LARGEST = 10**6  # largest number of channels, features, rows or columns
 # Keys that PyTorchTNN accepts and overwrites while it builds the graph.
 _OVERWRITTEN = ("in_channels", "input_in_channels", "input_shape", "num_timesteps", "state_shape")
 

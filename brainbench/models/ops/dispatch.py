@@ -224,8 +224,7 @@ class _Convolution(torch.autograd.Function):
         return None, None, *(part.to(kind) for part, (_, kind) in zip(parts, ctx.inputs, strict=True))
 
 
-TRITON = importlib.util.find_spec("triton") is not None
-"""True where the kernels can be compiled."""
+TRITON = importlib.util.find_spec("triton") is not None  # true where the kernels can be compiled
 
 
 def usable(x: torch.Tensor) -> bool:

@@ -97,8 +97,7 @@ RECTIFIER_GAIN = math.sqrt(2.0)
 
 _MANY_WEIGHTS = 1 << 18
 
-PRECISIONS = ("float32", "bf16")
-"""Precisions of a packed network."""
+PRECISIONS = ("float32", "bf16")  # precisions of a packed network
 
 ACTIVATIONS: Mapping[str, type[nn.Module]] = {
     "elu": nn.ELU,

@@ -77,8 +77,7 @@ def _solve(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
 # With M = 2 L points the wrapped tail is damped by 1e-10, and undoing the damping of the first L values
 # amplifies rounding by at most 1e5, in double precision.
 _WRAPPED = 1e-10
-_BLOCK = 1 << 23
-"""Complex numbers (channels × pairs × frequencies) held at once; bounds the memory of long kernels."""
+_BLOCK = 1 << 23  # complex numbers (channels × pairs × frequencies) held at once; bounds the memory of long kernels
 
 
 class System(NamedTuple):

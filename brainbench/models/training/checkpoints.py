@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 
 from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, check_name, listing, needing
 from brainbench.core.plugins import load_optional
-from brainbench.models.architecture import Architecture
+from brainbench.models.recipes import Architecture
 
 if TYPE_CHECKING:
     from torch import nn
@@ -22,8 +22,7 @@ if TYPE_CHECKING:
 FORMAT = 1
 WEIGHTS, CONFIG, CARD = "model.safetensors", "config.json", "README.md"
 LOCAL, HUB = "local-dir:", "hf-hub:"
-PREFIXES = (LOCAL, HUB)
-"""Beginnings of a model's name that is a folder or a repository instead of a registry name."""
+PREFIXES = (LOCAL, HUB)  # beginnings of a model's name that is a folder or a repository instead of a registry name
 DType = Literal["float32", "float16", "bfloat16"]
 DTYPES: tuple[DType, ...] = get_args(DType)
 FOREIGN, SCORED, SETTINGS = "*.ckpt", "val_best.ckpt", "config.yaml"

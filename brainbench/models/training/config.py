@@ -13,8 +13,17 @@ from typing import Annotated, Any, Literal
 
 from brainbench.core.errors import DataError, UsageError, check_each, check_kind, unknown_name
 from brainbench.core.limits import Limit, NotNegative, Positive, limited
-from brainbench.models.architecture import OBJECTIVES, Architecture, Objective, is_path
-from brainbench.models.recipes import BATCH_SIZE, EPOCHS, Optimizer, Schedule, recipe_for
+from brainbench.models.recipes import (
+    BATCH_SIZE,
+    EPOCHS,
+    OBJECTIVES,
+    Architecture,
+    Objective,
+    Optimizer,
+    Schedule,
+    is_path,
+    recipe_for,
+)
 from brainbench.models.training.checkpoints import DType
 
 _Times = Annotated[int, Limit(least=0, most=2**31 - 1)]

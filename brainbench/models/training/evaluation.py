@@ -35,7 +35,7 @@ from brainbench.models.parts import AllStepsDecoder
 from brainbench.models.recipes import BATCH_SIZE, PROBE
 from brainbench.models.registry import describe_model, load_model
 from brainbench.models.training.config import TrainingConfig
-from brainbench.models.training.optimizers import make_optimizer, rate_factor
+from brainbench.models.training.objectives import make_optimizer, rate_factor
 
 RAW, RANDOM, TWIN = CONTROLS = ("raw-input", "random-features", "untrained-twin")
 """Controls of a network's accuracy, each read by the linear probe."""
@@ -86,8 +86,7 @@ def topk(answers: torch.Tensor, labels: torch.Tensor, k: int) -> int:
 class SweepsHash:
     """Hash of labelled sweeps, whatever the batches in which they come: after each block, its labels."""
 
-    _BLOCK = 1024
-    """Batch of the published recipes, in which the networks that come with the package were evaluated."""
+    _BLOCK = 1024  # batch of the published recipes, in which the networks that come with the package were evaluated
 
     def __init__(self) -> None:
         self._digest = hashlib.sha256()

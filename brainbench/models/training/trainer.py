@@ -62,8 +62,7 @@ from brainbench.models.training.evaluation import (
     model_card,
     sweeps_hash,
 )
-from brainbench.models.training.objectives import make_learner
-from brainbench.models.training.optimizers import Gradients, compiled, make_optimizer, rate_factor
+from brainbench.models.training.objectives import Gradients, compiled, make_learner, make_optimizer, rate_factor
 
 _log = logging.getLogger(__name__)
 
@@ -131,11 +130,9 @@ class _Position:
 
     step: int = 0
     epoch: int = 0
-    best: float = math.inf
-    """Lowest validation score so far."""
+    best: float = math.inf  # lowest validation score so far
     best_epoch: int | None = None
-    total: float = 0.0
-    """Sum of the losses of this epoch's steps."""
+    total: float = 0.0  # sum of the losses of this epoch's steps
     count: int = 0
 
 

@@ -44,8 +44,7 @@ from brainbench.scoring.scores import ScoreInputs
 
 PERMUTATIONS = 1000
 """Random orders of the stimuli, above six stimuli; all orders up to six."""
-_FARTHEST = 0.4
-"""Largest lag, as a share of the recorded time."""
+_FARTHEST = 0.4  # largest lag, as a share of the recorded time
 
 
 @dataclass(frozen=True)

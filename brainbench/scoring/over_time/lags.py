@@ -25,11 +25,9 @@ from brainbench.metrics.rdms.comparison import compare_all, permuted_comparisons
 from brainbench.metrics.rdms.pairs import Floats, Ints, permuted_pairs, stimulus_count
 from brainbench.metrics.reliability.subject_rdm import is_flat
 
-_NEVER = -2.0
-"""Vote of a layer and lag that cannot be chosen; comparisons are at least −1."""
+_NEVER = -2.0  # vote of a layer and lag that cannot be chosen; comparisons are at least −1
 _CHUNK_ELEMENTS = 1 << 22
-_EXACT_STIMULI = 6
-"""Up to this many stimuli all orders are taken (6! = 720)."""
+_EXACT_STIMULI = 6  # up to this many stimuli all orders are taken (6! = 720)
 
 
 @dataclass(frozen=True)

@@ -24,8 +24,7 @@ SPLITS = 100
 _METHOD: dict[str, Any] = {
     "method": "crossnobis", "comparison": "whitened-cosine", "noise": "none", "splits": SPLITS,
 }  # fmt: skip
-_PARTLY = 0.5
-"""A last bin of which less than this share lies inside the stimulus is left out."""
+_PARTLY = 0.5  # a last bin of which less than this share lies inside the stimulus is left out
 
 
 @dataclass(frozen=True)

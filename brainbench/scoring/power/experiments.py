@@ -41,10 +41,8 @@ ANIMAL_COUNTS = (1, 2, 3, 4, 5, 6, 8, 11, 15, 20, 30, 50, 100)
 DIMENSIONS = 10
 """Dimensions of the patterns where nothing is known of them."""
 _COMPARISON = "whitened-pearson"
-_ORDERS = 999
-"""Random orders of simulated tests at levels from .01 on; below, as many as a score takes."""
-_EXACT_STIMULI = 6
-"""Up to this many stimuli all orders are taken."""
+_ORDERS = 999  # random orders of simulated tests at levels from .01 on; below, as many as a score takes
+_EXACT_STIMULI = 6  # up to this many stimuli all orders are taken
 _CHUNK_ELEMENTS = 1 << 21
 
 

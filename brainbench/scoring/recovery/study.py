@@ -27,8 +27,7 @@ from brainbench.scoring.recovery.boards import Candidate, RecoveryBoard, Recover
 from brainbench.scoring.recovery.confusion import Recovery
 
 BOARDS = 10
-_TOGETHER = 5
-"""Boards that one job makes and one file keeps."""
+_TOGETHER = 5  # boards that one job makes and one file keeps
 
 
 @dataclass(frozen=True)

@@ -38,12 +38,9 @@ PIECES_PER_PERIOD = 27
 """Pieces in one period of a sinusoid that are just followed: the velocity of a cubic is wrong by √3/216 (ω h)³."""
 LEAST_STEPS = 10
 """Steps per period of a motion where the fidelity names none."""
-_AT_ONCE = 400_000
-"""Looks at a time: bounds the memory."""
-_SLOW = 1e-6
-"""Speed (mm/ms) whose errors never count."""
-_INSIDE = 16
-"""Parts of a piece in which a corner or a jump is looked for."""
+_AT_ONCE = 400_000  # looks at a time: bounds the memory
+_SLOW = 1e-6  # speed (mm/ms) whose errors never count
+_INSIDE = 16  # parts of a piece in which a corner or a jump is looked for
 
 Path = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 """Times [n] (s) → coordinates [n, k] (mm; angles times a length)."""

@@ -391,12 +391,9 @@ def paint(layer: VisibleSurface, colors: NDArray[Any], background: NDArray[Any],
     flat[layer.pixels] = opacity * colors + (1 - opacity) * flat[layer.pixels]
 
 
-CREASE = math.radians(35)
-"""Neighbouring triangles at a smaller angle [rad] are shaded as one smooth surface."""
-SIDES = 7
-"""Corners of a whisker's cross-section."""
-ROUND = 64
-"""Corners of a circle of an object."""
+CREASE = math.radians(35)  # neighbouring triangles at a smaller angle [rad] are shaded as one smooth surface
+SIDES = 7  # corners of a whisker's cross-section
+ROUND = 64  # corners of a circle of an object
 
 
 @dataclass(frozen=True, eq=False)

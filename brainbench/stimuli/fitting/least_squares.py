@@ -35,8 +35,7 @@ from brainbench.stimuli.fitting.trials import Trial
 Array = NDArray[np.float64]
 WIDEST = 12.0
 """Distance from the estimate, in coordinates, at which an interval counts as open (a factor of 160,000)."""
-_STEPS = 12
-"""Points at which the profile is looked at on each side."""
+_STEPS = 12  # points at which the profile is looked at on each side
 
 
 def quantile(level: float, freedom: float) -> float:
@@ -150,8 +149,7 @@ class Profile:
         return math.sqrt(max(squares - self.least, 0.0) / self.scale)
 
 
-_ROUNDS = 3
-"""Fits with the noise of each channel estimated anew; it settles in two."""
+_ROUNDS = 3  # fits with the noise of each channel estimated anew; it settles in two
 STATED = 5.0
 """Fitted over stated deflection of a plucked whisker, or its inverse, from which a unit is wrong."""
 ALIKE = 16.0
@@ -213,12 +211,9 @@ def fit(
 class _Solution:
     """A minimum."""
 
-    u: Array
-    """[p] coordinates."""
-    sigma: Array
-    """[g] noise of each group (N, N·m, m)."""
-    deviance: float
-    """−2 log likelihood, but for a constant."""
+    u: Array  # [p] coordinates
+    sigma: Array  # [g] noise of each group (N, N·m, m)
+    deviance: float  # −2 log likelihood, but for a constant
     converged: bool
     iterations: int
 

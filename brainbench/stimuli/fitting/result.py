@@ -396,8 +396,7 @@ class FitResult:
         }
 
 
-_SHOWN = 6
-"""Shapes that are drawn of a trial."""
+_SHOWN = 6  # shapes that are drawn of a trial
 
 
 def draw_fit(trial: Trial, result: FitResult, path: str | os.PathLike[str]) -> Path:

@@ -35,8 +35,7 @@ from brainbench.stimuli.whiskers.array import MountedWhisker
 
 _LOG = logging.getLogger(__name__)
 
-_TAIL = 0.01
-"""Time [s] for which the last velocity is held beyond the end, for the last steps of a simulation."""
+_TAIL = 0.01  # time [s] for which the last velocity is held beyond the end, for the last steps of a simulation
 # Gauss-Legendre nodes of the fourth-order Magnus integrator (Blanes, Casas, Oteo & Ros 2009, Phys. Rep. 470).
 _NODES = (0.5 - math.sqrt(3) / 6, 0.5 + math.sqrt(3) / 6)
 

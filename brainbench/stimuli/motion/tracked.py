@@ -37,8 +37,7 @@ Array = NDArray[np.float64]
 NEAR = 0.25
 """Share of the traced length, from the base, whose chord is the direction of the base."""
 _ORDER = 4
-_TAIL = 0.01
-"""Time [s] for which the last pose is held beyond the end, for the last steps of a simulation."""
+_TAIL = 0.01  # time [s] for which the last pose is held beyond the end, for the last steps of a simulation
 _AXES = ("theta", "phi", "zeta")
 
 

@@ -186,8 +186,7 @@ class _SteadyMotion(_Motion):
 
     velocity: Vector
     """Final velocity in the world: [m/s] of a translation; [rad/s] of a spin, along the axis by the right-hand rule."""
-    onset: _Onset = 0.01
-    """Duration of the smooth start [s]; 0 moves at full speed from the first instant."""
+    onset: _Onset = 0.01  # duration of the smooth start [s]; 0 moves at full speed from the first instant
 
     @property
     def finest(self) -> float:

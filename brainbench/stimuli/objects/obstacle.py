@@ -57,10 +57,8 @@ class ConvexPart:
 class _Primitive:
     """Base of the bodies that some points and lengths describe."""
 
-    _points: ClassVar[tuple[str, ...]]
-    """Names of the fields that move with the body."""
-    _sizes: ClassVar[tuple[str, ...]] = ("radius",)
-    """Names of the fields that only grow with it."""
+    _points: ClassVar[tuple[str, ...]]  # names of the fields that move with the body
+    _sizes: ClassVar[tuple[str, ...]] = ("radius",)  # names of the fields that only grow with it
 
     def moved(self, rotation: NDArray[np.float64], translation: NDArray[np.float64]) -> Self:
         """Return the body rotated by a matrix [3, 3] about the origin, then translated by [3] (m)."""

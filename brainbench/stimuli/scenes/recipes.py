@@ -25,8 +25,7 @@ RECORDED = "rodgers-recorded"
 
 _RECORDED_START = math.radians(-10)
 """Azimuth at which recorded whisking starts: retracted as in ``rodgers``, and as the published sample begins."""
-_RAT_SCALE = 2.0
-"""Rat over mouse: rostro-caudal distances between facial landmarks (Bresee et al. 2023)."""
+_RAT_SCALE = 2.0  # Rat over mouse: rostro-caudal distances between facial landmarks (Bresee et al. 2023).
 
 
 def list_recipes() -> tuple[str, ...]:

@@ -139,8 +139,7 @@ def _summary(shards: Iterable[dict[str, Any]]) -> dict[str, int]:
     return {"shards": len(chosen), **counted}
 
 
-_SPARE = 64e6
-"""Bytes of disk that are left free."""
+_SPARE = 64e6  # bytes of disk that are left free
 
 
 def generate(

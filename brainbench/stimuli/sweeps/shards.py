@@ -28,8 +28,7 @@ from brainbench.stimuli.sweeps.plan import GenerationSettings, PlannedShard, Sha
 from brainbench.stimuli.sweeps.sweep_scenes import Sweep, SweepGrid, SweepScenes
 from brainbench.stimuli.whiskers.array import WhiskerArray
 
-_TOGETHER = 16
-"""Sweeps whose scenes exist at the same time: bounds the memory of a batch."""
+_TOGETHER = 16  # sweeps whose scenes exist at the same time: bounds the memory of a batch
 
 
 def simulate_sweeps(

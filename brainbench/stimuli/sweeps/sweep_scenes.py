@@ -26,8 +26,7 @@ from brainbench.stimuli.scenes.frames import Frames
 from brainbench.stimuli.scenes.scene import Head, Scene
 from brainbench.stimuli.whiskers.array import WhiskerArray
 
-_HEAD_ONSET = 0.01
-"""Smooth start [s] of a travelling head, whose whiskers would feel a jump of velocity as a blow."""
+_HEAD_ONSET = 0.01  # smooth start [s] of a travelling head, whose whiskers would feel a jump of velocity as a blow
 
 
 @dataclass(frozen=True)

@@ -450,8 +450,7 @@ def _need(names: tuple[str, ...], path: str | os.PathLike[str]) -> None:
 
 _LAYOUTS = {".whiskers": "whisk", **dict.fromkeys((".tr4", ".tr4_2d", ".mat"), "whiskerman")}
 """Layout by the ending of the file."""
-_SEVERAL = (".csv", ".h5", ".hdf5")
-"""Endings of several layouts, and of wrenches."""
+_SEVERAL = (".csv", ".h5", ".hdf5")  # endings of several layouts, and of wrenches
 
 
 def read_shapes(path: str | os.PathLike[str], options: TrackOptions):  # noqa: ANN201 — xarray is imported late

@@ -33,8 +33,7 @@ from brainbench.stimuli.whiskers.whisker import Whisker
 
 OBJECTS = ("post", "ball", "edge", "hollow")
 FRICTIONS = (0.0, 0.4, 0.8)
-FREQUENCIES = (5.0, 10.0, 20.0)
-"""Whisks per second [Hz]."""
+FREQUENCIES = (5.0, 10.0, 20.0)  # whisks per second [Hz]
 CELLS = len(SPECIES) * len(OBJECTS) * len(FRICTIONS) * len(FREQUENCIES)
 """Combinations of species, object, friction and speed."""
 _RETRACTION = math.radians(12)
@@ -150,8 +149,7 @@ def _faces() -> NDArray[np.float64]:
     return mesh.vertices.reshape(-1, 4, 3)
 
 
-_CLEARANCE = 1.2
-"""Half width of a pulley's groove in base radii of the whisker."""
+_CLEARANCE = 1.2  # half width of a pulley's groove in base radii of the whisker
 
 
 @dataclass(frozen=True, eq=False)

@@ -37,8 +37,7 @@ NONCE, KEY = 16, 32
 """Bytes of a nonce and of a key."""
 _HEADER = struct.Struct("<4sBBBxId")
 _TAG = 32
-_ORIGIN = struct.Struct("<Id")
-"""What a command comes from: number of its report, time until which it holds."""
+_ORIGIN = struct.Struct("<Id")  # what a command comes from: number of its report, time until which it holds
 
 
 @dataclass(frozen=True, eq=False)

@@ -35,14 +35,10 @@ from robotics_bridge.sensors import KinematicTaxel, Probes, SensorSuite
 
 RADIUS = 4e-3
 """Sensing radius of a taxel whose log does not say (m)."""
-_LARGEST = 1.0
-"""Distance of a taxel from the origin of its link above which it looks like millimetres (m)."""
-_TURN = 2 * np.pi
-"""Largest joint angle (rad); beyond it angles look like degrees."""
-_RATE = 200.0
-"""Least physics reports per second."""
-_MOST = 1_000_000
-"""Most frames of an episode."""
+_LARGEST = 1.0  # distance of a taxel from the origin of its link above which it looks like millimetres (m)
+_TURN = 2 * np.pi  # largest joint angle (rad); beyond it angles look like degrees
+_RATE = 200.0  # least physics reports per second
+_MOST = 1_000_000  # most frames of an episode
 
 
 @dataclass(frozen=True, eq=False)

@@ -33,8 +33,7 @@ FARTHEST = 4 * math.pi
 """Targets further from zero have no effect (rad or m): no joint of a hand has such a range."""
 MOST_OFFERS = 64
 """Greetings that a hand remembers until a session starts; the oldest goes first."""
-_ERRORS = 8
-"""Errors of the connection that are kept."""
+_ERRORS = 8  # errors of the connection that are kept
 
 
 class HandEnd(NamedTuple):

@@ -21,8 +21,8 @@ from torch import nn
 from brainbench.core.contracts import GRID_SHAPE
 from brainbench.core.errors import UsageError, brief, check_each, check_kind, unknown_name
 from brainbench.core.limits import Limit, Seed, limited
-from brainbench.models.architecture import Architecture
 from brainbench.models.cells import FORGET_BIAS, GRU
+from brainbench.models.recipes import Architecture
 from brainbench.models.registry import list_models
 from robotics_bridge import hands
 from robotics_bridge.hands.observations import observation_type
@@ -116,8 +116,7 @@ class ConvGRUProducts(nn.Module):
 UNITS = 96
 """Units of a reservoir, as many as the features of the small networks."""
 _LEAK, _RADIUS, _OFFSET = 0.5, 0.9, 0.1
-_FARTHEST = 10.0
-"""Standard deviations to which features are cut."""
+_FARTHEST = 10.0  # standard deviations to which features are cut
 
 
 class EchoState(nn.Module):
@@ -188,16 +187,13 @@ class FeatureNorm(nn.Module):
         return ((x.float() - self.mean.float()) / spread.float()).clamp(-_FARTHEST, _FARTHEST)
 
 
-AUTO = "auto"
-"""The published choice: ``tactile_convrnn`` where every link has a grid of taxels, ``rnn`` elsewhere."""
+AUTO = "auto"  # the published choice: `tactile_convrnn` where every link has a grid of taxels, `rnn` elsewhere
 _HIDDEN, _CHANNELS, _KERNEL = 64, (16, 32), 3
 _OF_NETWORKS = ("time", "learning", "pretrained", "options", "calibration")
 """Settings that encoders which are learned with the policy, and the reservoir, do not have."""
-_COUNTED = 1 << 24
-"""Values per channel whose squares are added up at a time."""
+_COUNTED = 1 << 24  # values per channel whose squares are added up at a time
 _Width = Annotated[int, Limit(least=1, most=8192)]
-Stepped = tuple[torch.Tensor, torch.Tensor]
-"""What a step gives, and the memory after it."""
+Stepped = tuple[torch.Tensor, torch.Tensor]  # what a step gives, and the memory after it
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -413,8 +409,7 @@ class _Recurrent(_Learned):
 class _Images(_Learned):
     """Base of the convolutional arms: the readings as images, one per link, or one of the whole hand."""
 
-    index: torch.Tensor
-    """Item in every cell of every link's image; N for none."""
+    index: torch.Tensor  # item in every cell of every link's image; N for none
     head: nn.Linear
 
     def __init__(self, config: EncoderConfig, *, canvas: bool = False) -> None:

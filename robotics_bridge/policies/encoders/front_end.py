@@ -27,8 +27,7 @@ from brainbench.models.network import FORCE_SCALE, MOMENT_SCALE, EncoderAttender
 from brainbench.models.registry import load_model
 from robotics_bridge.policies.encoders.taxel_grid import TaxelGrid
 
-_TOUCHING = 1e-3
-"""Cells below this share of the strongest one do not count as touched."""
+_TOUCHING = 1e-3  # cells below this share of the strongest one do not count as touched
 
 
 @dataclass(frozen=True)
@@ -71,8 +70,7 @@ class HandCalibration:
 
 Time = Literal["native", "resampled"]
 TIMES = ("native", "resampled")
-CONTROL_SUB_STEP = 0.005
-"""Seconds between readings of the tactile sensors (200 Hz physics)."""
+CONTROL_SUB_STEP = 0.005  # seconds between readings of the tactile sensors (200 Hz physics)
 
 
 class Resampler(nn.Module):

@@ -42,8 +42,7 @@ from robotics_bridge.sensors.probes.placement import Probes
 
 mujoco = mujoco_module()
 
-FINGERS = ("thumb", "index", "middle", "ring", "pinky")
-"""Rows of the grid, from the radial side on."""
+FINGERS = ("thumb", "index", "middle", "ring", "pinky")  # rows of the grid, from the radial side on
 _WORDS = {
     "thumb": ("thumb", "th"),
     "index": ("index", "ff", "fore"),
@@ -51,8 +50,7 @@ _WORDS = {
     "ring": ("ring", "rf"),
     "pinky": ("pinky", "little", "lf", "small"),
 }
-_SAME = 1e-4
-"""Points nearer along a finger axis than this (m) are never parted."""
+_SAME = 1e-4  # points nearer along a finger axis than this (m) are never parted
 
 
 def finger_rows(fingers: Mapping[str, Sequence[str]]) -> dict[str, int]:
@@ -199,8 +197,7 @@ def _lay_sites(axes: FingerAxes, reference: Layout) -> None:
                 axes.centers[row, column] = mine[members, 2:].mean(axis=0)
 
 
-SITES = GRID_SHAPE[0] * GRID_SHAPE[1]
-"""Cells of the grid."""
+SITES = GRID_SHAPE[0] * GRID_SHAPE[1]  # cells of the grid
 
 
 class TaxelGrid(nn.Module):

@@ -27,10 +27,8 @@ from robotics_bridge.sensors.noise.model import PRESETS
 
 TARGETS = ("position", "velocity", "spin", "contact")
 """Object (m, m/s, rad/s), and the centre of the contact forces on it (m), [3] each, world axes."""
-CALIBRATION_SECONDS = 2.0
-"""Length of the episodes of a calibration."""
-_SETTLING = 10
-"""Control steps after an episode's start that are left out: the object falls onto the palm."""
+CALIBRATION_SECONDS = 2.0  # length of the episodes of a calibration
+_SETTLING = 10  # control steps after an episode's start that are left out: the object falls onto the palm
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,8 +154,7 @@ class PostureTurn(nn.Module):
         return torch.cat((rotate(back, force), rotate(back, moment)), -1)
 
 
-NETWORK = "zhuang-intersection-ln-small"
-"""Network of the arms ``untrained``, ``simclr`` and ``supervised``."""
+NETWORK = "zhuang-intersection-ln-small"  # network of the arms `untrained`, `simclr` and `supervised`
 _TRACES = (0.5, 0.9)
 """Share that traces of the short memory keep in a control step (time constants of 36 and 237 ms at 40 Hz)."""
 

@@ -37,10 +37,8 @@ from robotics_bridge.policies.readouts.features import (
 from robotics_bridge.sensors.probes.placement import Probes
 
 FOLDS = 5
-FARTHEST = 10.0
-"""Standard deviations to which features are cut."""
-PENALTIES = (1e-3, 1e-2, 1e-1, 1.0, 10.0, 100.0)
-"""Ridge penalties that are tried, per sample."""
+FARTHEST = 10.0  # standard deviations to which features are cut
+PENALTIES = (1e-3, 1e-2, 1e-1, 1.0, 10.0, 100.0)  # ridge penalties that are tried, per sample
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,12 +149,9 @@ def _ridge(x: torch.Tensor, y: torch.Tensor, valid: torch.Tensor) -> Callable[[t
     return predict
 
 
-HALVES = 2
-"""Parts of the environments; what is chosen on the others is read on each."""
-_INNER = 4
-"""Folds of the environments on which a choice is made."""
-_PENALTY = 1.0
-"""Ridge penalty of the choice, per sample."""
+HALVES = 2  # parts of the environments; what is chosen on the others is read on each
+_INNER = 4  # folds of the environments on which a choice is made
+_PENALTY = 1.0  # ridge penalty of the choice, per sample
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from brainbench.core.errors import UsageError, brief, check_each, check_name, li
 from brainbench.core.limits import Count, Limit, Seed, Share, limited
 from brainbench.core.reading.regular import readable
 from brainbench.core.reading.texts import read_toml
-from brainbench.models.architecture import Architecture
+from brainbench.models.recipes import Architecture
 from robotics_bridge.hands.layouts import check_names
 from robotics_bridge.hands.observations import observation_type
 from robotics_bridge.policies.encoders.arms import ARMS, AUTO, EncoderConfig

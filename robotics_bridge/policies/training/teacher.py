@@ -39,7 +39,7 @@ from brainbench.core.runs.folder import (
     set_random_state,
 )
 from brainbench.core.runs.log import RunLog, check_sinks
-from robotics_bridge.envs.rsl_rl import RslRlEnv
+from robotics_bridge.envs.env import RslRlEnv
 from robotics_bridge.policies.contract import from_json
 from robotics_bridge.policies.evaluate import Policy
 from robotics_bridge.policies.fit import check_fit, check_version

@@ -30,8 +30,7 @@ _SIGNIFICANT = 6.63
 """Twice the gain in log-likelihood (χ², one degree, 1 %) that drift or hysteresis must bring to be kept."""
 _UNTOLD = 7.0
 """Half width of the interval of a logarithm, a factor of a thousand, at which a log does not tell a number."""
-_LOAD = 0.01
-"""Share of the largest load above which an episode begins under load."""
+_LOAD = 0.01  # share of the largest load above which an episode begins under load
 
 
 @dataclass(frozen=True)
@@ -316,10 +315,8 @@ def _bias(
     return float(np.average(values, weights=precisions)), max(statistical, between)
 
 
-_SURE = 25.0
-"""Difference of the misfit, in units of the noise's variance, at which one lag beats the next."""
-_WINDOW = 40
-"""Readings to either side over which drift counts as a level."""
+_SURE = 25.0  # difference of the misfit, in units of the noise's variance, at which one lag beats the next
+_WINDOW = 40  # readings to either side over which drift counts as a level
 
 
 def blur(x: NDArray[np.float64], first: int, last: int) -> NDArray[np.float64]:

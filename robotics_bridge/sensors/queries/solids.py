@@ -81,11 +81,9 @@ RESOLVED = 4.0
 THINNEST = 3e-3
 """Least width of a solid (m) below which it is thin: engines let bodies overlap by up to about half of it, so that what
 touches it may lie past its middle, where the nearest side is the wrong one."""
-_FLAT = 1e-6
-"""Mean thickness, as a part of the diagonal, below which a mesh encloses nothing."""
+_FLAT = 1e-6  # mean thickness, as a part of the diagonal, below which a mesh encloses nothing
 _SAMPLES = 2000
-_SHARE = 0.02
-"""Part of the surface that must lie over thin walls for the mesh to be thin: an edge alone is none."""
+_SHARE = 0.02  # part of the surface that must lie over thin walls for the mesh to be thin: an edge alone is none
 
 
 def as_solid(mesh: Mesh) -> Mesh:

@@ -24,14 +24,10 @@ from brainbench.core.reading.ranges import check_number
 SPAN = 1.5
 """Largest slope along an axis that the table holds."""
 _BINS = 61
-_BLUR = 1.0
-"""Width (bins) over which neighbouring slopes share their colour, so that gaps of the table are filled."""
-_MARKER = 0.12
-"""How much darker than its surroundings a marker is (of full scale)."""
-_WIDEST = (25, 25)
-"""Pixels in which a marker fits."""
-_FITTED = 3
-"""Order of the polynomial that stands for the picture of the rested gel, where there is none."""
+_BLUR = 1.0  # width (bins) over which neighbouring slopes share their colour, so that gaps of the table are filled
+_MARKER = 0.12  # how much darker than its surroundings a marker is (of full scale)
+_WIDEST = (25, 25)  # pixels in which a marker fits
+_FITTED = 3  # order of the polynomial that stands for the picture of the rested gel, where there is none
 
 
 @dataclass(frozen=True, eq=False)

@@ -33,8 +33,7 @@ from robotics_bridge.sensors.taxels.sensors import ElastomerTaxel, Layer
 
 wp = warp()
 
-_NEGLIGIBLE = 1e-7
-"""Weight of a Gaussian from which on it is left out."""
+_NEGLIGIBLE = 1e-7  # weight of a Gaussian from which on it is left out
 
 
 class ElastomerRuntime(ProbeRuntime):
@@ -219,8 +218,7 @@ def _spectrum(sensor: ElastomerTaxel, device: Any) -> tuple[tuple[int, int], Any
 
 
 _STEPS = 300
-_ACCURACY = 1e-5
-"""Change of the pressure in a step, as a part of its norm, at which it is taken as found."""
+_ACCURACY = 1e-5  # change of the pressure in a step, as a part of its norm, at which it is taken as found
 
 
 def contact_pressure(

@@ -18,8 +18,7 @@ PUBLISHED_TWIST = 2.0
 """k_ω of the published parameters (N·m·s): that of a disc of 1.4 m, which drowns every other moment when an object
 turns."""
 CONVENTIONS = ("physical", "thesis")
-_LAW = ("stiffness", "damping", "shear", "twist", "convention", "pairs")
-"""Settings of the law alone."""
+_LAW = ("stiffness", "damping", "shear", "twist", "convention", "pairs")  # settings of the law alone
 
 
 @dataclass(frozen=True, kw_only=True)

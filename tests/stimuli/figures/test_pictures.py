@@ -1,19 +1,25 @@
+from __future__ import annotations
+
 import dataclasses
+import math
 import re
+import sys
 
 import numpy as np
 import pytest
 
+from brainbench.core.errors import MissingDependencyError, UsageError
 from brainbench.stimuli.engines.fidelity import Fidelity
-from brainbench.stimuli.figures import scenes as module
-from brainbench.stimuli.figures.pictures import Picture, Style
-from brainbench.stimuli.figures.scenes import render
+from brainbench.stimuli.figures import pictures as module
+from brainbench.stimuli.figures.pictures import Picture, Style, film_times, render, still_time
 from brainbench.stimuli.figures.surfaces import Camera
-from brainbench.stimuli.motion.trajectories import Still
-from brainbench.stimuli.objects.solid import PlacedObject, cylinder
+from brainbench.stimuli.motion.trajectories import Still, Translation, Whisking
+from brainbench.stimuli.objects.solid import PlacedObject, box, cylinder
+from brainbench.stimuli.scenes.recipes import get_recipe
 from brainbench.stimuli.scenes.scene import Frames, Scene
 from brainbench.stimuli.whisker_shapes import Recording, record
 from brainbench.stimuli.whiskers.array import WhiskerArray
+from tests.factories.engines import FakeEngine
 
 FAST = Fidelity.preset("fast")
 
@@ -72,3 +78,142 @@ def test_a_failed_picture_leaves_the_old_one(tmp_path, monkeypatch):
         render(SCENE, path, style=SMALL, fidelity="fast", cache=False)
     assert path.read_bytes() == b"old"
     assert len(list(tmp_path.iterdir())) == 1
+
+
+def _picture(scene, camera=ABOVE, style=SMALL, times=(0.0,)):
+    return Picture(record(scene, times, fidelity=FAST, cache=False), camera, style)
+
+
+def _grey(image):
+    """Pixels with the hue of objects: bluish and not white."""
+    red, green, blue = np.moveaxis(image.astype(int), -1, 0)
+    return (red < 250) & (blue > red) & (np.abs(green - (red + blue) / 2) < 12)
+
+
+def test_an_object_has_its_true_size_and_place_in_a_drawing_to_scale():
+    image = _picture(SCENE).frame(0)
+    assert image.shape == (240, 320, 3)
+    y, x = np.nonzero(_grey(image))
+    assert len(x) * 1e-8 == pytest.approx(math.pi * 1.5e-3**2, rel=0.05)
+    # 0.1 mm a pixel; the pole stands 2 mm right of the middle and 3 mm rostral of it.
+    assert x.mean() == pytest.approx(160 + 20, abs=1)
+    assert y.mean() == pytest.approx(120 - 30, abs=1)
+
+
+def test_a_moving_object_moves_in_the_picture():
+    moving = dataclasses.replace(POLE, motion=Translation((0.0, -0.1, 0.0), 0.0))
+    picture = _picture(dataclasses.replace(SCENE, objects=(moving,)), times=(0.0, 0.02))
+    rows = [np.nonzero(_grey(picture.frame(index)))[0].mean() for index in (0, 1)]
+    assert rows[1] - rows[0] == pytest.approx(20, abs=1)
+
+
+def _count_coloured(image):
+    return int((np.ptp(image.astype(int), axis=-1) > 35).sum())
+
+
+def test_whiskers_vanish_behind_objects_and_shine_through_them_when_asked():
+    plate = box((0.06, 0.06, 1e-3))
+    seen = [_count_coloured(_picture(dataclasses.replace(SCENE, objects=())).frame(0))]
+    for height, opacity in ((-0.02, 1.0), (0.03, 1.0), (0.03, 0.4)):
+        scene = dataclasses.replace(SCENE, objects=(PlacedObject(plate, (0.0, 0.0, height)),))
+        seen.append(_count_coloured(_picture(scene, style=dataclasses.replace(SMALL, opacity=opacity)).frame(0)))
+    alone, before, behind, through = seen
+    assert alone > 200
+    assert before == pytest.approx(alone, rel=0.2)
+    assert behind == 0
+    assert through > 0.5 * alone
+
+
+def test_thicker_whiskers_cover_more():
+    covered = [
+        _count_coloured(_picture(SCENE, style=dataclasses.replace(SMALL, thickness=thickness)).frame(0))
+        for thickness in (1.0, 4.0)
+    ]
+    assert covered[1] > 1.5 * covered[0]
+
+
+def test_a_picture_is_written_whole_and_the_same_every_time(tmp_path):
+    from PIL import Image
+
+    written = [render(SCENE, tmp_path / name, style=SMALL, fidelity="fast", cache=False) for name in ("a.png", "b.png")]
+    first, second = (path.read_bytes() for path in written)
+    assert first == second
+    with Image.open(written[0]) as image:
+        assert image.size == (320, 240)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.png", "b.png"]
+
+
+def test_a_gif_has_a_frame_per_instant_and_repeats(tmp_path):
+    from PIL import Image
+
+    moving = dataclasses.replace(POLE, motion=Translation((0.0, -0.1, 0.0), 0.0))
+    scene = dataclasses.replace(SCENE, objects=(moving,))
+    style = dataclasses.replace(SMALL, frames_per_second=20.0)
+    calls = []
+    path = render(
+        scene,
+        tmp_path / "film.gif",
+        times=[0.0, 0.01, 0.02],
+        camera=ABOVE,
+        style=style,
+        fidelity="fast",
+        cache=False,
+        progress=lambda *call: calls.append(call),
+    )
+    with Image.open(path) as film:
+        assert (film.n_frames, film.size, film.info["loop"], film.info["duration"]) == (3, (320, 240), 0, 50)
+        rows = []
+        for index in range(3):
+            film.seek(index)
+            rows.append(np.nonzero(_grey(np.asarray(film.convert("RGB"))))[0].mean())
+    assert rows[0] < rows[1] < rows[2]
+    assert calls[-1] == (3, 3, "drawing frames")
+
+
+def test_an_mp4_has_a_frame_per_instant(tmp_path):
+    ffmpeg = pytest.importorskip("imageio_ffmpeg")
+    path = render(SCENE, tmp_path / "film.mp4", times=[0.0, 0.01, 0.02], style=SMALL, fidelity="fast", cache=False)
+    frames = ffmpeg.read_frames(str(path))
+    told = next(frames)
+    frames.close()
+    assert (told["size"], told["fps"], ffmpeg.count_frames_and_secs(str(path))[0]) == ((320, 240), 25.0, 3)
+
+
+@pytest.mark.parametrize(("package", "name"), [("matplotlib", "a.png"), ("imageio_ffmpeg", "a.mp4")])
+def test_a_missing_package_is_named_with_its_extra(tmp_path, monkeypatch, package, name):
+    monkeypatch.setitem(sys.modules, package, None)
+    backend = FakeEngine()
+    with pytest.raises(MissingDependencyError, match=r"\[report\]"):
+        render(SCENE, tmp_path / name, times=[0.0], style=SMALL, backend=backend)
+    assert not backend.jobs
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_telling_instant_of_a_scene_is_its_first_full_protraction():
+    assert still_time(get_recipe("rodgers").scenes[0]) == pytest.approx(0.075)
+    slow = dataclasses.replace(SCENE, whisking=Whisking(frequency=8.0, onset=0.0), frames=Frames(0.0, 0.01, 20))
+    assert still_time(slow) == pytest.approx(1 / 16)
+    assert still_time(SCENE) == pytest.approx(0.045)
+
+
+def test_a_film_runs_from_start_to_stop():
+    np.testing.assert_allclose(film_times(SCENE, 0.01, 0.03, 0.005), [0.01, 0.015, 0.02, 0.025, 0.03])
+    assert film_times(SCENE)[-1] == pytest.approx(0.09)
+    with pytest.raises(UsageError, match=r"received 0\.05 s to 0\.01 s"):
+        film_times(SCENE, 0.05, 0.01)
+    with pytest.raises(UsageError, match="at most 10,000"):
+        film_times(SCENE, 0.0, 1.0, 1e-6)
+
+
+@pytest.mark.parametrize(
+    ("name", "times", "message"),
+    [
+        ("a.jpg", None, "did you mean '.png'"),
+        ("a.png", [0.0, 0.1], "shows one instant"),
+        ("a.png", [1e6], r"ends at .* ms; received the instant 1e\+09 ms"),
+        ("a.gif", [0.0, 1e6], r"ends at .* ms; received the instant 1e\+09 ms"),
+    ],
+)
+def test_impossible_files_are_refused(tmp_path, name, times, message):
+    with pytest.raises(UsageError, match=message):
+        render(SCENE, tmp_path / name, times=times)

@@ -9,10 +9,8 @@ import torch
 import triton
 import triton.language as tl
 
-TILE = 2048
-"""Numbers that a program writes, all in one piece."""
-SLOTS = 4
-"""Inputs of one kernel; more are joined before."""
+TILE = 2048  # numbers that a program writes, all in one piece
+SLOTS = 4  # inputs of one kernel; more are joined before
 
 
 @triton.jit

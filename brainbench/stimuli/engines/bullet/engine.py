@@ -44,8 +44,7 @@ MOST_LINKS = 60
 HULL_MARGIN = 1e-3
 """Margin (mm) that PyBullet wraps around convex hulls; subtracted again from the distances."""
 
-_NOTHING = 1e-12
-"""Mass (mg) and inertia (mg·mm²) of carriers between joints: far below those of any tip."""
+_NOTHING = 1e-12  # mass (mg) and inertia (mg·mm²) of carriers between joints: far below those of any tip
 _STILL = (0.0, 0.0, 0.0, 1.0)
 
 
@@ -445,18 +444,13 @@ class BulletEngine(SteppedEngine):
 class _Rows:
     """Possible contacts of one step; lengths in mm, world axes."""
 
-    axes: NDArray[np.float64]
-    """[m, 3, 3] normal into the whisker and two tangents."""
-    jacobian: NDArray[np.float64]
-    """[3m, 6 + 2N] displacement along the axes per joint displacement."""
+    axes: NDArray[np.float64]  # [m, 3, 3] normal into the whisker and two tangents
+    jacobian: NDArray[np.float64]  # [3m, 6 + 2N] displacement along the axes per joint displacement
     free: NDArray[np.float64]
     """[3m] gap, and slip by the prescribed motion alone, at the end of the step with the hinges where they are."""
-    friction: NDArray[np.float64]
-    """[m]"""
-    arc: NDArray[np.float64]
-    """[m] arc length of the point on the whisker (m)."""
-    overlap: float
-    """Deepest overlap at the start of the step."""
+    friction: NDArray[np.float64]  # [m]
+    arc: NDArray[np.float64]  # [m] arc length of the point on the whisker (m)
+    overlap: float  # deepest overlap at the start of the step
 
 
 class _Run:

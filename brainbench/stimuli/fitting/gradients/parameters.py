@@ -94,10 +94,8 @@ BASE = ("x", "y", "z", "theta", "phi", "zeta")
 OBJECT = ("x", "y", "z", "rx", "ry", "rz", "friction")
 """Shift [m] and turn [rad] of an object about its middle at the start, in world axes, as ``object.x``; of further
 objects as ``object1.rz``, of all together as ``objects.x``."""
-_ANGLE = 0.1
-"""Scale of an angle (rad)."""
-_SHARE = 0.05
-"""Scale of a shift as a share of the arc length."""
+_ANGLE = 0.1  # scale of an angle (rad)
+_SHARE = 0.05  # scale of a shift as a share of the arc length
 _BASE_NAME = re.compile(r"base\.(\w+)(?:\[(\d+)\])?")
 _OBJECT_NAME = re.compile(r"object(\d*|s)\.(\w+)")
 

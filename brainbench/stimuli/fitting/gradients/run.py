@@ -41,8 +41,7 @@ from brainbench.stimuli.whiskers.whisker import Whisker
 Numbers = dict[str, NDArray[np.float64]]
 """Packed numbers of one job by the names of ``kernels.tangent.PackedTangents``; rotations as matrices."""
 
-_RIGID = 1e-7
-"""Share of its size by which a moved mesh may differ from a rigid one: rounding of its vertices."""
+_RIGID = 1e-7  # share of its size by which a moved mesh may differ from a rigid one: rounding of its vertices
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from brainbench.core.errors import UsageError
-from robotics_bridge.physics.cpu import MujocoEngine
+from robotics_bridge.physics.engines import MujocoEngine
 from robotics_bridge.physics.scene import Geometry, TouchScene
 from robotics_bridge.physics.state import HandState
 from robotics_bridge.sensors.audio.microphone import Microphone

@@ -11,7 +11,7 @@ from scipy.integrate import solve_ivp
 from scipy.special import erf
 
 from brainbench.core.errors import UsageError
-from robotics_bridge.physics.cpu import MujocoEngine
+from robotics_bridge.physics.engines import MujocoEngine
 from robotics_bridge.physics.scene import Geometry, TouchScene
 from robotics_bridge.physics.state import HandState
 from robotics_bridge.sensors.noise.model import Noise
