@@ -67,7 +67,7 @@ def read_rdms(path: str | os.PathLike[str]) -> StoredRDMs | None:
         if not is_rdms(file):
             return None
         node: Any = file["dissimilarities"]
-        values = np.asarray(node[...]) if hasattr(node, "dtype") else np.zeros(0)
+        values: Any = np.asarray(node[...]) if hasattr(node, "dtype") else np.zeros(0)
         if values.ndim != 2 or values.dtype.kind not in "fiu" or not values.size:
             raise DataError(f"{path} has dissimilarities of the shape {list(values.shape)}; expected [RDMs, pairs].")
         patterns, rdms = (_descriptors(file[f"{name}_descriptors"]) for name in ("pattern", "rdm"))

@@ -100,10 +100,11 @@ def _walk(parent: h5py.Group, path: Path, place: str = "") -> Iterator[tuple[str
         if (reason := dead_link(parent, name, path)) is not None:
             yield here, SessionTable(here, {}, str(path), reason)
         elif isinstance(group := parent[name], h5py.Group):
-            if (kind := _class(group)) not in _CLASSES:
+            if (kind := _class(group)) in _CLASSES:
+                yield here, group
+            else:
                 reason = f"{here} of {path} is of the class {brief(kind)}, which is none of {', '.join(_CLASSES)}."
-                group = SessionTable(here, {}, str(path), reason)
-            yield here, group
+                yield here, SessionTable(here, {}, str(path), reason)
             if kind == "Data" and here.count("/") < _DEEPEST:
                 yield from _walk(group, path, here)
 
@@ -184,7 +185,8 @@ def write_temporaldata(path: str | os.PathLike[str], session: Session) -> Path:
         # Whatever holds others needs the time over which these are known.
         for parent in {parent.as_posix() for place in places for parent in place.parents} | {"."}:
             if parent in file:
-                _interval(file[parent], "domain", np.array([[edges[:, 0].min(), edges[:, 1].max()]]))
+                holder: Any = file[parent]
+                _interval(holder, "domain", np.array([[edges[:, 0].min(), edges[:, 1].max()]]))
     return Path(path)
 
 
@@ -266,7 +268,7 @@ def _interval(file: h5py.Group, name: str, edges: NDArray[np.float64], **columns
 def _group(file: h5py.Group, place: str, kind: str) -> h5py.Group:
     """Make the group of an object, and those around it."""
     parent, _, name = place.rpartition("/")
-    around = file if not parent else file[parent] if parent in file else _group(file, parent, "Data")
+    around: Any = file if not parent else file[parent] if parent in file else _group(file, parent, "Data")
     return _object(around.create_group(name), kind)
 
 

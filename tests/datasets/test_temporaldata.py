@@ -4,7 +4,15 @@ import pytest
 import xarray as xr
 
 from brainbench.core.errors import DataError
-from brainbench.datasets import check, export, inspect, open_recordings, write_recordings
+from brainbench.datasets import (
+    StoredRDMs,
+    check,
+    export,
+    inspect,
+    open_recordings,
+    write_rdms,
+    write_recordings,
+)
 from brainbench.datasets.sessions import make_session
 from brainbench.datasets.temporaldata import write_temporaldata
 from tests.factories.recordings import make_simple_session
@@ -162,3 +170,21 @@ def test_what_temporaldata_cannot_hold_is_refused(tmp_path):
     with pytest.raises(DataError, match="rows without start_time or stop_time"):
         write_temporaldata(tmp_path / "a.h5", session)
     assert [*tmp_path.iterdir()] == []
+
+
+def test_formats_mix_in_a_folder_and_the_same_spikes_twice_are_refused(tmp_path):
+    for number, format in enumerate(("nwb", "brainbench", "temporaldata")):
+        path = write_recordings(tmp_path / f"{number}.h5", make_simple_session(subject=f"m{number}"))
+        export(path, tmp_path / "mixed" / f"{number}{'.nwb' if format == 'nwb' else '.h5'}", format=format)
+    mixed = counted(tmp_path / "mixed", strict=True)
+    assert sorted({*mixed["subject"].values.tolist()}) == ["m0", "m1", "m2"]
+    export(path, tmp_path / "mixed" / "again.nwb")
+    with pytest.raises(DataError, match="hold the same spikes"):
+        counted(tmp_path / "mixed")
+    write_rdms(tmp_path / "rdms.h5", StoredRDMs(np.ones((1, 3)), ("a", "b", "c"), ("m0",)))
+    (tmp_path / "rdms.h5").rename(tmp_path / "mixed" / "rdms.h5")
+    (tmp_path / "mixed" / "again.nwb").unlink()
+    with pytest.raises(DataError, match="RDMs without trials"):
+        counted([path for path in (tmp_path / "mixed").iterdir() if path.suffix == ".h5"], strict=True)
+    (reason,) = counted(tmp_path / "mixed").attrs["skipped"]
+    assert "RDMs without trials" in reason
