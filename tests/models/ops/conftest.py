@@ -32,7 +32,6 @@ def single(device: torch.device, monkeypatch: pytest.MonkeyPatch) -> torch.devic
 
     monkeypatch.setattr(dispatch, "usable", lambda x: not x.is_meta)
     monkeypatch.setattr(dispatch, "HALF", torch.float32)
-    monkeypatch.setattr(dispatch, "HALF", torch.float32)
     if device.type == "cuda":
         monkeypatch.setattr(torch.backends.cuda.matmul, "allow_tf32", False)
         monkeypatch.setattr(torch.backends.cudnn, "allow_tf32", False)
