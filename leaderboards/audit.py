@@ -26,8 +26,7 @@ from leaderboards.store import StoredRecord, read_records
 
 TOLERANCE = 1e-3
 """Two runs of one computation agree within this on every machine: float32 sums differ in their last digits."""
-MOST_NAMED = 3
-"""Most contradicting records that are named for one."""
+MOST_NAMED = 3  # most contradicting records that are named for one
 
 
 def remarks(stored: Iterable[StoredRecord]) -> dict[str, tuple[str, ...]]:

@@ -22,10 +22,8 @@ from leaderboards.entries import Entry, fold_seeds, same_computation
 from leaderboards.ranking import DOUBTFUL, Sample, lacking, rank_ranges, told_apart
 from leaderboards.text import number, plural, span
 
-RAW_INPUT = "raw input"
-"""Name of the baseline that a model must be told apart from."""
-MOST_CITED = 8
-"""Works that a board names; anyone may write records."""
+RAW_INPUT = "raw input"  # name of the baseline that a model must be told apart from
+MOST_CITED = 8  # works that a board names; anyone may write records
 NO_SCALE = "its record states neither chance nor the scores without single stimuli; score the model again"
 
 

@@ -20,8 +20,7 @@ from brainbench.core.limits import Count
 from brainbench.core.reading.texts import read_text
 from brainbench.core.reading.values import typed_values
 
-DATA, SALT = "held-out.h5", "salt.txt"
-"""Files of the secret folder."""
+DATA, SALT = "held-out.h5", "salt.txt"  # files of the secret folder
 
 
 class Commitment(msgspec.Struct, frozen=True, rename={"public": "kept"}):

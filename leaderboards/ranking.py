@@ -21,8 +21,7 @@ from brainbench.core.statistics import FEWEST_ANIMALS, FEWEST_STIMULI, LEVEL, tw
 
 FALSE_DISCOVERY_RATE = 0.05
 """Largest expected share of wrong statements among all pairs of a board that are told apart."""
-CHANCE_LEVEL = 0.05
-"""A score with a permutation p above this is not told apart from chance."""
+CHANCE_LEVEL = 0.05  # a score with a permutation p above this is not told apart from chance
 
 
 @dataclass(frozen=True)
@@ -190,8 +189,7 @@ MEANINGS: dict[Standing, str] = {
 }
 """Statements about a score, from the most to the least: every page uses these words and no others."""
 STANDINGS = tuple(MEANINGS)
-DOUBTFUL: tuple[Standing, ...] = ("unreliable", "undefined")
-"""Standings of scores that no conclusion is drawn from."""
+DOUBTFUL: tuple[Standing, ...] = ("unreliable", "undefined")  # standings of scores that no conclusion is drawn from
 BUILT_IN_METRICS = (
     "rsa", "rsa-correlation", "rsa-crossnobis", "rsa-partial", "cka", "decoding", "procrustes", "ridge",
     "soft-matching", "one-to-one",

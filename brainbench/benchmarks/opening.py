@@ -205,8 +205,7 @@ def _key(name: str) -> str:
 ENTRY_POINTS = "brainbench.benchmarks"
 """Group by which a package brings benchmarks: the name, and what is the path of a ``.toml`` or ``.zip``."""
 DEFINITION = "benchmark.toml"
-MOST_DEFINITION = 4 << 20
-"""Bytes of a definition."""
+MOST_DEFINITION = 4 << 20  # bytes of a definition
 ENDINGS = (".toml", ".zip")
 
 
@@ -375,8 +374,7 @@ def files_named_in(scene: Path, texts: object) -> Iterator[Path]:
             yield scene.parent / texts
 
 
-TOLERANCE = 1e-3
-"""Numbers of a ceiling agree within this on every machine."""
+TOLERANCE = 1e-3  # numbers of a ceiling agree within this on every machine
 ADVISED = {
     "citation": "the work to cite", "contact": "whom to ask", "recordings.source": "where the recordings are published",
     "recordings.doi": "their DOI", "recordings.licence": "what others may do with them",

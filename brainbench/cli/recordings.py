@@ -25,8 +25,7 @@ if TYPE_CHECKING:
 
 Metric = Annotated[str, typer.Option(help="RSA metric of the RDMs; 'rsa' is that of scores.")]
 
-_LARGEST_SHOWN = 12
-"""RDMs of more conditions are only written as JSON."""
+_LARGEST_SHOWN = 12  # RDMs of more conditions are only written as JSON
 
 app = typer.Typer(no_args_is_help=True, help="Inspect, check, copy and fetch neural recordings.")
 

@@ -37,8 +37,7 @@ if TYPE_CHECKING:
 FORMAT = "brainbench-recordings"
 VERSION = 1
 KINDS = ("spikes", "responses", "counts")
-RESPONSE = "response"
-"""Data set with the samples of a session by trial."""
+RESPONSE = "response"  # data set with the samples of a session by trial
 
 
 def write_recordings(path: str | os.PathLike[str], recordings: xr.Dataset | Session | Iterable[Session]) -> Path:

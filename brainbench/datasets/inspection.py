@@ -31,12 +31,10 @@ from brainbench.datasets.trials.signals import response_series
 if TYPE_CHECKING:
     import xarray as xr
 
-FEWEST_LABELS = 3
-"""Fewest conditions whose RDM can be compared."""
+FEWEST_LABELS = 3  # fewest conditions whose RDM can be compared
 ENOUGH_TRIALS = 4
 """Fewest trials of each label for the default metric, whose cross-validated distances need two in each half."""
-EXAMPLES = 6
-"""Number of values shown of a column."""
+EXAMPLES = 6  # number of values shown of a column
 _MOST_VALUES = 60
 _STIMULUS = re.compile(r"stim|cond|object|image|texture|shape|categ|orient|freq|odou?r|position", re.IGNORECASE)
 _BEHAVIOUR = re.compile(r"resp|choice|accuracy|correct|outcome|confid|reward|react|lick|key|tags", re.IGNORECASE)

@@ -195,8 +195,7 @@ def _walk(parent: h5py.Group, path: Path, place: str = "") -> Iterator[tuple[str
                 yield from _walk(group, path, here)
 
 
-_DEEPEST = 5
-"""Levels of groups that are searched for tables: links may run in circles."""
+_DEEPEST = 5  # levels of groups that are searched for tables: links may run in circles
 
 
 def _table(group: h5py.Group, name: str, path: Path) -> SessionTable:

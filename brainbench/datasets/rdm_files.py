@@ -24,8 +24,7 @@ from brainbench.datasets.sessions import decode, text
 if TYPE_CHECKING:
     import h5py
 
-LABELS, NAMES = "stimulus", "subject"
-"""Descriptors by which we call stimuli and RDMs."""
+LABELS, NAMES = "stimulus", "subject"  # descriptors by which we call stimuli and RDMs
 
 
 @dataclass(frozen=True)

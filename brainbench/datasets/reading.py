@@ -39,11 +39,9 @@ if TYPE_CHECKING:
 Source = str | os.PathLike[str] | Sequence[str | os.PathLike[str]]
 """A file, a folder, a glob, a list of these, or ``LAYOUT:PATH``."""
 
-ENDINGS = (".nwb", ".h5", ".hdf5")
-"""Endings searched for in a folder; other tools also leave ``.h5`` files beside NWB."""
+ENDINGS = (".nwb", ".h5", ".hdf5")  # endings searched for in a folder; other tools also leave `.h5` files beside NWB
 
-_DEMOS = ("demo", "demo-rodgers")
-"""Names of recordings that are made on first use, above this package."""
+_DEMOS = ("demo", "demo-rodgers")  # names of recordings that are made on first use, above this package
 _SELECTIONS = {"none": EVERYTHING, "default": DEFAULT}
 
 

@@ -30,12 +30,9 @@ if TYPE_CHECKING:
 
 IRREGULAR, REGULAR = "IrregularTimeSeries", "RegularTimeSeries"
 _CLASSES = ("Data", "ArrayDict", "Interval", IRREGULAR, REGULAR)
-_TIMES = {"start": "start_time", "end": "stop_time"}
-"""Columns of every interval → their names here."""
-_DEEPEST = 5
-"""Levels of groups that are searched: links may run in circles."""
-_LONGEST = 1e7
-"""Seconds of a session, each of which gets an entry; more are other units of time."""
+_TIMES = {"start": "start_time", "end": "stop_time"}  # columns of every interval → their names here
+_DEEPEST = 5  # levels of groups that are searched: links may run in circles
+_LONGEST = 1e7  # seconds of a session, each of which gets an entry; more are other units of time
 
 
 def is_temporaldata(file: h5py.File) -> bool:

@@ -15,8 +15,7 @@ import numpy as np
 from brainbench.core.devices import torch_device
 from brainbench.core.errors import UsageError
 
-Array = Any
-"""A numpy array or a torch tensor."""
+Array = Any  # a numpy array or a torch tensor
 
 
 def is_tensor(values: Any) -> bool:

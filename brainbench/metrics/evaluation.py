@@ -247,8 +247,7 @@ def take_layers(values: Floats, index: Ints) -> Floats:
     return np.take_along_axis(values, index[..., None, :], axis=-2)[..., 0, :]
 
 
-Orders = Callable[[], Iterable[Ints]]
-"""Gives chunks of orders of the stimuli [N, K], the same at every call."""
+Orders = Callable[[], Iterable[Ints]]  # gives chunks of orders of the stimuli [N, K], the same at every call
 
 
 @dataclass(frozen=True)

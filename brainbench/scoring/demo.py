@@ -21,8 +21,7 @@ DEMOS = {"demo": "objects", "demo-rodgers": "rodgers"}
 """Names of the demo recordings, each with the recipe of its stimuli."""
 HIDDEN_NETWORK, HIDDEN_LAYER = "resnet18-small+gpt.simclr", "attender.lm_head"
 """The network whose units the neurons of ``demo`` mix, and the layer, averaged over time."""
-VERSION = 3
-"""Raised when the same stimuli and network give other spikes in ``demo``, so that old caches are not reused."""
+VERSION = 3  # raised when the same stimuli and network give other spikes in `demo`, so that old caches are not reused
 _SEED = 18
 
 

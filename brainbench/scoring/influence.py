@@ -13,8 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.records import Score
 
-DECIDES = 0.5
-"""Share from which a unit or an animal decides alone."""
+DECIDES = 0.5  # share from which a unit or an animal decides alone
 _CHANCE_LEVEL = 0.05
 
 

@@ -28,10 +28,8 @@ if TYPE_CHECKING:
 
 _LOG = logging.getLogger(__name__)
 DEFAULT_STIMULI = "rodgers"
-RAW_INPUT = "raw input"
-"""Name of the first baseline, which is the first control of the unique part too."""
-RANDOM_FEATURES = 512
-"""Width of the random-features baseline."""
+RAW_INPUT = "raw input"  # name of the first baseline, which is the first control of the unique part too
+RANDOM_FEATURES = 512  # width of the random-features baseline
 _ELSEWHERE = "features computed elsewhere"
 
 

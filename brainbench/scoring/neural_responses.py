@@ -26,8 +26,7 @@ if TYPE_CHECKING:
     from brainbench.metrics import Metric
     from brainbench.scoring.options import ScoreOptions
 
-PUBLISHED_LAYOUT = "published-npz"
-"""Layout of files of rates whose zeros the published estimators count."""
+PUBLISHED_LAYOUT = "published-npz"  # layout of files of rates whose zeros the published estimators count
 
 
 @dataclass(frozen=True)

@@ -22,8 +22,7 @@ if TYPE_CHECKING:
     from brainbench.metrics import Metric
     from brainbench.stimuli import Fidelity, Stimuli
 
-TIME_BIN = 0.05
-"""Bin width of scores over time, seconds."""
+TIME_BIN = 0.05  # bin width of scores over time, seconds
 
 _NO_NUMBERS = (
     "recordings", "title", "stimuli", "conditions", "match", "select", "window", "whiskers", "fidelity", "metric",

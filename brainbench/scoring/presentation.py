@@ -25,10 +25,8 @@ if TYPE_CHECKING:
     from brainbench.metrics.reliability.drift import Drift
     from brainbench.metrics.reliability.subject_rdm import SubjectRDM
 
-CONTROL = "presentation time"
-"""Name of the control among the baselines of a record."""
-CHANCE_LEVEL = 0.05
-"""The times explain something where their permutation p is at most this."""
+CONTROL = "presentation time"  # name of the control among the baselines of a record
+CHANCE_LEVEL = 0.05  # the times explain something where their permutation p is at most this
 
 
 @dataclass(frozen=True)

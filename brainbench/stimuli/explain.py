@@ -24,8 +24,7 @@ from brainbench.stimuli.scenes.scene import Scene
 if TYPE_CHECKING:
     import xarray as xr
 
-ATTRIBUTE = "explanation"
-"""Attribute of a stimulus set that holds the explanation as JSON."""
+ATTRIBUTE = "explanation"  # attribute of a stimulus set that holds the explanation as JSON
 SECONDS = "seconds"
 """Key of a stimulus set's ``encoding`` under which this process keeps what took how long."""
 _PASSING = ("seconds", "source")  # fields that are not kept

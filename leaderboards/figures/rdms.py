@@ -21,8 +21,7 @@ from leaderboards.text import number
 # colour-blind readers.
 _VIRIDIS = ("440154", "472d7b", "3b528b", "2c728e", "21918c", "28ae80", "5ec962", "addc30", "fde725")
 _LEVELS = 254
-MOST_GROUPS = 60
-"""Most points of a line over pairs of stimuli."""
+MOST_GROUPS = 60  # most points of a line over pairs of stimuli
 
 
 @dataclass(frozen=True)

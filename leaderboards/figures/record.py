@@ -138,8 +138,7 @@ def _head(drawing: Drawing, x: float, y: float, dx: int, dy: int, kind: str = "c
     drawing.path(f"M{x} {y:.1f}L{bx + 3.2 * dy} {by + 3.2 * dx:.1f}L{bx - 3.2 * dy} {by - 3.2 * dx:.1f}z", kind)
 
 
-ALPHA = 0.05
-"""Times with a corrected p up to this are filled."""
+ALPHA = 0.05  # times with a corrected p up to this are filled
 _COURSE_WIDTH, _LEFT, _RIGHT = 640.0, 150.0, 20.0
 _CURVE, _ROW = 190.0, 18.0
 _MOST_LAYERS = 60
@@ -221,8 +220,7 @@ def _ends(interval: Mapping[str, Any] | None) -> tuple[float, ...]:
     return ends if all(map(math.isfinite, ends)) else ()
 
 
-_MOST_STIMULI = 24
-"""Stimuli that are drawn: those that add most to a score, and those that take most from it."""
+_MOST_STIMULI = 24  # stimuli that are drawn: those that add most to a score, and those that take most from it
 
 
 def stimulus_parts(score: Score) -> Drawing | None:
@@ -276,8 +274,7 @@ def unit_parts(statistics: Mapping[str, Any]) -> Drawing | None:
         return None
 
 
-PARTS = {"encoder": "c1", "attender": "c2", "decoder": "c3"}
-"""Colour class of each part of a network."""
+PARTS = {"encoder": "c1", "attender": "c2", "decoder": "c3"}  # colour class of each part of a network
 _WIDTH, _START = 490.0, 150.0
 
 

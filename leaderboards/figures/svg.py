@@ -33,8 +33,7 @@ svg.figure{font:12px system-ui,-apple-system,"Segoe UI",Roboto,"Helvetica Neue",
 """
 """Colours of a drawing that stands alone; the pages bring their own for light and dark."""
 
-COLOURS = 8
-"""Classes ``c1`` to ``c8``; ``c0`` is grey."""
+COLOURS = 8  # classes `c1` to `c8`; `c0` is grey
 
 
 @dataclass
@@ -182,8 +181,7 @@ def _end(element: str, tip: str) -> str:
 
 
 WIDTH = 760.0
-SHOWN = 60
-"""Most models in one figure; the table holds all."""
+SHOWN = 60  # most models in one figure; the table holds all
 
 
 @dataclass(frozen=True)

@@ -135,8 +135,7 @@ def _write_manifest(root: Path, hashes: _Hashes) -> None:
     write_json(root / MANIFEST, {name: sorted(set(hashes[name])) for name in hashes})
 
 
-PAGE = 50
-"""Rows of the table shown at once."""
+PAGE = 50  # rows of the table shown at once
 MODEL_PAGES = 1000
 """Models of a board that have a page of their own, the best first; a site of one record makes that of any other."""
 DOWNLOADS = {

@@ -28,8 +28,7 @@ from robotics_bridge.envs.step import VELOCITY
 from robotics_bridge.policies.contract import RATE, PolicyContract
 from robotics_bridge.policies.export import Runner
 
-PRIORITY = 20
-"""Priority under SCHED_FIFO (1–99); above ordinary threads, below the kernel's own (50)."""
+PRIORITY = 20  # priority under SCHED_FIFO (1–99); above ordinary threads, below the kernel's own (50)
 
 
 @contextlib.contextmanager

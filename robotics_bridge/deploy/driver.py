@@ -35,8 +35,7 @@ class HandReading:
     """Summed contact force of each finger tip [F, 3], as the maker's ``calc_pressure`` gives it."""
 
 
-Source = Callable[["HandReading"], "NDArray[np.floating]"]
-"""A group of observations for a report: touch, or the goal."""
+Source = Callable[["HandReading"], "NDArray[np.floating]"]  # a group of observations for a report: touch, or the goal
 
 
 @dataclass
@@ -127,5 +126,4 @@ def open_driver(name: str, request: DriverRequest) -> AbstractContextManager[Dri
     return opener(request)
 
 
-DRIVERS = "robotics_bridge.drivers"
-"""Group of entry points: name → opener of a driver."""
+DRIVERS = "robotics_bridge.drivers"  # group of entry points: name → opener of a driver

@@ -138,8 +138,7 @@ class Command:
     """Latest time (s, by the link's clock) at which it may be sent (:meth:`SafeLink.deadline`)."""
 
 
-SILENCE = 0.25
-"""Longest time without a command (s) after which the link stops the hand, in a thread of its own."""
+SILENCE = 0.25  # longest time without a command (s) after which the link stops the hand, in a thread of its own
 
 
 class SafeLink:

@@ -22,10 +22,8 @@ from robotics_bridge.policies.contract import PolicyContract
 from robotics_bridge.policies.export import read_policy
 from robotics_bridge.tasks.task import check_measured
 
-REAL_TYPES = ("agg_bool", "agg_force")
-"""Observation types that a real hand can measure."""
-LARGEST_SCALE = 1e6
-"""Largest scale or threshold of a pressure calibration."""
+REAL_TYPES = ("agg_bool", "agg_force")  # observation types that a real hand can measure
+LARGEST_SCALE = 1e6  # largest scale or threshold of a pressure calibration
 _Scale = Annotated[float, Limit(least=-LARGEST_SCALE, most=LARGEST_SCALE)]
 
 
@@ -110,8 +108,7 @@ class RealTouch:
         return group
 
 
-LARGEST_INPUT = 1e6
-"""Largest magnitude of a constant in place of an observation."""
+LARGEST_INPUT = 1e6  # largest magnitude of a constant in place of an observation
 _MEANINGS = {
     "thermal": "temperatures of the skin",
     "command": "what the hand is told",

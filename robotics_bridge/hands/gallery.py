@@ -20,8 +20,7 @@ mujoco = mujoco_module()
 _RADIUS = 6e-3  # radius of the balls that press (m)
 _DEPTH = 3e-4  # depth to which they press (m)
 _AWAY = 10.0  # where a ball waits (m)
-WRONG = 0.01
-"""Part of a load that taxels may lack without a word."""
+WRONG = 0.01  # part of a load that taxels may lack without a word
 
 
 @dataclass(frozen=True)

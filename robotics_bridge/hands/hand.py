@@ -34,8 +34,7 @@ _AUTO_GRIDS = {
     "high": {"tips": (6, 8, 0.002), "fingers": (6, 7, 0.0016), "palm": (20, 11, 0.0016)},
 }
 """Rows, columns and radius (m) on a link of a hand without a layout of its own."""
-UNKNOWN_SPEED = 5.0
-"""Speed (rad/s) that counts as the largest of a hinge whose data states none."""
+UNKNOWN_SPEED = 5.0  # speed (rad/s) that counts as the largest of a hinge whose data states none
 LEVER = 0.05
 """Length of a finger (m) whose tip moves as a slide, where a number is stated for hinges alone: 1 rad is .05 m."""
 _PHYSICS = (

@@ -17,8 +17,7 @@ from robotics_bridge.hands.spec import BoxGeometry, CapsuleGeometry, Grid, Link,
 from robotics_bridge.sensors.probes.placement import Probes
 
 RESOLUTIONS = ("low", "med", "high")
-PLACEMENTS = ("hand", "tips", "fingers", "palm")
-"""``fingers`` includes the tips; ``hand`` is fingers and palm."""
+PLACEMENTS = ("hand", "tips", "fingers", "palm")  # `fingers` includes the tips; `hand` is fingers and palm
 Layout = dict[str, Probes]
 """Link → its probes, in the link's frame."""
 

@@ -17,10 +17,8 @@ from robotics_bridge import sensors
 from robotics_bridge.hands.layouts import Layout
 from robotics_bridge.sensors.sensor import Sensor
 
-PATCH_FORCE_SCALE = 1e4
-"""From summed depth (m) to the reading of the real finger tip (4.29)."""
-TAXELS_IN_CONTACT = 2
-"""More taxels than this must touch for a link to count as touching (table 4.6)."""
+PATCH_FORCE_SCALE = 1e4  # from summed depth (m) to the reading of the real finger tip (4.29)
+TAXELS_IN_CONTACT = 2  # more taxels than this must touch for a link to count as touching (table 4.6)
 
 HOLDING: Mapping[str, Any] = {"total": "engine", "friction": 1.0}
 """Settings of force taxels whose tangential reading is what holds an object (coefficient of rubber on a solid, 1)."""
@@ -65,8 +63,7 @@ def observation_type(name: str) -> ObservationType:
     return OBSERVATIONS[name]
 
 
-PROXIMITY_RADIUS = 0.01
-"""Sensing radius of proximity taxels (table 4.6) [m]."""
+PROXIMITY_RADIUS = 0.01  # sensing radius of proximity taxels (table 4.6) [m]
 
 
 def sensors_for(

@@ -21,12 +21,10 @@ _NAMES = {"name", "class", "childclass", "joint", "body", "link", "geom", "site"
 _LARGEST = 1e15  # magnitude of numbers in a hand's file that no hand has
 _DEEPEST = 32  # includes within one another
 _FOLDERS = ("meshdir", "texturedir", "assetdir")
-MOST_SAMPLES = 1 << 24
-"""Samples of a height field or picture."""
+MOST_SAMPLES = 1 << 24  # samples of a height field or picture
 MOST_COPIES = 10_000
 """Copies of an element, within one another together; also points of a flexible body and entries of tables."""
-MOST_ARENA = 1 << 30
-"""Bytes that a file may ask for contacts and constraints."""
+MOST_ARENA = 1 << 30  # bytes that a file may ask for contacts and constraints
 _SUFFIXES = {"": 1, "K": 1 << 10, "M": 1 << 20, "G": 1 << 30, "T": 1 << 40, "P": 1 << 50, "E": 1 << 60}
 _COUNTED = ("replicate", "composite", "flexcomp", "grid")
 _TABLES = re.compile(r"n(user|key|uspare|user_\w+)?(data)?")

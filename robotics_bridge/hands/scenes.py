@@ -20,8 +20,7 @@ from robotics_bridge.hands.tree import Tree, coupled
 
 mujoco = mujoco_module()
 
-OBJECT = "object"
-"""Name of the free body and of its geometry."""
+OBJECT = "object"  # name of the free body and of its geometry
 WEAK_SERVO, WEAK_PUSH, ARMATURE = (2.0, 0.2), (300.0, 10.0), 0.01
 """Stiffness and damping of a hinge without a servo (N·m/rad, N·m·s/rad) and of such a slide (N/m, N·s/m); inertia of
 their drives (kg·m², kg for a slide)."""

@@ -14,8 +14,7 @@ FOLDER = Path(__file__).parent / "trained"
 """A run's folder per policy, with a model card."""
 SENSING = "policy"
 """Folder in a teacher's run with the policy as a student's, where it trained on what a hand measures."""
-HINT = "Or give the folder of a training run."
-"""What to do instead where there is no policy of a name."""
+HINT = "Or give the folder of a training run."  # what to do instead where there is no policy of a name
 
 
 def list_policies(kind: str, task: str | None = None) -> list[str]:

@@ -30,10 +30,8 @@ from robotics_bridge.sensors.temperature.grid import TemperatureGrid
 
 LARGEST = 3.0
 """Radius (m) around the probes of one sensor, or around a touched mesh, above which numbers look like millimetres."""
-WIDEST = 0.3
-"""Sensing radius (m) of a taxel above which it does, if it also exceeds the patch of its sensor."""
-DEEPEST = 0.05
-"""Depth (m) at which a contact begins above which it does."""
+WIDEST = 0.3  # sensing radius (m) of a taxel above which it does, if it also exceeds the patch of its sensor
+DEEPEST = 0.05  # depth (m) at which a contact begins above which it does
 _CONVEX = ("sphere", "capsule", "ellipsoid", "cylinder", "box")
 
 

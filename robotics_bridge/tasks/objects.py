@@ -18,10 +18,8 @@ from brainbench.core.limits import Positive, limited
 from brainbench.core.reading.ranges import check_numbers
 from robotics_bridge.tasks.settings import unit_vector
 
-GRAIN = 1e-4
-"""Half size of the stand-in for a solid that a shape lacks [m]."""
-LARGEST = 3.0
-"""Half size above which numbers of a hand's object look like millimetres [m]."""
+GRAIN = 1e-4  # half size of the stand-in for a solid that a shape lacks [m]
+LARGEST = 3.0  # half size above which numbers of a hand's object look like millimetres [m]
 _SIZES = {"box": 3, "cylinder": 2, "capsule": 2, "sphere": 1}
 
 
@@ -182,8 +180,7 @@ CUBES = tuple(
     )
 )  # fmt: skip
 """The published blocks of the two reorientation tasks (released settings of the thesis)."""
-PRIMITIVES = (*CUBES, cylinder(0.020, 0.042), cylinder(0.017, 0.038))
-"""Blocks and cylinders."""
+PRIMITIVES = (*CUBES, cylinder(0.020, 0.042), cylinder(0.017, 0.038))  # blocks and cylinders
 SCREWDRIVERS = (
     screwdriver(0.2032, 0.0960, 0.0218, 0.0035), screwdriver(0.2032, 0.0960, 0.0223, 0.0040),
     screwdriver(0.2032, 0.1090, 0.0195, 0.0030), screwdriver(0.2032, 0.1000, 0.0210, 0.0028),

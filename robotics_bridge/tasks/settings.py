@@ -15,10 +15,8 @@ from brainbench.core.errors import UsageError, brief, check_each
 from brainbench.core.limits import Count, Limit, NotNegative, Positive, Share, limited
 from brainbench.core.reading.ranges import check_numbers
 
-Range = tuple[float, float]
-"""Lower and upper bound of a uniform distribution."""
-Factors = tuple[NotNegative, NotNegative]
-"""The same of numbers that are not negative."""
+Range = tuple[float, float]  # lower and upper bound of a uniform distribution
+Factors = tuple[NotNegative, NotNegative]  # the same of numbers that are not negative
 
 
 def check_order(options: Any, *names: str, of: str = "{}") -> None:

@@ -335,8 +335,7 @@ class Task:
 ACTION_LIMIT = 2.0
 """Bound of actions of the tasks on which we train: an action of 1 is half a joint's range, so 2 reaches every target
 from every rest position."""
-TASK_VERSION = 3
-"""Raised when a change of the tasks leaves earlier policies in a world that they were not trained in."""
+TASK_VERSION = 3  # raised when a change of the tasks leaves earlier policies in a world that they were not trained in
 GROUPS = (
     "proprio", "tactile", "link_pose", "command", "goal", "priv_proprio", "priv_obj_state", "priv_obj_props",
     "priv_thermal", "thermal", "aux_obj_size", "aux_goal_dist", "aux_obj_tilt", "aux_rotation_progress",

@@ -32,12 +32,10 @@ from robotics_bridge.tasks.task import (
     Task,
 )
 
-PALM_UP = (0.7071067811865476, 0.0, -0.7071067811865475, 0.0)
-"""The palm faces up, the fingers point along −x."""
+PALM_UP = (0.7071067811865476, 0.0, -0.7071067811865475, 0.0)  # the palm faces up, the fingers point along −x
 GOALS = 15
 PUBLISHED_GOAL = SteppingRotation(axis=(-1.0, 0.0, 0.0), step=1.570795, threshold=0.1, allowed_off_axis=0.5235983333)
-FLAT_GOAL = replace(PUBLISHED_GOAL, lying_flat=True, by_looks=True)
-"""Goals at which every object can lie on the palm."""
+FLAT_GOAL = replace(PUBLISHED_GOAL, lying_flat=True, by_looks=True)  # goals at which every object can lie on the palm
 CUPPED = {
     "right_hand_thumb_bend_joint": 1.2, "right_hand_thumb_rota_joint1": 0.25, "right_hand_thumb_rota_joint2": 0.8,
     "right_hand_mid_joint1": 0.5, "right_hand_mid_joint2": 0.8,

@@ -28,10 +28,8 @@ from brainbench.core.reading.regular import check_file, readable
 
 SECONDS = 60.0
 """Time for a file, by default."""
-MEMORY = 8 << 30
-"""Address space [bytes]; compiled libraries reserve much more than they use."""
-MOST_WRITTEN = 16 << 30
-"""Bytes that a file which is written may have."""
+MEMORY = 8 << 30  # address space [bytes]; compiled libraries reserve much more than they use
+MOST_WRITTEN = 16 << 30  # bytes that a file which is written may have
 CRASHED = "is damaged: the library that reads it crashed or did not come back; copy it again"
 """What is said after the name of a file with which the process ended."""
 

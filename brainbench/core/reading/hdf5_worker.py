@@ -17,14 +17,11 @@ import stat
 from pathlib import Path
 from typing import Any
 
-MOST_MEMORY = 2 << 30
-"""Bytes that an array may take beyond :data:`MOST_EXPANSION` times what is stored of it."""
-MOST_EXPANSION = 200
-"""Bytes of an array for each stored one; recordings reach about 20, a decompression bomb 1000."""
+MOST_MEMORY = 2 << 30  # bytes that an array may take beyond MOST_EXPANSION times what is stored of it
+MOST_EXPANSION = 200  # bytes of an array for each stored one; recordings reach about 20, a decompression bomb 1000
 SMALL = 1 << 20
 """Bytes of an array that is read as a whole, since its numbers may lead elsewhere (texts of any length)."""
-MOST_HOPS = 32
-"""Links that follow one another."""
+MOST_HOPS = 32  # links that follow one another
 
 
 class Refused(Exception):

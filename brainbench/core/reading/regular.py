@@ -10,12 +10,9 @@ from pathlib import Path
 
 from brainbench.core.errors import BrainbenchError, DataError, DataFileNotFoundError, brief, nearest
 
-MOST_TEXT = 64 << 20
-"""Bytes of a text file that is parsed; nested lists take about twenty times as much memory."""
-MOST_TABLE = 256 << 20
-"""Bytes of a table of comma-separated numbers."""
-MOST_PART = 512 << 20
-"""Bytes of a file that another names: a mesh, a buffer, a picture."""
+MOST_TEXT = 64 << 20  # bytes of a text file that is parsed; nested lists take about twenty times as much memory
+MOST_TABLE = 256 << 20  # bytes of a table of comma-separated numbers
+MOST_PART = 512 << 20  # bytes of a file that another names: a mesh, a buffer, a picture
 
 
 def check_file(path: str | os.PathLike[str], kind: str = "file", *, most: int | None = None) -> Path:

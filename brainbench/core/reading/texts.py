@@ -12,10 +12,8 @@ from typing import Any
 from brainbench.core.errors import DataError, brief, listing, needing, repeats
 from brainbench.core.reading.regular import MOST_TEXT, check_file, readable, reason
 
-MOST_LEVELS = 64
-"""Levels of nesting."""
-LARGEST_WHOLE = 2**63 - 1
-"""Largest magnitude of a whole number."""
+MOST_LEVELS = 64  # levels of nesting
+LARGEST_WHOLE = 2**63 - 1  # largest magnitude of a whole number
 
 
 def read_text(path: str | os.PathLike[str], kind: str = "text file", *, most: int = MOST_TEXT) -> str:

@@ -36,10 +36,8 @@ from brainbench.datasets.trials.selection import (
 )
 
 Severity = Literal["error", "warning", "note"]
-SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
-"""Worst first."""
-LONGEST_SESSION = 48 * 3600.0
-"""Times that span more than this (s) are no seconds."""
+SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")  # worst first
+LONGEST_SESSION = 48 * 3600.0  # times that span more than this (s) are no seconds
 
 
 @dataclass(frozen=True)
@@ -68,8 +66,7 @@ def some(names: list[str], limit: int = 5) -> str:
     return listing(names, limit=limit, quoted=False)
 
 
-_FEW = 2
-"""Split halves need this many trials of every stimulus."""
+_FEW = 2  # split halves need this many trials of every stimulus
 
 
 def check_labels(session: Session, layout: RecordingLayout | None, conditions: Conditions | None) -> Iterator[Finding]:
@@ -175,12 +172,9 @@ def _answers(table: SessionTable) -> Iterator[Finding]:
 
 
 _LONGEST_TRIAL = 600.0
-_MANY_ROWS = 10
-"""A table of few long rows may be one of epochs."""
-_SHIFTS = range(-5, 6)
-"""Rows by which a column is tried against the trials."""
-_GAP = 30.0
-"""A silence of all units this long (s) is a break in the recording."""
+_MANY_ROWS = 10  # a table of few long rows may be one of epochs
+_SHIFTS = range(-5, 6)  # rows by which a column is tried against the trials
+_GAP = 30.0  # a silence of all units this long (s) is a break in the recording
 
 
 def check_tables(session: Session) -> Iterator[Finding]:
@@ -372,24 +366,18 @@ def _gaps(spikes: list[NDArray[np.float64]], low: float, high: float) -> list[tu
     return [(float(edges[busy[index]] + 1), float(edges[busy[index + 1]])) for index in after]
 
 
-BIN = 0.005
-"""Resolution, s."""
-RESPONSE = (0.005, 0.030)
-"""Time after a touch in which neurons answer, s."""
-BEFORE = 0.060
-"""Baseline before it, s."""
-LARGEST = 600.0
-"""Largest shift that is searched for, s."""
+BIN = 0.005  # resolution, s
+RESPONSE = (0.005, 0.030)  # time after a touch in which neurons answer, s
+BEFORE = 0.060  # baseline before it, s
+LARGEST = 600.0  # largest shift that is searched for, s
 CLEAR = 6.5
 """Standard deviations from which a response at any of 240,000 lags is taken for real; Poisson noise of
 one to thirty units reached 6 in 450 sessions."""
 PRESENT, ABSENT = 3.5, 2.5
 """Standard deviations from which, and below which, there is (not) a response at the touch itself; noise
 exceeds the first in one session of 450."""
-RHYTHM = 2.0
-"""Time (s) around a first touch in which other touches are answered too."""
-TOLERANCE = 0.020
-"""Shift (s) up to which the clock is taken for right."""
+RHYTHM = 2.0  # time (s) around a first touch in which other touches are answered too
+TOLERANCE = 0.020  # shift (s) up to which the clock is taken for right
 _FEWEST_EVENTS = 20
 # Longest span of spikes that is searched, s: 8.6 million bins, of which the correlation makes several arrays.
 _LONGEST = 12 * 3600.0
@@ -534,16 +522,12 @@ def _seconds(lag: float) -> str:
 
 Spikes = list[NDArray[np.float64]]
 
-COINCIDENT = 2e-4
-"""Spikes of two units this close (s) are taken for one: a spike lasts about a millisecond."""
-SAME, SIMILAR = 0.95, 0.5
-"""Share of the smaller unit's spikes that coincide with the other's, beyond chance."""
-REFRACTORY = 1.5e-3
-"""No neuron fires again within this time (s)."""
+COINCIDENT = 2e-4  # spikes of two units this close (s) are taken for one: a spike lasts about a millisecond
+SAME, SIMILAR = 0.95, 0.5  # share of the smaller unit's spikes that coincide with the other's, beyond chance
+REFRACTORY = 1.5e-3  # no neuron fires again within this time (s)
 VIOLATIONS, MANY_VIOLATIONS = 0.01, 0.1
 """Share of intervals below the refractory time in a unit that is not one neuron, or no neuron at all."""
-_FEWEST_SPIKES = 50
-"""Spikes that a unit needs to be judged."""
+_FEWEST_SPIKES = 50  # spikes that a unit needs to be judged
 
 
 def check_spikes(session: Session, spikes: Spikes) -> Iterator[Finding]:

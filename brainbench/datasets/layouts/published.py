@@ -148,8 +148,7 @@ DETECTION = replace(
 TRAIN = "acquisition/SpikeTrain"
 ONSET, OFFSET = "touch_onset", "touch_offset"
 _WHISKER = re.compile(rf"^(?P<prefix>acquisition/(?:principal_)?whisker_(?P<name>\w+)/){ONSET}$")
-WHISKER = "C2"
-"""The files do not name the whisker; the paper recorded around the C2 column with one whisker left."""
+WHISKER = "C2"  # the files do not name the whisker; the paper recorded around the C2 column with one whisker left
 
 POLE_RULES = (Rule("type", refuse=("N/A",)), Rule("stim_present", refuse=("true",), required=False))
 """Photostimulated trials are not the neuron's own answer to touch."""

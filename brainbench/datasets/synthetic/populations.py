@@ -25,8 +25,7 @@ from brainbench.core.contracts import Trials
 from brainbench.core.errors import DataError, UsageError
 from brainbench.core.reading.ranges import check_fields, check_number
 
-MODULATION = 0.4
-"""Largest modulation: beyond it too many rates would be cut off at zero for the truth to hold."""
+MODULATION = 0.4  # largest modulation: beyond it too many rates would be cut off at zero for the truth to hold
 
 
 @dataclass(frozen=True)

@@ -38,8 +38,7 @@ from brainbench.datasets.synthetic.truth import (
 if TYPE_CHECKING:
     import xarray as xr
 
-CHOICE = (0.80, 0.97)
-"""Earliest and latest choice, s after the shape comes into reach."""
+CHOICE = (0.80, 0.97)  # earliest and latest choice, s after the shape comes into reach
 _REACH = 1.0  # from trial start to the first frame of the stimulus, s
 _LAYERS = ((130, "1"), (450, "2/3"), (600, "4"), (950, "5"), (1300, "6"))
 
@@ -253,8 +252,7 @@ def first_contacts(
     return first
 
 
-VERSION = 3
-"""Raised when the same stimuli give other spikes, so that old caches are not reused."""
+VERSION = 3  # raised when the same stimuli give other spikes, so that old caches are not reused
 
 _ANIMALS = (
     (SessionPlan("demo01", "01", 34, 170, detection=True), SessionPlan("demo01", "02", 30, 140)),

@@ -237,8 +237,7 @@ def _pearson(first: NDArray[np.float64], second: NDArray[np.float64]) -> float:
     return float(a @ b / size) if size > 0 else float("nan")
 
 
-_LATENCY, _JITTER = 0.012, 0.003
-"""Onset response after contact, s."""
+_LATENCY, _JITTER = 0.012, 0.003  # onset response after contact, s
 _ONSET = 0.15  # share of the spikes in a window that belong to the onset response
 _DEAD = 0.002  # refractory time, s
 
@@ -302,8 +301,7 @@ _BEFORE = 0.5  # from trial start to contact, s
 _AFTER = (0.25, 1.25)
 """Least and most time from the end of the window to the end of the trial, s: no two trials are alike in
 length, so that a shifted clock cannot hide behind a regular rhythm."""
-REST = 0.5
-"""Rate between windows, as a share of a unit's mean rate."""
+REST = 0.5  # rate between windows, as a share of a unit's mean rate
 _TOUCH = 0.05  # duration of a contact, s
 
 

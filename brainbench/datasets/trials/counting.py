@@ -19,8 +19,7 @@ from brainbench.datasets.trials.selection import CONTACTS, Conditions, Selection
 from brainbench.datasets.trials.signals import VOLTAGES, Samples, response_series
 
 COVARIATES = ("contacts", "licks", "choice")
-LICKS = "licks"
-"""Name of the event series, and of the table that a copy keeps it in."""
+LICKS = "licks"  # name of the event series, and of the table that a copy keeps it in
 _NO_CHOICE = ("", "nogo", "none", "miss", "nan")
 
 
@@ -63,8 +62,7 @@ def _inside(times: NDArray[np.float64], edges: NDArray[np.float64]) -> NDArray[n
     return np.diff(np.searchsorted(times, edges, side="left"), axis=1)[:, 0].astype(np.float64)
 
 
-GROUPS = ("area", "layer", "cell_type")
-"""Unit columns whose values are groups of units."""
+GROUPS = ("area", "layer", "cell_type")  # unit columns whose values are groups of units
 UNIT_COLUMNS = {"depth": float, "inhibitory": float, **dict.fromkeys(GROUPS, str)}
 """Unit columns carried along where present, with the type that can say "missing"."""
 OTHER_NAMES = {
@@ -75,8 +73,7 @@ OTHER_NAMES = {
 """Names that files give to a unit column, in the order in which they are looked for."""
 
 _TRUTH = {"true": 1.0, "false": 0.0}
-_MOST_COUNTS = 1 << 32
-"""Counts of one session that are made at most: 16 GiB."""
+_MOST_COUNTS = 1 << 32  # counts of one session that are made at most: 16 GiB
 
 
 @dataclass(frozen=True)

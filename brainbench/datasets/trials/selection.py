@@ -264,10 +264,8 @@ class Selection:
             yield f"subjects: {', '.join(self.subjects)}"
 
 
-EVERYTHING = Selection(min_spikes=0, name="none")
-"""No rule at all, silent units included."""
-DEFAULT = Selection(name="default")
-"""All trials; units with at least one spike."""
+EVERYTHING = Selection(min_spikes=0, name="none")  # no rule at all, silent units included
+DEFAULT = Selection(name="default")  # all trials; units with at least one spike
 
 
 def select_rows(table: SessionTable, rules: Sequence[Rule], kind: str, ledger: Ledger) -> NDArray[np.bool_]:
@@ -502,8 +500,7 @@ class Window:
         return np.where(first < until, first, np.nan)
 
 
-WHOLE = Window("start", stop="stop")
-"""The whole interval of each row."""
+WHOLE = Window("start", stop="stop")  # the whole interval of each row
 
 
 def _event(table: SessionTable, anchor: str) -> NDArray[np.float64]:

@@ -27,8 +27,7 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float64]
 POOLS = ("subject", "session", "all")
-ALL = "all"
-"""Name of the one subject that pooling all animals makes."""
+ALL = "all"  # name of the one subject that pooling all animals makes
 NAMES = ("stimulus", "subject", "session", "unit_subject", "unit_session")
 """Coordinates that decide which counts are compared."""
 
@@ -367,12 +366,9 @@ def _about(part: SessionCounts) -> dict[str, Any]:
     }
 
 
-_FEWEST_SPIKES = 6
-"""Spikes that a unit needs to be recognised."""
-_COMPARED = 32
-"""Intervals that are compared; so many that agree to a tenth of a millisecond are no chance."""
-_EQUAL = 1e-4
-"""Intervals (s) that differ by less are equal."""
+_FEWEST_SPIKES = 6  # spikes that a unit needs to be recognised
+_COMPARED = 32  # intervals that are compared; so many that agree to a tenth of a millisecond are no chance
+_EQUAL = 1e-4  # intervals (s) that differ by less are equal
 
 
 @dataclass

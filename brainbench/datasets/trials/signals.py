@@ -19,10 +19,8 @@ from brainbench.datasets.sessions import Series, Session, SessionTable
 from brainbench.datasets.trials.selection import WHOLE, Selection, Window
 
 Floats = NDArray[np.float64]
-VOLTAGES = "ElectricalSeries"
-"""Type of signals that are read as power in a band."""
-ORDER = 4
-"""Order of the Butterworth filter of a band, which runs forwards and backwards."""
+VOLTAGES = "ElectricalSeries"  # type of signals that are read as power in a band
+ORDER = 4  # order of the Butterworth filter of a band, which runs forwards and backwards
 SETTLING = 4.0
 """Cycles of the lower edge, and inverse widths of the band, that are filtered on either side of what is read."""
 

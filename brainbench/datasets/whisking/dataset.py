@@ -204,10 +204,8 @@ def most_open() -> int:
 View = Literal["grid", "raw"]
 Unstable = Literal["skip", "zero", "error"]
 
-SPLITS = ("train", "validation", "test", "all")
-"""Values of ``split``; ``all`` is the three together."""
-SWEEP_READERS = "brainbench.sweeps"
-"""Entry points that open sweeps of others; the published study's are ``published``."""
+SPLITS = ("train", "validation", "test", "all")  # values of `split`; `all` is the three together
+SWEEP_READERS = "brainbench.sweeps"  # entry points that open sweeps of others; the published study's are `published`
 
 _AHEAD = 2
 _BLOCK = 64

@@ -24,8 +24,7 @@ if TYPE_CHECKING:
 
     from brainbench.datasets.whisking.dataset import WhiskingDataset
 
-FEW_OBJECTS = 5
-"""With fewer objects of a class than this the accuracy is called unreliable."""
+FEW_OBJECTS = 5  # with fewer objects of a class than this the accuracy is called unreliable
 FOLDS = 5
 RESAMPLES = 2000
 _PENALTY = 10.0

@@ -22,16 +22,13 @@ from brainbench.metrics.arrays import find_device
 from brainbench.metrics.rdms.comparison import check_comparison, permuted_comparisons
 from brainbench.metrics.rdms.pairs import Floats, Ints, permuted_pairs, rdm_stack, square, stimulus_count
 
-EXACT_STIMULI = 8
-"""Up to this many stimuli all orders are taken (8! = 40,320)."""
+EXACT_STIMULI = 8  # up to this many stimuli all orders are taken (8! = 40,320)
 
 RANDOM_PERMUTATIONS = 10_000
 
-SMALLEST_STIMULI = 4
-"""Below this no p is given: 3 stimuli have 6 orders, so p could never fall below 1/6."""
+SMALLEST_STIMULI = 4  # below this no p is given: 3 stimuli have 6 orders, so p could never fall below 1/6
 
-TIE = 1e-12
-"""Statistics closer than this are equal: permutations that map an RDM onto itself differ by rounding."""
+TIE = 1e-12  # statistics closer than this are equal: permutations that map an RDM onto itself differ by rounding
 
 _CHUNK_ELEMENTS = 1 << 22
 

@@ -19,8 +19,7 @@ from brainbench.metrics.measures.patterns import PatternMetric
 from brainbench.metrics.rdms.pairs import Floats, Ints
 from brainbench.metrics.reliability.subject_rdm import SubjectRDM
 
-MOST_FEATURES = 128
-"""Features that soft matching takes of a layer, at random; as many as units, where these are more."""
+MOST_FEATURES = 128  # features that soft matching takes of a layer, at random; as many as units, where these are more
 
 
 class UnitMatching(PatternMetric):

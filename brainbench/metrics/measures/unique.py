@@ -25,10 +25,8 @@ from brainbench.metrics.rdms.pairs import Floats, Ints, permuted_pairs, stimulus
 from brainbench.metrics.reliability.noise_correction import spearman_brown
 from brainbench.metrics.reliability.subject_rdm import SubjectRDM, is_flat
 
-FEWEST_STIMULI = 10
-"""Stimuli below which a half has too few pairs to fit and to judge weights."""
-SPLITS = 24
-"""Random halves of the stimuli; the error that their number leaves is stated."""
+FEWEST_STIMULI = 10  # stimuli below which a half has too few pairs to fit and to judge weights
+SPLITS = 24  # random halves of the stimuli; the error that their number leaves is stated
 _SWEEPS, _TOLERANCE = 100, 1e-8
 _TRIAL_SPLITS, _FEWEST_TRIAL_SPLITS, _FEW_STIMULI = 40, 4, 40
 """Splits of the trials for each half of up to 40 stimuli, of more in proportion fewer, and the fewest."""

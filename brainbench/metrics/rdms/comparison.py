@@ -279,8 +279,7 @@ LINEAR: dict[str, Transform] = {
 }
 """Comparisons that are products of linear functions of both RDMs, divided by their lengths."""
 
-WITHOUT = ("cosine", "whitened-cosine")
-"""Comparisons whose products without a stimulus follow from those of all."""
+WITHOUT = ("cosine", "whitened-cosine")  # comparisons whose products without a stimulus follow from those of all
 
 _METHODS: dict[str, tuple[Transform, Transform]] = {
     "pearson": (_pearson, _pearson),
@@ -294,8 +293,7 @@ _METHODS: dict[str, tuple[Transform, Transform]] = {
 }
 """Comparison → what makes its vectors, and what RDMs pass through before they are averaged."""
 
-COMPARISONS = tuple(_METHODS)
-"""Names that ``method`` of :func:`compare` takes."""
+COMPARISONS = tuple(_METHODS)  # names that `method` of compare takes
 
 
 def _compare_complete(left: Floats, right: Floats, method: str) -> Floats:

@@ -153,8 +153,7 @@ def _correlation_of_present(patterns: Array) -> Array:
 
 
 POISSON_PRIOR_MEAN = 1.0
-POISSON_PRIOR_WEIGHT = 0.1
-"""Gamma prior that keeps the logarithm of a silent unit finite (rsatoolbox's defaults)."""
+POISSON_PRIOR_WEIGHT = 0.1  # gamma prior that keeps the logarithm of a silent unit finite (rsatoolbox's defaults)
 
 _ASYMMETRY = 1e-6  # largest difference across the diagonal of a noise precision, as a share of its largest number
 
@@ -358,5 +357,4 @@ _METHODS: dict[str, Callable[[_Responses], Array]] = {
     "poisson": _poisson,
 }
 
-RDM_METHODS = tuple(_METHODS)
-"""Names that ``method`` of :func:`rdm` takes."""
+RDM_METHODS = tuple(_METHODS)  # names that `method` of rdm takes

@@ -21,8 +21,7 @@ from brainbench.metrics.arrays import is_tensor, library
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
-LARGEST = 1e150
-"""Largest dissimilarity, whose square is still a number."""
+LARGEST = 1e150  # largest dissimilarity, whose square is still a number
 
 
 def stimulus_count(pairs: int) -> int:
@@ -102,8 +101,7 @@ def rdm_stack(rdms: ArrayLike | Sequence[ArrayLike], what: str) -> Floats:
 
 _LARGEST_LABELLED = 24  # stimuli up to which names are written; above, the cells alone are drawn
 _LARGEST_DRAWN = 120
-_SIDE, _WIDE = 300, 26
-"""Side of the matrix, and of the smallest cell that holds a number, in pixels."""
+_SIDE, _WIDE = 300, 26  # side of the matrix, and of the smallest cell that holds a number, in pixels
 _DARK, _LIGHT, _MISSING = np.array([14, 77, 84]), np.array([240, 246, 245]), np.array([214, 208, 196])
 
 

@@ -18,8 +18,7 @@ from brainbench.metrics.arrays import finite_mean
 from brainbench.metrics.reliability.noise_correction import RELIABILITY_GATE, spearman_brown
 from brainbench.metrics.reliability.subject_rdm import FEWEST_SESSIONS, SubjectRDM
 
-LEVEL = 0.01
-"""Responses drift where so few random halves agree as little; of fewer than 100 halves, where none does."""
+LEVEL = 0.01  # responses drift where so few random halves agree as little; of fewer than 100 halves, where none does
 _ORDERS = 999
 _TIE = 1e-12
 

@@ -245,8 +245,7 @@ def half_rdms(sessions: list[SortedTrials], count: int, method: str, index: Ints
     return np.concatenate([part[0] for part in parts]), np.concatenate([part[1] for part in parts])
 
 
-UNIT_GATE = 0.5
-"""Smallest reliability of a unit that :func:`reliable_units` keeps (published)."""
+UNIT_GATE = 0.5  # smallest reliability of a unit that reliable_units keeps (published)
 
 _SPLITS = 100
 _CHUNK = 20

@@ -32,8 +32,7 @@ ANIMAL_GATE = 0.3
 """Smallest reliability of an animal that is scored with the others. It lies well below the gate of the study: animals
 kept just above a gate are those whose reliability came out too high, and their scores too low."""
 
-THESIS_FILTER = 0.5
-"""The published estimator drops split halves whose raw correlation is below this."""
+THESIS_FILTER = 0.5  # the published estimator drops split halves whose raw correlation is below this
 
 
 _Estimator = Callable[[Floats, Floats, Floats | None, list[float]], tuple[float, int, str]]

@@ -34,11 +34,9 @@ from brainbench.metrics.reliability.noise_correction import spearman_brown
 from brainbench.metrics.reliability.sessions import SortedTrials, shifted_sessions, usable_sessions, whitened_sessions
 from brainbench.metrics.stimulus_labels import membership, stimulus_means
 
-SPLITS = 1000
-"""Random split halves per animal."""
+SPLITS = 1000  # random split halves per animal
 
-FEWEST_SESSIONS = 3
-"""Sessions of an animal from which their order can be told from chance."""
+FEWEST_SESSIONS = 3  # sessions of an animal from which their order can be told from chance
 
 _CHUNK_BYTES = 1 << 24
 _HALVES_BYTES = 1 << 26
@@ -286,8 +284,7 @@ def is_flat(rdms: Floats) -> NDArray[np.bool_]:
     return np.isnan(compare(rdms, rdms, method="pearson")) | ~np.isfinite(rdms).all(axis=-1)
 
 
-SIMULATIONS = 20
-"""Noisy copies of an animal over which what a perfect model attains is averaged."""
+SIMULATIONS = 20  # noisy copies of an animal over which what a perfect model attains is averaged
 
 
 def denoised(patterns: Floats, noise: Floats) -> Floats:

@@ -24,8 +24,7 @@ from brainbench.metrics.inference.multiple import adjust
 if TYPE_CHECKING:
     from brainbench.scoring.scores import ScoreInputs
 
-LEVEL = 0.05
-"""Largest corrected p of a group that is named, against chance and against each other group."""
+LEVEL = 0.05  # largest corrected p of a group that is named, against chance and against each other group
 
 
 @dataclass(frozen=True)

@@ -42,8 +42,7 @@ from brainbench.scoring.over_time.lags import (
 from brainbench.scoring.over_time.movies import AnimalMovie, animal_movie, layer_movie
 from brainbench.scoring.scores import ScoreInputs
 
-PERMUTATIONS = 1000
-"""Random orders of the stimuli, above six stimuli; all orders up to six."""
+PERMUTATIONS = 1000  # random orders of the stimuli, above six stimuli; all orders up to six
 _FARTHEST = 0.4  # largest lag, as a share of the recorded time
 
 

@@ -159,8 +159,7 @@ def best_lag(excess: Floats) -> Floats:
     return np.where(inside, at + np.clip(shift, -1, 1), np.nan)
 
 
-ALPHA = 0.05
-"""Level at which a layer's latency is given."""
+ALPHA = 0.05  # level at which a layer's latency is given
 
 
 @dataclass(frozen=True)

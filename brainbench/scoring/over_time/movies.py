@@ -19,8 +19,7 @@ from brainbench.metrics.rdms.dissimilarity import rdm
 from brainbench.metrics.rdms.pairs import Floats
 from brainbench.metrics.reliability.subject_rdm import subject_rdm
 
-SPLITS = 100
-"""Random split halves of an animal in each bin."""
+SPLITS = 100  # random split halves of an animal in each bin
 _METHOD: dict[str, Any] = {
     "method": "crossnobis", "comparison": "whitened-cosine", "noise": "none", "splits": SPLITS,
 }  # fmt: skip

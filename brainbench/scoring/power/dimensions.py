@@ -20,8 +20,7 @@ from brainbench.core.contracts import Trials
 from brainbench.core.errors import DataError, UsageError
 from brainbench.metrics.rdms.pairs import Floats
 
-MOST = 100.0
-"""Largest number of dimensions that is told apart from more."""
+MOST = 100.0  # largest number of dimensions that is told apart from more
 _SPLITS = 20
 
 

@@ -35,11 +35,9 @@ from brainbench.metrics.rdms.pairs import Floats, Ints, upper
 
 SIMULATIONS = 1000
 STIMULUS_COUNTS = (4, 5, 6, 7, 8, 10, 12, 16, 20, 24, 32)
-ANIMAL_COUNTS = (1, 2, 3, 4, 5, 6, 8, 11, 15, 20, 30, 50, 100)
-"""Numbers that :func:`needed` tries, in order."""
+ANIMAL_COUNTS = (1, 2, 3, 4, 5, 6, 8, 11, 15, 20, 30, 50, 100)  # numbers that needed tries, in order
 
-DIMENSIONS = 10
-"""Dimensions of the patterns where nothing is known of them."""
+DIMENSIONS = 10  # dimensions of the patterns where nothing is known of them
 _COMPARISON = "whitened-pearson"
 _ORDERS = 999  # random orders of simulated tests at levels from .01 on; below, as many as a score takes
 _EXACT_STIMULI = 6  # up to this many stimuli all orders are taken

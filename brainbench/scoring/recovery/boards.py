@@ -32,8 +32,7 @@ from brainbench.metrics.rdms.pairs import Ints
 from brainbench.metrics.score import score_layers
 from brainbench.scoring.options import ScoreOptions
 
-FEWEST_STIMULI = 4
-"""Fewest stimuli whose RDMs can be compared after one is left out."""
+FEWEST_STIMULI = 4  # fewest stimuli whose RDMs can be compared after one is left out
 
 
 @dataclass(frozen=True)
@@ -173,8 +172,7 @@ def open_candidates(
     return tuple(candidates), origin
 
 
-LEVEL = 0.05
-"""False discovery rate over all pairs of a board."""
+LEVEL = 0.05  # false discovery rate over all pairs of a board
 
 
 @dataclass(frozen=True)

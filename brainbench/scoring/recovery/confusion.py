@@ -15,8 +15,7 @@ from brainbench.core.statistics import FEWEST_ANIMALS, FEWEST_STIMULI, wilson_in
 from brainbench.metrics.rdms.pairs import Floats, Ints
 from brainbench.scoring.recovery.boards import RecoveryBoard, RecoveryDesign
 
-WANTED = 0.8
-"""Share of boards that the true candidate is to win."""
+WANTED = 0.8  # share of boards that the true candidate is to win
 
 
 @dataclass(frozen=True)

@@ -36,12 +36,9 @@ from brainbench.stimuli.engines import get_engine
 from brainbench.stimuli.engines.fidelity import DEFAULT_ENGINE, Fidelity
 
 Array = NDArray[np.float64]
-SUBSTEPS = 5
-"""Frames of a time step of the input, as in :func:`brainbench.stimuli.stimulus_set.to_grid`."""
-FINER = 5
-"""Divisor of the time step for a gradient of whiskers that cannot be trusted."""
-BOARDS = 10
-"""Boards of each network on which motions are compared."""
+SUBSTEPS = 5  # frames of a time step of the input, as in to_grid
+FINER = 5  # divisor of the time step for a gradient of whiskers that cannot be trusted
+BOARDS = 10  # boards of each network on which motions are compared
 
 
 @dataclass(frozen=True)

@@ -24,10 +24,8 @@ from brainbench.metrics.rdms.pairs import Floats, Ints, permuted_pairs
 from brainbench.scoring.recovery.boards import FEWEST_STIMULI, Candidate, RecoveryDesign, draw_board
 from brainbench.scoring.recovery.study import check_candidates
 
-BOARDS = 4
-"""Boards of each candidate on which stimuli are chosen."""
-FIRST_BOARD = 1_000_000
-"""Number of the first of them, far from those on which rates are measured."""
+BOARDS = 4  # boards of each candidate on which stimuli are chosen
+FIRST_BOARD = 1_000_000  # number of the first of them, far from those on which rates are measured
 EXCHANGES = 1500
 
 

@@ -22,23 +22,17 @@ from brainbench.stimuli.whiskers.whisker import Whisker
 HALF_STEP, MORE_LINKS = 2.0, 3.0
 """Error over what half the step changes, and over what half as many links again change. Errors that fall with the first
 power of the step and of the links have exactly these."""
-MORE = 1.5
-"""Links of the second finer simulation, over those that were asked for."""
-MOST = 60
-"""Most links of finer simulations, which every engine can take."""
+MORE = 1.5  # links of the second finer simulation, over those that were asked for
+MOST = 60  # most links of finer simulations, which every engine can take
 TOLERANCE = 1e-6
 """Relative error to which the run in half steps solves contact forces, so that their error is seen too."""
-LARGEST_ERROR = 0.1
-"""Estimated error beyond which a whisker has a remark where the fidelity promises none."""
-SLOW = 3.0
-"""Periods of the first mode in the finest motion of a base from which a whisker follows it without ringing."""
+LARGEST_ERROR = 0.1  # estimated error beyond which a whisker has a remark where the fidelity promises none
+SLOW = 3.0  # periods of the first mode in the finest motion of a base from which a whisker follows it without ringing
 CALM = 1.5
 """Error of such a whisker, which touches nothing, times the square of its links: .023, .012 and .004 for the presets,
 measured .014 to .018, .007 to .008 and .003 to .004 (mouse and rat, 5 and 20 Hz)."""
-ROUNDS = 5
-"""Times that whiskers are simulated again, with more links or shorter steps, to keep a promised error."""
-FINEST_STEP = 2e-6
-"""Step (s) below which none is halved to keep a promise: single precision ends there."""
+ROUNDS = 5  # times that whiskers are simulated again, with more links or shorter steps, to keep a promised error
+FINEST_STEP = 2e-6  # step (s) below which none is halved to keep a promise: single precision ends there
 
 Run = Callable[[Sequence[Job], Fidelity], Sequence[Trace]]
 """Simulates jobs, each as often as it takes to be trusted."""

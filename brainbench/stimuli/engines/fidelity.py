@@ -22,8 +22,7 @@ from brainbench.stimuli.whiskers.whisker import Whisker
 if TYPE_CHECKING:
     from brainbench.stimuli.motion.jobs import Job
 
-DEFAULT_ENGINE = "rod"
-"""Engine of whatever does not ask for one; it needs no GPU."""
+DEFAULT_ENGINE = "rod"  # engine of whatever does not ask for one; it needs no GPU
 MOST_LINKS = 100
 """Links per whisker that are allowed; error is far below 0.1 % before. MuJoCo's cost grows with their square."""
 
@@ -154,8 +153,7 @@ def steps_to_ring(damping_ratio: float) -> float:
     return math.pi / max(damping_ratio, LEAST_DAMPING)
 
 
-FINEST_SINGLE = 1e-6
-"""Least ``contact_tolerance`` in single precision, whose rounding is not far below it."""
+FINEST_SINGLE = 1e-6  # least `contact_tolerance` in single precision, whose rounding is not far below it
 LEAST_DAMPING = 0.05
 """Damping ratio below which steps are not shortened to keep it; isolated whiskers have .11 to .17."""
 RESOLUTION = ("links", "links_per_mm", "time_step", "steps_per_period", "contact_tolerance")

@@ -24,20 +24,14 @@ from brainbench.stimuli.engines.units import MILLI
 from brainbench.stimuli.motion.jobs import Follicle
 from brainbench.stimuli.objects.obstacle import Obstacle, RigidMotion
 
-KNOT = 1e-3
-"""Length of a cell (s); one cubic piece follows whisking at 20 Hz to 1e-7 of its way."""
-SPEED_ERROR = 1e-4
-"""Largest error of the velocity, as a share of the greatest speed of the motion."""
-PLACE_ERROR = 1e-4
-"""Largest error of the position (mm)."""
-MOST_PIECES = 512
-"""Pieces of a cell at most: they follow about 20 kHz."""
-LOOKS = 128
-"""Looks per cell at a motion that says nothing about itself, and wherever one piece does not follow."""
+KNOT = 1e-3  # length of a cell (s); one cubic piece follows whisking at 20 Hz to 1e-7 of its way
+SPEED_ERROR = 1e-4  # largest error of the velocity, as a share of the greatest speed of the motion
+PLACE_ERROR = 1e-4  # largest error of the position (mm)
+MOST_PIECES = 512  # pieces of a cell at most: they follow about 20 kHz
+LOOKS = 128  # looks per cell at a motion that says nothing about itself, and wherever one piece does not follow
 PIECES_PER_PERIOD = 27
 """Pieces in one period of a sinusoid that are just followed: the velocity of a cubic is wrong by √3/216 (ω h)³."""
-LEAST_STEPS = 10
-"""Steps per period of a motion where the fidelity names none."""
+LEAST_STEPS = 10  # steps per period of a motion where the fidelity names none
 _AT_ONCE = 400_000  # looks at a time: bounds the memory
 _SLOW = 1e-6  # speed (mm/ms) whose errors never count
 _INSIDE = 16  # parts of a piece in which a corner or a jump is looked for

@@ -27,8 +27,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
 Array = NDArray[np.float64]
-PER_LINK = 8
-"""Samples of the curve in each link."""
+PER_LINK = 8  # samples of the curve in each link
 
 
 def normal_offsets(nodes: Array, joints: Array, points: Array) -> Array:
@@ -93,10 +92,8 @@ def _normals(tangent: Array) -> tuple[Array, Array]:
     return np.cross(second, tangent), second
 
 
-STEPS = 48
-"""Runge-Kutta steps from the contact to the base; the force is then within 1e-6 of that of 400."""
-BEYOND = 12
-"""Samples from the contact to the tip."""
+STEPS = 48  # runge-Kutta steps from the contact to the base; the force is then within 1e-6 of that of 400
+BEYOND = 12  # samples from the contact to the tip
 
 
 # With the angle ψ of the rod against its direction at the contact, the equations of the elastica (Antman 2005,
@@ -211,19 +208,14 @@ def _rotated(points: Array, angle: Array) -> Array:
 
 
 _LOG = logging.getLogger(__name__)
-NEAREST, FARTHEST = 0.05, 0.995
-"""Contact arcs that are looked for, as shares of the whisker's length."""
-NO_FORCE = 3.0
-"""Force over its standard deviation below which there is no sign of a contact."""
-VAGUE = 0.15
-"""Relative standard deviation of the force from which it is unreliable."""
-MISFIT = 1.5
-"""Residuals over the stated noise from which the model does not fit."""
+NEAREST, FARTHEST = 0.05, 0.995  # contact arcs that are looked for, as shares of the whisker's length
+NO_FORCE = 3.0  # force over its standard deviation below which there is no sign of a contact
+VAGUE = 0.15  # relative standard deviation of the force from which it is unreliable
+MISFIT = 1.5  # residuals over the stated noise from which the model does not fit
 ALIKE = 4.0
 """Deviations of the serial correlation along the whisker, over all frames, from which residuals are no white noise."""
 FEWEST_POINTS = 6
-WHOLE = 0.95
-"""Share of the whisker's length from which a trace counts as whole."""
+WHOLE = 0.95  # share of the whisker's length from which a trace counts as whole
 SAMPLE, TURNED = 3, 0.5
 """Frames in which points are also fitted the other way round, and the share of their distance from the fitted shapes
 below which that is the right way: it is a tenth where the order or the y axis is wrong, above one where it is right."""

@@ -102,12 +102,9 @@ def changed(scene: Scene, names: Sequence[str], values: Array) -> Scene:
     return scene
 
 
-SCALE = 0.05
-"""Size of a small change of a variable, as a share of its range."""
-NOTHING = -50.0
-"""Log D² where nothing is felt."""
-SOFTNESS = 0.15
-"""Width of the soft minimum over pairs, in log D²."""
+SCALE = 0.05  # size of a small change of a variable, as a share of its range
+NOTHING = -50.0  # log D² where nothing is felt
+SOFTNESS = 0.15  # width of the soft minimum over pairs, in log D²
 
 
 @dataclass(frozen=True)

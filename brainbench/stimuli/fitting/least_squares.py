@@ -33,8 +33,7 @@ from brainbench.stimuli.fitting.result import (
 from brainbench.stimuli.fitting.trials import Trial
 
 Array = NDArray[np.float64]
-WIDEST = 12.0
-"""Distance from the estimate, in coordinates, at which an interval counts as open (a factor of 160,000)."""
+WIDEST = 12.0  # distance from the estimate, in coordinates, at which an interval counts as open (a factor of 160,000)
 _STEPS = 12  # points at which the profile is looked at on each side
 
 
@@ -150,10 +149,8 @@ class Profile:
 
 
 _ROUNDS = 3  # fits with the noise of each channel estimated anew; it settles in two
-STATED = 5.0
-"""Fitted over stated deflection of a plucked whisker, or its inverse, from which a unit is wrong."""
-ALIKE = 16.0
-"""Difference of the deviance (−2 log likelihood) up to which two minima fit alike: odds of 3,000 to one."""
+STATED = 5.0  # fitted over stated deflection of a plucked whisker, or its inverse, from which a unit is wrong
+ALIKE = 16.0  # difference of the deviance (−2 log likelihood) up to which two minima fit alike: odds of 3,000 to one
 
 
 def fit(

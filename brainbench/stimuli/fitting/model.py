@@ -23,8 +23,7 @@ from brainbench.stimuli.motion.jobs import Job, Trace
 from brainbench.stimuli.validation import references
 
 Array = NDArray[np.float64]
-SCALE = 5e-3
-"""Size of a small change of a coordinate."""
+SCALE = 5e-3  # size of a small change of a coordinate
 SHORTER = 2.5
 """Divisor of the time step of the simulations that show how far an estimate is from that of a finer simulation."""
 FEWEST = 20

@@ -29,13 +29,11 @@ if TYPE_CHECKING:
 
 UNITS = 100.0
 """Size of the wrenches over that at the start, or its inverse, from which the unit is wrong and not the start."""
-OPPOSITE = -0.8
-"""Correlation with the wrenches at the start from which the sign is wrong."""
+OPPOSITE = -0.8  # correlation with the wrenches at the start from which the sign is wrong
 MULTIPLE = 1.5
 """Size of the forces (moments) over that of the fitted whisker, or its inverse, from which one of the kinds has another
 unit: where they disagree, a fit follows the one and takes the other for noise."""
-SURE = 5.0
-"""Standard deviations by which such a size is known to differ."""
+SURE = 5.0  # standard deviations by which such a size is known to differ
 DEAD = 0.05
 """Share of the largest predicted component of its kind from which one that reads zero throughout is doubtful."""
 
@@ -113,14 +111,10 @@ def _of_kind(trial: Trial, trace: Trace, kind: str) -> tuple[NDArray[np.float64]
 
 
 Array = NDArray[np.float64]
-LAGS = 3
-"""Places up to which readings are neighbours."""
-SWING_LAGS = 4
-"""Places up to which residuals that swing are looked for."""
-ALPHA = 0.01
-"""Chance that noise alone fails any of the tests of a fit."""
-FEWEST = 20
-"""Pairs from which an ordering is tested."""
+LAGS = 3  # places up to which readings are neighbours
+SWING_LAGS = 4  # places up to which residuals that swing are looked for
+ALPHA = 0.01  # chance that noise alone fails any of the tests of a fit
+FEWEST = 20  # pairs from which an ordering is tested
 
 
 @dataclass(frozen=True)
@@ -226,8 +220,7 @@ def failed_words(tests: Sequence[ResidualTest]) -> tuple[str, ...]:
 
 UNKNOWN = 0.7
 """Standard deviation along a direction, in coordinates (a factor of 2), from which it counts as not identified."""
-MEMBER = 0.1
-"""Share of the largest component of a direction from which a parameter belongs to it."""
+MEMBER = 0.1  # share of the largest component of a direction from which a parameter belongs to it
 
 
 # With whitened residuals of Jacobian J [m, p] the Fisher information is JᵀJ (Seber & Wild 2003, Nonlinear Regression,

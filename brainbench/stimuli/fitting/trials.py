@@ -40,13 +40,11 @@ SETTLING = 4.0
 """Time for which a plucked whisker is held, in decay times 1/(ζ ω) of its first mode; it is held in a way that hardly
 swings."""
 
-RARE = 10.0
-"""Periods of the first mode between two readings from which the clock is wrong."""
+RARE = 10.0  # periods of the first mode between two readings from which the clock is wrong
 SHORT = 0.02
 """Share of a period of the first mode that the readings last from which the clock or the whisker is wrong."""
 FEWEST_FRAMES = 3
-SPENT = 25.0
-"""Decay times of the first mode after which nothing is left of a swing: e⁻²⁵."""
+SPENT = 25.0  # decay times of the first mode after which nothing is left of a swing: e⁻²⁵
 
 
 @dataclass(frozen=True)

@@ -34,8 +34,7 @@ from brainbench.stimuli.whiskers.array import ROWS, MountedWhisker
 
 _LOG = logging.getLogger(__name__)
 Array = NDArray[np.float64]
-NEAR = 0.25
-"""Share of the traced length, from the base, whose chord is the direction of the base."""
+NEAR = 0.25  # share of the traced length, from the base, whose chord is the direction of the base
 _ORDER = 4
 _TAIL = 0.01  # time [s] for which the last pose is held beyond the end, for the last steps of a simulation
 _AXES = ("theta", "phi", "zeta")

@@ -18,8 +18,7 @@ from brainbench.core.limits import Limit, limited
 from brainbench.core.rotations import Vector, base_rotation
 from brainbench.stimuli.whiskers.array import MountedWhisker
 
-STEEPEST = math.radians(87)
-"""Elevation up to which a follicle is driven by its Euler angles."""
+STEEPEST = math.radians(87)  # elevation up to which a follicle is driven by its Euler angles
 _RATE = 1000.0
 """Instants per second at which angles are followed from the start; between two of them nothing turns by 180°."""
 

@@ -188,14 +188,11 @@ PROCEDURAL_24 = (
 COLLECTIONS = {"procedural-24": PROCEDURAL_24, "procedural": list_families()}
 """Named collections of shape families; ``procedural-24:40`` is 40 members of each of its 24 families."""
 
-DIAGONAL = 0.04
-"""Size [m] at which objects are built; each sweep scales them to its own."""
+DIAGONAL = 0.04  # size [m] at which objects are built; each sweep scales them to its own
 
 
-MOST_CHARACTERS = 4096
-"""Most characters of the name of an object: as many as a path may have."""
-MOST_MEMBERS = 1_000_000
-"""Most members of a family in one data set."""
+MOST_CHARACTERS = 4096  # most characters of the name of an object: as many as a path may have
+MOST_MEMBERS = 1_000_000  # most members of a family in one data set
 SURFACE = "surface"
 """Stands for ``surfaces`` where shape families are built; other kinds of objects have their default then."""
 

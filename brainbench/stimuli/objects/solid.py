@@ -89,8 +89,7 @@ units of the published mesh (1 unit = 34.324 mm at a diagonal of 55 mm). Fitted 
 through all 101 published vertices of that face within 6e-7."""
 RODGERS_OFFSET = (-0.020447, -0.046006)
 """Displacement (x, y) from the convex to the concave face: the profile is the curve swept along it."""
-RODGERS_SPAN = (-0.256589, 0.251290)
-"""Lowest and highest z of the extruded profile."""
+RODGERS_SPAN = (-0.256589, 0.251290)  # lowest and highest z of the extruded profile
 
 
 def sphere(radius: float) -> Solid:

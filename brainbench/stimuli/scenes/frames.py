@@ -19,8 +19,7 @@ Phase = Literal["zero", "causal"]
 """``zero``: the filter runs forwards and backwards, so that nothing is delayed and frames know a little of the
 future. ``causal``: it runs forwards, as a sensor would, and delays."""
 
-READINGS_PER_CUTOFF = 4
-"""Readings per period of the cut-off that a filter needs at least."""
+READINGS_PER_CUTOFF = 4  # readings per period of the cut-off that a filter needs at least
 # Periods of the cut-off that are read behind the last frame for the backward pass; order of the filter.
 _EDGE = 2.0
 _ORDER = 4

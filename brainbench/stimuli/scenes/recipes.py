@@ -20,8 +20,7 @@ if TYPE_CHECKING:
     from brainbench.stimuli.objects.solid import Solid
     from brainbench.stimuli.scenes.scene_files import Recipe
 
-RECORDED = "rodgers-recorded"
-"""Recipe whose whisking comes from a file."""
+RECORDED = "rodgers-recorded"  # recipe whose whisking comes from a file
 
 _RECORDED_START = math.radians(-10)
 """Azimuth at which recorded whisking starts: retracted as in ``rodgers``, and as the published sample begins."""

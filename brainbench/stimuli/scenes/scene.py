@@ -25,8 +25,7 @@ from brainbench.stimuli.objects.solid import PlacedObject
 from brainbench.stimuli.scenes.frames import Frames
 from brainbench.stimuli.whiskers.array import MountedWhisker, WhiskerArray, match_whiskers
 
-WhiskerMotion = Still | Whisking | Recorded | Tracked
-"""Motion of whiskers relative to the head."""
+WhiskerMotion = Still | Whisking | Recorded | Tracked  # motion of whiskers relative to the head
 
 
 @dataclass(frozen=True)

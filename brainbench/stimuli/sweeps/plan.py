@@ -26,8 +26,7 @@ from brainbench.stimuli.objects.collections import NamedObject
 from brainbench.stimuli.sweeps.sweep_scenes import SweepGrid
 from brainbench.stimuli.whiskers.array import WhiskerArray
 
-SPLITS = ("train", "validation", "test")
-"""Names of the splits, in the order of the numbers that stand for them."""
+SPLITS = ("train", "validation", "test")  # names of the splits, in the order of the numbers that stand for them
 
 SplitBy = Literal["object", "sweep"]
 """``object``: all sweeps of an object are in one split, so that a network meets new objects in the test.
@@ -74,11 +73,9 @@ def _in_order(count: int) -> NDArray[np.int8]:
     return np.repeat(np.arange(3, dtype=np.int8), [count - tenth - test, tenth, test])
 
 
-SHARD_SIZES = {"mujoco": 32, "bullet": 8}
-"""Sweeps per shard of slow backends, so that a kill costs minutes at most."""
+SHARD_SIZES = {"mujoco": 32, "bullet": 8}  # sweeps per shard of slow backends, so that a kill costs minutes at most
 USUAL_SHARD = 512
-GPU_SHARD = 2048
-"""Sweeps per shard on a GPU, which takes thousands at a time."""
+GPU_SHARD = 2048  # sweeps per shard on a GPU, which takes thousands at a time
 
 
 @dataclass(frozen=True)

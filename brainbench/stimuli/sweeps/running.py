@@ -35,20 +35,17 @@ from brainbench.stimuli.sweeps.shards import (
     write_shard,
 )
 
-Done = Callable[[int], None]
-"""Called with the number of sweeps of a shard that is written."""
+Done = Callable[[int], None]  # called with the number of sweeps of a shard that is written
 
 SIDE_BY_SIDE = 16
 """Most shards that are simulated on one GPU at the same time. Whiskers that are simulated again are few and take many
 steps one after the other, however idle the GPU is, which meanwhile computes those of other shards."""
 WHISKER_BYTES = 10_000, 32
 """Room on a GPU for a whisker of a sweep, and for each of its frames more: state, contacts and results."""
-WRITERS = 4
-"""Shards behind a GPU that may be hashed and written meanwhile: one thread hashes about 1 GB/s."""
+WRITERS = 4  # shards behind a GPU that may be hashed and written meanwhile: one thread hashes about 1 GB/s
 AHEAD = 4
 """Shards at least whose objects are built ahead of the simulation; more if a process would have nothing to do."""
-STARTING = 8
-"""Objects that take about as long to build as a process to start."""
+STARTING = 8  # objects that take about as long to build as a process to start
 
 
 def run_here(tasks: Sequence[ShardTask], folder: Path, workers: int | None, done: Done) -> None:

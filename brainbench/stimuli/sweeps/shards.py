@@ -87,11 +87,9 @@ def _one_by_one(
     )
 
 
-OK, UNSTABLE, UNUSABLE = 0, 1, 2
-"""Values of ``status``: fine; the simulation failed; the object could not be built."""
+OK, UNSTABLE, UNUSABLE = 0, 1, 2  # values of `status`: fine; the simulation failed; the object could not be built
 
-ALIGNMENT = 4096
-"""The forces begin at a multiple of this, so that pages of memory and of the file coincide."""
+ALIGNMENT = 4096  # the forces begin at a multiple of this, so that pages of memory and of the file coincide
 
 COUNTS: tuple[str, ...] = ("steps", "steps_in_full", "retried", "unsolved")
 """Attributes that say how much was simulated, and in how many steps contact forces were not solved."""

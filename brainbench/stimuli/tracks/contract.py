@@ -28,10 +28,8 @@ if TYPE_CHECKING:
     import xarray as xr
 
 AXES = ("x", "y", "z")
-FARTHEST = 1e3
-"""Magnitude [m] beyond which no point of a whisker is, also where millimetres are taken for metres."""
-LARGEST_FORCE = 1e3
-"""Magnitude [N, N·m] that no base of a whisker feels."""
+FARTHEST = 1e3  # magnitude [m] beyond which no point of a whisker is, also where millimetres are taken for metres
+LARGEST_FORCE = 1e3  # magnitude [N, N·m] that no base of a whisker feels
 _NOISE = "noise of a measurement (standard deviation, SI units)"
 
 
@@ -133,8 +131,7 @@ def check_times(times: ArrayLike, count: int) -> NDArray[np.float64]:
     return values
 
 
-MOST_GAPS = 0.5
-"""Share of the frames without a shape up to which a track is used."""
+MOST_GAPS = 0.5  # share of the frames without a shape up to which a track is used
 LONGER = 1.1
 """Traced length over arc length from which a shape cannot be that whisker: noise lengthens a polyline a little."""
 UNITS = 5.0

@@ -29,8 +29,7 @@ from brainbench.core.reading.tables import read_columns, read_rows, to_numbers
 from brainbench.stimuli.tracks.contract import check_track, every_frame, new_shapes
 
 Array = NDArray[np.float64]
-Segments = dict[tuple[int, int], Array]
-"""Points [k, 2] (pixels) of each trace by frame and number within the frame."""
+Segments = dict[tuple[int, int], Array]  # points [k, 2] (pixels) of each trace by frame and number within the frame
 _HEADER = b"bwhiskbin1\0\0"
 _MOST_POINTS = 100_000
 

@@ -21,8 +21,7 @@ from brainbench.core.limits import limited
 from brainbench.core.rotations import Angles, Point
 from brainbench.stimuli.whiskers.whisker import Whisker
 
-ROWS = "ABCDE"
-"""Letters of the whisker rows, dorsal to ventral."""
+ROWS = "ABCDE"  # letters of the whisker rows, dorsal to ventral
 
 _RANGE = re.compile(r"([A-Ea-e])(\d+)\s*-\s*([A-Ea-e])(\d+)")
 

@@ -29,12 +29,9 @@ MAGIC = b"BBH3"
 """Version of the frames; either end drops those of another one. In ``BBH2`` commands were targets alone."""
 HELLO, WELCOME, START, STATE, COMMAND, STOP = range(1, 7)
 """Kinds: the controller asks for a session, the hand offers one, the controller takes it; then states and commands."""
-LARGEST = 8192
-"""Bytes of the largest datagram that is read: more than a state of :data:`MOST` joints and fingers."""
-MOST = 255
-"""Most joints and fingers of a hand."""
-NONCE, KEY = 16, 32
-"""Bytes of a nonce and of a key."""
+LARGEST = 8192  # bytes of the largest datagram that is read: more than a state of MOST joints and fingers
+MOST = 255  # most joints and fingers of a hand
+NONCE, KEY = 16, 32  # bytes of a nonce and of a key
 _HEADER = struct.Struct("<4sBBBxId")
 _TAG = 32
 _ORIGIN = struct.Struct("<Id")  # what a command comes from: number of its report, time until which it holds
@@ -149,8 +146,7 @@ def read_key(path: str | os.PathLike[str]) -> bytes:
 
 Verdict = Literal["new", "late", "replayed", "stale"]
 """``late``: came after a newer one for the first time; ``replayed``: again; ``stale``: too old, by number or time."""
-MAX_AGE = 0.25
-"""Oldest frame that has an effect (s); as long as a hand without commands moves on."""
+MAX_AGE = 0.25  # oldest frame that has an effect (s); as long as a hand without commands moves on
 
 
 class SequenceWindow:

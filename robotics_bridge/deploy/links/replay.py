@@ -33,8 +33,7 @@ from robotics_bridge.hands import Hand
 from robotics_bridge.hands.layouts import Layout
 from robotics_bridge.sensors import KinematicTaxel, Probes, SensorSuite
 
-RADIUS = 4e-3
-"""Sensing radius of a taxel whose log does not say (m)."""
+RADIUS = 4e-3  # sensing radius of a taxel whose log does not say (m)
 _LARGEST = 1.0  # distance of a taxel from the origin of its link above which it looks like millimetres (m)
 _TURN = 2 * np.pi  # largest joint angle (rad); beyond it angles look like degrees
 _RATE = 200.0  # least physics reports per second

@@ -33,8 +33,7 @@ from robotics_bridge.sensors import SensorSuite
 from robotics_bridge.tasks.scenes import drives_of
 from robotics_bridge.tasks.settings import CONTACTS, ContactModel, set_contacts
 
-HOLD_AFTER = 0.25
-"""Seconds without a command after which the hand holds by itself."""
+HOLD_AFTER = 0.25  # seconds without a command after which the hand holds by itself
 _Delay = Annotated[float, Limit(least=0, below=3600, unit="s")]
 
 

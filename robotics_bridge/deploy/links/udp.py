@@ -27,12 +27,9 @@ from robotics_bridge.deploy.safety import ClockOffset
 LOOPBACK = "127.0.0.1"
 GREET_EVERY = 0.2
 """Seconds from one greeting to the next, until the hand reports. An answer that takes longer is not accepted."""
-MOST_AT_ONCE = 256
-"""Datagrams read at once; a flood must not hold the control loop up."""
-FARTHEST = 4 * math.pi
-"""Targets further from zero have no effect (rad or m): no joint of a hand has such a range."""
-MOST_OFFERS = 64
-"""Greetings that a hand remembers until a session starts; the oldest goes first."""
+MOST_AT_ONCE = 256  # datagrams read at once; a flood must not hold the control loop up
+FARTHEST = 4 * math.pi  # targets further from zero have no effect (rad or m): no joint of a hand has such a range
+MOST_OFFERS = 64  # greetings that a hand remembers until a session starts; the oldest goes first
 _ERRORS = 8  # errors of the connection that are kept
 
 

@@ -23,8 +23,7 @@ from robotics_bridge.physics.scene import Geometry
 from robotics_bridge.sensors.audio.sensors import ElasticMaterial, Modes, elastic_material
 from robotics_bridge.sensors.probes.placement import face_areas, spread_over
 
-SMALLEST = 0.05
-"""A tetrahedron may shrink to this share of its volume when its corners are moved to a surface."""
+SMALLEST = 0.05  # a tetrahedron may shrink to this share of its volume when its corners are moved to a surface
 
 
 def skfem() -> Any:

@@ -37,8 +37,7 @@ from robotics_bridge.sensors.calibration.likelihood import (
 from robotics_bridge.sensors.calibration.log import SHORTEST, Episode, Log, find_dead, find_quantum, segments
 from robotics_bridge.sensors.noise.model import Noise
 
-NOT_FITTED = ("radius", "crosstalk")
-"""Knobs that a log of one signal cannot tell: they need known places."""
+NOT_FITTED = ("radius", "crosstalk")  # knobs that a log of one signal cannot tell: they need known places
 _ROUNDS = 12
 ORDER = (
     "gain_low", "gain_high", "hysteresis", "hysteresis_tau", "walk", "white", "bias", "quantum", "dead_probability",

@@ -24,8 +24,7 @@ from robotics_bridge.sensors.calibration.log import Episode
 Aligned = tuple["NDArray[np.float64]", "NDArray[np.float64]", "NDArray[np.int64]"]
 """x [T'] from the start of the episode, readings y [T, N], and for each reading the index of x that it shows."""
 
-Z95 = 1.959963984540054
-"""Half width of a 95 % interval in standard errors."""
+Z95 = 1.959963984540054  # half width of a 95 % interval in standard errors
 _SIGNIFICANT = 6.63
 """Twice the gain in log-likelihood (χ², one degree, 1 %) that drift or hysteresis must bring to be kept."""
 _UNTOLD = 7.0

@@ -31,12 +31,9 @@ from robotics_bridge.sensors.kernels.wide import load_planes, store_planes
 
 wp = warp()
 
-ROUNDS = 6
-"""Times that weights lean over at most."""
-STEEPEST = 10.0
-"""Largest exponent of a weight."""
-TOUCH, BEHIND, NEAR = range(3)
-"""Sources of carriers."""
+ROUNDS = 6  # times that weights lean over at most
+STEEPEST = 10.0  # largest exponent of a weight
+TOUCH, BEHIND, NEAR = range(3)  # sources of carriers
 
 
 @wp.struct

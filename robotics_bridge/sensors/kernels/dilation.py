@@ -19,8 +19,7 @@ from robotics_bridge.sensors.kernels.readout import ProbeArrays, ReadoutArrays, 
 
 wp = warp()
 
-NEGLIGIBLE = 17.0
-"""Exponent of a Gaussian from which it is left out: 4e-8 of its middle."""
+NEGLIGIBLE = 17.0  # exponent of a Gaussian from which it is left out: 4e-8 of its middle
 
 
 @wp.struct

@@ -16,11 +16,9 @@ wp = warp()
 PLANE, SPHERE, CAPSULE, ELLIPSOID, CYLINDER, BOX, MESH, OTHER, WALL, THIN = range(10)
 """Numbers of the kinds, in the order of :data:`robotics_bridge.physics.scene.KINDS`; then meshes with thin walls, and a
 mark, no kind, of thin solids among the others."""
-SIDED = frozenset({WALL, THIN})
-"""Those that are asked from the side of the sensor."""
+SIDED = frozenset({WALL, THIN})  # those that are asked from the side of the sensor
 
-FAR = 1.0e6
-"""Distance that stands for "out of reach" (m)."""
+FAR = 1.0e6  # distance that stands for "out of reach" (m)
 
 
 @wp.struct

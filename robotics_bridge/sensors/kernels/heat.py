@@ -13,10 +13,8 @@ wp = warp()
 # Contracted products would change how a level field rounds.
 wp.set_module_options({"fuse_fp": False})
 
-CAPACITY = 48
-"""M: contacts of one sensor that are looked at."""
-PIECES = 8
-"""A patch is cut into this many pieces along each of its two directions, each of which lies in one cell."""
+CAPACITY = 48  # M: contacts of one sensor that are looked at
+PIECES = 8  # a patch is cut into this many pieces along each of its two directions, each of which lies in one cell
 
 
 @wp.struct

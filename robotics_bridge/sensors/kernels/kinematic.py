@@ -84,12 +84,10 @@ def hold(
     return sigma
 
 
-THREADS = 256
-"""Threads of a block."""
+THREADS = 256  # threads of a block
 BLOCKS = {CLEAN: 3, FUSED: 2, STAGED: 3}
 """Blocks that a multiprocessor holds at once, by mode: what registers are left to a thread."""
-BLOCKS_SINGLE = 4
-"""The same where every row is one taxel, except for ray casts, which need the registers."""
+BLOCKS_SINGLE = 4  # the same where every row is one taxel, except for ray casts, which need the registers
 
 
 @wp.struct

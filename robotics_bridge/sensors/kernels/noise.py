@@ -21,8 +21,7 @@ wp.set_module_options({"fuse_fp": False})
 
 EPISODE, RADIUS, JITTER, CHANNELS = 0, 1, 2, 16
 """Purposes of random numbers: of an episode, the radius, the delay, and from 16 on of pairs of channels."""
-PAIRS = 256 - CHANNELS
-"""Purposes of pairs of channels."""
+PAIRS = 256 - CHANNELS  # purposes of pairs of channels
 
 
 @wp.struct

@@ -23,8 +23,7 @@ from robotics_bridge.sensors.kernels.readout import (
 
 wp = warp()
 
-BLOCK = 32
-"""Points of a block."""
+BLOCK = 32  # points of a block
 
 
 @wp.struct

@@ -166,8 +166,7 @@ def anchor_kernel(kinds: frozenset[int], raycast: bool, side_by_side: bool) -> A
     return anchors
 
 
-CHUNK = 32
-"""Points whose weights are kept at once."""
+CHUNK = 32  # points whose weights are kept at once
 
 
 @wp.func

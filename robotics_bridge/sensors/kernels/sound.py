@@ -12,8 +12,7 @@ from robotics_bridge.sensors.kernels.readout import ReadoutArrays
 
 wp = warp()
 
-SCRAPE, FRICTION = 200, 201
-"""Purposes of random numbers: sliding contact, friction of drives."""
+SCRAPE, FRICTION = 200, 201  # purposes of random numbers: sliding contact, friction of drives
 
 
 @wp.struct

@@ -22,8 +22,7 @@ from brainbench.core.reading.regular import readable
 
 BASE_KNOBS = frozenset({"read_delay", "jitter", "white", "bias", "walk", "quantum"})
 """Knobs of every sensor (table 4.2)."""
-PROBE_KNOBS = BASE_KNOBS | {"radius"}
-"""Knobs of probe sensors."""
+PROBE_KNOBS = BASE_KNOBS | {"radius"}  # knobs of probe sensors
 TAXEL_KNOBS = PROBE_KNOBS | {"gain", "dead_probability", "dead_range", "hysteresis", "hysteresis_tau"}
 """Knobs of tactile probe sensors."""
 GRID_KNOBS = TAXEL_KNOBS | {"crosstalk", "crosstalk_sigma"}

@@ -12,8 +12,7 @@ from brainbench.core.errors import UsageError, brief
 from brainbench.core.reading.ranges import check_fields, check_number, check_numbers
 from brainbench.geometry import Mesh
 
-FARTHEST = 10.0
-"""Distance [m] from its link beyond which no probe is, and largest radius."""
+FARTHEST = 10.0  # distance [m] from its link beyond which no probe is, and largest radius
 
 
 @dataclass(frozen=True, eq=False)

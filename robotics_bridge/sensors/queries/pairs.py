@@ -16,8 +16,7 @@ from robotics_bridge.sensors.queries.solids import Solids
 
 DIVERGED = 1
 """Status of an environment: since its reset, a pose or velocity was not finite, or a quaternion not of unit length."""
-OVERFULL = 2
-"""Status of an environment: the state had no room for some contacts."""
+OVERFULL = 2  # status of an environment: the state had no room for some contacts
 _LISTED = 16  # geometries in contact with one link that are listed where lists of all would be too long
 _LIST_BYTES = 2**28  # most memory for lists of all (bytes)
 _PLACE_BYTES = 76  # memory of one place of a list (bytes)

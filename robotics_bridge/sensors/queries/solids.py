@@ -76,8 +76,7 @@ def mesh_tree(mesh: Mesh, device: Any, *, winding: bool = False) -> Any:
     )
 
 
-RESOLVED = 4.0
-"""Cells across a wall from which a distance field tells its two sides apart."""
+RESOLVED = 4.0  # cells across a wall from which a distance field tells its two sides apart
 THINNEST = 3e-3
 """Least width of a solid (m) below which it is thin: engines let bodies overlap by up to about half of it, so that what
 touches it may lie past its middle, where the nearest side is the wrong one."""

@@ -21,8 +21,7 @@ from brainbench.core.files import atomic_path
 from brainbench.core.reading.archives import read_npz
 from brainbench.core.reading.ranges import check_number
 
-SPAN = 1.5
-"""Largest slope along an axis that the table holds."""
+SPAN = 1.5  # largest slope along an axis that the table holds
 _BINS = 61
 _BLUR = 1.0  # width (bins) over which neighbouring slopes share their colour, so that gaps of the table are filled
 _MARKER = 0.12  # how much darker than its surroundings a marker is (of full scale)

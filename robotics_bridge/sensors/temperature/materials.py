@@ -9,8 +9,7 @@ from typing import Annotated
 from brainbench.core.errors import check_name
 from brainbench.core.limits import Limit, Positive, Share, limited
 
-ABSOLUTE_ZERO = -273.15
-"""[°C]."""
+ABSOLUTE_ZERO = -273.15  # [°C]
 
 
 @dataclass(frozen=True)

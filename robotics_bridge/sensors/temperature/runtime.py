@@ -33,8 +33,7 @@ wp = warp()
 
 SPREAD = 0.1
 """Largest α Δt / edge² of a cell that is stepped at once: what a face takes up must not stay in the outermost cell."""
-PARTS = 64
-"""Most parts into which an update is split."""
+PARTS = 64  # most parts into which an update is split
 
 
 class TemperatureRuntime(Runtime):

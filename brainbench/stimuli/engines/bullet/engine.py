@@ -37,12 +37,9 @@ from brainbench.stimuli.motion.jobs import Trace
 from brainbench.stimuli.objects.obstacle import Box, Capsule, ConvexPart, Cylinder, Obstacle, Part, Sphere
 from brainbench.stimuli.whiskers.chain import Chain
 
-FOLLICLE = 6
-"""Joints of the follicle, which come first."""
-MOST_LINKS = 60
-"""Links per whisker: PyBullet moves fewer than 128 degrees of freedom through its interface."""
-HULL_MARGIN = 1e-3
-"""Margin (mm) that PyBullet wraps around convex hulls; subtracted again from the distances."""
+FOLLICLE = 6  # joints of the follicle, which come first
+MOST_LINKS = 60  # links per whisker: PyBullet moves fewer than 128 degrees of freedom through its interface
+HULL_MARGIN = 1e-3  # margin (mm) that PyBullet wraps around convex hulls; subtracted again from the distances
 
 _NOTHING = 1e-12  # mass (mg) and inertia (mg·mm²) of carriers between joints: far below those of any tip
 _STILL = (0.0, 0.0, 0.0, 1.0)
@@ -241,14 +238,11 @@ class BulletWorld:
         return self.bullet.createCollisionShape(kind, collisionFramePosition=centre, **options)
 
 
-MOST_SWEEPS = 3000
-"""Gauss–Seidel sweeps over the contacts of one step before they count as unsolved."""
+MOST_SWEEPS = 3000  # gauss–Seidel sweeps over the contacts of one step before they count as unsolved
 SWEEPS = 12
 """Sweeps between two attempts to finish by Newton's method, which needs to know what touches and what slides."""
-MOST_ITERATIONS = 12
-"""Newton iterations of one attempt."""
-TOLERANCE = 1e-9
-"""Relative change of the forces in one sweep at which they count as solved."""
+MOST_ITERATIONS = 12  # Newton iterations of one attempt
+TOLERANCE = 1e-9  # relative change of the forces in one sweep at which they count as solved
 
 
 # Contacts of one step with Coulomb friction are solved together with the implicit springs. Rows of a contact are its
@@ -402,8 +396,7 @@ def hold_or_slide(yielding: NDArray[np.float64], slip: NDArray[np.float64], most
     return np.array([cosine * f[0] - sine * f[1], sine * f[0] + cosine * f[1]])
 
 
-SEARCH = 0.02
-"""Distance (mm), beside the way that the whisker may move in the step, within which contacts are sought."""
+SEARCH = 0.02  # distance (mm), beside the way that the whisker may move in the step, within which contacts are sought
 
 
 @dataclass(frozen=True)

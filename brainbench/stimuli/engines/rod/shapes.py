@@ -18,8 +18,7 @@ from brainbench.stimuli.engines.rod.packing import PackedMotions, Track
 from brainbench.stimuli.engines.units import MILLI
 from brainbench.stimuli.objects.obstacle import Box, Capsule, ConvexPart, Cylinder, Obstacle, Sphere
 
-EMPTY = 1e30
-"""Coordinate of children that a node lacks: further away than any search goes."""
+EMPTY = 1e30  # coordinate of children that a node lacks: further away than any search goes
 
 
 def spatial_order(corners: NDArray[np.float64]) -> NDArray[np.intp]:
@@ -73,8 +72,7 @@ def in_eights(rows: NDArray[np.float64]) -> NDArray[np.float64]:
 
 SLIVER = 1e-6
 """Height over longest side below which a triangle has no direction of its own: vertices are rounded to some 1e-9."""
-SLIVER_ROUNDS = 32
-"""Slivers beside one another that are looked through."""
+SLIVER_ROUNDS = 32  # slivers beside one another that are looked through
 
 
 @dataclass(frozen=True, eq=False)

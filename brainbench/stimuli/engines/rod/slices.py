@@ -29,12 +29,9 @@ from brainbench.stimuli.engines.rod.limits import AFTER_OTHERS, WARP, contacts_f
 
 AHEAD = 1
 """Counts that may be outstanding when the next graphs are launched, so that a GPU does not wait for the host."""
-POLL = 4e-4
-"""Time (s) between two looks at whether a GPU is done."""
-LONG = 10_000
-"""Looks after which the GPU is asked with Warp's own call, which tells of a failure."""
-PIECE = 2**21
-"""Numbers that are copied to the host under one hold of the lock: some 2 ms."""
+POLL = 4e-4  # time (s) between two looks at whether a GPU is done
+LONG = 10_000  # looks after which the GPU is asked with Warp's own call, which tells of a failure
+PIECE = 2**21  # numbers that are copied to the host under one hold of the lock: some 2 ms
 
 _LOCK = threading.RLock()
 _OWN = threading.local()
@@ -105,17 +102,14 @@ def download(arrays: Mapping[str, Any], stream: Any) -> dict[str, NDArray[Any]]:
     return {name: array.numpy() for name, array in host.items()}
 
 
-BUDGET = 4
-"""Steps that a whisker begins in one slice."""
+BUDGET = 4  # steps that a whisker begins in one slice
 FEW = 2**14
 """Whiskers below which one step begins in a slice: a kernel then takes as long as its slowest thread, and whiskers in
 contact, which need two slices a step, would wait for others' four."""
 SMALL = 2**10
 """Whiskers below which a recorded graph is kept as it is: threads without a whisker cost it nothing then."""
-SLICES_PER_CHECK = 8
-"""Slices (an even number) after which the host counts the whiskers that are left."""
-MOST_THREADS = 2**19
-"""Most threads that find distances at once: a few times as many as a GPU runs side by side."""
+SLICES_PER_CHECK = 8  # slices (an even number) after which the host counts the whiskers that are left
+MOST_THREADS = 2**19  # most threads that find distances at once: a few times as many as a GPU runs side by side
 REPEATS, RARELY = (4, 64), 256
 """Least and most times that a recorded graph is launched for each count, and slices so far for one time more: the host
 has many launches to look after."""

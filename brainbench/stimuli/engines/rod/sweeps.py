@@ -42,12 +42,10 @@ from brainbench.stimuli.engines.trust import BLOW
 from brainbench.stimuli.engines.units import MILLI
 from brainbench.stimuli.objects.solid import Solid
 
-BLOCK = 64
-"""Threads of one block on a GPU."""
+BLOCK = 64  # threads of one block on a GPU
 BOUNDS = (BLOCK, 8)
 """CUDA launch bounds: registers are spilled for twice as many threads at a time (benchmarks/RESULTS.md)."""
-SLICED_BOUNDS = (BLOCK, 4)
-"""The same for whiskers in slices, whose registers are needed more than further threads."""
+SLICED_BOUNDS = (BLOCK, 4)  # the same for whiskers in slices, whose registers are needed more than further threads
 
 
 class SweepLauncher:

@@ -50,10 +50,8 @@ from brainbench.stimuli.engines.rod.slices import allocate, lock_of, parts_of
 from brainbench.stimuli.engines.units import MICRO, MILLI
 from brainbench.stimuli.whiskers.chain import Chain
 
-KERNELS = f"{__package__}.kernels"
-"""Package that writes steps down."""
-ROOM = 2**26
-"""Bytes that records of the steps of a launch may take; beyond them they are written down in parts."""
+KERNELS = f"{__package__}.kernels"  # package that writes steps down
+ROOM = 2**26  # bytes that records of the steps of a launch may take; beyond them they are written down in parts
 
 
 class RecordingSolver(WhiskerSolver):

@@ -19,8 +19,7 @@ from brainbench.core.rotations import euler_matrix
 if TYPE_CHECKING:
     from manifold3d import Manifold
 
-WEDGES = 24
-"""Wedges around the axis that stand for a hollow turned wall: convex pieces within 1 % of its radius."""
+WEDGES = 24  # wedges around the axis that stand for a hollow turned wall: convex pieces within 1 % of its radius
 
 
 class ShapeSampler:

@@ -20,12 +20,9 @@ from ..algebra import reader, vec3
 from ..delassus import DelassusRows, PerRow1, SolverState, ThreadContacts, add_rates, own_rows, row, row_size
 from ..parameters import real
 
-NEWTON_STEPS = 30
-"""Most steps; a start near the forces takes two to four."""
-HALVINGS = 8
-"""Most halvings of a step."""
-SETTLED = 1e-9
-"""Change of the forces in a step, as a share of the normal ones, from which the next would be rounding."""
+NEWTON_STEPS = 30  # most steps; a start near the forces takes two to four
+HALVINGS = 8  # most halvings of a step
+SETTLED = 1e-9  # change of the forces in a step, as a share of the normal ones, from which the next would be rounding
 CAUTIOUS, DIRECT = 0.3, 1.0
 """ρ times the tangential compliance of a contact, in turn: where one goes in circles, the other does not."""
 
