@@ -17,7 +17,7 @@ from robotics_bridge import tasks
 from robotics_bridge.policies.encoders.arms import ARMS, EncoderConfig
 from robotics_bridge.policies.encoders.front_end import CONTROL_SUB_STEP, HandCalibration
 from robotics_bridge.policies.evaluate import Policy, evaluate
-from robotics_bridge.policies.fit import with_contacts_of
+from robotics_bridge.policies.fit import check_version, with_contacts_of
 from robotics_bridge.policies.shipped import list_policies
 from robotics_bridge.policies.training.distill import DistillResult, distill
 from robotics_bridge.policies.training.distill_config import DistillConfig
@@ -119,13 +119,15 @@ def is_done(config: DistillConfig, out: Path, stop_at: int | None = None) -> boo
     if not (out / EVALUATION).is_file():
         return False
     mine = config.resolved(tasks.load(config.task, config.variant).student)
-    stored = DistillConfig.of(read_mapping(out / CONFIG).get("distill", {}))
+    described = read_mapping(out / CONFIG)
+    check_version(described, str(out))
+    stored = DistillConfig.of(described.get("distill", {}))
     # Contacts and calibration that a student does not state are chosen when it begins.
     settings = {**stored.encoder_settings, **mine.encoder_settings}
     mine = replace(mine, encoder_settings=settings, contacts=mine.contacts or stored.contacts)
     total = stored.iterations or 0
-    wanted = min(total, stop_at or total)
-    return mine == stored and all(item.get("iterations", total) >= wanted for item in read_json(out / EVALUATION))
+    rows = read_json(out / EVALUATION)
+    return mine == stored and all(row.get("iterations", total) >= min(total, stop_at or total) for row in rows)
 
 
 def calibrated(config: DistillConfig, env: Any, teacher: Any, out: Path) -> DistillConfig:

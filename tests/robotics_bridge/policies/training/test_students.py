@@ -7,13 +7,14 @@ from dataclasses import asdict, replace
 
 import pytest
 
-from brainbench.core.errors import UsageError
+from brainbench.core.errors import DataError, UsageError
 from brainbench.core.files import read_json, write_json
 from robotics_bridge import tasks
 from robotics_bridge.policies.contract import trained_contacts
 from robotics_bridge.policies.training.distill_config import DistillConfig
 from robotics_bridge.policies.training.students import calibrated, is_done, train_student
 from robotics_bridge.tasks.settings import CONTACTS
+from robotics_bridge.tasks.task import TASK_VERSION
 from tests.factories.policies import teacher_in
 from tests.factories.task_worlds import Follower, TouchWorld
 
@@ -80,6 +81,7 @@ def test_a_student_is_taught_in_the_contacts_of_its_teacher_unless_told_otherwis
     train_student(config, tmp_path / "run", episodes=0)
     described = read_json(tmp_path / "run" / "config.json")
     assert described["distill"]["contacts"] == contacts
+    assert (described["deployment"]["twist"] is None) == (config.variant == "default")
     assert trained_contacts(described) == trained_contacts(described["deployment"]) == CONTACTS[contacts]
 
 
@@ -87,7 +89,7 @@ def test_a_student_is_done_once_the_very_one_was_evaluated_after_its_last_iterat
     config = DistillConfig(task="in_palm_rotate", teacher="in_palm_rotate.teacher", observe="none", num_envs=2)
     stored = replace(config.resolved(tasks.load("in_palm_rotate").student), contacts="firm")
     assert not is_done(config, tmp_path)
-    write_json(tmp_path / "config.json", {"distill": asdict(stored)})
+    write_json(tmp_path / "config.json", {"distill": asdict(stored), "task_version": TASK_VERSION})
     for iterations, done in ((stored.iterations, True), (3, False)):
         write_json(tmp_path / "evaluation.json", [{"seed": 1000, "success": [0.0], "iterations": iterations}])
         assert is_done(config, tmp_path) is done
@@ -97,6 +99,10 @@ def test_a_student_is_done_once_the_very_one_was_evaluated_after_its_last_iterat
     assert is_done(config, tmp_path)
     changes = ({"iterations": 3}, {"steps_per_env": 3}, {"contacts": "published"}, {"teacher": "runs/other"})
     assert not any(is_done(replace(config, **change), tmp_path) for change in changes)
+    # What another version of the tasks trained is no student of this one.
+    write_json(tmp_path / "config.json", {"distill": asdict(stored), "task_version": TASK_VERSION - 1})
+    with pytest.raises(DataError, match=r"version 2 of the tasks.*train it again"):
+        is_done(config, tmp_path)
 
 
 def test_resampled_time_is_for_readings_as_often_as_the_encoder_assumes(tmp_path, monkeypatch) -> None:
