@@ -200,7 +200,7 @@ def main() -> None:
             }  # fmt: skip
         env = make(task)
         reports: list[Report] = []
-        cases = [(way, {"faults": faults}) for way, faults in FAULTY.items()]
+        cases: list[tuple[str, dict[str, Any]]] = [(way, {"faults": faults}) for way, faults in FAULTY.items()]
         with tempfile.TemporaryDirectory() as folder:
             target = Path(folder) / "policy.onnx"
             deployed = read_deployed(export_policy(student, target, deployment=described["deployment"]).path)

@@ -106,13 +106,14 @@ def judge_claim(claim: Mapping[str, Any], types: Sequence[str], arms: Arms, leve
         return None
     if claim["rule"] == "mean":
         effect, margin = difference(arms, pairs, level), claim.get("margin", 0.0)
-        bounds = replace(effect.interval, low=effect.interval.low + margin, high=effect.interval.high + margin)
-        return Judged(effect, judge(replace(effect, value=effect.value + margin, interval=bounds), 1))
+        bounds = effect.interval
+        moved = bounds and replace(bounds, low=bounds.low + margin, high=bounds.high + margin)
+        return Judged(effect, judge(replace(effect, value=effect.value + margin, interval=moved), 1))
     effects = {" less ".join(map(in_words, pair)): difference(arms, [pair], level) for pair in pairs}
     weakest = min(effects, key=lambda name: effects[name].value)
     verdicts = [judge(effect, 1) for effect in effects.values()]
-    worst: tuple[Verdict, ...] = ("does not hold", "undecided")
-    verdict = next((each for each in worst if each in verdicts), "holds")
+    order = ["does not hold", "undecided", "holds"]
+    verdict = min(verdicts, key=order.index)
     return Judged(effects[weakest], verdict, weakest)
 
 
