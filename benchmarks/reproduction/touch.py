@@ -111,7 +111,7 @@ def judge_claim(claim: Mapping[str, Any], types: Sequence[str], arms: Arms, leve
         return Judged(effect, judge(replace(effect, value=effect.value + margin, interval=moved), 1))
     effects = {" less ".join(map(in_words, pair)): difference(arms, [pair], level) for pair in pairs}
     weakest = min(effects, key=lambda name: effects[name].value)
-    verdicts = [judge(effect, 1) for effect in effects.values()]
+    verdicts: list[Verdict] = [judge(effect, 1) for effect in effects.values()]
     order = ["does not hold", "undecided", "holds"]
     verdict = min(verdicts, key=order.index)
     return Judged(effects[weakest], verdict, weakest)
