@@ -57,7 +57,7 @@ def main() -> None:
 
 def _run() -> None:
     from brainbench.cli.application import build
-    from brainbench.core.errors import BrainbenchError, visible_lines
+    from brainbench.core.errors import BrainbenchError, brief, visible_lines
 
     # A shell that completes words asks for all of them.
     completing = "_BRAINBENCH_COMPLETE" in os.environ
@@ -70,6 +70,9 @@ def _run() -> None:
         print(f"brainbench: {visible_lines(str(error))}", file=sys.stderr)
         sys.exit(error.exit_code)
     except OSError as error:
+        if error.errno in (errno.ENAMETOOLONG, errno.EACCES, errno.EPERM, errno.EROFS, errno.ELOOP) and error.filename:
+            print(f"brainbench: {brief(str(error.filename))} cannot be opened ({error.strerror}).", file=sys.stderr)
+            sys.exit(2)
         if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EIO):
             raise
         # It would be tried again, and fail again, when Python ends.

@@ -149,3 +149,18 @@ def test_a_full_output_is_one_sentence(boards, words):
         done = _command(*words[:2], *(boards if "diff" in words else ()), *words[2:], stdout=full)
     assert done.returncode == 1
     assert done.stderr == "brainbench: The output cannot be written (No space left on device).\n"
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("models", "add", "{}.py:Mine", "--name", "mine"), ("leaderboard", "verify", "{}"),
+        ("stimuli", "objects", "{}"),
+        ("leaderboard", "build", "{}", "--out", "site"), ("benchmark", "check", "{}"), ("recordings", "inspect", "{}"),
+    ],
+)  # fmt: skip
+def test_a_name_longer_than_the_system_allows_is_one_sentence(run, words):
+    outcome = run(*(word.format("/none" * 2000) for word in words))
+    assert (outcome.status in (1, 2), outcome.out, outcome.err.count("\n")) == (True, "", 1)
+    assert "File name too long" in outcome.err
+    assert len(outcome.err) < 420

@@ -104,9 +104,9 @@ def read_graph(source: Mapping[str, Any] | str | os.PathLike[str]) -> GraphSpec:
     Feedback is what leads back in ``ff_order`` if that is given, else in the listed order of the nodes; without cycles
     nothing is feedback. ``num_timesteps`` is not needed and ignored.
     """
-    if isinstance(source, Mapping):
-        return _graph(source)
-    with readable(source, "graph configuration"):
+    with readable("a graph" if isinstance(source, Mapping) else source, "graph configuration"):
+        if isinstance(source, Mapping):
+            return _graph(source)
         return _graph(read_mapping(source) if os.fspath(source).endswith(".toml") else read_json(source))
 
 

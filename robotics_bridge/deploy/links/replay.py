@@ -35,6 +35,7 @@ from robotics_bridge.sensors import KinematicTaxel, Probes, SensorSuite
 
 RADIUS = 4e-3  # sensing radius of a taxel whose log does not say (m)
 _LARGEST = 1.0  # distance of a taxel from the origin of its link above which it looks like millimetres (m)
+_STRONGEST = 1e9  # largest reading of a taxel, in any unit; beyond it the number is damaged
 _TURN = 2 * np.pi  # largest joint angle (rad); beyond it angles look like degrees
 _RATE = 200.0  # least physics reports per second
 _MOST = 1_000_000  # most frames of an episode
@@ -72,6 +73,10 @@ class TouchLog:
         if not self.joints or not self.points.links:
             raise DataError(
                 f"{self.name} needs joints and taxels; it has {len(self.joints)} and {self.force.shape[1]}."
+            )
+        if (most := float(np.abs(self.force).max(initial=0.0))) > _STRONGEST:
+            raise DataError(
+                f"{self.name}: a taxel reads {most:g}, more than any hand feels ({_STRONGEST:g}); correct it."
             )
         far = float(np.abs(self.points.position).max())
         if far > _LARGEST:

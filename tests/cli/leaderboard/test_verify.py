@@ -6,6 +6,7 @@ import re
 import shutil
 import stat
 import subprocess
+import tomllib
 from dataclasses import replace
 from pathlib import Path
 
@@ -391,6 +392,21 @@ def test_the_workflow_is_this_command(tmp_path):
     assert [step["with"]["persist-credentials"] for step in job["steps"] if "checkout" in step.get("uses", "")] == [
         False
     ]
+    # Packages are those of the list, each by its hash, in the tested version; the package itself brings none along.
+    hashes = WORKFLOW.parents[1] / "submission.txt"
+    assert [run for run in runs if "pip" in run] == [
+        f"pip install --require-hashes --only-binary :all: -r {hashes.relative_to(WORKFLOW.parents[2])}",
+        "pip install --no-deps --no-build-isolation .",
+    ]
+    pins = dict(
+        re.findall(r"^([\w.-]+)==([\w.]+)(?:\+cpu)? --hash=sha256:[0-9a-f]{64}$", hashes.read_text(), re.MULTILINE)
+    )
+    tested = (WORKFLOW.parents[2] / "constraints.txt").read_text().splitlines()
+    names = {line.partition("==")[0]: line.partition("==")[2] for line in tested}
+    assert {name: names[name] for name in pins if name in names and names[name] != pins[name]} == {}
+    needed = tomllib.loads((WORKFLOW.parents[2] / "pyproject.toml").read_text())["project"]["dependencies"]
+    needed = {re.match(r"[\w-]+", need)[0].lower() for need in needed}
+    assert needed | {"setuptools"} <= {name.lower() for name in pins}
     # Nothing of the pull request stands inside a shell command.
     assert "${{" not in "".join(runs)
     # The secret is fetched before anything of the submission is there.

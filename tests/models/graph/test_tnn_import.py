@@ -164,6 +164,12 @@ def test_a_missing_key_is_named(key):
         read_graph(config)
 
 
+@pytest.mark.parametrize("edges", [1.5, None, [3], "x"])
+def test_edges_of_another_kind_are_refused(edges):
+    with pytest.raises(DataError, match=r"edge|graph configuration"):
+        read_graph({"nodes": [], "input_nodes": [], "output_node": "a", "input_shape": [3, 5, 7], "edges": edges})
+
+
 def test_several_outputs_are_refused():
     with pytest.raises(DataError, match=r"\['a', 'b'\]; .*one"):
         read_graph(_config(output_node=["a", "b"]))

@@ -56,6 +56,13 @@ def _table(path: Path, log: TouchLog) -> Path:
     return path
 
 
+def test_a_reading_that_no_hand_feels_is_refused(recorded) -> None:
+    force = recorded.log.force.copy()
+    force[3, 0] = 1e308
+    with pytest.raises(DataError, match="more than any hand feels"):
+        replace(recorded.log, force=force)
+
+
 def test_what_the_simulated_hand_recorded_is_replayed_to_the_last_newton(recorded, jaws) -> None:
     result = replay(recorded.log, str(jaws))
     peaks = recorded.simulated.max(axis=0)
