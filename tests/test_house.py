@@ -20,7 +20,7 @@ MOST_MODULES = 16
 MOST_LINES = 700
 """Lines of a module, which is cut by idea; 150 to 450 are usual."""
 BUDGETS = {
-    "brainbench/stimuli": 26_400,  # the estimated error of every whisker
+    "brainbench/stimuli": 26_750,  # the estimated error of every whisker, follicles that give way in two engines
     "robotics_bridge": 24_800,  # newtons that no taxel has, trees of any hand, deadlines, replays, gel pictures
     "brainbench/models": 8_410,  # the proof that a layer is a response, ONNX files tried apart
     "brainbench/datasets": 7_900,  # the balance of a reading, signals; files of torch_brain and rsatoolbox, both ways

@@ -69,9 +69,10 @@ def simulate(
         ``contact`` [stimulus, time, whisker], ``contact_arc`` (m along the whisker, NaN without contact),
         ``first_contact`` (s, when the first reading with contact was taken; NaN without), ``penetration`` (m, deepest
         overlap; a poor contact when large), ``error`` (estimated, as a share of force or moment; NaN where it is not),
-        ``damping`` (ratio of the first mode), ``status``, ``reason``, ``remark`` [stimulus, whisker]. The remark says
-        that an error is beyond what the fidelity promises. From the instant a whisker became ``unstable`` its numbers
-        are NaN. Attributes say how frames were made (``readout``), their ``axes`` and
+        ``damping`` (ratio of the first mode), ``status``, ``reason``, ``remark`` [stimulus, whisker]; where follicles
+        give way ``displacement`` [stimulus, time, whisker, axis] (m, rad; along the axes of a rigid base). The remark
+        says that an error is beyond what the fidelity promises. From the instant a whisker became ``unstable`` its
+        numbers are NaN. Attributes say how frames were made (``readout``), their ``axes`` and
         how many components were clipped in each stimulus (``clipped``). The attribute ``config_hash`` names what was
         asked for and is equal on every machine; ``content_hash`` names the numbers, whose last digits depend on the
         processor. :meth:`brainbench.stimuli.explain.Explanation.of` reads what was simulated, shared and left out.
@@ -254,6 +255,13 @@ def _assemble(
             "backend": backend,
         },
     )
+    if any(trace.displacement is not None for row in traces for trace in row):
+        rigid = np.zeros((len(frames.readings), 6))
+        gave = [[rigid if trace.displacement is None else trace.displacement for trace in row] for row in traces]
+        places = np.stack([np.stack([frames.reduce(each) for each in row], axis=1) for row in gave])
+        about = {"units": "m (x, y, z), rad (rx, ry, rz)", "long_name": "slide and turn of the follicle, its own axes"}
+        dataset["displacement"] = ((*over_time, "axis"), places.astype(np.float32), about)
+        dataset.coords["axis"] = np.array(["x", "y", "z", "rx", "ry", "rz"], dtype=object)
     if orientation is not None:
         dataset[ORIENTATION] = (("stimulus", "time", "whisker", "row_axis", "col_axis"), orientation)
     if clipped is not None:

@@ -118,6 +118,8 @@ def bending_moments(job: Job, joints: NDArray[np.float64]) -> NDArray[np.float64
         across = np.stack([-np.cos(about_y) * np.sin(about_z), np.cos(about_z), np.sin(about_y) * np.sin(about_z)], -1)
         second = np.einsum("nij,nj->ni", frame, across)
         frame = np.stack([along[:, link], second, np.cross(along[:, link], second)], axis=-1)
+    if job.whisker.follicle is not None:  # the turn of the first joint is that of the follicle too
+        moments[:, 0] = 2 * moments[:, 1] - moments[:, 2]
     return moments
 
 

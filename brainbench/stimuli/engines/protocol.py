@@ -164,6 +164,8 @@ class WhiskerEngine(ABC):
     """Values of :attr:`Fidelity.solver` it knows."""
     twists: ClassVar[bool] = False
     """True when whiskers can twist about their axis; in other engines they only bend."""
+    yields: ClassVar[bool] = False
+    """True when follicles can give way (:class:`brainbench.stimuli.whiskers.whisker.FollicleSprings`)."""
     surfaces: ClassVar[bool] = False
     """True when it collides the exact surface of obstacles that have one; others collide convex parts."""
     batches: ClassVar[bool] = False

@@ -16,6 +16,9 @@ from brainbench.stimuli.objects.obstacle import Capsule, Cylinder, Obstacle, Sph
 from brainbench.stimuli.whiskers.chain import Chain
 from brainbench.stimuli.whiskers.whisker import Whisker
 
+LARGEST_SLIDE = 0.1
+"""Way that a follicle may give, in lengths of its whisker."""
+
 
 @dataclass(frozen=True)
 class Reach:
@@ -65,7 +68,7 @@ def reachable(
     With ``surfaces`` the surface of every obstacle that has one is taken, as by engines that collide meshes; otherwise
     its parts, and the surface only where there are none.
     """
-    limit = whisker.arc_length + whisker.thickest
+    limit = whisker.arc_length * (1 if whisker.follicle is None else 1 + LARGEST_SLIDE) + whisker.thickest
     still = np.array([obstacle.motion is None for obstacle in obstacles], dtype=bool)
     bounds = np.array([obstacle.bounds for obstacle, stands in zip(obstacles, still, strict=True) if stands])
     apart = np.zeros(len(obstacles))

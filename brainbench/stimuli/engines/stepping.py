@@ -133,6 +133,7 @@ def silent_trace(job: Job, fidelity: Fidelity, record_shape: bool, seconds: floa
         wrench=np.zeros((count, 6)),
         contact=np.zeros(count, dtype=bool),
         contact_arc=np.full(count, np.nan),
+        displacement=None if job.whisker.follicle is None else np.zeros((count, 6)),
         error=0.0,
         seconds=seconds,
         link_positions=shape,
@@ -242,11 +243,13 @@ class SteppedJob:
         penetration: float,
         reason: str,
         steps: int,
+        displacement: NDArray[np.float64] | None = None,
         doubt: str = "",
     ) -> Trace:
         """Return the trace of values at the frames, NaN where not trusted.
 
-        ``shape`` is in m; ``steps`` are those that can be trusted; ``doubt`` is a fault without a time.
+        ``shape`` is in m, ``displacement`` in m and rad; ``steps`` are those that can be trusted; ``doubt`` is a fault
+        without a time.
         """
         good, penetration = frames.good, max(penetration, self.overlap[2])
         if not reason and penetration > 2 * LARGEST_OVERLAP:
@@ -265,6 +268,7 @@ class SteppedJob:
             reason=reason,
             steps=steps,
             seconds=time.thread_time() - self.started,
+            displacement=None if displacement is None else np.where(good[:, None], displacement, np.nan),
             link_positions=np.where(good[:, None, None], shape, np.nan) if self.record_shape else None,
         )
 

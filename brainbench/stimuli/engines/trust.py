@@ -14,7 +14,7 @@ from brainbench.core.reading.ranges import check_number
 from brainbench.core.rotations import base_rotation
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.protocol import WhiskerEngine
-from brainbench.stimuli.engines.reach import Reach, distances
+from brainbench.stimuli.engines.reach import LARGEST_SLIDE, Reach, distances
 from brainbench.stimuli.engines.units import MILLI
 from brainbench.stimuli.motion.jobs import Job
 from brainbench.stimuli.objects.obstacle import Obstacle
@@ -71,17 +71,20 @@ whisker is then within 20 % of the force in far shorter steps, up to 25 m/s."""
 HEAD_ON = 0.98
 """Cosine of the angle between an object's way and a straight whisker from which it pushes along it."""
 
-OK, BENT, LOST, STARTED_INSIDE, GOT_INSIDE, AT_BASE = range(6)
+OK, BENT, LOST, STARTED_INSIDE, GOT_INSIDE, AT_BASE, GAVE_WAY = range(7)
 """Ends of an integration: in order; with a joint bent beyond :data:`LARGEST_BEND`; with a value that is no number; in
-an object from the start, or later; with an object over the base point, where contact has no lever and is not felt."""
+an object from the start, or later; with an object over the base point, where contact has no lever and is not felt; with
+a follicle that gave way."""
 
 
+_FARTHEST = f"{LARGEST_BEND:g} rad or {LARGEST_SLIDE:.0%} of the length of its whisker"
 _FINER = "at {0:.6g} s; choose more links or a smaller time step"
 _FAULTS = {
     BENT: f"a joint bent by more than {LARGEST_BEND:g} rad, more than a chain of links can represent, {_FINER}",
     LOST: f"the state stopped being finite, {_FINER}",
     STARTED_INSIDE: "the whisker starts {1:.3g} mm deep in an object; move one of them",
     GOT_INSIDE: "the whisker was {1:.3g} mm deep in an object at {0:.6g} s; choose a smaller time step",
+    GAVE_WAY: "the follicle gave way at {0:.6g} s by more than " + _FARTHEST + "; give it stiffer springs",
     AT_BASE: "an object reached the whisker's base point, where nothing is felt, at {0:.6g} s; move one of them",
 }
 """Fault in words, given its time (s) and the deepest overlap (mm)."""
@@ -98,7 +101,8 @@ class RunFacts:
     """Facts of simulated whiskers on which :func:`judge` rests: arrays of one shape, times in s."""
 
     status: NDArray[np.int32]
-    """:data:`OK`, :data:`BENT`, :data:`LOST`, :data:`STARTED_INSIDE`, :data:`GOT_INSIDE` or :data:`AT_BASE`."""
+    """:data:`OK`, :data:`BENT`, :data:`LOST`, :data:`STARTED_INSIDE`, :data:`GOT_INSIDE`, :data:`AT_BASE` or
+    :data:`GAVE_WAY`."""
     failed: NDArray[np.floating]
     """Time at which that happened."""
     strength: NDArray[np.floating]
@@ -377,6 +381,11 @@ def check_jobs(engine: WhiskerEngine, jobs: Sequence[Job], fidelity: Fidelity, w
     if fidelity.twist and not engine.twists:
         raise UsageError(
             f"Whiskers of the backend {engine.name!r} bend but do not twist; leave twist out, or use the backend 'rod'."
+        )
+    if not engine.yields and any(job.whisker.follicle is not None for job in jobs):
+        raise UsageError(
+            f"Whiskers of the backend {engine.name!r} have rigid follicles; leave follicle out, or use the backend"
+            " 'rod' or 'mujoco'."
         )
     if not engine.surfaces:
         require_parts(jobs, engine.name)

@@ -134,6 +134,9 @@ class Trace:
     of engines that count them (``rod`` does)."""
     seconds: float = 0.0
     """Processor time of this whisker [s]."""
+    displacement: NDArray[np.float64] | None = None
+    """[n, 6] how far the follicle has given way along its own axes: slide (m) and rotation vector (rad), those of the
+    whisker's base frame where nothing gives way; None for a rigid one."""
     link_positions: NDArray[np.float64] | None = None
     """[n, links + 1, 3] joints and tip (m, world) when the shape was asked for."""
     contact_wrench: NDArray[np.float64] | None = None

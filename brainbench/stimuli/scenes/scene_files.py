@@ -10,6 +10,7 @@
     whiskers = "C1,C2"
     [array.replace.C2]           # optional: other whisker properties, SI units, by selection
     young_modulus = 3.3e9        # along the whisker: moduli = [[0, 3e9], [0.0153, 4.5e9]], radii likewise
+    follicle = { about_z = [2e-6, 2e-9] }  # gives way: stiffness and damping along_x … about_z, N/m or N·m/rad
 
     [head]                       # the array frame in the world; rotation about x, then y, then z
     position_mm = [0, 0, 0]

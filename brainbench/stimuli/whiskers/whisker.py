@@ -7,14 +7,14 @@ plane with its concave side towards +y. Arc length s runs from 0 at the base to 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
-from typing import Annotated
+from dataclasses import dataclass, field, fields
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.polynomial import Polynomial
 from numpy.typing import ArrayLike, NDArray
 
-from brainbench.core.errors import UsageError, brief
+from brainbench.core.errors import UsageError, brief, check_each
 from brainbench.core.limits import Limit, NotNegative, limited
 from brainbench.core.rotations import Length
 
@@ -28,8 +28,40 @@ NODES, WEIGHTS = np.polynomial.legendre.leggauss(8)
 """Gauss-Legendre quadrature on [−1, 1]."""
 
 
+_Stiffness = Annotated[float, Limit(above=0)]
+_Spring = tuple[_Stiffness, _Stiffness]
+
+
 @dataclass(frozen=True)
-@limited(of="{} of a whisker")
+@limited(of="{} of a follicle")
+class FollicleSprings:
+    """What holds a follicle that gives way: a spring and a damper of each axis that is not rigid.
+
+    Axes are those of the base frame: x along the whisker, curvature in the x-y plane. No absolute constants are
+    published; a first guess is a turn of the size of the whisker's own, k = 3 E I/L.
+    """
+
+    along_x: _Spring | None = None
+    """Stiffness [N/m] and damping [N·s/m] against slides along an axis; rigid without."""
+    along_y: _Spring | None = None
+    along_z: _Spring | None = None
+    about_x: _Spring | None = None
+    """Stiffness [N·m/rad] and damping [N·m·s/rad] against turns about an axis; rigid without."""
+    about_y: _Spring | None = None
+    about_z: _Spring | None = None
+
+    def __post_init__(self) -> None:
+        if not self.constants.any():
+            raise UsageError("A follicle that gives way has one spring at least, such as about_z = (1e-6, 1e-9).")
+
+    @property
+    def constants(self) -> NDArray[np.float64]:
+        """[6, 2] stiffness and damping of slides along x, y, z and of turns about them; 0 for rigid axes."""
+        return np.array([getattr(self, axis.name) or (0.0, 0.0) for axis in fields(self)])
+
+
+@dataclass(frozen=True)
+@limited(of="{} of a whisker", unresolved=("follicle",))
 class Whisker:
     """Geometry and material of one whisker.
 
@@ -63,6 +95,9 @@ class Whisker:
     moduli: tuple[tuple[float, float], ...] = field(default=(), metadata={"later": True})
     """Rows (arc length [m], Young's modulus [Pa]) likewise, in place of ``young_modulus``, then that at the base."""
 
+    follicle: FollicleSprings | None = field(default=None, metadata={"later": True})
+    """What gives way at the base; nothing when None."""
+
     def __post_init__(self) -> None:
         for name, what, least in (("radii", "radius", 0.0), ("moduli", "Young's modulus", SOFTEST)):
             rows = tuple((float(arc), float(value)) for arc, value in getattr(self, name))
@@ -74,6 +109,10 @@ class Whisker:
             object.__setattr__(self, "tip_radius", self.radii[-1][1])
         if self.moduli:
             object.__setattr__(self, "young_modulus", self.moduli[0][1])
+        if isinstance(self.follicle, dict):
+            check_each("follicle axis", self.follicle, [axis.name for axis in fields(FollicleSprings)])
+            springs: Any = {axis: tuple(map(float, pair)) for axis, pair in self.follicle.items()}
+            object.__setattr__(self, "follicle", FollicleSprings(**springs))
         if isinstance(self.density, (tuple, list)):
             object.__setattr__(self, "density", (float(self.density[0]), float(self.density[1])))
         thickest = self.thickest

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from brainbench.core.errors import UsageError
 from brainbench.core.files import content_hash, to_plain
-from brainbench.stimuli.whiskers.whisker import Whisker
+from brainbench.stimuli.whiskers.whisker import FollicleSprings, Whisker
 from tests.factories.whiskers import C2
 
 
@@ -113,4 +113,27 @@ def test_a_table_of_the_cone_is_the_cone_and_stands_for_both_its_radii():
     np.testing.assert_allclose(
         whisker.bending_stiffness(s) / C2.bending_stiffness(s), np.linspace(2e9, 4e9, 31) / C2.young_modulus, rtol=1e-13
     )
+    assert hash(whisker) != hash(C2)
+
+
+@pytest.mark.parametrize(
+    ("springs", "words"),
+    [
+        ({"about_z": (0.0, 1e-9)}, "about_z of a follicle must be"),
+        ({"about_z": (math.inf, 1e-9)}, "about_z of a follicle must be"),
+        ({"along_y": (0.1, 0.0)}, "along_y of a follicle must be"),
+        ({"about_w": (1e-6, 1e-9)}, "'about_w'.*about_z"),
+        ({}, "has one spring at least"),
+    ],
+)
+def test_follicles_without_sense_are_refused(springs, words):
+    with pytest.raises(UsageError, match=words):
+        replace(C2, follicle=springs)
+
+
+def test_follicle_of_a_file_is_that_of_python():
+    whisker = replace(C2, follicle={"about_z": [2e-6, 2e-9]})
+    assert whisker.follicle == FollicleSprings(about_z=(2e-6, 2e-9))
+    assert whisker.follicle.constants[5].tolist() == [2e-6, 2e-9]
+    assert content_hash(whisker) != content_hash(C2)
     assert hash(whisker) != hash(C2)

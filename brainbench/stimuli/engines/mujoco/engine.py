@@ -10,7 +10,7 @@ from __future__ import annotations
 import contextlib
 import logging
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import import_module
 
 import numpy as np
@@ -18,9 +18,16 @@ from numpy.typing import NDArray
 
 from brainbench.core.rotations import euler_matrix
 from brainbench.stimuli.engines.mujoco.model import ARMATURE, SLOT_WIDTH, WhiskerModel, build_model, engine
-from brainbench.stimuli.engines.reach import Reach, stays_in_plane
+from brainbench.stimuli.engines.reach import LARGEST_SLIDE, Reach, stays_in_plane
 from brainbench.stimuli.engines.stepping import SteppedEngine, SteppedJob
-from brainbench.stimuli.engines.trust import LARGEST_BEND, LARGEST_CHANGE, state_fault, strongest_force
+from brainbench.stimuli.engines.trust import (
+    GAVE_WAY,
+    LARGEST_BEND,
+    LARGEST_CHANGE,
+    fault,
+    state_fault,
+    strongest_force,
+)
 from brainbench.stimuli.engines.units import MICRO, MILLI
 from brainbench.stimuli.motion.jobs import Job, Trace
 from brainbench.stimuli.whiskers.chain import Chain
@@ -37,6 +44,7 @@ class MujocoWhiskerEngine(SteppedEngine):
 
     name = "mujoco"
     twists = True
+    yields = True
     package = "mujoco-core"
     revision = "+1"  # one contact for a pair of convex bodies
 
@@ -61,6 +69,13 @@ class MujocoWhiskerEngine(SteppedEngine):
             job, chain, stepped.reach, stepped.step, stepped.times, twists=twists, contact_tolerance=tolerance
         )
         sensors, hinges, failed, reason = _integrate(built, job, stepped.times)
+        displacement, still = None, built
+        if len(built.yielding):
+            displacement, hinges, built = _give_way(built, sensors, hinges)
+            far = np.abs(displacement) >= np.repeat([LARGEST_SLIDE * job.whisker.arc_length, LARGEST_BEND], 3)
+            first = int(np.argmax(far.any(axis=1)))
+            if far[first].any() and first < failed:
+                failed, reason = first, fault(GAVE_WAY, float(stepped.times[first]), 0.0)
         failed, reason = stepped.end(failed, reason)
         frames = stepped.frames(failed)
         nearest = frames.nearest
@@ -71,15 +86,34 @@ class MujocoWhiskerEngine(SteppedEngine):
             shape = frames.interpolate(lambda steps: _shape(built, chain, hinges[steps], steps))
         return stepped.trace(
             frames,
-            frames.interpolate(lambda steps: _wrench(built, sensors, steps)),
+            frames.interpolate(lambda steps: _wrench(still, sensors, steps)),
             contact,
             arc,
             shape / MILLI,
             penetration=_penetration(sensors[: failed + 1, 6:], hinges[: failed + 1], built, chain),
             reason=reason,
             steps=failed,
+            displacement=None if displacement is None else frames.interpolate(displacement.__getitem__),
             doubt=_lost_friction(*_friction(sensors[:failed, 6:], job, stepped.reach)),
         )
+
+
+def _give_way(
+    built: WhiskerModel, sensors: NDArray, joints: NDArray
+) -> tuple[NDArray[np.float64], NDArray[np.float64], WhiskerModel]:
+    """Return how far the follicle is before every step [n, 6] (m, rad), the whisker's own hinges [n, hinge], and the
+    model with its base there; moments of ``sensors`` [n, …] are put about the new base."""
+    from scipy.spatial.transform import Rotation
+
+    count = len(built.yielding)
+    places = np.zeros((len(joints), 6))
+    places[:, built.yielding] = joints[:, :count]
+    slide, turns = places[:, :3], Rotation.from_euler("XYZ", places[:, 3:])
+    # Sensors stand where the follicle would be if it were rigid.
+    sensors[:, 3:6] -= np.cross(slide, sensors[:, :3])
+    arm = np.einsum("nij,nj->ni", built.rotation, slide)
+    moved = replace(built, base=built.base + arm, rotation=built.rotation @ turns.as_matrix())
+    return np.concatenate([slide / MILLI, turns.as_rotvec()], axis=1), joints[:, count:], moved
 
 
 def _wrench(built: WhiskerModel, sensors: NDArray, steps: NDArray) -> NDArray[np.float64]:
@@ -102,7 +136,8 @@ def _integrate(
     data = mujoco.MjData(model)
     steps, strongest = len(times) - 1, strongest_force(job.whisker) * MILLI
     sensors = np.zeros((steps, model.nsensordata))
-    hinges = np.zeros((steps, 2 * len(built.twisting) + np.count_nonzero(built.twisting)))
+    axes = len(built.yielding)
+    hinges = np.zeros((steps, axes + 2 * len(built.twisting) + np.count_nonzero(built.twisting)))
     spec = int(mujoco.mjtState.mjSTATE_QFRC_APPLIED)
     if job.loads:
         spec |= int(mujoco.mjtState.mjSTATE_XFRC_APPLIED)
@@ -136,12 +171,12 @@ def _integrate(
         hinges[first + 1 : first + count] = angles[:-1]
         warned = [str(mujoco.mjtWarning(int(kind)).name) for kind in np.flatnonzero(data.warning.number)]
         # Also true of NaN; looking at every step by itself takes as long as a step of a short chain.
-        sound = np.isfinite(read).all() and np.abs(hinges[window]).max() < LARGEST_BEND
+        sound = np.isfinite(read).all() and np.abs(hinges[window, axes:]).max() < LARGEST_BEND
         if warned or not sound or np.abs(read[0, :, :3]).max() > strongest:
-            bad = ~np.isfinite(read[0]).all(axis=1) | ~(np.abs(hinges[window]) < LARGEST_BEND).all(axis=1)
+            bad = ~np.isfinite(read[0]).all(axis=1) | ~(np.abs(hinges[window, axes:]) < LARGEST_BEND).all(axis=1)
             bad |= np.abs(read[0, :, :3]).max(axis=1) > strongest
             failed = first + (int(np.argmax(bad)) if bad.any() else 0)
-            fault = state_fault(hinges[failed], sensors[failed, :6] / MILLI, job.whisker)
+            fault = state_fault(hinges[failed, axes:], sensors[failed, :6] / MILLI, job.whisker)
             fault = fault or f"MuJoCo warned of {', '.join(warned) or 'a non-finite sensor'}"
             return sensors, hinges, failed, f"at {times[failed]:.6g} s {fault}"
         state = states[0, -1].copy()

@@ -26,6 +26,7 @@ from brainbench.stimuli.engines.units import MICRO, MILLI
 from brainbench.stimuli.motion.jobs import Job
 from brainbench.stimuli.objects.obstacle import Box, ConvexPart, Obstacle, Part, Sphere
 from brainbench.stimuli.whiskers.chain import Chain
+from brainbench.stimuli.whiskers.whisker import Whisker
 
 ARMATURE = 1e9
 """Inertia of a prescribed coordinate. Larger would cost the solver digits, smaller would let the whisker's
@@ -119,6 +120,9 @@ class WhiskerModel:
     """[N] thickness (mm) of each link beyond the core from which contact distances are counted."""
     twisting: NDArray[np.bool_]
     """[N] True for joints with a third hinge."""
+    yielding: NDArray[np.intp]
+    """[joint] axes of the follicle that give way, of slides along x, y, z and turns about them: joints before the
+    whisker's own."""
 
 
 def engine() -> Any:
@@ -186,6 +190,7 @@ def build_model(
     travel = max((float(move.max(initial=0.0)) for move in moves), default=0.0) * MILLI
     cores = [_thickness(chain, link, travel) for link in range(chain.links)]
     twisting = (chain.torsion > 0) & twists
+    base, yielding = _add_springs(base, job.whisker, step)
     _add_links(base, assets, job, chain, chain.damping(time_step), reach.nearest, cores, twisting)
     sensors = _add(root, "sensor")
     _add(sensors, "force", site="base")
@@ -201,6 +206,7 @@ def build_model(
         loads=tuple(model.body(f"load{index}").id for index in range(len(job.loads))),
         margins=np.array([margin for _, margin in cores]),
         twisting=twisting,
+        yielding=yielding,
     )
 
 
@@ -231,6 +237,23 @@ def _add_follicle(world: Element, position: NDArray, euler: NDArray) -> tuple[El
         else:
             body = _add(body, "body", quat=_quaternion(angle[0], axis))
     return _add(body, "body", name="base"), np.reshape(paths, (len(paths), len(position))).T
+
+
+def _add_springs(base: Element, whisker: Whisker, step: float) -> tuple[Element, NDArray[np.intp]]:
+    """Add the joints of a follicle that gives way; return the body behind them, and their axes."""
+    if whisker.follicle is None:
+        return base, np.zeros(0, dtype=int)
+    constants = whisker.follicle.constants * np.repeat([[1, MILLI], [MICRO, MICRO * MILLI]], 3, axis=0)
+    axes, body = np.flatnonzero(constants[:, 0]), _add(base, "body")
+    for axis in axes:
+        stiffness, damping = constants[axis]
+        # A step damps like its length times the stiffness by itself.
+        how = {"stiffness": stiffness, "damping": max(damping - step * stiffness, 0.0)}
+        _add(body, "joint", type="slide" if axis < 3 else "hinge", axis=np.eye(3)[axis % 3], **how)
+    # Its turns and those of the first link are about one point: with no inertia between them rounding would decide.
+    mass = 1e-6 * whisker.mass * MICRO
+    _add(body, "inertial", pos="0 0 0", mass=mass, diaginertia=np.full(3, mass * (whisker.arc_length * MILLI) ** 2 / 3))
+    return body, axes
 
 
 def _add_links(

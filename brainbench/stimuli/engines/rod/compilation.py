@@ -20,6 +20,7 @@ def load_kernels(
     *,
     hinges: int = 2,
     recorder: str = "",
+    yields: bool = False,
     compiling: Callable[[bool], None] | None = None,
     **options: Any,
 ) -> Any:
@@ -34,12 +35,12 @@ def load_kernels(
     """
     from brainbench.stimuli.engines.rod.kernels import BUILDING, build_kernels
 
+    kind = {"hinges": hinges, "recorder": recorder} | ({"yields": True} if yields else {})
     with BUILDING:
         if device.is_cuda:
-            kernels = build_kernels(real, capacity, needs, cuda=True, hinges=hinges, recorder=recorder, **options)
+            kernels = build_kernels(real, capacity, needs, cuda=True, **kind, **options)
         else:
-            sliced = options.get("sliced", False)
-            kernels = build_kernels(real, capacity, sliced=sliced, hinges=hinges, recorder=recorder)
+            kernels = build_kernels(real, capacity, sliced=options.get("sliced", False), **kind)
     if device.is_cuda and options.get("sliced"):
         with kernels.loading, lock_of(device):
             _load_together(kernels, options["bounds"][0], device)

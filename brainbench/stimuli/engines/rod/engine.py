@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from brainbench.core.devices import pick_device, usable_processors, warp
 from brainbench.core.progress import Progress as NamedProgress
+from brainbench.core.rotations import base_rotation
 from brainbench.stimuli.engines.error_estimates import MORE, MOST, with_errors
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.protocol import PassiveSweeps, Progress, SweepBatch, WhiskerEngine, run_groups
@@ -51,6 +52,7 @@ class RodEngine(WhiskerEngine):
     devices = ("cpu", "cuda")
     solvers = ("dynamic", "quasistatic")
     twists = True
+    yields = True
     surfaces = True
     batches = True
 
@@ -164,8 +166,8 @@ def _simulate(
         else:
             tasks[index] = task
             spent[index] = time.thread_time() - started
-    for twists in (False, True):
-        some = {index: task for index, task in tasks.items() if task.twists == twists}
+    for alike in sorted({task.kind for task in tasks.values()}):
+        some = {index: task for index, task in tasks.items() if task.kind == alike}
         seconds = np.array([spent[index] for index in some])
         traces |= _simulate_alike(some, seconds, retry, fidelity, device, record_shape) if some else {}
     return traces
@@ -174,7 +176,7 @@ def _simulate(
 def _simulate_alike(
     tasks: dict[int, JobTask], seconds: NDArray, retry: int, fidelity: Fidelity, device: Any, record_shape: bool
 ) -> dict[int, Trace]:
-    """Run tasks of which all or none twist in one launch; ``seconds`` [task] is the processor time of each so far."""
+    """Run tasks of one kind in one launch; ``seconds`` [task] is the processor time of each so far."""
     given = list(tasks.values())
 
     def launch(tries: Sequence[Try]) -> list[LaunchResult]:
@@ -204,7 +206,12 @@ def trace_of(result: LaunchResult, row: int, job: Job, fidelity: Fidelity, secon
     touching = (arc >= 0) & good
     reason = without_escape(str(result.verdict.reasons[row, 0]), job, float(result.verdict.until[row, 0]))
     shape, felt = result.points, result.contact_wrench
-    base = np.asarray(job.follicle.pose(job.times)[0], dtype=float)[:, None]
+    position, euler = (np.asarray(values, dtype=float) for values in job.follicle.pose(job.times))
+    displacement = None
+    if result.displacement is not None:
+        displacement = np.where(good[:, None], result.displacement[row, :, 0].astype(float), np.nan)
+        position = position + np.einsum("nij,nj->ni", base_rotation(euler), displacement[:, :3])
+    base = position[:, None]
     nodes = fidelity.link_count(job.whisker.arc_length) + 1
     return Trace(
         wrench=np.where(good[:, None], result.wrench[row, :, 0].astype(float), np.nan),
@@ -215,6 +222,7 @@ def trace_of(result: LaunchResult, row: int, job: Job, fidelity: Fidelity, secon
         reason=reason,
         steps=int(result.steps[row, 0]),
         unsolved=int(result.counts["unsolved"][row, 0]),
+        displacement=displacement,
         seconds=seconds,
         link_positions=None if shape is None else np.where(good[:, None, None], base + shape[row, :, :nodes], np.nan),
         contact_wrench=None if felt is None else np.where(good[:, None], felt[row], np.nan),

@@ -24,7 +24,7 @@ from brainbench.core.devices import to_struct, warp
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.rod.compilation import load_kernels
 from brainbench.stimuli.engines.rod.limits import LIGHT, LONGEST_SPAN, TO_ROUNDING, contact_iterations
-from brainbench.stimuli.engines.rod.packing import PackedJobs, PackedMotions, capacity_for, pack_chains
+from brainbench.stimuli.engines.rod.packing import PackedJobs, PackedMotions, capacity_for, pack_chains, pack_follicles
 from brainbench.stimuli.engines.rod.shapes import PackedShapes
 from brainbench.stimuli.engines.rod.slices import Slices, allocate, download, lock_of, make_problems, parts_of
 from brainbench.stimuli.engines.trust import (
@@ -109,6 +109,8 @@ class LaunchResult:
     """[row, column]"""
     retried: NDArray[np.bool_]
     """[row, column] True where a whisker was simulated again."""
+    displacement: NDArray[np.floating] | None = None
+    """[row, reading, column, 6] as :attr:`brainbench.stimuli.motion.jobs.Trace.displacement`; None if all are rigid."""
     points: NDArray[np.floating] | None = None
     """[row, reading, node, 3] joints and tip (m) from the base point, when shapes were asked for."""
     contact_wrench: NDArray[np.floating] | None = None
@@ -145,6 +147,8 @@ class LaunchResult:
         )
         for values, new in zip(mine, theirs, strict=True):
             values[which] = new[:, 0]
+        if self.displacement is not None and finer.displacement is not None:
+            self.displacement[row, :, column] = finer.displacement[:, :, 0]
         if self.points is not None and self.contact_wrench is not None:
             self.points[row], self.contact_wrench[row] = finer.points, finer.contact_wrench
         self.retried |= which
@@ -194,8 +198,13 @@ class WhiskerSolver:
         hinges = 2 + (fidelity.twist is not False if twists is None else twists)
         if options:
             options["sliced"] = sliced
-        self.kernels = load_kernels(device, self.real, self.capacity, needs, hinges=hinges, **options)
+        self.yields = any(chain.whisker.follicle is not None for chain in self.chains)
+        self.kernels = load_kernels(
+            device, self.real, self.capacity, needs, hinges=hinges, yields=self.yields, **options
+        )
         packed = pack_chains(self.capacity, self.chains, self.quasistatic, hinges)
+        if self.yields:
+            packed["follicle"] = pack_follicles(self.chains, self.quasistatic)
         with lock_of(device):
             self.chain_arrays = to_struct(self.kernels.structs.ChainArrays, packed, device)
         self.block = {} if block is None else {"block_dim": block}
@@ -255,6 +264,7 @@ class WhiskerSolver:
         result = LaunchResult(
             wrench, values["contact"], counts, depth, missed, judge(facts), np.zeros(size, dtype=bool)
         )
+        result.displacement = values.get("displacement")
         result.seconds = dict(zip(("upload", "kernel", "download"), np.diff(clock).tolist(), strict=True))
         if given.record_shape:
             result.points = np.moveaxis(values["points"].astype(float) / MILLI, 2, 0)
@@ -288,6 +298,8 @@ class WhiskerSolver:
             "points": (frames, self.capacity + 1, count) if given.record_shape else (1, 1, 1),
             "contact_wrench": (frames, 2, count) if given.record_shape else (1, 1, 1),
         }
+        if self.yields:
+            shapes_of["displacement"] = shapes_of["wrench"]
         with lock_of(device):
             results = allocate(structs.ResultArrays, device, **shapes_of)
             results.contact = wp.full((size[0], frames, size[1]), -1.0, dtype=self.real, device=device)

@@ -3,9 +3,11 @@
 from brainbench.stimuli.engines.trust import (  # noqa: F401 — kernels take every limit from here
     AT_BASE,
     BENT,
+    GAVE_WAY,
     GOT_INSIDE,
     LARGEST_BEND,
     LARGEST_OVERLAP,
+    LARGEST_SLIDE,
     LARGEST_START_OVERLAP,
     LOST,
     STARTED_INSIDE,

@@ -254,6 +254,18 @@ def pack_chains(capacity: int, chains: Sequence[Chain], quasistatic: bool, hinge
     }
 
 
+def pack_follicles(chains: Sequence[Chain], quasistatic: bool) -> NDArray[np.void]:
+    """Return the kernel's ``FollicleConstants`` [whisker]; N/m are mN/mm, N·m become µN·m."""
+    names = "slide_stiffness", "slide_damping", "turn_stiffness", "turn_damping"
+    springs = np.zeros(len(chains), dtype=[(name, "f8", 3) for name in names])
+    for w, chain in enumerate(chains):
+        if chain.whisker.follicle is not None:
+            stiffness, damping = chain.whisker.follicle.constants.T * np.array([[1.0], [0.0 if quasistatic else MILLI]])
+            springs["slide_stiffness"][w], springs["turn_stiffness"][w] = stiffness[:3], stiffness[3:] * MICRO
+            springs["slide_damping"][w], springs["turn_damping"][w] = damping[:3], damping[3:] * MICRO
+    return springs
+
+
 def _links(capacity: int, count: int, *names: str) -> NDArray[np.void]:
     """Return records [link, whisker] of numbers with these names, all zero."""
     return np.zeros((capacity, count), dtype=[(name, "f8") for name in names])

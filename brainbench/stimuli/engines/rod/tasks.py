@@ -50,6 +50,11 @@ class JobTask:
     twists: bool
     """Whether it may leave its plane, and may twist at this fidelity."""
 
+    @property
+    def kind(self) -> tuple[bool, bool]:
+        """Whether it twists, and whether its follicle gives way: tasks of one launch are alike."""
+        return self.twists, self.job.whisker.follicle is not None
+
 
 def make_task(
     job: Job, fidelity: Fidelity, bodies: dict[Any, tuple[NDArray, Track]], *, silent: bool = False

@@ -377,6 +377,8 @@ class GradientRun:
         self.jobs = tuple(build(self.values.copy()))
         self.device = pick_device(device)
         check_jobs(RodEngine(device), self.jobs, self.fidelity, None)
+        if any(job.whisker.follicle is not None for job in self.jobs):
+            raise UsageError("Derivatives know rigid follicles only; leave follicle out of the whisker.")
         # Two jobs a parameter, a little below and above: how packed numbers change is their difference.
         self._changed = [
             tuple(tuple(build(self.values + sign * width * (np.arange(len(self.values)) == p))) for sign in (-1, 1))

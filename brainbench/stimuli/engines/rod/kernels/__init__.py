@@ -77,6 +77,7 @@ def build_kernels(
     cuda: bool = False,
     hinges: int = 2,
     recorder: str = "",
+    yields: bool = False,
 ) -> Kernels:
     """Return the kernels for chains of at most ``capacity`` links in one precision; each is compiled by itself.
 
@@ -90,9 +91,11 @@ def build_kernels(
         hinges: hinges of a joint, 2 for bending alone or 3 for bending and twist.
         recorder: package of the kernels that write steps down (``recording``, ``records``) and solve their contact
             forces to rounding (``newton``); whiskers then pause after some steps. Not with ``sliced``.
+        yields: whether follicles give way; not with a ``recorder``.
     """
     most = contacts_for(capacity)
     common = {"real": real, "capacity": capacity, "against": against, "sliced": sliced, "cuda": cuda, "hinges": hinges}
+    common |= {"yields": True} if yields else {}
     whole = {"max_contacts": most, "bounds": bounds, **common}
     if recorder:
         whole |= {"recorded": True, "recorder": recorder}

@@ -96,6 +96,36 @@ def unrotate(q: vec4, x: vec3) -> vec3:
     return x + q[0] * t + wp.cross(u, t)
 
 
+@wp.func
+def quaternion_product(p: vec4, q: vec4) -> vec4:
+    """Return the quaternion of turn q and then turn p."""
+    a = vec3(p[1], p[2], p[3])
+    b = vec3(q[1], q[2], q[3])
+    c = p[0] * b + q[0] * a + wp.cross(a, b)
+    return vec4(p[0] * q[0] - wp.dot(a, b), c[0], c[1], c[2])
+
+
+@wp.func
+def quaternion_of(turn: vec3) -> vec4:
+    """Return the unit quaternion of a rotation vector."""
+    half = real(0.5) * wp.length(turn)
+    share = real(0.5)
+    if half > real(1e-4):
+        share = real(0.5) * wp.sin(half) / half
+    return vec4(wp.cos(half), share * turn[0], share * turn[1], share * turn[2])
+
+
+@wp.func
+def rotation_vector(q: vec4) -> vec3:
+    """Return the rotation vector of a unit quaternion, of less than half a turn."""
+    u = vec3(q[1], q[2], q[3])
+    sine_half = wp.length(u)
+    share = real(2.0)
+    if sine_half > real(1e-4):
+        share = real(2.0) * wp.atan2(sine_half, q[0]) / sine_half
+    return u * share
+
+
 def chosen(name: str, sign: str) -> str:
     """Return native code that picks one of two numbers.
 

@@ -11,7 +11,7 @@ D = SᵀU + h d + h² k, with stiffness k and damping d = βk, and stiffness lim
 
 import warp as wp
 
-from brainbench.stimuli.engines.rod.limits import BENT, FOLD, LARGEST_BEND, LOST, STOP
+from brainbench.stimuli.engines.rod.limits import BENT, FOLD, GAVE_WAY, LARGEST_BEND, LARGEST_SLIDE, LOST, STOP
 
 from .algebra import (
     JointInverse,
@@ -30,7 +30,10 @@ from .algebra import (
     plus,
     plus_cross,
     plus_inertia_times,
+    quaternion_of,
+    quaternion_product,
     rotate,
+    rotation_vector,
     scaled,
     sine,
     spatial,
@@ -42,7 +45,7 @@ from .algebra import (
     vec6,
 )
 from .motion import BodyMotion, elapsed
-from .parameters import hinges, real
+from .parameters import hinges, real, yields
 from .state import (
     ChainArrays,
     ContactCandidates,
@@ -86,6 +89,12 @@ class ChainState:
         gain3: HingeGains
     acceleration: PerLinkJoint
     """D⁻¹u of the joint, then its accelerations."""
+    if yields:
+        axes: mat33
+        inertia: SpatialInertia
+        compliance: SpatialInertia
+        yielding: Spatial
+        """As in :class:`ContactProblem`."""
 
 
 @wp.func
@@ -315,6 +324,144 @@ def add_link(
     return xa
 
 
+@wp.func
+def turned_symmetric(axes: mat33, a: mat33) -> vec6:
+    """Return the symmetric matrix a in turned axes."""
+    b = axes * a * wp.transpose(axes)
+    return vec6(b[0, 0], b[1, 1], b[2, 2], b[0, 1], b[0, 2], b[1, 2])
+
+
+@wp.func
+def full(a: vec6) -> mat33:
+    """Return a symmetric matrix with all its elements."""
+    return mat33(a[0], a[3], a[4], a[3], a[1], a[5], a[4], a[5], a[2])
+
+
+@wp.func
+def spring_pull(stiffness: vec3, damping: vec3, h: real, stretch: vec3, rate: vec3) -> vec3:
+    """Return the pull of springs and dampers at the end of a step at whose beginning they move at a rate."""
+    # As in a joint: the step of length h damps like h k by itself.
+    pull = vec3()
+    for d in range(3):
+        pull[d] = -stiffness[d] * stretch[d] - wp.max(h * stiffness[d], damping[d]) * rate[d]
+    return pull
+
+
+@wp.func
+def yield_base(job: WhiskerJob, state: WhiskerState, start: Step) -> Step:
+    """Return a step whose base is moved by the follicle; its acceleration is that without one of the follicle."""
+    step = start
+    zero = real(0.0)
+    x = rotate(start.pose.quaternion, vec3(real(1.0), zero, zero))
+    y = rotate(start.pose.quaternion, vec3(zero, real(1.0), zero))
+    z = wp.cross(x, y)
+    step.axes = mat33(x[0], y[0], z[0], x[1], y[1], z[1], x[2], y[2], z[2])
+    step.slide = state.slide
+    step.rate = state.rate
+    spin = start.pose.spin
+    arm = step.axes * state.slide.v
+    turning = step.axes * state.rate.w
+    sliding = step.axes * state.rate.v
+    carried = start.base.v + wp.cross(spin, start.pose.velocity) + wp.cross(start.base.w, arm)
+    carried = carried + wp.cross(spin, wp.cross(spin, arm) + real(2.0) * sliding)
+    step.pose.quaternion = quaternion_product(start.pose.quaternion, quaternion_of(state.slide.w))
+    step.pose.place = start.pose.place + arm
+    step.pose.velocity = start.pose.velocity + wp.cross(spin, arm) + sliding
+    step.pose.spin = spin + turning
+    step.base.w = start.base.w + wp.cross(spin, turning)
+    step.base.v = carried - wp.cross(step.pose.spin, step.pose.velocity)
+    return step
+
+
+@wp.func
+def yield_follicle(
+    chains: ChainArrays, job: WhiskerJob, chain: wp.ref[ChainState], step: Step, body: ArticulatedBody
+) -> Spatial:
+    """Solve for the acceleration of the follicle, (Iᴬ + h d + h² k) a = its pull − the wrench without it, and return
+    the wrench on the base."""
+    h = step.length
+    springs = chains.follicle[job.whisker]
+    to_world = step.axes
+    to_follicle = wp.transpose(to_world)
+    wrench = plus(inertia_times(body.inertia, step.base), body.bias, real(1.0))
+    a = to_follicle * full(body.inertia.a) * to_world
+    b = to_follicle * body.inertia.b * to_world
+    c = to_follicle * full(body.inertia.c) * to_world
+    for d in range(3):
+        turn = springs.turn_stiffness[d]
+        slide = springs.slide_stiffness[d]
+        a[d, d] = a[d, d] + h * wp.max(h * turn, springs.turn_damping[d])
+        c[d, d] = c[d, d] + h * wp.max(h * slide, springs.slide_damping[d])
+        # A rigid axis takes no part.
+        for e in range(3):
+            if turn <= real(0.0):
+                a[d, e] = real(0.0)
+                a[e, d] = real(0.0)
+                b[d, e] = real(0.0)
+            if slide <= real(0.0):
+                c[d, e] = real(0.0)
+                c[e, d] = real(0.0)
+                b[e, d] = real(0.0)
+        if turn <= real(0.0):
+            a[d, d] = real(1.0)
+        if slide <= real(0.0):
+            c[d, d] = real(1.0)
+    # Inverse of (a b; bᵀ c) by its blocks.
+    bottom = wp.inverse(c)
+    beside = b * bottom
+    top = wp.inverse(a - beside * wp.transpose(b))
+    corner = top * beside
+    bottom = bottom + wp.transpose(beside) * corner
+    for d in range(3):
+        if springs.turn_stiffness[d] <= real(0.0):
+            top[d, d] = real(0.0)
+        if springs.slide_stiffness[d] <= real(0.0):
+            bottom[d, d] = real(0.0)
+    chain.axes = to_world
+    chain.inertia = body.inertia
+    chain.compliance.a = turned_symmetric(to_world, top)
+    chain.compliance.b = to_world * corner * to_follicle * real(-1.0)
+    chain.compliance.c = turned_symmetric(to_world, bottom)
+    pull = spatial(
+        to_world * spring_pull(springs.turn_stiffness, springs.turn_damping, h, step.slide.w, step.rate.w),
+        to_world * spring_pull(springs.slide_stiffness, springs.slide_damping, h, step.slide.v, step.rate.v),
+    )
+    moved = inertia_times(chain.compliance, minus(pull, wrench, real(1.0)))
+    chain.yielding = spatial(to_follicle * moved.w, to_follicle * moved.v)
+    return plus(wrench, inertia_times(body.inertia, moved), real(1.0))
+
+
+@wp.func
+def integrate_follicle(
+    chains: ChainArrays, job: WhiskerJob, chain: wp.ref[ChainState], state: wp.ref[WhiskerState], h: real, end: real,
+    quasistatic: int,
+):  # fmt: skip
+    """Move the follicle by its acceleration to the end of the step."""
+    turning = state.rate.w + chain.yielding.w * h
+    sliding = state.rate.v + chain.yielding.v * h
+    turn = rotation_vector(quaternion_product(quaternion_of(turning * h), quaternion_of(state.slide.w)))
+    for d in range(3):
+        # Turns about two axes add up to a small one about the third, which a rigid axis does not let grow.
+        if chains.follicle[job.whisker].turn_stiffness[d] <= real(0.0):
+            turn[d] = real(0.0)
+    slide = state.slide.v + sliding * h
+    state.slide = spatial(turn, slide)
+    state.rate = spatial(turning, sliding)
+    if quasistatic == 1:
+        state.rate = Spatial()
+    size = wp.max(wp.length(turn), wp.length(slide))
+    if not (
+        wp.length(turn) < real(wp.static(LARGEST_BEND))
+        and wp.length(slide) < real(wp.static(LARGEST_SLIDE)) * chains.length[job.whisker]
+    ):
+        if state.status == 0:
+            state.status = wp.static(GAVE_WAY)
+            if not (size < real(1e30)):
+                state.status = wp.static(LOST)
+            state.failed_at = end
+    state.largest_change = wp.max(state.largest_change, wp.max(size, wp.max(wp.length(turning), wp.length(sliding))))
+
+
 @wp.func(inline=True)
 def articulated_inertia(
     scene: SceneArrays,
@@ -414,6 +561,8 @@ def articulated_inertia(
         body.inertia.c = body.inertia.c - symmetric_outer(u1.v, g1.v, u2.v, g2.v)
         body.inertia.b = body.inertia.b - wp.outer(u1.w, g1.v) - wp.outer(u2.w, g2.v)
         body.bias = plus(plus(plus_inertia_times(body.bias, body.inertia, c), u1, f1), u2, f2)
+    if wp.static(yields):
+        return yield_follicle(scene.chains, job, chain, step, body)
     # f = Iᴬa + pᴬ at the base, whose acceleration is given.
     return plus(inertia_times(body.inertia, step.base), body.bias, one)
 
@@ -462,6 +611,8 @@ def joint_accelerations(
     """
     h = step.length
     a = step.base
+    if wp.static(yields):
+        a = spatial(a.w + step.axes * chain.yielding.w, a.v + step.axes * chain.yielding.v)
     v = spatial(step.pose.spin, step.pose.velocity)
     for i in range(job.links):
         at = row(chain.node, i)

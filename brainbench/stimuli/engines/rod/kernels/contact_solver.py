@@ -33,7 +33,7 @@ from .delassus import (
     select_contacts,
     stride,
 )
-from .parameters import capacity, cuda, group_size, max_contacts, module_options, queue, real, recorded
+from .parameters import capacity, cuda, group_size, max_contacts, module_options, queue, real, recorded, yields
 from .state import (
     ContactCandidates,
     ContactProblems,
@@ -81,6 +81,11 @@ def write_problem(
     problems.given[index].contacts = previous_contacts
     problems.given[index].step = h
     problems.given[index].tip = chain_row(chain.node, job.links)
+    if wp.static(yields):
+        problems.given[index].axes = chain.axes
+        problems.given[index].inertia = chain.inertia
+        problems.given[index].compliance = chain.compliance
+        problems.given[index].yielding = chain.yielding
     for i in range(job.links):
         problems.joint[index * wp.static(capacity) + i] = joint_record(chain, proximity, i)
         problems.free_acceleration[index, i] = chain_row(chain.acceleration, i)
@@ -123,6 +128,8 @@ def read_solution(problems: ContactProblems, job: WhiskerJob, chain: wp.ref[Chai
     state.load = state.load + problems.solution[index].load
     for i in range(job.links):
         chain.acceleration[i] = problems.free_acceleration[index, i] + problems.added_acceleration[index, i]
+    if wp.static(yields):
+        chain.yielding = problems.solution[index].yielding
 
 
 if recorded:

@@ -12,10 +12,10 @@ import warp as wp
 
 from brainbench.stimuli.engines.rod.limits import CLOSED, CREVICE
 
-from .algebra import JointVector, Spatial, minus, reader, vec3, vec6
+from .algebra import JointVector, Spatial, inertia_times, minus, plus, reader, spatial, vec3, vec6
 from .articulated_body import acceleration_over_joint, force_over_joint, inverse_times
 from .distances import NUMBERS
-from .parameters import capacity, group_size, hinges, max_contacts, real, recorded
+from .parameters import capacity, group_size, hinges, max_contacts, real, recorded, yields
 from .state import ContactProblems, JointRecord, PerLinkJoint, most_candidates
 from .thread_groups import broadcast, group_or, group_sum, warp_max
 
@@ -308,6 +308,37 @@ def joint_rates(unit: wp.ref[UnitForces], hinge: int, r: int, contact: int) -> v
 
 
 @wp.func(inline=True)
+def add_follicle(
+    problems: ContactProblems,
+    solver: wp.ref[SolverState],
+    unit: wp.ref[UnitForces],
+    matrix: wp.ref[DelassusRows],
+):
+    """Add the follicle's part of G, as that of two joints of three hinges: its turns and its slides."""
+    compliance = problems.given[solver.job].compliance
+    each = solver.own_count
+    for part in range(2):
+        for r in range(3 * each):
+            turn = vec3(unit.w[0, r], unit.w[1, r], unit.w[2, r])
+            slide = vec3(unit.v[0, r], unit.v[1, r], unit.v[2, r])
+            moved = inertia_times(compliance, spatial(turn, slide))
+            rate = turn
+            impulse = moved.w * solver.step
+            if part == 1:
+                rate = slide
+                impulse = moved.v * solver.step
+            for d in range(3):
+                unit.joint_rate[d, r] = rate[d]
+                unit.impulse[d, r] = impulse[d]
+        for e in range(solver.warp_contacts):
+            r = wp.static(3 * stride) * e
+            o1 = joint_rates(unit, 0, r, e)
+            o2 = joint_rates(unit, 1, r, e)
+            o3 = joint_rates(unit, 2, r, e)
+            add_joint(unit, e, o1, o2, o3, 1, r, each, matrix)
+
+
+@wp.func(inline=True)
 def build_delassus(
     problems: ContactProblems, solver: wp.ref[SolverState], own: wp.ref[ThreadContacts], matrix: wp.ref[DelassusRows]
 ):
@@ -346,6 +377,8 @@ def build_delassus(
                 if wp.static(hinges == 3) and twists == 1:
                     o3 = joint_rates(unit, 2, r, e)
                 add_joint(unit, e, o1, o2, o3, twists, r, each, matrix)
+    if wp.static(yields):
+        add_follicle(problems, solver, unit, matrix)
     if wp.static(group_size == 1):
         for r in range(3 * count):
             for c in range(r):
@@ -416,6 +449,13 @@ def apply_forces(
     more = int(0)
     if active == 1:
         a = Spatial()
+        if wp.static(yields):
+            given = problems.given[solver.job]
+            a = inertia_times(given.compliance, force)
+            force = minus(force, inertia_times(given.inertia, a), real(1.0))
+            to_follicle = wp.transpose(given.axes)
+            yielding = plus(given.yielding, spatial(to_follicle * a.w, to_follicle * a.v), real(1.0))
+            problems.solution[solver.job].yielding = yielding
         for i in range(solver.links):
             extra = JointVector()
             # Joints behind the last contact are only carried along.

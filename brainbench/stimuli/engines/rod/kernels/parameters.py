@@ -11,6 +11,8 @@ capacity = 12
 """Links that fit."""
 hinges = 2
 """Hinges of a joint: two for bending; with three, the last lets the whisker twist."""
+yields = False
+"""True: follicles give way, see ``FollicleConstants``."""
 against = MESHES
 """Kinds of shapes that there are to touch, see ``limits``."""
 sliced = False

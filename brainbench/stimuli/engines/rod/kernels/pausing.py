@@ -11,11 +11,11 @@ import warp as wp
 
 from brainbench.stimuli.engines.rod.limits import AFTER_CONTACTS, AFTER_DISTANCES, AFTER_OTHERS, NOTHING, WARP
 
-from .algebra import JointVector, rotate, vec3
+from .algebra import JointVector, Spatial, rotate, vec3
 from .articulated_body import ChainState, ProximityState
 from .motion import BodyMotion, elapsed, pose_at, pose_from
 from .narrow_phase import link_shape_distance
-from .parameters import against, hinges, real, sliced
+from .parameters import against, hinges, real, sliced, yields
 from .state import (
     WAIT_DISTANCES,
     WAIT_FORCES,
@@ -240,4 +240,7 @@ def check_rest(
         for i in range(job.links):
             chain.angle[i] = JointVector()
             chain.rate[i] = JointVector()
+        if wp.static(yields):
+            state.slide = Spatial()
+            state.rate = Spatial()
     return 0

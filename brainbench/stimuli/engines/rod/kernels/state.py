@@ -13,9 +13,9 @@ import warp as wp
 
 from brainbench.stimuli.engines.rod.limits import LISTED, SPARE, WIDE, contacts_for
 
-from .algebra import JointInverse, JointVector, Spatial, mat33, reader, vec3, vec4
+from .algebra import JointInverse, JointVector, Spatial, SpatialInertia, mat33, reader, vec3, vec4
 from .motion import BodyMotion, Instant, JobArrays, MotionArrays, ReadingArrays, instant, pose_at
-from .parameters import capacity, hinges, real, recorded
+from .parameters import capacity, hinges, real, recorded, yields
 
 if recorded:
     from .recorder.records import StepRecords
@@ -81,6 +81,16 @@ class LinkTaper:
 
 
 @wp.struct
+class FollicleConstants:
+    """Springs and dampers of a follicle along and about its own axes; axes without stiffness are rigid."""
+
+    slide_stiffness: vec3
+    slide_damping: vec3
+    turn_stiffness: vec3
+    turn_damping: vec3
+
+
+@wp.struct
 class ChainArrays:
     """Whiskers as chains of rigid links with elastic joints."""
 
@@ -98,6 +108,9 @@ class ChainArrays:
     """[link, whisker]"""
     taper: wp.array2d(dtype=LinkTaper)
     """[link, whisker]"""
+    if yields:
+        follicle: wp.array(dtype=FollicleConstants)
+        """[whisker]"""
 
 
 @wp.struct
@@ -189,6 +202,9 @@ class ResultArrays:
 
     wrench: wp.array4d(dtype=real)
     """[row, reading, column, 6] action of the whisker on its base (N, N m)."""
+    if yields:
+        displacement: wp.array4d(dtype=real)
+        """[row, reading, column, 6] slide (m) and rotation vector (rad) of the follicle along its own axes."""
     contact: wp.array3d(dtype=real)
     """[row, reading, column] arc of the contact (m), negative without."""
     points: wp.array3d(dtype=vec3)
@@ -249,6 +265,12 @@ class Step:
     """Acceleration of the base, less gravity."""
     margin: real
     """Gap up to which a contact takes part, once that is known."""
+    if yields:
+        axes: mat33
+        """Rotation from the axes of the follicle, which its whisker does not move."""
+        slide: Spatial
+        """Turn and slide of the follicle at the beginning, along its axes."""
+        rate: Spatial
 
 
 @wp.func(inline=True)
@@ -291,6 +313,10 @@ class WhiskerState:
     """Speed of the fastest object among these."""
     top_speed: real
     """Speed of the fastest point."""
+    if yields:
+        slide: Spatial
+        """Turn (a rotation vector) and slide of the follicle along its axes, and their rates."""
+        rate: Spatial
     velocity_jump: real
     """By how much contact can change that in a step."""
     last_step: real
@@ -382,6 +408,14 @@ class ContactProblem:
     base: Spatial
     """Wrench on the base."""
     tip_acceleration: vec3
+    if yields:
+        axes: mat33
+        inertia: SpatialInertia
+        """Articulated inertia at the base."""
+        compliance: SpatialInertia
+        """Acceleration of the base for a force on it."""
+        yielding: Spatial
+        """Acceleration of the follicle along its axes."""
 
 
 @wp.struct
@@ -438,6 +472,8 @@ class ContactSolution:
     load: real
     base: Spatial
     tip_acceleration: vec3
+    if yields:
+        yielding: Spatial
     normal_sum: real
     """Sum of the normal forces; of these times arc."""
     arc_sum: real

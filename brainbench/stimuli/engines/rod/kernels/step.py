@@ -16,13 +16,15 @@ from .articulated_body import (
     ProximityState,
     articulated_inertia,
     forward_kinematics,
+    integrate_follicle,
     integrate_joint,
     joint_accelerations,
+    yield_base,
 )
 from .broad_phase import NearShapes, count_near_links, find_candidates, lower_clearance, query_distances, search_range
 from .contact_solver import any_gap_closes, queue_problem, read_solution, solve_contacts, write_problem
 from .motion import cell_at, elapsed, instant
-from .parameters import against, bounds, module_options, real, recorded, sliced
+from .parameters import against, bounds, module_options, real, recorded, sliced, yields
 from .pausing import check_rest, keep, next_job, resume, stand_in_queue
 from .state import (
     ENDED,
@@ -94,6 +96,16 @@ def preferred_step(scene: SceneArrays, job: WhiskerJob, state: wp.ref[WhiskerSta
     if state.split_time > real(0.0) and pace * wanted > real(wp.static(TRAVEL)):
         wanted = wp.max(wanted / real(wp.static(FINEST)), real(wp.static(TRAVEL)) / pace)
     return wanted
+
+
+@wp.func
+def write_displacement(scene: SceneArrays, results: ResultArrays, job: WhiskerJob, state: wp.ref[WhiskerState]):
+    """Write what the follicle gives, in m and rad."""
+    first = scene.jobs.row[job.index]
+    column = scene.jobs.column[job.index]
+    for d in range(3):
+        results.displacement[first, state.pending_reading, column, d] = state.slide.v[d] * real(1e-3)
+        results.displacement[first, state.pending_reading, column, 3 + d] = state.slide.w[d]
 
 
 @wp.func(inline=True)
@@ -245,6 +257,8 @@ def run(
                 solved = 1
             else:
                 step = begin_step(scene, job, now, h)
+                if wp.static(yields):
+                    step = yield_base(job, state, step)
                 # A whisker that pauses takes this step again: with these restored, the step has the same length.
                 previous_split = state.split_time
                 previous_near_speed = state.near_speed
@@ -327,7 +341,13 @@ def run(
             # What contact did to the tip's speed, and may do again.
             state.velocity_jump = wp.max(h * wp.length(tip_acceleration), real(0.5) * state.velocity_jump)
             state.touching = state.touching + touched
+            if wp.static(yields):
+                # A quasi-static reading takes the end of the step.
+                if scene.options.quasistatic == 1:
+                    integrate_follicle(scene.chains, job, chain, state, h, elapsed(now) + h, 1)
             if state.pending_reading >= 0:
+                if wp.static(yields):
+                    write_displacement(scene, results, job, state)
                 write_reading(scene, results, problems, job, chain, state.pending_reading, base_wrench, solved)
                 state.pending_reading = int(-1)
             if count > 0:
@@ -335,6 +355,9 @@ def run(
                     integrate_joint(
                         chain, state, i, row(chain.acceleration, i), h, elapsed(now) + h, scene.options.quasistatic
                     )
+            if wp.static(yields):
+                if scene.options.quasistatic == 0:
+                    integrate_follicle(scene.chains, job, chain, state, h, elapsed(now) + h, 0)
             if wp.static(recorded):
                 if paused.keep == 1:
                     record_accelerations(paused, job, chain, state.steps - first_step, h)
