@@ -39,14 +39,19 @@ def plan(scenes: Sequence[Scene], *, surfaces: bool = False) -> JobSchedule:
     places, reaches = [], []
     for scene in scenes:
         row, near = [], []
+        digests: dict[tuple[int, bool], str] = {}
         owners = [part for part in scene.split() for _ in part.array]
         for mount, owner, job in zip(scene.mounts, owners, scene.jobs(), strict=True):
             reach = reach_of(job, surfaces=surfaces)
             travels = not isinstance(owner.head.motion, Still)
-            seen = owner.config() if travels or reach else {"whisking": owner.whisking.config()}
+            # Of one animal the whiskers differ by their mounts alone, and a scene may have a thousand objects.
+            what = id(owner), bool(travels or reach)
+            if what not in digests:
+                seen = owner.config() if travels or reach else {"whisking": owner.whisking.config()}
+                digests[what] = content_hash({**seen, "label": None})
             # A head that is turned otherwise feels gravity in another direction.
             pull = {"pull": job.gravity} if any(job.gravity) else {}
-            key = content_hash(mount, {**seen, "label": None, **pull})
+            key = content_hash(mount, digests[what], pull)
             if key not in distinct:
                 distinct[key] = len(jobs)
                 jobs.append(job)
