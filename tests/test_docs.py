@@ -149,7 +149,7 @@ PRELUDES = {
 ELSEWHERE = ("docs/recordings.md", "docs/statistics.md", "docs/datasets.md")
 """Pages whose code other tests here run."""
 
-SLOW = ("docs/tactile-hands.md",)
+SLOW = ("docs/rods.md", "docs/tactile-hands.md")
 
 
 @pytest.mark.parametrize(
