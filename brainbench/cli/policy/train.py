@@ -141,7 +141,10 @@ def distill(
 @with_options(DISTILL, ("num_envs", "iterations"), parameter="changes", flags=DISTILL_FLAGS, given=True)
 def sweep(
     changes: dict[str, Any],
-    file: Annotated[Path | None, typer.Argument(help="TOML file, placement-and-type, or table-4.10 (default).")] = None,
+    file: Annotated[
+        Path | None,
+        typer.Argument(help="TOML file, placement-and-type, noise-resolution-law, or table-4.10 (default)."),
+    ] = None,
     subset: Annotated[str, typer.Option(help="all, types, encoders, or an observation type.")] = "all",
     count: Annotated[bool, typer.Option("--count", help="Print how many students there are, and stop.")] = False,
     names: Annotated[bool, typer.Option("--list", help="Print their names, and stop.")] = False,
