@@ -238,7 +238,7 @@ def figure(records: Sequence[Mapping[str, Any]]) -> Drawing:
     """Draw the success of every student by arm, with the mean of the arm, its interval and the teacher (figure 4.6)."""
     groups = [(record, ranked(record)) for record in records]
     drawing = Drawing(760, 30 + sum(17 * len(arms) + 52 for _, arms in groups), "Success of students by what they feel")
-    axis, y = Scale(0, 1, 230, 740), 24.0
+    axis, y = Scale(0, 1, 270, 740), 24.0
     for record, arms in groups:
         drawing.text(10, y, f"{record['name'].capitalize()} (dots: students; diamonds: means; bars: 95 %)", "title")
         top, bottom = y + 8, y + 17 * len(arms) + 8
@@ -248,8 +248,8 @@ def figure(records: Sequence[Mapping[str, Any]]) -> Drawing:
         drawing.line(axis.at(record["teacher"]), top, axis.at(record["teacher"]), bottom, "one")
         for arm, effect in arms.items():
             y += 17
-            colour = "c0" if arm.startswith("none") else "c1" if arm.endswith("hand") else "c2"
-            drawing.text(220, y + 4, in_words(arm), "end small")
+            colour = "c0" if arm.startswith("none") else "c1" if "whole hand" in in_words(arm) else "c2"
+            drawing.text(260, y + 4, in_words(arm), "end small")
             if is_finite(effect.interval):
                 drawing.line(axis.at(effect.interval.low), y, axis.at(effect.interval.high), y, f"{colour} span")
             for row in record["students"]:
