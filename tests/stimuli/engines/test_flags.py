@@ -11,7 +11,7 @@ from brainbench.geometry import Mesh
 from brainbench.stimuli import get_recipe, simulate
 from brainbench.stimuli.engines import get_engine
 from brainbench.stimuli.engines.fidelity import Fidelity
-from brainbench.stimuli.engines.trust import LARGEST_OVERLAP, LARGEST_STRAIN, LOST, halved, judge
+from brainbench.stimuli.engines.trust import GAVE_WAY, LARGEST_OVERLAP, LARGEST_STRAIN, LOST, halved, judge
 from brainbench.stimuli.motion.jobs import Job, Load, StillFollicle
 from brainbench.stimuli.objects.obstacle import Box, Capsule, Obstacle, Sphere
 from brainbench.stimuli.validation.bench_tests import contact_jobs, difference
@@ -97,6 +97,7 @@ FLAGGED = {
     ),
     "has too many contacts": ("more contacts", lambda: _judged(crowded=3)),
     "folds": ("bent by", lambda: _reason(loads=(Load(C2.arc_length, (0.0, 1.0, 0.0)),))),
+    "has a follicle that gives way too far": ("follicle gave way", lambda: _judged(status=GAVE_WAY, failed=0.1)),
     "is not finite": ("finite", lambda: _judged(status=LOST, failed=0.1)),
     "meets an object that moves too fast": (
         "further than the 0.8 mm up to which contact is followed",
