@@ -147,9 +147,6 @@ class SoftMatching(UnitMatching):
         units, features = likeness.shape
         if not likeness.size:
             return super().pairs(likeness)
-        copies = -(-max(units, features) // min(units, features))
-        if features >= units:
-            rows, columns = super().pairs(np.repeat(likeness, copies, axis=0))
-            return rows // copies, columns
-        rows, columns = super().pairs(np.repeat(likeness, copies, axis=1))
-        return rows, columns // copies
+        copies = np.array([max(1, -(-features // units)), max(1, -(-units // features))])
+        rows, columns = super().pairs(likeness.repeat(copies[0], axis=0).repeat(copies[1], axis=1))
+        return rows // copies[0], columns // copies[1]
