@@ -55,7 +55,9 @@ class Outcome:
 
 
 @pytest.fixture
-def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., Outcome]:
+def run(
+    request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> Callable[..., Outcome]:
     """Return a function that runs the command line in this process, as the console script does."""
     from brainbench.cli import main, output
 
@@ -70,6 +72,9 @@ def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> 
         except SystemExit as stop:
             status = int(stop.code or 0)
         captured = capsys.readouterr()
+        if status:
+            # What a command refused explains a test that fails later.
+            request.node.add_report_section("call", f"status {status}", captured.err)
         return Outcome(status, captured.out, captured.err)
 
     return call
