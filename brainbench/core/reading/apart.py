@@ -27,7 +27,9 @@ from brainbench.core.reading.archives import read_npz
 from brainbench.core.reading.regular import check_file, readable
 
 SECONDS = 60.0
-"""Time for a file, by default."""
+"""Processor time for a file, by default."""
+PATIENCE = 120.0
+"""Time by the clock beyond it: a busy disk, or a machine that stood still, is no fault of the file."""
 MEMORY = 8 << 30  # address space [bytes]; compiled libraries reserve much more than they use
 MOST_WRITTEN = 16 << 30  # bytes that a file which is written may have
 CRASHED = "is damaged: the library that reads it crashed or did not come back; copy it again"
@@ -59,13 +61,16 @@ def save_arrays(function: str, source: str, arrays: str) -> str:
 
 
 def call_apart(function: str, arguments: Sequence[Any], seconds: float) -> Any:
-    """Return what ``module:function`` returns in another process, as JSON; None where that ended or took longer."""
+    """Return what ``module:function`` returns in another process, as JSON.
+
+    None where that ended, or took more processor time than ``seconds``.
+    """
     with _Worker.lock:
         process = _Worker.running()
-        watch = threading.Timer(seconds + 3, process.kill)
+        watch = threading.Timer(seconds + PATIENCE + 3, process.kill)
         watch.start()
         try:
-            process.stdin.write(json.dumps([function, *arguments, seconds]) + "\n")  # type: ignore[union-attr]
+            process.stdin.write(json.dumps([function, *arguments, [seconds, seconds + PATIENCE]]) + "\n")  # type: ignore[union-attr]
             process.stdin.flush()  # type: ignore[union-attr]
             answer = process.stdout.readline()  # type: ignore[union-attr]
         except OSError:
@@ -120,11 +125,12 @@ def _answer(request: str) -> str:
     return json.dumps(_load(function)(*arguments)) + "\n"
 
 
-def _bound(seconds: float) -> None:
-    """Set limits to what this process takes: the signal ends it even within a loop of a library."""
+def _bound(processor: float, clock: float) -> None:
+    """Set limits to what this process takes: the signals end it even within a loop of a library."""
     import resource
 
-    signal.setitimer(signal.ITIMER_REAL, max(seconds, 1e-3))
+    signal.setitimer(signal.ITIMER_PROF, max(processor, 1e-3))
+    signal.setitimer(signal.ITIMER_REAL, max(clock, 1e-3))
     resource.setrlimit(resource.RLIMIT_FSIZE, (MOST_WRITTEN, MOST_WRITTEN))
     files = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
     resource.setrlimit(resource.RLIMIT_NOFILE, (files, files))
@@ -148,7 +154,7 @@ def _serve() -> None:
                 answers.write(_answer(line))
             elif (child := os.fork()) == 0:
                 # Damage can spoil a library's memory: a file has a process to itself, which tells of it when it ends.
-                _bound(json.loads(line)[-1])
+                _bound(*json.loads(line)[-1])
                 answers.write(_answer(line))
                 answers.flush()
                 os._exit(0)

@@ -18,9 +18,8 @@ if TYPE_CHECKING:
     import h5py
 
 SECONDS = 8.0
-"""Time for looking through a file, after the worker's own limit; more for large ones, a second per :data:`RATE`."""
+"""Processor time for looking through a file; more for large ones, a second per :data:`RATE` bytes."""
 RATE = 10 << 20
-"""Bytes per second at which even a slow disk is looked through."""
 LINKED_VARIABLE = "BRAINBENCH_ALLOW_LINKED"
 """Environment variable with folders, as in PATH, that HDF5 files may link into; ``--allow-linked`` sets it."""
 WALK = "brainbench.core.reading.hdf5_worker:fault_of"

@@ -231,8 +231,9 @@ class _Copy:
             raise Missing(f"takes a part from {name[-80:]!r}, which is missing") from None
         if not stat.S_ISREG(status.st_mode):
             raise Refused(f"takes a part from {name[-80:]!r}, which is no regular file")
-        # A second for each part of a large one, as for the file itself.
-        signal.alarm(signal.alarm(0) + status.st_size // (10 << 20)) if hasattr(signal, "alarm") else None
+        if hasattr(signal, "setitimer"):  # a second for each part of a large one, as for the file itself
+            left = signal.getitimer(signal.ITIMER_PROF)[0]
+            signal.setitimer(signal.ITIMER_PROF, left and left + status.st_size / (10 << 20))
         return place
 
     def _values(self, node: Any, route: tuple[Any, ...] = ()) -> Any:

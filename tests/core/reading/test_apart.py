@@ -1,6 +1,7 @@
 """Files that are read in a process of their own."""
 
 import os
+import time
 from pathlib import Path
 
 import numpy as np
@@ -30,6 +31,11 @@ def fail(path):
 def hang(path):
     while True:
         pass
+
+
+def rest(path):
+    time.sleep(2)
+    return whole(path)
 
 
 def objects(path):
@@ -66,3 +72,15 @@ def test_what_never_ends_is_ended(read, monkeypatch):
     monkeypatch.setattr(apart, "SECONDS", 1.5)
     with pytest.raises(DataError, match="crashed or did not come back"):
         read(hang)
+
+
+def test_a_machine_that_stands_still_is_no_fault_of_the_file(read, monkeypatch):
+    monkeypatch.setattr(apart, "SECONDS", 1.0)
+    assert read(rest)["size"] == 3
+
+
+def test_what_waits_for_ever_is_ended(read, monkeypatch):
+    monkeypatch.setattr(apart, "SECONDS", 0.5)
+    monkeypatch.setattr(apart, "PATIENCE", 0.5)
+    with pytest.raises(DataError, match="crashed or did not come back"):
+        read(rest)
