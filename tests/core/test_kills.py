@@ -37,6 +37,14 @@ def test_a_killed_addition_is_repeated(tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("name", ["leaderboard add", "leaderboard build", "score, empty cache"])
+def test_commands_that_are_ended_stopped_or_run_in_pairs_lose_nothing(name, tmp_path):
+    found = _killed(name, tmp_path, "--kills", "27", "--signals", "TERM,HUP,STOP", "--pairs", "9")
+    _check(found)
+    assert (found["kills"], found["pairs"]) == (27, 9)
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("job", JOBS, ids=lambda job: job.name)
 def test_commands_killed_at_many_instants_end_with_the_bytes_of_unbroken_ones(job, tmp_path):
     if job.name == "policy train":

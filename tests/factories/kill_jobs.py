@@ -15,7 +15,7 @@ import signal
 import sys
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from importlib import import_module
 from pathlib import Path
@@ -24,6 +24,8 @@ from typing import Any
 from brainbench.core.errors import BrainbenchError
 from tests.factories.sweep_batches import files_of
 
+PAUSE = 0.2
+"""Seconds for which a stopped command stands still."""
 TIMES = ("time", "seconds", "sweeps_per_second", "collect_s", "learn_s")
 """Fields of JSON files that hold times and durations; all else is compared by its bytes."""
 
@@ -66,6 +68,7 @@ class Outcome:
     """Files that an unbroken run does not leave."""
     failed: list[str] = field(default_factory=list)
     """Last lines of repetitions that failed."""
+    pairs: int = 0
     together: list[str] = field(default_factory=list)
     """What was wrong after two runs at once."""
 
@@ -84,8 +87,11 @@ def content(folder: Path, job: KillJob) -> dict[str, Any]:
     return found
 
 
-def measure(job: KillJob, folder: Path, kills: int) -> Outcome:
-    """Kill a command so often, at times drawn with a fixed seed, and repeat it each time."""
+def measure(job: KillJob, folder: Path, kills: int, signals: Sequence[str] = ("KILL",), pairs: int = 1) -> Outcome:
+    """Send a command so many signals in turn, at times drawn with a fixed seed, and repeat what they end each time.
+
+    One that was stopped (``STOP``) is let go on. So many ``pairs`` of runs share a folder.
+    """
     for module in job.modules:
         import_module(module)
     inputs, whole = folder / "inputs", folder / "whole"
@@ -110,8 +116,13 @@ def measure(job: KillJob, folder: Path, kills: int) -> Outcome:
         if late:
             _wait_for_part(out, job.part)
         time.sleep(draw.uniform(0.0, outcome.seconds - first * late))
-        os.kill(child, signal.SIGKILL)
-        met = os.WIFSIGNALED(os.waitpid(child, 0)[1])
+        sent = signals[outcome.kills % len(signals)]
+        os.kill(child, signal.Signals[f"SIG{sent}"])
+        if sent == "STOP":
+            time.sleep(PAUSE)
+            os.kill(child, signal.SIGCONT)
+        status = os.waitpid(child, 0)[1]
+        met = os.WIFSIGNALED(status) or (status == 0) == (sent == "STOP")
         outcome.kills += met
         there = out.is_dir() and any(not Path(name).name.startswith(".") for name in files_of(out))
         outcome.resumed += met and there and job.resumes
@@ -124,7 +135,8 @@ def measure(job: KillJob, folder: Path, kills: int) -> Outcome:
         outcome.left += sorted(now.keys() - expected.keys())
         outcome.different += [name for name in _differ(now, expected) if name in expected]
         shutil.rmtree(out, ignore_errors=True)
-    _run_together(job, inputs, folder, expected, outcome)
+    for _ in range(pairs):
+        _run_together(job, inputs, folder, expected, outcome)
     return outcome
 
 
@@ -144,6 +156,8 @@ def _run_together(job: KillJob, inputs: Path, folder: Path, expected: dict[str, 
         outcome.together.append("none finished")
     outcome.together += [text.strip()[-300:] for text in failed if "Traceback" in text]
     outcome.together += _differ(content(out, job), expected)
+    outcome.pairs += 1
+    shutil.rmtree(out)
 
 
 def _fork(run: Callable[[], None], log: Path) -> int:
@@ -334,9 +348,12 @@ def main() -> None:
     parser.add_argument("name", choices=[job.name for job in JOBS])
     parser.add_argument("folder", type=Path)
     parser.add_argument("--kills", type=int)
+    parser.add_argument("--signals", default="KILL", help="sent in turn: KILL,TERM,HUP,STOP")
+    parser.add_argument("--pairs", type=int, default=1)
     chosen = parser.parse_args()
     job = next(item for item in JOBS if item.name == chosen.name)
-    found = measure(job, chosen.folder, job.kills if chosen.kills is None else chosen.kills)
+    kills = job.kills if chosen.kills is None else chosen.kills
+    found = measure(job, chosen.folder, kills, chosen.signals.split(","), chosen.pairs)
     sys.stdout.write(json.dumps(asdict(found)) + "\n")
 
 

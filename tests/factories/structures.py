@@ -11,6 +11,7 @@ import io
 import json
 import math
 import random
+import tomllib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -340,7 +341,30 @@ def _words(path: Path, chance: random.Random) -> str:
     return f"{piece[:10]!r} at {place}"
 
 
+def _settings(path: Path, chance: random.Random) -> str:
+    """Change TOML: it is written again with its tables in one line each."""
+    try:
+        value = tomllib.loads(path.read_text())
+    except ValueError:  # a change before this one
+        return "nothing"
+    what = _alter(value, chance)
+    lines = [f"{json.dumps(key)} = {_toml(inner)}\n" for key, inner in value.items()]
+    path.write_text("".join(lines), errors="replace")
+    return what
+
+
+def _toml(value: Any) -> str:
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{json.dumps(key)} = {_toml(inner)}" for key, inner in value.items()) + "}"
+    if isinstance(value, list):
+        return "[" + ", ".join(map(_toml, value)) + "]"
+    if isinstance(value, float):
+        return repr(value)
+    return '"none"' if value is None else json.dumps(value, ensure_ascii=False)
+
+
 _CHANGES: dict[str, Callable[[Path, random.Random], str]] = {
+    ".toml": _settings,
     ".json": _document,
     ".csv": _table,
     ".py": _code,

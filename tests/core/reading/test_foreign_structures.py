@@ -1,7 +1,12 @@
 """What others send beside recordings, with its structure changed by seed: refused in one sentence, or sound."""
 
+import os
+import signal
+
 import pytest
 
+from brainbench.core.errors import DataError
+from tests.factories.foreign_commands import DOORS, FAILURES, Door, cases
 from tests.factories.foreign_surfaces import FOREIGN
 from tests.factories.reading_trials import attempt
 from tests.factories.structures import restructure
@@ -39,3 +44,29 @@ def test_changes_are_those_of_their_seed(tmp_path):
     pairs = [(restructure(tmp_path / "a.json", seed), restructure(tmp_path / "b.json", seed)) for seed in range(20)]
     assert all(left == right for left, right in pairs)
     assert (tmp_path / "a.json").read_bytes() == (tmp_path / "b.json").read_bytes()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("door", DOORS, ids=lambda door: door.name.replace(", ", "-").replace(" ", "-"))
+def test_commands_refuse_what_was_changed_in_one_sentence(door, tmp_path):
+    verdicts = list(cases(door, tmp_path, range(6)))
+    assert [verdict for verdict in verdicts if verdict.kind in FAILURES] == []
+
+
+def test_each_kind_of_failure_is_seen(tmp_path):
+    def verdict(read):
+        door = Door("tried", "log", read=read)
+        (only,) = cases(door, tmp_path, range(-1, 0))
+        return only.kind
+
+    assert verdict(lambda path: 1.0) == "accepted"
+    assert verdict(lambda path: float("nan")) == "silent"
+    assert verdict(lambda path: int("x")) == "traceback"
+    assert verdict(lambda path: os.kill(os.getpid(), signal.SIGKILL)) == "crash"
+    assert verdict(lambda path: (path.parent / "../../etc/passwd").read_text(encoding="utf-8")) == "leaked"
+
+    def refuse(path):
+        (path.parent / "half").touch()
+        raise DataError("No.")
+
+    assert verdict(refuse) == "half-written"

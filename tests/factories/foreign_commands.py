@@ -1,0 +1,339 @@
+"""What others send, changed by seed and given to the command or function that takes it, in a process of its own.
+
+``python -m tests.factories.foreign_commands FOLDER NAME… --cases N`` prints a line of JSON for each case. The good
+input stands in the folder or is made there, so that another version of the packages (PYTHONPATH) can be given the same.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import os
+import re
+import resource
+import shlex
+import shutil
+import signal
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import partial
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from tests.factories.structures import restructure
+
+FAILURES = ("traceback", "hang", "crash", "silent", "leaked", "half-written", "wordy")
+SECONDS = 60.0
+"""Time of a case by the clock, on a busy machine."""
+MEMORY = 16 << 30
+"""Address space [bytes] of a case; libraries reserve much more than they use."""
+LONGEST = 400
+"""Characters of one sentence to a user."""
+SECRET = "PRIVATE-7f3a91"
+"""Stands in files that no case was given: ``../../etc/passwd`` from its folder, and the user's settings beside it."""
+LARGEST = 1e200
+"""Magnitude that no number of a result has."""
+
+
+@dataclass(frozen=True)
+class Door:
+    """An entrance for files or words of others."""
+
+    name: str
+    make: str
+    """Function of :mod:`tests.factories.foreign_goods` that writes a good input into a folder, and returns the file to
+    be changed."""
+    words: str = ""
+    """Words of the command line, with ``{file}`` and ``{folder}``."""
+    read: Callable[[Path], Any] | None = None
+    """Without words: a public function; what it imports may not be there."""
+    modules: tuple[str, ...] = ()
+    """Loaded once, before the cases."""
+    after: Callable[[Path], None] | None = None
+    """What whoever changes a file can do to make it pass for whole, such as sealing it again."""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What became of a case: ``accepted``, ``refused``, ``absent`` (no such entrance), or one of :data:`FAILURES`."""
+
+    kind: str
+    what: str = ""
+    """The change."""
+    detail: str = ""
+
+
+def cases(door: Door, folder: Path, seeds: range) -> Iterator[Verdict]:
+    """Yield what becomes of each change (seeds below zero: none); each case is a fork, after the modules are loaded.
+
+    The good input stands in the folder, where an earlier call has made it.
+    """
+    note = folder / "name.txt"
+    if not note.is_file():
+        (folder / "good").mkdir(parents=True)
+        path = getattr(import_module("tests.factories.foreign_goods"), door.make)(folder / "good")
+        note.write_text(path.relative_to(folder / "good").as_posix())
+    for module in door.modules:
+        with suppress(ImportError):
+            import_module(module)
+    root = folder / f"cases-{os.getpid()}"
+    for seed in seeds:
+        (root / "etc").mkdir(parents=True)
+        (root / "etc" / "passwd").write_text(f'{{"{SECRET}": 1}}\n')
+        place = root / "a" / "case"
+        shutil.copytree(folder / "good", place)
+        path = place / note.read_text()
+        what = "nothing" if seed < 0 else restructure(path, seed)
+        if door.after is not None and path.is_file():
+            door.after(path)
+        yield _judge(door, path, place, what)
+        shutil.rmtree(root, ignore_errors=True)
+
+
+def _judge(door: Door, path: Path, place: Path, what: str) -> Verdict:
+    before, streams = _files(place), (place.parent / "out", place.parent / "err")
+    child = os.fork()
+    if not child:
+        _run(door, path, place, streams)
+    status = _wait(child)
+    out, err = (stream.read_text(errors="replace") for stream in streams)
+    error = re.sub(r"\s+", " ", err).strip().removeprefix("brainbench: ")
+    written = _files(place) - before
+    verdict = partial(Verdict, what=what, detail=error[-600:])
+    if status is None:
+        return verdict("hang")
+    if status == ABSENT:
+        return verdict("absent")
+    if status < 0:
+        return verdict("crash", detail=f"signal {-status}: {error[-400:]}")
+    if "Traceback (most recent call last)" in err + out:
+        return verdict("traceback")
+    if _leaks([out, err, *(file.read_bytes().decode(errors="replace") for file in written if file.is_file())]):
+        return verdict("leaked")
+    if status:
+        if written:
+            return verdict("half-written", detail=f"{sorted(file.name for file in written)}: {error[:300]}")
+        return verdict("wordy" if len(error) > LONGEST or not error else "refused")
+    unfinished = [file.name for file in written if file.name.startswith(".")]
+    if unfinished:
+        return verdict("half-written", detail=str(unfinished))
+    return verdict("silent" if _odd(out) else "accepted", detail=out[:300])
+
+
+ABSENT = 97
+
+
+def _run(door: Door, path: Path, place: Path, streams: tuple[Path, Path]) -> None:
+    """Do the work of a case in this process, and end it."""
+    status = 1
+    try:
+        for number, stream in enumerate(streams, 1):
+            os.dup2(os.open(stream, os.O_CREAT | os.O_WRONLY | os.O_TRUNC), number)
+        sys.stdout, sys.stderr = open(1, "w", closefd=False), open(2, "w", closefd=False)  # noqa: SIM115
+        os.chdir(place)
+        os.environ["BRAINBENCH_CONFIG"] = str(place)
+        os.setpgid(0, 0)
+        resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
+        status = _call(door, path, place)
+    except SystemExit as end:
+        status = end.code if isinstance(end.code, int) else int(end.code is not None)
+    except BaseException:  # noqa: BLE001 - whatever ends a case is told
+        import traceback
+
+        traceback.print_exc()
+    finally:
+        with suppress(BaseException):
+            sys.stdout.flush()
+            sys.stderr.flush()
+        os._exit(status)
+
+
+def _call(door: Door, path: Path, place: Path) -> int:
+    if door.read is None:
+        from brainbench.cli import main
+
+        values = {"file": path, "folder": place, "stem": path.with_suffix("")}
+        sys.argv = ["brainbench", *(word.format(**values) for word in shlex.split(door.words))]
+        main()
+        return 0
+    from brainbench.core.errors import BrainbenchError
+    from tests.factories.reading_trials import not_finite
+
+    try:
+        result = door.read(path)
+    except ModuleNotFoundError as error:
+        if (error.name or "").startswith(("brainbench", "robotics_bridge", "leaderboards")):
+            return ABSENT
+        raise
+    except BrainbenchError as error:
+        sys.stderr.write(f"{error}\n")
+        return error.exit_code
+    sys.stdout.write(json.dumps({"odd": math.nan if not_finite(result) else 0.0, "text": str(result)[:2000]}))
+    return 0
+
+
+def _text(path: Path) -> str:
+    return path.read_bytes().decode(errors="replace").replace("\0", "")[:100_000] if path.is_file() else ""
+
+
+def _wait(child: int) -> int | None:
+    """Return the exit status of a process, negative for a signal; None where its time was over."""
+    end, pause = time.monotonic() + SECONDS, 0.002
+    while time.monotonic() < end:
+        ended, status = os.waitpid(child, os.WNOHANG)
+        if ended:
+            return os.waitstatus_to_exitcode(status)
+        time.sleep(pause := min(2 * pause, 0.05))
+    with suppress(ProcessLookupError):
+        os.killpg(child, signal.SIGKILL)
+    os.waitpid(child, 0)
+    return None
+
+
+def _files(folder: Path) -> set[Path]:
+    return {path for path in folder.rglob("*") if path.name != "__pycache__" and path.suffix != ".pyc"}
+
+
+def _leaks(texts: list[str]) -> bool:
+    return any(SECRET in text or "root:x:0" in text for text in texts)
+
+
+def _odd(out: str) -> bool:
+    """Return whether a result holds a number that is not finite or no quantity has."""
+    try:
+        value = json.loads(out, parse_constant=lambda word: math.inf)
+    except ValueError:
+        return False
+    return any(abs(number) > LARGEST for number in _numbers(value))
+
+
+def _numbers(value: Any) -> Iterator[float]:
+    if isinstance(value, bool):
+        return
+    if isinstance(value, (int, float)):
+        yield value
+    for inner in value.values() if isinstance(value, dict) else value if isinstance(value, list) else ():
+        yield from _numbers(inner)
+
+
+def _layout(path: Path) -> Any:
+    from robotics_bridge import hands
+
+    return dict(hands.load("xhand1").layout(str(path)))
+
+
+def _student(path: Path) -> Any:
+    from robotics_bridge.policies.training.student_files import load_student
+
+    student, described = load_student(path.parent)
+    return dict(student.state_dict()), described
+
+
+def _plan(path: Path) -> Any:
+    from brainbench.core.identity import SealedPlan  # pyright: ignore[reportAttributeAccessIssue]
+
+    return SealedPlan.read(path)
+
+
+def _seal(path: Path) -> None:
+    """Give a plan the hash that it has now, as whoever edits one can."""
+    with suppress(ValueError, TypeError, AttributeError, RecursionError):
+        data = json.loads(path.read_text())
+        data.pop("hash", None)
+        with suppress(ImportError):
+            from brainbench.core import identity
+
+            path.write_text(json.dumps({**data, "hash": identity._hash(data)}))
+
+
+def _hub(path: Path) -> Any:
+    """Return the folder that a name is taken for by a hub that has everything."""
+    import types
+
+    from brainbench.models.training.checkpoints import find_folder
+
+    orders: list[str] = []
+
+    def download(repository: str, *, revision: str | None = None, allow_patterns: Any = ()) -> str:
+        orders.extend((repository, revision or "", *allow_patterns))
+        return str(path.parent)
+
+    sys.modules["huggingface_hub"] = types.SimpleNamespace(snapshot_download=download)  # type: ignore[assignment]
+    folder = find_folder(_text(path))
+    odd = any(".." in order.split("/") or not order.isascii() or not order.isprintable() for order in orders)
+    return math.nan if odd or (orders and ".." in folder.parts) else str(folder)
+
+
+_CLI = ("torch", "h5py", "numpy", "brainbench.cli.application")
+_STIMULI = (*_CLI, "brainbench.stimuli", "warp", "scipy.optimize", "xarray")
+_HANDS = (*_CLI, "mujoco", "robotics_bridge.hands", "robotics_bridge.policies", "robotics_bridge.tasks")
+_FIT = "stimuli fit {file} --most-iterations 1 --links 4 --steps-per-period 20 --json"
+_TRACK = f"{_FIT} --whisker mouse:C2 --metres-per-pixel 5e-5 --frame-rate 500"
+_REPLAY = "tactile replay {folder}/set --hand {folder}/jaws.urdf --json"
+_IMPORT = "--out {folder}/imported --json"
+_MODELS = (*_CLI, "brainbench.models", "brainbench.models.zoo")
+
+DOORS = (
+    Door(
+        "contract", "contract", "policy deploy {stem} --seconds 0.05 --input command=0 --json",
+        modules=(*_HANDS, "onnxruntime", "robotics_bridge.deploy"),
+    ),
+    Door("student, configuration", "student", read=_student, modules=_HANDS),
+    Door("student, weights", "student_weights", read=_student, modules=_HANDS),
+    Door("probe layout", "layout", read=_layout, modules=_HANDS),
+    Door("calibration log", "log", "tactile calibrate {file} --out {folder}/preset.json --json", modules=_HANDS),
+    Door("fit table", "wrenches", f"{_FIT} --whisker mouse:C2 --parameters young_modulus", modules=_STIMULI),
+    Door("track, points", "points", _TRACK, modules=_STIMULI),
+    Door("track, DeepLabCut", "deeplabcut", _TRACK, modules=_STIMULI),
+    Door("track, DeepLabCut HDF5", "deeplabcut_hdf5", _TRACK, modules=_STIMULI),
+    Door("track, whisk", "whisk", _TRACK, modules=_STIMULI),
+    Door("track, WhiskerMan", "whiskerman", f"{_TRACK} --track 1", modules=_STIMULI),
+    Door("track, angles", "angles", "stimuli show {folder}/scene.toml --json", modules=_STIMULI),
+    Door("episode, table", "replayed", "tactile replay {file} --hand {folder}/jaws.urdf --json", modules=_HANDS),
+    Door("episode, LeRobot", "lerobot", _REPLAY, modules=_HANDS),
+    Door("episode, places", "lerobot_places", _REPLAY, modules=_HANDS),
+    Door("episode, frames", "lerobot_frames", _REPLAY, modules=_HANDS),
+    Door("models add, file", "model", "models add {file}:Mine --name mine --json", modules=_MODELS),
+    Door("models add, settings", "settings", "models show mine --json", modules=_MODELS),
+    Door(
+        "models import", "checkpoint",
+        f"models import {{file}} --architecture zhuang-gru-small {_IMPORT}", modules=_MODELS,
+    ),
+    Door(
+        "models import, graph", "graph", f"models import {{folder}}/best.ckpt --config {{file}} {_IMPORT}",
+        modules=_MODELS,
+    ),
+    Door(
+        "task file", "task", "policy evaluate foreign --config nothing --task-file {file} --json", modules=_HANDS,
+    ),
+    Door("plan", "plan", read=_plan, modules=_CLI, after=_seal),
+    Door("benchmark", "benchmark", "benchmark check {file} --json", modules=(*_STIMULI, *_MODELS)),
+    Door("benchmark, packed", "packed", "benchmark check {file} --json", modules=(*_STIMULI, *_MODELS)),
+    Door("hub name", "hub", read=_hub, modules=_MODELS),
+)  # fmt: skip
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("names", nargs="*", help="entrances; all of them by default")
+    parser.add_argument("--cases", type=int, default=200)
+    parser.add_argument("--first", type=int, default=0)
+    chosen = parser.parse_args()
+    for door in DOORS:
+        if not chosen.names or door.name in chosen.names:
+            folder = chosen.folder.absolute() / door.name.replace(" ", "-")
+            for seed, verdict in enumerate(
+                cases(door, folder, range(chosen.first - 1, chosen.cases)), chosen.first - 1
+            ):
+                sys.stdout.write(json.dumps({"name": door.name, "seed": seed, **vars(verdict)}) + "\n")
+                sys.stdout.flush()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,167 @@
+"""Good inputs of the entrances in :mod:`tests.factories.foreign_commands`, each written into a folder."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from brainbench.benchmarks.opening import make, pack
+from brainbench.core.files import write_json
+from brainbench.core.identity import SealedPlan
+from brainbench.scoring.options import ScoreOptions
+from robotics_bridge import hands
+from robotics_bridge.deploy.links.episodes import PARTS, SessionFacts, TactilePoints, write_lerobot
+from robotics_bridge.deploy.links.replay import taxel_names
+from tests.factories import foreign_surfaces, policies, published_surfaces, reading_surfaces, robot_surfaces
+from tests.factories.ringdown_table import write_ringdown
+from tests.factories.scored_files import write_study
+from tests.factories.whisker_tracks import (
+    bent_shapes,
+    write_deeplabcut_csv,
+    write_deeplabcut_table,
+    write_points,
+    write_whiskers,
+)
+
+JAWS = """<robot name="jaws">
+<link name="base"><inertial><mass value=".1"/><inertia ixx="1e-4" iyy="1e-4" izz="1e-4" ixy="0" ixz="0" iyz="0"/>
+</inertial><collision><geometry><box size=".06 .12 .04"/></geometry></collision></link>
+<link name="left"><inertial><mass value=".1"/><inertia ixx="1e-4" iyy="1e-4" izz="1e-4" ixy="0" ixz="0" iyz="0"/>
+</inertial><collision><geometry><box size=".02 .01 .04"/></geometry></collision></link>
+<link name="right"><inertial><mass value=".1"/><inertia ixx="1e-4" iyy="1e-4" izz="1e-4" ixy="0" ixz="0" iyz="0"/>
+</inertial><collision><geometry><box size=".02 .01 .04"/></geometry></collision></link>
+<joint name="l" type="prismatic"><parent link="base"/><child link="left"/><origin xyz="0 .02 .06"/><axis xyz="0 1 0"/>
+<limit lower="0" upper=".03" effort="10" velocity="1"/></joint>
+<joint name="r" type="prismatic"><parent link="base"/><child link="right"/><origin xyz="0 -.02 .06"/>
+<axis xyz="0 -1 0"/><limit lower="0" upper=".03" effort="10" velocity="1"/><mimic joint="l" multiplier="1"/></joint>
+</robot>"""
+"""A gripper with two jaws."""
+SCENE = """[array]
+whiskers = "C2"
+[whisking]
+kind = "track"
+path = "angles.csv"
+layout = "angles"
+whiskers = { C2 = "RC2" }
+[frames]
+first_ms = 10
+interval_ms = 10
+count = 5
+[[scene]]
+label = "played"
+"""
+
+student, student_weights = robot_surfaces._student("config.json"), robot_surfaces._student("model.safetensors")
+layout, log, settings = robot_surfaces._probes, foreign_surfaces._log, foreign_surfaces._settings
+checkpoint, whiskerman = published_surfaces._checkpoint, foreign_surfaces._control
+
+
+def contract(folder: Path) -> Path:
+    return policies.export_small(folder).with_name("policy.onnx.json")
+
+
+def wrenches(folder: Path) -> Path:
+    return write_ringdown(folder / "ringdown.csv")
+
+
+def points(folder: Path) -> Path:
+    return write_points(folder / "track.csv", bent_shapes())
+
+
+def deeplabcut(folder: Path) -> Path:
+    return write_deeplabcut_csv(folder / "track.csv", foreign_surfaces._pixels(), np.ones((12, 10)))
+
+
+def deeplabcut_hdf5(folder: Path) -> Path:
+    write_deeplabcut_table(folder / "track.h5", foreign_surfaces._pixels(), np.ones((12, 10)))
+    return folder / "track.h5"
+
+
+def whisk(folder: Path) -> Path:
+    write_whiskers(folder / "track.whiskers", foreign_surfaces._traces())
+    return folder / "track.whiskers"
+
+
+def angles(folder: Path) -> Path:
+    (folder / "scene.toml").write_text(SCENE)
+    return foreign_surfaces._angles(folder)
+
+
+def _recorded(folder: Path) -> tuple[Any, Any, np.ndarray, Any]:
+    (folder / "jaws.urdf").write_text(JAWS)
+    hand = hands.load(folder / "jaws.urdf")
+    probes = hand.layout("low", "tips")
+    place, normal = ([getattr(each, name)[each.active] for each in probes.values()] for name in ("position", "normal"))
+    links = np.repeat(list(probes), [len(each) for each in place])
+    places = TactilePoints(tuple(links.tolist()), np.concatenate(place), np.concatenate(normal))
+    closing = np.linspace(0.03, 0.0, 10)[:, None].repeat(len(hand.joints), axis=1)
+    return hand, probes, closing, places
+
+
+def replayed(folder: Path) -> Path:
+    hand, _, closing, places = _recorded(folder)
+    names = ["time", *hand.joints, *taxel_names(places.links)]
+    table = np.c_[np.arange(10) / 50, closing, np.ones((10, len(places.links)))]
+    np.savetxt(folder / "log.csv", table, delimiter=",", header=",".join(names), comments="", fmt="%.6g")
+    return folder / "log.csv"
+
+
+def lerobot(folder: Path) -> Path:
+    hand, _, closing, places = _recorded(folder)
+    touch = np.zeros((10, len(places.links), 6))
+    frames = dict(zip(PARTS, (closing, 0 * closing, closing, touch, np.zeros((10, 6))), strict=True))
+    facts = SessionFacts(task="close", fps=50, joints=hand.joints, points=places, robot="jaws", unit="N")
+    return write_lerobot(folder / "set", frames, facts) / "meta" / "info.json"
+
+
+def lerobot_places(folder: Path) -> Path:
+    return lerobot(folder).with_name("tactile.json")
+
+
+def lerobot_frames(folder: Path) -> Path:
+    return lerobot(folder).parents[1] / "data" / "chunk-000" / "file-000.parquet"
+
+
+def model(folder: Path) -> Path:
+    (folder / "mine.py").write_text(foreign_surfaces.MODEL)
+    return folder / "mine.py"
+
+
+def graph(folder: Path) -> Path:
+    checkpoint(folder)
+    return write_json(folder / "graph.json", reading_surfaces.GRAPH)
+
+
+def task(folder: Path) -> Path:
+    (folder / "task.py").write_text(foreign_surfaces.TASK)
+    return folder / "task.py"
+
+
+def plan(folder: Path) -> Path:
+    sealed = SealedPlan(
+        "power", 4, 3, layer="area", names=("a", "b", "c", "d"), models=("zhuang-small",), units=5, trials=8,
+        expected={"0.2": 0.8}, command="brainbench power --plan p.json",
+    )  # fmt: skip
+    return sealed.write(folder / "plan.json")
+
+
+def benchmark(folder: Path) -> Path:
+    write_study(folder)
+    options = ScoreOptions(
+        recordings=str(folder / "data"), conditions="trials:texture", stimuli=str(folder / "eight.h5"), seed=1
+    )
+    words = {"name": "lab", "citation": "Doe J., A Journal 1:2 (2026)", "doi": "10.1/2"}
+    (folder / "lab.toml").write_text(make(options, folder / "lab.toml", **words).to_toml())
+    return folder / "lab.toml"
+
+
+def packed(folder: Path) -> Path:
+    pack(benchmark(folder), folder / "lab.zip")
+    return folder / "lab.zip"
+
+
+def hub(folder: Path) -> Path:
+    (folder / "name.txt").write_text("hf-hub:owner/model/inner@main")
+    return folder / "name.txt"
