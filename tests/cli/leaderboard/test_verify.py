@@ -380,6 +380,14 @@ def test_too_many_records_are_refused_at_once(run, board, monkeypatch):
     assert "at most 1 at once" in _submitted(run, board, _add, _add_another_file).out
 
 
+@pytest.mark.parametrize("path", sorted(WORKFLOW.parent.glob("*.y*ml")), ids=lambda path: path.stem)
+def test_workflows_pin_every_action_by_its_commit(path):
+    lines = [line for line in path.read_text().splitlines() if "uses:" in line]
+    assert lines
+    pinned = re.compile(r"\s*(- )?uses: [\w./-]+@[0-9a-f]{40}  # v\d+\.\d+\.\d+")
+    assert [line for line in lines if not pinned.fullmatch(line)] == []
+
+
 def test_the_workflow_is_this_command(tmp_path):
     text = WORKFLOW.read_text()
     workflow = yaml.safe_load(text)
@@ -387,8 +395,6 @@ def test_the_workflow_is_this_command(tmp_path):
     runs = [step["run"] for step in job["steps"] if "run" in step]
     assert runs[-1].startswith("brainbench leaderboard check-submission HEAD FETCH_HEAD")
     assert not any("git diff" in run or "git show" in run for run in runs)
-    actions = [step["uses"] for step in job["steps"] if "uses" in step]
-    assert all(len(action.partition("@")[2]) == 40 for action in actions)
     assert [step["with"]["persist-credentials"] for step in job["steps"] if "checkout" in step.get("uses", "")] == [
         False
     ]
