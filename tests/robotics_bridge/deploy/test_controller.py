@@ -11,10 +11,9 @@ import pytest
 
 from brainbench.core.errors import UsageError
 from robotics_bridge import hands
-from robotics_bridge.deploy.controller import PRIORITY, Clock, Controller, LatencyHistogram, RateMonitor, realtime
-from robotics_bridge.deploy.driver import HandReading, LinkCounters
+from robotics_bridge.deploy.controller import PRIORITY, Controller, LatencyHistogram, RateMonitor, realtime
 from robotics_bridge.deploy.safety import SafetyLimits
-from robotics_bridge.policies.contract import PolicyContract
+from tests.factories.paper_hands import OwnClock, PaperHand, make_contract, make_limits, run_session
 
 linux = pytest.mark.skipif(not hasattr(os, "SCHED_FIFO"), reason="SCHED_FIFO is Linux's")
 
@@ -52,78 +51,8 @@ def test_other_systems_are_told_that_they_have_none(monkeypatch: pytest.MonkeyPa
         pass
 
 
-JOINTS = ("a", "b", "c")
-
-
-class OwnClock(Clock):
-    def __init__(self) -> None:
-        self.now = 100.0
-
-    def __call__(self) -> float:
-        return self.now
-
-    def sleep(self, seconds: float) -> None:
-        self.now += max(seconds, 1e-6)
-
-
-class PaperHand:
-    """Follows its targets at once; ``spoil(reading number, fields)`` may change what it reports."""
-
-    def __init__(self, clock: OwnClock, spoil=None) -> None:
-        self.joints, self.fingers = JOINTS, ("thumb", "index")
-        self.counters = LinkCounters()
-        self.clock, self.spoil = clock, spoil
-        self.position = np.zeros(3)
-        self.sent: list[np.ndarray] = []
-        self.number, self.stops = 0, 0
-        self.last: HandReading | None = None
-
-    def read(self) -> HandReading | None:
-        self.number += 1
-        fields = {
-            "sequence": self.number, "time": self.clock() - 50.0, "arrived": self.clock(),
-            "position": self.position.copy(), "velocity": np.zeros(3), "pressure": np.zeros((2, 3)),
-        }  # fmt: skip
-        if self.spoil is not None:
-            fields = self.spoil(self.number, fields)
-        if fields is not None:
-            self.last = HandReading(**fields)
-        return self.last
-
-    def send(self, targets) -> None:
-        self.sent.append(np.array(targets))
-        self.position = np.array(targets)
-
-    def stop(self) -> None:
-        self.stops += 1
-
-    def close(self) -> None:
-        pass
-
-
-ACTIONS = {"default": (0.1, 0.2), "scale": (0.5, 0.5), "low": (-1.0, 0.0), "high": (1.0, 0.4)}
-
-
-def _contract(groups=("proprio",), rate=40.0) -> PolicyContract:
-    return PolicyContract(dict.fromkeys(groups, (1,)), rate, "paper", JOINTS, ("a", "c"), ACTIONS, {"b": 0.3})
-
-
-def _limits(**changes) -> SafetyLimits:
-    return SafetyLimits(np.full(3, -1.0), np.full(3, 1.0), np.full(3, 8.0), **changes)
-
-
-def _control(spoil=None, *, policy=None, seconds=2.0, clock=None, **changes):
-    clock = clock or OwnClock()
-    hand = PaperHand(clock, spoil)
-    controller = Controller(
-        policy or (lambda obs, forget: np.array([0.2, 0.1], np.float32)), hand,
-        _contract(changes.pop("groups", ("proprio",))), _limits(), clock=clock, **changes,
-    )  # fmt: skip
-    return controller.run(seconds), hand, controller
-
-
 def test_a_quiet_session_runs_at_its_rate_and_ends_with_the_hand_holding() -> None:
-    report, hand, controller = _control()
+    report, hand, controller = run_session()
     assert (report.status, report.reason) == ("finished", "")
     assert report.ticks == pytest.approx(80, abs=1)
     assert hand.stops == 1
@@ -141,7 +70,7 @@ def test_observations_are_those_of_the_tasks() -> None:
     def spoil(number, fields):
         return {**fields, "velocity": np.array([1.0, 2.0, 3.0])}
 
-    _control(spoil, policy=policy, seconds=0.1)
+    run_session(spoil, policy=policy, seconds=0.1)
     first, second = seen[0], seen[1]
     np.testing.assert_allclose(first[0], [0, 0, 0, 0.2, 0.4, 0.6, 0, 0], atol=1e-6)
     np.testing.assert_allclose(second[0][-2:], [0.4, -0.2], atol=1e-6)
@@ -171,7 +100,7 @@ NAN = np.array([0.0, np.nan, 0.0])
     ],
 )
 def test_bad_data_stops_the_hand_before_it_is_acted_upon(spoil, message) -> None:
-    report, hand, _ = _control(spoil)
+    report, hand, _ = run_session(spoil)
     assert report.status == "stopped"
     assert re.search(message, report.reason), report.reason
     assert hand.stops == 1
@@ -181,20 +110,20 @@ def test_bad_data_stops_the_hand_before_it_is_acted_upon(spoil, message) -> None
 
 def test_short_gaps_and_repeats_are_survived() -> None:
     # Two of three reports are lost: the newest is at most 50 ms old.
-    report, _, _ = _control(lambda n, fields: fields if n % 3 == 0 else None)
+    report, _, _ = run_session(lambda n, fields: fields if n % 3 == 0 else None)
     assert report.status == "finished"
     assert report.ticks > 70
 
 
 def test_a_silent_hand_is_not_waited_for_for_ever() -> None:
-    report, hand, _ = _control(lambda n, fields: None)
+    report, hand, _ = run_session(lambda n, fields: None)
     assert report.reason == "the hand said nothing for 3 s"
     assert (report.ticks, hand.sent, hand.stops) == (0, [], 1)
 
 
 def test_a_policy_that_gives_no_numbers_or_fails_leaves_the_hand_holding() -> None:
     calls = iter([np.zeros(2), np.zeros(2), np.array([np.nan, 0.0])])
-    report, hand, _ = _control(policy=lambda obs, forget: next(calls))
+    report, hand, _ = run_session(policy=lambda obs, forget: next(calls))
     assert "policy gave values that are no numbers" in report.reason
     assert len(hand.sent) == 2
     clock = OwnClock()
@@ -203,7 +132,7 @@ def test_a_policy_that_gives_no_numbers_or_fails_leaves_the_hand_holding() -> No
     def broken(obs, forget):
         raise RuntimeError("boom")
 
-    controller = Controller(broken, hand, _contract(), _limits(), clock=clock)
+    controller = Controller(broken, hand, make_contract(), make_limits(), clock=clock)
     with pytest.raises(RuntimeError, match="boom"):
         controller.run(1.0)
     assert hand.stops == 1
@@ -216,22 +145,22 @@ def test_slow_control_is_noticed() -> None:
         clock.now += 0.05
         return np.zeros(2)
 
-    report, _, _ = _control(policy=slow, clock=clock, seconds=5)
+    report, _, _ = run_session(policy=slow, clock=clock, seconds=5)
     assert "control runs at 20.0 Hz instead of 40" in report.reason
     assert report.overruns > 15
 
 
 def test_what_does_not_fit_is_refused_before_anything_moves() -> None:
     with pytest.raises(UsageError, match="group 'command'"):
-        _control(groups=("proprio", "command"))
+        run_session(groups=("proprio", "command"))
     with pytest.raises(UsageError, match=r"'timeout' .* -1"):
-        _limits(timeout=-1)
+        make_limits(timeout=-1)
     hand = hands.load("xhand1")
     limits = SafetyLimits.of_hand(hand, hand.joints)
     assert limits.speed.max() == pytest.approx(14.38)
     with pytest.raises(UsageError, match=r"'xhand1' .*'knee'"):
         SafetyLimits.of_hand(hand, ("knee",))
-    report, _, _ = _control(groups=("proprio", "command"), sources={"command": lambda r: np.array([np.nan])})
+    report, _, _ = run_session(groups=("proprio", "command"), sources={"command": lambda r: np.array([np.nan])})
     assert report.reason == "the observation 'command' holds values that are no numbers"
 
 
@@ -251,4 +180,4 @@ def test_histogram_and_rate() -> None:
 
 def test_a_source_that_the_policy_does_not_read_is_refused() -> None:
     with pytest.raises(UsageError, match=r"'comand'.*did you mean 'command'"):
-        _control(groups=("proprio", "command"), sources={"comand": None, "command": lambda reading: np.zeros(1)})
+        run_session(groups=("proprio", "command"), sources={"comand": None, "command": lambda reading: np.zeros(1)})
