@@ -157,7 +157,7 @@ def test_without_a_folder_every_other_module_imports_and_a_model_is_scored(packa
         path.relative_to(tree).with_suffix("").as_posix().replace("/", ".").removesuffix(".__init__")
         for name in PACKAGES
         for path in (Path(where) / file for where, _, some in os.walk(tree / name, followlinks=True) for file in some)
-        if path.suffix == ".py" and path.name != "__main__.py" and "derivatives/kernels" not in path.as_posix()
+        if path.suffix == ".py" and path.name != "__main__.py" and "fitting/kernels" not in path.as_posix()
     )
     code = f"import importlib, brainbench.core\nfor name in {modules!r}:\n    importlib.import_module(name)"
     done = _run(tree, "-W", "ignore", "-c", code)

@@ -241,17 +241,17 @@ def stages(args: argparse.Namespace) -> None:
     """Run the command in this process, and print when each shard was where and what its stages took."""
     from brainbench.cli import app
     from brainbench.stimuli.engines.rod import launch
-    from brainbench.stimuli.sweeps import running
+    from brainbench.stimuli.sweeps import generation
 
     seen, moments, lock = _timed_launches(), [], threading.Lock()
     if args.ahead:
         launch.ON_AN_IDLE_GPU = _tries(args.ahead)
     if args.side_by_side:
-        running.SIDE_BY_SIDE = args.side_by_side
+        generation.SIDE_BY_SIDE = args.side_by_side
     totals: dict[str, float] = {}
 
     def timed(what: str, name: str) -> None:
-        real = getattr(running, name)
+        real = getattr(generation, name)
 
         def call(first: Any, *rest: Any) -> Any:
             begun = time.time()
@@ -262,7 +262,7 @@ def stages(args: argparse.Namespace) -> None:
                 moments.append((what, task.name, begun - STARTED, time.time() - STARTED))
             return result
 
-        setattr(running, name, call)
+        setattr(generation, name, call)
 
     timed("load kernels", "warm_up")
     timed("simulate", "simulate_shard")
@@ -276,7 +276,8 @@ def stages(args: argparse.Namespace) -> None:
         made, total = json.loads(told.getvalue()), time.time() - STARTED
         print(
             f"{made['sweeps']:,} sweeps in {total:.1f} s, {made['sweeps'] / total:,.0f} sweeps/s, at most "
-            f"{running.SIDE_BY_SIDE} shards at once on a GPU, {made['unstable']} unstable, hash {made['content_hash']}"
+            f"{generation.SIDE_BY_SIDE} shards at once on a GPU, {made['unstable']} unstable, "
+            f"hash {made['content_hash']}"
         )
     except BaseException as error:  # noqa: BLE001 - what was measured until then is worth seeing
         print(f"ended after {time.time() - STARTED:.1f} s by {error!r}")

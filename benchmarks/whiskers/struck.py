@@ -82,7 +82,7 @@ def soft(each: int, fidelity: Fidelity) -> list[list[str]]:
     fine = replace(fidelity, time_step=2e-5, steps_per_period=120, precision="double", contact_tolerance=1e-9)
     reference, judged = RodEngine().run(jobs, fine), engine.run(jobs, fidelity)
     # Without the limit, what soft contacts lose of the friction has numbers too.
-    with patch("brainbench.stimuli.engines.mujoco.engine.LARGEST_CHANGE", 9.0):
+    with patch("brainbench.stimuli.engines.mujoco.LARGEST_CHANGE", 9.0):
         every = get_engine("mujoco").run(jobs, fidelity)
     rows = []
     for friction in FRICTIONS:

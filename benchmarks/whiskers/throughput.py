@@ -17,11 +17,10 @@ from brainbench.core.devices import pick_device
 from brainbench.stimuli import Fidelity
 from brainbench.stimuli.engines.rod.launch import Launch, WhiskerSolver
 from brainbench.stimuli.engines.rod.limits import NOTHING
-from brainbench.stimuli.engines.rod.packing import PackedJobs, PackedMotions, still_knots
-from brainbench.stimuli.engines.rod.shapes import PackedShapes
+from brainbench.stimuli.engines.rod.packing import PackedJobs, PackedMotions, PackedShapes, still_knots
 from brainbench.stimuli.engines.rod.sweeps import BLOCK
 from brainbench.stimuli.whiskers.array import WhiskerArray
-from brainbench.stimuli.whiskers.chain import build_chain
+from brainbench.stimuli.whiskers.whisker import build_chain
 
 
 def free(

@@ -1,4 +1,6 @@
-"""Work that a simulation did and work that it could leave out: whisker runs, time steps, contact pairs and seconds.
+"""Distinct jobs of some scenes, and the work that their simulation did and could leave out.
+
+Told are whisker runs, time steps, contact pairs and seconds.
 
 A *run* is one whisker in one stimulus. Runs that cannot differ are simulated once and shared; runs that
 cannot feel anything are not simulated. A contact *pair* is one link of a whisker against one convex part of
@@ -13,16 +15,74 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import msgspec
+import numpy as np
 
 from brainbench.core.errors import DataError, UsageError
+from brainbench.core.files import content_hash
 from brainbench.stimuli.engines.fidelity import Fidelity
-from brainbench.stimuli.engines.job_schedule import JobSchedule
-from brainbench.stimuli.motion.jobs import Trace
+from brainbench.stimuli.engines.reach import Reach, reachable
+from brainbench.stimuli.motion.jobs import Job, Trace
+from brainbench.stimuli.motion.trajectories import Still
 from brainbench.stimuli.objects.solid import Solid
 from brainbench.stimuli.scenes.scene import Scene
 
 if TYPE_CHECKING:
     import xarray as xr
+
+SAMPLING = 1000.0
+"""Instants per second at which reach is judged; what moves in between counts as an error bound."""
+
+
+@dataclass(frozen=True, eq=False)
+class JobSchedule:
+    """Distinct jobs of some scenes, and where each whisker of each scene finds its trace."""
+
+    jobs: tuple[Job, ...]
+    """Jobs to run: a whisker that reaches no object does the same in every scene with the same motion."""
+    places: tuple[tuple[int, ...], ...]
+    """[scene][whisker] index into ``jobs``."""
+    reaches: tuple[tuple[Reach, ...], ...]
+    """[scene][whisker] what of its scene the whisker could ever touch."""
+    surfaces: bool = False
+    """True for an engine that touches exact surfaces where there are some, instead of convex parts."""
+
+
+def plan(scenes: Sequence[Scene], *, surfaces: bool = False) -> JobSchedule:
+    """Find the distinct jobs of ``scenes``, for an engine that touches exact ``surfaces`` or convex parts."""
+    distinct: dict[str, int] = {}
+    jobs: list[Job] = []
+    places, reaches = [], []
+    for scene in scenes:
+        row, near = [], []
+        digests: dict[tuple[int, bool], str] = {}
+        owners = [part for part in scene.split() for _ in part.array]
+        for mount, owner, job in zip(scene.mounts, owners, scene.jobs(), strict=True):
+            reach = reach_of(job, surfaces=surfaces)
+            travels = not isinstance(owner.head.motion, Still)
+            # Of one animal the whiskers differ by their mounts alone, and a scene may have a thousand objects.
+            what = id(owner), bool(travels or reach)
+            if what not in digests:
+                seen = owner.config() if travels or reach else {"whisking": owner.whisking.config()}
+                digests[what] = content_hash({**seen, "label": None})
+            # A head that is turned otherwise feels gravity in another direction.
+            pull = {"pull": job.gravity} if any(job.gravity) else {}
+            key = content_hash(mount, digests[what], pull)
+            if key not in distinct:
+                distinct[key] = len(jobs)
+                jobs.append(job)
+            row.append(distinct[key])
+            near.append(reach)
+        places.append(tuple(row))
+        reaches.append(tuple(near))
+    return JobSchedule(tuple(jobs), tuple(places), tuple(reaches), surfaces)
+
+
+def reach_of(job: Job, *, surfaces: bool = False) -> Reach:
+    """Return what of its obstacles the whisker of this job could ever touch."""
+    duration = job.times[-1] - job.start
+    times = np.linspace(job.start, job.times[-1], max(2, math.ceil(duration * SAMPLING)))
+    return reachable(job.whisker, job.follicle.pose(times)[0], job.obstacles, times, surfaces=surfaces)
+
 
 ATTRIBUTE = "explanation"  # attribute of a stimulus set that holds the explanation as JSON
 SECONDS = "seconds"

@@ -20,9 +20,8 @@ from brainbench.core.reading.hdf5 import open_hdf5
 from brainbench.core.reading.regular import readable
 from brainbench.core.reading.texts import read_toml
 from brainbench.stimuli.engines.fidelity import DEFAULT_ENGINE, Fidelity
-from brainbench.stimuli.kept_sets import find_kept
 from brainbench.stimuli.scenes.recipes import get_recipe, is_packaged, is_recipe, list_recipes, recipe_file
-from brainbench.stimuli.stimulus_set import hash_stimulus_set, read_stimulus_set, to_grid
+from brainbench.stimuli.stimulus_set import find_kept, hash_stimulus_set, read_stimulus_set, to_grid
 from brainbench.stimuli.whiskers.array import match_whiskers
 
 if TYPE_CHECKING:

@@ -21,7 +21,7 @@ from brainbench.models.training.checkpoints import find_folder
 from brainbench.published.checkpoint_import import read_settings
 from brainbench.stimuli import Whisker
 from brainbench.stimuli.fitting.trials import Trial, read_wrenches
-from brainbench.stimuli.motion.tracked import PlayOptions, load_angles
+from brainbench.stimuli.motion.recorded import PlayOptions, load_angles
 from brainbench.stimuli.tracks.readers import TrackOptions, read_shapes
 from robotics_bridge import hands, tasks
 from robotics_bridge.deploy.links.episodes import PARTS, SessionFacts, TactilePoints, write_lerobot

@@ -15,8 +15,7 @@ from brainbench.stimuli.engines.rod.tasks import make_task
 from brainbench.stimuli.fitting.gradients import GradientRun, JobParameters
 from brainbench.stimuli.motion.jobs import Job, StillFollicle, Trace
 from brainbench.stimuli.objects.obstacle import Obstacle, Part
-from brainbench.stimuli.whiskers.chain import build_chain
-from brainbench.stimuli.whiskers.whisker import Whisker
+from brainbench.stimuli.whiskers.whisker import Whisker, build_chain
 
 COARSE = Fidelity(links=8, time_step=1e-4)
 WHISKER = Whisker(0.02, 5e-5, 5e-6, 3e9, 1300.0, 0.3, curvature=10.0, friction=0.0)

@@ -15,8 +15,8 @@ from brainbench.core.files import atomic_path, to_json, write_json, write_text
 from brainbench.core.reading.sealed import seal_file
 from brainbench.stimuli import Fidelity, get_recipe
 from brainbench.stimuli.engines import get_engine
-from brainbench.stimuli.kept_sets import SHIPPED, SHIPPED_INDEX, error_file, shipped_facts
 from brainbench.stimuli.simulation import cache_path, simulate_uncached
+from brainbench.stimuli.stimulus_set import SHIPPED, SHIPPED_INDEX, error_file, shipped_facts
 
 RECIPES = ("objects", "rodgers")
 """Stimuli of the demo recordings, and of whatever names none."""

@@ -17,8 +17,7 @@ from brainbench.stimuli.fitting.model import FitModel
 from brainbench.stimuli.fitting.parameters import FitOptions, FreeParameters
 from brainbench.stimuli.fitting.trials import Trial
 from brainbench.stimuli.tracks.contract import new_shapes, new_wrenches
-from brainbench.stimuli.whiskers.chain import build_chain
-from brainbench.stimuli.whiskers.whisker import Whisker
+from brainbench.stimuli.whiskers.whisker import Whisker, build_chain
 
 if TYPE_CHECKING:
     import xarray as xr

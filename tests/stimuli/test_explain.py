@@ -1,6 +1,9 @@
+from __future__ import annotations
+
 import dataclasses
 import json
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,19 +15,42 @@ from brainbench.stimuli import simulation
 from brainbench.stimuli.engines import reach as _reach
 from brainbench.stimuli.engines import stepping
 from brainbench.stimuli.engines.fidelity import Fidelity
-from brainbench.stimuli.engines.job_schedule import plan, reach_of
-from brainbench.stimuli.engines.mujoco.model import build_model
+from brainbench.stimuli.engines.mujoco import build_model
 from brainbench.stimuli.engines.reach import Reach
-from brainbench.stimuli.explain import Explanation
-from brainbench.stimuli.motion.trajectories import Still, Translation
-from brainbench.stimuli.objects.obstacle import Obstacle
-from brainbench.stimuli.objects.solid import PlacedObject, box, rodgers_solid, sphere
+from brainbench.stimuli.explain import Explanation, plan, reach_of
+from brainbench.stimuli.motion.trajectories import Still, Translation, Whisking
+from brainbench.stimuli.objects.obstacle import Obstacle, Sphere
+from brainbench.stimuli.objects.solid import PlacedObject, Solid, box, rodgers_solid, sphere
 from brainbench.stimuli.scenes.recipes import get_recipe
 from brainbench.stimuli.scenes.scene import Frames, Scene
 from brainbench.stimuli.simulation import simulate
 from brainbench.stimuli.whiskers.array import WhiskerArray
-from brainbench.stimuli.whiskers.chain import build_chain
+from brainbench.stimuli.whiskers.whisker import build_chain
 from tests.factories.engines import FakeEngine
+
+
+def _make_scene(label, position):
+    ball = PlacedObject(Solid("ball", (Sphere((0.0, 0.0, 0.0), 1e-3),)), position=position)
+    return Scene(label, WhiskerArray.mouse(whiskers="C1,C2"), whisking=Whisking(), objects=(ball,))
+
+
+def test_whiskers_that_reach_nothing_do_the_same_in_every_scene():
+    scenes = [_make_scene(label, (1.0, 0.0, z)) for label, z in (("far", 0.0), ("farther", 1.0))]
+    schedule = plan(scenes)
+    assert len(schedule.jobs) == 2
+    assert schedule.places[0] == schedule.places[1]
+    assert not any(reach for row in schedule.reaches for reach in row)
+
+
+def test_whiskers_of_another_motion_or_near_an_object_have_jobs_of_their_own():
+    far = _make_scene("far", (1.0, 0.0, 0.0))
+    faster = replace(far, whisking=Whisking(frequency=10.0))
+    mount = far.mounts[1]
+    near = _make_scene("near", tuple(float(x) for x in mount.position))
+    schedule = plan([far, faster, near])
+    assert len(set(schedule.places[0]) | set(schedule.places[1])) == 4
+    assert schedule.places[2][1] not in schedule.places[0]
+
 
 # The same step on every whisker, so that steps can be counted by hand.
 FAST = Fidelity(links=6, time_step=2e-4)

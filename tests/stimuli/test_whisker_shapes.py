@@ -9,11 +9,10 @@ from brainbench.core.errors import UsageError
 from brainbench.core.rotations import base_rotation, euler_matrix
 from brainbench.stimuli import simulation
 from brainbench.stimuli.engines.fidelity import Fidelity
-from brainbench.stimuli.engines.mujoco.engine import MujocoWhiskerEngine
+from brainbench.stimuli.engines.mujoco import MujocoWhiskerEngine
 from brainbench.stimuli.motion.trajectories import Still, Translation, Whisking
 from brainbench.stimuli.scenes.scene import Animal, Frames, Head, Scene
-from brainbench.stimuli.simulation import simulate
-from brainbench.stimuli.whisker_shapes import record
+from brainbench.stimuli.simulation import record, simulate
 from brainbench.stimuli.whiskers.array import WhiskerArray
 from tests.factories.engines import FakeEngine
 from tests.factories.pushed_bar import pushed_bar

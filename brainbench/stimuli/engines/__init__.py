@@ -1,8 +1,7 @@
 """Physics engines for whiskers: jobs and a fidelity go in, traces of forces come out (:mod:`.protocol`).
 
-A schedule finds the distinct jobs of some scenes (:mod:`.job_schedule`) and what each can touch (:mod:`.reach`); one of
-the engines ``rod``, ``mujoco`` and, if its folder is there, ``bullet`` simulates them; one rule says which results are
-reliable (:mod:`.trust`).
+One of the engines ``rod``, ``mujoco`` and, if its folder is there, ``bullet`` simulates them with what each can touch
+(:mod:`.reach`); one rule says which results are reliable (:mod:`.trust`).
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ PHYSICS_VERSION = 7
 change of the code changes what a simulation gives; tests/stimuli/engines/test_golden_wrenches.py says when."""
 
 _ENGINES = {
-    "mujoco": ("brainbench.stimuli.engines.mujoco.engine", "MujocoWhiskerEngine"),
+    "mujoco": ("brainbench.stimuli.engines.mujoco", "MujocoWhiskerEngine"),
     "rod": ("brainbench.stimuli.engines.rod.engine", "RodEngine"),
 }
 """Name of each engine, and the module and class that it is; optional engines are entry points of :data:`_GROUP`."""

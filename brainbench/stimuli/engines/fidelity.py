@@ -16,8 +16,7 @@ from brainbench.core.errors import UsageError, brief, check_name
 from brainbench.core.limits import Limit, Positive, limited, read_pairs, read_value, with_changes
 from brainbench.core.reading.ranges import check_number
 from brainbench.core.tradeoffs import TradeoffPoint, cheapest
-from brainbench.stimuli.whiskers.chain import Chain
-from brainbench.stimuli.whiskers.whisker import Whisker
+from brainbench.stimuli.whiskers.whisker import Chain, Whisker
 
 if TYPE_CHECKING:
     from brainbench.stimuli.motion.jobs import Job
@@ -109,7 +108,7 @@ class Fidelity:
 
     def chain(self, whisker: Whisker) -> Chain:
         """Return the chain of links that stands for a whisker; errors as for :meth:`link_count`."""
-        from brainbench.stimuli.whiskers.chain import build_chain
+        from brainbench.stimuli.whiskers.whisker import build_chain
 
         return build_chain(whisker, self.link_count(whisker.arc_length))
 

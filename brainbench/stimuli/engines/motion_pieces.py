@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.errors import UsageError
 from brainbench.core.rotations import to_matrices
-from brainbench.stimuli.engines.units import MILLI
+from brainbench.stimuli.engines.protocol import MILLI
 from brainbench.stimuli.motion.jobs import Follicle
 from brainbench.stimuli.objects.obstacle import Obstacle, RigidMotion
 

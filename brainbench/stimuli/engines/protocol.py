@@ -1,6 +1,7 @@
 """What every physics engine does: whisker jobs (:mod:`brainbench.stimuli.motion.jobs`) go in, traces come out.
 
-Here too: the results of many sweeps at once, and threads that share jobs.
+Here too: the results of many sweeps at once, threads that share jobs, and the units in which engines calculate: mm, ms
+and mg, so mN and µN·m, keep every number near one.
 """
 
 from __future__ import annotations
@@ -22,6 +23,9 @@ from brainbench.stimuli.motion.jobs import Job, StillFollicle, Trace  # noqa: F4
 if TYPE_CHECKING:
     from brainbench.stimuli.objects.solid import Solid
     from brainbench.stimuli.whiskers.array import WhiskerArray
+
+MILLI = 1e3  # millimetres in a metre, milliseconds in a second, millinewtons in a newton
+MICRO = 1e6  # milligrams in a kilogram, µN·m in a newton metre
 
 
 def run_groups(

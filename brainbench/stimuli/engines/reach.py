@@ -13,8 +13,7 @@ from brainbench.core.rotations import base_rotation, to_matrices
 from brainbench.geometry import winding_number
 from brainbench.stimuli.motion.jobs import Job
 from brainbench.stimuli.objects.obstacle import Capsule, Cylinder, Obstacle, Sphere
-from brainbench.stimuli.whiskers.chain import Chain
-from brainbench.stimuli.whiskers.whisker import Whisker
+from brainbench.stimuli.whiskers.whisker import Chain, Whisker
 
 LARGEST_SLIDE = 0.1
 """Way that a follicle may give, in lengths of its whisker."""

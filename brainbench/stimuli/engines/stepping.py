@@ -34,7 +34,7 @@ from brainbench.stimuli.engines.trust import (
 )
 from brainbench.stimuli.motion.jobs import Job, Trace
 from brainbench.stimuli.objects.obstacle import Box, Capsule, Cylinder, Obstacle, Part, Sphere
-from brainbench.stimuli.whiskers.chain import Chain
+from brainbench.stimuli.whiskers.whisker import Chain
 
 LEAST_TAPER = 1e-6
 """Difference of the radii of a link's ends (mm) below which it is a capsule."""
@@ -271,6 +271,34 @@ class SteppedJob:
             displacement=None if displacement is None else np.where(good[:, None], displacement, np.nan),
             link_positions=np.where(good[:, None, None], shape, np.nan) if self.record_shape else None,
         )
+
+
+@dataclass(frozen=True, eq=False)
+class PrescribedMotion:
+    """Prescribed positions and velocities of some joints and the accelerations that produce them."""
+
+    position: NDArray[np.float64]
+    """[n, coordinates] as MuJoCo's qpos, before step n."""
+    velocity: NDArray[np.float64]
+    """[n, degrees of freedom] as MuJoCo's qvel, before step n."""
+    acceleration: NDArray[np.float64]
+    """[n, degrees of freedom] over step n."""
+
+
+def drive_scalars(path: NDArray[np.float64], step: float) -> PrescribedMotion:
+    """Drive hinges or slides along ``path`` [n + 1, joints] sampled at every step (ms)."""
+    return driven(path[:-1], np.diff(path, axis=0) / step, step)
+
+
+def driven(position: NDArray, after: NDArray, step: float) -> PrescribedMotion:
+    """Build a drive from positions before and velocities after each step."""
+    acceleration = np.empty_like(after)
+    # Second difference of the path. Force B a on the armature B makes the integrator's own velocities those of the
+    # path.
+    acceleration[1:] = np.diff(after, axis=0) / step
+    # The acceleration at the start is unknown before the first sample: continue the next one.
+    acceleration[0] = acceleration[1] if len(after) > 1 else 0.0
+    return PrescribedMotion(position, after - step * acceleration, acceleration)
 
 
 class SteppedEngine(WhiskerEngine):

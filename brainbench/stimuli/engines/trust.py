@@ -13,9 +13,8 @@ from brainbench.core.errors import UsageError, listing
 from brainbench.core.reading.ranges import check_number
 from brainbench.core.rotations import base_rotation
 from brainbench.stimuli.engines.fidelity import Fidelity
-from brainbench.stimuli.engines.protocol import WhiskerEngine
+from brainbench.stimuli.engines.protocol import MILLI, WhiskerEngine
 from brainbench.stimuli.engines.reach import LARGEST_SLIDE, Reach, distances
-from brainbench.stimuli.engines.units import MILLI
 from brainbench.stimuli.motion.jobs import Job
 from brainbench.stimuli.objects.obstacle import Obstacle
 from brainbench.stimuli.whiskers.whisker import Whisker

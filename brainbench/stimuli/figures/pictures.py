@@ -24,8 +24,7 @@ from brainbench.core.files import atomic_path
 from brainbench.core.limits import Limit, Positive, Share, limited
 from brainbench.core.progress import Progress, track
 from brainbench.stimuli.engines.fidelity import DEFAULT_ENGINE, Fidelity
-from brainbench.stimuli.engines.protocol import WhiskerEngine
-from brainbench.stimuli.engines.units import MILLI
+from brainbench.stimuli.engines.protocol import MILLI, WhiskerEngine
 from brainbench.stimuli.figures.surfaces import (
     Camera,
     DrawnSurface,
@@ -44,7 +43,7 @@ from brainbench.stimuli.figures.surfaces import (
 )
 from brainbench.stimuli.motion.trajectories import Whisking
 from brainbench.stimuli.scenes.scene import Scene
-from brainbench.stimuli.whisker_shapes import Recording, record
+from brainbench.stimuli.simulation import Recording, record
 from brainbench.stimuli.whiskers.array import ROWS
 
 ROW_COLORS = ("#3466ac", "#1b9aa0", "#d1495b", "#7b4fa3", "#e08e1b")
@@ -431,7 +430,7 @@ def render(
         times: instants to draw [s], one for a picture; :func:`still_time` or :func:`film_times` when None.
         camera, style: an oblique perspective that frames whiskers and objects when None; films are smaller than
             pictures.
-        fidelity, backend, progress, cache: as for :func:`brainbench.stimuli.whisker_shapes.record`.
+        fidelity, backend, progress, cache: as for :func:`brainbench.stimuli.simulation.record`.
     """
     path = Path(out)
     suffix = check_format(path, FORMATS)

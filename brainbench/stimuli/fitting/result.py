@@ -21,8 +21,7 @@ from brainbench.stimuli.fitting.model import Readings
 from brainbench.stimuli.fitting.parameters import PARAMETERS, Prior
 from brainbench.stimuli.fitting.trials import Trial
 from brainbench.stimuli.motion.jobs import Trace
-from brainbench.stimuli.whiskers.chain import build_chain
-from brainbench.stimuli.whiskers.whisker import Whisker
+from brainbench.stimuli.whiskers.whisker import Whisker, build_chain
 
 if TYPE_CHECKING:
     from scipy.sparse import coo_array

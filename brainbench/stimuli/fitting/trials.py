@@ -28,8 +28,7 @@ from brainbench.stimuli.fitting.parameters import Condition
 from brainbench.stimuli.motion.jobs import Job, Load, StillFollicle, Trace
 from brainbench.stimuli.tracks.contract import AXES, check_length, new_wrenches
 from brainbench.stimuli.validation import references
-from brainbench.stimuli.whiskers.chain import build_chain
-from brainbench.stimuli.whiskers.whisker import Whisker
+from brainbench.stimuli.whiskers.whisker import Whisker, build_chain
 
 if TYPE_CHECKING:
     import xarray as xr

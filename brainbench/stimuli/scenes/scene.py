@@ -18,8 +18,7 @@ from brainbench.core.errors import UsageError
 from brainbench.core.limits import limited
 from brainbench.core.rotations import Angles, Point, base_rotation, euler_matrix
 from brainbench.stimuli.motion.jobs import Acceleration, Job
-from brainbench.stimuli.motion.recorded import Recorded
-from brainbench.stimuli.motion.tracked import Tracked
+from brainbench.stimuli.motion.recorded import Recorded, Tracked
 from brainbench.stimuli.motion.trajectories import ArrayFollicle, Path, Still, Translation, Whisking
 from brainbench.stimuli.objects.solid import PlacedObject
 from brainbench.stimuli.scenes.frames import Frames

@@ -48,11 +48,11 @@
     friction = 0.3               # optional
     velocity_mm_s = [0, -30, 0]  # optional; or spin_deg_s = [0, 0, 90] about its position; or keyframes as for the head
 
-``kind = "track"`` plays what a video showed (:mod:`brainbench.stimuli.motion.tracked`): ``whiskers`` names the whiskers
-of the array that were tracked, each with its label in the file (empty where the file holds one). ``layout``,
+``kind = "track"`` plays what a video showed (:mod:`brainbench.stimuli.motion.recorded`): ``whiskers`` names the
+whiskers of the array that were tracked, each with its label in the file (empty where it holds one). ``layout``,
 ``zero_frame``, ``parts``, ``least_likelihood`` and ``identities_path`` are those of ``stimuli fit``, ``rest_deg``,
 ``view``, ``rostral_deg``, ``longest_gap_ms`` and ``lowpass_hz`` those of
-:class:`~brainbench.stimuli.motion.tracked.PlayOptions`; ``lowpass_hz = 0`` filters nothing. A file of ``layout =
+:class:`~brainbench.stimuli.motion.recorded.PlayOptions`; ``lowpass_hz = 0`` filters nothing. A file of ``layout =
 "angles"`` is a table of angles. A scene whose label holds ``{trial}`` stands for as many scenes as there are files at
 ``path``, where ``{trial}`` is any text; it may also stand in other texts of the scene.
 
@@ -83,8 +83,15 @@ from brainbench.core.reading.texts import read_toml
 from brainbench.core.rotations import Vector
 from brainbench.geometry import DecompositionSettings
 from brainbench.stimuli.motion import trajectories
-from brainbench.stimuli.motion.recorded import Recorded, load_initial_angles, load_trajectory
-from brainbench.stimuli.motion.tracked import PlayOptions, Tracked, load_angles, load_tracks
+from brainbench.stimuli.motion.recorded import (
+    PlayOptions,
+    Recorded,
+    Tracked,
+    load_angles,
+    load_initial_angles,
+    load_tracks,
+    load_trajectory,
+)
 from brainbench.stimuli.motion.trajectories import ROTATIONS, Rotations, Spin, Still, Translation, Whisking
 from brainbench.stimuli.objects import procedural
 from brainbench.stimuli.objects.solid import (

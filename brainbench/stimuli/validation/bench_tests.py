@@ -28,8 +28,7 @@ from brainbench.stimuli.objects.obstacle import Capsule, Cylinder, Obstacle, Rig
 from brainbench.stimuli.objects.solid import Solid, box, capsule, rodgers_solid, sphere
 from brainbench.stimuli.validation import references
 from brainbench.stimuli.whiskers.array import SPECIES, MountedWhisker, WhiskerArray
-from brainbench.stimuli.whiskers.chain import build_chain
-from brainbench.stimuli.whiskers.whisker import Whisker
+from brainbench.stimuli.whiskers.whisker import Whisker, build_chain
 
 OBJECTS = ("post", "ball", "edge", "hollow")
 FRICTIONS = (0.0, 0.4, 0.8)

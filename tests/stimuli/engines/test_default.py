@@ -6,7 +6,7 @@ import pytest
 
 from brainbench.cli.stimuli import draw, simulate
 from brainbench.cli.stimuli import simulate as simulate_command
-from brainbench.stimuli import load_stimuli, simulation, whisker_shapes
+from brainbench.stimuli import load_stimuli, simulation
 from brainbench.stimuli.engines import fidelity, get_engine, list_engines
 from brainbench.stimuli.engines.fidelity import DEFAULT_ENGINE
 from brainbench.stimuli.figures import pictures
@@ -16,7 +16,7 @@ from brainbench.stimuli.validation import bench_tests
 from tests.factories import out_of_plane
 
 ASKED = (
-    simulation.simulate, simulation.prepare, load_stimuli, whisker_shapes.record, pictures.render, simulate_sweeps,
+    simulation.simulate, simulation.prepare, load_stimuli, simulation.record, pictures.render, simulate_sweeps,
     bench_tests.peg, bench_tests.point_load, bench_tests.ringdown, bench_tests.slip_off, out_of_plane.load_aside,
     out_of_plane.push_aside, fidelity.measured,
     fidelity.Fidelity.auto, GenerationSettings, draw.render, draw.plot,

@@ -18,8 +18,7 @@ from brainbench.stimuli.scenes.scene import Frames, Scene
 from brainbench.stimuli.simulation import simulate
 from brainbench.stimuli.stimulus_set import read_stimulus_set, write_stimulus_set
 from brainbench.stimuli.whiskers.array import WhiskerArray
-from brainbench.stimuli.whiskers.chain import build_chain
-from brainbench.stimuli.whiskers.whisker import FollicleSprings, Whisker
+from brainbench.stimuli.whiskers.whisker import FollicleSprings, Whisker, build_chain
 
 ENGINES = pytest.mark.parametrize("backend", ["rod", "mujoco"])
 STRAIGHT = Whisker(0.03, 5e-5, 2e-5, 3e9, 1300.0, 0.1)

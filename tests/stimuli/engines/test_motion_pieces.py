@@ -7,7 +7,7 @@ from brainbench.core.errors import UsageError
 from brainbench.stimuli.engines import get_engine
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.motion_pieces import KNOT, MOST_PIECES, SPEED_ERROR, Cutting
-from brainbench.stimuli.engines.mujoco.engine import MujocoWhiskerEngine
+from brainbench.stimuli.engines.mujoco import MujocoWhiskerEngine
 from brainbench.stimuli.engines.rod.engine import RodEngine
 from brainbench.stimuli.engines.stepping import SteppedJob
 from brainbench.stimuli.motion.jobs import Job, StillFollicle

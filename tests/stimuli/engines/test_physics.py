@@ -15,7 +15,7 @@ from brainbench.stimuli.motion.jobs import Job, Load, StillFollicle
 from brainbench.stimuli.objects.obstacle import Box, Capsule, ConvexPart, Cylinder, Obstacle, Sphere
 from brainbench.stimuli.validation import bench_tests
 from brainbench.stimuli.validation.bench_tests import ringdown
-from brainbench.stimuli.whiskers.chain import build_chain
+from brainbench.stimuli.whiskers.whisker import build_chain
 from tests.factories.obstacles import post
 from tests.factories.swing import Swing
 from tests.factories.whiskers import C2

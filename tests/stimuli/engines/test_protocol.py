@@ -1,13 +1,28 @@
 """What engines share: names, devices, jobs that cannot be."""
 
+from __future__ import annotations
+
 import numpy as np
 import pytest
 
 from brainbench.core.errors import UsageError
 from brainbench.stimuli.engines import get_engine, list_engines
 from brainbench.stimuli.engines.fidelity import Fidelity
+from brainbench.stimuli.engines.protocol import MICRO, MILLI
 from brainbench.stimuli.motion.jobs import Job, Load, StillFollicle
 from tests.factories.whiskers import C2
+
+
+def test_force_is_mass_times_acceleration():
+    mass, acceleration = 3e-7, 12.0
+    in_milligrams, in_mm_per_ms2 = mass * MICRO, acceleration * MILLI / MILLI**2
+    assert in_milligrams * in_mm_per_ms2 == pytest.approx(mass * acceleration * MILLI)
+
+
+def test_torque_is_force_times_lever():
+    force, lever = 2e-3, 0.04
+    assert (force * MILLI) * (lever * MILLI) == pytest.approx(force * lever * MICRO)
+
 
 COARSE = Fidelity(links=8, time_step=1e-4)
 

@@ -17,7 +17,7 @@ from brainbench.stimuli.motion.trajectories import Still, Translation, Whisking
 from brainbench.stimuli.objects.solid import PlacedObject, box, cylinder
 from brainbench.stimuli.scenes.recipes import get_recipe
 from brainbench.stimuli.scenes.scene import Frames, Scene
-from brainbench.stimuli.whisker_shapes import Recording, record
+from brainbench.stimuli.simulation import Recording, record
 from brainbench.stimuli.whiskers.array import WhiskerArray
 from tests.factories.engines import FakeEngine
 

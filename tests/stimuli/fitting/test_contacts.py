@@ -12,7 +12,7 @@ from brainbench.stimuli import WhiskerArray, references
 from brainbench.stimuli.fitting import ContactOptions, find_contacts, new_shapes
 from brainbench.stimuli.fitting.contacts import STEPS, LoadedWhisker, normal_offsets
 from brainbench.stimuli.validation import peg
-from brainbench.stimuli.whiskers.chain import build_chain
+from brainbench.stimuli.whiskers.whisker import build_chain
 
 WHISKER = WhiskerArray.of("rat")["C2"].whisker
 

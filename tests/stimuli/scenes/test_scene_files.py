@@ -11,7 +11,7 @@ from brainbench.stimuli.motion.trajectories import ROTATIONS, Path, Spin, Still,
 from brainbench.stimuli.objects.obstacle import Cylinder
 from brainbench.stimuli.scenes.frames import Frames
 from brainbench.stimuli.scenes.scene_files import load_scene
-from brainbench.stimuli.whiskers.chain import build_chain
+from brainbench.stimuli.whiskers.whisker import build_chain
 from tests.factories.scene_files import POLE
 
 

@@ -9,7 +9,7 @@ import pytest
 
 from brainbench.core.errors import DataError, MissingDependencyError, UsageError
 from brainbench.core.runs import jobs
-from brainbench.stimuli.sweeps import running
+from brainbench.stimuli.sweeps import generation
 from brainbench.stimuli.sweeps.generation import generate
 from tests.factories.sweep_batches import files_of, killed_plan, small_plan
 
@@ -45,7 +45,7 @@ def test_a_cluster_only_makes_what_is_missing(threads, tmp_path):
 
 
 def test_workers_that_write_to_a_disk_of_their_own_are_noticed(threads, tmp_path, monkeypatch):
-    monkeypatch.setattr(running, "make_shard", _write_elsewhere)
+    monkeypatch.setattr(generation, "make_shard", _write_elsewhere)
     with pytest.raises(DataError, match=r"\w+-00000\.h5, .*all workers"):
         generate(small_plan(("brick:2",), split="object", limit=1), tmp_path, scheduler=threads.scheduler_address)
 
@@ -93,6 +93,6 @@ def test_without_dask_the_extra_is_named(tmp_path, monkeypatch):
 
 
 def test_a_local_run_loads_no_dask():
-    code = "import sys, brainbench.stimuli.sweeps.generation, brainbench.stimuli.sweeps.running\n"
+    code = "import sys, brainbench.stimuli.sweeps.generation\n"
     code += "assert not {'dask', 'distributed', 'h5py'} & set(sys.modules), sys.modules.keys()"
     subprocess.run([sys.executable, "-c", code], check=True)

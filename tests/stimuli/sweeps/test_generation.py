@@ -1,9 +1,12 @@
+from __future__ import annotations
+
 import dataclasses
 import json
 import logging
 import os
 import shutil
 from collections import namedtuple
+from concurrent.futures import Future
 
 import h5py
 import numpy as np
@@ -14,9 +17,10 @@ from brainbench.core.devices import warp
 from brainbench.core.errors import DataError, UsageError
 from brainbench.stimuli.engines.fidelity import Fidelity, list_presets
 from brainbench.stimuli.objects.collections import resolve_objects
-from brainbench.stimuli.sweeps import running
+from brainbench.stimuli.sweeps import generation
 from brainbench.stimuli.sweeps.generation import generate
 from brainbench.stimuli.sweeps.plan import GenerationPlan, GenerationSettings
+from brainbench.stimuli.sweeps.shards import BuiltObject
 from brainbench.stimuli.sweeps.sweep_scenes import SweepGrid
 from tests.factories.sweep_batches import GRID, files_of, small_plan
 
@@ -31,6 +35,94 @@ def unbroken(plan, tmp_path_factory):
     folder = tmp_path_factory.mktemp("unbroken")
     generate(plan, folder, workers=1)
     return folder
+
+
+def test_the_pipeline_behind_a_gpu_writes_the_same_bytes(plan, unbroken, tmp_path, monkeypatch):
+    monkeypatch.setattr(generation, "worker_pool", _threads)
+    shutil.copy(unbroken / "config.json", tmp_path)
+    done = []
+    generation.run_pipelined(plan.shards, tmp_path, 2, done.append)
+    assert sum(done) == 32
+    expected = {name: data for name, data in files_of(unbroken).items() if name != "manifest.json"}
+    assert files_of(tmp_path) == expected
+
+
+@pytest.mark.parametrize(("processes", "ahead"), [(1, 5), (4, 8), (40, 8)])
+def test_objects_are_built_one_by_one_and_as_many_ahead_as_keep_processes_busy(processes, ahead, monkeypatch):
+    plan = small_plan(("brick:8",), shard_size=4)
+    asked = []
+
+    class Pool:
+        def submit(self, build, item):
+            asked.append(item.name)
+            done = Future()
+            done.set_result(build(item))
+            return done
+
+    monkeypatch.setattr(
+        generation, "build_object", lambda item, *, settings, grid: BuiltObject(None, f"no {item.name}")
+    )
+    for count, (task, objects) in enumerate(generation._built_ahead(plan.shards, Pool(), processes)):
+        assert len(asked) == min(8, ahead + count)
+        assert [one.reason for one in objects] == [f"no {item.name}" for item in task.objects]
+    assert asked == [item.name for task in plan.shards for item in task.objects]
+
+
+@pytest.mark.gpu
+def test_shards_at_once_on_a_gpu_are_those_one_after_the_other(tmp_path, monkeypatch):
+    plan = small_plan(("brick:4", "cone:4"), backend="rod", device="cuda", shard_size=4, whiskers="C1,C2,C3")
+    generate(plan, tmp_path / "together", workers=2)
+    monkeypatch.setattr(generation, "SIDE_BY_SIDE", 1)
+    generate(plan, tmp_path / "alone", workers=2)
+    assert files_of(tmp_path / "together") == files_of(tmp_path / "alone")
+
+
+@pytest.mark.slow
+def test_several_gpus_share_the_shards_and_write_the_same_bytes(plan, unbroken, tmp_path, monkeypatch):
+    monkeypatch.setattr(generation, "gpus", lambda: ["0", "1"])
+    done = []
+    generation.run_on_gpus(plan.shards, tmp_path, 2, done.append)
+    assert done == [len(task) for task in plan.shards]
+    expected = {name: data for name, data in files_of(unbroken).items() if name.startswith(("train", "val", "test"))}
+    assert files_of(tmp_path) == expected
+
+
+@pytest.mark.slow
+def test_what_went_wrong_on_one_of_several_gpus_is_told(plan, tmp_path, monkeypatch):
+    monkeypatch.setattr(generation, "gpus", lambda: ["0", "1"])
+    (tmp_path / "file").write_text("")
+    with pytest.raises(DataError, match="cannot be written"):
+        generation.run_on_gpus(plan.shards, tmp_path / "file", 2, print)
+
+
+def test_a_process_of_a_gpu_that_dies_is_told(tmp_path, monkeypatch):
+    monkeypatch.setattr(generation, "gpus", lambda: ["0", "1"])
+    monkeypatch.setattr(generation, "_run_share", os._exit)
+    # Two shards that no process comes to.
+    with pytest.raises(DataError, match="ended unexpectedly"):
+        generation.run_on_gpus([None, None], tmp_path, 2, print)
+
+
+def test_a_shard_that_fails_ends_the_others_and_is_told(plan, tmp_path, monkeypatch):
+    monkeypatch.setattr(generation, "worker_pool", _threads)
+    monkeypatch.setattr(generation, "write_shard", _refuse)
+    told = []
+    monkeypatch.setattr(generation, "stop_pool", lambda pool: told.append(generation.STOPPING.is_set()))
+    with pytest.raises(DataError, match="disk"):
+        generation.run_pipelined(plan.shards, tmp_path, 2, print)
+    assert told == [True]
+    assert not generation.STOPPING.is_set()
+
+
+def _refuse(content, folder):
+    raise DataError("the disk is full")
+
+
+def _threads(processes):
+    """A pool of threads in place of one of processes: quick to start."""
+    from concurrent.futures import ThreadPoolExecutor
+
+    return ThreadPoolExecutor(processes)
 
 
 def test_the_manifest_tells_of_every_shard_object_and_split(plan, unbroken):
@@ -103,8 +195,8 @@ def test_a_set_of_sweeps_has_the_hash_that_it_always_had(tmp_path, monkeypatch):
     assert (manifest["sweeps"], manifest["steps"], manifest["unstable"]) == (18, 0, 0)
     # Made by commit a79787b0.
     assert manifest["content_hash"] == "46790092c1343cc7"
-    monkeypatch.setattr(running, "worker_pool", _threads)
-    running.run_pipelined(plan.shards, tmp_path, 1, print)
+    monkeypatch.setattr(generation, "worker_pool", _threads)
+    generation.run_pipelined(plan.shards, tmp_path, 1, print)
     assert all(
         (tmp_path / "set" / task.name).read_bytes() == (tmp_path / task.name).read_bytes() for task in plan.shards
     )
@@ -141,13 +233,6 @@ def test_a_gpu_that_is_not_there_is_told(tmp_path):
     plan = small_plan(("brick:1",), backend="rod", device="cuda")
     with pytest.raises(UsageError, match="0 CUDA devices"):
         generate(plan, tmp_path, workers=1)
-
-
-def _threads(processes):
-    """A pool of threads in place of one of processes: quick to start."""
-    from concurrent.futures import ThreadPoolExecutor
-
-    return ThreadPoolExecutor(processes)
 
 
 @pytest.mark.slow

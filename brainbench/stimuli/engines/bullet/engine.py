@@ -28,14 +28,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.errors import MissingDependencyError, UsageError, install_command, missing_dependency
 from brainbench.core.rotations import base_rotation, from_z_axis, to_matrices
-from brainbench.stimuli.engines.mujoco.model import drive_scalars
+from brainbench.stimuli.engines.protocol import MICRO, MILLI
 from brainbench.stimuli.engines.reach import Reach
-from brainbench.stimuli.engines.stepping import LEAST_TAPER, SteppedEngine, SteppedJob, cone_vertices
+from brainbench.stimuli.engines.stepping import LEAST_TAPER, SteppedEngine, SteppedJob, cone_vertices, drive_scalars
 from brainbench.stimuli.engines.trust import state_fault
-from brainbench.stimuli.engines.units import MICRO, MILLI
 from brainbench.stimuli.motion.jobs import Trace
 from brainbench.stimuli.objects.obstacle import Box, Capsule, ConvexPart, Cylinder, Obstacle, Part, Sphere
-from brainbench.stimuli.whiskers.chain import Chain
+from brainbench.stimuli.whiskers.whisker import Chain
 
 FOLLICLE = 6  # joints of the follicle, which come first
 MOST_LINKS = 60  # links per whisker: PyBullet moves fewer than 128 degrees of freedom through its interface

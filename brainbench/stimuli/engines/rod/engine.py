@@ -18,17 +18,16 @@ from brainbench.core.rotations import base_rotation
 from brainbench.stimuli.engines.error_estimates import MORE, MOST, with_errors
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.protocol import PassiveSweeps, Progress, SweepBatch, WhiskerEngine, run_groups
-from brainbench.stimuli.engines.rod.compilation import load_kernels
 from brainbench.stimuli.engines.rod.launch import (
     LaunchResult,
     Try,
     WhiskerSolver,
+    load_kernels,
     real_type,
     run_with_retries,
     tries_ahead,
 )
-from brainbench.stimuli.engines.rod.packing import Track, capacity_for
-from brainbench.stimuli.engines.rod.shapes import PackedSurface
+from brainbench.stimuli.engines.rod.packing import PackedSurface, Track, capacity_for
 from brainbench.stimuli.engines.rod.tasks import JobTask, PackedTasks, make_task
 from brainbench.stimuli.engines.stepping import silent_trace
 from brainbench.stimuli.engines.trust import check_jobs, without_escape

@@ -1,5 +1,7 @@
 """One launch of the whisker kernel: packed jobs go in, judged results come out, and who is in doubt is tried again.
 
+Kernels are compiled when a machine first needs them and kept by Warp.
+
 Few whiskers take a GPU as long as the one with most steps. With steps over 2, 5, 10 and 20 one after the other these
 waits add up to 38 times that of the first simulation; with 2 and 5, then 10 and 20 at the same time to 26. But half of
 the tries that are simulated ahead are not needed: where other whiskers would have the GPU meanwhile, they cost more
@@ -13,8 +15,10 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,10 +26,24 @@ from numpy.typing import NDArray
 
 from brainbench.core.devices import to_struct, warp
 from brainbench.stimuli.engines.fidelity import Fidelity
-from brainbench.stimuli.engines.rod.compilation import load_kernels
-from brainbench.stimuli.engines.rod.limits import LIGHT, LONGEST_SPAN, TO_ROUNDING, contact_iterations
-from brainbench.stimuli.engines.rod.packing import PackedJobs, PackedMotions, capacity_for, pack_chains, pack_follicles
-from brainbench.stimuli.engines.rod.shapes import PackedShapes
+from brainbench.stimuli.engines.protocol import MILLI
+from brainbench.stimuli.engines.rod.limits import (
+    CONTACT_BOUNDS,
+    DISTANCE_BOUNDS,
+    LIGHT,
+    LONGEST_SPAN,
+    MESHES,
+    TO_ROUNDING,
+    contact_iterations,
+)
+from brainbench.stimuli.engines.rod.packing import (
+    PackedJobs,
+    PackedMotions,
+    PackedShapes,
+    capacity_for,
+    pack_chains,
+    pack_follicles,
+)
 from brainbench.stimuli.engines.rod.slices import Slices, allocate, download, lock_of, make_problems, parts_of
 from brainbench.stimuli.engines.trust import (
     FEWEST_READINGS,
@@ -37,8 +55,61 @@ from brainbench.stimuli.engines.trust import (
     residual,
     strongest_force,
 )
-from brainbench.stimuli.engines.units import MILLI
-from brainbench.stimuli.whiskers.chain import Chain
+from brainbench.stimuli.whiskers.whisker import Chain
+
+
+def load_kernels(
+    device: Any,
+    real: type,
+    capacity: int,
+    needs: int = MESHES,
+    *,
+    hinges: int = 2,
+    recorder: str = "",
+    yields: bool = False,
+    compiling: Callable[[bool], None] | None = None,
+    **options: Any,
+) -> Any:
+    """Return the kernels for chains of at most ``capacity`` links on a device, ready to be launched.
+
+    On a processor one kernel serves whatever there is to touch: what a scene does not use costs it nothing there, while
+    every further kernel would cost its compilation. Threads may ask at once; each kernel is compiled once.
+
+    ``compiling`` is called with True before compiling and with False after it, not at all for kernels that Warp has
+    kept. Everything else is as for :func:`brainbench.stimuli.engines.rod.kernels.build_kernels`; of ``options`` a
+    processor knows ``sliced`` alone.
+    """
+    from brainbench.stimuli.engines.rod.kernels import BUILDING, build_kernels
+
+    kind = {"hinges": hinges, "recorder": recorder} | ({"yields": True} if yields else {})
+    with BUILDING:
+        if device.is_cuda:
+            kernels = build_kernels(real, capacity, needs, cuda=True, **kind, **options)
+        else:
+            kernels = build_kernels(real, capacity, sliced=options.get("sliced", False), **kind)
+    if device.is_cuda and options.get("sliced"):
+        with kernels.loading, lock_of(device):
+            _load_together(kernels, options["bounds"][0], device)
+        return kernels
+    if device.is_cuda and options:  # compiled at their launch, for the blocks that it asks for
+        return kernels
+    block = 1 if device.is_cpu else None
+    with kernels.loading:
+        module = kernels.run.module
+        compiled = Path(warp().config.kernel_cache_dir, module.get_module_identifier(block)).is_dir()
+        tell = (lambda begins: None) if compiled or compiling is None else compiling
+        tell(True)
+        module.load(device, block_dim=block)
+        tell(False)
+    return kernels
+
+
+def _load_together(kernels: Any, block: int, device: Any) -> None:
+    """Load the kernels of whiskers in slices; those that this machine does not have yet compile side by side."""
+    blocks = {kernels.run: block, kernels.swap_queues: None, kernels.measure_distances: DISTANCE_BOUNDS[0]}
+    blocks |= {kernel: CONTACT_BOUNDS[0] for kernel, _ in kernels.solve_contacts}
+    with ThreadPoolExecutor(len(blocks)) as pool:
+        list(pool.map(lambda kernel: kernel.module.load(device, block_dim=blocks[kernel]), blocks))
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,11 +255,11 @@ class WhiskerSolver:
 
         Args:
             chains, fidelity: whiskers, with their time step, precision and solver.
-            device, needs, options: as for :func:`brainbench.stimuli.engines.rod.compilation.load_kernels`.
+            device, needs, options: as for :func:`brainbench.stimuli.engines.rod.launch.load_kernels`.
             twists: False when nothing twists the whiskers: their joints then have two hinges instead of three. As the
                 fidelity says when None.
             block: threads of a block on a GPU; Warp's choice when None.
-            sliced: True when whiskers pause for distances and contact forces (:class:`.scheduling.Slices`).
+            sliced: True when whiskers pause for distances and contact forces (:class:`.slices.Slices`).
         """
         self.chains, self.device, self.sliced = list(chains), device, sliced
         self.real = real_type(fidelity)

@@ -22,7 +22,7 @@ from brainbench.core.errors import UsageError
 from brainbench.core.rotations import base_rotation, euler_matrix, from_matrices
 from brainbench.stimuli.engines.error_estimates import HALF_STEP, MORE_LINKS, changes, halved_step, more_links
 from brainbench.stimuli.engines.fidelity import Fidelity
-from brainbench.stimuli.engines.protocol import PassiveSweeps, SweepBatch, describe_unstable, join_batches
+from brainbench.stimuli.engines.protocol import MILLI, PassiveSweeps, SweepBatch, describe_unstable, join_batches
 from brainbench.stimuli.engines.rod.launch import (
     Ahead,
     Approach,
@@ -35,11 +35,16 @@ from brainbench.stimuli.engines.rod.launch import (
     tries_ahead,
 )
 from brainbench.stimuli.engines.rod.limits import MESHES
-from brainbench.stimuli.engines.rod.packing import KNOT, PackedJobs, PackedMotions, still_knots
-from brainbench.stimuli.engines.rod.shapes import PackedShapes, PackedSurface
+from brainbench.stimuli.engines.rod.packing import (
+    KNOT,
+    PackedJobs,
+    PackedMotions,
+    PackedShapes,
+    PackedSurface,
+    still_knots,
+)
 from brainbench.stimuli.engines.rod.tasks import followed
 from brainbench.stimuli.engines.trust import BLOW
-from brainbench.stimuli.engines.units import MILLI
 from brainbench.stimuli.objects.solid import Solid
 
 BLOCK = 64  # threads of one block on a GPU
@@ -67,7 +72,7 @@ class SweepLauncher:
         bounds = SLICED_BOUNDS if sliced else BOUNDS
         self.scenes, self.grid = scenes, grid
         self.ahead: Callable[[], Ahead] = partial(tries_ahead, self.device)
-        """As in :func:`.tries.run_with_retries`."""
+        """As in :func:`.launch.run_with_retries`."""
         self.seconds: dict[str, float] = {}
         """Elapsed time of the last launch for placing objects, uploading, and computing."""
         mounts = list(scenes.array)

@@ -30,8 +30,7 @@ from brainbench.stimuli.motion.jobs import Job, Load, StillFollicle
 from brainbench.stimuli.objects.obstacle import Box, Capsule, ConvexPart, Cylinder, Obstacle, Sphere
 from brainbench.stimuli.scenes.frames import Frames
 from brainbench.stimuli.validation import bench_tests
-from brainbench.stimuli.whiskers.chain import build_chain
-from brainbench.stimuli.whiskers.whisker import Whisker
+from brainbench.stimuli.whiskers.whisker import Whisker, build_chain
 from tests.factories.obstacles import post
 from tests.factories.swing import Swing
 from tests.factories.whiskers import C2

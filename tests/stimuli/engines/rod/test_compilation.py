@@ -7,8 +7,8 @@ import pytest
 from brainbench.core import devices as _device
 from brainbench.core.errors import UsageError
 from brainbench.stimuli.engines.fidelity import Fidelity
-from brainbench.stimuli.engines.rod.compilation import load_kernels
 from brainbench.stimuli.engines.rod.engine import RodEngine
+from brainbench.stimuli.engines.rod.launch import load_kernels
 from brainbench.stimuli.engines.rod.limits import MESHES, NOTHING, PRIMITIVES
 
 FINE = Fidelity(links=10, time_step=1e-3)

@@ -10,14 +10,13 @@ import pytest
 
 from brainbench.stimuli.engines import get_engine
 from brainbench.stimuli.engines.fidelity import Fidelity
-from brainbench.stimuli.engines.mujoco.model import build_model, engine
+from brainbench.stimuli.engines.mujoco import build_model, engine
 from brainbench.stimuli.engines.reach import Reach
 from brainbench.stimuli.motion.jobs import Job, StillFollicle
 from brainbench.stimuli.objects.obstacle import Cylinder, Obstacle, Sphere
 from brainbench.stimuli.validation.bench_tests import contact_jobs, difference
 from brainbench.stimuli.whiskers.array import WhiskerArray
-from brainbench.stimuli.whiskers.chain import build_chain
-from brainbench.stimuli.whiskers.whisker import Whisker
+from brainbench.stimuli.whiskers.whisker import Whisker, build_chain
 
 SPEED = 0.03
 """Of the object (m/s), a brisk sweep of the recipes."""

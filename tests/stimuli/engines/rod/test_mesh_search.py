@@ -9,7 +9,7 @@ from brainbench.core.devices import to_struct
 from brainbench.geometry import Mesh
 from brainbench.stimuli.engines.rod.kernels import specialize
 from brainbench.stimuli.engines.rod.limits import WIDE
-from brainbench.stimuli.engines.rod.shapes import EMPTY, PackedShapes, PackedSurface, spatial_order, tree_boxes
+from brainbench.stimuli.engines.rod.packing import EMPTY, PackedShapes, PackedSurface, spatial_order, tree_boxes
 from tests.factories.rod_threads import WARP, Memory, thread_warp
 
 wp = pytest.importorskip("warp")

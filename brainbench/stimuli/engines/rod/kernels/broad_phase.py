@@ -8,6 +8,7 @@ only the nearest are looked at; a bound tells when another may have come near (`
 
 import warp as wp
 
+from brainbench.stimuli.engines.protocol import MILLI
 from brainbench.stimuli.engines.rod.limits import (
     AT_BASE,
     CAPSULE,
@@ -21,7 +22,6 @@ from brainbench.stimuli.engines.rod.limits import (
     STARTED_INSIDE,
     WIDEST,
 )
-from brainbench.stimuli.engines.units import MILLI
 
 from .algebra import first_axis, rotate, vec3
 from .articulated_body import ChainState, ProximityState, hinge_direction

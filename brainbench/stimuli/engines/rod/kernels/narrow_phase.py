@@ -1,6 +1,6 @@
 """Exact distance of a link from a shape: from the triangles of a surface by its tree, from primitives in closed form.
 
-The tree is that of ``brainbench.stimuli.engines.rod.shapes``: eight children a node, without pointers. The search
+The tree is that of ``brainbench.stimuli.engines.rod.packing``: eight children a node, without pointers. The search
 always opens the box that may hold something nearer and is nearest, and measures the triangles of leaves. It begins at
 the leaf where the last search of the same link ended, so that hardly anything else is left to open. Each thread of a
 group takes its share of eight boxes or triangles: one on a GPU, all on a processor, side by side (``distances``).

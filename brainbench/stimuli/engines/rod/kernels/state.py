@@ -144,7 +144,7 @@ class ShapeArrays:
     box: wp.array(dtype=wp.int32)
     """[shape] first of its nodes below."""
     boxes: wp.array(dtype=NodeBoxes)
-    """[node] boxes of its children, as in ``brainbench.stimuli.engines.rod.shapes``."""
+    """[node] boxes of its children, as in ``brainbench.stimuli.engines.rod.packing``."""
     corners: wp.array(dtype=LeafCorners)
     """[leaf] of its triangles; each surface begins with a leaf of its own."""
     outward: wp.array2d(dtype=vec3)

@@ -1,4 +1,7 @@
-"""Simulation of jobs that is differentiated: results, and the gradient of any number made of them.
+"""Gradients of simulated whiskers: of base wrenches, shapes and contact forces by whatever jobs are built from.
+
+:class:`JobParameters` names parameters of jobs, :class:`GradientRun` simulates and differentiates,
+:class:`ContactEvents` say where a gradient holds on one side only.
 
 The kernels give derivatives by what is packed: masses, stiffness, knots, places of shapes. Whatever else a job is made
 of reaches the solver through these alone. So a parameter is anything from which a job can be built, and a difference of
@@ -24,19 +27,27 @@ from brainbench.core.rotations import base_rotation
 from brainbench.geometry import Mesh
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.motion_pieces import carried_pose
+from brainbench.stimuli.engines.protocol import MILLI
 from brainbench.stimuli.engines.reach import reachable, stays_in_plane
 from brainbench.stimuli.engines.rod.engine import RodEngine, trace_of
 from brainbench.stimuli.engines.rod.limits import LIGHT
-from brainbench.stimuli.engines.rod.packing import capacity_for, knots_alike, pack_chains, rotation_vectors
-from brainbench.stimuli.engines.rod.shapes import PackedShapes, middle_of
+from brainbench.stimuli.engines.rod.packing import (
+    PackedShapes,
+    capacity_for,
+    knots_alike,
+    middle_of,
+    pack_chains,
+    rotation_vectors,
+)
 from brainbench.stimuli.engines.rod.tasks import JobTask, PackedTasks, make_task
 from brainbench.stimuli.engines.trust import check_jobs
-from brainbench.stimuli.engines.units import MILLI
-from brainbench.stimuli.fitting.derivatives.recorded_run import RecordingSolver
+from brainbench.stimuli.fitting.parameters import JobParameters
+from brainbench.stimuli.fitting.recorded_run import RecordingSolver
 from brainbench.stimuli.motion.jobs import Job, Trace
 from brainbench.stimuli.objects.obstacle import ConvexPart, Obstacle
-from brainbench.stimuli.whiskers.chain import Chain, build_chain
-from brainbench.stimuli.whiskers.whisker import Whisker
+from brainbench.stimuli.whiskers.whisker import Chain, Whisker, build_chain
+
+__all__ = ["ContactEvents", "Gradient", "GradientRun", "JobParameters", "Tangents"]
 
 Numbers = dict[str, NDArray[np.float64]]
 """Packed numbers of one job by the names of ``kernels.tangent.PackedTangents``; rotations as matrices."""
@@ -272,7 +283,7 @@ class ContactEvents:
 
 
 def contact_events(summary: Any, reason: str) -> ContactEvents:
-    """Return the events of one job from its ``fitting.derivatives.kernels.contacts.ContactSummary``.
+    """Return the events of one job from its ``fitting.kernels.contacts.ContactSummary``.
 
     ``reason`` is why the run cannot be trusted, if so.
     """

@@ -12,9 +12,15 @@ from brainbench.core.rotations import euler_matrix
 from brainbench.geometry import Mesh
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.rod.tasks import PackedTasks, make_task
-from brainbench.stimuli.fitting.derivatives.recorded_run import RecordingSolver
-from brainbench.stimuli.fitting.gradients import GradientRun, JobParameters
-from brainbench.stimuli.fitting.gradients.run import PackedPlaces, contact_events, packed_change, packed_part
+from brainbench.stimuli.fitting.gradients import (
+    GradientRun,
+    JobParameters,
+    PackedPlaces,
+    contact_events,
+    packed_change,
+    packed_part,
+)
+from brainbench.stimuli.fitting.recorded_run import RecordingSolver
 from brainbench.stimuli.motion.jobs import Job, Load, StillFollicle
 from brainbench.stimuli.objects.obstacle import Box, Capsule, Cylinder, Obstacle, Sphere
 from brainbench.stimuli.validation.bench_tests import contact_jobs

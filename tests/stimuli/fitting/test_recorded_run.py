@@ -10,7 +10,7 @@ import pytest
 from brainbench.core.devices import pick_device
 from brainbench.stimuli.engines.rod.engine import RodEngine
 from brainbench.stimuli.engines.rod.tasks import PackedTasks, make_task
-from brainbench.stimuli.fitting.derivatives.recorded_run import RecordingSolver
+from brainbench.stimuli.fitting.recorded_run import RecordingSolver
 from brainbench.stimuli.objects.obstacle import Capsule
 from brainbench.stimuli.validation.bench_tests import contact_jobs
 from tests.factories.gradients import COARSE, touching_job
@@ -86,7 +86,7 @@ def test_going_over_the_steps_twice_gives_the_same():
 @pytest.mark.slow
 def test_scenes_that_ask_for_no_gradient_do_not_load_its_kernels():
     code = (
-        "import sys; from tests.stimuli.fitting.derivatives.test_recorded_run import *;"
+        "import sys; from tests.stimuli.fitting.test_recorded_run import *;"
         "RodEngine().run([touching_job(POST)], COARSE);"
         "loaded = [name for name in sys.modules if 'kernels' in name and 'recorder' in name];"
         "assert not loaded, loaded"

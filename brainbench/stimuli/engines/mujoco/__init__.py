@@ -1,1 +1,0 @@
-"""MuJoCo as a whisker engine: the independent CPU reference."""
