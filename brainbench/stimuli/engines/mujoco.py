@@ -5,8 +5,8 @@ M + hD + h²K, so the time step is limited by accuracy and not by stability. Nat
 
 Each whisker among its obstacles is a small model of its own, in mg, mm and ms, so in mN and µN·m. These units keep
 every number near one; with kilograms MuJoCo rejects thin tips as massless. Body tree: world → only the follicle joints
-that move → base, which carries the force and torque sensors → link 0 → … → link N − 1, each with two hinges, and a third
-where the chain twists. Letters: n time step, N link.
+that move → base, which carries the force and torque sensors → link 0 → … → link N − 1, each with two hinges, and a
+third where the chain twists. Letters: n time step, N link.
 """
 
 from __future__ import annotations
