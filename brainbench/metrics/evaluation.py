@@ -387,7 +387,9 @@ def evaluate(
     # a jackknife that repeats it measures the jumps instead of the stimuli.
     single = rule.kind == "halves" or estimator != "default"
     factors_without = weights if single else metric.factors_without(votes.compared.animals, weights)
-    without = (take_layers(votes.compared.without_each(), chosen) * factors_without).mean(axis=-1)
+    some, place = np.unique(chosen, return_inverse=True)
+    jackknife = votes.compared.among([votes.compared.layers[layer] for layer in some], votes.compared.animals)
+    without = (take_layers(jackknife.without_each(), place) * factors_without).mean(axis=-1)
     test, null = _test(votes.permuted, rule, weights[: len(votes.permuted.animals)], seed)
     if rule.kind == "halves":
         values, chosen_r = values.mean(keepdims=True), chosen_r.mean(keepdims=True)

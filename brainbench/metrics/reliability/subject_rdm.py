@@ -5,9 +5,8 @@ averaging trials, so an RDM spans them all. :mod:`brainbench.metrics.reliability
 and how ``mahalanobis`` and ``crossnobis`` divide by noise; ``crossnobis`` takes every trial as its own fold, so unequal
 numbers of trials leave it unbiased.
 
-How a perfect model would score is found from the animal without its noise: the products of the mean responses hold the
-noise of the means on their diagonal, which trials tell. What is left is the geometry of the noiseless responses, of
-which eigenvalues below zero are chance.
+How a perfect model would score is found from the animal without its noise: responses whose products, with the noise of
+the means that trials tell, have the eigenvalues that were observed.
 """
 
 from __future__ import annotations
@@ -285,37 +284,59 @@ def is_flat(rdms: Floats) -> NDArray[np.bool_]:
 
 
 SIMULATIONS = 20  # noisy copies of an animal over which what a perfect model attains is averaged
+_ROUNDS, _DRAWS, _DRAWN_STIMULI = 10, 8, 800
+"""Corrections of the eigenvalues of noiseless products, and draws of the noise in each: fewer above 100 stimuli."""
+_ROUNDING = 1e-12
 
 
 def denoised(patterns: Floats, noise: Floats) -> Floats:
-    """Return patterns [K, U] whose products are those of the given ones without their noise.
+    """Return patterns [K, U] that, with noise on them, have products with the eigenvalues of the given ones.
 
-    ``patterns`` [K, U] are mean responses, ``noise`` [K, U] the variance of these means.
+    Noise spreads eigenvalues: it adds small ones, which no other stimulus predicts, and makes large ones larger. Those
+    of the noiseless products are moved until noise makes what was observed of them; their sum is unbiased.
+
+    Args:
+        patterns: [K, U] mean responses.
+        noise: [K, U] variance of these means.
     """
-    mean = patterns.mean(axis=0)
-    centred = patterns - mean
-    diagonal = np.diag(noise.sum(axis=1))
-    # Both sides centred over stimuli: E[C Cᵀ] = G + H diag(n) H, with the centring matrix H.
-    diagonal = diagonal - diagonal.mean(axis=0)
-    gram = centred @ centred.T - (diagonal - diagonal.mean(axis=1, keepdims=True))
-    values, vectors = np.linalg.eigh(gram)
-    positive = np.flatnonzero(values > 0)[::-1][: patterns.shape[1]]
-    total = float(np.trace(gram))
-    if not len(positive) or total <= 0:
+    mean, order = patterns.mean(axis=0), _unit_order(patterns, noise)
+    centred, spread = (patterns - mean)[:, order], np.sqrt(np.maximum(noise, 0.0))[:, order]
+    count = min(len(patterns) - 1, patterns.shape[1])
+    observed, vectors = (part[..., ::-1] for part in np.linalg.eigh(centred @ centred.T))
+    total = float(observed.sum() - noise.sum() * (1 - 1 / len(patterns)))
+    if not total > 0:
         return np.broadcast_to(mean, patterns.shape)
-    # Dropping what is negative leaves too much in all; the trace is unbiased.
-    values = values[positive] * total / values[positive].sum()
-    directions = centred.T @ vectors[:, positive] * np.sqrt(values)
-    # The nearest orthonormal directions of units keep each unit's part as close to the data as the products allow.
-    left, _, right = np.linalg.svd(directions, full_matrices=False)
-    return mean + (vectors[:, positive] * np.sqrt(values)) @ (left @ right).T
+    # Each unit keeps its part in every direction of the stimuli.
+    size = np.sqrt(np.where(observed > _ROUNDING * observed[0], observed, np.inf))[:, None]
+    units = vectors.T @ centred / size
+    # Of many stimuli the eigenvalues of one draw are as good as their mean.
+    generator, draws = np.random.default_rng(0), max(1, min(_DRAWS, _DRAWN_STIMULI // len(patterns)))
+    crossed, squares = np.empty((2, draws, len(patterns), len(patterns)))
+    for index in range(draws):
+        drawn = spread * generator.standard_normal(patterns.shape)
+        drawn = vectors.T @ (drawn - drawn.mean(axis=0))
+        crossed[index], squares[index] = units @ drawn.T, drawn @ drawn.T
+    values = np.where(np.arange(len(patterns)) < count, total / count, 0.0)
+    for _ in range(_ROUNDS):
+        mixed = np.sqrt(values)[:, None] * crossed
+        noisy = np.linalg.eigvalsh(np.diag(values) + mixed + mixed.swapaxes(1, 2) + squares)[:, ::-1].mean(axis=0)
+        moved = np.sort(np.maximum(values + observed - noisy, 0.0)[:count])[::-1]
+        if not moved.any():
+            break
+        values[:count] = moved * total / moved.sum()
+    return mean + ((vectors * np.sqrt(values)) @ units)[:, np.argsort(order)]
+
+
+def _unit_order(patterns: Floats, noise: Floats) -> Ints:
+    """Return an order of the units that does not depend on how they were listed."""
+    # Rounding makes no order.
+    scale = np.abs(patterns).max(initial=0.0) or 1.0
+    return np.lexsort(np.round(np.concatenate([noise / scale**2, patterns / scale]), 9))
 
 
 def simulated_animals(animal: SubjectRDM, seed: int) -> tuple[Floats, list[SubjectRDM]]:
     """Return an animal's responses without noise [K, U], and copies of the animal with new noise on them."""
-    # Sorted by their responses, units draw the same noise in whatever order they were listed; rounding makes no order.
-    scale = np.abs(animal.patterns).max(initial=0.0) or 1.0
-    units = np.lexsort(np.round(np.concatenate([animal.noise / scale**2, animal.patterns / scale]), 9))
+    units = _unit_order(animal.patterns, animal.noise)
     animal = replace(animal, patterns=animal.patterns[:, units], noise=animal.noise[:, units])
     truth = denoised(animal.patterns, animal.noise)
     generator = np.random.default_rng(seed)

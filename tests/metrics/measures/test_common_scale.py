@@ -85,6 +85,21 @@ def test_denoised_patterns_have_the_products_of_the_truth():
     assert np.mean(found) == pytest.approx(np.trace(centred @ centred.T), rel=0.05)
 
 
+def test_noise_adds_no_dimensions_to_denoised_patterns():
+    """Eigenvalues that noise made would be predicted by nothing, and lower what a perfect encoder attains."""
+    rng = np.random.default_rng(3)
+    truth = rng.normal(size=(40, 5)) @ rng.normal(size=(5, 60))
+    noise = np.full(truth.shape, 2.5)
+    noisy = truth + np.sqrt(noise) * rng.normal(size=truth.shape)
+    patterns = denoised(noisy, noise)
+    real, spread, values = (np.linalg.eigvalsh(np.cov(part.T))[::-1] for part in (truth, noisy, patterns))
+    assert spread[:5].sum() < 0.8 * spread.sum()
+    assert values[:5].sum() > 0.95 * values.sum()
+    np.testing.assert_allclose(values[:5], real[:5], rtol=0.2)
+    units = rng.permutation(60)
+    np.testing.assert_allclose(denoised(noisy[:, units], noise[:, units]), patterns[:, units], atol=1e-8)
+
+
 @pytest.mark.parametrize("name", ["rsa", "rsa-correlation", "cka", "ridge", "procrustes"])
 @pytest.mark.parametrize("scale", [1e300, 1e-300])
 def test_the_scale_of_activations_changes_nothing(name, scale):
