@@ -29,7 +29,7 @@ def kill(name: str, cache: Path) -> dict[str, Any]:
     """Kill one command as often as its slow test does, in a process of its own."""
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "BRAINBENCH_CACHE": str(cache)}
     with tempfile.TemporaryDirectory() as folder:
-        words = [sys.executable, "-m", "tests.factories.kill_jobs", name, str(Path(folder) / "work")]
+        words = [sys.executable, "-m", "tests.factories.kill_jobs", str(Path(folder) / "work"), name]
         found = subprocess.run(words, env=environment, stdout=subprocess.PIPE, text=True, check=True)
     return json.loads(found.stdout.splitlines()[-1])
 

@@ -69,6 +69,11 @@ def _run() -> None:
     except BrainbenchError as error:
         print(f"brainbench: {visible_lines(str(error))}", file=sys.stderr)
         sys.exit(error.exit_code)
+    except RuntimeError as error:
+        if "home directory" not in str(error):  # pathlib's word for the ~ of nobody
+            raise
+        print("brainbench: A path begins with the ~ of a user that there is not; write it out.", file=sys.stderr)
+        sys.exit(2)
     except OSError as error:
         if error.errno in (errno.ENAMETOOLONG, errno.EACCES, errno.EPERM, errno.EROFS, errno.ELOOP) and error.filename:
             print(f"brainbench: {brief(str(error.filename))} cannot be opened ({error.strerror}).", file=sys.stderr)

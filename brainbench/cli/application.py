@@ -59,7 +59,7 @@ def build(words: Sequence[str] | None = None) -> typer.Typer:
         rich_markup_mode="rich",
         context_settings={"help_option_names": ["-h", "--help"]},
     )
-    app.callback()(_set_up if bare else _root)
+    app.callback()((lambda: _log(logging.WARNING)) if bare else _root)
     for name, summary in COMMANDS.items():
         if first is None or first == name:
             module = import_module(f"brainbench.cli.{ELSEWHERE.get(name, name)}")
@@ -129,10 +129,6 @@ def _version(show: bool) -> None:
     if show:
         print(__version__)
         raise typer.Exit
-
-
-def _set_up() -> None:
-    _log(logging.WARNING)
 
 
 def _root(

@@ -164,3 +164,10 @@ def test_a_name_longer_than_the_system_allows_is_one_sentence(run, words):
     assert (outcome.status in (1, 2), outcome.out, outcome.err.count("\n")) == (True, "", 1)
     assert "File name too long" in outcome.err
     assert len(outcome.err) < 420
+
+
+@pytest.mark.parametrize("words", [("models", "show", "local-dir:~nobody9/x"), ("recordings", "inspect", "~nobody9/x")])
+def test_a_home_that_nobody_has_is_one_sentence(run, words):
+    ended = run(*words)
+    assert (ended.status, ended.out) == (2, "")
+    assert "begins with the ~ of a user that there is not" in ended.err

@@ -18,7 +18,7 @@ ROOT = Path(__file__).parents[3]
 
 def _killed(name: str, folder: Path, *words: str) -> dict[str, Any]:
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
-    command = [sys.executable, "-m", "tests.factories.kill_jobs", name, str(folder / "work"), *words]
+    command = [sys.executable, "-m", "tests.factories.kill_jobs", str(folder / "work"), name, *words]
     ended = subprocess.run(command, cwd=ROOT, env=environment, stdout=subprocess.PIPE, text=True, check=True)
     return json.loads(ended.stdout.splitlines()[-1])
 

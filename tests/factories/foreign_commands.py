@@ -1,12 +1,14 @@
 """What others send, changed by seed and given to the command or function that takes it, in a process of its own.
 
-``python -m tests.factories.foreign_commands FOLDER NAME… --cases N`` prints a line of JSON for each case. The good
+``python -m tests.factories.foreign_commands FOLDER NAME… --cases N`` writes what becomes of each case into the folder,
+leaves out cases that stand there, and prints the table; ``--before OTHER`` adds what stands in another folder. The good
 input stands in the folder or is made there, so that another version of the packages (PYTHONPATH) can be given the same.
 """
 
 from __future__ import annotations
 
 import argparse
+import gc
 import json
 import math
 import os
@@ -81,6 +83,7 @@ def cases(door: Door, folder: Path, seeds: range) -> Iterator[Verdict]:
     for module in door.modules:
         with suppress(ImportError):
             import_module(module)
+    gc.freeze()  # a fork copies what the collector touches
     root = folder / f"cases-{os.getpid()}"
     for seed in seeds:
         (root / "etc").mkdir(parents=True)
@@ -91,8 +94,9 @@ def cases(door: Door, folder: Path, seeds: range) -> Iterator[Verdict]:
         what = "nothing" if seed < 0 else restructure(path, seed)
         if door.after is not None and path.is_file():
             door.after(path)
-        yield _judge(door, path, place, what)
+        verdict = _judge(door, path, place, what)
         shutil.rmtree(root, ignore_errors=True)
+        yield verdict
 
 
 def _judge(door: Door, path: Path, place: Path, what: str) -> Verdict:
@@ -234,6 +238,18 @@ def _student(path: Path) -> Any:
     return dict(student.state_dict()), described
 
 
+def _batch(path: Path) -> Any:
+    from brainbench.scoring.jobs import read_batch
+
+    return [vars(job.options) for job in read_batch(path)]
+
+
+def _sweep(path: Path) -> Any:
+    from robotics_bridge.policies.training.distill_config import read_sweep
+
+    return [vars(student) for student in read_sweep(path).students()]
+
+
 def _plan(path: Path) -> Any:
     from brainbench.core.identity import SealedPlan  # pyright: ignore[reportAttributeAccessIssue]
 
@@ -292,6 +308,11 @@ DOORS = (
     Door("track, DeepLabCut", "deeplabcut", _TRACK, modules=_STIMULI),
     Door("track, DeepLabCut HDF5", "deeplabcut_hdf5", _TRACK, modules=_STIMULI),
     Door("track, whisk", "whisk", _TRACK, modules=_STIMULI),
+    Door(
+        "track, whisk's measurements", "whisk_labels",
+        f"{_TRACK} --track 0 --identities {{file}}".replace("{file}", "{folder}/track.whiskers", 1), modules=_STIMULI,
+    ),
+    Door("track, WhiskiWrap", "whiskiwrap", _TRACK, modules=_STIMULI),
     Door("track, WhiskerMan", "whiskerman", f"{_TRACK} --track 1", modules=_STIMULI),
     Door("track, angles", "angles", "stimuli show {folder}/scene.toml --json", modules=_STIMULI),
     Door("episode, table", "replayed", "tactile replay {file} --hand {folder}/jaws.urdf --json", modules=_HANDS),
@@ -309,7 +330,16 @@ DOORS = (
         modules=_MODELS,
     ),
     Door(
-        "task file", "task", "policy evaluate foreign --config nothing --task-file {file} --json", modules=_HANDS,
+        "models import, settings", "run_settings",
+        f"models import {{folder}}/best.ckpt --architecture zhuang-gru-small --config {{file}} {_IMPORT}",
+        modules=_MODELS,
+    ),
+    Door("batch file", "batch", read=_batch, modules=_MODELS),
+    Door("sweep of students", "sweep", read=_sweep, modules=_HANDS),
+    Door(
+        "task file", "task",
+        "policy evaluate foreign --task-file {file} --envs 1 --episodes 1 --seeds 1 --change episode=0.2 --json",
+        modules=_HANDS,
     ),
     Door("plan", "plan", read=_plan, modules=_CLI, after=_seal),
     Door("benchmark", "benchmark", "benchmark check {file} --json", modules=(*_STIMULI, *_MODELS)),
@@ -318,21 +348,45 @@ DOORS = (
 )  # fmt: skip
 
 
+def tabulate(now: dict[str, list[str]], before: dict[str, list[str]]) -> str:
+    """Return a table of outcomes by entrance; with an earlier tree's, as ``before → now``."""
+    lines = [f"| surface | cases | {' | '.join(FAILURES)} |", "|---|---|" + "---|" * len(FAILURES)]
+    sums = ({**side, "all": [kind for kinds in side.values() for kind in kinds]} for side in (before, now))
+    before, now = sums
+    for name in now:
+        sides = [[kind for kind in side.get(name, ()) if kind != "absent"] for side in (before, now)]
+        counts = [[len(side), *map(side.count, FAILURES)] for side in sides if side or side is sides[1]]
+        lines.append(
+            f"| {name} | " + " | ".join(" → ".join(map(str, pair)) for pair in zip(*counts, strict=True)) + " |"
+        )
+    return "\n".join(lines) + "\n"
+
+
+def _outcomes(folder: Path) -> dict[str, list[str]]:
+    """Return what became of the cases of each entrance that stand in a folder."""
+    files = {door.name: folder / f"{door.name}.jsonl" for door in DOORS}
+    lines = {name: file.read_text().splitlines() for name, file in files.items() if file.is_file()}
+    return {name: [json.loads(line)["kind"] for line in rows] for name, rows in lines.items()}
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("folder", type=Path)
     parser.add_argument("names", nargs="*", help="entrances; all of them by default")
     parser.add_argument("--cases", type=int, default=200)
-    parser.add_argument("--first", type=int, default=0)
+    parser.add_argument("--before", type=Path, help="folder of an earlier tree")
     chosen = parser.parse_args()
+    folder = chosen.folder.absolute()
+    folder.mkdir(parents=True, exist_ok=True)
     for door in DOORS:
         if not chosen.names or door.name in chosen.names:
-            folder = chosen.folder.absolute() / door.name.replace(" ", "-")
-            for seed, verdict in enumerate(
-                cases(door, folder, range(chosen.first - 1, chosen.cases)), chosen.first - 1
-            ):
-                sys.stdout.write(json.dumps({"name": door.name, "seed": seed, **vars(verdict)}) + "\n")
-                sys.stdout.flush()
+            first = len(_outcomes(folder).get(door.name, ()))
+            if not first and (good := next(cases(door, folder / door.name, range(-1, 0)))).kind != "accepted":
+                raise SystemExit(f"{door.name}: what is whole is not accepted: {good}")
+            with (folder / f"{door.name}.jsonl").open("a") as stream:
+                for seed, verdict in enumerate(cases(door, folder / door.name, range(first, chosen.cases)), first):
+                    print(json.dumps({"seed": seed, **vars(verdict)}), file=stream, flush=True)
+    sys.stdout.write(tabulate(_outcomes(folder), _outcomes(chosen.before) if chosen.before else {}))
 
 
 if __name__ == "__main__":

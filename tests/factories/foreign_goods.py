@@ -9,20 +9,23 @@ import numpy as np
 
 from brainbench.benchmarks.opening import make, pack
 from brainbench.core.files import write_json
-from brainbench.core.identity import SealedPlan
+from brainbench.core.identity import SealedPlan, content_hash
 from brainbench.scoring.options import ScoreOptions
 from robotics_bridge import hands
 from robotics_bridge.deploy.links.episodes import PARTS, SessionFacts, TactilePoints, write_lerobot
 from robotics_bridge.deploy.links.replay import taxel_names
-from tests.factories import foreign_surfaces, policies, published_surfaces, reading_surfaces, robot_surfaces
+from tests.factories import policies, published_surfaces, reading_surfaces, robot_surfaces
 from tests.factories.ringdown_table import write_ringdown
 from tests.factories.scored_files import write_study
 from tests.factories.whisker_tracks import (
     bent_shapes,
     write_deeplabcut_csv,
     write_deeplabcut_table,
+    write_measurements,
     write_points,
+    write_whiskerman,
     write_whiskers,
+    write_whiskiwrap,
 )
 
 JAWS = """<robot name="jaws">
@@ -38,6 +41,30 @@ JAWS = """<robot name="jaws">
 <axis xyz="0 -1 0"/><limit lower="0" upper=".03" effort="10" velocity="1"/><mimic joint="l" multiplier="1"/></joint>
 </robot>"""
 """A gripper with two jaws."""
+PIXEL = 5e-5
+"""m"""
+MODEL = """import torch
+
+
+class Mine(torch.nn.Module):
+    def __init__(self):
+        super().__init__()
+        self.read = torch.nn.Linear(6, 3)
+
+    def forward(self, x):
+        return self.read(x.flatten(3).mean(dim=(1, 3)))
+"""
+TASK = """from dataclasses import replace
+
+from robotics_bridge import tasks
+
+TASK = replace(tasks.load("in_palm_rotate"), name="foreign")
+
+
+@tasks.register("foreign")
+def foreign():
+    return TASK
+"""
 SCENE = """[array]
 whiskers = "C2"
 [whisking]
@@ -54,8 +81,27 @@ label = "played"
 """
 
 student, student_weights = robot_surfaces._student("config.json"), robot_surfaces._student("model.safetensors")
-layout, log, settings = robot_surfaces._probes, foreign_surfaces._log, foreign_surfaces._settings
-checkpoint, whiskerman = published_surfaces._checkpoint, foreign_surfaces._control
+layout, log, checkpoint = robot_surfaces._probes, robot_surfaces._log, published_surfaces._checkpoint
+batch, sweep = (
+    next(surface.make for surface in reading_surfaces.SURFACES if surface.name == name)
+    for name in ("batch file", "sweep of students")
+)
+
+
+def _pixels() -> np.ndarray:
+    shapes = bent_shapes() / PIXEL
+    shapes[..., 1] *= -1
+    return shapes
+
+
+def _traces() -> dict[tuple[int, int], np.ndarray]:
+    return {(frame, 0): shape for frame, shape in enumerate(_pixels())}
+
+
+def whiskerman(folder: Path) -> Path:
+    control = np.zeros((12, 3, 3))
+    control[:, :2] = _pixels()[:, [0, 4, 9]].transpose(0, 2, 1)
+    return write_whiskerman(folder / "track.tr4", control, control[:, :, 0], np.ones(12, bool))
 
 
 def contract(folder: Path) -> Path:
@@ -71,22 +117,38 @@ def points(folder: Path) -> Path:
 
 
 def deeplabcut(folder: Path) -> Path:
-    return write_deeplabcut_csv(folder / "track.csv", foreign_surfaces._pixels(), np.ones((12, 10)))
+    return write_deeplabcut_csv(folder / "track.csv", _pixels(), np.ones((12, 10)))
 
 
 def deeplabcut_hdf5(folder: Path) -> Path:
-    write_deeplabcut_table(folder / "track.h5", foreign_surfaces._pixels(), np.ones((12, 10)))
+    write_deeplabcut_table(folder / "track.h5", _pixels(), np.ones((12, 10)))
     return folder / "track.h5"
 
 
 def whisk(folder: Path) -> Path:
-    write_whiskers(folder / "track.whiskers", foreign_surfaces._traces())
+    write_whiskers(folder / "track.whiskers", _traces())
     return folder / "track.whiskers"
+
+
+def whisk_labels(folder: Path) -> Path:
+    whisk(folder)
+    labels = dict.fromkeys(_traces(), 0)
+    return write_measurements(folder / "labels.csv", labels, dict.fromkeys(labels, (0.0, 0.0)))
+
+
+def whiskiwrap(folder: Path) -> Path:
+    write_whiskiwrap(folder / "track.h5", _traces(), dict.fromkeys(_traces(), (0.0, 0.0)))
+    return folder / "track.h5"
 
 
 def angles(folder: Path) -> Path:
     (folder / "scene.toml").write_text(SCENE)
-    return foreign_surfaces._angles(folder)
+    times = 0.002 * np.arange(60)
+    table = np.column_stack([times, 90 + 20 * np.sin(50 * times), 5 * np.cos(50 * times)])
+    np.savetxt(
+        folder / "angles.csv", table, delimiter=",", header="time_s,RC2.theta_deg,RC2.phi_deg", comments="", fmt="%.6g"
+    )
+    return folder / "angles.csv"
 
 
 def _recorded(folder: Path) -> tuple[Any, Any, np.ndarray, Any]:
@@ -125,8 +187,12 @@ def lerobot_frames(folder: Path) -> Path:
 
 
 def model(folder: Path) -> Path:
-    (folder / "mine.py").write_text(foreign_surfaces.MODEL)
+    (folder / "mine.py").write_text(MODEL)
     return folder / "mine.py"
+
+
+def settings(folder: Path) -> Path:
+    return write_json(folder / "models.json", {"mine": {"target": "mine.py:Mine", "hash": content_hash(model(folder))}})
 
 
 def graph(folder: Path) -> Path:
@@ -134,8 +200,14 @@ def graph(folder: Path) -> Path:
     return write_json(folder / "graph.json", reading_surfaces.GRAPH)
 
 
+def run_settings(folder: Path) -> Path:
+    graph(folder)
+    encoder = {"model_config_file": "configs/rnn_fdb_converted_modern_gru.json"}
+    return write_json(folder / "config.json", {"model": {"encoder": encoder}, "train": {"ssl": "SimCLRLoss"}})
+
+
 def task(folder: Path) -> Path:
-    (folder / "task.py").write_text(foreign_surfaces.TASK)
+    (folder / "task.py").write_text(TASK)
     return folder / "task.py"
 
 

@@ -1,7 +1,7 @@
 """Commands that are killed at any instant: what each needs, what it does, and what it must leave.
 
-``python -m tests.factories.kill_jobs NAME FOLDER --kills N`` loads the modules of a command once; every run is a fork,
-so that a kill hits the work and not the loading. It prints one JSON object.
+``python -m tests.factories.kill_jobs FOLDER NAME… --kills N`` loads the modules of a command once; every run is a fork,
+so that a kill hits the work and not the loading. It prints one JSON object for each.
 """
 
 from __future__ import annotations
@@ -345,16 +345,19 @@ JOBS = (
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("name", choices=[job.name for job in JOBS])
     parser.add_argument("folder", type=Path)
+    parser.add_argument("names", nargs="+", choices=[job.name for job in JOBS], metavar="NAME")
     parser.add_argument("--kills", type=int)
     parser.add_argument("--signals", default="KILL", help="sent in turn: KILL,TERM,HUP,STOP")
     parser.add_argument("--pairs", type=int, default=1)
     chosen = parser.parse_args()
-    job = next(item for item in JOBS if item.name == chosen.name)
-    kills = job.kills if chosen.kills is None else chosen.kills
-    found = measure(job, chosen.folder, kills, chosen.signals.split(","), chosen.pairs)
-    sys.stdout.write(json.dumps(asdict(found)) + "\n")
+    for job in JOBS:
+        if job.name in chosen.names:
+            kills = job.kills if chosen.kills is None else chosen.kills
+            folder = chosen.folder / job.name
+            outcome = measure(job, folder, kills, chosen.signals.split(","), chosen.pairs)
+            sys.stdout.write(json.dumps(asdict(outcome)) + "\n")
+            sys.stdout.flush()
 
 
 if __name__ == "__main__":

@@ -26,7 +26,7 @@ SECONDS = 10.0
 """Seconds of work after which a reader hangs; by the clock, what waits has three times as many on a busy machine."""
 MEMORY = 2 << 30
 """Address space [bytes] that a reader may take beyond what the process has."""
-LONGEST = 1000
+LONGEST = 400
 """Characters of one sentence to a user."""
 
 

@@ -94,9 +94,9 @@ def _bad_layout(layout: Any) -> bool:
 
 def _log(folder: Path) -> Path:
     draw, times = np.random.default_rng(0), 0.01 * np.arange(60)
-    table = np.column_stack([times, np.sin(5 * times), np.sin(5 * times)[:, None] + 0.01 * draw.normal(size=(60, 3))])
-    lines = [",".join(f"{value:.5f}" for value in row) for row in table]
-    (folder / "log.csv").write_text("\n".join(["time,reference,p1,p2,p3", *lines]) + "\n")
+    signal = np.where(np.sin(5 * times) > 0, np.sin(5 * times), 0.0)
+    table = np.column_stack([times, signal, signal[:, None] + 0.01 * draw.normal(size=(60, 3))])
+    np.savetxt(folder / "log.csv", table, delimiter=",", header="time,reference,p1,p2,p3", comments="", fmt="%.5f")
     return folder / "log.csv"
 
 

@@ -26,7 +26,7 @@ PREFIXES = (LOCAL, HUB)  # beginnings of a model's name that is a folder or a re
 DType = Literal["float32", "float16", "bfloat16"]
 DTYPES: tuple[DType, ...] = get_args(DType)
 FOREIGN, SCORED, SETTINGS = "*.ckpt", "val_best.ckpt", "config.yaml"
-_NAME = re.compile(r"\w[\w.+-]*", re.ASCII)
+_NAME = re.compile(r"\w[\w.+-]{0,249}", re.ASCII)
 """A part of a name on a hub: none leads out of the folder that the hub sends."""
 IMPORTERS = "brainbench.checkpoints"
 """Entry points of functions that make a model's folder of a foreign file and its settings (None without any)."""

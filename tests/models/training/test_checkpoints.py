@@ -110,8 +110,9 @@ def test_the_hub_is_asked_only_by_its_prefix(folder, monkeypatch):
     monkeypatch.setitem(sys.modules, "huggingface_hub", types.SimpleNamespace(snapshot_download=download))
     assert load_model("hf-hub:someone/touch@v2").spec.outputs == 7
     assert asked == [("someone/touch", "v2")]
-    with pytest.raises(UsageError, match="received 'hf-hub:touch'"):
-        find_folder("hf-hub:touch")
+    for odd in ("touch", "someone/touch/" + 300 * "x", "someone/../touch"):
+        with pytest.raises(UsageError, match=f"received 'hf-hub:{odd[:9]}"):
+            find_folder(f"hf-hub:{odd}")
     monkeypatch.setitem(sys.modules, "huggingface_hub", None)
     with pytest.raises(MissingDependencyError, match=r"\[hub\]"):
         load_model("hf-hub:someone/touch")
