@@ -26,15 +26,14 @@ from numpy.typing import NDArray
 from benchmarks.report import publish, script_parser, table
 from brainbench.core.statistics import wilson_interval
 from robotics_bridge import tasks
-from robotics_bridge.deploy.controller import Clock, Report
 from robotics_bridge.deploy.driver import HandReading, LinkCounters
-from robotics_bridge.deploy.session import DeployedPolicy, PressureCalibration, read_deployed
+from robotics_bridge.deploy.session import Clock, DeployedPolicy, PressureCalibration, Report, read_deployed
 from robotics_bridge.envs.env import Env
 from robotics_bridge.envs.step import VELOCITY
 from robotics_bridge.policies.evaluate import Policy, evaluate, mean_of_episodes
 from robotics_bridge.policies.export import export_policy
 from robotics_bridge.policies.fit import with_contacts_of
-from robotics_bridge.policies.training.student_files import load_student
+from robotics_bridge.policies.training.distill import load_student
 from robotics_bridge.tasks.task import Task
 
 

@@ -100,8 +100,7 @@ def front_end(sense: str, env: Env) -> Callable[[torch.Tensor], None] | None:
     """Return one streaming step of an encoder on the group ``tactile``."""
     if sense not in ENCODERS:
         return None
-    from robotics_bridge.policies.encoders.front_end import FrontEnd
-    from robotics_bridge.policies.encoders.taxel_grid import TaxelGrid
+    from robotics_bridge.policies.encoders.taxel_grid import FrontEnd, TaxelGrid
 
     assert env.touch is not None
     module = FrontEnd(ENCODERS[sense], TaxelGrid(env.hand, placement="hand", resolution="med")).to(env.device).eval()

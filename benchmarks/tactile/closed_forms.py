@@ -16,8 +16,7 @@ from robotics_bridge.physics import Geometry, HandState, MujocoEngine, TouchScen
 from robotics_bridge.sensors import ContactAudio, Noise, SensorSuite, TemperatureGrid
 from robotics_bridge.sensors.audio.modes import find_modes
 from robotics_bridge.sensors.audio.sensors import ElasticMaterial
-from robotics_bridge.sensors.calibration.calibrate import calibrate
-from robotics_bridge.sensors.calibration.log import Log
+from robotics_bridge.sensors.calibration.calibrate import Log, calibrate
 from robotics_bridge.sensors.noise.stages import simulate
 from robotics_bridge.sensors.temperature.materials import ThermalBody, ThermalMaterial, material
 

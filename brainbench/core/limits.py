@@ -46,6 +46,7 @@ def Limit(
     longest: int | None = None,
     unit: str = "",
     infinite: bool = False,
+    rising: bool = False,
 ) -> msgspec.Meta:
     """Return what stands behind the type in ``Annotated[...]``.
 
@@ -55,9 +56,10 @@ def Limit(
         shortest, longest: lengths of a tuple or a text.
         unit: unit of the number, for messages.
         infinite: True where infinity is a value too.
+        rising: True for a range (low, high) that is in order.
     """
     numbers: dict[str, Any] = {"ge": least, "le": most, "gt": above, "lt": below}
-    about = {"unit": unit, "infinite": infinite}
+    about = {"unit": unit, "infinite": infinite, "rising": rising}
     return msgspec.Meta(min_length=shortest, max_length=longest, extra=about, **numbers)
 
 
@@ -269,6 +271,8 @@ def _values(fixed: bool, kinds: Sequence[Any], limit: msgspec.Meta) -> Check | N
         for inner, limited in zip(values, checks if fixed else checks * len(values), strict=True):
             if limited is not None:
                 limited(name, inner)
+        if (limit.extra or {}).get("rising") and values[0] > values[-1]:
+            raise UsageError(f"{name} is a range (low, high); received {brief(value)}.")
 
     return check
 

@@ -28,7 +28,7 @@ from brainbench.geometry import Mesh, winding_number
 from brainbench.tradeoffs.study import Panel, Row, Study
 from robotics_bridge.physics import Geometry, HandState, TouchScene
 from robotics_bridge.sensors.probes.placement import Probes
-from robotics_bridge.sensors.queries.surface_points import surface_points
+from robotics_bridge.sensors.queries.solids import surface_points
 from robotics_bridge.sensors.sensor import Sensor
 from robotics_bridge.sensors.suite import SensorSuite
 from robotics_bridge.sensors.taxels.sensors import KinematicTaxel, ProximityTaxel

@@ -1,8 +1,7 @@
 """Batched environments of dexterous tasks, and adapters to rsl_rl and gymnasium.
 
-``simulation`` has options, physics and actuators; ``contacts`` is what is felt; ``state`` holds parts and memory of a
-batch; ``reset`` begins episodes; ``step`` goes from an action over physics to rewards and observations; ``env``
-puts them together.
+``simulation`` has options, physics, actuators and what is felt; ``state`` holds parts and memory of a batch; ``step``
+begins episodes and goes from an action over physics to rewards and observations; ``env`` puts them together.
 """
 
 from __future__ import annotations

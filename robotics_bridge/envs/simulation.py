@@ -21,16 +21,10 @@ from brainbench.core.devices import mujoco_module, pick_device, warp
 from brainbench.core.errors import UsageError, check_kind
 from brainbench.core.limits import Count, Limit, limited
 from brainbench.core.rotations import conjugate, from_xyzw, rotate
-from robotics_bridge.envs.kernels.actuation import ActuatorArrays, actuate, add_contact_forces, count_launch
+from robotics_bridge.envs.kernels.actuation import ActuatorArrays, actuate, add_contact_forces
 from robotics_bridge.hands import Hand
 from robotics_bridge.hands.layouts import check_names
-from robotics_bridge.hands.observations import (
-    PATCH_FORCE_SCALE,
-    TAXELS_IN_CONTACT,
-    center_of_pressure,
-    observation_type,
-    sensors_for,
-)
+from robotics_bridge.hands.observations import ObservationMap, observation_type, sensors_for
 from robotics_bridge.physics import MujocoEngine, MujocoWarpEngine
 from robotics_bridge.physics.state import MOST_ENVS, HandState
 from robotics_bridge.sensors import Probes, SensorSuite, SurfaceDistanceProbe
@@ -250,7 +244,6 @@ class Actuators:
         self.seed(seed)
         self._noise = self.nominal["effort"] * (task.actuators.torque_noise if task.actuators else 0.0)
         wp = warp()
-        self._actuate, self._count = actuate, count_launch
         self._arrays = ActuatorArrays()
         for name, value in self.values.items():
             setattr(self._arrays, name, wp.from_torch(value, dtype=wp.float32))
@@ -296,8 +289,8 @@ class Actuators:
         wp, device = warp(), self._simulation.warp_device
         inputs = [self._arrays, self._qpos, self._qvel, self._target, self._random]
         inputs += [int(substep == 0), 1.0 / self._substeps, self._ctrl, self._power]
-        wp.launch(self._actuate, dim=self.target.shape, inputs=inputs, device=device)
-        wp.launch(self._count, dim=1, inputs=[self._random], device=device)
+        wp.launch(actuate, dim=self.target.shape, inputs=inputs, device=device)
+        self._noise_state[0] += 1
 
     def memory(self) -> dict[str, torch.Tensor]:
         """Return the tensors themselves that the next launch depends on, by name."""
@@ -314,7 +307,7 @@ class Contacts:
 
     def __init__(self, simulation: Simulation, model: TaskModel, *, step_dt: float, seed: int) -> None:
         wp, scene, device = warp(), simulation.engine.scene, simulation.warp_device
-        self._simulation, self._kernel, self._dt = simulation, add_contact_forces, step_dt
+        self._simulation, self._dt = simulation, step_dt
         tips = list(model.tips)
         self._tips = len(tips)
         self.tip_links = torch.as_tensor([scene.link_index(tip) for tip in tips], device=simulation.device)
@@ -343,7 +336,9 @@ class Contacts:
         self._forces.zero_()
         inputs = [state.contact_count, state.contact_geom, state.contact_env, state.contact_normal]
         inputs += [state.contact_force, self._rows, self._forces]
-        wp.launch(self._kernel, dim=state.contact_env.shape[0], inputs=inputs, device=self._simulation.warp_device)
+        wp.launch(
+            add_contact_forces, dim=state.contact_env.shape[0], inputs=inputs, device=self._simulation.warp_device
+        )
         self._suite.update(state, self._dt)
 
     def reset(self, mask: torch.Tensor) -> None:
@@ -389,11 +384,10 @@ class TactileObservation:
         knobs = {"twist": task.taxel_twist, **options.knobs}
         sensors = sensors_for(observe, taxels, noisy=options.noisy, track=model.objects, **knobs)
         self.suite = SensorSuite(simulation.engine.scene, sensors, num_envs=num_envs, device=device, seed=options.seed)
-        self._name, self.links = observe, tuple(taxels)
+        self.links = tuple(taxels)
         """Links with taxels, in the order of their columns."""
         active = {link: np.flatnonzero(probes.active) for link, probes in taxels.items()}
         counts = [len(active[link]) for link in taxels]
-        links = np.repeat(np.arange(len(counts)), counts)
         where = simulation.device
         self._parts: list[tuple[Any, torch.Tensor, torch.Tensor]] = []
         starts = dict(zip(taxels, np.cumsum([0, *counts[:-1]]).tolist(), strict=True))
@@ -403,25 +397,9 @@ class TactileObservation:
             planes = warp().to_torch(runtime.measured())
             self._parts.append((planes, torch.as_tensor(source, device=where), torch.as_tensor(target, device=where)))
         width: int = 3 if observe == "force" else int(self._parts[0][0].shape[0])
-        self._taxels = torch.zeros(num_envs, len(links), width, device=where)
-        self._pool = None
-        self._patches: list[tuple[torch.Tensor, ...]] = []
-        columns = len(links)
-        if observe == "center_of_pressure":
-            columns = len(taxels)
-            for number, (link, probes) in enumerate(taxels.items()):
-                arrays = (probes.position[active[link]], probes.normal[active[link]])
-                patch = [torch.as_tensor(array, dtype=torch.float32, device=where) for array in arrays]
-                self._patches.append((torch.as_tensor(np.flatnonzero(links == number), device=where), *patch))
-        elif kind.per_link:
-            columns = len(taxels)
-            pool = np.zeros((len(links), columns, kind.channels))
-            # Sum over the taxels of a link as one matrix product: counts of contacts, or 10⁴ Σ d n with axes z, y, x
-            # (4.29).
-            normal = np.concatenate([probes.normal[active[link]] for link, probes in taxels.items()])
-            pool[np.arange(len(links)), links] = 1.0 if observe == "agg_bool" else PATCH_FORCE_SCALE * normal[:, ::-1]
-            self._pool = torch.as_tensor(pool, dtype=torch.float32, device=where).flatten(1)
-        self.reading = torch.zeros(num_envs, task.solver.decimation, columns, kind.channels, device=where)
+        self._taxels = torch.zeros(num_envs, sum(counts), width, device=where)
+        self._map = ObservationMap(observe, taxels, where)
+        self.reading = torch.zeros(num_envs, task.solver.decimation, self._map.items, kind.channels, device=where)
         """[B, S, N, C] of the last control step, oldest first; zeros after a reset."""
 
     def update(self, state: HandState, dt: float, substep: int) -> None:
@@ -433,22 +411,7 @@ class TactileObservation:
                 self._taxels = part
             else:
                 self._taxels.index_copy_(1, target, part)
-        if self._patches:
-            # The index tensors lie on the device, so that a graph can record the step.
-            parts = [
-                center_of_pressure(self._taxels.index_select(1, members), place, normal)
-                for members, place, normal in self._patches
-            ]
-            self.reading[:, substep] = torch.stack(parts, dim=1)
-            return
-        if self._pool is None:
-            self.reading[:, substep] = self._taxels
-            return
-        # One product for all links: no sum has to be taken by index, whose order differs from run to run on a GPU.
-        pooled = self._taxels[..., 0] @ self._pool
-        if self._name == "agg_bool":
-            pooled = (pooled > TAXELS_IN_CONTACT).float()
-        self.reading[:, substep] = pooled.unflatten(1, self.reading.shape[2:])
+        self.reading[:, substep] = self._map(self._taxels)
 
     def reset(self, mask: torch.Tensor) -> None:
         """Begin new episodes in some environments [B] bool."""

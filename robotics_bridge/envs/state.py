@@ -229,8 +229,6 @@ class EnvState:
         self.goals = GoalState(task, self.num_envs, self.device, round_about)
         self.touch: TactileObservation | None = None
         if options.observe != "none":
-            from robotics_bridge.envs.simulation import TactileObservation
-
             self.touch = TactileObservation(self.model, hand, self.simulation, options, task)
         self._index()
         self.episode = EpisodeState.start(

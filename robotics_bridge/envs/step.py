@@ -22,6 +22,7 @@ from brainbench.core.reading.sealed import read_sealed, write_sealed
 from brainbench.core.rotations import about, conjugate, constant, multiply, rotate, six_numbers
 from robotics_bridge.envs.state import EnvState
 from robotics_bridge.hands import Hand
+from robotics_bridge.hands.tree import lineage
 from robotics_bridge.tasks import terms
 from robotics_bridge.tasks.scenes import TaskModel
 from robotics_bridge.tasks.task import Solver, Task
@@ -439,14 +440,11 @@ class _Trial:
 
     def _above(self, body: int) -> NDArray[np.int64]:
         """Return the numbers of the flexing joints that move a body; those that spread a finger are left alone."""
-        model, columns = self._model, []
+        model = self._model
         # A joint whose range lies about its zero spreads the finger; flexion has a one-sided range.
         flexes = np.abs(model.low + model.high) >= 0.5 * (model.high - model.low)
         owners = np.array([self._m.jnt_bodyid[self._m.joint(name).id] for name in model.joints])
-        while body > 0:
-            columns.append(np.flatnonzero((owners == body) & flexes))
-            body = int(self._m.body_parentid[body])
-        return np.concatenate(columns)
+        return np.concatenate([np.flatnonzero((owners == b) & flexes) for b in lineage(self._m, body)[:-1]])
 
     def _contacts(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """Return the other body and the depth (m) of every contact of the tool."""

@@ -30,8 +30,7 @@ from robotics_bridge.hands.observations import observe, sensors_for
 from robotics_bridge.hands.scenes import OBJECT, flexed, holding_spec, replace_drives
 from robotics_bridge.physics import Geometry, MujocoEngine
 from robotics_bridge.physics.scene import compile_variants
-from robotics_bridge.policies.encoders.front_end import HandCalibration
-from robotics_bridge.policies.encoders.taxel_grid import FINGERS, SITES, TaxelGrid
+from robotics_bridge.policies.encoders.taxel_grid import FINGERS, SITES, HandCalibration, TaxelGrid
 from robotics_bridge.sensors import SensorSuite
 
 

@@ -1,7 +1,7 @@
 """Robot hands: two of our own made of primitives, any URDF or MJCF file, and where their probes sit.
 
 ``spec`` describes a hand as data (``sharpa.toml``, ``xhand1.toml``), ``files`` reads any other,
-``hand`` makes either ready for use, ``layouts`` and ``surface`` place probes on its links, ``observations`` turns
+``hand`` makes either ready for use, ``layouts`` and ``tree`` place probes on its links, ``observations`` turns
 their readings into what a policy gets, and ``scenes`` lays an object on the palm.
 """
 

@@ -14,6 +14,7 @@ from brainbench.core.errors import BrainbenchError
 from robotics_bridge.hands import load_all
 from robotics_bridge.hands.hand import Hand
 from robotics_bridge.hands.layouts import Layout, active_count
+from robotics_bridge.hands.tree import link_points
 
 mujoco = mujoco_module()
 
@@ -140,7 +141,6 @@ def press(hand: Hand, layout: Layout) -> dict[str, tuple[np.ndarray, np.ndarray,
 def draw(hand: Hand, layout: Layout, path: Path) -> None:
     """Draw the taxels of a hand at rest over the corners of its links, from the side of the palm and from beside."""
     from brainbench.core.figures import panels, save_figure
-    from robotics_bridge.hands.surface import link_points
 
     model, data = hand.model, mujoco.MjData(hand.model)
     mujoco.mj_kinematics(model, data)

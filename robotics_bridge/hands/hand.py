@@ -22,8 +22,7 @@ from brainbench.core.reading.regular import readable
 from robotics_bridge.hands.files import read_mjspec, stated_speeds
 from robotics_bridge.hands.layouts import Layout, check_names, is_probe_file, pad_probes, read_probes, select
 from robotics_bridge.hands.spec import HandSpec, build
-from robotics_bridge.hands.surface import palmar_directions
-from robotics_bridge.hands.tree import Tree
+from robotics_bridge.hands.tree import Tree, cast_grid, geoms_of, palmar_directions
 from robotics_bridge.sensors.probes.placement import Probes
 
 _log = logging.getLogger(__name__)
@@ -159,8 +158,6 @@ class Hand:
         return replace(self, custom=layout)
 
     def _cast(self, resolution: str, links: tuple[str, ...]) -> Layout:
-        from robotics_bridge.hands.surface import cast_grid, geoms_of
-
         layout: Layout = {}
         reasons: list[str] = []
         facing = palmar_directions(self.model, self.palm, self.fingers)

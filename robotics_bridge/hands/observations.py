@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any
 
+import numpy as np
 import torch
 
 from brainbench.core.errors import UsageError, check_each, check_name
@@ -135,27 +136,50 @@ def observe(name: str, readings: Mapping[str, torch.Tensor], layout: Layout) -> 
                 f"The reading {name!r} of link {link!r} with its {len(probes)} probes has the shape ({wanted}); "
                 f"received {tuple(reading.shape)}."
             )
-        parts.append(_part(name, reading.reshape(reading.shape[0], len(probes), make.channels or 1), probes))
-    return torch.cat(parts, dim=1)
+        active = torch.as_tensor(probes.active.copy(), device=reading.device)
+        parts.append(reading.reshape(reading.shape[0], len(probes), make.channels or 1)[:, active].float())
+    taxels = torch.cat(parts, dim=1)
+    return ObservationMap(name, layout, taxels.device)(taxels).flatten(1)
 
 
-def _part(name: str, values: torch.Tensor, probes: Any) -> torch.Tensor:
-    """Return the observation [B, F] of one link."""
-    active = torch.as_tensor(probes.active.copy(), device=values.device)
-    values = values[:, active].float()
-    if name == "agg_bool":
-        return (values[..., 0].sum(dim=1, keepdim=True) > TAXELS_IN_CONTACT).float()
-    if name == "agg_force":
-        normal = torch.as_tensor(probes.normal[probes.active].copy(), dtype=values.dtype, device=values.device)
-        # 10⁴ P Σ d n with P the order z, y, x of the axes (4.29).
-        return PATCH_FORCE_SCALE * (values[..., :1] * normal).sum(dim=1).flip(-1)
-    if name == "center_of_pressure":
-        place = torch.as_tensor(probes.position[probes.active].copy(), dtype=values.dtype, device=values.device)
-        normal = torch.as_tensor(probes.normal[probes.active].copy(), dtype=values.dtype, device=values.device)
-        return center_of_pressure(values, place, normal)
-    if name == "force":
-        values = values[..., :3]
-    return values.flatten(1)
+class ObservationMap:
+    """From the active taxels of a layout, link by link [B, N, C], to their observation [B, items, channels]."""
+
+    def __init__(self, name: str, layout: Layout, device: Any = "cpu") -> None:
+        kind = observation_type(name)
+        counts = [int(probes.active.sum()) for probes in layout.values()]
+        links = np.repeat(np.arange(len(counts)), counts)
+        self._name, self._channels = name, kind.channels
+        self.items: int = len(counts) if kind.per_link else len(links)
+        """Active taxels, or links."""
+        self._pool = None
+        self._patches: list[tuple[torch.Tensor, ...]] = []
+        if name == "center_of_pressure":
+            for number, probes in enumerate(layout.values()):
+                arrays = (probes.position[probes.active], probes.normal[probes.active])
+                patch = [torch.as_tensor(array, dtype=torch.float32, device=device) for array in arrays]
+                self._patches.append((torch.as_tensor(np.flatnonzero(links == number), device=device), *patch))
+        elif kind.per_link:
+            pool = np.zeros((len(links), self.items, kind.channels))
+            # Sum over the taxels of a link as one matrix product: counts of contacts, or 10⁴ Σ d n with axes z, y, x
+            # (4.29).
+            normal = np.concatenate([probes.normal[probes.active] for probes in layout.values()])
+            pool[np.arange(len(links)), links] = 1.0 if name == "agg_bool" else PATCH_FORCE_SCALE * normal[:, ::-1]
+            self._pool = torch.as_tensor(pool, dtype=torch.float32, device=device).flatten(1)
+
+    def __call__(self, taxels: torch.Tensor) -> torch.Tensor:
+        """Return the observation; a graph can record it."""
+        if self._patches:
+            parts = [
+                center_of_pressure(taxels.index_select(1, members), place, normal)
+                for members, place, normal in self._patches
+            ]
+            return torch.stack(parts, dim=1)
+        if self._pool is None:
+            return taxels[..., : self._channels]
+        # One product for all links: no sum has to be taken by index, whose order differs from run to run on a GPU.
+        pooled = (taxels[..., 0] @ self._pool).unflatten(1, (self.items, self._channels))
+        return (pooled > TAXELS_IN_CONTACT).float() if self._name == "agg_bool" else pooled
 
 
 def center_of_pressure(values: torch.Tensor, place: torch.Tensor, normal: torch.Tensor) -> torch.Tensor:

@@ -15,8 +15,7 @@ from brainbench.core.reading.ranges import check_number
 from brainbench.core.rotations import from_matrices, from_z_axis, to_matrices
 from robotics_bridge.hands.hand import Hand
 from robotics_bridge.hands.spec import add_servo
-from robotics_bridge.hands.surface import half_open, link_middle, opens, palmar_directions, slide_of
-from robotics_bridge.hands.tree import Tree, coupled
+from robotics_bridge.hands.tree import Tree, coupled, half_open, link_middle, opens, palmar_directions, slide_of
 
 mujoco = mujoco_module()
 

@@ -1,19 +1,288 @@
-"""What the tree of a model says of hands: palms, fingers with their linkages, and joints that follow others."""
+"""What the tree of a model says of hands: palms, fingers with their linkages, joints that follow others, and pads.
+
+A link touches on the side to which it goes when fingers flex, a jaw on the side of the opposite jaw; probes are cast on
+it as a bundle of parallel rays.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.devices import mujoco_module
-from robotics_bridge.hands.surface import half_open, link_points, looped_bodies
+from brainbench.core.errors import UsageError
+from brainbench.core.reading.ranges import check_number, check_numbers
+from brainbench.core.rotations import to_matrices
+from robotics_bridge.sensors.probes.placement import Probes
 
 mujoco = mujoco_module()
+
+
+def link_points(model: Any, body: int) -> NDArray[np.float64]:
+    """Return points [n, 3] that span a body's solids, in its frame (m): vertices of meshes, corners of the rest."""
+    points = []
+    signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T
+    for geom in geoms_of(model, body):
+        local = model.geom_aabb[geom, :3] + signs * model.geom_aabb[geom, 3:]
+        if int(model.geom_type[geom]) == mujoco.mjtGeom.mjGEOM_MESH:
+            mesh = int(model.geom_dataid[geom])
+            first = int(model.mesh_vertadr[mesh])
+            local = model.mesh_vert[first : first + int(model.mesh_vertnum[mesh])]
+        points.append(local @ to_matrices(model.geom_quat[geom]).T + model.geom_pos[geom])
+    return np.concatenate(points) if points else np.zeros((0, 3))
+
+
+def geoms_of(model: Any, body: int) -> list[int]:
+    """Return the geometries of a body that collide, or all of them where none does."""
+    mine = np.flatnonzero(model.geom_bodyid == body).tolist()
+    solid = [geom for geom in mine if model.geom_contype[geom] or model.geom_conaffinity[geom]]
+    return solid or mine
+
+
+def lineage(model: Any, body: int) -> list[int]:
+    """Return a body and those that carry it, one after the other; the world is last."""
+    bodies = [body]
+    while bodies[-1]:
+        bodies.append(int(model.body_parentid[bodies[-1]]))
+    return bodies
+
+
+def looped_bodies(model: Any) -> list[frozenset[int]]:
+    """Return the closed loops of a model: the bodies on both ways from what is tied together to where these part."""
+    loops: list[frozenset[int]] = []
+    ties = (model.eq_type == mujoco.mjtEq.mjEQ_CONNECT) | (model.eq_type == mujoco.mjtEq.mjEQ_WELD)
+    for row in np.flatnonzero(ties & (model.eq_active0 != 0)).tolist():
+        ends = [int(model.eq_obj1id[row]), int(model.eq_obj2id[row])]
+        if int(model.eq_objtype[row]) == int(mujoco.mjtObj.mjOBJ_SITE):
+            ends = [int(model.site_bodyid[end]) for end in ends]
+        loop = frozenset({*lineage(model, ends[0])} ^ {*lineage(model, ends[1])})
+        if len(loop) > 1 and loop not in loops:
+            loops.append(loop)
+    return loops
+
+
+def cast_grid(
+    model: Any, link: str, rows: int, columns: int, *, facing: ArrayLike, radius: float, extent: float = 0.8
+) -> Probes:
+    """Lay a grid on the side of a link that faces a direction.
+
+    Rays run against ``facing`` over a share ``extent`` of the link; columns run along its longest extent across
+    ``facing``. Rays that miss the link leave fillers.
+    """
+    for name, number in {"rows": rows, "columns": columns}.items():
+        check_number(name, number, least=1, whole=True)
+    check_number("extent", extent, above=0, most=1)
+    check_numbers("facing", facing, 3)
+    body = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, link)
+    if body < 0:
+        raise UsageError(f"The model has no link {link!r}.")
+    corners = link_points(model, body)
+    if not len(corners):
+        raise UsageError(f"Link {link!r} has no geometry, so no probe can lie on it.")
+    length = np.linalg.norm(facing)
+    if not length:
+        raise UsageError("'facing' is a direction of some length; received a zero vector.")
+    up = np.asarray(facing, dtype=float) / length
+    u, v = _plane(up, corners)
+    # Extent of the link across and along the rays: the grid covers its shadow, and rays start just above its top.
+    seen = corners @ np.stack([u, v, up], axis=1)
+    low, high = seen.min(axis=0), seen.max(axis=0)
+    middle, half = (low + high) / 2, (high - low) / 2 * extent
+    x = middle[0] + (np.linspace(-1, 1, columns) if columns > 1 else np.zeros(1)) * half[0]
+    y = middle[1] + (np.linspace(-1, 1, rows) if rows > 1 else np.zeros(1)) * half[1]
+    start = high[2] + 0.01
+    position, normal, radii = np.zeros((rows * columns, 3)), np.tile(up, (rows * columns, 1)), np.zeros(rows * columns)
+    for index, (row, column) in enumerate(np.ndindex(rows, columns)):
+        origin = x[column] * u + y[row] * v + start * up
+        hit = _nearest(model, geoms_of(model, body), origin, -up)
+        position[index] = origin - up * (hit[0] if hit else start)
+        if hit:
+            normal[index], radii[index] = hit[1], radius
+    if not radii.any():
+        raise UsageError(f"Link {link!r} has no surface that faces {tuple(np.round(up, 3))}.")
+    return Probes(position, normal, radii, (rows, columns))
+
+
+def _plane(up: NDArray, corners: NDArray) -> tuple[NDArray, NDArray]:
+    """Return the directions of columns and rows across ``up``."""
+    # The axis nearest to the rays is no candidate for the direction of columns.
+    extent = np.ptp(corners, axis=0)
+    extent[np.argmax(np.abs(up))] = -1
+    u = np.eye(3)[np.argmax(extent)]
+    # Gram–Schmidt: columns run across the rays even if that axis does not.
+    u = u - up * (u @ up)
+    u = u / np.linalg.norm(u)
+    return u, np.cross(up, u)
+
+
+def _nearest(model: Any, geoms: list[int], origin: NDArray, direction: NDArray) -> tuple[float, NDArray] | None:
+    """Return distance and surface normal where a ray first meets one of the geometries (body's frame)."""
+    data = mujoco.MjData(model)
+    best: tuple[float, NDArray] | None = None
+    for geom in geoms:
+        matrix, normal = to_matrices(model.geom_quat[geom]).ravel(), np.zeros(3)
+        kind = int(model.geom_type[geom])
+        if kind == mujoco.mjtGeom.mjGEOM_MESH:
+            data.geom_xpos[geom], data.geom_xmat[geom] = model.geom_pos[geom], matrix
+            distance = mujoco.mj_rayMesh(model, data, geom, origin, direction, normal)
+        else:
+            place, size = model.geom_pos[geom], model.geom_size[geom]
+            distance = mujoco.mju_rayGeom(place, matrix, size, origin, direction, kind, normal)
+        # A ray that misses has the distance −1.
+        if distance >= 0 and (best is None or distance < best[0]):
+            best = (distance, normal)
+    return best
+
+
+_CROSSED = 0.012  # joints nearer to each other (m) act on a link together
+_SNAP = 0.9  # cosine from which a direction counts as that of an axis of its link: jaws have flat faces
+_JAWS = 0.4
+"""Length of the mean direction of finger tips up to which they go towards each other: .8 and more of hands."""
+_APART = -0.5  # cosine to the other tips below which a tip goes away from them
+
+
+def palmar_directions(model: Any, palm: str, fingers: Mapping[str, tuple[str, ...]]) -> dict[str, np.ndarray]:
+    """Return link → the direction [3] of its palmar side, in the link's frame.
+
+    A link's palmar side is where it moves when its joint flexes (of two crossed joints, the one with more range
+    counts), or where it comes from if that opens a gripper (:func:`opens`). A joint that swings as far to both sides
+    spreads or twists the finger and tells nothing: such links face as the next one towards the tip does. What slides,
+    and tips of which no joint tells, face the other fingers. The palm faces where the finger tips go, along the nearest
+    axis of its frame, or the tips of jaws.
+    """
+    data = half_open(model)
+    sign = -1.0 if opens(model, fingers) else 1.0
+    # Which way a link of a closed loop turns is told by the loop, not by its own joint.
+    looped = {int(model.body_weldid[body]) for loop in looped_bodies(model) for body in loop}
+    towards: dict[str, np.ndarray] = {}
+    tips = []
+    for name, chain in fingers.items():
+        facing: np.ndarray | None = None
+        for place in reversed(range(len(chain))):
+            body = model.body(chain[place]).id
+            following = data.xpos[model.body(chain[place + 1]).id] if place + 1 < len(chain) else None
+            in_loop = int(model.body_weldid[body]) in looped
+            world = None if in_loop else _flexed(model, data, body, following)
+            if world is None and facing is None and place + 1 == len(chain):
+                others = [other[-1] for key, other in fingers.items() if key != name] or [palm]
+                world = _opposite(model, data, body, [model.body(other).id for other in others])
+                if world is None:
+                    world = _flexed(model, data, body, following, symmetric=True)
+                elif in_loop:
+                    world = sign * world
+            facing = facing if world is None else sign * world
+            if facing is not None:
+                towards[chain[place]] = data.xmat[body].reshape(3, 3).T @ facing
+                tips += [facing] if place + 1 == len(chain) else []
+    if tips:
+        mean, body = np.mean(tips, axis=0), model.body(palm).id
+        if np.linalg.norm(mean) <= _JAWS:
+            # Jaws go towards each other: the palm faces what lies between them.
+            ends = [link_middle(model, data, model.body(chain[-1]).id) for chain in fingers.values()]
+            mean = np.mean(ends, axis=0) - link_middle(model, data, body)
+        elif list(map(len, fingers.values())) == [1]:
+            # A single jaw closes on the palm itself.
+            mean = -mean
+        if np.linalg.norm(mean) > 1e-6:
+            # In the palm's frame, snapped to the nearest of its axes.
+            turned = data.xmat[body].reshape(3, 3).T @ mean
+            face = np.argmax(np.abs(turned))
+            towards[palm] = np.sign(turned[face]) * np.eye(3)[face]
+    return towards
+
+
+def opens(model: Any, fingers: Mapping[str, tuple[str, ...]]) -> bool:
+    """Return whether flexion, the longer side of the ranges, parts the finger tips: a gripper that is closed at 0."""
+    data, tips = half_open(model), [model.body(chain[-1]).id for chain in fingers.values()]
+    middles = np.array([link_middle(model, data, tip) for tip in tips])
+    for place, tip in enumerate(tips):
+        way = _flexed(model, data, tip, None)
+        if way is None or len(tips) < 2:
+            return False
+        away = np.delete(middles, place, axis=0).mean(axis=0) - middles[place]
+        if not way @ away < _APART * np.linalg.norm(away):
+            return False
+    return True
+
+
+def half_open(model: Any) -> Any:
+    """Return the ``mujoco.MjData`` of a hand at rest, with jaws that slide half open: one lies on each side."""
+    data = mujoco.MjData(model)
+    for joint in np.flatnonzero((model.jnt_type == mujoco.mjtJoint.mjJNT_SLIDE) & (model.jnt_limited != 0)):
+        data.qpos[model.jnt_qposadr[joint]] = model.jnt_range[joint].mean()
+    mujoco.mj_kinematics(model, data)
+    return data
+
+
+def link_middle(model: Any, data: Any, body: int) -> NDArray[np.float64]:
+    """Return the middle of a body's solids [3] (world, m), its origin where it has none."""
+    points = link_points(model, body)
+    local = (points.min(axis=0) + points.max(axis=0)) / 2 if len(points) else np.zeros(3)
+    return data.xpos[body] + data.xmat[body].reshape(3, 3) @ local
+
+
+def _opposite(model: Any, data: Any, body: int, others: list[int]) -> NDArray[np.float64] | None:
+    """Return the direction [3] (world) from a tip to the others: along its slide, else along an axis of its frame."""
+    away = np.mean([link_middle(model, data, other) for other in others], axis=0) - link_middle(model, data, body)
+    length = float(np.linalg.norm(away))
+    if length < 1e-6:
+        return None
+    slide = slide_of(model, body)
+    if slide >= 0:
+        axis = data.xmat[model.jnt_bodyid[slide]].reshape(3, 3) @ model.jnt_axis[slide]
+        along = float(axis @ away)
+        return np.sign(along) * axis if abs(along) > 0.1 * length else None
+    axes = data.xmat[body].reshape(3, 3).T
+    cosine = axes @ away / length
+    face = int(np.argmax(np.abs(cosine)))
+    return np.sign(cosine[face]) * axes[face] if abs(cosine[face]) > _SNAP else away / length
+
+
+def slide_of(model: Any, body: int) -> int:
+    """Return the joint that moves a body, of its own or of what it is fixed to, if it slides; −1 otherwise."""
+    joint = int(model.body_jntadr[model.body_weldid[body]])
+    return joint if joint >= 0 and model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE else -1
+
+
+def _flexed(
+    model: Any, data: Any, body: int, following: np.ndarray | None, *, symmetric: bool = False
+) -> np.ndarray | None:
+    """Return where a body goes [3] (world) when its joint flexes; None if that is not known."""
+    points = link_points(model, body)
+    joint = _flexion(model, body)
+    if joint < 0 or slide_of(model, body) >= 0 or not len(points):
+        return None
+    low, high = (float(value) for value in model.jnt_range[joint])
+    if not symmetric and abs(high + low) < 0.2 * (high - low):
+        return None
+    end, start = following, int(model.body_weldid[body])
+    if end is None or start != body or np.linalg.norm(end - data.xpos[body]) < 1e-6:
+        end = data.xpos[body] + data.xmat[body].reshape(3, 3) @ points.mean(axis=0)
+    axis = data.xmat[model.jnt_bodyid[joint]].reshape(3, 3) @ model.jnt_axis[joint]
+    reach = end - data.xpos[start]
+    # Velocity of the far end under a turn about the joint, ω × r; the longer side of its range is flexion.
+    way = (1.0 if abs(high) >= abs(low) else -1.0) * np.cross(axis, reach)
+    length = float(np.linalg.norm(way))
+    return way / length if length > 1e-9 * max(float(np.linalg.norm(reach)), 1e-9) else None
+
+
+def _flexion(model: Any, body: int) -> int:
+    """Return the joint that flexes a body: of its own and those that cross them, the one with the largest range."""
+    best, most = -1, 0.0
+    for link in lineage(model, body)[:-1]:
+        for joint in np.flatnonzero(model.jnt_bodyid == link).tolist():
+            span = float(np.ptp(model.jnt_range[joint])) if model.jnt_limited[joint] else 2 * np.pi
+            if int(model.jnt_type[joint]) == 3 and span > most:
+                best, most = joint, span
+        if best >= 0 and np.linalg.norm(model.body_pos[link]) > _CROSSED:
+            break
+    return best
+
 
 _LONGEST = 0.25
 """Way from a palm to where its fingers may fork (m); beyond it another body is a palm of its own, at the end of an arm.
@@ -63,21 +332,14 @@ class Tree:
 
     def _outranks(self, fork: int, body: int, count: dict[int, int]) -> bool:
         """Return whether of two forks, one below the other, the first is the palm."""
-        if self._is_below(fork, body):
+        if body in lineage(self._model, fork)[1:]:
             return count[fork] >= max(count[body], 3) or self._away(fork, body) > _LONGEST
-        if self._is_below(body, fork):
+        if fork in lineage(self._model, body)[1:]:
             return not (count[body] >= max(count[fork], 3) or self._away(fork, body) > _LONGEST)
         return False
 
     def _away(self, first: int, second: int) -> float:
         return float(np.linalg.norm(self._data.xpos[first] - self._data.xpos[second]))
-
-    def _is_below(self, body: int, above: int) -> bool:
-        while body:
-            body = int(self._model.body_parentid[body])
-            if body == above:
-                return True
-        return False
 
     def _branches(self, body: int) -> list[int]:
         return [child for child in self._children[body] if self._joints[child]]

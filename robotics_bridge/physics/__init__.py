@@ -1,7 +1,6 @@
 """One state interface for tactile sensors, filled by C MuJoCo on the processor or MuJoCo Warp on the GPU.
 
-``scene`` says what there is to touch, and what differs between environments; ``cpu`` and ``gpu`` step it and fill a
-``state``.
+``scene`` says what there is to touch, and what differs between environments; ``engines`` step it and fill a ``state``.
 """
 
 from __future__ import annotations

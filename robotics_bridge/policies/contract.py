@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 import math
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, is_dataclass
 from pathlib import Path
@@ -18,6 +17,7 @@ from msgspec import Meta
 
 from brainbench.core.errors import DataError, UsageError, brief, check_each, repeats
 from brainbench.core.files import read_mapping, to_json
+from brainbench.core.reading.values import typed_values
 from robotics_bridge.hands.observations import OBSERVATIONS
 from robotics_bridge.tasks.settings import CONTACTS, ContactModel
 
@@ -36,16 +36,7 @@ def from_json(kind: type[T], values: Any, where: str) -> T:
     """Return parsed JSON of ``where``, a file or a place in one, as a class."""
     if is_dataclass(kind) and isinstance(values, Mapping):
         check_each(f"setting in {where!r}", values, kind.__dataclass_fields__)
-    try:
-        return msgspec.convert(values, kind)
-    except msgspec.ValidationError as error:
-        fault, _, place = str(error).partition(" - at `$")
-        value = values
-        for step in re.findall(r"\w+|\[\.\.\.\]", place):
-            if step == "[...]":  # an entry of a mapping, whose name is not told
-                break
-            value = value[int(step)] if isinstance(value, list) else value[step]
-        raise wrong(where, place.strip(".`"), value, fault) from error
+    return typed_values(kind, values, repr(where), advice=f" It stands in {where!r}.")
 
 
 def wrong(where: str, place: str, received: Any, allowed: str) -> DataError:

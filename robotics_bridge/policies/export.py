@@ -10,10 +10,11 @@ import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from brainbench.core.errors import BrainbenchError, DataError
 from brainbench.core.files import atomic_path, file_hash, provenance, write_json
@@ -22,10 +23,7 @@ from brainbench.models.export import onnx_session, require_onnx
 from robotics_bridge.policies.contract import MOST_NUMBERS, check_contract
 from robotics_bridge.policies.student import TactilePolicy
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-Runner = Callable[[Mapping[str, "NDArray[np.float32]"], bool], "NDArray[np.float32]"]
+Runner = Callable[[Mapping[str, NDArray[np.float32]], bool], NDArray[np.float32]]
 """(groups of one row [n…], forget first) → actions [A]."""
 
 

@@ -13,7 +13,7 @@ from brainbench.core.lazy import lazy_exports
 
 if TYPE_CHECKING:
     from robotics_bridge.sensors.afferents import AfferentFilter
-    from robotics_bridge.sensors.audio.microphone import Microphone
+    from robotics_bridge.sensors.audio.runtime import Microphone
     from robotics_bridge.sensors.audio.sensors import ActuationAudio, ContactAudio
     from robotics_bridge.sensors.noise.model import Noise
     from robotics_bridge.sensors.probes.placement import Probes

@@ -20,8 +20,7 @@ from robotics_bridge.physics.state import MOST_ENVS, EnvIds, HandState, select_e
 from robotics_bridge.sensors.context import memory_of
 from robotics_bridge.sensors.kernels.pairs import clear_readings, count_update, reset_clock
 from robotics_bridge.sensors.probes.placement import Probes, enclosing_sphere
-from robotics_bridge.sensors.probes.runtime import DistanceRuntime
-from robotics_bridge.sensors.probes.sensors import ContactProbe, SurfaceDistanceProbe
+from robotics_bridge.sensors.probes.sensors import ContactProbe, DistanceRuntime, SurfaceDistanceProbe
 from robotics_bridge.sensors.queries.pairs import DIVERGED, OVERFULL, PairTable
 from robotics_bridge.sensors.queries.solids import Solids
 from robotics_bridge.sensors.runtime import History, Runtime, SuiteContext

@@ -1,6 +1,6 @@
 """Dexterous tasks as data: scene, reward terms, goals, settings of learning.
 
-``load`` returns a task, ``register`` adds one of your own, ``overrides`` changes numbers in one. ``make`` builds the
+``load`` returns a task, ``register`` adds one of your own, ``registry`` changes numbers in one. ``make`` builds the
 batched environment of a task; it stands in ``robotics_bridge.envs``, is exported here by name alone and loaded on first
 use, since tasks know nothing of environments.
 """

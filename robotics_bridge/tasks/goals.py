@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 from brainbench.core.errors import UsageError
 from brainbench.core.limits import Count, Limit, limited
 from brainbench.core.rotations import TURN, about, constant, multiply, tilted, twist_of
-from robotics_bridge.tasks.settings import Factors, check_order, unit_vector
+from robotics_bridge.tasks.settings import Factors, unit_vector
 
 if TYPE_CHECKING:
     import torch
@@ -52,7 +52,6 @@ class Goal(abc.ABC):
     """Factor by which it narrows."""
 
     def __post_init__(self) -> None:
-        check_order(self, "deadline", of="{} of a goal (s)")
         if self.axis is not None:
             object.__setattr__(self, "axis", unit_vector("axis of a goal", self.axis, 3))
         if self.start_threshold is not None and not self.threshold <= self.start_threshold:
@@ -105,13 +104,9 @@ class SteppingRotation(Goal):
 class TimedRotation(Goal):
     """Each goal is the object's orientation at the time, tilted at random about x and y, to be reached in time."""
 
-    tilt: tuple[_Half, _Half] = (-0.7853975, 0.7853975)
+    tilt: Annotated[tuple[_Half, _Half], Limit(rising=True)] = (-0.7853975, 0.7853975)
     """Range of both angles [rad]."""
     deadline: Factors | None = (4.0, 6.0)
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_order(self, "tilt", of="{} of a goal (rad)")
 
     def following(self, quat: torch.Tensor, goal: torch.Tensor, draw: torch.Tensor) -> torch.Tensor:
         """Return tilted orientations of the object."""

@@ -11,13 +11,15 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
+import torch
 
 from brainbench.core.devices import mujoco_module, warp
 from brainbench.core.errors import UsageError
 from brainbench.core.limits import Count, Limit, NotNegative, Positive, limited
+from robotics_bridge.sensors import SensorSuite
 from robotics_bridge.sensors.taxels.sensors import PUBLISHED_TWIST
 from robotics_bridge.sensors.temperature.grid import TemperatureGrid
 from robotics_bridge.sensors.temperature.materials import ABSOLUTE_ZERO, ThermalBody, ThermalMaterial, material
@@ -27,12 +29,7 @@ from robotics_bridge.tasks.objects import ball
 from robotics_bridge.tasks.registry import bounded, register
 from robotics_bridge.tasks.settings import StudentSettings, TeacherSettings
 from robotics_bridge.tasks.task import ObservationNoise, Placement, Reward, Success, Task
-
-if TYPE_CHECKING:
-    import torch
-
-    from robotics_bridge.tasks.terms import StepContext, TaskScene
-
+from robotics_bridge.tasks.terms import StepContext, TaskScene
 
 _Celsius = Annotated[float, Limit(least=ABSOLUTE_ZERO, unit="°C")]
 
@@ -98,11 +95,7 @@ class Thermometers:
     """
 
     def __init__(self, env: TaskScene, thermal: ThermalSettings, *, chooses: bool = True) -> None:
-        import torch
-
-        from robotics_bridge.sensors import SensorSuite
-
-        wp, scene = warp(), env.simulation.engine.scene
+        scene = env.simulation.engine.scene
         self._env, self.thermal, self._chooses = env, thermal, chooses
         links = [link for link in env.hand.links("fingers") if scene.geometries_of(link)]
         balls = env.model.objects
@@ -131,9 +124,12 @@ class Thermometers:
             roles[list(scene.geometries_of(tip))] = 1
         for index, name in enumerate(balls):
             roles[list(scene.geometries_of(name))] = 2 + index
-        self._roles = wp.array(roles, dtype=wp.int32, device=env.simulation.warp_device)
-        self._touch = wp.zeros((env.num_envs, len(balls)), dtype=wp.int32, device=env.simulation.warp_device)
-        self._touched = wp.to_torch(self._touch)
+        self._roles = torch.as_tensor(roles, device=env.device)
+        state = env.simulation.state
+        buffers = (state.contact_count, state.contact_geom, state.contact_env, state.contact_distance)
+        self._contacts = tuple(map(warp().to_torch, buffers))
+        self._places = torch.arange(len(self._contacts[2]), device=env.device)
+        self._touched = torch.zeros(env.num_envs, len(balls), dtype=torch.long, device=env.device)
         zeros = torch.zeros(env.num_envs, device=env.device)
         self.latched = zeros.bool()
         """[B] whether the latch has fired in this episode."""
@@ -148,14 +144,10 @@ class Thermometers:
 
     def temperature(self) -> torch.Tensor:
         """Return the highest cell temperature [B, F] of every finger link (°C)."""
-        import torch
-
         return torch.stack([cells.flatten(1).amax(dim=1) for cells in self._cells], dim=1)
 
     def reset(self, mask: torch.Tensor) -> None:
         """Begin new episodes: cold fingers, another hot ball."""
-        import torch
-
         if self._chooses:
             balls = len(self._balls)
             drawn = (self._env.draw(1, 0.0, 1.0)[:, 0] * balls).long().clamp(max=balls - 1)
@@ -184,15 +176,13 @@ class Thermometers:
 
     def update_latch(self, dt: float) -> None:
         """Advance latch and metric by a control step of dt (s)."""
-        import torch
-
-        from robotics_bridge.tasks.kernels.touching import find_touched
-
-        state, device = self._env.simulation.state, self._env.simulation.warp_device
-        self._touch.zero_()
-        inputs = [state.contact_count, state.contact_geom, state.contact_env, state.contact_distance]
-        inputs += [self._roles, self._touch]
-        warp().launch(find_touched, dim=state.contact_env.shape[0], inputs=inputs, device=device)
+        count, pair, owner, distance = self._contacts
+        used = (self._places < count) & ~(distance > 0) & (pair >= 0).all(dim=1)
+        first, second = self._roles[torch.where(used[:, None], pair, 0)].unbind(1)
+        ball = torch.where(first == 1, second, torch.where(second == 1, first, 0)) - 2
+        touches = used & (ball >= 0)
+        place = torch.where(touches, owner * len(self._balls) + ball, 0)
+        self._touched.zero_().view(-1).index_add_(0, place, touches.long())
         self.age += dt
         self.touching.copy_(self._touched.gather(1, self._env.episode.target.unsqueeze(1))[:, 0] > 0)
         # The latch fires once, at progress 1 − m of the warmest cell, and holds for the episode; S counts from then on
@@ -208,8 +198,6 @@ class Thermometers:
 
     def observe(self, group: str) -> torch.Tensor:
         """Return ``thermal`` (all cells, as progress) or ``priv_thermal`` (progress per link, latch, touch)."""
-        import torch
-
         t = self.thermal
         if group == "thermal":
             cells = torch.cat([readings.flatten(1) for readings in self._cells], dim=1)
@@ -236,8 +224,6 @@ class Thermometers:
 
     def _apply(self, mask: torch.Tensor) -> None:
         """Make the target ball hot."""
-        import torch
-
         hot = self._env.episode.target.unsqueeze(1) == self._numbers
         value = self.thermal.ambient + (self.thermal.hot - self.thermal.ambient) * hot
         present = self._heat[:, self._balls]

@@ -15,16 +15,9 @@ from brainbench.core.errors import UsageError, brief, check_each
 from brainbench.core.limits import Count, Limit, NotNegative, Positive, Share, limited
 from brainbench.core.reading.ranges import check_numbers
 
-Range = tuple[float, float]  # lower and upper bound of a uniform distribution
-Factors = tuple[NotNegative, NotNegative]  # the same of numbers that are not negative
-
-
-def check_order(options: Any, *names: str, of: str = "{}") -> None:
-    """Raise UsageError unless fields of a dataclass that are ranges (low, high) are in order; None is."""
-    for name in names:
-        value = getattr(options, name)
-        if value is not None and value[0] > value[1]:
-            raise UsageError(f"{of.replace('{}', name)} is a range (low, high); received {brief(value)}.")
+Range = Annotated[tuple[float, float], Limit(rising=True)]  # lower and upper bound of a uniform distribution
+Factors = Annotated[tuple[NotNegative, NotNegative], Limit(rising=True)]  # the same of numbers that are not negative
+Span = Annotated[tuple[Positive, Positive], Limit(rising=True)]  # and of positive ones
 
 
 def unit_vector(name: str, value: Any, count: int) -> tuple[float, ...]:
@@ -140,7 +133,7 @@ class TeacherSettings:
     """Aim of the adaptive learning rate."""
     schedule: Literal["adaptive", "fixed"] = "adaptive"
     """``adaptive``: the rate follows the KL divergence of updates; ``fixed``: it stays."""
-    learning_rate_range: tuple[Positive, Positive] = (1e-5, 1e-2)
+    learning_rate_range: Span = (1e-5, 1e-2)
     """Bounds of the adaptive rate; the widest are those of rsl_rl."""
     entropy: NotNegative = 2e-3
     """Weight of the bonus for spread actions."""
@@ -154,7 +147,7 @@ class TeacherSettings:
     """Standard deviation of the first actions."""
     std_type: str = "log"
     """Form of the policy's standard deviation (text above table 4.4; the released settings say ``log``)."""
-    std_range: tuple[Positive, Positive] = (1e-6, 1e6)
+    std_range: Span = (1e-6, 1e6)
     """Bounds of the standard deviation of actions."""
     rnd_weight: NotNegative = 100.0
     """Weight of the curiosity reward, per second; 0 trains without it."""
@@ -164,7 +157,6 @@ class TeacherSettings:
     """Learning rate of the predicting network."""
 
     def __post_init__(self) -> None:
-        check_order(self, "learning_rate_range", "std_range")
         low, high = self.learning_rate_range
         if not _WIDEST[0] <= low <= self.learning_rate <= high <= _WIDEST[1]:
             raise UsageError(

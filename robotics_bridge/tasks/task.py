@@ -21,9 +21,9 @@ from robotics_bridge.tasks.settings import (
     ContactModel,
     Factors,
     Range,
+    Span,
     StudentSettings,
     TeacherSettings,
-    check_order,
     check_parameters,
     unit_vector,
 )
@@ -65,7 +65,7 @@ class ActuatorRandomisation:
     """Factor on the gain of the velocity."""
     strength: Factors = (0.95, 1.05)
     """Factor on the torque."""
-    position_bias: tuple[_Angle, _Angle] = (-0.01, 0.01)
+    position_bias: Annotated[tuple[_Angle, _Angle], Limit(rising=True)] = (-0.01, 0.01)
     """Error of the measured joint position [rad]."""
     deadband: Factors = (0.0, 0.005)
     """Error below which the drive does nothing [rad]."""
@@ -78,10 +78,6 @@ class ActuatorRandomisation:
     torque_noise: NotNegative = 0.1
     """Half width of white noise in every physics step, in units of the joint's effort."""
 
-    def __post_init__(self) -> None:
-        names = ("stiffness", "damping", "strength", "position_bias", "deadband", "backlash", "kick_ratio")
-        check_order(self, *names, of="actuators.{}")
-
 
 @dataclass(frozen=True, kw_only=True)
 @limited(of="object_changes.{}")
@@ -92,13 +88,10 @@ class ObjectRandomisation:
     """Factor on the object's friction, which decides in all its contacts."""
     mass_offset: Range = (0.0, 0.0)
     """Added to the object's mass [kg]."""
-    size: tuple[Positive, Positive] = (1.0, 1.0)
+    size: Span = (1.0, 1.0)
     """Factor on all lengths, spread evenly over environments; drawn once."""
     each_reset: bool = True
     """Draw friction and mass anew at every reset, or once."""
-
-    def __post_init__(self) -> None:
-        check_order(self, "friction", "mass_offset", "size", of="object_changes.{}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,9 +108,6 @@ class Push:
     interval: Factors = (2.0, 4.0)
     """Time from one push to the next [s]; a control step at least."""
 
-    def __post_init__(self) -> None:
-        check_order(self, "x", "y", "z", "interval", of="push.{}")
-
 
 @dataclass(frozen=True, kw_only=True)
 @limited(of="placement.{}")
@@ -129,7 +119,7 @@ class Placement:
     x: Range = (0.0, 0.0)
     y: Range = (0.0, 0.0)
     """Coordinates of its origin [m]."""
-    yaw: tuple[_Turn, _Turn] = (0.0, 0.0)
+    yaw: Annotated[tuple[_Turn, _Turn], Limit(rising=True)] = (0.0, 0.0)
     """About the vertical [rad]."""
     quaternion: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
     """Orientation at yaw 0 (w, x, y, z); made unit length."""
@@ -137,7 +127,6 @@ class Placement:
     """Places of several objects, taken in random order [m]; x, y and height are added."""
 
     def __post_init__(self) -> None:
-        check_order(self, "x", "y", "yaw", of="placement.{}")
         object.__setattr__(self, "quaternion", unit_vector("placement.quaternion", self.quaternion, 4))
 
 

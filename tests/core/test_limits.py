@@ -295,3 +295,19 @@ def test_values_without_annotation_are_read_like_the_present_ones():
     assert read_value("count", "2", kind_of(1)) == 2
     assert read_value("target", "0,0,.5", kind_of((0.0, 0.0, 1.0))) == (0.0, 0.0, 0.5)
     assert read_value("limit", "3", kind_of(None)) == 3.0
+
+
+@dataclass(frozen=True)
+@limited(of="{} of a draw")
+class _Draw:
+    span: Annotated[tuple[float, float], Limit(rising=True)] | None = None
+
+
+def test_a_range_is_in_order_also_where_it_comes_from_a_file() -> None:
+    assert _Draw((1.0, 1.0)).span == (1.0, 1.0)
+    with pytest.raises(UsageError, match=r"span of a draw is a range \(low, high\); received \(2.0, 1.0\)"):
+        _Draw((2.0, 1.0))
+    with pytest.raises((UsageError, msgspec.ValidationError), match="is a range"):
+        msgspec.convert({"span": [2.0, 1.0]}, _Draw)
+    with pytest.raises(UsageError, match="is a range"):
+        with_changes(_Draw((0.0, 1.0)), {"span": "2,1"})

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from robotics_bridge.sensors.calibration.log import Log
+from robotics_bridge.sensors.calibration.calibrate import Log
 from robotics_bridge.sensors.noise.model import Noise
 from robotics_bridge.sensors.noise.stages import simulate
 

@@ -232,7 +232,7 @@ def _layout(path: Path) -> Any:
 
 
 def _student(path: Path) -> Any:
-    from robotics_bridge.policies.training.student_files import load_student
+    from robotics_bridge.policies.training.distill import load_student
 
     student, described = load_student(path.parent)
     return dict(student.state_dict()), described

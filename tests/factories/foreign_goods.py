@@ -12,8 +12,7 @@ from brainbench.core.files import write_json
 from brainbench.core.identity import SealedPlan, content_hash
 from brainbench.scoring.options import ScoreOptions
 from robotics_bridge import hands
-from robotics_bridge.deploy.links.episodes import PARTS, SessionFacts, TactilePoints, write_lerobot
-from robotics_bridge.deploy.links.replay import taxel_names
+from robotics_bridge.deploy.links.replay import PARTS, SessionFacts, TactilePoints, taxel_names, write_lerobot
 from tests.factories import policies, published_surfaces, reading_surfaces, robot_surfaces
 from tests.factories.ringdown_table import write_ringdown
 from tests.factories.scored_files import write_study

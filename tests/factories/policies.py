@@ -15,8 +15,8 @@ from robotics_bridge import hands
 from robotics_bridge.policies.export import export_policy
 from robotics_bridge.policies.shipped import FOLDER
 from robotics_bridge.policies.student import TactilePolicy
+from robotics_bridge.policies.training.distill import build_student
 from robotics_bridge.policies.training.distill_config import DistillConfig
-from robotics_bridge.policies.training.student_files import build_student
 from robotics_bridge.tasks.settings import CONTACTS
 from robotics_bridge.tasks.task import TASK_VERSION
 

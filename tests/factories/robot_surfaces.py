@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 
 from robotics_bridge import hands, tasks
-from robotics_bridge.deploy.links.frames import KEY, read_key
 from robotics_bridge.deploy.links.simulated_hand import Faults
+from robotics_bridge.deploy.links.udp import KEY, read_key
 from robotics_bridge.hands.layouts import read_probes, write_probes
 from robotics_bridge.policies.contract import PolicyContract
+from robotics_bridge.policies.training.distill import load_student
 from robotics_bridge.policies.training.distill_config import StudentSweep, read_sweep
-from robotics_bridge.policies.training.student_files import load_student
-from robotics_bridge.sensors.calibration.log import read_log
+from robotics_bridge.sensors.calibration.calibrate import read_log
 from robotics_bridge.sensors.noise.model import Noise
 from robotics_bridge.tasks.registry import apply_overrides
 from tests.factories.policies import contract_of, student_folder

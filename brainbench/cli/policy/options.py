@@ -90,7 +90,7 @@ def agent_of(name: str, env: Env, *, seed: int = 0) -> Any:
         return evaluate.agent(name, env, seed=seed)
     if stored(name).get("brainbench_student"):
         from robotics_bridge.policies.fit import check_fit
-        from robotics_bridge.policies.training.student_files import load_student
+        from robotics_bridge.policies.training.distill import load_student
 
         student, described = load_student(name, device=str(env.device))
         check_fit(described, env, name)

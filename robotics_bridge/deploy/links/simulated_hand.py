@@ -21,8 +21,7 @@ from brainbench.core.limits import Limit, Seed, Share, limited, read_pairs, with
 from brainbench.core.reading.ranges import check_number
 from robotics_bridge import hands
 from robotics_bridge.deploy.driver import DriverRequest, HandReading
-from robotics_bridge.deploy.links.frames import new_key
-from robotics_bridge.deploy.links.udp import LOOPBACK, HandEnd, HandLink, UdpDriver
+from robotics_bridge.deploy.links.udp import LOOPBACK, HandEnd, HandLink, UdpDriver, new_key
 from robotics_bridge.deploy.session import PressureCalibration
 from robotics_bridge.hands.layouts import check_probes
 from robotics_bridge.hands.observations import observation_type, observe, sensors_for

@@ -1,28 +1,206 @@
 """The driver of a hand behind a UDP socket, local or remote; frames are authenticated with a key that both sides hold.
 
 A session begins with three frames: greeting, welcome, start. Its keys come from the shared key and a fresh nonce of
-either side (:mod:`~robotics_bridge.deploy.links.frames`).
+either side.
+
+A frame is one datagram, little-endian. Header: 4 bytes ``BBH3``, kind, joints J, fingers F, 0 (u8 each), sequence
+(u32), time of the sender's clock (f64, s). A state carries positions f32[J], velocities f32[J] and pressures f32[F·3];
+a command the number of the report that it was decided from (u32), the time of the hand's clock until which it holds
+(f64, s; infinite for none) and f32[J] targets; a greeting the controller's nonce (16 bytes), a welcome the controller's
+and the hand's. HMAC-SHA256 (RFC 2104) of all of it ends the frame, 32 bytes.
 """
 
 from __future__ import annotations
 
 import contextlib
+import hmac
 import math
+import os
 import secrets
 import socket
+import struct
 import time
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from brainbench.core.errors import UsageError, check_once
+from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, check_once
 from brainbench.core.reading.ranges import check_number
 from robotics_bridge import hands
-from robotics_bridge.deploy.driver import DriverRequest, HandReading, LinkCounters
-from robotics_bridge.deploy.links import frames
-from robotics_bridge.deploy.links.frames import Frame, Receiver
-from robotics_bridge.deploy.safety import ClockOffset
+from robotics_bridge.deploy.driver import ClockOffset, DriverRequest, HandReading, LinkCounters
+
+MAGIC = b"BBH3"
+"""Version of the frames; either end drops those of another one. In ``BBH2`` commands were targets alone."""
+HELLO, WELCOME, START, STATE, COMMAND, STOP = range(1, 7)
+"""Kinds: the controller asks for a session, the hand offers one, the controller takes it; then states and commands."""
+LARGEST = 8192  # bytes of the largest datagram that is read: more than a state of MOST joints and fingers
+MOST = 255  # most joints and fingers of a hand
+NONCE, KEY = 16, 32  # bytes of a nonce and of a key
+_HEADER = struct.Struct("<4sBBBxId")
+_TAG = 32
+_ORIGIN = struct.Struct("<Id")  # what a command comes from: number of its report, time until which it holds
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """An authentic datagram."""
+
+    kind: int
+    """:data:`HELLO` to :data:`STOP`."""
+    joints: int
+    """J."""
+    fingers: int
+    """F."""
+    sequence: int
+    """Number of the frame in its session and direction; goes on from 0 after 2³² − 1."""
+    time: float
+    """Time of the sender's clock (s)."""
+    body: bytes = b""
+    """Nonces, or values as f32."""
+
+    @property
+    def values(self) -> NDArray[np.float64]:
+        """Positions (rad), velocities (rad/s) and pressures of a state, targets (rad) of a command, in this order."""
+        return np.frombuffer(self.body, "<f4", offset=_ORIGIN.size * (self.kind == COMMAND)).astype(np.float64)
+
+    @property
+    def origin(self) -> tuple[int, float]:
+        """Number of the report that a command was decided from, and the time (s, of the hand) until which it holds."""
+        return _ORIGIN.unpack_from(self.body)
+
+
+def pack_command(targets: ArrayLike, report: int = 0, until: float = math.inf) -> bytes:
+    """Return targets (rad) as the body of a command."""
+    return _ORIGIN.pack(report & 0xFFFFFFFF, until) + pack_values(targets)
+
+
+def pack_values(values: ArrayLike) -> bytes:
+    """Return values as the body of a frame; what is too large for it becomes infinite."""
+    with np.errstate(over="ignore"):
+        return np.asarray(values, dtype="<f4").tobytes()
+
+
+def encode(frame: Frame, key: bytes) -> bytes:
+    """Return the bytes of a frame, authenticated by a key."""
+    head = _HEADER.pack(MAGIC, frame.kind, frame.joints, frame.fingers, frame.sequence & 0xFFFFFFFF, frame.time)
+    return head + frame.body + hmac.digest(key, head + frame.body, "sha256")
+
+
+def decode(data: bytes, key: bytes) -> Frame | None:
+    """Return what a datagram says; None if it has another size or form, or was not made with this key."""
+    if not _HEADER.size + _TAG <= len(data) <= LARGEST:
+        return None
+    signed, tag = data[:-_TAG], data[-_TAG:]
+    if not hmac.compare_digest(hmac.digest(key, signed, "sha256"), tag):
+        return None
+    magic, kind, joints, fingers, sequence, time = _HEADER.unpack_from(signed)
+    sizes = {
+        HELLO: NONCE,
+        WELCOME: 2 * NONCE,
+        START: 0,
+        STATE: 4 * (2 * joints + 3 * fingers),
+        COMMAND: _ORIGIN.size + 4 * joints,
+    }
+    size = {**sizes, STOP: 0}.get(kind)
+    if magic != MAGIC or len(signed) - _HEADER.size != size or not np.isfinite(time):
+        return None
+    return Frame(kind, joints, fingers, sequence, time, signed[_HEADER.size :])
+
+
+def session_keys(key: bytes, controller: bytes, hand: bytes) -> tuple[bytes, bytes]:
+    """Return the keys (to the hand, to the controller) of a session from the shared key and both nonces."""
+    # Both sides add a fresh nonce, so frames of an earlier session fit no later one; one key per direction, so that no
+    # frame can be sent back to its sender.
+    first, second = (hmac.digest(key, label + controller + hand, "sha256") for label in (b"to hand", b"to controller"))
+    return first, second
+
+
+def new_key() -> bytes:
+    """Return a new random key."""
+    return secrets.token_bytes(KEY)
+
+
+def check_key(key: bytes) -> None:
+    """Raise UsageError unless a key has :data:`KEY` bytes: a short one, or none, would let strangers move the hand."""
+    if not isinstance(key, bytes) or len(key) != KEY:
+        raise UsageError(f"The key of a hand is {KEY} bytes, as new_key and read_key give it; another came.")
+
+
+def read_key(path: str | os.PathLike[str]) -> bytes:
+    """Read a key from a file of 64 hexadecimal digits that nobody but its owner can read.
+
+    Raises:
+        DataFileNotFoundError: there is no such file.
+    """
+    path = Path(path)
+    hint = f"Make one with: (umask 077; openssl rand -hex {KEY} > hand.key), and copy it to the hand's computer."
+    if not path.is_file():
+        raise DataFileNotFoundError(f"There is no key file {str(path)!r}. {hint}")
+    if os.name == "posix" and path.stat().st_mode & 0o077:
+        raise DataError(f"Other users of this computer can read the key {str(path)!r}; run: chmod 600 {path.name}")
+    try:
+        with path.open("rb") as stream:
+            key = bytes.fromhex(stream.read(LARGEST).decode("ascii"))
+    except (OSError, ValueError):
+        key = b""
+    if len(key) != KEY:
+        raise DataError(f"{str(path)!r} holds no key of {2 * KEY} hexadecimal digits. {hint}")
+    return key
+
+
+Verdict = Literal["new", "late", "replayed", "stale"]
+"""``late``: came after a newer one for the first time; ``replayed``: again; ``stale``: too old, by number or time."""
+MAX_AGE = 0.25  # oldest frame that has an effect (s); as long as a hand without commands moves on
+
+
+class SequenceWindow:
+    """Numbers of 32 bits that were seen, with wrap-around (RFC 1982) and a window as in RFC 4303, section 3.4.3."""
+
+    SIZE = 1024
+    """Numbers behind the newest that are told apart."""
+    _SPAN = 1 << 32
+
+    def __init__(self) -> None:
+        self.newest: int | None = None
+        self._seen = 0  # bit i: newest - i was seen
+
+    def judge(self, number: int) -> tuple[Verdict, int]:
+        """Count a number; return what it is, and how many were skipped if it is new."""
+        if self.newest is None:
+            self.newest, self._seen = number, 1
+            return "new", 0
+        ahead = (number - self.newest) % self._SPAN
+        if 0 < ahead < self._SPAN // 2:
+            # Shifted by the whole window at most: a jump must not build a number of 2³¹ bits.
+            self._seen = (self._seen << min(ahead, self.SIZE)) & ((1 << self.SIZE) - 1) | 1
+            self.newest = number
+            return "new", ahead - 1
+        behind = (self.newest - number) % self._SPAN
+        if behind >= self.SIZE:
+            return "stale", 0
+        if self._seen >> behind & 1:
+            return "replayed", 0
+        self._seen |= 1 << behind
+        return "late", 0
+
+
+class Receiver:
+    """One direction of one session; ``offset`` is what is known already of the sender's clock."""
+
+    def __init__(self, key: bytes, offset: ClockOffset | None = None) -> None:
+        self.key = key
+        self._window, self._offset = SequenceWindow(), offset or ClockOffset()
+
+    def judge(self, frame: Frame, now: float) -> tuple[Verdict, int]:
+        """Return what an authentic frame that arrives now is, and how many were skipped if it is new."""
+        verdict, skipped = self._window.judge(frame.sequence)
+        # A number comes back after 2³² frames, a time never does.
+        age = self._offset.age(frame.time, now, now) if verdict in ("new", "late") else 0.0
+        return ("stale", skipped) if age > MAX_AGE else (verdict, skipped)
+
 
 LOOPBACK = "127.0.0.1"
 GREET_EVERY = 0.2
@@ -43,7 +221,7 @@ class HandEnd(NamedTuple):
     fingers: tuple[str, ...]
     """Names of its sensing fingers, in its order."""
     key: bytes
-    """Shared key (:func:`~robotics_bridge.deploy.links.frames.read_key`)."""
+    """Shared key (:func:`~robotics_bridge.deploy.links.udp.read_key`)."""
 
 
 def open_remote(request: DriverRequest) -> UdpDriver:
@@ -56,19 +234,19 @@ def open_remote(request: DriverRequest) -> UdpDriver:
     if request.faults:
         raise UsageError("--fault is of the simulated hand; a hand behind a socket has faults of its own.")
     hand = hands.load(request.contract.hand)
-    return UdpDriver((host, int(port)), hand.joints, tuple(hand.fingers), frames.read_key(request.key))
+    return UdpDriver((host, int(port)), hand.joints, tuple(hand.fingers), read_key(request.key))
 
 
 class UdpDriver:
     """Speaks to a hand that holds the same key; arguments as of :class:`HandEnd`."""
 
     def __init__(self, address: tuple[str, int], joints: tuple[str, ...], fingers: tuple[str, ...], key: bytes) -> None:
-        check_number("joints of a hand", len(joints), least=1, most=frames.MOST)
-        check_number("fingers of a hand", len(fingers), most=frames.MOST)
+        check_number("joints of a hand", len(joints), least=1, most=MOST)
+        check_number("fingers of a hand", len(fingers), most=MOST)
         check_once("joints of a hand", joints)
         check_once("fingers of a hand", fingers)
         check_number("port of a hand", address[1], least=1, most=65535, whole=True)
-        frames.check_key(key)
+        check_key(key)
         self.address, self.joints, self.fingers = (address[0] or LOOPBACK, address[1]), joints, fingers
         self.counters = LinkCounters()
         self._key = key
@@ -92,7 +270,7 @@ class UdpDriver:
         """Return the newest report, the same one again if nothing came, or None before the first."""
         for _ in range(MOST_AT_ONCE):
             try:
-                data = self._socket.recv(frames.LARGEST + 1)
+                data = self._socket.recv(LARGEST + 1)
             except BlockingIOError:
                 break
             except OSError as error:  # nobody listens there (any more): silence, which the watchdog hears
@@ -107,33 +285,33 @@ class UdpDriver:
 
     def _greet(self, now: float) -> None:
         # A new nonce each time, so that the answer is as young as its greeting.
-        self._nonce, self._greeted = secrets.token_bytes(frames.NONCE), now
-        hello = Frame(frames.HELLO, len(self.joints), len(self.fingers), 0, now, self._nonce)
-        self._send(frames.encode(hello, self._key))
+        self._nonce, self._greeted = secrets.token_bytes(NONCE), now
+        hello = Frame(HELLO, len(self.joints), len(self.fingers), 0, now, self._nonce)
+        self._send(encode(hello, self._key))
 
     def _welcomed(self, data: bytes, now: float) -> bool:
         """Begin the session that the hand offers; return False where the datagram offers none."""
-        welcome = frames.decode(data, self._key)
-        if welcome is None or welcome.kind != frames.WELCOME:
+        welcome = decode(data, self._key)
+        if welcome is None or welcome.kind != WELCOME:
             return False
-        ours, theirs = welcome.body[: frames.NONCE], welcome.body[frames.NONCE :]
+        ours, theirs = welcome.body[:NONCE], welcome.body[NONCE:]
         if ours != self._nonce or now - self._greeted > GREET_EVERY:
             self.counters.stale += 1
             return True
-        self._send_key, key = frames.session_keys(self._key, ours, theirs)
+        self._send_key, key = session_keys(self._key, ours, theirs)
         self._nonce = b""  # a greeting begins one session
         # The welcome was under way for at most GREET_EVERY: later reports cannot all be much older unnoticed.
         offset = ClockOffset()
         offset.age(welcome.time, now, now)
         self._receiver, self._sequence = Receiver(key, offset), 0
-        self._command(frames.START)
+        self._command(START)
         return True
 
     def _take(self, data: bytes, now: float) -> bool:
         """Take a report; return False where the datagram is none of this session and hand."""
-        frame = frames.decode(data, self._receiver.key) if self._receiver is not None else None
+        frame = decode(data, self._receiver.key) if self._receiver is not None else None
         joints, fingers = len(self.joints), len(self.fingers)
-        if frame is None or self._receiver is None or frame.kind != frames.STATE:
+        if frame is None or self._receiver is None or frame.kind != STATE:
             return False
         if (frame.joints, frame.fingers) != (joints, fingers):
             return False
@@ -157,26 +335,26 @@ class UdpDriver:
         """
         fits = np.shape(targets) == (len(self.joints),)
         # As they would be sent: a large double is infinite as a float.
-        if not (fits and np.isfinite(np.frombuffer(frames.pack_values(targets), "<f4")).all()):
+        if not (fits and np.isfinite(np.frombuffer(pack_values(targets), "<f4")).all()):
             self.stop()
             raise UsageError(f"A command is {len(self.joints)} finite targets (rad); received {str(targets)[:80]}.")
         if not self._stopped:
             number, until = (0, math.inf) if report is None else (report.sequence, report.time + allowed)
-            self._command(frames.COMMAND, frames.pack_command(targets, number, until))
+            self._command(COMMAND, pack_command(targets, number, until))
 
     def stop(self) -> None:
         """Hold where the hand is, and refuse targets until it is connected anew."""
         self._stopped = True
         # The one frame that must not be lost; the hand's own watchdog is behind it.
         for _ in range(5):
-            self._command(frames.STOP)
+            self._command(STOP)
 
     def _command(self, kind: int, body: bytes = b"") -> None:
         if not self._send_key:
             return  # no session yet: nothing can move
         self._sequence += 1
         frame = Frame(kind, len(self.joints), len(self.fingers), self._sequence, time.monotonic(), body)
-        self._send(frames.encode(frame, self._send_key))
+        self._send(encode(frame, self._send_key))
 
     def close(self) -> None:
         """End the connection."""
@@ -206,20 +384,20 @@ class HandLink:
 
     Args:
         link: A bound UDP socket.
-        key: Shared key (:func:`~robotics_bridge.deploy.links.frames.read_key`).
+        key: Shared key (:func:`~robotics_bridge.deploy.links.udp.read_key`).
         joints: J.
         fingers: F.
     """
 
     def __init__(self, link: socket.socket, key: bytes, joints: int, fingers: int) -> None:
-        frames.check_key(key)
+        check_key(key)
         link.setblocking(False)
         self.link, self.joints, self.fingers = link, joints, fingers
         self.peer: Any = ()
         """Address of the controller; empty without a session."""
         self.stopped = True
         """True until a session begins, and after its stop: the hand holds where it is."""
-        self._key, self._challenge = key, secrets.token_bytes(frames.NONCE)
+        self._key, self._challenge = key, secrets.token_bytes(NONCE)
         self._offered: dict[tuple[Any, bytes], tuple[bytes, bytes]] = {}  # who may start a session → its two keys
         self._receiver: Receiver | None = None
         self._send_key = b""
@@ -230,7 +408,7 @@ class HandLink:
         targets = None
         for _ in range(MOST_AT_ONCE):
             try:
-                data, sender = self.link.recvfrom(frames.LARGEST + 1)
+                data, sender = self.link.recvfrom(LARGEST + 1)
             except ConnectionError:
                 continue
             except OSError:  # nothing more
@@ -246,8 +424,8 @@ class HandLink:
     def report(self, values: ArrayLike, time: float) -> bytes:
         """Return the frame of a report: positions, velocities and pressures [2J + 3F], measured at a time (s)."""
         self._sequence += 1
-        state = Frame(frames.STATE, self.joints, self.fingers, self._sequence, time, frames.pack_values(values))
-        return frames.encode(state, self._send_key)
+        state = Frame(STATE, self.joints, self.fingers, self._sequence, time, pack_values(values))
+        return encode(state, self._send_key)
 
     def send(self, data: bytes) -> None:
         """Send a frame to the controller, if there is one."""
@@ -257,24 +435,24 @@ class HandLink:
 
     def _offer(self, data: bytes, sender: Any, now: float) -> None:
         """Answer a greeting. A greeting that is repeated by a stranger ends no session and begins none."""
-        hello = frames.decode(data, self._key)
-        if hello is None or (hello.kind, hello.joints, hello.fingers) != (frames.HELLO, self.joints, self.fingers):
+        hello = decode(data, self._key)
+        if hello is None or (hello.kind, hello.joints, hello.fingers) != (HELLO, self.joints, self.fingers):
             return
         # Each greeting has an offer of its own: one that a stranger repeats takes no place of another.
         self._offered.pop((sender, hello.body), None)
-        self._offered[sender, hello.body] = frames.session_keys(self._key, hello.body, self._challenge)
+        self._offered[sender, hello.body] = session_keys(self._key, hello.body, self._challenge)
         if len(self._offered) > MOST_OFFERS:
             del self._offered[next(iter(self._offered))]
         body = hello.body + self._challenge
-        welcome = frames.encode(Frame(frames.WELCOME, self.joints, self.fingers, 0, now, body), self._key)
+        welcome = encode(Frame(WELCOME, self.joints, self.fingers, 0, now, body), self._key)
         with contextlib.suppress(OSError):
             self.link.sendto(welcome, sender)
 
     def _start(self, data: bytes, sender: Any, now: float) -> bool:
         """Begin the session that was offered to this sender; return False where the datagram starts none."""
         for (offered, _), keys in self._offered.items():
-            frame = frames.decode(data, keys[0]) if sender == offered else None
-            if frame is not None and frame.kind == frames.START:
+            frame = decode(data, keys[0]) if sender == offered else None
+            if frame is not None and frame.kind == START:
                 break
         else:
             return False
@@ -283,21 +461,21 @@ class HandLink:
         self._receiver.judge(frame, now)
         self.peer, self.stopped = sender, False
         # Used once: what was recorded of this session starts no other.
-        self._offered, self._challenge = {}, secrets.token_bytes(frames.NONCE)
+        self._offered, self._challenge = {}, secrets.token_bytes(NONCE)
         return True
 
     def _command(self, data: bytes, sender: Any, now: float) -> NDArray[np.float64] | None:
         """Return the targets of a command of this session that is new, young and possible; heed its stop."""
         if self._receiver is None or sender != self.peer:
             return None
-        frame = frames.decode(data, self._receiver.key)
+        frame = decode(data, self._receiver.key)
         if frame is None or frame.joints != self.joints:
             return None
         verdict, _ = self._receiver.judge(frame, now)
-        if frame.kind == frames.STOP:
+        if frame.kind == STOP:
             # However late it comes: to hold is safe.
             self.stopped = True
         # A comparison with NaN is false.
-        if frame.kind != frames.COMMAND or verdict != "new" or not (np.abs(frame.values) <= FARTHEST).all():
+        if frame.kind != COMMAND or verdict != "new" or not (np.abs(frame.values) <= FARTHEST).all():
             return None
         return frame.values if now <= frame.origin[1] else None

@@ -80,11 +80,6 @@ def actuate(
 
 
 @wp.kernel(module="unique")
-def count_launch(random: wp.array(dtype=wp.int32)):
-    random[0] = random[0] + 1
-
-
-@wp.kernel(module="unique")
 def add_contact_forces(
     count: wp.array(dtype=wp.int32),  # [1] contacts in use
     geoms: wp.array(dtype=wp.vec2i),  # [C]

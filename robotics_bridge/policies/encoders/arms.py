@@ -26,8 +26,14 @@ from brainbench.models.recipes import Architecture
 from brainbench.models.registry import list_models
 from robotics_bridge import hands
 from robotics_bridge.hands.observations import observation_type
-from robotics_bridge.policies.encoders.front_end import FrontEnd, HandCalibration, Learning, Time
-from robotics_bridge.policies.encoders.taxel_grid import TaxelGraph, TaxelGrid
+from robotics_bridge.policies.encoders.taxel_grid import (
+    FrontEnd,
+    HandCalibration,
+    Learning,
+    TaxelGraph,
+    TaxelGrid,
+    Time,
+)
 
 MOST_CELLS = 64
 """Cells of a picture beyond which the products outweigh what they save (they grow with the square of P)."""

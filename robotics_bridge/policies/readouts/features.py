@@ -20,8 +20,7 @@ from brainbench.models.registry import locate_model
 from robotics_bridge.envs.env import Env
 from robotics_bridge.hands.observations import TAXELS_IN_CONTACT
 from robotics_bridge.policies.encoders.arms import EchoState
-from robotics_bridge.policies.encoders.front_end import FrontEnd, HandCalibration, Time
-from robotics_bridge.policies.encoders.taxel_grid import TaxelGraph, TaxelGrid
+from robotics_bridge.policies.encoders.taxel_grid import FrontEnd, HandCalibration, TaxelGraph, TaxelGrid, Time
 from robotics_bridge.policies.evaluate import Acting, forget
 from robotics_bridge.sensors.noise.model import PRESETS
 

@@ -20,13 +20,11 @@ from brainbench.core.limits import Count, Limit, limited
 from brainbench.core.progress import Progress
 from robotics_bridge.envs.env import Env
 from robotics_bridge.hands.layouts import PLACEMENTS, Layout, active_count
-from robotics_bridge.policies.encoders.front_end import FrontEnd
-from robotics_bridge.policies.encoders.taxel_grid import TaxelGraph, TaxelGrid
+from robotics_bridge.policies.encoders.taxel_grid import FrontEnd, TaxelGraph, TaxelGrid
 from robotics_bridge.policies.evaluate import Acting
 from robotics_bridge.policies.readouts.features import (
     ARMS,
     TARGETS,
-    Features,
     Subject,
     TouchRollout,
     calibrate,
@@ -34,7 +32,7 @@ from robotics_bridge.policies.readouts.features import (
     networks,
     traces,
 )
-from robotics_bridge.sensors.probes.placement import Probes
+from robotics_bridge.sensors.probes.placement import Probes, farthest_points
 
 FOLDS = 5
 FARTHEST = 10.0  # standard deviations to which features are cut
@@ -268,13 +266,10 @@ def even_taxels(layout: Mapping[str, Probes], count: int) -> list[int]:
     whole[np.argsort(whole - share, kind="stable")[: count - whole.sum()]] += 1
     taxels: list[int] = []
     for first, number, probes in zip(np.cumsum(sizes) - sizes, whole, layout.values(), strict=True):
-        points, mine = probes.position[probes.active], []
-        away = -np.linalg.norm(points - points.mean(0), axis=1)
-        for _ in range(number):
-            mine.append(int(away.argmax()))
-            gap = np.linalg.norm(points - points[mine[-1]], axis=1)
-            away = gap if len(mine) == 1 else np.minimum(away, gap)
-        taxels += [int(first) + one for one in mine]
+        points = probes.position[probes.active]
+        if number:
+            middle = int(np.linalg.norm(points - points.mean(0), axis=1).argmin())
+            taxels += [int(first) + one for one in farthest_points(points, number, middle)]
     return taxels
 
 
@@ -417,14 +412,10 @@ def probe(env: Env, policy: Acting, options: ProbeOptions, progress: Progress | 
     for index, name in enumerate(names):
         say(index + 1, len(names) + 1, f"reading {name}")
         features = ARMS[name](subject) if name in ARMS else networks("native", name, subject)
-        readouts.append(read_arm(name, rollout, features))
+        solved = [read_targets(rollout.proprio, draw, rollout.wanted, rollout.valid) for draw in features]
+        errors = np.stack([one for one, _ in solved])
+        readouts.append(Readout(name, features[0].shape[-1], errors, solved[0][1]))
     return readouts
-
-
-def read_arm(name: str, rollout: TouchRollout, draws: Sequence[Features]) -> Readout:
-    """Return what is read from an arm's features, once for each draw."""
-    solved = [read_targets(rollout.proprio, draw, rollout.wanted, rollout.valid) for draw in draws]
-    return Readout(name, draws[0].shape[-1], np.stack([one for one, _ in solved]), solved[0][1])
 
 
 @torch.no_grad()

@@ -15,13 +15,12 @@ from brainbench.core.files import read_json, read_mapping, write_json
 from brainbench.core.progress import Progress, track
 from robotics_bridge import tasks
 from robotics_bridge.policies.encoders.arms import ARMS, EncoderConfig
-from robotics_bridge.policies.encoders.front_end import CONTROL_SUB_STEP, HandCalibration
+from robotics_bridge.policies.encoders.taxel_grid import CONTROL_SUB_STEP, HandCalibration
 from robotics_bridge.policies.evaluate import Policy, evaluate
 from robotics_bridge.policies.fit import check_version, with_contacts_of
 from robotics_bridge.policies.shipped import list_policies
-from robotics_bridge.policies.training.distill import DistillResult, distill
+from robotics_bridge.policies.training.distill import CONFIG, DistillResult, distill, load_student
 from robotics_bridge.policies.training.distill_config import DistillConfig
-from robotics_bridge.policies.training.student_files import CONFIG, load_student
 from robotics_bridge.policies.training.teacher import load_teacher
 from robotics_bridge.tasks.settings import CONTACTS, contacts_name
 

@@ -15,7 +15,7 @@ import time
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 import torch
 
@@ -39,20 +39,16 @@ from brainbench.core.runs.folder import (
     set_random_state,
 )
 from brainbench.core.runs.log import RunLog, check_sinks
-from robotics_bridge.envs.env import RslRlEnv
+from robotics_bridge.envs.env import Env, RslRlEnv
 from robotics_bridge.policies.contract import from_json
 from robotics_bridge.policies.evaluate import Policy
 from robotics_bridge.policies.fit import check_fit, check_version
 from robotics_bridge.policies.shipped import SENSING, policy_path
 from robotics_bridge.policies.student import TACTILE, ActingModel
-from robotics_bridge.policies.training.distill import describe_run
+from robotics_bridge.policies.training.distill import CONFIG, MODEL, describe_run
 from robotics_bridge.policies.training.distill_config import DistillConfig
-from robotics_bridge.policies.training.student_files import CONFIG, MODEL
 from robotics_bridge.tasks.settings import CONTACTS, TeacherSettings, contacts_name
 from robotics_bridge.tasks.task import GROUPS, TASK_VERSION, Task, check_measured
-
-if TYPE_CHECKING:
-    from robotics_bridge.envs.env import Env
 
 SENSES = {
     "proprio": "proprio", "touch": TACTILE, "command": "command", "link_pose": "link_pose", "thermal": "thermal"

@@ -61,12 +61,13 @@ def elastic_material(name: str | ElasticMaterial) -> ElasticMaterial:
 
 
 @dataclass(frozen=True)
+@limited(of="{} of a mode")
 class Modes:
     """Damped modes of a solid."""
 
-    frequency: tuple[float, ...]
+    frequency: tuple[Positive, ...]
     """[Hz]."""
-    decay: tuple[float, ...]
+    decay: tuple[NotNegative, ...]
     """Amplitude decay rate [1/s]."""
     gain: tuple[float, ...]
     """Velocity of the surface per impulse [1/kg]: the mode's normal components where it is struck and heard."""
@@ -77,10 +78,6 @@ class Modes:
                 f"Modes need as many frequencies as decays and gains; received {len(self.frequency)}, "
                 f"{len(self.decay)} and {len(self.gain)}."
             )
-        for frequency, decay, gain in self.rows():
-            check_number("frequency of a mode", frequency, above=0)
-            check_number("decay of a mode", decay, least=0)
-            check_number("gain of a mode", gain)
 
     def rows(self) -> Sequence[tuple[float, float, float]]:
         """Return (frequency, decay, gain) of each mode."""

@@ -1,5 +1,5 @@
 """Noise knobs fitted to a recording of a real device, an optional room.
 
-``log`` reads the recording, ``likelihood`` fits the dynamics and the delays, ``calibrate`` decides and reports,
-``commands`` brings ``brainbench tactile calibrate``.
+``calibrate`` reads the recording, decides and reports, ``likelihood`` fits the dynamics and the delays, ``commands``
+brings ``brainbench tactile calibrate``.
 """

@@ -24,7 +24,7 @@ def calibrate(
     Load the preset with robotics_bridge.sensors.Noise.load(path).
     """
     from robotics_bridge.sensors.calibration.calibrate import calibrate as fit
-    from robotics_bridge.sensors.calibration.log import read_log
+    from robotics_bridge.sensors.calibration.calibrate import read_log
 
     check_number("--max-delay (s)", max_delay, least=0)
     result = fit(read_log(log), max_delay=max_delay)

@@ -19,8 +19,9 @@ from scipy.signal import lfilter
 from scipy.stats import chi2
 
 from brainbench.core.errors import DataError
-from robotics_bridge.sensors.calibration.log import Episode
 
+Episode = tuple["NDArray[np.float64]", "NDArray[np.float64]"]
+"""x [T], y [T, N]: the true signal and the readings."""
 Aligned = tuple["NDArray[np.float64]", "NDArray[np.float64]", "NDArray[np.int64]"]
 """x [T'] from the start of the episode, readings y [T, N], and for each reading the index of x that it shows."""
 

@@ -26,8 +26,7 @@ from brainbench.core.devices import warp
 from robotics_bridge.physics.kernels.state import StateArrays
 from robotics_bridge.sensors.kernels.distance import FAR, SIDED, SolidArrays, shape_functions
 from robotics_bridge.sensors.kernels.pairs import PairArrays, SlotArrays
-from robotics_bridge.sensors.kernels.readout import ProbeArrays, ReadoutArrays, silenced
-from robotics_bridge.sensors.kernels.wide import load_planes, store_planes
+from robotics_bridge.sensors.kernels.readout import ProbeArrays, ReadoutArrays, load_planes, silenced, store_planes
 
 wp = warp()
 

@@ -15,6 +15,7 @@ from brainbench.core.devices import warp
 from robotics_bridge.sensors.kernels.contact_load import ContactFaces, PressArrays, SpreadPlan
 from robotics_bridge.sensors.kernels.distance import FAR, SIDED, SolidArrays, SolidShape, shape_functions
 from robotics_bridge.sensors.kernels.noise import NoiseParams, episode_draw, radius_noise
+from robotics_bridge.sensors.kernels.noise import power as series_power
 from robotics_bridge.sensors.kernels.pairs import PairArrays
 from robotics_bridge.sensors.kernels.readout import (
     CLEAN,
@@ -22,11 +23,12 @@ from robotics_bridge.sensors.kernels.readout import (
     STAGED,
     ProbeArrays,
     ReadoutArrays,
+    entry_of,
+    load_four,
     readout_functions,
     silenced,
+    store_planes,
 )
-from robotics_bridge.sensors.kernels.series import power as series_power
-from robotics_bridge.sensors.kernels.wide import entry_of, load_four, store_planes
 
 wp = warp()
 
@@ -170,7 +172,7 @@ def kinematic_kernel(
         kinds: of the geometries tracked.
         raycast: ask triangles.
         physical: convention of the forces.
-        sticky: taxels hold what they touch (``taxels.kernels.stick``).
+        sticky: taxels hold what they touch.
         summed: ``press`` is written in place of readings, for links with a contact (``contact_load``).
         mode: of the readout.
         hysteresis: whether it is stored.

@@ -13,7 +13,7 @@ from typing import Any
 from brainbench.core.devices import warp
 from robotics_bridge.physics.kernels.state import StateArrays, in_scene, link_fails, status_of
 from robotics_bridge.sensors.kernels.distance import PLANE, SolidArrays
-from robotics_bridge.sensors.kernels.wide import entry, load_contacts, load_owners
+from robotics_bridge.sensors.kernels.readout import entry, load_contacts, load_owners
 
 wp = warp()
 

@@ -12,12 +12,12 @@ import hashlib
 import os
 import struct
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Annotated, Any
 
 from brainbench.core.devices import warp
 from brainbench.core.errors import DataError, UsageError, check_name, listing
 from brainbench.core.files import read_json, to_plain, write_json
-from brainbench.core.limits import NotNegative, Share, limited
+from brainbench.core.limits import Limit, NotNegative, Share, limited
 from brainbench.core.reading.regular import readable
 
 BASE_KNOBS = frozenset({"read_delay", "jitter", "white", "bias", "walk", "quantum"})
@@ -49,11 +49,11 @@ class Noise:
     """Step of the analogue-to-digital converter [unit of the sensor]; 0 does not round."""
     radius: NotNegative = 0.0
     """Half width of the uniform error of the sensing radius, new in every update [m] (4.23)."""
-    gain: tuple[NotNegative, NotNegative] = (1.0, 1.0)
+    gain: Annotated[tuple[NotNegative, NotNegative], Limit(rising=True)] = (1.0, 1.0)
     """Range of each probe's calibration factor, drawn at every reset (4.24). It multiplies the depth."""
     dead_probability: Share = 0.0
     """Probability that a probe is stuck for an episode (4.25)."""
-    dead_range: tuple[float, float] = (0.0, 0.0)
+    dead_range: Annotated[tuple[float, float], Limit(rising=True)] = (0.0, 0.0)
     """Range of the stuck value; one value fills all channels of the probe [unit of the sensor]."""
     hysteresis: float = 0.0
     """Strength β of the viscoelastic overshoot (4.26, 4.27)."""
@@ -66,10 +66,7 @@ class Noise:
 
     def __post_init__(self) -> None:
         for name in ("gain", "dead_range"):
-            low, high = map(float, getattr(self, name))
-            if low > high:
-                raise UsageError(f"{name} is a range (low, high) with low ≤ high; received ({low}, {high}).")
-            object.__setattr__(self, name, (low, high))
+            object.__setattr__(self, name, tuple(map(float, getattr(self, name))))
         if self.jitter > self.read_delay:
             raise UsageError(
                 f"jitter ({self.jitter:g} s) must not exceed read_delay ({self.read_delay:g} s): "

@@ -236,10 +236,14 @@ def spread_over(corners: NDArray, area: NDArray, count: int, seed: int) -> tuple
     points = a * (1 - u)[:, None] + b * (u * (1 - v))[:, None] + c * (u * v)[:, None]
     if many == count:
         return points, faces
-    chosen = np.zeros(count, dtype=int)
-    distance = np.linalg.norm(points - points[0], axis=1)
-    for index in range(1, count):
-        # Greedy farthest points: each next one is as far as can be from all that were chosen.
-        chosen[index] = int(distance.argmax())
-        distance = np.minimum(distance, np.linalg.norm(points - points[chosen[index]], axis=1))
+    chosen = farthest_points(points, count)
     return points[chosen], faces[chosen]
+
+
+def farthest_points(points: NDArray, count: int, first: int = 0) -> list[int]:
+    """Return the numbers of ``count`` points of [N, 3]: each next one is as far as can be from all before it."""
+    chosen, distance = [first], np.linalg.norm(points - points[first], axis=1)
+    while len(chosen) < count:
+        chosen.append(int(distance.argmax()))
+        distance = np.minimum(distance, np.linalg.norm(points - points[chosen[-1]], axis=1))
+    return chosen

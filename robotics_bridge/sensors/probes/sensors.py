@@ -1,14 +1,21 @@
-"""Probes: distance to surfaces before contact, depth in contact, and contact as a bit (thesis 4.2–4.3)."""
+"""Probes: distance to surfaces before contact, depth in contact, and contact as a bit (thesis 4.2–4.3); runtimes."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, ClassVar
+from typing import Annotated, Any, ClassVar
 
+import numpy as np
+
+from brainbench.core.devices import warp
 from brainbench.core.limits import Limit, NotNegative, limited
 from brainbench.core.reading.ranges import check_fields
+from robotics_bridge.physics.state import HandState
+from robotics_bridge.sensors.kernels.probe import depth_kernel, distance_kernel
 from robotics_bridge.sensors.noise.model import PROBE_KNOBS, TAXEL_KNOBS
+from robotics_bridge.sensors.runtime import ProbeRuntime, SuiteContext
 from robotics_bridge.sensors.sensor import QuerySensor
 
 
@@ -28,7 +35,7 @@ class SurfaceDistanceProbe(QuerySensor):
     units: ClassVar[str] = "m"
     knobs: ClassVar[frozenset[str]] = PROBE_KNOBS
     shared: ClassVar[tuple[str, ...]] = ("query", "nearest")
-    runtime: ClassVar[str] = "robotics_bridge.sensors.probes.runtime:DistanceRuntime"
+    runtime: ClassVar[str] = "robotics_bridge.sensors.probes.sensors:DistanceRuntime"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,7 +44,7 @@ class ContactDepthProbe(QuerySensor):
 
     units: ClassVar[str] = "m"
     knobs: ClassVar[frozenset[str]] = TAXEL_KNOBS
-    runtime: ClassVar[str] = "robotics_bridge.sensors.probes.runtime:DepthRuntime"
+    runtime: ClassVar[str] = "robotics_bridge.sensors.probes.sensors:DepthRuntime"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,8 +59,50 @@ class ContactProbe(QuerySensor):
 
     units: ClassVar[str] = "1"
     knobs: ClassVar[frozenset[str]] = TAXEL_KNOBS
-    runtime: ClassVar[str] = "robotics_bridge.sensors.probes.runtime:DepthRuntime"
+    runtime: ClassVar[str] = "robotics_bridge.sensors.probes.sensors:DepthRuntime"
 
     def __post_init__(self) -> None:
         super().__post_init__()
         check_fields(self, "release", least=0, most=self.threshold)
+
+
+class DistanceRuntime(ProbeRuntime):
+    """Serves surface-distance probes of one group."""
+
+    def __init__(self, sensors: Mapping[str, SurfaceDistanceProbe], context: SuiteContext) -> None:
+        super().__init__(sensors, 1, context, reach=None)
+        first = next(iter(sensors.values()))
+        self._kernel = distance_kernel(self.kinds, first.query == "raycast", first.nearest, self.mode, *self.stores)
+        self._limits = context.array([sensor.max_range for sensor in sensors.values()], float)
+        self.points: Any = context.zeros((3, context.num_envs, self.count) if first.nearest else (1, 1, 1))
+        """Nearest points [3, B, N] in the link frame (m)."""
+        self.lasting = [self.points] if first.nearest else []
+        self.readable += self.lasting
+
+    def run_kernels(self, state: HandState, dt: float) -> None:
+        """Run the kernels."""
+        c = self.context
+        inputs = [self.probes, c.solids.struct, c.pairs.struct, self.io]
+        self.launch(self._kernel, *inputs, self._limits, self.points)
+
+
+class DepthRuntime(ProbeRuntime):
+    """Serves contact-depth probes, or contact probes, which are read as 0 or 1."""
+
+    def __init__(
+        self, sensors: Mapping[str, ContactDepthProbe] | Mapping[str, ContactProbe], context: SuiteContext
+    ) -> None:
+        super().__init__(sensors, 1, context)
+        first = next(iter(sensors.values()))
+        binary = isinstance(first, ContactProbe)
+        self._kernel = depth_kernel(self.kinds, first.query == "raycast", binary, self.mode, *self.stores)
+        limits = np.zeros((len(sensors), 2))
+        for row, sensor in zip(limits, sensors.values(), strict=True):
+            if isinstance(sensor, ContactProbe):
+                row[:] = sensor.threshold, sensor.threshold if sensor.release is None else sensor.release
+        self._limits = context.array(limits, warp().vec2f)
+
+    def run_kernels(self, state: HandState, dt: float) -> None:
+        """Run the kernels."""
+        c = self.context
+        self.launch(self._kernel, self.probes, c.solids.struct, c.pairs.struct, self.io, self._limits)

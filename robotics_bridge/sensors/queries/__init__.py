@@ -1,3 +1,4 @@
-"""Geometry that sensors ask for: ``solids`` with their distance fields, ``pairs`` of links and geometries, and
-``surface_points``. An update lists pairs first; kernels of sensors then ask the solids of each pair.
+"""Geometry that sensors ask for: ``solids`` with distance fields and surface points, ``pairs`` of links and solids.
+
+An update lists pairs first; kernels of sensors then ask the solids of each pair.
 """

@@ -18,15 +18,17 @@ from brainbench.core.reading.ranges import check_number
 from robotics_bridge.physics.state import HandState
 from robotics_bridge.sensors.context import ReadoutSlice, fill
 from robotics_bridge.sensors.kernels.dilation import (
+    CHUNK,
     ElastomerArrays,
     GelParams,
+    anchor_kernel,
     indent_kernel,
     marker_kernel,
     spread_kernel,
+    sum_shear,
 )
 from robotics_bridge.sensors.kernels.proximity import BLOCK, CloudArrays
-from robotics_bridge.sensors.kernels.shear import CHUNK, anchor_kernel, sum_shear
-from robotics_bridge.sensors.queries.surface_points import sample_cloud
+from robotics_bridge.sensors.queries.solids import sample_cloud
 from robotics_bridge.sensors.runtime import ProbeRuntime, SuiteContext
 from robotics_bridge.sensors.suite import SensorSuite
 from robotics_bridge.sensors.taxels.sensors import ElastomerTaxel, Layer

@@ -23,7 +23,7 @@ from robotics_bridge.sensors.kernels.kinematic import KinematicParams, StickArra
 from robotics_bridge.sensors.kernels.proximity import ProximityArrays, ProximityParams, proximity_kernel
 from robotics_bridge.sensors.kernels.readout import FUSED
 from robotics_bridge.sensors.probes.placement import Probes
-from robotics_bridge.sensors.queries.surface_points import list_by_cells, sample_cloud
+from robotics_bridge.sensors.queries.solids import list_by_cells, sample_cloud
 from robotics_bridge.sensors.runtime import ProbeRuntime, SuiteContext, probe_rows
 from robotics_bridge.sensors.taxels.sensors import KinematicTaxel, ProximityTaxel
 

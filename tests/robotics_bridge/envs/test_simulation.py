@@ -15,7 +15,7 @@ from robotics_bridge import tasks
 from robotics_bridge.envs import Env, EnvOptions
 from robotics_bridge.hands import load
 from robotics_bridge.hands.observations import OBSERVATIONS, observation_type, observe, sensors_for
-from robotics_bridge.hands.surface import cast_grid
+from robotics_bridge.hands.tree import cast_grid
 from robotics_bridge.tasks.settings import CONTACTS
 from robotics_bridge.tasks.task import ActuatorRandomisation, ObjectRandomisation
 

@@ -15,7 +15,7 @@ from robotics_bridge.policies.evaluate import Policy, evaluate
 from robotics_bridge.policies.export import export_policy
 from robotics_bridge.policies.fit import with_contacts_of
 from robotics_bridge.policies.shipped import FOLDER, list_policies, policy_path
-from robotics_bridge.policies.training.student_files import load_student
+from robotics_bridge.policies.training.distill import load_student
 from robotics_bridge.policies.training.teacher import Trainer, load_teacher
 from robotics_bridge.tasks.task import MEASURED
 

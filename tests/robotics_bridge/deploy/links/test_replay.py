@@ -9,12 +9,148 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+import torch
+from pyarrow import parquet
 
 from brainbench.core.errors import DataError, UsageError
 from robotics_bridge import hands
-from robotics_bridge.deploy.links.episodes import PARTS, SessionFacts, TactilePoints, write_lerobot
-from robotics_bridge.deploy.links.replay import Replay, TouchLog, read_touch_log, replay, taxel_names
+from robotics_bridge.deploy.driver import HandReading
+from robotics_bridge.deploy.links.replay import (
+    PARTS,
+    Replay,
+    SessionFacts,
+    SessionRecorder,
+    TactilePoints,
+    TouchLog,
+    read_touch_log,
+    replay,
+    taxel_names,
+    total_wrench,
+    write_lerobot,
+)
+from robotics_bridge.deploy.session import PressureCalibration
+from robotics_bridge.hands.observations import observe
+from robotics_bridge.policies.contract import PolicyContract
+from robotics_bridge.policies.encoders.taxel_grid import TaxelGrid, finger_axes_of
 from tests.robotics_bridge.hands.test_grippers import JAWS, LINK, URDF
+
+HAND = hands.load("xhand1")
+TIPS = HAND.tips
+PROBES = HAND.layout("low", "tips")
+PLACES = [[getattr(probes, name)[probes.active] for probes in PROBES.values()] for name in ("position", "normal")]
+LINKS = tuple(np.repeat(list(PROBES), list(map(len, PLACES[0]))).tolist())
+POINTS = TactilePoints(LINKS, *map(np.concatenate, PLACES))
+SESSION = SessionFacts(task="turn the ball", fps=40, joints=HAND.joints, points=POINTS, robot="xhand1", unit="N")
+CONTRACT = PolicyContract({}, 40.0, "xhand1", HAND.joints, HAND.joints, {}, {})
+
+
+def _frames(length: int) -> dict[str, np.ndarray]:
+    rng = np.random.default_rng(0)
+    shapes = dict(zip(PARTS, ((12,), (12,), (12,), (45, 6), (6,)), strict=True))
+    return {name: rng.normal(size=(length, *shape)) for name, shape in shapes.items()}
+
+
+@pytest.fixture
+def folder(tmp_path):
+    return write_lerobot(tmp_path / "set", _frames(4), SESSION)
+
+
+def test_frames_are_those_that_were_recorded(folder) -> None:
+    info = json.loads((folder / "meta" / "info.json").read_text())
+    assert (info["codebase_version"], info["total_frames"], info["fps"]) == ("v3.0", 4, 40)
+    found = pd.read_parquet(folder / info["data_path"].format(chunk_index=0, file_index=0))
+    assert set(found.columns) == set(info["features"])
+    given = _frames(4)
+    np.testing.assert_allclose(np.stack(found["action"]), given["action"], rtol=1e-6)
+    tactile = np.array([np.stack(row) for row in found["observation.tactile"]])
+    np.testing.assert_allclose(tactile, given["observation.tactile"], rtol=1e-6)
+    assert found["frame_index"].tolist() == found["index"].tolist() == [0, 1, 2, 3]
+    np.testing.assert_allclose(found["timestamp"], np.arange(4) / 40)
+    for name, feature in info["features"].items():
+        if name.startswith(("observation", "action")):
+            assert list(np.stack(found[name].iloc[0]).shape) == feature["shape"]
+        else:
+            assert str(found[name].dtype) == feature["dtype"]
+
+
+def test_columns_have_the_types_that_lerobot_stores(folder) -> None:
+    kinds = parquet.read_schema(folder / "data" / "chunk-000" / "file-000.parquet")
+    told = {name: str(kinds.field(name).type) for name in kinds.names}
+    assert told["action"] == "fixed_size_list<element: float>[12]"
+    assert told["observation.tactile"] == "list<element: list<element: float>>"
+    assert (told["timestamp"], told["index"]) == ("float", "int64")
+
+
+def test_episodes_and_tasks_are_found_as_lerobot_looks_for_them(folder) -> None:
+    tasks = pd.read_parquet(folder / "meta" / "tasks.parquet")
+    assert tasks.loc["turn the ball", "task_index"] == 0
+    (episode,) = pd.read_parquet(folder / "meta" / "episodes" / "chunk-000" / "file-000.parquet").to_dict("records")
+    assert (episode["dataset_from_index"], episode["dataset_to_index"], *episode["tasks"]) == (0, 4, "turn the ball")
+    stats = json.loads((folder / "meta" / "stats.json").read_text())
+    given = _frames(4)
+    np.testing.assert_allclose(stats["observation.wrench"]["mean"], given["observation.wrench"].mean(axis=0), rtol=1e-5)
+    np.testing.assert_allclose(episode["stats/action/max"], given["action"].max(axis=0), rtol=1e-6)
+    points = json.loads((folder / "meta" / "tactile.json").read_text())
+    assert len(points["position"]) == len(points["link"]) == 45
+    assert set(points["links"]) == set(HAND.tips)
+    assert points["units"] == ["N", "N·m"]
+
+
+def test_a_session_states_forces_in_the_unit_of_the_hand(tmp_path) -> None:
+    recorder = SessionRecorder(CONTRACT, tmp_path / "set").begin(HAND.joints, HAND.fingers)
+    assert recorder.write() is None
+    pressure = np.zeros((5, 3))
+    pressure[0] = 0.2
+    reading = HandReading(1, 0.0, 0.0, np.zeros(12), np.zeros(12), pressure)
+    recorder(reading, None, None, np.zeros(12))
+    folder = recorder.write()
+    points = json.loads((folder / "meta" / "tactile.json").read_text())
+    assert all("pressure" in unit for unit in points["units"])
+
+
+@pytest.mark.parametrize("fingers", [None, ("thumb", "pinky", "index"), ()])
+def test_recorded_forces_are_those_of_pressed_skin(tmp_path, fingers) -> None:
+    """Pressed along its normal, each tip is pushed inward, whatever the order of the fingers in the reports."""
+    layout, order = HAND.layout("med", "tips"), tuple(HAND.fingers) if fingers is None else fingers
+    recorder = SessionRecorder(CONTRACT, tmp_path / "set").begin(HAND.joints, order)
+    depth = {link: torch.rand(1, *layout[link].shape) for link in TIPS}
+    felt = observe("agg_force", depth, {link: layout[link] for link in TIPS})
+    pressure = PressureCalibration().pressure(tuple(HAND.fingers), felt.reshape(-1, 3).numpy())
+    rows = [list(HAND.fingers).index(finger) for finger in order]
+    recorder(HandReading(1, 0.0, 0.0, np.zeros(12), np.zeros(12), pressure[rows]), None, None, np.zeros(12))
+    weighed = {link: d.numpy().reshape(-1, 1) * layout[link].normal for link, d in depth.items()}
+    inward = {link: -10.0 * each[layout[link].active].sum(0) for link, each in weighed.items()}
+    assert {*recorder.points.links} == {TIPS[row] for row in rows}
+    for link, point in zip(recorder.points.links, recorder.frames[0][3], strict=True):
+        np.testing.assert_allclose(point[:3], inward[link], rtol=1e-4)
+
+
+def test_the_wrench_is_the_sum_of_the_points() -> None:
+    axes = finger_axes_of(HAND, HAND.layout("med", "hand"))
+    rng = np.random.default_rng(2)
+    points = rng.normal(size=(45, 6))
+    total = total_wrench(points, POINTS.links, axes)
+    grid = TaxelGrid("xhand1", placement="tips", resolution="low")
+    image = grid(torch.from_numpy(points).float()[None, None])[0].numpy().astype(float)
+    force = image[:3].sum((1, 2))
+    moment = (image[3:] + np.cross(grid.axes.centers.transpose(2, 0, 1), image[:3], axis=0)).sum((1, 2))
+    np.testing.assert_allclose(total, [*force, *moment], atol=1e-4)
+
+
+def test_sessions_that_do_not_fit_are_refused(tmp_path) -> None:
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "x").write_text("")
+    with pytest.raises(UsageError, match=r"/full' .*empty"):
+        write_lerobot(tmp_path / "full", _frames(2), SESSION)
+    with pytest.raises(UsageError, match=r"whole number.* 33\.3"):
+        write_lerobot(tmp_path / "a", _frames(2), replace(SESSION, fps=33.3))
+    with pytest.raises(UsageError, match=r"observation.state .*\(0, 12\)"):
+        write_lerobot(tmp_path / "b", _frames(0), SESSION)
+    spoiled = _frames(2)
+    spoiled["observation.wrench"][1][0] = np.nan
+    with pytest.raises(DataError, match=r"observation.wrench .* no numbers"):
+        write_lerobot(tmp_path / "c", spoiled, SESSION)
+
 
 FRAMES = 20
 

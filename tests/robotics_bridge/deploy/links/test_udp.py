@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
+import hmac
+import os
 import re
 import socket
 import threading
@@ -10,14 +13,27 @@ import time
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from brainbench.core.errors import UsageError
-from robotics_bridge.deploy.controller import Clock, Controller
-from robotics_bridge.deploy.links import frames
-from robotics_bridge.deploy.links.frames import Frame, new_key
+from brainbench.core.errors import DataError, UsageError
+from robotics_bridge.deploy.driver import Command, SafeLink, SafetyLimits
+from robotics_bridge.deploy.links import udp
 from robotics_bridge.deploy.links.simulated_hand import Faults, SimulatedHand, serve, simulated_hand
-from robotics_bridge.deploy.links.udp import HandLink, UdpDriver
-from robotics_bridge.deploy.safety import Command, SafeLink, SafetyLimits
+from robotics_bridge.deploy.links.udp import (
+    COMMAND,
+    Frame,
+    HandLink,
+    Receiver,
+    SequenceWindow,
+    UdpDriver,
+    decode,
+    encode,
+    new_key,
+    pack_values,
+    read_key,
+)
+from robotics_bridge.deploy.session import Clock, Controller
 from robotics_bridge.policies.contract import PolicyContract
 
 JOINTS, FINGERS, KEY = ("a", "b"), ("thumb",), new_key()
@@ -273,8 +289,8 @@ def test_genuine_commands_are_followed_and_reports_are_read(wire) -> None:
 
 def test_forged_truncated_and_oversized_commands_move_nothing(wire) -> None:
     genuine = wire.capture(0.5)
-    forged = frames.encode(Frame(frames.COMMAND, J, 0, 9, time.monotonic(), frames.pack_command([1, 1])), new_key())
-    with_master = frames.encode(Frame(frames.COMMAND, J, 0, 9, time.monotonic(), frames.pack_command([1, 1])), KEY)
+    forged = udp.encode(Frame(udp.COMMAND, J, 0, 9, time.monotonic(), udp.pack_command([1, 1])), new_key())
+    with_master = udp.encode(Frame(udp.COMMAND, J, 0, 9, time.monotonic(), udp.pack_command([1, 1])), KEY)
     changed = bytearray(genuine)
     changed[-40] ^= 1
     bad = [forged, with_master, bytes(changed), b"", genuine[:-1], genuine[:20], genuine + b"\0", genuine * 40]
@@ -356,7 +372,7 @@ def test_only_new_and_young_reports_of_this_hand_are_read(wire) -> None:
     wire.report()
     wire.driver.read()
     genuine = wire.reports[-1]
-    forged = frames.encode(Frame(frames.STATE, J, F, 99, time.monotonic(), frames.pack_values(_VALUES + 1)), new_key())
+    forged = udp.encode(Frame(udp.STATE, J, F, 99, time.monotonic(), udp.pack_values(_VALUES + 1)), new_key())
     reflected = wire.capture(0.5)
     for data in (genuine, forged, reflected, genuine[:-1], genuine + b"\0", genuine + bytes(60_000), b""):
         wire.front.sendto(data, wire.controller)
@@ -389,8 +405,8 @@ def test_commands_without_finite_targets_stop_the_hand_at_either_end(wire, value
     assert wire.told() is None
     assert wire.hand.stopped
     again = wire.connect()
-    body = frames.pack_command(np.array([0.0, np.nan]))
-    again._command(frames.COMMAND, body)
+    body = udp.pack_command(np.array([0.0, np.nan]))
+    again._command(udp.COMMAND, body)
     wire.pass_on()
     assert wire.told() is None
 
@@ -414,7 +430,7 @@ def test_a_safe_link_tells_the_hand_what_a_command_comes_from(wire) -> None:
     reading = link.read()
     assert link.send(Command(reading.position, reading, link.deadline(reading))) is None
     wire.pass_on()
-    frame = frames.decode(wire.seen[-1], wire.driver._send_key)
+    frame = udp.decode(wire.seen[-1], wire.driver._send_key)
     assert frame.origin == (reading.sequence, reading.time + link._limits.timeout)
 
 
@@ -449,3 +465,119 @@ def test_a_hand_without_a_whole_key_is_open_to_nobody(key) -> None:
 def test_a_hand_that_cannot_be_told_apart_is_not_called(address, joints, fingers, told) -> None:
     with pytest.raises(UsageError, match=told):
         UdpDriver(address, joints, fingers, KEY)
+
+
+SHARED = bytes(range(32))
+
+
+@given(st.binary(max_size=200))
+def test_no_datagram_breaks_the_reader(data) -> None:
+    assert decode(data, SHARED) is None
+
+
+@given(st.integers(0, 12), st.integers(0, 5), st.data())
+def test_frames_survive_the_way_and_every_change_is_noticed(joints, fingers, data) -> None:
+    values = np.arange(2 * joints + 3 * fingers, dtype=np.float32)
+    sent = encode(Frame(udp.STATE, joints, fingers, 7, 1.5, pack_values(values)), SHARED)
+    frame = decode(sent, SHARED)
+    assert frame is not None
+    assert (frame.sequence, frame.time) == (7, 1.5)
+    np.testing.assert_array_equal(frame.values, values)
+    place = data.draw(st.integers(0, len(sent) - 1))
+    damaged = bytearray(sent)
+    damaged[place] ^= data.draw(st.integers(1, 255))
+    for changed in (bytes(damaged), sent[:place], sent + sent[: place + 1], sent[place:] + sent[:place][1:]):
+        assert changed == sent or decode(changed, SHARED) is None
+    assert decode(sent, new_key()) is None
+
+
+def test_a_frame_ends_with_the_standard_hmac_of_the_rest() -> None:
+    sent = encode(Frame(udp.COMMAND, 1, 0, 1 << 32, 2.0, udp.pack_command([0.5], 7, 2.25)), SHARED)
+    # RFC 2104 by its definition: H(key ⊕ opad ‖ H(key ⊕ ipad ‖ text)).
+    padded = SHARED.ljust(64, b"\0")
+    inner = hashlib.sha256(bytes(byte ^ 0x36 for byte in padded) + sent[:-32]).digest()
+    assert sent[-32:] == hashlib.sha256(bytes(byte ^ 0x5C for byte in padded) + inner).digest()
+    assert sent[8:12] == bytes(4)  # the number goes on from 0
+    frame = decode(sent, SHARED)
+    assert (frame.origin, frame.values.tolist()) == ((7, 2.25), [0.5])
+    # Ends of an earlier version get no answer.
+    assert decode(sent.replace(b"BBH3", b"BBH2")[:-32], SHARED) is None
+
+
+@pytest.mark.parametrize("time", [np.nan, np.inf])
+@pytest.mark.parametrize("kind", [0, udp.STATE, 77, 255])
+def test_authentic_frames_of_no_known_form_are_not_read(kind, time) -> None:
+    for body in (b"", bytes(4), bytes(5000)):
+        assert decode(encode(Frame(kind, 1, 1, 0, time, body), SHARED), SHARED) is None
+
+
+def test_sessions_and_directions_have_keys_of_their_own() -> None:
+    nonces = [bytes([number]) * udp.NONCE for number in range(3)]
+    found = {key for a in nonces for b in nonces for key in udp.session_keys(SHARED, a, b)}
+    assert len(found) == 18
+    assert hmac.compare_digest(udp.session_keys(SHARED, *nonces[:2])[0], udp.session_keys(SHARED, *nonces[:2])[0])
+
+
+def test_a_key_is_read_from_a_private_file(tmp_path) -> None:
+    path = tmp_path / "hand.key"
+    with pytest.raises(FileNotFoundError, match=r"hand\.key"):
+        read_key(path)
+    for text in ("", "12", "zz" * 32, "00" * 33, "é" * 64):
+        path.write_text(text, encoding="utf-8")
+        path.chmod(0o600)
+        with pytest.raises(DataError, match=r"hand\.key"):
+            read_key(path)
+    path.write_text(f"{SHARED.hex()}\n")
+    assert read_key(path) == SHARED
+    path.chmod(0o644)
+    if os.name == "posix":
+        with pytest.raises(DataError, match="chmod 600"):
+            read_key(path)
+
+
+@pytest.mark.parametrize("first", [0, 1, 5000, (1 << 32) - 300, (1 << 32) - 1])
+def test_numbers_are_judged_as_a_list_of_all_of_them_would(first) -> None:
+    random = np.random.default_rng(first % 97)
+    window, seen, newest, lost, gaps = SequenceWindow(), set(), None, 0, []
+    for _ in range(3000):
+        # Without wrap-around, and with a memory of everything: what the window must agree with.
+        number = (newest if newest is not None else first) + int(random.integers(-1200, 30))
+        number = max(number, first)
+        if newest is None or number > newest:
+            expected = "new"
+            gaps.append(0 if newest is None else number - newest - 1)
+        elif newest - number >= SequenceWindow.SIZE:
+            expected = "stale"
+        else:
+            expected = "replayed" if number in seen else "late"
+        verdict, skipped = window.judge(number % (1 << 32))
+        assert verdict == expected
+        lost += skipped
+        seen.add(number)
+        newest = number if newest is None else max(newest, number)
+    assert lost == sum(gaps)
+
+
+def test_a_jump_by_half_of_all_numbers_takes_no_memory_and_no_number_from_behind() -> None:
+    window = SequenceWindow()
+    window.judge(0)
+    assert window.judge((1 << 31) - 1) == ("new", (1 << 31) - 2)
+    assert window.judge(0)[0] == "stale"
+    assert window.judge((1 << 31) - 1)[0] == "replayed"
+    assert window.judge((1 << 31) - 2)[0] == "late"
+
+
+def test_old_frames_are_stale_although_their_number_is_new() -> None:
+    receiver = Receiver(b"")
+
+    def judge(number, sent, arrived):
+        return receiver.judge(Frame(COMMAND, 1, 0, number, sent), arrived)[0]
+
+    assert judge(1, 10.0, 500.0) == "new"
+    assert judge(2, 10.1, 500.2) == "new"
+    assert judge(3, 10.2, 500.5) == "stale"
+    assert judge(4, 10.6, 500.6) == "new"
+    # All numbers were used once: one that comes back is new again by number, and old by time.
+    for number in (0x5000_0000, 0xA000_0000, 0xF000_0000, 1):
+        verdict = judge(number, 10.61 if number == 1 else 10.6, 500.6 if number != 1 else 900.0)
+    assert verdict == "stale"

@@ -8,8 +8,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from robotics_bridge import tasks
-from robotics_bridge.policies.encoders.front_end import HandCalibration
-from robotics_bridge.policies.encoders.taxel_grid import TaxelGrid
+from robotics_bridge.policies.encoders.taxel_grid import HandCalibration, TaxelGrid
 from robotics_bridge.policies.evaluate import agent
 from robotics_bridge.policies.readouts import features
 from robotics_bridge.policies.readouts.features import PostureTurn, TouchRollout, calibrate, collect

@@ -7,8 +7,8 @@ import pytest
 from brainbench.core.errors import DataError, UsageError
 from robotics_bridge import hands
 from robotics_bridge.hands.observations import OBSERVATIONS
+from robotics_bridge.policies.training.distill import build_student
 from robotics_bridge.policies.training.distill_config import PUBLISHED, DistillConfig, read_sweep
-from robotics_bridge.policies.training.student_files import build_student
 
 
 @pytest.mark.parametrize(

@@ -9,9 +9,8 @@ from robotics_bridge import tasks
 from robotics_bridge.deploy.session import read_deployed
 from robotics_bridge.policies.evaluate import Policy
 from robotics_bridge.policies.export import export_policy
-from robotics_bridge.policies.training.distill import distill
+from robotics_bridge.policies.training.distill import distill, load_student
 from robotics_bridge.policies.training.distill_config import DistillConfig
-from robotics_bridge.policies.training.student_files import load_student
 
 SETTINGS = {"task": "in_palm_rotate", "observe": "agg_force", "placement": "tips"}
 

@@ -23,7 +23,7 @@ from robotics_bridge import tasks
 from robotics_bridge.envs import Env
 from robotics_bridge.policies.evaluate import Policy, evaluate
 from robotics_bridge.policies.shipped import FOLDER, SENSING
-from robotics_bridge.policies.training.student_files import load_student
+from robotics_bridge.policies.training.distill import load_student
 from robotics_bridge.policies.training.teacher import TeacherRun, Trainer, load_teacher, newest
 from robotics_bridge.policies.training.teacher import train as train_teacher
 from robotics_bridge.tasks.goals import SteppingRotation

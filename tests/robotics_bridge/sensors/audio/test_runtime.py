@@ -10,10 +10,11 @@ import pytest
 from brainbench.core.errors import UsageError
 from robotics_bridge.physics.scene import Geometry, TouchScene
 from robotics_bridge.physics.state import HandState
-from robotics_bridge.sensors.audio.runtime import joint_drive
+from robotics_bridge.sensors.audio.runtime import Microphone, joint_drive
 from robotics_bridge.sensors.audio.sensors import ActuationAudio, ContactAudio, Modes
 from robotics_bridge.sensors.noise.model import Noise
 from robotics_bridge.sensors.suite import SensorSuite
+from tests.factories.touch_scenes import pad_scene, poses_at, state_of
 
 MODES = Modes((500.0, 1730.0, 4100.0), (8.0, 15.0, 40.0), (1.0, -0.7, 0.4))
 
@@ -133,3 +134,149 @@ def test_samples_of_a_block_of_any_length_have_noise_of_their_own(samples):
         suite.update(state, DT)
         heard.append(suite.read("sound")[0, 0].numpy().copy())
     assert len(np.unique(heard)) == pytest.approx(3 * samples, rel=0.01)
+
+
+@pytest.mark.parametrize("distance", [0.343, 1.0, 2.5])
+def test_a_microphone_hears_late_by_r_over_c_and_weaker_by_one_over_r(distance):
+    suite, state = _make()
+    listener = Microphone(position=(distance, 0.0, 0.0)).build(suite)
+    suite.update(state, DT)
+    listener.update(state, DT)
+    _touch(state, 10.0)
+    source, heard = [], []
+    for _ in range(6):
+        suite.update(state, DT)
+        listener.update(state, DT)
+        state.contact_count.fill_(0)
+        source.append(suite.read("sound")[0, 0].numpy().copy())
+        heard.append(listener.read()[0].numpy().copy())
+    source, heard = np.concatenate(source), np.concatenate(heard)
+    onset = np.flatnonzero(np.abs(heard) > 1e-6)[0] / RATE
+    assert onset == pytest.approx(distance / 343, abs=1.5 / RATE)
+    lag = distance / 343 * RATE
+    late = np.interp(np.arange(len(source)) - lag, np.arange(-1, len(source)), [0.0, *source], left=0.0) / distance
+    assert heard == pytest.approx(late, abs=1e-3 * np.abs(late).max())
+
+
+def test_a_microphone_set_up_during_an_episode_is_no_louder_at_first():
+    sensor = ActuationAudio(link="box", joints=1, samples=K, hum=1.0, hum_frequency=400.0)
+    suite, state = SensorSuite(_scene(), {"drives": sensor}, num_envs=1), HandState.empty(1, 3)
+    pose = np.tile([1.0, 0, 0, 1, 0, 0, 0], (3, 1))
+    pose[0, 0] = 0.0
+    state.set_pose(pose)
+    suite.update(state, DT)
+    listener, peaks = Microphone().build(suite), []
+    for _ in range(4):
+        suite.update(state, DT)
+        listener.update(state, DT)
+        peaks.append(float(listener.read().abs().max()))
+    assert peaks[0] < 1.1 * peaks[3]
+
+
+def test_sources_add_up_and_the_power_of_distance_is_chosen():
+    sensors = {name: ContactAudio(link=name, modes=MODES, samples=K) for name in ("box", "ball")}
+    suite, state = SensorSuite(_scene(), sensors, num_envs=1), HandState.empty(1, 3, 4)
+    pose = np.zeros((3, 7))
+    pose[:, 3] = 1
+    pose[1, 0], pose[2, 0] = 1.0, -1.0
+    state.set_pose(pose)
+    both = Microphone(power=2.0).build(suite)
+    one = Microphone(power=2.0, sources=("box",)).build(suite)
+    for block in range(3):
+        if block == 1:
+            _touch(state, 10.0)
+        suite.update(state, DT)
+        both.update(state, DT)
+        one.update(state, DT)
+    assert np.abs(one.read().numpy()).max() > 0
+    assert both.read().numpy() == pytest.approx(2 * one.read().numpy(), rel=1e-5)
+    with pytest.raises(UsageError, match="did you mean 'ball'"):
+        Microphone(sources=("bal",)).build(suite)
+
+
+def test_a_microphone_without_sources_and_wrong_settings_are_explained():
+    with pytest.raises(UsageError, match="no source of sound"):
+        Microphone().build(SensorSuite(_scene(), {}, num_envs=1))
+    with pytest.raises(UsageError, match=r"samples .*received 0"):
+        ContactAudio(link="box", modes=MODES, samples=0)
+    with pytest.raises(UsageError, match=r"threshold .*received -1"):
+        ContactAudio(link="box", modes=MODES, threshold=-1.0)
+    with pytest.raises(UsageError, match=r"joints .*at least 1"):
+        ActuationAudio(link="box", joints=0)
+    with pytest.raises(UsageError, match=r"speed_of_sound .*received 0"):
+        Microphone(speed_of_sound=0.0)
+
+
+@pytest.mark.parametrize("place", range(3))
+@pytest.mark.parametrize("value", [np.nan, np.inf, True])
+def test_a_microphone_stands_somewhere(place, value):
+    position = [0.0, 0.0, 0.0]
+    position[place] = value
+    with pytest.raises(UsageError, match=rf"position .*received {value}"):
+        Microphone(position=tuple(position))
+    with pytest.raises(UsageError, match="position holds 3 numbers"):
+        Microphone(position=(0.0, 1.0))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_sound_that_is_not_finite_is_heard_as_nan_until_the_reset_and_not_as_silence(value):
+    suite = SensorSuite(_scene(), {"drive": ActuationAudio(link="box", joints=2, samples=K, hum=1.0)}, num_envs=2)
+    state = HandState.empty(2, 3, 4)
+    listener = Microphone(position=(1.0, 0.0, 0.0)).build(suite)
+    torque, _speed = joint_drive(suite, "drive")
+
+    def hear():
+        suite.update(state, DT)
+        listener.update(state, DT)
+        return listener.read()
+
+    assert hear().isfinite().all()
+    torque[1, 0] = value
+    for _ in range(3):
+        heard = hear()
+        assert heard[0].isfinite().all()
+        assert heard[1].isnan().all()
+    torque[:] = 0
+    # What was lost is still under way to the listener.
+    assert hear()[1].isnan().all()
+    assert listener.diverged.tolist() == [False, True]
+    suite.reset([1])
+    hear()
+    assert hear().abs().amax(dim=1).gt(0).all()
+    assert not listener.diverged.any()
+
+
+def test_a_state_that_diverged_is_heard_as_nan():
+    suite, state = _make(2)
+    listener = Microphone(position=(1.0, 0.0, 0.0)).build(suite)
+    state.pose_torch[1, 1, 0] = np.nan
+    suite.update(state, DT)
+    listener.update(state, DT)
+    assert suite.diverged.tolist() == listener.diverged.tolist() == [False, True]
+    assert listener.read().isnan().all(dim=1).tolist() == [False, True]
+
+
+BALL = Geometry(name="ball", link="ball", kind="sphere", size=(0.01,))
+
+
+def _suite(*, num_envs: int = 1, **sensors) -> SensorSuite:
+    return SensorSuite(pad_scene(BALL), sensors, num_envs=num_envs)
+
+
+def _state(*heights: float):
+    poses = np.stack([poses_at(3, {2: (0, 0, height)}).reshape(3, 7) for height in heights])
+    scene = pad_scene(BALL)
+    state = state_of(scene, poses)
+    pair = [scene.geometries_of("hand")[0], scene.geometries_of("ball")[0]]
+    state.set_contacts(range(len(heights)), [pair] * len(heights))
+    return state
+
+
+@pytest.mark.parametrize("dt", [0, -0.01, np.nan, np.inf])
+def test_a_microphone_hears_blocks_of_some_length(dt) -> None:
+    suite = _suite(a=ContactAudio(link="hand", modes=Modes((500.0,), (0.0,), (1.0,))))
+    suite.update(_state(0.014))
+    with pytest.raises(UsageError, match="dt"):
+        Microphone().build(suite).update(_state(0.014), dt)
+    with pytest.raises(UsageError, match="sources"):
+        Microphone(sources="a")

@@ -10,9 +10,8 @@ from brainbench.core.errors import UsageError
 from robotics_bridge.physics.engines import MujocoEngine
 from robotics_bridge.physics.scene import Geometry, TouchScene
 from robotics_bridge.physics.state import HandState
-from robotics_bridge.sensors.audio.microphone import Microphone
 from robotics_bridge.sensors.audio.modes import find_modes
-from robotics_bridge.sensors.audio.runtime import joint_drive
+from robotics_bridge.sensors.audio.runtime import Microphone, joint_drive
 from robotics_bridge.sensors.audio.sensors import ActuationAudio, ContactAudio, Modes
 from robotics_bridge.sensors.suite import SensorSuite
 from tests.factories.sensor_episode import require_processor

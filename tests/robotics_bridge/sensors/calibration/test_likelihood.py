@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from brainbench.core.errors import DataError
-from robotics_bridge.sensors.calibration.calibrate import calibrate
-from robotics_bridge.sensors.calibration.log import Log
+from robotics_bridge.sensors.calibration.calibrate import Log, calibrate
 from robotics_bridge.sensors.noise.model import Noise
 from robotics_bridge.sensors.noise.stages import simulate
 from tests.factories.calibration_logs import DT, log_of, presses

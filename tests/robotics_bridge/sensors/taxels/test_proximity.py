@@ -7,7 +7,7 @@ import pytest
 
 from robotics_bridge.physics import Geometry
 from robotics_bridge.sensors import Noise, Probes, ProximityTaxel, SensorSuite
-from robotics_bridge.sensors.queries.surface_points import surface_points
+from robotics_bridge.sensors.queries.solids import surface_points
 from tests.factories.touch_scenes import pad_scene, poses_at, random_pose, rotation_of, state_of
 
 GRID = Probes.grid(4, 4, size=(0.02, 0.02), center=(0, 0, 0.005), radius=0.008)

@@ -18,8 +18,7 @@ EXPONENTS = (0.5, 1.0, 1.2, 1.5, 2.0, 3.0)
 @cache
 def _kernels() -> SimpleNamespace:
     from brainbench.core.devices import warp
-    from robotics_bridge.sensors.kernels.noise import decay, normals
-    from robotics_bridge.sensors.kernels.series import power, power_of_two, split_log
+    from robotics_bridge.sensors.kernels.noise import decay, normals, power, power_of_two, split_log
 
     wp = warp()
 

@@ -1,1 +1,0 @@
-"""Warp kernels of tasks that keep a state of their own."""
