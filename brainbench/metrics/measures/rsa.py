@@ -21,7 +21,6 @@ from brainbench.metrics.measures.unique import unique_part
 from brainbench.metrics.rdms.comparison import (
     LINEAR,
     WITHOUT,
-    SquareMoves,
     check_comparison,
     permuted_comparisons,
     products_without,
@@ -186,13 +185,15 @@ def _linear_agreement(matrices: Floats, factors: Floats, orders: Ints) -> Floats
 
     Products of a matrix with the sum of the others are sums of products of two.
     """
-    moves, agreements = SquareMoves(matrices.shape[-1]), np.empty(len(orders))
-    weights = moves.fixed(np.ones((1, *matrices.shape[1:])))
-    sources, rows = [moves.source(part[None]) for part in matrices], np.empty((len(matrices), weights.size))
+    count, agreements = matrices.shape[-1], np.empty(len(orders))
+    rows, cols = np.triu_indices(count)
+    # Of one triangle; what stands in both counts twice.
+    sources = (matrices * np.where(np.eye(count), 1.0, math.sqrt(2))).reshape(len(matrices), -1)
+    moved = np.empty((len(matrices), len(rows)))
     for index, each in enumerate(orders):
-        for row, source, order in zip(rows, sources, each, strict=True):
-            row[:] = moves.moved(source, order)[:, 0]
-        products = (rows * weights) @ rows.T
+        for row, source, order in zip(moved, sources, each, strict=True):
+            source.take((order * count)[rows] + order[cols], out=row, mode="clip")
+        products = moved @ moved.T
         size = np.diagonal(products)
         crossed = products.sum(axis=1) - size
         others = products.sum() - 2 * products.sum(axis=1) + size

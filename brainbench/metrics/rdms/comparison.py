@@ -28,6 +28,7 @@ _OF_MATRICES = ("whitened-cosine", "whitened-pearson")
 
 _FEW_STIMULI, _BLOCK_ELEMENTS = 64, 1 << 24
 """Up to so many stimuli all orders of a chunk are compared at once; numbers of layers' matrices that are held."""
+_ORDERS, _ROWS = 64, 4  # orders, and rows of matrices, that are moved at once
 
 _SIGN_LIMIT = 128  # above this many pairs Kendall's tau sorts (P log P) instead of comparing all pairs of pairs (P²)
 
@@ -113,9 +114,9 @@ def permuted_comparisons(
 
 
 def _permuted_squares(layers: Floats, brain: Floats, chunks: Iterator[Ints], method: str) -> Iterator[Floats]:
-    """Do what :func:`permuted_comparisons` does, order by order and without more than a block of layers in memory."""
+    """Do what :func:`permuted_comparisons` does without more than a block of layers in memory."""
     count = stimulus_count(layers.shape[-1])
-    moves, size = SquareMoves(count), max(1, _BLOCK_ELEMENTS // count**2)
+    size = max(1, _BLOCK_ELEMENTS // count**2)
     animals = squares(features(brain, method), method)
     blocks = [layers[start : start + size] for start in range(0, len(layers), size)]
     # What would not fit is made anew for each chunk of orders.
@@ -125,40 +126,32 @@ def _permuted_squares(layers: Floats, brain: Floats, chunks: Iterator[Ints], met
         for index, block in enumerate(blocks):
             left = first if index == 0 else squares(features(block, method), method)
             # ⟨PMPᵀ, B⟩ = ⟨M, PᵀBP⟩: the side of fewer matrices is moved.
-            forth = len(left) <= len(animals)
-            fixed, source = (moves.fixed(animals), left) if forth else (moves.fixed(left), animals)
-            source, turns = moves.source(source), orders if forth else np.argsort(orders, axis=1)
-            values = np.stack([fixed @ moves.moved(source, order) for order in turns])
-            parts.append(values.swapaxes(1, 2) if forth else values)
+            if len(left) <= len(animals):
+                parts.append(_moved_products(left, animals, orders).swapaxes(1, 2))
+            else:
+                parts.append(_moved_products(animals, left, np.argsort(orders, axis=1)))
         yield np.concatenate(parts, axis=1)
 
 
-class SquareMoves:
-    """Inner products of symmetric matrices [N, K, K] whose rows and columns move together: of one triangle each."""
-
-    def __init__(self, count: int) -> None:
-        self._count = count
-        self._rows, self._cols = np.triu_indices(count)
-        # Memory that is taken anew for every order would cost more than the move.
-        self._index, self._moved = np.empty((2, len(self._rows)), dtype=np.int64), np.empty((len(self._rows), 0))
-
-    def fixed(self, matrices: Floats) -> Floats:
-        """Return one triangle [N, K(K + 1)/2] of matrices; what stands in both counts twice."""
-        weights = np.where(self._rows == self._cols, 1.0, 2.0)
-        return matrices[:, self._rows, self._cols] * weights
-
-    def source(self, matrices: Floats) -> Floats:
-        """Return the numbers [K², N] of matrices, from which :meth:`moved` takes."""
-        return np.ascontiguousarray(matrices.reshape(len(matrices), -1).T)
-
-    def moved(self, source: Floats, order: Ints) -> Floats:
-        """Return one triangle [K(K + 1)/2, N] with the stimuli in an order, until the next call."""
-        if self._moved.shape[1] != source.shape[1]:
-            self._moved = np.empty((len(self._rows), source.shape[1]))
-        index, columns = self._index
-        np.take(order * self._count, self._rows, out=index, mode="clip")
-        index += np.take(order, self._cols, out=columns, mode="clip")
-        return source.take(index, axis=0, out=self._moved, mode="clip")
+def _moved_products(matrices: Floats, fixed: Floats, orders: Ints) -> Floats:
+    """Return the inner products [N, F, M] of symmetric matrices [M, K, K], whose rows and columns move to each order
+    [N, K], with fixed ones [F, K, K]."""
+    count, result = matrices.shape[-1], np.empty((len(orders), len(fixed), len(matrices)))
+    rows, cols = np.triu_indices(count)
+    # Of one triangle; what stands in both counts twice.
+    triangles = fixed[:, rows, cols] * np.where(rows == cols, 1.0, 2.0)
+    source = np.ascontiguousarray(matrices.reshape(len(matrices), -1).T)
+    for start in range(0, len(orders), _ORDERS):
+        columns = np.ascontiguousarray(orders[start : start + _ORDERS].T)
+        size, total, place = columns.shape[1] * len(matrices), 0.0, 0
+        # Numbers of few rows are multiplied while they lie in the nearest memory.
+        for first in range(0, count, _ROWS):
+            some = range(first, min(first + _ROWS, count))
+            index = np.concatenate([columns[row] * count + columns[row:] for row in some])
+            total += triangles[:, place : place + len(index)] @ source.take(index, axis=0).reshape(-1, size)
+            place += len(index)
+        result[start : start + _ORDERS] = total.reshape(len(fixed), -1, len(matrices)).swapaxes(0, 1)
+    return result
 
 
 def squares(vectors: Floats, method: str) -> Floats:
@@ -181,7 +174,8 @@ def products_without(a: Floats, b: Floats, method: str) -> Floats:
     if method == "cosine":
         rows = _row_products(square(a), square(b))
         return rows.sum(axis=-1, keepdims=True) / 2 - rows
-    left, right = (_second_moment(rdms).reshape(square(rdms).shape) for rdms in (a, b))
+    left = squares(_second_moment(a), method)
+    right = left if b is a else squares(_second_moment(b), method)
     rows = _row_products(left, right)
     diagonals = np.einsum("...nkk,...akk->...nak", left, right)
     # Rows of a centred matrix add up to 0, so those of what is left add up to −M_ik, and all of it to M_kk: centring

@@ -45,6 +45,11 @@ def _pair_indices(count: int, like: Any) -> Any:
     """Return the rows [P] and columns [P] of all pairs, where and what ``like`` is."""
     if is_tensor(like):
         return library(like).triu_indices(count, count, offset=1, device=like.device).unbind()
+    return _pairs(count)
+
+
+@lru_cache(maxsize=4)
+def _pairs(count: int) -> tuple[Ints, Ints]:
     return np.triu_indices(count, k=1)
 
 

@@ -12,6 +12,7 @@ to find, so report it with the score.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 
@@ -142,13 +143,12 @@ class _Sums:
     """Sums over the member trials of one session: of patterns [N, K, F], and of what distances take from them."""
 
     def __init__(self, session: SortedTrials, members: Floats, count: int) -> None:
-        groups = [session.group(stimulus) for stimulus in range(count)]
         factor = session.factor
         self.patterns = np.empty((len(members), count, factor.shape[1]))
-        for stimulus, rows in enumerate(groups):
-            np.matmul(members[:, rows], factor[rows], out=self.patterns[:, stimulus])
         # Trials are sorted by stimulus, so one pass of reduceat sums each of them.
-        starts = [rows.start for rows in groups]
+        starts = np.searchsorted(session.labels, np.arange(count))
+        for stimulus, (start, stop) in enumerate(pairwise((*starts.tolist(), len(factor)))):
+            np.matmul(members[:, start:stop], factor[start:stop], out=self.patterns[:, stimulus])
         squares = np.einsum("ru,ru->r", factor, factor)
         self.number = np.add.reduceat(members, starts, axis=1)
         self.units = np.add.reduceat(members * session.responses.sum(axis=1), starts, axis=1)
