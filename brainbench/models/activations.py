@@ -37,7 +37,7 @@ _log = logging.getLogger(__name__)
 READOUTS = "brainbench.readouts"  # entry points of ways to read layers other than the default
 OUTPUT = "output"  # layer name of a user model's own output
 MEMORY = 2.0  # memory for activations [GiB], by default
-_SAMPLED = 7  # stimuli in a batch of the second run, unlike the 16 of the first
+_SAMPLED, _PROBED = 7, 5  # stimuli in a batch of the second run, unlike the 16 of the first, and beside probes
 
 
 @dataclass(frozen=True)
@@ -107,7 +107,7 @@ def extract(
     what was not read, and why.
 
     The model runs in evaluation mode without gradients on copies of the stimuli; modes are put back and no hook stays.
-    The proof runs a copy of it on 8 probes and a quarter of the stimuli. Memory beyond the result is that copy and
+    The proof runs a copy of it on 8 probes and an eighth of the stimuli. Memory beyond the result is that copy and
     half of ``memory``, or one stimulus and the probes where these need more.
 
     Args:
@@ -450,11 +450,10 @@ class _HookedReader:
         """Prove and read all layers."""
         rooms, run = self.rooms, self.run
         try:
-            self._prove()
+            sketches = self._prove()
         except UsageError:  # a model may be made for batches of one size
             self.fill = min(chunk, run.count)
-            self._prove()
-        sketches = _Sketches(run.sample)
+            sketches = self._prove()
         self._run_sample(sketches)
         chunk = max(1, min(chunk, rooms.memory // 2 // self.size))
         self._run_all(chunk, sketches)
@@ -496,8 +495,8 @@ class _HookedReader:
             count(OUTPUT, output)
         return {name: last + 1 for name, last in counts.items()}
 
-    def _prove(self) -> None:
-        """Find the places of stimuli and time in what each module returns."""
+    def _prove(self) -> _Sketches:
+        """Find the places of stimuli and time in what each module returns; the second batch holds sampled stimuli."""
         import torch
 
         from brainbench.models import proof
@@ -505,14 +504,18 @@ class _HookedReader:
         run, model = self.run, self.fresh or self.run.model
         stimuli = run.stimuli(run.sample[:16])
         rows = proof.probes(stimuli.cpu(), run.steps)
+        picks = np.resize(run.sample[:_PROBED], max(self.fill - len(proof.SECOND), min(_PROBED, len(run.sample))))
         batches = []
-        for batch in (proof.FIRST, proof.SECOND):
-            filling = [stimuli[place % len(stimuli)] for place in range(self.fill - len(batch))]
+        for batch, filling in (
+            (proof.FIRST, [stimuli[place % len(stimuli)] for place in range(self.fill - len(proof.FIRST))]),
+            (proof.SECOND, run.stimuli(picks)),
+        ):
             probes = [stimuli[0] if row is None else rows[row].to(stimuli) for row in batch]
             batches.append(torch.stack([*probes, *filling]))
         sizes = (len(batches[0]), len(batches[1]))
         calls: dict[str, list[Any]] = {}
         proven: dict[str, list[Any]] = {}
+        sampled: dict[tuple[str, int], Any] = {}
 
         def capture(name: str, index: int, tensor: Any) -> None:
             # A later operation in place must not change what was captured.
@@ -523,7 +526,8 @@ class _HookedReader:
             if first is None or tensor is None:
                 result = [], "gives no tensor of numbers"
             else:
-                result = proof.stimulus_layouts(first, tensor.cpu(), sizes)
+                sampled[name, index] = tensor.cpu().clone()
+                result = proof.stimulus_layouts(first, sampled[name, index], sizes)
             proven.setdefault(name, []).append(result)
 
         self._forward(model, batches[0], capture)
@@ -538,6 +542,11 @@ class _HookedReader:
                 self.rooms.not_read[name] = "does not run alike in every batch"
                 continue
             self._place(name, tensors, proven[name], sizes[0])
+        sketches = _Sketches(run.sample)
+        for key, place in self.places.items():
+            part = place.layout.rows(sampled[key], sizes[1], run.steps)[len(proof.SECOND) :]
+            sketches.add(1, (place.layer, place.step), part, picks)
+        return sketches
 
     def _place(self, name: str, tensors: list[Any], proven: list[Any], batch: int) -> None:
         """Decide which layers, and which steps of them, the calls of a module are."""
@@ -591,9 +600,9 @@ class _HookedReader:
         return (layout, before, count // steps // before) if misfit < 1 else None
 
     def _run_sample(self, sketches: _Sketches) -> None:
-        """Run the sampled stimuli in their own order and batches."""
-        run = self.run
-        for part in np.array_split(run.sample, -(-len(run.sample) // _SAMPLED)):
+        """Run the other sampled stimuli in their own order and batches."""
+        run, rest = self.run, self.run.sample[_PROBED:]
+        for part in np.array_split(rest, -(-len(rest) // _SAMPLED)) if len(rest) else ():
             picks = np.resize(part, max(len(part), self.fill))
 
             def take(name: str, index: int, tensor: Any, picks: Any = picks) -> None:

@@ -111,7 +111,7 @@ def test_sketches_see_one_entry_that_differs_or_changed_its_place():
     assert not proof.agree(before, proof.sketch(lost), torch.float32)
 
 
-@pytest.mark.parametrize(("count", "size"), [(1, 3), (12, 3), (40, 10), (2000, 128)])
+@pytest.mark.parametrize(("count", "size"), [(1, 3), (12, 3), (40, 5), (2000, 128)])
 def test_the_sample_comes_from_everywhere(count, size):
     sample = proof.draw_sample(count)
     assert len(sample) == size
