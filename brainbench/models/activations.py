@@ -15,7 +15,7 @@ import tempfile
 import weakref
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -273,11 +273,14 @@ class _Sketches:
         pairs = [(row, place) for row, stimulus in enumerate(stimuli) for place in self.places.get(int(stimulus), ())]
         if pairs:
             source, target = (list(part) for part in zip(*pairs, strict=True))
-            numbers = proof.sketch(rows[source])
-            store = self.runs[run].setdefault(key, np.full((len(self.sample), numbers.shape[1]), np.nan))
-            if store.shape[1] == numbers.shape[1]:
-                store[target] = numbers
-            self.kinds[key] = rows.dtype
+            self.keep(run, key, proof.sketch(rows[source]), target, rows.dtype)
+
+    def keep(self, run: int, key: tuple[str, int | None], numbers: np.ndarray, target: Any, kind: Any) -> None:
+        """Keep sketches at their places in the sample."""
+        store = self.runs[run].setdefault(key, np.full((len(self.sample), numbers.shape[1]), np.nan))
+        if store.shape[1] == numbers.shape[1]:
+            store[target] = numbers
+        self.kinds[key] = kind
 
     def unequal(self) -> dict[str, str]:
         """Return the layers that the runs do not agree on, with the reason."""
@@ -504,18 +507,16 @@ class _HookedReader:
         run, model = self.run, self.fresh or self.run.model
         stimuli = run.stimuli(run.sample[:16])
         rows = proof.probes(stimuli.cpu(), run.steps)
-        picks = np.resize(run.sample[:_PROBED], max(self.fill - len(proof.SECOND), min(_PROBED, len(run.sample))))
+        sampled = slice(0, min(_PROBED, len(stimuli)))
         batches = []
-        for batch, filling in (
-            (proof.FIRST, [stimuli[place % len(stimuli)] for place in range(self.fill - len(proof.FIRST))]),
-            (proof.SECOND, run.stimuli(picks)),
-        ):
+        for batch, least in ((proof.FIRST, 0), (proof.SECOND, sampled.stop)):
+            filling = [stimuli[place % len(stimuli)] for place in range(max(self.fill - len(batch), least))]
             probes = [stimuli[0] if row is None else rows[row].to(stimuli) for row in batch]
             batches.append(torch.stack([*probes, *filling]))
         sizes = (len(batches[0]), len(batches[1]))
         calls: dict[str, list[Any]] = {}
         proven: dict[str, list[Any]] = {}
-        sampled: dict[tuple[str, int], Any] = {}
+        sketched: dict[tuple[str, int, Layout], np.ndarray] = {}
 
         def capture(name: str, index: int, tensor: Any) -> None:
             # A later operation in place must not change what was captured.
@@ -526,8 +527,10 @@ class _HookedReader:
             if first is None or tensor is None:
                 result = [], "gives no tensor of numbers"
             else:
-                sampled[name, index] = tensor.cpu().clone()
-                result = proof.stimulus_layouts(first, sampled[name, index], sizes)
+                result = proof.stimulus_layouts(first, tensor.cpu(), sizes)
+                for layout, _ in result[0]:
+                    rows = layout.split(tensor, sizes[1])[len(proof.SECOND) :]
+                    sketched[name, index, layout] = proof.sketch(rows[sampled])
             proven.setdefault(name, []).append(result)
 
         self._forward(model, batches[0], capture)
@@ -544,8 +547,7 @@ class _HookedReader:
             self._place(name, tensors, proven[name], sizes[0])
         sketches = _Sketches(run.sample)
         for key, place in self.places.items():
-            part = place.layout.rows(sampled[key], sizes[1], run.steps)[len(proof.SECOND) :]
-            sketches.add(1, (place.layer, place.step), part, picks)
+            sketches.keep(1, (place.layer, place.step), sketched[*key, replace(place.layout, time=None)], sampled, None)
         return sketches
 
     def _place(self, name: str, tensors: list[Any], proven: list[Any], batch: int) -> None:
@@ -608,7 +610,7 @@ class _HookedReader:
             def take(name: str, index: int, tensor: Any, picks: Any = picks) -> None:
                 place = self.places.get((name, index))
                 if place is not None and tensor is not None and place.layout.fits(tuple(tensor.shape), len(picks)):
-                    rows = place.layout.rows(tensor, len(picks), run.steps)
+                    rows = place.layout.split(tensor, len(picks))
                     sketches.add(1, (place.layer, place.step), rows, picks)
 
             self._forward(self.fresh or run.model, run.stimuli(picks), take)
@@ -638,7 +640,8 @@ class _HookedReader:
                     rooms.not_read[place.layer] = f"gives {shape} for {batch} stimuli, unlike in other batches"
                     return
                 rows = place.layout.rows(tensor, batch, run.steps)
-                sketches.add(0, (place.layer, place.step), rows, range(part.start, part.stop))
+                split = place.layout.split(tensor, batch)
+                sketches.add(0, (place.layer, place.step), split, range(part.start, part.stop))
                 if not place.moved and (name, index) not in moved:
                     first = firsts.setdefault((name, index), rows[:1].cpu().clone())
                     if not proof.same(first.expand_as(rows), rows.cpu(), 0.0):
