@@ -209,8 +209,8 @@ def main() -> None:
 NOTE = (
     "Largest resident memory of a process that does one job (PyTorch, NumPy and the rest of the program, .4 to .7 GB, "
     f"are in it). Where nothing else is said, scores are of one session of {UNITS:,} units × {TRIALS} trials × 1 s in "
-    f"bins of {BIN:g} s. Durations are with other work on the machine. Layers are "
-    "read of 40 stimuli × 10 steps, and the last column has what the proof adds. Missing lines were not measured yet."
+    f"bins of {BIN:g} s. Durations are with other work on the machine. Lines without a processor "
+    "time are of 2026-11-22. Layers are read of 40 stimuli × 10 steps; the last column has what the proof adds."
 )
 
 

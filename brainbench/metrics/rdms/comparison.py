@@ -143,7 +143,8 @@ def _moved_products(matrices: Floats, fixed: Floats, orders: Ints) -> Floats:
     source = np.ascontiguousarray(matrices.reshape(len(matrices), -1).T)
     for start in range(0, len(orders), _ORDERS):
         columns = np.ascontiguousarray(orders[start : start + _ORDERS].T)
-        size, total, place = columns.shape[1] * len(matrices), 0.0, 0
+        size, place = columns.shape[1] * len(matrices), 0
+        total = np.zeros((len(fixed), size))
         # Numbers of few rows are multiplied while they lie in the nearest memory.
         for first in range(0, count, _ROWS):
             some = range(first, min(first + _ROWS, count))
