@@ -326,7 +326,8 @@ DOORS = (
         f"models import {{file}} --architecture zhuang-gru-small {_IMPORT}", modules=_MODELS,
     ),
     Door(
-        "models import, graph", "graph", f"models import {{folder}}/best.ckpt --config {{file}} {_IMPORT}",
+        "models import, graph", "graph",
+        f"models import {{folder}}/best.ckpt --architecture zhuang-gru-small --config {{file}} {_IMPORT}",
         modules=_MODELS,
     ),
     Door(
