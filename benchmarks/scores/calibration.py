@@ -2,8 +2,9 @@
 
     python -m benchmarks.scores.calibration [NAME ...] [--simulations N] [--workers N] [--seed N] [--write]
 
-Names: nulls, coverage, noise, unique, pairs, over-time, dimensions, corrections, crossnobis, recovery, ceiling, faults;
-all by default. ``--write`` puts the tables into RESULTS.md and docs/calibration.md, and the figures into docs/images.
+Names: nulls, coverage, noise, unique, ridge, pairs, over-time, dimensions, corrections, crossnobis, recovery, ceiling,
+faults; all by default. ``--write`` puts the tables into RESULTS.md and docs/calibration.md, and the figures into
+docs/images.
 """
 
 from __future__ import annotations
@@ -182,6 +183,28 @@ def unique(run: Run) -> Result:
     columns = ["stimuli", "reliability", "network, hidden share", "true", "mean", "coverage", "found above 0"]
     return Result("Unique part of networks of six layers, eight animals, ten trials", columns, rows)
 
+
+def ridge(run: Run) -> Result:
+    """Coverage of the scaled score of ridge and of its unique part, with the scale that the animals' noise leaves."""
+    rows = []
+    for stimuli, trials, reliability in RIDGE_DESIGNS:
+        jobs = [NoisyStudy(seed, stimuli, trials, reliability) for seed in run.seeds()]
+        studies = np.array(run.each(simulated_boards.ridge_study, jobs))
+        for (kind, share_hidden), each in zip(simulated_boards.UNIQUE_CASES, np.moveaxis(studies, 0, 2), strict=True):
+            ok = each[0] > 0
+            row = [str(stimuli), str(trials), f"{reliability:g}", f"{kind}, {share_hidden:g}", f"{ok.mean():.2f}"]
+            for value, low, high, truth in (each[1:5, ok], each[5:9, ok]):
+                true = truth.mean() if ok.any() else math.nan
+                held = share((low <= true) & (true <= high)) if ok.sum() >= _FEWEST_OK else "–"
+                row += [f"{true:.3f}", f"{value.mean():.3f}" if ok.any() else "–", held]
+            rows.append([*row, share(each[6, ok] > 0) if ok.sum() >= _FEWEST_OK else "–"])
+    columns = ["stimuli", "trials", "reliability", "network, hidden share", "ok"]
+    columns += ["true score", "mean", "coverage", "true unique part", "mean", "coverage", "found above 0"]
+    return Result("Ridge: scaled score and unique part of networks of six layers, eight animals", columns, rows)
+
+
+RIDGE_DESIGNS = ((12, 10, 0.8), (24, 4, 0.5), (24, 20, 0.8))
+"""Stimuli, trials and reliability of the animals."""
 
 _FEWEST_OK = 15
 """Studies that are ``ok`` below which a coverage says nothing."""
@@ -482,6 +505,7 @@ JOBS: dict[str, Callable[[Run], Result]] = {
     "coverage": coverage,
     "noise": noise,
     "unique": unique,
+    "ridge": ridge,
     "pairs": pairs,
     "over-time": over_time,
     "dimensions": dimensions,

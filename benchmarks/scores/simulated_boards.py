@@ -7,6 +7,7 @@ user's would be; :mod:`benchmarks.scores.calibration` runs many of them on all p
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
 from itertools import combinations
 from typing import Any
@@ -21,6 +22,7 @@ from brainbench.datasets.synthetic import PopulationDesign, ResponseGeometry
 from brainbench.datasets.synthetic.populations import draw_sessions
 from brainbench.metrics import get_metric, rdm
 from brainbench.metrics.evaluation import gather
+from brainbench.metrics.measures.patterns import RidgeEncoding
 from brainbench.metrics.measures.rsa import RSA
 from brainbench.metrics.measures.unique import unique_part
 from brainbench.metrics.rdms.comparison import compare_all
@@ -157,21 +159,8 @@ def unique_study(study: NoisyStudy) -> list[tuple[float, float, float, float]]:
 
     Animals mix features of the raw input and hidden ones; networks have six layers, one of which says something.
     """
-    rng = np.random.default_rng([study.seed, study.stimuli, study.trials, round(100 * study.reliability)])
-    raw, hidden = rng.normal(size=(2, study.stimuli, DIMENSIONS))
-    names, labels = [f"s{index}" for index in range(study.stimuli)], np.repeat(np.arange(study.stimuli), study.trials)
     metric, results = FewSplits(splits=20), []
-    for kind, share in UNIQUE_CASES:
-        felt, animals, noiseless = np.hstack([math.sqrt(1 - share) * raw, math.sqrt(share) * hidden]), [], []
-        for index in range(8):
-            patterns = felt @ rng.normal(size=(2 * DIMENSIONS, 60))
-            trials = patterns[labels] + math.sqrt(study.noise(patterns)) * rng.normal(size=(len(labels), 60))
-            keys = [f"{study.seed}/{index}/{trial}" for trial in range(len(labels))]
-            animals.append(metric.animal(f"m{index}", [Trials(trials, labels, keys)], study.stimuli, stimuli=names))
-            noiseless.append(rdm(patterns, method="sqeuclidean"))
-        layers = [metric.layer(rng.normal(size=(study.stimuli, 20))) for _ in range(6)]
-        if kind != "unrelated":
-            layers[0] = metric.layer((hidden if kind == "hidden" else raw) @ rng.normal(size=(DIMENSIONS, 40)))
+    for patterns, animals, layers, raw in _unique_cases(study, metric):
         gathered = gather(metric, animals, study.stimuli)
         factors = gathered.factors(gathered.scored)
         scored = [gathered.subjects[index] for index in gathered.scored]
@@ -179,11 +168,64 @@ def unique_study(study: NoisyStudy) -> list[tuple[float, float, float, float]]:
             results.append((math.nan,) * 4)
             continue
         without = metric.factors_without(scored, factors)
-        sides = ({str(place): layer for place, layer in enumerate(layers)}, {"raw input": metric.layer(raw)})
+        sides = [{name: metric.layer(part) for name, part in side.items()} for side in (layers, {"raw input": raw})]
         how: dict[str, Any] = {"comparison": metric.comparison}
         part = unique_part(*sides, scored, factors=factors, factors_without=without, **how)
-        truth = unique_part(*sides, [without_noise(each) for each in noiseless], factors=np.ones(8), **how)
+        noiseless = [without_noise(rdm(each, method="sqeuclidean")) for each in patterns]
+        truth = unique_part(*sides, noiseless, factors=np.ones(len(noiseless)), **how)
         results.append((part.unique, part.low, part.high, truth.unique))
+    return results
+
+
+def _unique_cases(study: NoisyStudy, metric: Any) -> Iterator[tuple[list[np.ndarray], list[Any], dict, np.ndarray]]:
+    """Yield noiseless patterns [K, U], animals, layers [K, F] and the raw input [K, D] of each of the cases."""
+    rng = np.random.default_rng([study.seed, study.stimuli, study.trials, round(100 * study.reliability)])
+    raw, hidden = rng.normal(size=(2, study.stimuli, DIMENSIONS))
+    names, labels = [f"s{index}" for index in range(study.stimuli)], np.repeat(np.arange(study.stimuli), study.trials)
+    for kind, share in UNIQUE_CASES:
+        felt, every, animals = np.hstack([math.sqrt(1 - share) * raw, math.sqrt(share) * hidden]), [], []
+        for index in range(8):
+            patterns = felt @ rng.normal(size=(2 * DIMENSIONS, 60))
+            trials = patterns[labels] + math.sqrt(study.noise(patterns)) * rng.normal(size=(len(labels), 60))
+            keys = [f"{study.seed}/{index}/{trial}" for trial in range(len(labels))]
+            animals.append(metric.animal(f"m{index}", [Trials(trials, labels, keys)], study.stimuli, stimuli=names))
+            every.append(patterns)
+        layers = [rng.normal(size=(study.stimuli, 20)) for _ in range(6)]
+        if kind != "unrelated":
+            layers[0] = (hidden if kind == "hidden" else raw) @ rng.normal(size=(DIMENSIONS, 40))
+        yield every, animals, {str(place): layer for place, layer in enumerate(layers)}, raw
+
+
+class FewOrdersRidge(RidgeEncoding):
+    """Ridge with few splits and orders, whose p and chance are coarse."""
+
+    orders, splits = 19, 20
+
+
+def ridge_study(study: NoisyStudy) -> list[tuple[float, ...]]:
+    """Return ok, then scaled score and unique part, each with its interval and the truth, for each of the cases.
+
+    The truth is on the scale on which 1 is what the animals' responses without noise reach.
+    """
+    metric, results, names = FewOrdersRidge(), [], [str(index) for index in range(study.stimuli)]
+    for patterns, animals, layers, raw in _unique_cases(study, metric):
+        score = metric.score(layers, animals, name="", stimuli=names, controls={"raw input": raw})
+        part, span = score.provenance.unique, score.scaled_interval
+        if part is None or span is None:
+            results.append((0.0, *[math.nan] * 8))
+            continue
+        order = np.arange(study.stimuli)[None]
+        true = [
+            metric.compare_orders(one, [animal], order).item() for one, animal in zip(patterns, animals, strict=True)
+        ]
+        reached = np.mean(np.array(true) * [metric.correction(animal, "default").value for animal in animals])
+        results.append(
+            (
+                float(score.status == "ok"),
+                *(score.scaled, span.low, span.high, (score.value - score.chance) / (reached - score.chance)),
+                *(part.unique, part.low, part.high, part.unique * score.attainable / reached),
+            )
+        )
     return results
 
 

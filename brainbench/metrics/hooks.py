@@ -59,6 +59,8 @@ class MetricHooks:
     """Names that ``estimator`` takes."""
     of_rdms = False
     """True when layers and animals are compared by RDMs [P], which a record then shows."""
+    of_unique_parts = False
+    """True when :meth:`unique` says what layers explain beyond controls."""
     of_model_alone = False
     """True when a comparison says nothing of the animal."""
     of_covariates = False

@@ -130,7 +130,7 @@ def score_layers(
     if result is None:
         empty = tuple(LayerScore(label, math.nan, math.nan, "undefined") for label in names)
         parts = tuple(_subject(animals, index, math.nan, math.nan, None) for index in range(len(animals.subjects)))
-        if beyond and metric.of_rdms:
+        if beyond and metric.of_unique_parts:
             part = UniquePart("undefined", ("the score is undefined",))
             stated["statistics"] = {"unique": part.stated}
         return Score(value=math.nan, layers=empty, subjects=parts, provenance=Provenance.of(stated), **about), None

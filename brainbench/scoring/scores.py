@@ -246,7 +246,7 @@ def _compare(inputs: ScoreInputs, *, baselines: bool, progress: Progress | None)
     else:
         how: dict[str, Any] = {"stimuli": inputs.labels, "estimator": options.estimator, "seed": options.seed}
         more: dict[str, Any] = {network.card.name: {"layer": network.card.layer}}
-        if (raw := rivals.get(RAW_INPUT)) and inputs.metric.of_rdms:
+        if (raw := rivals.get(RAW_INPUT)) and inputs.metric.of_unique_parts:
             kinematics = {name: values[inputs.rows] for name, values in network.kinematics.items()}
             more[network.card.name]["controls"] = {RAW_INPUT: raw["input"], **kinematics}
         scores = [

@@ -5,13 +5,17 @@ Their base, linear CKA, the Procrustes distance, and ridge encoding.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from brainbench.core.errors import UsageError
+from brainbench.core.provenance import UniquePart
+from brainbench.metrics.evaluation import most_chosen
+from brainbench.metrics.inference.permutation import canonical_order
 from brainbench.metrics.measures.metric import Metric
+from brainbench.metrics.measures.unique import lacking, parted
 from brainbench.metrics.rdms.pairs import Floats, Ints
 from brainbench.metrics.reliability.noise_correction import Corrected, gated
 from brainbench.metrics.reliability.subject_rdm import SubjectRDM
@@ -139,6 +143,7 @@ class RidgeEncoding(PatternMetric):
     name = "ridge"
     title = "share of explainable variance that ridge regression predicts for stimuli left out"
     orders_between = 39
+    of_unique_parts = True
 
     def correction(self, animal: SubjectRDM, estimator: str) -> Corrected:
         """Return the ratio of all variance to that without noise."""
@@ -154,16 +159,103 @@ class RidgeEncoding(PatternMetric):
         return _share(error, base, animals) * _explainable(animals)
 
     def compare_without(self, layers: Sequence[Floats], animals: Sequence[SubjectRDM]) -> Floats:
-        """Return raw values [K, L, A] without each stimulus in turn; the others stay in their folds."""
-        count, shares = animals[0].count, []
-        for stimulus in range(count):
-            rest = np.delete(np.arange(count), stimulus)
-            others, order = [animal.take(rest) for animal in animals], np.arange(count - 1)[None]
-            # Its part in the training of the others must go too: without that, intervals of 14 stimuli were a quarter
-            # too narrow.
-            sums = [_errors(layer[rest], others, order, _folds(count)[rest]) for layer in layers]
-            shares.append([_share(error[0], base[0], others) for error, base in sums])
-        return np.array(shares) * _explainable(animals)
+        """Return raw values [K, L, A] without each stimulus in turn; the others keep their folds and penalties.
+
+        A stimulus also leaves the training of the others: without that, intervals of 14 stimuli were a quarter too
+        narrow.
+        """
+        parts = [
+            _banded(animals, np.zeros_like(kernel), [kernel], ONE_BAND) for kernel in map(centred_products, layers)
+        ]
+        return np.stack([without[0] for _, without, _ in parts]).T.swapaxes(1, 2) * _explainable(animals)
+
+    def unique(
+        self,
+        layers: Mapping[str, Floats],
+        controls: Mapping[str, Floats],
+        animals: Sequence[SubjectRDM],
+        factors: Floats,
+        *,
+        attainable: float = 1.0,
+        committed: str | None = None,
+        seed: int = 0,
+    ) -> UniquePart:
+        """Return what layers predict of left-out stimuli beyond controls, by banded ridge (Nunez-Elizalde 2019).
+
+        Controls make one band and a layer the other. Layer, weight of the bands and penalty are chosen on the training
+        stimuli of every fold, by leaving each of them out; the layer is that of all animals.
+        """
+        layers = {name: layer for name, layer in layers.items() if committed in (None, name) and self._complete(layer)}
+        controls = {name: part for name, part in controls.items() if self._complete(part)}
+        if reason := lacking(layers, controls, animals[0].count):
+            return UniquePart("undefined", (reason,), controls=tuple(controls))
+        order = canonical_order(np.stack([animal.rdm for animal in animals]))
+        control = np.mean([unit_products(part[order], np.trace) for part in controls.values()], axis=0)
+        kernels = [unit_products(layer[order], np.trace) for layer in layers.values()]
+        shares, without, chosen = _banded([animal.take(order) for animal in animals], control, kernels)
+        unique = (without[0] - without[1]).mean(axis=0) / attainable
+        return parted(shares / attainable, unique, controls, list(layers)[most_chosen(chosen)], 0.0)
+
+    def _complete(self, layer: Floats) -> bool:
+        return bool(np.isfinite(layer).all()) and self.varies(layer)
+
+
+BANDS = (0.0, 0.05, 0.2, 0.5, 0.8, 0.95, 1.0)
+"""Weights of a layer's kernel beside that of the controls, both of unit trace, from which both together choose."""
+ONE_BAND = (1.0,)
+
+
+def _banded(
+    animals: Sequence[SubjectRDM], control: Floats, kernels: Sequence[Floats], bands: Sequence[float] = BANDS
+) -> tuple[Floats, Floats, Ints]:
+    """Return shares [3, A] by both bands, controls and layer, those without each stimulus [3, A, K], and the layers."""
+    count, folds, weights = len(control), _folds(len(control)), np.array(bands)[:, None, None]
+    products = np.stack([centred_products(animal.patterns) for animal in animals])
+    flat, size = products.reshape(len(animals), -1), np.trace(products, axis1=1, axis2=2)
+    last = len(PENALTIES)
+    candidates = np.arange(len(bands) * last)
+    sides = (candidates, candidates[:last], candidates[-last:])
+    # Sums of squared errors: all, and without each stimulus; the last side is the training mean.
+    sums, chosen = np.zeros((len(sides) + 1, len(animals), 1 + count)), []
+    for fold in np.unique(folds):
+        test, train = np.flatnonzero(folds == fold), np.flatnonzero(folds != fold)
+        fits = [_fits((1 - weights) * control + weights * kernel, train, test) for kernel in kernels]
+        losses = [
+            (residuals.swapaxes(1, 2) @ residuals).reshape(len(residuals), -1) @ flat.T / size for residuals, _ in fits
+        ]
+        # Rounding chooses between no two layers that are equal.
+        totals = np.array([loss.min(axis=0).sum() for loss in losses])
+        layer = int(np.flatnonzero(totals <= totals.min() * (1 + _TIE))[0])
+        chosen.append(layer)
+        (residuals, combinations), loss = fits[layer], losses[layer]
+        mean = np.zeros((count, count))
+        mean[train] = _means(count, train, train) * len(train) / (len(train) - 1)
+        for index, product in enumerate(products):
+            best = [side[int(np.argmin(loss[side, index]))] for side in sides]
+            pairs = [(residuals[place], combinations[place]) for place in best] + [(mean, _means(count, train, test))]
+            for side, pair in enumerate(pairs):
+                sums[side, index] += _errors_without(*pair, product, test)
+    noise = np.array([animal.noise.sum(axis=1) for animal in animals])
+    noise = noise.sum(axis=1, keepdims=True) - np.concatenate([np.zeros((len(noise), 1)), noise], axis=1)
+    sums -= noise
+    shares = 1 - sums[:-1] / np.where(sums[-1] > 0, sums[-1], np.nan)
+    return shares[..., 0], shares[..., 1:], np.array(chosen)
+
+
+_TIE = 1e-9
+
+
+def _errors_without(residuals: Floats, combinations: Floats, products: Floats, test: Ints) -> Floats:
+    """Return the squared error [1 + K] of left-out stimuli, of all and without each stimulus in turn.
+
+    A training stimulus leaves a fit of a given penalty by its own residual [K, K] when it is predicted from the others.
+    """
+    moved = products @ combinations.T
+    errors = (combinations.T * moved).sum(axis=0)
+    size = ((residuals @ products) * residuals).sum(axis=1)
+    without = errors - 2 * combinations.T * (residuals @ moved) + combinations.T**2 * size[:, None]
+    without[test, np.arange(len(test))] = 0.0
+    return np.concatenate([errors.sum(keepdims=True), without.sum(axis=1)])
 
 
 def _share(error: Floats, base: Floats, animals: Sequence[SubjectRDM]) -> Floats:
@@ -199,7 +291,8 @@ def _errors(model: Floats, animals: Sequence[SubjectRDM], orders: Ints, folds: I
     error, base = np.empty((len(flat), count)), np.empty((len(flat), count))
     for fold in np.unique(folds):
         test, train = np.flatnonzero(folds == fold), np.flatnonzero(folds != fold)
-        inner, combinations = _fits(kernel, train, test)
+        residuals, combinations = _fits(kernel[None], train, test)
+        inner = residuals.swapaxes(1, 2) @ residuals
         # The penalty with the least squared error over left-out training stimuli serves the fold, chosen anew for
         # every order.
         chosen = np.argmin(flat @ inner.reshape(len(PENALTIES), -1).T, axis=1)
@@ -221,27 +314,27 @@ def _means(count: int, train: Ints, test: Ints) -> Floats:
     return combination
 
 
-def _fits(kernel: Floats, train: Ints, test: Ints) -> tuple[Floats, Floats]:
-    """Return, per penalty, what gives the training error [Λ, K, K] and the combinations [Λ, test, K] of residuals.
+def _fits(kernels: Floats, train: Ints, test: Ints) -> tuple[Floats, Floats]:
+    """Return the combinations [M · Λ, K, K] and [M · Λ, test, K] that give residuals, per kernel [M, K, K] and penalty.
 
-    The product of the first with Y Yᵀ is the squared error over the training stimuli, each predicted from the others.
+    The first are of training stimuli, each predicted from the others, the second of left-out ones.
     """
-    count, size = len(kernel), len(train)
+    count, size = kernels.shape[-1], len(train)
     # Centring by the training mean is the intercept, which is not penalised.
     centre = np.eye(size) - 1 / size
-    inside = centre @ kernel[np.ix_(train, train)] @ centre
-    across = (kernel[np.ix_(test, train)] - kernel[np.ix_(train, train)].mean(axis=0)) @ centre
-    # ŷ = k (K + λ·1)⁻¹ y: one eigendecomposition of the kernel serves all penalties.
-    values, vectors = np.linalg.eigh(inside)
+    square = kernels[:, train[:, None], train]
+    inside = centre @ square @ centre
+    across = (kernels[:, test[:, None], train] - square.mean(axis=1, keepdims=True)) @ centre
+    # ŷ = k (K + λ·1)⁻¹ y: one eigendecomposition of a kernel serves all penalties.
+    values, vectors = (part[:, None] for part in np.linalg.eigh(inside))
     values = np.maximum(values, 0)
-    scale = max(float(np.trace(inside)) / size, np.finfo(float).tiny)
-    inner, outer = np.zeros((len(PENALTIES), count, count)), np.empty((len(PENALTIES), len(test), count))
-    for index, penalty in enumerate(PENALTIES):
-        # Leaving one training stimulus out: its residual is that of the whole fit over 1 − its leverage.
-        hat = (vectors * (values / (values + penalty * scale))) @ vectors.T + 1 / size
-        residual = (np.eye(size) - hat) / (1 - np.diag(hat))[:, None]
-        inner[index][np.ix_(train, train)] = residual.T @ residual
-        weight = across @ (vectors / (values + penalty * scale)) @ vectors.T @ centre
-        outer[index] = _means(count, train, test)
-        outer[index][:, train] -= weight
-    return inner, outer
+    scale = np.maximum(np.trace(inside, axis1=1, axis2=2) / size, np.finfo(float).tiny)
+    penalties = values + np.array(PENALTIES)[:, None] * scale[:, None, None]
+    # Leaving one training stimulus out: its residual is that of the whole fit over 1 − its leverage.
+    rest = np.eye(size) - 1 / size - (vectors * (values / penalties)[..., None, :]) @ vectors.swapaxes(-1, -2)
+    residuals = np.zeros((*rest.shape[:2], count, count))
+    residuals[:, :, train[:, None], train] = rest / np.diagonal(rest, axis1=-2, axis2=-1)[..., None]
+    weights = across[:, None] @ (vectors / penalties[..., None, :]) @ vectors.swapaxes(-1, -2) @ centre
+    combinations = np.tile(_means(count, train, test), (*rest.shape[:2], 1, 1))
+    combinations[..., train] -= weights
+    return residuals.reshape(-1, count, count), combinations.reshape(-1, len(test), count)

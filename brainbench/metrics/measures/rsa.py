@@ -62,6 +62,7 @@ class RSA(Metric):
     """Random halves of the trials of each animal."""
 
     of_rdms = True
+    of_unique_parts = True
     orders = 1999
     orders_between = 499
     fewest = 3

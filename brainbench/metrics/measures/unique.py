@@ -18,7 +18,7 @@ import numpy as np
 
 from brainbench.core.provenance import UniquePart
 from brainbench.core.statistics import two_factor_interval
-from brainbench.metrics.evaluation import first_best
+from brainbench.metrics.evaluation import first_best, most_chosen
 from brainbench.metrics.inference.permutation import canonical_order
 from brainbench.metrics.rdms.comparison import LINEAR, products_without
 from brainbench.metrics.rdms.pairs import Floats, Ints, permuted_pairs, stimulus_count
@@ -64,7 +64,8 @@ def unique_part(
     count = stimulus_count(brain.shape[-1])
     layers = {name: rdm for name, rdm in layers.items() if committed in (None, name) and not is_flat(rdm)}
     controls = {name: rdm for name, rdm in controls.items() if not is_flat(rdm)}
-    if reason := _problem(layers, controls, count, comparison):
+    ranks = f"the comparison {comparison!r} takes ranks, which do not add up; choose from {', '.join(LINEAR)}"
+    if reason := lacking(layers, controls, count) if comparison in LINEAR else ranks:
         return UniquePart("undefined", (reason,), controls=tuple(controls))
     # In an order that the animals fix, the halves do not depend on how stimuli were listed.
     order = canonical_order(brain)
@@ -86,30 +87,43 @@ def unique_part(
             for half, part in zip((halves[fitted], halves[judged]), rest, strict=True):
                 without[half] += (part * weights[half, None]).mean(axis=-1) / (2 * splits)
     by_split = np.array(whole).reshape(splits, 2, len(_PARTS), -1).mean(axis=1)
-    span = attainable - float(by_split[:, -1].mean())
+    equal = by_split[:, -1:]
+    span = attainable - float(equal.mean())
     if not span > 0:
         return UniquePart("undefined", ("equal distances reach all that is attainable",), controls=tuple(controls))
-    both, rivals, network, equal = by_split.mean(axis=0) / span
-    unique, draws = both - rivals, (by_split[:, 0] - by_split[:, 1]).mean(axis=1) / span
-    interval = two_factor_interval(float(unique.mean()), unique, (without[:, 0] - without[:, 1]) / span)
+    parts = (by_split[:, :-1] - equal) / span
+    draws = (parts[:, 0] - parts[:, 1]).mean(axis=1)
+    error = float(draws.std(ddof=1) / math.sqrt(splits))
+    layer = list(layers)[most_chosen(np.array(chosen))]
+    return parted(parts.mean(axis=0), (without[:, 0] - without[:, 1]) / span, controls, layer, error)
+
+
+def parted(
+    shares: Floats, without: Floats, controls: Mapping[str, Floats], layer: str, monte_carlo_error: float
+) -> UniquePart:
+    """Return the parts of shares [3, A] that both sides, controls and the layer reach, of what is attainable.
+
+    ``without`` [K] is the unique part without each stimulus in turn.
+    """
+    both, rivals, network = shares
+    unique = both - rivals
+    interval = two_factor_interval(float(unique.mean()), unique, without)
     return UniquePart(
         status="ok",
         unique=float(unique.mean()),
         low=math.nan if interval is None else interval.low,
         high=math.nan if interval is None else interval.high,
-        total=float((both - equal).mean()),
-        shared=float((network + rivals - both - equal).mean()),
+        total=float(both.mean()),
+        shared=float((network + rivals - both).mean()),
         controls_alone=float((both - network).mean()),
         controls=tuple(controls),
-        layer=list(layers)[int(np.argmax(np.bincount(chosen)))],
-        monte_carlo_error=float(draws.std(ddof=1) / math.sqrt(splits)),
+        layer=layer,
+        monte_carlo_error=monte_carlo_error,
     )
 
 
-def _problem(layers: Mapping[str, Floats], controls: Mapping[str, Floats], count: int, comparison: str) -> str:
-    """Return why there is no unique part; empty where there is one."""
-    if comparison not in LINEAR:
-        return f"the comparison {comparison!r} takes ranks, which do not add up; choose from {', '.join(LINEAR)}"
+def lacking(layers: Mapping[str, Floats], controls: Mapping[str, Floats], count: int) -> str:
+    """Return why there is no unique part of layers and controls with a value for each of K stimuli; empty if one is."""
     if count < FEWEST_STIMULI:
         return f"{count} stimuli are too few to fit one half and judge the other; at least {FEWEST_STIMULI} are needed"
     if not controls:

@@ -9,7 +9,15 @@ from scipy.linalg import orthogonal_procrustes
 from brainbench.core.contracts import Trials
 from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError
 from brainbench.metrics import PatternMetric, compare, get_metric, list_metrics, rdm, register_metric
-from brainbench.metrics.measures.patterns import PENALTIES, Procrustes, RidgeEncoding
+from brainbench.metrics.measures import patterns
+from brainbench.metrics.measures.patterns import (
+    PENALTIES,
+    Procrustes,
+    RidgeEncoding,
+    _errors_without,
+    _fits,
+    centred_products,
+)
 from brainbench.metrics.reliability.subject_rdm import subject_rdm
 from tests.factories.animals import STIMULI, make_block, make_latent
 
@@ -35,18 +43,20 @@ def test_the_registry_lists_what_there_is():
         register_metric(get_metric("ridge"))
 
 
-def test_ridge_without_a_stimulus_is_ridge_on_the_data_without_it():
+def test_ridge_without_a_stimulus_is_ridge_on_the_data_without_it(monkeypatch):
     """Also the predictions of the other stimuli change: the shares are those of data that never had it."""
-    metric = RidgeEncoding()
-    latent, animals = _make(metric, count=2)
-    found = metric.compare_without([latent], animals)[:, 0]
+    # A vanishing penalty is the same with a stimulus and without it; chosen among several it may be another one.
+    monkeypatch.setattr(patterns, "PENALTIES", (1e-9,))
+    metric, features = RidgeEncoding(), np.random.default_rng(0).normal(size=(8, 3))
+    animals = [metric.animal(f"m{i}", [make_block(features, seed=i, repeats=12)], 8) for i in range(2)]
+    values = metric.compare_without([features, features[::-1]], animals)[:, 0]
     factors = [metric.correction(animal, "default").value for animal in animals]
-    for stimulus in range(6):
-        kept = np.delete(np.arange(6), stimulus)
-        others = [animal.take(kept) for animal in animals]
-        alone = metric.compare_orders(latent[kept], others, np.arange(5)[None])[0]
+    for stimulus in range(8):
+        rest = np.delete(np.arange(8), stimulus)
+        others = [animal.take(rest) for animal in animals]
+        alone = metric.compare_orders(features[rest], others, np.arange(7)[None])[0]
         scale = [metric.correction(animal, "default").value for animal in others]
-        np.testing.assert_allclose(found[stimulus] * factors, alone * scale, rtol=1e-9)
+        np.testing.assert_allclose(values[stimulus] * factors, alone * scale, rtol=1e-6)
 
 
 @pytest.mark.slow
@@ -235,3 +245,81 @@ def test_many_stimuli_take_random_orders():
     found = metric.score({"a": latent}, animals, name="x", stimuli=[str(k) for k in range(12)])
     assert found.p == pytest.approx(1 / 1000)
     assert "999 random orders" in found.p_method
+
+
+def _mixing(hidden, raw, share, *, count=4, noise=1.0, seed=0):
+    """Animals that mix features of the input and hidden ones, of which they have a share."""
+    rng, metric, animals = np.random.default_rng(seed), RidgeEncoding(), []
+    labels = np.repeat(np.arange(len(raw)), 8)
+    for index in range(count):
+        parts = [part @ rng.normal(size=(part.shape[1], 20)) for part in (raw, hidden)]
+        tuned = np.sqrt(1 - share) * parts[0] / parts[0].std() + np.sqrt(share) * parts[1] / parts[1].std()
+        trials = tuned[labels] + noise * rng.normal(size=(len(labels), 20))
+        keys = [f"{index}/{row}" for row in range(len(labels))]
+        animals.append(metric.animal(f"m{index}", [Trials(trials, labels, keys)], len(raw), splits=20))
+    return animals
+
+
+def _unique(layers, raw, animals, **options):
+    return RidgeEncoding().unique(layers, {"raw input": raw}, animals, np.ones(len(animals)), **options)
+
+
+def test_the_unique_part_of_ridge_is_none_for_a_copy_and_nearly_all_for_the_hidden_network():
+    rng = np.random.default_rng(0)
+    raw, hidden = rng.normal(size=(2, 18, 4))
+    animals = _mixing(hidden, raw, 1.0)
+    copied = _unique({"copy": 3 * raw @ np.linalg.qr(rng.normal(size=(4, 4)))[0]}, raw, animals)
+    assert copied.unique == pytest.approx(0, abs=1e-9)
+    assert copied.shared == pytest.approx(copied.total, abs=1e-9)
+    part = _unique({"luck": rng.normal(size=(18, 4)), "hidden": hidden}, raw, animals)
+    assert (part.status, part.layer) == ("ok", "hidden")
+    assert part.unique > 0.85
+    assert part.low > 0.6
+    assert part.total == pytest.approx(part.unique + part.shared + part.controls_alone)
+    assert _unique({"luck": rng.normal(size=(18, 4)), "hidden": hidden}, raw, animals, committed="luck").unique < 0.1
+    mixed = _unique({"hidden": hidden}, raw, _mixing(hidden, raw, 0.5))
+    assert 0.3 < mixed.unique < 0.65
+    assert 0.3 < mixed.controls_alone < 0.65
+
+
+def test_networks_of_many_layers_that_know_nothing_have_no_unique_part_for_ridge():
+    parts = []
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        raw, hidden = rng.normal(size=(2, 14, 4))
+        layers = {f"layer {index}": rng.normal(size=(14, 6)) for index in range(4)}
+        parts.append(_unique(layers, raw, _mixing(hidden, raw, 0.5, count=3, seed=seed)))
+    assert np.mean([part.unique for part in parts]) < 0.05
+    assert not any(part.low > 0 for part in parts)
+
+
+def test_the_unique_part_of_ridge_says_what_it_lacks_and_does_not_depend_on_the_order_of_stimuli():
+    rng = np.random.default_rng(1)
+    raw, hidden = rng.normal(size=(2, 12, 4))
+    animals = _mixing(hidden, raw, 0.5, count=2)
+    assert "no control has differences" in _unique({"a": hidden}, np.ones((12, 2)), animals).reasons[0]
+    assert "no layer has a value" in _unique({"a": np.full((12, 2), np.nan)}, raw, animals).reasons[0]
+    few = [animal.take(np.arange(9)) for animal in animals]
+    assert "9 stimuli are too few" in _unique({"a": hidden[:9]}, raw[:9], few).reasons[0]
+    order = rng.permutation(12)
+    first = _unique({"a": hidden}, raw, animals)
+    second = _unique({"a": hidden[order]}, raw[order], [animal.take(order) for animal in animals])
+    assert (second.unique, second.low) == pytest.approx((first.unique, first.low), abs=1e-9)
+
+
+def test_errors_without_a_training_stimulus_are_those_of_a_fit_that_never_had_it():
+    rng = np.random.default_rng(2)
+    features, responses = rng.normal(size=(12, 5)), rng.normal(size=(12, 3))
+    train, test, place = np.arange(3, 12), np.arange(3), 4
+    kernel = features @ features.T
+    residuals, combinations = (part[place] for part in _fits(kernel[None], train, test))
+    errors = _errors_without(residuals, combinations, centred_products(responses), test)
+    centred = features[train] - features[train].mean(axis=0)
+    penalty = PENALTIES[place] * (centred**2).sum() / len(train)
+    for without in (None, 3, 7, 1):
+        rest, judged = (side[side != without] for side in (train, test))
+        x, y = (part[rest] - part[rest].mean(axis=0) for part in (features, responses))
+        slope = np.linalg.solve(x.T @ x + penalty * np.eye(5), x.T @ y)
+        predicted = (features[judged] - features[rest].mean(axis=0)) @ slope + responses[rest].mean(axis=0)
+        expected = ((responses[judged] - predicted) ** 2).sum()
+        assert errors[0 if without is None else 1 + without] == pytest.approx(expected)
