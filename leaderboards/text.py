@@ -101,9 +101,10 @@ def unique_sentence(score: Score) -> str:
     ends = f" [{number(part.low, 2)}, {number(part.high, 2)}]" if math.isfinite(part.low + part.high) else ""
     doubt = "" if part.status == "ok" else f"; {visible(part.status)}: {visible('; '.join(part.reasons))}"
     controls = visible(listing(part.controls, quoted=False))
+    nothing = "the mean response" if score.metric.startswith("ridge") else "equal distances"
     return (
         f"Unique part {number(part.unique, 2)}{ends}, beyond {controls}; shared with "
-        f"them {number(part.shared, 2)} (0 = equal distances, 1 = all that is reliable){doubt}."
+        f"them {number(part.shared, 2)} (0 = {nothing}, 1 = all that is reliable){doubt}."
     )
 
 

@@ -117,18 +117,9 @@ def coverage(run: Run) -> Result:
             truth, known = noiseless.mean(), np.isfinite(low)
             inside = (low <= truth) & (truth <= high)
             held.append(inside[known].mean())
-            rows.append(
-                [
-                    str(stimuli),
-                    str(animals),
-                    f"{asked:g}",
-                    f"{truth:.3f}",
-                    f"{np.nanmean(value):.3f}",
-                    f"{np.nanmean(scaled):.3f}",
-                    share(inside[known]),
-                    f"{np.mean((high - low)[known]):.3f}",
-                ]
-            )
+            means = map("{:.3f}".format, (truth, np.nanmean(value), np.nanmean(scaled)))
+            width = f"{np.mean((high - low)[known]):.3f}"
+            rows.append([str(stimuli), str(animals), f"{asked:g}", *means, share(inside[known]), width])
         lines[f"{stimuli} stimuli, {animals} animals"] = held
 
     def draw() -> None:
@@ -167,44 +158,22 @@ def noise(run: Run) -> Result:
     return Result("Coverage of 95 % intervals of studies that are ok, eight animals", columns, rows)
 
 
-def unique(run: Run) -> Result:
+def unique(
+    run: Run, study: Any = simulated_boards.unique_study, sides: tuple[str, ...] = ("",), designs: Any = None
+) -> Result:
     """Coverage of the interval of the unique part, and how often it is found where there is one and where not."""
     rows = []
-    for stimuli, reliability in product((12, 24, 40), (0.5, 0.8)):
-        jobs = [NoisyStudy(seed, stimuli, 10, reliability) for seed in run.seeds()]
-        studies = np.array(run.each(simulated_boards.unique_study, jobs))
-        for (kind, share_hidden), (part, low, high, truth) in zip(
-            simulated_boards.UNIQUE_CASES, np.moveaxis(studies, 0, 2), strict=True
-        ):
-            true, known = np.nanmean(truth), np.isfinite(part)
-            part, low, high = part[known], low[known], high[known]
+    for stimuli, reliability in designs or product((12, 24, 40), (0.5, 0.8)):
+        studies = run.each(study, [NoisyStudy(seed, stimuli, 10, reliability) for seed in run.seeds()])
+        labels = [f"{kind}, {hidden:g}{side}" for kind, hidden in simulated_boards.UNIQUE_CASES for side in sides]
+        for label, (part, low, high, truth) in zip(labels, np.moveaxis(np.array(studies), 0, 2), strict=True):
+            known = np.isfinite(part)
+            true, part, low, high = np.nanmean(truth), part[known], low[known], high[known]
             numbers = f"{true:.3f}", f"{part.mean():.3f}", share((low <= true) & (true <= high)), share(low > 0)
-            rows.append([str(stimuli), f"{reliability:g}", f"{kind}, {share_hidden:g}", *numbers])
+            rows.append([str(stimuli), f"{reliability:g}", label, *numbers])
     columns = ["stimuli", "reliability", "network, hidden share", "true", "mean", "coverage", "found above 0"]
     return Result("Unique part of networks of six layers, eight animals, ten trials", columns, rows)
 
-
-def ridge(run: Run) -> Result:
-    """Coverage of the scaled score of ridge and of its unique part, with the scale that the animals' noise leaves."""
-    rows = []
-    for stimuli, trials, reliability in RIDGE_DESIGNS:
-        jobs = [NoisyStudy(seed, stimuli, trials, reliability) for seed in run.seeds()]
-        studies = np.array(run.each(simulated_boards.ridge_study, jobs))
-        for (kind, share_hidden), each in zip(simulated_boards.UNIQUE_CASES, np.moveaxis(studies, 0, 2), strict=True):
-            ok = each[0] > 0
-            row = [str(stimuli), str(trials), f"{reliability:g}", f"{kind}, {share_hidden:g}", f"{ok.mean():.2f}"]
-            for value, low, high, truth in (each[1:5, ok], each[5:9, ok]):
-                true = truth.mean() if ok.any() else math.nan
-                held = share((low <= true) & (true <= high)) if ok.sum() >= _FEWEST_OK else "–"
-                row += [f"{true:.3f}", f"{value.mean():.3f}" if ok.any() else "–", held]
-            rows.append([*row, share(each[6, ok] > 0) if ok.sum() >= _FEWEST_OK else "–"])
-    columns = ["stimuli", "trials", "reliability", "network, hidden share", "ok"]
-    columns += ["true score", "mean", "coverage", "true unique part", "mean", "coverage", "found above 0"]
-    return Result("Ridge: scaled score and unique part of networks of six layers, eight animals", columns, rows)
-
-
-RIDGE_DESIGNS = ((12, 10, 0.8), (24, 4, 0.5), (24, 20, 0.8))
-"""Stimuli, trials and reliability of the animals."""
 
 _FEWEST_OK = 15
 """Studies that are ``ok`` below which a coverage says nothing."""
@@ -505,7 +474,9 @@ JOBS: dict[str, Callable[[Run], Result]] = {
     "coverage": coverage,
     "noise": noise,
     "unique": unique,
-    "ridge": ridge,
+    "ridge": partial(
+        unique, study=simulated_boards.ridge_study, sides=(": score", ": unique part"), designs=((12, 0.8), (24, 0.5))
+    ),
     "pairs": pairs,
     "over-time": over_time,
     "dimensions": dimensions,

@@ -16,15 +16,14 @@ import numpy as np
 from scipy import stats
 
 from brainbench.core.contracts import Trials
-from brainbench.core.records import Score
+from brainbench.core.records import Interval, Score
 from brainbench.core.statistics import two_factor_error
 from brainbench.datasets.synthetic import PopulationDesign, ResponseGeometry
 from brainbench.datasets.synthetic.populations import draw_sessions
 from brainbench.metrics import get_metric, rdm
 from brainbench.metrics.evaluation import gather
 from brainbench.metrics.measures.patterns import RidgeEncoding
-from brainbench.metrics.measures.rsa import RSA
-from brainbench.metrics.measures.unique import unique_part
+from brainbench.metrics.measures.rsa import RSA, unique_part
 from brainbench.metrics.rdms.comparison import compare_all
 from brainbench.metrics.reliability.subject_rdm import SubjectRDM
 from brainbench.scoring.over_time import AnimalMovie, score_over_time
@@ -122,17 +121,14 @@ class FewSplits(RSA):
 SHARES_OF_NOISY = (0.0, 0.5, 1.0)
 
 
-def noisy_study(study: NoisyStudy) -> list[tuple[float, float, float, float, float, float]]:
+def noisy_study(study: NoisyStudy) -> list[tuple[float, ...]]:
     """Return ok, value, low, high, the noiseless comparison and the reliability, for models of three shares."""
     rng = np.random.default_rng([study.seed, study.stimuli, study.trials, round(100 * study.reliability)])
     shared, metric = rng.normal(size=(study.stimuli, DIMENSIONS)), FewSplits(splits=20)
-    names, labels = [f"s{index}" for index in range(study.stimuli)], np.repeat(np.arange(study.stimuli), study.trials)
-    animals, noiseless = [], []
+    names, animals, noiseless = [f"s{index}" for index in range(study.stimuli)], [], []
     for index in range(8):
         patterns = shared @ rng.normal(size=(DIMENSIONS, 60))
-        trials = patterns[labels] + math.sqrt(study.noise(patterns)) * rng.normal(size=(len(labels), 60))
-        keys = [f"{study.seed}/{index}/{trial}" for trial in range(len(labels))]
-        animals.append(metric.animal(f"m{index}", [Trials(trials, labels, keys)], study.stimuli))
+        animals.append(_noisy_animal(study, metric, patterns, index, rng))
         noiseless.append(rdm(patterns, method="sqeuclidean"))
     found = []
     for share in SHARES_OF_NOISY:
@@ -140,18 +136,21 @@ def noisy_study(study: NoisyStudy) -> list[tuple[float, float, float, float, flo
         score = metric.score(layer, animals, name="", stimuli=names)
         own = rdm(layer["0"], method="sqeuclidean")
         truth = compare_all(own[None], np.stack(noiseless), method="whitened-cosine").mean()
-        span = (score.interval.low, score.interval.high) if score.interval else (math.nan, math.nan)
-        found.append((float(score.status == "ok"), score.value, *span, float(truth), score.reliability))
+        ok = float(score.status == "ok")
+        found.append((ok, score.value, *_ends(score.interval), float(truth), score.reliability))
     return found
+
+
+def _noisy_animal(study: NoisyStudy, metric: Any, patterns: np.ndarray, index: int, rng: np.random.Generator) -> Any:
+    """Return an animal whose trials of patterns [K, U] have the noise of the study."""
+    labels = np.repeat(np.arange(study.stimuli), study.trials)
+    trials = patterns[labels] + math.sqrt(study.noise(patterns)) * rng.normal(size=(len(labels), patterns.shape[1]))
+    keys = [f"{study.seed}/{index}/{trial}" for trial in range(len(labels))]
+    return metric.animal(f"m{index}", [Trials(trials, labels, keys)], study.stimuli)
 
 
 UNIQUE_CASES = (("hidden", 1.0), ("hidden", 0.5), ("hidden", 0.2), ("raw", 0.5), ("unrelated", 0.5))
 """What the network has, and the share of the animals' features that the raw input lacks."""
-
-
-def without_noise(distances: np.ndarray) -> SubjectRDM:
-    """Return an animal whose RDM [P] is known exactly."""
-    return SubjectRDM("animal", distances, np.empty(0), np.empty((0, 2, len(distances))))
 
 
 def unique_study(study: NoisyStudy) -> list[tuple[float, float, float, float]]:
@@ -171,7 +170,8 @@ def unique_study(study: NoisyStudy) -> list[tuple[float, float, float, float]]:
         sides = [{name: metric.layer(part) for name, part in side.items()} for side in (layers, {"raw input": raw})]
         how: dict[str, Any] = {"comparison": metric.comparison}
         part = unique_part(*sides, scored, factors=factors, factors_without=without, **how)
-        noiseless = [without_noise(rdm(each, method="sqeuclidean")) for each in patterns]
+        rdms = [rdm(each, method="sqeuclidean") for each in patterns]
+        noiseless = [SubjectRDM("animal", each, np.empty(0), np.empty((0, 2, len(each)))) for each in rdms]
         truth = unique_part(*sides, noiseless, factors=np.ones(len(noiseless)), **how)
         results.append((part.unique, part.low, part.high, truth.unique))
     return results
@@ -181,14 +181,11 @@ def _unique_cases(study: NoisyStudy, metric: Any) -> Iterator[tuple[list[np.ndar
     """Yield noiseless patterns [K, U], animals, layers [K, F] and the raw input [K, D] of each of the cases."""
     rng = np.random.default_rng([study.seed, study.stimuli, study.trials, round(100 * study.reliability)])
     raw, hidden = rng.normal(size=(2, study.stimuli, DIMENSIONS))
-    names, labels = [f"s{index}" for index in range(study.stimuli)], np.repeat(np.arange(study.stimuli), study.trials)
     for kind, share in UNIQUE_CASES:
         felt, every, animals = np.hstack([math.sqrt(1 - share) * raw, math.sqrt(share) * hidden]), [], []
         for index in range(8):
             patterns = felt @ rng.normal(size=(2 * DIMENSIONS, 60))
-            trials = patterns[labels] + math.sqrt(study.noise(patterns)) * rng.normal(size=(len(labels), 60))
-            keys = [f"{study.seed}/{index}/{trial}" for trial in range(len(labels))]
-            animals.append(metric.animal(f"m{index}", [Trials(trials, labels, keys)], study.stimuli, stimuli=names))
+            animals.append(_noisy_animal(study, metric, patterns, index, rng))
             every.append(patterns)
         layers = [rng.normal(size=(study.stimuli, 20)) for _ in range(6)]
         if kind != "unrelated":
@@ -196,36 +193,26 @@ def _unique_cases(study: NoisyStudy, metric: Any) -> Iterator[tuple[list[np.ndar
         yield every, animals, {str(place): layer for place, layer in enumerate(layers)}, raw
 
 
-class FewOrdersRidge(RidgeEncoding):
-    """Ridge with few splits and orders, whose p and chance are coarse."""
-
-    orders, splits = 19, 20
-
-
-def ridge_study(study: NoisyStudy) -> list[tuple[float, ...]]:
-    """Return ok, then scaled score and unique part, each with its interval and the truth, for each of the cases.
+def ridge_study(study: NoisyStudy) -> list[tuple[float, float, float, float]]:
+    """Return scaled score and unique part of ridge, with interval and truth, for each of the cases; NaN if not ok.
 
     The truth is on the scale on which 1 is what the animals' responses without noise reach.
     """
-    metric, results, names = FewOrdersRidge(), [], [str(index) for index in range(study.stimuli)]
+    metric, results, order = RidgeEncoding(), [], np.arange(study.stimuli)[None]
+    metric.orders, metric.splits = 19, 20  # p and chance are coarse
     for patterns, animals, layers, raw in _unique_cases(study, metric):
-        score = metric.score(layers, animals, name="", stimuli=names, controls={"raw input": raw})
+        score = metric.score(layers, animals, name="", stimuli=list(map(str, order[0])), controls={"raw input": raw})
         part, span = score.provenance.unique, score.scaled_interval
-        if part is None or span is None:
-            results.append((0.0, *[math.nan] * 8))
+        if score.status != "ok" or part is None or span is None:
+            results += 2 * [(math.nan,) * 4]
             continue
-        order = np.arange(study.stimuli)[None]
         true = [
-            metric.compare_orders(one, [animal], order).item() for one, animal in zip(patterns, animals, strict=True)
+            metric.compare_orders(*pair, order).item() for pair in zip(patterns, [[a] for a in animals], strict=True)
         ]
         reached = np.mean(np.array(true) * [metric.correction(animal, "default").value for animal in animals])
-        results.append(
-            (
-                float(score.status == "ok"),
-                *(score.scaled, span.low, span.high, (score.value - score.chance) / (reached - score.chance)),
-                *(part.unique, part.low, part.high, part.unique * score.attainable / reached),
-            )
-        )
+        truth = (score.value - score.chance) / (reached - score.chance)
+        results.append((score.scaled, span.low, span.high, float(truth)))
+        results.append((part.unique, part.low, part.high, float(part.unique * score.attainable / reached)))
     return results
 
 
@@ -234,20 +221,16 @@ def null_p(study: Study) -> float:
     return score_study(study)[0][0].p
 
 
-def interval_found(study: Study) -> list[tuple[float, float, float, float, float]]:
+def interval_found(study: Study) -> list[tuple[float, ...]]:
     """Return value, low, high, scaled value and the noiseless comparison of every model."""
-    scores, truths = score_study(study)
-    nothing = float("nan")
     return [
-        (
-            score.value,
-            score.interval.low if score.interval else nothing,
-            score.interval.high if score.interval else nothing,
-            score.scaled,
-            float(truth),
-        )
-        for score, truth in zip(scores, truths, strict=True)
+        (score.value, *_ends(score.interval), score.scaled, float(truth))
+        for score, truth in zip(*score_study(study), strict=True)
     ]
+
+
+def _ends(interval: Interval | None) -> tuple[float, float]:
+    return (interval.low, interval.high) if interval else (math.nan, math.nan)
 
 
 def pairs_told_apart(study: Study) -> dict[str, dict[str, tuple[float, float, float]]]:
@@ -304,5 +287,4 @@ def study_over_time(seed: int) -> tuple[float, float, float, float, float]:
     null = score_over_time(layers, animals, width=BIN, permutations=199, seed=seed)
     related = score_over_time({"followed": movie(followed, 40, 0.0)}, animals, width=BIN, permutations=99, seed=seed)
     (found,) = related.latencies
-    span = (found.interval.low, found.interval.high) if found.interval else (math.nan, math.nan)
-    return null.p, min(item.p for item in null.latencies), found.latency, *span
+    return null.p, min(item.p for item in null.latencies), found.latency, *_ends(found.interval)

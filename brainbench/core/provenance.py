@@ -13,10 +13,10 @@ from brainbench.core.files import content_hash
 
 @dataclass(frozen=True)
 class UniquePart:
-    """What a network explains beyond controls, in parts of what is reliable and more than equal distances.
+    """What a network explains beyond controls, in parts of what is reliable.
 
-    Equal distances explain 0, all that is reliable is 1. ``total`` is the sum of ``unique``, ``shared`` and
-    ``controls_alone``. A number is NaN where there is none.
+    Equal distances (of RDMs) or the mean response (of ridge) explain 0, all that is reliable is 1. ``total`` is the sum
+    of ``unique``, ``shared`` and ``controls_alone``. A number is NaN where there is none.
     """
 
     status: str

@@ -22,6 +22,7 @@ from brainbench.metrics.reliability.noise_correction import Corrected, gated
 from brainbench.metrics.reliability.subject_rdm import SubjectRDM, simulated_animals, subject_rdm
 from brainbench.metrics.stimulus_labels import response_matrix
 
+Layers = Mapping[str, Floats]  # what :meth:`MetricHooks.layer` made of layers, by name
 _SAFE_EXPONENT = 64
 """Features whose largest value lies outside 2^±64 are rescaled, so that no square overflows or vanishes."""
 _SPLIT_STIMULI, _FEWEST_SPLITS = 40, 20
@@ -163,12 +164,7 @@ class MetricHooks:
         return {}
 
     def unique(
-        self,
-        layers: Mapping[str, Floats],
-        controls: Mapping[str, Floats],
-        animals: Sequence[SubjectRDM],
-        factors: Floats,
-        **options: Any,
+        self, layers: Layers, controls: Layers, animals: Sequence[SubjectRDM], factors: Floats, **options: Any
     ) -> UniquePart | None:
         """Return what layers explain of animals beyond controls; None where a metric does not say.
 

@@ -22,8 +22,7 @@ from brainbench.core.statistics import PresentationOrder, presentation_order
 
 if TYPE_CHECKING:
     from brainbench.metrics import Metric
-    from brainbench.metrics.reliability.drift import Drift
-    from brainbench.metrics.reliability.subject_rdm import SubjectRDM
+    from brainbench.metrics.reliability.subject_rdm import Drift, SubjectRDM
 
 CONTROL = "presentation time"  # name of the control among the baselines of a record
 CHANCE_LEVEL = 0.05  # the times explain something where their permutation p is at most this
@@ -100,8 +99,7 @@ def presentation_of(
 ) -> Presentation:
     """Return the orders of presentation and drift; the control is scored if asked for, or if time is confounded."""
     from brainbench.metrics.hooks import MetricHooks
-    from brainbench.metrics.reliability.drift import drift_between, drift_within
-    from brainbench.metrics.reliability.subject_rdm import SubjectRDM
+    from brainbench.metrics.reliability.subject_rdm import SubjectRDM, drift_between, drift_within
 
     prepared = [animal for animal in animals if isinstance(animal, SubjectRDM) and animal.problem is None]
     orders = {

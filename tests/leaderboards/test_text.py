@@ -101,6 +101,8 @@ def test_the_unique_part_is_one_sentence_or_the_reason_for_none(make_score):
         "Unique part 0.75 [0.62, 0.88], beyond raw input; shared with them 0.02 (0 = equal distances, 1 = all that is "
         "reliable)."
     )
+    ridge = make_score(metric="ridge: share of variance", provenance={"statistics": {"unique": stated}})
+    assert "(0 = the mean response, 1 = all that is reliable)" in words.unique_sentence(ridge)
     assert said(status="unreliable", reasons=["the score is not ok"]).endswith("; unreliable: the score is not ok.")
     assert said(status="undefined", reasons=["few stimuli"]) == "No unique part: few stimuli."
     assert said(unique="much") == "No unique part: no number is stated."

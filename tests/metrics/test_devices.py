@@ -10,8 +10,7 @@ from brainbench.core.errors import DataError, UsageError
 from brainbench.metrics import compare_models, noise_precision, permutation_test, rdm
 from brainbench.metrics.measures.rsa import score_rdms
 from brainbench.metrics.rdms.comparison import COMPARISONS
-from brainbench.metrics.rdms.dissimilarity import RDM_METHODS
-from brainbench.metrics.rdms.noise import NOISE_METHODS
+from brainbench.metrics.rdms.dissimilarity import NOISE_METHODS, RDM_METHODS
 from tests.factories.animals import STIMULI, make_rdm, make_subject
 
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)]

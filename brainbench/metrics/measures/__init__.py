@@ -7,10 +7,15 @@ features with animals' mean responses. Ours are registered here, in the order in
 from __future__ import annotations
 
 from brainbench.metrics.measures.decoding import LabelDecoding
-from brainbench.metrics.measures.matching import OneToOne, SoftMatching
 from brainbench.metrics.measures.metric import register_metric
-from brainbench.metrics.measures.nuisance import PartialRSA
-from brainbench.metrics.measures.patterns import LinearCKA, Procrustes, RidgeEncoding
+from brainbench.metrics.measures.patterns import (
+    LinearCKA,
+    OneToOne,
+    PartialRSA,
+    Procrustes,
+    RidgeEncoding,
+    SoftMatching,
+)
 from brainbench.metrics.measures.rsa import RSA
 
 for measure in (

@@ -1,24 +1,33 @@
 """Metrics of patterns: models' features [K, F] against animals' mean responses [K, U].
 
-Their base, linear CKA, the Procrustes distance, and ridge encoding.
+Their base, linear CKA, the Procrustes distance, ridge encoding, matched units (one to one, and soft matching by Khosla
+and Williams 2023), and RDMs without what contacts, licks and choices explain.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from brainbench.core.errors import UsageError
+from brainbench.core.contracts import Trials
+from brainbench.core.errors import DataError, UsageError
 from brainbench.core.provenance import UniquePart
+from brainbench.core.statistics import t_interval
 from brainbench.metrics.evaluation import most_chosen
-from brainbench.metrics.inference.permutation import canonical_order
+from brainbench.metrics.hooks import Layers
+from brainbench.metrics.inference.permutation import SMALLEST_STIMULI, canonical_order, label_orders, tail_p
 from brainbench.metrics.measures.metric import Metric
-from brainbench.metrics.measures.unique import lacking, parted
-from brainbench.metrics.rdms.pairs import Floats, Ints
+from brainbench.metrics.measures.rsa import lacking, parted
+from brainbench.metrics.rdms.dissimilarity import rdm
+from brainbench.metrics.rdms.pairs import Floats, Ints, permuted_pairs, rdm_stack, stimulus_count, upper
 from brainbench.metrics.reliability.noise_correction import Corrected, gated
 from brainbench.metrics.reliability.subject_rdm import SubjectRDM
+from brainbench.metrics.stimulus_labels import stimulus_codes, stimulus_means
 
 
 class PatternMetric(Metric):
@@ -165,29 +174,25 @@ class RidgeEncoding(PatternMetric):
         narrow.
         """
         parts = [
-            _banded(animals, np.zeros_like(kernel), [kernel], ONE_BAND) for kernel in map(centred_products, layers)
+            _banded(animals, np.zeros_like(kernel), [kernel], BANDS[-1:]) for kernel in map(centred_products, layers)
         ]
         return np.stack([without[0] for _, without, _ in parts]).T.swapaxes(1, 2) * _explainable(animals)
 
     def unique(
-        self,
-        layers: Mapping[str, Floats],
-        controls: Mapping[str, Floats],
-        animals: Sequence[SubjectRDM],
-        factors: Floats,
-        *,
-        attainable: float = 1.0,
-        committed: str | None = None,
-        seed: int = 0,
+        self, layers: Layers, controls: Layers, animals: Sequence[SubjectRDM], factors: Floats, **options: Any
     ) -> UniquePart:
         """Return what layers predict of left-out stimuli beyond controls, by banded ridge (Nunez-Elizalde 2019).
 
         Controls make one band and a layer the other. Layer, weight of the bands and penalty are chosen on the training
         stimuli of every fold, by leaving each of them out; the layer is that of all animals.
         """
-        layers = {name: layer for name, layer in layers.items() if committed in (None, name) and self._complete(layer)}
-        controls = {name: part for name, part in controls.items() if self._complete(part)}
-        if reason := lacking(layers, controls, animals[0].count):
+        attainable, committed = options.get("attainable", 1.0), options.get("committed")
+        layers, controls = (
+            {name: part for name, part in side.items() if np.isfinite(part).all() and self.varies(part)}
+            for side in ({committed: layers[committed]} if committed is not None else layers, controls)
+        )
+        no_scale = "" if attainable > 0 else "a perfect model could not be told from chance"
+        if reason := lacking(layers, controls, animals[0].count) or no_scale:
             return UniquePart("undefined", (reason,), controls=tuple(controls))
         order = canonical_order(np.stack([animal.rdm for animal in animals]))
         control = np.mean([unit_products(part[order], np.trace) for part in controls.values()], axis=0)
@@ -196,13 +201,9 @@ class RidgeEncoding(PatternMetric):
         unique = (without[0] - without[1]).mean(axis=0) / attainable
         return parted(shares / attainable, unique, controls, list(layers)[most_chosen(chosen)], 0.0)
 
-    def _complete(self, layer: Floats) -> bool:
-        return bool(np.isfinite(layer).all()) and self.varies(layer)
-
 
 BANDS = (0.0, 0.05, 0.2, 0.5, 0.8, 0.95, 1.0)
 """Weights of a layer's kernel beside that of the controls, both of unit trace, from which both together choose."""
-ONE_BAND = (1.0,)
 
 
 def _banded(
@@ -338,3 +339,317 @@ def _fits(kernels: Floats, train: Ints, test: Ints) -> tuple[Floats, Floats]:
     combinations = np.tile(_means(count, train, test), (*rest.shape[:2], 1, 1))
     combinations[..., train] -= weights
     return residuals.reshape(-1, count, count), combinations.reshape(-1, len(test), count)
+
+
+MOST_FEATURES = 128  # features that soft matching takes of a layer, at random; as many as units, where these are more
+
+
+class UnitMatching(PatternMetric):
+    """Base of both: the mean correlation of matched units and features."""
+
+    orders = 199
+    orders_between = 39
+
+    def pairs(self, likeness: Floats) -> tuple[Ints, Ints]:
+        """Return the units [M] and the features [M] that are matched, from their likeness [U, F]."""
+        from scipy.optimize import linear_sum_assignment
+
+        units, features = linear_sum_assignment(likeness, maximize=True)
+        return np.asarray(units), np.asarray(features)
+
+    def chosen(self, features: int, units: int) -> Ints:
+        """Return the features of a layer that take part."""
+        return np.arange(features)
+
+    def compare_orders(self, model: Floats, animals: Sequence[SubjectRDM], orders: Ints) -> Floats:
+        """Return values [N, A] with the model's stimuli in each order [N, K]."""
+        values = np.empty((len(orders), len(animals)))
+        for index, animal in enumerate(animals):
+            left, right = self._tunings(model, animal)
+            for row, order in enumerate(orders):
+                likeness = right.T @ left[order]
+                values[row, index] = likeness[self.pairs(likeness)].mean() if likeness.size else np.nan
+        return values
+
+    def compare_without(self, layers: Sequence[Floats], animals: Sequence[SubjectRDM]) -> Floats:
+        """Return values [K, L, A] without each stimulus in turn, of the pairs that all stimuli match."""
+        count = animals[0].count
+        values = np.full((count, len(layers), len(animals)), np.nan)
+        if count <= 3:
+            return values
+        # Of unit vectors over K stimuli, without one: their product, and the length of each, centred anew.
+        share = count / (count - 1)
+        for row, layer in enumerate(layers):
+            for column, animal in enumerate(animals):
+                left, right = self._tunings(layer, animal)
+                units, features = self.pairs(right.T @ left)
+                a, b = right[:, units], left[:, features]
+                length = (1 - share * a**2) * (1 - share * b**2)
+                product = (a * b).sum(axis=0) - share * a * b
+                part = np.divide(product, np.sqrt(np.maximum(length, 0.0)), out=np.zeros_like(a), where=length > 1e-12)
+                values[:, row, column] = part.mean(axis=1) if a.size else np.nan
+        return values
+
+    def contributions(self, model: Floats, animal: SubjectRDM) -> Floats:
+        """Return the mean correlation [U] of each unit with the features that it is matched with; NaN without any."""
+        left, right = self._tunings(model, animal)
+        likeness = right.T @ left
+        units, features = self.pairs(likeness)
+        number = np.bincount(units, minlength=len(likeness))
+        total = np.bincount(units, weights=likeness[units, features], minlength=len(likeness))
+        return np.divide(total, number, out=np.full(len(likeness), np.nan), where=number > 0)
+
+    def statistics(self, layer: Floats, animals: Sequence[SubjectRDM], seed: int) -> dict[str, Any]:
+        """Return what each unit adds, and the means of each area, layer and cell type over the animals that have it."""
+        parts = {animal.subject: self.contributions(layer, animal) for animal in animals}
+        values = {subject: [float(f"{value:.4g}") for value in part] for subject, part in parts.items()}
+        stated: dict[str, Any] = {"animals": values}
+        columns = sorted({name for animal in animals for name in animal.columns})
+        for column in columns:
+            texts = {animal.subject: animal.columns.get(column, np.full(0, "")) for animal in animals}
+            groups = {}
+            for group in sorted({str(text) for part in texts.values() for text in part} - {""}):
+                inside = [parts[name][part == group] for name, part in texts.items() if (part == group).any()]
+                means = np.array([np.nanmean(part) for part in inside if np.isfinite(part).any()])
+                if not len(means):
+                    continue
+                span = t_interval(means, over="animals")
+                groups[group] = {
+                    "value": float(means.mean()),
+                    "interval": None if span is None else [span.low, span.high],
+                    "units": sum(map(len, inside)),
+                    "animals": len(means),
+                }
+            if groups:
+                stated.setdefault("groups", {})[column] = groups
+        return {"units": stated}
+
+    def _tunings(self, model: Floats, animal: SubjectRDM) -> tuple[Floats, Floats]:
+        """Return the tunings of features [K, F] and of units [K, U], centred and of unit length; silent ones are 0."""
+        units = animal.patterns
+        features = model[:, self.chosen(model.shape[1], units.shape[1])]
+        return _unit_tunings(features), _unit_tunings(units)
+
+
+def _unit_tunings(patterns: Floats) -> Floats:
+    centred = patterns - patterns.mean(axis=0)
+    length = np.linalg.norm(centred, axis=0)
+    # What rounding leaves of a constant response is no tuning.
+    floor = 64 * np.finfo(float).eps * np.abs(patterns).max(axis=0, initial=0.0) * np.sqrt(len(patterns))
+    return np.divide(centred, length, out=np.zeros_like(centred), where=length > floor)
+
+
+class OneToOne(UnitMatching):
+    """Each unit has a feature of its own, so that the mean correlation is the largest (an assignment)."""
+
+    name = "one-to-one"
+    title = "mean correlation over stimuli of units with features of their own, matched one to one"
+
+
+class SoftMatching(UnitMatching):
+    """Equal masses of all units go to equal masses of all features, so that the mean correlation is the largest.
+
+    This is the optimal transport between both. Where one side has a multiple of the other's number its solution is an
+    assignment of copies; so the features of a larger layer are a random sample of a multiple of the units' number. Of a
+    smaller layer each unit gets one feature, and each feature at most a unit more than its share.
+    """
+
+    name = "soft-matching"
+    title = "mean correlation over stimuli of units and features of equal masses, matched by optimal transport"
+
+    def chosen(self, features: int, units: int) -> Ints:
+        """Return a sample of the features, a multiple of the units in number where there are as many."""
+        if features <= units or not units:
+            return np.arange(features)
+        size = units * (min(features, max(MOST_FEATURES, units)) // units)
+        return np.sort(np.random.default_rng(features).permutation(features)[:size])
+
+    def pairs(self, likeness: Floats) -> tuple[Ints, Ints]:
+        """Return the units [M] and the features [M] that share mass; all shares are equal."""
+        units, features = likeness.shape
+        if not likeness.size:
+            return super().pairs(likeness)
+        copies = np.array([max(1, -(-features // units)), max(1, -(-units // features))])
+        rows, columns = super().pairs(likeness.repeat(copies[0], axis=0).repeat(copies[1], axis=1))
+        return rows // copies[0], columns // copies[1]
+
+
+@dataclass(frozen=True)
+class VariancePartition:
+    """Shares of the variance of animals' RDMs, averaged over animals; they add up to ``total``."""
+
+    total: float
+    """R² of model and nuisances together."""
+    unique_model: float
+    """R² that is lost without the model, never negative in a fit to the same pairs."""
+    unique_nuisance: float
+    """R² that is lost without the nuisances."""
+    shared: float
+    """R² that either explains; negative where one hides the other (suppression)."""
+    partial_r: float
+    """Mean correlation of model and animals, both without what the nuisances explain linearly."""
+    p: float
+    """P(partial r under permuted stimuli of the model ≥ observed); NaN below 4 stimuli."""
+    chance: float
+    """Mean unique share of the model under permutation: what fitting few pairs gives for nothing."""
+    nuisances: tuple[str, ...]
+    reason: str = ""
+    """Reason for an undefined p; empty otherwise."""
+
+
+def variance_partition(
+    model_rdm: ArrayLike, nuisance_rdms: Mapping[str, ArrayLike], brain_rdms: ArrayLike, *, seed: int = 0
+) -> VariancePartition:
+    """Partition the variance of animals' RDMs [A, P] between a model's RDM [P] and nuisance RDMs.
+
+    Ordinary least squares per animal, with an intercept; the R² are averaged over animals. The p-value permutes the
+    model's stimuli, as in :func:`permutation_test`, and tests the partial correlation.
+    """
+    if not nuisance_rdms:
+        raise UsageError("There are no nuisances; give the RDM of at least one, or use permutation_test.")
+    model = rdm_stack(model_rdm, "model_rdm")
+    brain = np.atleast_2d(rdm_stack(brain_rdms, "brain_rdms"))
+    rivals = np.stack([rdm_stack(given, f"The nuisance {name!r}") for name, given in nuisance_rdms.items()])
+    pairs = brain.shape[1]
+    if model.shape != (pairs,) or rivals.shape[1:] != (pairs,):
+        raise UsageError(f"RDMs have different numbers of stimuli: {model.shape}, {rivals.shape[1:]} and {(pairs,)}.")
+    if not all(np.isfinite(part).all() for part in (model, brain, rivals)):
+        raise DataError("An RDM has missing pairs; variance can be partitioned over complete RDMs only.")
+    if pairs < len(rivals) + 3:
+        raise DataError(f"{pairs} pairs are too few to fit {len(rivals)} nuisances and a model; use fewer nuisances.")
+    stimuli = stimulus_count(pairs)
+    # In an order of the stimuli that the data fix, random permutations do not depend on how stimuli were listed.
+    order = permuted_pairs(canonical_order(brain)[None])[0]
+    model, brain, rivals = model[order], brain[:, order], rivals[:, order]
+    rest = _without(rivals)
+    residual = brain @ rest
+    scale = ((brain - brain.mean(axis=1, keepdims=True)) ** 2).sum(axis=1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        # R² of each model from sums of squares: residual after the nuisances, and the projection on the model alone.
+        by_nuisance = 1 - (residual**2).sum(axis=1) / scale
+        partial, unique = _partial(model[None], rest, residual, scale)
+        centred = model - model.mean()
+        by_model = (brain @ centred) ** 2 / (centred @ centred) / scale
+    # R² of both = R² of the nuisances + unique share of the model; the other shares are differences.
+    total = by_nuisance + unique[0]
+    reason, p, chance = "", math.nan, math.nan
+    if stimuli < SMALLEST_STIMULI:
+        reason = f"{stimuli} stimuli are too few to permute; at least {SMALLEST_STIMULI} are needed"
+    elif not np.isfinite(partial).all():
+        reason = "the model or an animal varies no more than the nuisances explain"
+    else:
+        chunks = [
+            _partial(model[permuted_pairs(orders)], rest, residual, scale)
+            for orders in label_orders(stimuli, seed, step=4096)
+        ]
+        null = np.concatenate([item[0] for item in chunks]).mean(axis=1)
+        p = float(tail_p(null))
+        chance = float(np.concatenate([item[1] for item in chunks]).mean())
+    return VariancePartition(
+        total=float(total.mean()),
+        unique_model=float(unique[0].mean()),
+        unique_nuisance=float((total - by_model).mean()),
+        shared=float((by_model - unique[0]).mean()),
+        partial_r=float(partial[0].mean()),
+        p=p,
+        chance=chance,
+        nuisances=tuple(nuisance_rdms),
+        reason=reason,
+    )
+
+
+def partial_correlations(models: Floats, nuisances: Floats, brain: Floats) -> Floats:
+    """Return correlations [N] of models [N, P] with an animal [P], both without what nuisances [J, P] explain linearly.
+
+    NaN where nothing is left of either, or where the pairs are too few for so many nuisances.
+    """
+    # Intercept, nuisances and model must leave one degree of freedom.
+    if len(brain) < len(nuisances) + 3:
+        return np.full(len(models), np.nan)
+    rest = _without(nuisances)
+    residual = (brain @ rest)[None]
+    centred = brain - brain.mean()
+    if not (residual**2).sum() > 1e-20 * (centred**2).sum():
+        return np.full(len(models), np.nan)
+    return _partial(models, rest, residual, np.array([(centred**2).sum()]))[0][:, 0]
+
+
+def _without(rivals: Floats) -> Floats:
+    """Return the symmetric projection [P, P] that takes away an intercept and the nuisances."""
+    pairs = rivals.shape[1]
+    basis = np.concatenate([np.ones((1, pairs)), rivals - rivals.mean(axis=1, keepdims=True)])
+    basis /= np.maximum(np.linalg.norm(basis, axis=1, keepdims=True), np.finfo(float).tiny)
+    # 1 − UUᵀ with an orthonormal basis U of intercept and nuisances; the SVD drops collinear ones.
+    left, values, _ = np.linalg.svd(basis.T, full_matrices=False)
+    left = left[:, values > values[0] * 1e-10]
+    return np.eye(pairs) - left @ left.T
+
+
+def _partial(models: Floats, rest: Floats, residual: Floats, scale: Floats) -> tuple[Floats, Floats]:
+    """Return partial correlations and unique shares [N, A] of models [N, P] with animals' residuals [A, P]."""
+    # With residuals a, b: r = a·b/(|a||b|), and R² grows by (a·b)²/(|a|² Σ(y − ȳ)²) when the model is added.
+    left = models @ rest
+    size = (left**2).sum(axis=1)[:, None]
+    size = np.where(size > 1e-20 * (models**2).sum(axis=1)[:, None], size, np.nan)
+    product = left @ residual.T
+    return product / np.sqrt(size * (residual**2).sum(axis=1)), product**2 / size / scale
+
+
+class PartialRSA(PatternMetric):
+    """Partial correlation between RDMs of correlation distances, given nuisance RDMs."""
+
+    name = "rsa-partial"
+    title = "correlation between RDMs without what contacts, licks and choices explain"
+
+    brain_method = "correlation"
+    comparison = "pearson"
+    of_covariates = True
+
+    def animal(self, subject: str, blocks: Sequence[Trials], n_stimuli: int, **options: Any) -> SubjectRDM:
+        """Return the animal with its nuisance RDMs; without any it cannot be used."""
+        animal = super().animal(subject, blocks, n_stimuli, **options)
+        nuisances, lacking = _nuisances(blocks, n_stimuli)
+        if animal.problem is None and not nuisances:
+            absent = f" ({', '.join(lacking)} do not)" if lacking else ""
+            return replace(animal, problem=f"no contacts, licks or choices that differ between stimuli{absent}")
+        return replace(animal, nuisances=nuisances)
+
+    def compare_orders(self, model: Floats, animals: Sequence[SubjectRDM], orders: Ints) -> Floats:
+        """Return values [N, A] with the model's stimuli in each order [N, K]."""
+        permuted = rdm(model)[permuted_pairs(orders)]
+        values = np.full((len(orders), len(animals)), np.nan)
+        for column, animal in enumerate(animals):
+            brain = rdm(animal.patterns)
+            # Nothing is known of what else animals felt whose units were joined.
+            if animal.nuisances and np.isfinite(brain).all():
+                values[:, column] = partial_correlations(permuted, np.stack(list(animal.nuisances.values())), brain)
+        return values
+
+    def statistics(self, layer: Floats, animals: Sequence[SubjectRDM], seed: int) -> dict[str, Any]:
+        """Return the shares of variance of the chosen layer, averaged over animals."""
+        if not np.isfinite(layer).all():
+            return {}
+        parts = [variance_partition(rdm(layer), one.nuisances, rdm(one.patterns), seed=seed) for one in animals]
+        names = ("total", "unique_model", "unique_nuisance", "shared", "chance")
+        nuisances = sorted({name for part in parts for name in part.nuisances})
+        shares = {name: float(np.mean([getattr(part, name) for part in parts])) for name in names}
+        return {"variance_partition": {**shares, "nuisances": nuisances}}
+
+
+def _nuisances(blocks: Sequence[Trials], count: int) -> tuple[dict[str, Floats], list[str]]:
+    """Return the RDM of every covariate with a value for all stimuli and a difference between some, and the others."""
+    # Sessions without two trials of each stimulus are no part of the animal's RDM either.
+    blocks = [block for block in blocks if np.bincount(block.labels, minlength=count).min() > 1]
+    labels = [stimulus_codes(block.labels, count)[0] for block in blocks]
+    rdms, lacking = {}, []
+    for name in dict.fromkeys(name for block in blocks for name in block.covariates):
+        values = [
+            np.asarray(block.covariates.get(name, np.full(len(codes), math.nan)), dtype=np.float64)
+            for block, codes in zip(blocks, labels, strict=True)
+        ]
+        means = stimulus_means(np.concatenate(values)[:, None], np.concatenate(labels), count)[:, 0]
+        if np.isfinite(means).all() and np.ptp(means) > 0:
+            rdms[name] = upper(np.abs(means[:, None] - means))
+        else:
+            lacking.append(name)
+    return rdms, lacking

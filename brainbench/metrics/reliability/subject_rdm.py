@@ -7,6 +7,9 @@ numbers of trials leave it unbiased.
 
 How a perfect model would score is found from the animal without its noise: responses whose products, with the noise of
 the means that trials tell, have the eigenvalues that were observed.
+
+Where responses to a stimulus stay what they are, the halves of its trials by time agree as random halves do; the same
+holds of earlier and later sessions. If few random halves agree as little, the responses drift.
 """
 
 from __future__ import annotations
@@ -25,11 +28,10 @@ from brainbench.core.reading.ranges import check_number
 from brainbench.core.records import Interval
 from brainbench.metrics.arrays import finite_mean
 from brainbench.metrics.rdms.comparison import LINEAR, WITHOUT, check_comparison, compare, products, products_without
-from brainbench.metrics.rdms.dissimilarity import RDM_METHODS
-from brainbench.metrics.rdms.noise import NOISE_METHODS
+from brainbench.metrics.rdms.dissimilarity import NOISE_METHODS, RDM_METHODS
 from brainbench.metrics.rdms.pairs import Floats, Ints, permuted_pairs, stimulus_count
 from brainbench.metrics.reliability.halves import SplitRDMs, half_rdms, time_members
-from brainbench.metrics.reliability.noise_correction import spearman_brown
+from brainbench.metrics.reliability.noise_correction import RELIABILITY_GATE, spearman_brown
 from brainbench.metrics.reliability.sessions import SortedTrials, shifted_sessions, usable_sessions, whitened_sessions
 from brainbench.metrics.stimulus_labels import membership, stimulus_means
 
@@ -89,7 +91,7 @@ class SubjectRDM:
     between: Floats = field(default_factory=lambda: np.empty((0, 0)), repr=False)
     """[S, S] comparisons of the RDMs of single sessions, in order; empty below :data:`FEWEST_SESSIONS`."""
     nuisances: Mapping[str, Floats] = field(default_factory=dict, repr=False)
-    """Name → RDM [P] of what else was measured in the trials; see :mod:`brainbench.metrics.measures.nuisance`."""
+    """Name → RDM [P] of what else was measured in the trials; see :mod:`brainbench.metrics.measures.patterns`."""
 
     def take(self, stimuli: Ints) -> SubjectRDM:
         """Return the animal with some stimuli [K'], in this order; the split halves' comparisons stay as they are."""
@@ -343,3 +345,78 @@ def simulated_animals(animal: SubjectRDM, seed: int) -> tuple[Floats, list[Subje
     spread = np.sqrt(np.maximum(animal.noise, 0.0))
     drawn = (truth + spread * generator.standard_normal(truth.shape) for _ in range(SIMULATIONS))
     return truth, [replace(animal, patterns=patterns) for patterns in drawn]
+
+
+LEVEL = 0.01  # responses drift where so few random halves agree as little; of fewer than 100 halves, where none does
+_ORDERS = 999
+_TIE = 1e-12
+
+
+@dataclass(frozen=True)
+class Drift:
+    """Agreement of halves by time, and of random ones."""
+
+    by_time: float
+    """Within sessions a reliability, between them a share of what any two sessions have in common."""
+    random: float
+    p: float
+    """Of an agreement as low for random halves."""
+    level: float
+    animals: int
+
+    @property
+    def present(self) -> bool:
+        """True where halves by time agree less than chance explains."""
+        return self.p <= self.level
+
+    @property
+    def reliable(self) -> bool:
+        """True where halves by time are as reliable as a score needs."""
+        return self.by_time >= RELIABILITY_GATE
+
+    @property
+    def stated(self) -> dict[str, Any]:
+        """What a record keeps."""
+        return {"by_time": self.by_time, "random": self.random, "p": self.p, "animals": self.animals}
+
+
+def drift_within(animals: Sequence[SubjectRDM]) -> Drift | None:
+    """Compare the halves by time of every session's trials with random ones; None where no times are known."""
+    timed = [animal for animal in animals if animal.problem is None and np.isfinite(animal.by_time)]
+    if not timed:
+        return None
+    # Comparisons, not products: what changes over time averages out in the length of the whole, not in that of halves.
+    # Splits of different animals are independent, so each column of splits is a draw of the mean over animals.
+    null = finite_mean(np.stack([animal.split_half_r for animal in timed]), axis=0)
+    null = null[np.isfinite(null)]
+    observed = float(np.mean([animal.by_time for animal in timed]))
+    p, smallest = _tail(null, observed), 1 / (len(null) + 1)
+    shorter, longer = spearman_brown([observed, float(null.mean())])
+    reliability = float(np.mean([animal.reliability for animal in timed]))
+    by_time = reliability * float(shorter / longer) if longer > 0 else np.nan
+    return Drift(by_time, reliability, p, max(LEVEL, smallest), len(timed))
+
+
+def drift_between(animals: Sequence[SubjectRDM], *, seed: int = 0) -> Drift | None:
+    """Compare the earlier with the later sessions of each animal, in random orders too; None without such animals."""
+    generator, sums, count = np.random.default_rng(seed), np.zeros(_ORDERS + 1), 0
+    for animal in animals:
+        size = len(animal.between)
+        common = animal.between.sum() - np.trace(animal.between)
+        # Sessions that have nothing in common lose nothing over time.
+        if size < FEWEST_SESSIONS or not common > 0:
+            continue
+        orders = np.tile(np.arange(size), (_ORDERS + 1, 1))
+        orders[1:] = generator.permuted(orders[1:], axis=1)
+        half = size // 2
+        crossed = animal.between[orders[:, :half, None], orders[:, None, size - half :]]
+        sums += crossed.mean(axis=(1, 2)) / (common / (size * (size - 1)))
+        count += 1
+    if not count:
+        return None
+    shares = sums / count
+    return Drift(float(shares[0]), 1.0, _tail(shares[1:], float(shares[0])), LEVEL, count)
+
+
+def _tail(null: np.ndarray, observed: float) -> float:
+    return float((1 + (null <= observed + _TIE).sum()) / (len(null) + 1))

@@ -9,7 +9,7 @@ from scipy.stats import kstest
 
 from brainbench.core.contracts import Trials
 from brainbench.metrics import get_metric
-from brainbench.metrics.measures.matching import MOST_FEATURES, OneToOne, SoftMatching
+from brainbench.metrics.measures.patterns import MOST_FEATURES, OneToOne, SoftMatching
 from brainbench.metrics.reliability.subject_rdm import SubjectRDM
 
 STIMULI, TRIALS = 12, 8
@@ -36,7 +36,7 @@ def _make_animals(metric, tunings, *, noise=1.0, seed=0, columns=None):
     return animals
 
 
-def _score(metric, layers, animals):
+def _matched_score(metric, layers, animals):
     return metric.score(layers, animals, name="model", stimuli=NAMES)
 
 
@@ -63,14 +63,17 @@ def test_a_network_with_the_same_units_reaches_one_and_a_turned_one_does_not(nam
     truth = rng.normal(size=(STIMULI, 40)) ** 3
     tunings = [truth[:, rng.permutation(40)[:20]] for _ in range(4)]
     animals = _make_animals(metric, tunings, noise=2.0)
-    equal = _score(metric, {"layer": truth}, animals)
-    turned = _score(metric, {"layer": truth @ np.linalg.qr(rng.normal(size=(40, 40)))[0]}, animals)
+    equal = _matched_score(metric, {"layer": truth}, animals)
+    turned = _matched_score(metric, {"layer": truth @ np.linalg.qr(rng.normal(size=(40, 40)))[0]}, animals)
     assert (equal.status, equal.p) == ("ok", pytest.approx(1 / 200))
     # Of twice as many features soft matching has to use those of other animals' units, too.
     assert equal.scaled == pytest.approx(1.0, abs=0.1) if name == "one-to-one" else equal.scaled > 0.4
     assert turned.scaled < equal.scaled - 0.2
     rsa = get_metric("rsa")
-    same = [_score(rsa, {"layer": part}, _make_animals(rsa, tunings, noise=2.0)).value for part in (truth, truth * 2)]
+    same = [
+        _matched_score(rsa, {"layer": part}, _make_animals(rsa, tunings, noise=2.0)).value
+        for part in (truth, truth * 2)
+    ]
     assert same[0] == pytest.approx(same[1])
 
 
@@ -93,7 +96,7 @@ def test_what_each_unit_adds_is_known_by_unit_and_by_layer():
     tunings = [np.c_[truth, rng.normal(size=(STIMULI, 10))] for _ in range(4)]
     layers = np.repeat(["L4", "L5"], 10)
     animals = _make_animals(metric, tunings, noise=0.5, columns={"layer": layers, "area": np.full(20, "")})
-    units = _score(metric, {"layer": truth}, animals).provenance.statistics["units"]
+    units = _matched_score(metric, {"layer": truth}, animals).provenance.statistics["units"]
     parts = np.array(units["animals"]["m0"], dtype=float)
     assert parts[:10].min() > 0.9
     groups = units["groups"]["layer"]

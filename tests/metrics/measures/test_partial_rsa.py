@@ -9,7 +9,7 @@ import pytest
 
 from brainbench.core.contracts import Trials
 from brainbench.metrics import get_metric, rdm
-from brainbench.metrics.measures.nuisance import partial_correlations, variance_partition
+from brainbench.metrics.measures.patterns import partial_correlations, variance_partition
 
 STIMULI = list("abcdefg")
 LABELS = np.tile(np.arange(7), 12)

@@ -17,9 +17,10 @@ from brainbench.metrics.measures.patterns import (
     _errors_without,
     _fits,
     centred_products,
+    variance_partition,
 )
 from brainbench.metrics.reliability.subject_rdm import subject_rdm
-from tests.factories.animals import STIMULI, make_block, make_latent
+from tests.factories.animals import STIMULI, make_block, make_latent, make_rdm
 
 OTHERS = [name for name in ("cka", "procrustes", "ridge", "rsa", "rsa-crossnobis")]
 
@@ -242,9 +243,13 @@ def test_many_stimuli_take_random_orders():
     latent = rng.normal(size=(12, 3))
     metric = get_metric("ridge")
     animals = [metric.animal(f"m{i}", [make_block(latent, seed=i)], 12) for i in range(3)]
-    found = metric.score({"a": latent}, animals, name="x", stimuli=[str(k) for k in range(12)])
+    controls = {"raw input": rng.normal(size=(12, 3))}
+    found = metric.score({"a": latent}, animals, name="x", stimuli=[str(k) for k in range(12)], controls=controls)
     assert found.p == pytest.approx(1 / 1000)
     assert "999 random orders" in found.p_method
+    part = found.provenance.unique
+    assert (part.status, part.layer, part.controls) == ("ok", "a", ("raw input",))
+    assert part.low < part.unique < part.high
 
 
 def _mixing(hidden, raw, share, *, count=4, noise=1.0, seed=0):
@@ -323,3 +328,65 @@ def test_errors_without_a_training_stimulus_are_those_of_a_fit_that_never_had_it
         predicted = (features[judged] - features[rest].mean(axis=0)) @ slope + responses[rest].mean(axis=0)
         expected = ((responses[judged] - predicted) ** 2).sum()
         assert errors[0 if without is None else 1 + without] == pytest.approx(expected)
+
+
+def _r2(y, *x):
+    design = np.column_stack([np.ones(len(y)), *x])
+    rest = y - design @ np.linalg.lstsq(design, y, rcond=None)[0]
+    return 1 - rest @ rest / ((y - y.mean()) @ (y - y.mean()))
+
+
+def test_the_parts_are_differences_of_r_squared_and_add_up():
+    rng = np.random.default_rng(0)
+    model, one, two = (make_rdm(rng) for _ in range(3))
+    brain = np.stack([model + one + 0.3 * make_rdm(rng) for _ in range(3)])
+    found = variance_partition(model, {"contacts": one, "licks": two}, brain)
+    full = np.mean([_r2(y, model, one, two) for y in brain])
+    nuisance = np.mean([_r2(y, one, two) for y in brain])
+    alone = np.mean([_r2(y, model) for y in brain])
+    assert found.total == pytest.approx(full)
+    assert found.unique_model == pytest.approx(full - nuisance)
+    assert found.unique_nuisance == pytest.approx(full - alone)
+    assert found.unique_model + found.unique_nuisance + found.shared == pytest.approx(found.total)
+    assert found.nuisances == ("contacts", "licks")
+
+
+def test_a_model_that_is_only_the_nuisance_has_no_unique_share():
+    rng = np.random.default_rng(1)
+    contacts = make_rdm(rng)
+    brain = np.stack([contacts + 0.1 * make_rdm(rng) for _ in range(4)])
+    copied = variance_partition(contacts + 0.05 * make_rdm(rng), {"contacts": contacts}, brain)
+    assert copied.unique_model < 0.1
+    assert copied.p > 0.05
+    assert copied.shared > 0.8
+    geometry = make_rdm(rng)
+    true = variance_partition(geometry, {"contacts": contacts}, brain + 2 * geometry)
+    assert true.p <= 0.01
+    assert true.partial_r > 0.9
+    assert true.unique_model > true.chance
+
+
+def test_p_values_of_unrelated_models_are_uniform():
+    rng = np.random.default_rng(2)
+    p = []
+    for _ in range(200):
+        nuisance, model = make_rdm(rng), make_rdm(rng)
+        p.append(variance_partition(model, {"n": nuisance}, nuisance + make_rdm(rng)).p)
+    assert 0.01 <= np.mean(np.array(p) <= 0.05) <= 0.1
+    assert np.mean(p) == pytest.approx(0.5, abs=0.07)
+
+
+def test_misuse_is_told_in_a_sentence():
+    rng = np.random.default_rng(3)
+    model = make_rdm(rng)
+    with pytest.raises(UsageError, match="no nuisances"):
+        variance_partition(model, {}, model)
+    with pytest.raises(DataError, match="missing pairs"):
+        variance_partition(model, {"a": np.full(15, np.nan)}, model)
+    with pytest.raises(DataError, match="too few to fit 4 nuisances"):
+        variance_partition(model[:6], {str(i): model[:6] for i in range(4)}, model[:6])
+    with pytest.raises(UsageError, match="different numbers of stimuli"):
+        variance_partition(model[:10], {"a": model}, model)
+    few = variance_partition(model, {"a": model}, make_rdm(rng))
+    assert np.isnan(few.p)
+    assert "no more than the nuisances explain" in few.reason
