@@ -272,10 +272,10 @@ class _Sketches:
 
         pairs = [(row, place) for row, stimulus in enumerate(stimuli) for place in self.places.get(int(stimulus), ())]
         if pairs:
-            source, target = (list(part) for part in zip(*pairs, strict=True))
+            source, target = map(list, zip(*pairs, strict=True))
             self.keep(run, key, proof.sketch(rows[source]), target, rows.dtype)
 
-    def keep(self, run: int, key: tuple[str, int | None], numbers: np.ndarray, target: Any, kind: Any) -> None:
+    def keep(self, run: int, key: tuple[str, int | None], numbers: np.ndarray, target: Any, kind: Any = None) -> None:
         """Keep sketches at their places in the sample."""
         store = self.runs[run].setdefault(key, np.full((len(self.sample), numbers.shape[1]), np.nan))
         if store.shape[1] == numbers.shape[1]:
@@ -460,8 +460,7 @@ class _HookedReader:
         self._run_sample(sketches)
         chunk = max(1, min(chunk, rooms.memory // 2 // self.size))
         self._run_all(chunk, sketches)
-        for name, reason in sketches.unequal().items():
-            rooms.not_read.setdefault(name, reason)
+        rooms.not_read = sketches.unequal() | rooms.not_read
         self._check(rooms.not_read)
 
     def _check(self, not_read: Mapping[str, str]) -> None:
@@ -507,10 +506,10 @@ class _HookedReader:
         run, model = self.run, self.fresh or self.run.model
         stimuli = run.stimuli(run.sample[:16])
         rows = proof.probes(stimuli.cpu(), run.steps)
-        sampled = slice(0, min(_PROBED, len(stimuli)))
+        least, sketches = min(_PROBED, len(stimuli)), _Sketches(run.sample)
         batches = []
-        for batch, least in ((proof.FIRST, 0), (proof.SECOND, sampled.stop)):
-            filling = [stimuli[place % len(stimuli)] for place in range(max(self.fill - len(batch), least))]
+        for batch, more in ((proof.FIRST, 0), (proof.SECOND, least)):
+            filling = [stimuli[place % len(stimuli)] for place in range(max(self.fill - len(batch), more))]
             probes = [stimuli[0] if row is None else rows[row].to(stimuli) for row in batch]
             batches.append(torch.stack([*probes, *filling]))
         sizes = (len(batches[0]), len(batches[1]))
@@ -524,30 +523,26 @@ class _HookedReader:
 
         def compare(name: str, index: int, tensor: Any) -> None:
             first = calls[name][index] if index < len(calls.get(name, ())) else None
-            if first is None or tensor is None:
-                result = [], "gives no tensor of numbers"
-            else:
+            result: Any = [], "gives no tensor of numbers"
+            if first is not None and tensor is not None:
                 result = proof.stimulus_layouts(first, tensor.cpu(), sizes)
                 for layout, _ in result[0]:
                     rows = layout.split(tensor, sizes[1])[len(proof.SECOND) :]
-                    sketched[name, index, layout] = proof.sketch(rows[sampled])
+                    sketched[name, index, layout] = proof.sketch(rows[:least])
             proven.setdefault(name, []).append(result)
 
         self._forward(model, batches[0], capture)
         self._forward(model, batches[1], compare)
         self.places, self.rooms.not_read, self.size = {}, {}, 1
-        for name in self.modules:
-            if (name not in calls) and (name not in proven):
-                continue
+        for name in [name for name in self.modules if name in calls or name in proven]:
             self.rooms.called.add(name)
             tensors = calls.pop(name, [])
             if len(tensors) != len(proven.get(name, ())):
                 self.rooms.not_read[name] = "does not run alike in every batch"
                 continue
             self._place(name, tensors, proven[name], sizes[0])
-        sketches = _Sketches(run.sample)
         for key, place in self.places.items():
-            sketches.keep(1, (place.layer, place.step), sketched[*key, replace(place.layout, time=None)], sampled, None)
+            sketches.keep(1, (place.layer, place.step), sketched[*key, replace(place.layout, time=None)], slice(least))
         return sketches
 
     def _place(self, name: str, tensors: list[Any], proven: list[Any], batch: int) -> None:
@@ -610,8 +605,7 @@ class _HookedReader:
             def take(name: str, index: int, tensor: Any, picks: Any = picks) -> None:
                 place = self.places.get((name, index))
                 if place is not None and tensor is not None and place.layout.fits(tuple(tensor.shape), len(picks)):
-                    rows = place.layout.split(tensor, len(picks))
-                    sketches.add(1, (place.layer, place.step), rows, picks)
+                    sketches.add(1, (place.layer, place.step), place.layout.split(tensor, len(picks)), picks)
 
             self._forward(self.fresh or run.model, run.stimuli(picks), take)
 
@@ -640,8 +634,8 @@ class _HookedReader:
                     rooms.not_read[place.layer] = f"gives {shape} for {batch} stimuli, unlike in other batches"
                     return
                 rows = place.layout.rows(tensor, batch, run.steps)
-                split = place.layout.split(tensor, batch)
-                sketches.add(0, (place.layer, place.step), split, range(part.start, part.stop))
+                stimuli = range(part.start, part.stop)
+                sketches.add(0, (place.layer, place.step), place.layout.split(tensor, batch), stimuli)
                 if not place.moved and (name, index) not in moved:
                     first = firsts.setdefault((name, index), rows[:1].cpu().clone())
                     if not proof.same(first.expand_as(rows), rows.cpu(), 0.0):
