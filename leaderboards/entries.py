@@ -46,11 +46,12 @@ class Entry:
     """True when it is told apart above the raw input."""
     below_leader: bool = False
     """True when it is told apart below the entry with the highest score."""
-    sample: Sample = field(init=False, repr=False, compare=False)
+    sample: Sample = field(default=None, repr=False, compare=False)  # type: ignore[assignment] - folded below
 
     def __post_init__(self) -> None:
-        """Fold the seeds."""
-        object.__setattr__(self, "sample", Sample.of([record.score for record in self.records]))
+        """Fold the seeds; a copy with other ranks or notes has the same sample."""
+        if self.sample is None:
+            object.__setattr__(self, "sample", Sample.of([record.score for record in self.records]))
 
     @property
     def rank(self) -> str:

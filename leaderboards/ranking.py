@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.records import Interval, ResultRecord, Score
-from brainbench.core.statistics import FEWEST_ANIMALS, FEWEST_STIMULI, LEVEL, two_factor_error
+from brainbench.core.statistics import FEWEST_ANIMALS, FEWEST_STIMULI, LEVEL, error_of_spreads, two_factor_error
 
 FALSE_DISCOVERY_RATE = 0.05
 """Largest expected share of wrong statements among all pairs of a board that are told apart."""
@@ -47,7 +47,8 @@ class Sample:
         left_out = [[score.on_scale(value) for value in score.without_stimulus] for score in scores]
         alike = len({len(values) for values in left_out}) == 1
         seeds = tuple(score.scaled for score in scores)
-        animals = {name: float(np.mean([seed[name] for seed in by_seed])) for name in shared}
+        means = np.mean([[seed[name] for name in shared] for seed in by_seed], axis=0).tolist()
+        animals = dict(zip(shared, means, strict=True))
         return cls(float(np.mean(seeds)), animals, np.mean(left_out, axis=0) if alike else np.empty(0), seeds)
 
     @property
@@ -91,13 +92,16 @@ def apart(count: int, row: Row) -> NDArray[np.bool_]:
     one seed each the test is that of :func:`brainbench.core.statistics.compare_scores`. Of thousands of models only the
     p of each pair is kept, negative where the difference is.
     """
-    from scipy.special import stdtr
+    from scipy.special import ndtri, stdtr
 
     rows: list[NDArray[np.float64]] = []
+    least = -ndtri(FALSE_DISCOVERY_RATE / 2)
     for place in range(count):
         difference, error, freedom = row(place)
         t = np.divide(np.abs(difference), error, out=np.where(difference == 0, 0.0, math.inf), where=error > 0)
-        p = np.where(np.isnan(difference), math.nan, 2 * stdtr(np.where(error > 0, freedom, 1.0), -t))
+        p = np.where(np.isnan(difference), math.nan, 1.0)
+        large = (t > least) & (p == 1)  # below it no p of a t distribution, whose tails are heavier, is within the rate
+        p[large] = 2 * stdtr(np.where(error > 0, freedom, 1.0)[large], -t[large])
         rows.append(np.where(difference < 0, -p, p))
     pairs, limit, passed = sum(int(np.isfinite(p).sum()) for p in rows), FALSE_DISCOVERY_RATE, -1
     # The largest k with k values of p up to k/pairs of the rate: from above, each step takes those that are too large.
@@ -140,6 +144,8 @@ def lacking(animals: int, stimuli: int) -> str:
 
 def differences(samples: Sequence[Sample]) -> Row:
     """Return the differences of each model to those after it; NaN: not tested."""
+    from scipy.spatial.distance import cdist
+
     names = sorted({name for sample in samples for name in sample.animals})
     size = max(len(sample.without_stimulus) for sample in samples)
     table = np.array([[sample.animals.get(name, math.nan) for name in names] for sample in samples])
@@ -149,9 +155,17 @@ def differences(samples: Sequence[Sample]) -> Row:
         if len(sample.without_stimulus) == size:
             row[:] = sample.without_stimulus
     variances = np.array([sample.seed_variance for sample in samples])
+    whole = all(np.isfinite(values).all() for values in (table, left_out))
+    whole &= len(names) >= FEWEST_ANIMALS and size >= FEWEST_STIMULI
+    means = table.mean(axis=1)
+    centred = [values - values.mean(axis=1, keepdims=True) for values in (table, left_out)]
 
     def row_of(place: int) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
         after = slice(place + 1, None)
+        if whole:  # without an array of the differences, which took most of the time of a large board
+            spreads = (cdist(values[[place]], values[after], "sqeuclidean")[0] for values in centred)
+            error, freedom = error_of_spreads(*spreads, len(names), size)
+            return means[place] - means[after], *_with_seeds(error, freedom, [variances[place], variances[after].T])
         animals, stimuli = table[place] - table[after], left_out[place] - left_out[after]
         enough = np.isfinite(animals).sum(axis=1) >= FEWEST_ANIMALS
         enough &= np.isfinite(stimuli).sum(axis=1) >= FEWEST_STIMULI

@@ -13,6 +13,7 @@ import os
 from array import array
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,9 +23,12 @@ from brainbench.core.errors import DataError, DataFileNotFoundError
 from brainbench.core.files import write_text
 from brainbench.core.reading.texts import parse_json, read_text
 from brainbench.core.records import ResultRecord, Score, record_identity
+from brainbench.core.runs.jobs import run_jobs
 
 SCHEMA_PATH = Path(__file__).with_name("record.schema.json")
 """The published JSON Schema (draft 2020-12) of one record file, shipped with the package."""
+BATCH = 250  # records that one process reads at a time
+FEWEST_BATCHES = 4  # of light records that are worth the start of other processes
 MAKE_ONE = "make one with: brainbench score MODEL --out FOLDER"
 
 
@@ -171,18 +175,27 @@ def read_records(
     if not paths:
         places = ", ".join(repr(os.fspath(item)) for item in sources) or "the empty list of files"
         raise DataFileNotFoundError(f"No result records (*.json) in {places}; {MAKE_ONE}")
+    ordered = sorted(set(paths))
+    batches = [ordered[start : start + BATCH] for start in range(0, len(ordered), BATCH)]
+    workers = None if light and len(batches) >= FEWEST_BATCHES else 1
+    parts = dict(run_jobs(partial(_read_all, light=light), batches, workers=workers))
     stored: dict[str, StoredRecord] = {}
-    shared: dict[object, Any] = {}
-    for path in sorted(set(paths)):
+    for item in (item for place in range(len(batches)) for item in parts[place]):
+        stored.setdefault(item.record.identity if item.record else os.fspath(item.path), item)
+    return list(stored.values())
+
+
+def _read_all(paths: Sequence[Path], *, light: bool) -> list[StoredRecord]:
+    stored, shared = [], {}
+    for path in paths:
         try:
             record, digest = _read(path)
         except DataError as error:
-            stored[os.fspath(path)] = StoredRecord(path, None, str(error))
-            continue
-        if record.identity not in stored:
+            stored.append(StoredRecord(path, None, str(error)))
+        else:
             small = StoredRecord(path, lightened(record, shared), digest=digest) if light else None
-            stored[record.identity] = small or StoredRecord(path, record)
-    return list(stored.values())
+            stored.append(small or StoredRecord(path, record))
+    return stored
 
 
 def _parse(text: str, path: Path) -> tuple[ResultRecord, dict[str, Any]]:

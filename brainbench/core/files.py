@@ -230,6 +230,9 @@ def _is_unused(value: Any, field: Field[Any]) -> bool:
     return value is unused or value == unused  # NaN equals nothing
 
 
+_PLAIN = {str, int, bool, type(None)}
+
+
 def to_plain(value: Any) -> Any:
     """Turn dataclasses, mappings, arrays and paths into JSON types; a float without value is null.
 
@@ -239,10 +242,10 @@ def to_plain(value: Any) -> Any:
     # Most of a record are the numbers of its RDMs.
     if type(value) is float:
         return value if math.isfinite(value) else None
-    if value is None or type(value) in (str, int, bool):
+    if type(value) in _PLAIN:
         return value
     if isinstance(value, Mapping):
-        return {str(key): to_plain(item) for key, item in value.items()}
+        return {str(key): item if type(item) in _PLAIN else to_plain(item) for key, item in value.items()}
     if is_dataclass(value) and not isinstance(value, type):
         return {
             field.name: to_plain(getattr(value, field.name))

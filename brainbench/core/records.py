@@ -496,7 +496,8 @@ def _check_rest(data: Any, built: Any, place: str) -> None:
             if name not in names:
                 raise DataError(f"{place or 'the record'} has no field {name!r}; it has {listing(names, limit=40)}.")
             inner = getattr(built, name)
-            if inner is not None and type(inner) not in (str, int, bool):
+            kind = type(inner)
+            if inner is not None and kind not in (str, int, bool) and (kind is not float or math.isinf(inner)):
                 _check_rest(value, inner, f"{place}.{name}".lstrip("."))
     elif isinstance(built, tuple):
         # Most of a record are the numbers of its RDMs: none of these is looked at alone.

@@ -53,14 +53,21 @@ def two_factor_error(
     Returns:
         Standard errors [...] and degrees of freedom [...]; NaN with fewer than two animals or stimuli.
     """
-    left, right = np.asarray(animals, dtype=np.float64), np.asarray(without_stimulus, dtype=np.float64)
-    count, stimuli = np.isfinite(left).sum(axis=-1), np.isfinite(right).sum(axis=-1)
+    parts = np.asarray(animals, dtype=np.float64), np.asarray(without_stimulus, dtype=np.float64)
+    return error_of_spreads(*map(_spread, parts), *(np.isfinite(values).sum(axis=-1) for values in parts))
+
+
+def error_of_spreads(
+    animals: NDArray[np.float64], stimuli: NDArray[np.float64], animal_count: ArrayLike, stimulus_count: ArrayLike
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return what :func:`two_factor_error` does, from the squared deviations [...] over animals and over stimuli."""
+    count, left_out = np.asarray(animal_count), np.asarray(stimulus_count)
     with np.errstate(invalid="ignore", divide="ignore"):
-        over_animals = _spread(left) / (count * (count - 1))
-        over_stimuli = _spread(right) * (stimuli - 1) / stimuli
+        over_animals = animals / (count * (count - 1))
+        over_stimuli = stimuli * (left_out - 1) / left_out
         total = over_animals + over_stimuli
-        freedom = total**2 / (over_animals**2 / (count - 1) + over_stimuli**2 / (stimuli - 1))
-    usable = (count > 1) & (stimuli > 1)
+        freedom = total**2 / (over_animals**2 / (count - 1) + over_stimuli**2 / (left_out - 1))
+    usable = (count > 1) & (left_out > 1)
     return np.where(usable, np.sqrt(total), np.nan), np.where(usable, freedom, np.nan)
 
 

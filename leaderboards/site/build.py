@@ -212,7 +212,8 @@ def _pages(stored: Sequence[StoredRecord], title: str) -> Iterator[tuple[str, _C
         boards[place] = replace(board, entries=(*board.entries[:MODEL_PAGES], *rest))
     synthetic = any(board.synthetic for board in boards)
     benchmarks, means = means_over(boards)
-    columns = [page_board(str(place), board) for place, board in enumerate(boards, start=1)]
+    rows = [table_rows(board) for board in boards]
+    columns = [page_board(str(place), *both) for place, both in enumerate(zip(boards, rows, strict=True), start=1)]
     # Records of earlier versions state no unique part.
     unique = any(part is not None for board in columns for part in board["data"].get("unique", ()))
     table = [column for column in COLUMNS if unique or column["key"] != "unique"]
@@ -256,9 +257,8 @@ def _pages(stored: Sequence[StoredRecord], title: str) -> Iterator[tuple[str, _C
                 yield f"records/{name}", text
         stream.seek(0)
         yield "data/records.zip", stream
-    rows = [row for board in boards for row in table_rows(board)]
-    yield "data/leaderboard.csv", table_csv(rows)
-    yield "data/leaderboard.json", to_json(rows) + "\n"
+    yield "data/leaderboard.csv", table_csv(row for part in rows for row in part)
+    yield "data/leaderboard.json", to_json([row for part in rows for row in part]) + "\n"
     yield "data/record.schema.json", SCHEMA_PATH.read_bytes()
     if benchmarks:
         yield "data/benchmarks.json", to_json({"benchmarks": benchmarks, "models": means}) + "\n"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 from brainbench.core.errors import visible
@@ -76,9 +76,8 @@ def table_csv(rows: Iterable[dict[str, Any]]) -> str:
     return stream.getvalue()
 
 
-def page_board(key: str, board: Board) -> dict[str, Any]:
-    """Return a board as columns, by a key: what the script of the first page shows."""
-    rows = table_rows(board)
+def page_board(key: str, board: Board, rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Return a board and its :func:`table_rows` as columns, by a key: what the script of the first page shows."""
     # Records of earlier versions state no chance: a board of such alone shows the metric's own values.
     scaled = any(row["scaled"] is not None for row in rows)
     score, low, high = ("scaled", "scaled_low", "scaled_high") if scaled else ("value", "low", "high")
