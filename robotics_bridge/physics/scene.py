@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.devices import mujoco_module
 from brainbench.core.errors import UsageError, check_name, repeats, unknown_name
-from brainbench.core.reading.ranges import check_fields, check_number, check_numbers
+from brainbench.core.reading.ranges import check_number, check_numbers
 from brainbench.geometry import Mesh
 
 mujoco = mujoco_module()
@@ -52,11 +52,12 @@ class Geometry:
 
     def __post_init__(self) -> None:
         check_name("kind of geometry", self.kind, KINDS)
-        of = f"{{}} of {self.name!r}"
-        check_numbers(f"size of {self.name!r}", self.size, _SIZES[self.kind], above=0)
-        check_fields(self, "contype", "affinity", of=of, whole=True)
-        check_fields(self, "position", of=of, items=3)
-        check_fields(self, "quaternion", of=of, items=4)
+        of = f"of {self.name!r}"
+        check_numbers(f"size {of}", self.size, _SIZES[self.kind], above=0)
+        check_number(f"contype {of}", self.contype, whole=True)
+        check_number(f"affinity {of}", self.affinity, whole=True)
+        check_numbers(f"position {of}", self.position, 3)
+        check_numbers(f"quaternion {of}", self.quaternion, 4)
         if (self.kind == "mesh") != (self.mesh is not None):
             verb = "has" if self.mesh is not None else "names no"
             raise UsageError(f"The {self.kind} {self.name!r} {verb} mesh; kind='mesh' goes with mesh=Mesh(...).")

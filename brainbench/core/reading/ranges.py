@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import numbers
 from collections.abc import Iterable
-from dataclasses import fields
 from typing import Any
 
 from brainbench.core.errors import UsageError, brief
@@ -39,20 +38,3 @@ def check_numbers(name: str, value: Any, count: int, **bounds: Any) -> None:
         raise UsageError(f"{name} holds {count} numbers; received {brief(value)}.")
     for number in values:
         check_number(name, number, **bounds)
-
-
-def check_fields(options: Any, *names: str, of: str = "{}", items: int = 0, **bounds: Any) -> None:
-    """Check fields of a dataclass as :func:`check_number` does; None passes where the type of the field allows it.
-
-    Errors call a field by its name in place of the braces of ``of``. With ``items`` each field holds so many numbers.
-    """
-    kinds = {field.name: str(field.type) for field in fields(options)}
-    for name in names:
-        # No format: what a user named may hold braces of its own.
-        value, label = getattr(options, name), of.replace("{}", name)
-        if value is None and "None" in kinds[name]:
-            continue
-        if items:
-            check_numbers(label, value, items, **bounds)
-        else:
-            check_number(label, value, **bounds)

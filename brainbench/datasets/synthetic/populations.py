@@ -16,62 +16,58 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.contracts import Trials
 from brainbench.core.errors import DataError, UsageError
-from brainbench.core.reading.ranges import check_fields, check_number
+from brainbench.core.limits import Count, Limit, NotNegative, Positive, Share, limited
+from brainbench.core.reading.ranges import check_number
 
 MODULATION = 0.4  # largest modulation: beyond it too many rates would be cut off at zero for the truth to hold
 
 
 @dataclass(frozen=True)
+@limited
 class PopulationDesign:
     """Size of synthetic recordings, and how noisy they are; the defaults make RDMs of about half reliability."""
 
-    animals: int = 10
-    sessions: int = 1
+    animals: Count = 10
+    sessions: Count = 1
     """Sessions per animal; each has its own units."""
-    units: int = 60
+    units: Count = 60
     """Units per session."""
     trials: int | tuple[int, int] = (16, 20)
     """Trials of each stimulus in a session: one number, or the fewest and the most, drawn evenly."""
-    rate: float = 6.0
+    rate: Positive = 6.0
     """Mean rate of a unit, Hz."""
-    window: float = 0.5
+    window: Positive = 0.5
     """Duration in which spikes are counted, s."""
-    modulation: float = 0.2
+    modulation: Annotated[float, Limit(least=0, most=MODULATION)] = 0.2
     """Standard deviation of a unit's rate over stimuli, as a share of its mean; 0 is the null."""
-    individual: float = 0.0
+    individual: Share = 0.0
     """Share of the tuning variance that is an animal's own and not the shared geometry."""
-    emphasis: float = 0.3
+    emphasis: NotNegative = 0.3
     """Standard deviation over animals of the logarithm of the weight of each axis of the geometry."""
-    spread: float = 0.4
+    spread: NotNegative = 0.4
     """Standard deviation of the logarithm of mean rates over units."""
-    dispersion: float = 0.2
+    dispersion: NotNegative = 0.2
     """φ of the negative binomial: variance = mean + φ mean² per unit and trial; 0 is Poisson."""
-    shared_gain: float = 0.2
+    shared_gain: NotNegative = 0.2
     """Standard deviation of a gain (mean one) that all units of a trial share."""
-    session_gain: float = 0.0
+    session_gain: NotNegative = 0.0
     """Standard deviation of the logarithm of each session's overall rate."""
-    drift: float = 0.0
+    drift: Annotated[float, Limit(above=-1)] = 0.0
     """Relative change of all rates from the first trial of a session to the last, above −1."""
     missing: tuple[tuple[int, int], ...] = ()
     """Pairs (animal, stimulus) without any trial."""
 
     def __post_init__(self) -> None:
-        check_fields(self, "animals", "sessions", "units", least=1, whole=True)
         fewest, most = self.trial_range
         if not 1 <= fewest <= most:
             raise UsageError(f"A design needs at least one of trials, fewest before most; received {self.trials}.")
-        check_fields(self, "rate", "window", above=0)
-        check_fields(self, "emphasis", "spread", "dispersion", "shared_gain", "session_gain", least=0)
-        check_fields(self, "modulation", least=0, most=MODULATION)
-        check_fields(self, "individual", least=0, most=1)
-        check_fields(self, "drift", above=-1)
 
     @property
     def trial_range(self) -> tuple[int, int]:
@@ -171,7 +167,7 @@ class DrawnSession:
     """[R] stimulus of each trial."""
     expected: NDArray[np.float64]
     """[K, U] expected rate, Hz."""
-    window: float
+    window: Positive
     """Duration in which spikes are counted, s."""
 
     @property
@@ -260,7 +256,7 @@ def draw_counts(
     random: np.random.Generator,
     design: PopulationDesign,
     rates: NDArray[np.float64],
-    window: float | NDArray[np.float64],
+    window: Positive | NDArray[np.float64],
 ) -> NDArray[np.int64]:
     """Draw spike counts [R, U] around expected rates [R, U] (Hz) in windows of one length or one each [R, 1], s."""
     # Drift is linear from the first trial to the last, with a mean of one.

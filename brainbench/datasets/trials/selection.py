@@ -21,7 +21,7 @@ from brainbench.core.contracts import (
     near_labels,
 )
 from brainbench.core.errors import DataError, UsageError, brief, check_once, listing, nearest, repeats, unknown_name
-from brainbench.core.reading.ranges import check_fields
+from brainbench.core.reading.ranges import check_number
 from brainbench.datasets.ledger import Ledger
 from brainbench.datasets.sessions import Session, SessionTable
 
@@ -140,7 +140,9 @@ class Rule:
         values = (*self.allow, *self.refuse)
         if not all(values) or (not values and self.low is None and self.high is None):
             raise UsageError(f"The rule on {self.column!r} has an empty value; write a|b or low..high.")
-        check_fields(self, "low", "high", of=f"{{}} of the rule on {self.column!r}")
+        for name, end in (("low", self.low), ("high", self.high)):
+            if end is not None:
+                check_number(f"{name} of the rule on {self.column!r}", end)
         if self.low is not None and self.high is not None and self.low > self.high:
             raise UsageError(f"The rule {self} keeps nothing: the lower end of a range stands first.")
 
@@ -202,7 +204,7 @@ class Selection:
     name: str = "custom"
 
     def __post_init__(self) -> None:
-        check_fields(self, "min_spikes", least=0, whole=True)
+        check_number("min_spikes", self.min_spikes, least=0, whole=True)
         _check_texts("subjects", self.subjects)
 
     @classmethod
@@ -378,8 +380,10 @@ class Window:
     def __post_init__(self) -> None:
         if self.stop is None and self.length is None:
             raise UsageError(f"The window from {self.anchor!r} has no end; give stop (an anchor) or length (s).")
-        check_fields(self, "offset", "stop_offset", of="A window's {} (s)")
-        check_fields(self, "length", above=0, of="A window's {} (s)")
+        check_number("A window's offset (s)", self.offset)
+        check_number("A window's stop_offset (s)", self.stop_offset)
+        if self.length is not None:
+            check_number("A window's length (s)", self.length, above=0)
         if self.stop is None and self.stop_offset:
             raise UsageError("stop_offset is after an event, and this window has no stop; give length alone.")
         if self.anchor != FIRST_CONTACT and self.fallback is not None:

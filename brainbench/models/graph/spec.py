@@ -13,7 +13,7 @@ from functools import cached_property
 from typing import Any, Literal
 
 from brainbench.core.errors import UsageError, brief, check_name, listing
-from brainbench.core.reading.ranges import check_fields, check_number
+from brainbench.core.reading.ranges import check_number
 
 Shape = tuple[int, ...]
 Unroll = Literal["biological", "full"]
@@ -45,8 +45,9 @@ class Operation:
     """``{"method": name in torch.nn.init, **options}``; None is the He-uniform of this package."""
 
     def __post_init__(self) -> None:
-        check_fields(self, "dropout", least=0, most=1)
-        check_fields(self, "bias")
+        check_number("dropout", self.dropout, least=0, most=1)
+        if self.bias is not None:
+            check_number("bias", self.bias)
 
     def output_shape(self, shape: Shape) -> Shape:
         """Return the shape of the output for an input (C, H, W) or (F,)."""
@@ -67,7 +68,7 @@ class Convolution(Operation):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_fields(self, "channels", least=1, whole=True)
+        check_number("channels", self.channels, least=1, whole=True)
         _check_pair("kernel size of a convolution", self.kernel_size)
         _check_pair("stride of a convolution", self.stride)
         if self.padding not in ("same", "valid"):
@@ -92,7 +93,7 @@ class Dense(Operation):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_fields(self, "features", least=1, whole=True)
+        check_number("features", self.features, least=1, whole=True)
 
     def output_shape(self, shape: Shape) -> Shape:
         """Return (features,)."""
@@ -118,7 +119,7 @@ class Memory:
     def __post_init__(self) -> None:
         check_name("memory", self.kind, MEMORIES)
         _check_pair("kernel size of a memory", self.kernel_size)
-        check_fields(self, "tau")
+        check_number("tau", self.tau)
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.errors import UsageError, brief
-from brainbench.core.reading.ranges import check_fields, check_number, check_numbers
+from brainbench.core.reading.ranges import check_number, check_numbers
 from brainbench.geometry import Mesh
 
 FARTHEST = 10.0  # distance [m] from its link beyond which no probe is, and largest radius
@@ -42,7 +42,8 @@ class Probes:
             raise UsageError("A sensor needs at least one probe; received none.")
         for side in shape:
             check_number("a side of the shape", side, least=1, whole=True)
-        check_fields(self, "pitch", items=2, least=0)
+        if self.pitch is not None:
+            check_numbers("pitch", self.pitch, 2, least=0)
         if len(normal) != count or math.prod(shape) != count or len(shape) > 2:
             raise UsageError(f"{count} positions do not go with {len(normal)} normals in the shape {shape}.")
         if not (np.isfinite(position).all() and np.isfinite(normal).all() and np.isfinite(radius).all()):

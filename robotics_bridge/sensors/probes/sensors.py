@@ -11,7 +11,7 @@ import numpy as np
 
 from brainbench.core.devices import warp
 from brainbench.core.limits import Limit, NotNegative, limited
-from brainbench.core.reading.ranges import check_fields
+from brainbench.core.reading.ranges import check_number
 from robotics_bridge.physics.state import HandState
 from robotics_bridge.sensors.kernels.probe import depth_kernel, distance_kernel
 from robotics_bridge.sensors.noise.model import PROBE_KNOBS, TAXEL_KNOBS
@@ -63,7 +63,8 @@ class ContactProbe(QuerySensor):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_fields(self, "release", least=0, most=self.threshold)
+        if self.release is not None:
+            check_number("release", self.release, least=0, most=self.threshold)
 
 
 class DistanceRuntime(ProbeRuntime):
