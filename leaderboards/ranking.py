@@ -163,8 +163,8 @@ def differences(samples: Sequence[Sample]) -> Row:
     def row_of(place: int) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
         after = slice(place + 1, None)
         if whole:  # without an array of the differences, which took most of the time of a large board
-            spreads = (cdist(values[[place]], values[after], "sqeuclidean")[0] for values in centred)
-            error, freedom = error_of_spreads(*spreads, len(names), size)
+            animals, stimuli = (cdist(values[[place]], values[after], "sqeuclidean")[0] for values in centred)
+            error, freedom = error_of_spreads(animals, stimuli, len(names), size)
             return means[place] - means[after], *_with_seeds(error, freedom, [variances[place], variances[after].T])
         animals, stimuli = table[place] - table[after], left_out[place] - left_out[after]
         enough = np.isfinite(animals).sum(axis=1) >= FEWEST_ANIMALS
