@@ -39,11 +39,19 @@ def read_npz(path: str | os.PathLike[str], kind: str = ".npz file") -> dict[str,
 
 
 def _array(stored: Mapping[str, Any], key: str, name: str) -> NDArray[np.generic]:
-    """Return an array of an archive; NumPy refuses objects, which could run code, and more than is stored."""
+    """Return an array of an archive; NumPy itself refuses objects, and more than is stored."""
     with readable(name, "array"):
-        if hasattr(array := stored[key], "dtype"):
-            return array
-    raise DataError(f"{brief(name)} is no array, or it is damaged.")
+        try:
+            array = stored[key]
+        except ValueError as error:
+            if "allow_pickle" not in str(error):
+                raise
+            raise DataError(
+                f"{brief(name)} holds Python objects, which are never loaded: they could run code."
+            ) from error
+    if not hasattr(array, "dtype"):
+        raise DataError(f"{brief(name)} is no array, or it is damaged.")
+    return array
 
 
 def check_archive(archive: zipfile.ZipFile, path: str | os.PathLike[str], kind: str) -> None:
