@@ -50,8 +50,7 @@ class Entry:
 
     def __post_init__(self) -> None:
         """Fold the seeds; a copy with other ranks or notes has the same sample."""
-        if self.sample is None:
-            object.__setattr__(self, "sample", Sample.of([record.score for record in self.records]))
+        object.__setattr__(self, "sample", self.sample or Sample.of([record.score for record in self.records]))
 
     @property
     def rank(self) -> str:

@@ -47,8 +47,7 @@ class Sample:
         left_out = [[score.on_scale(value) for value in score.without_stimulus] for score in scores]
         alike = len({len(values) for values in left_out}) == 1
         seeds = tuple(score.scaled for score in scores)
-        means = np.mean([[seed[name] for name in shared] for seed in by_seed], axis=0).tolist()
-        animals = dict(zip(shared, means, strict=True))
+        animals = {name: float(np.mean([seed[name] for seed in by_seed])) for name in shared}
         return cls(float(np.mean(seeds)), animals, np.mean(left_out, axis=0) if alike else np.empty(0), seeds)
 
     @property
@@ -95,12 +94,11 @@ def apart(count: int, row: Row) -> NDArray[np.bool_]:
     from scipy.special import ndtri, stdtr
 
     rows: list[NDArray[np.float64]] = []
-    least = -ndtri(FALSE_DISCOVERY_RATE / 2)
     for place in range(count):
         difference, error, freedom = row(place)
         t = np.divide(np.abs(difference), error, out=np.where(difference == 0, 0.0, math.inf), where=error > 0)
         p = np.where(np.isnan(difference), math.nan, 1.0)
-        large = (t > least) & (p == 1)  # below it no p of a t distribution, whose tails are heavier, is within the rate
+        large = (t > -ndtri(FALSE_DISCOVERY_RATE / 2)) & (p == 1)  # tails of t are heavier than the normal's
         p[large] = 2 * stdtr(np.where(error > 0, freedom, 1.0)[large], -t[large])
         rows.append(np.where(difference < 0, -p, p))
     pairs, limit, passed = sum(int(np.isfinite(p).sum()) for p in rows), FALSE_DISCOVERY_RATE, -1
@@ -155,17 +153,16 @@ def differences(samples: Sequence[Sample]) -> Row:
         if len(sample.without_stimulus) == size:
             row[:] = sample.without_stimulus
     variances = np.array([sample.seed_variance for sample in samples])
-    whole = all(np.isfinite(values).all() for values in (table, left_out))
-    whole &= len(names) >= FEWEST_ANIMALS and size >= FEWEST_STIMULI
-    means = table.mean(axis=1)
     centred = [values - values.mean(axis=1, keepdims=True) for values in (table, left_out)]
+    whole = len(names) >= FEWEST_ANIMALS and size >= FEWEST_STIMULI and np.isfinite([*map(np.sum, centred)]).all()
 
     def row_of(place: int) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
         after = slice(place + 1, None)
         if whole:  # without an array of the differences, which took most of the time of a large board
             animals, stimuli = (cdist(values[[place]], values[after], "sqeuclidean")[0] for values in centred)
-            error, freedom = error_of_spreads(animals, stimuli, len(names), size)
-            return means[place] - means[after], *_with_seeds(error, freedom, [variances[place], variances[after].T])
+            seeds = [variances[place], variances[after].T]
+            error = _with_seeds(*error_of_spreads(animals, stimuli, len(names), size), seeds)
+            return table[place].mean() - table[after].mean(axis=1), *error
         animals, stimuli = table[place] - table[after], left_out[place] - left_out[after]
         enough = np.isfinite(animals).sum(axis=1) >= FEWEST_ANIMALS
         enough &= np.isfinite(stimuli).sum(axis=1) >= FEWEST_STIMULI

@@ -28,7 +28,6 @@ from brainbench.core.runs.jobs import run_jobs
 SCHEMA_PATH = Path(__file__).with_name("record.schema.json")
 """The published JSON Schema (draft 2020-12) of one record file, shipped with the package."""
 BATCH = 250  # records that one process reads at a time
-FEWEST_BATCHES = 4  # of light records that are worth the start of other processes
 MAKE_ONE = "make one with: brainbench score MODEL --out FOLDER"
 
 
@@ -177,24 +176,25 @@ def read_records(
         raise DataFileNotFoundError(f"No result records (*.json) in {places}; {MAKE_ONE}")
     ordered = sorted(set(paths))
     batches = [ordered[start : start + BATCH] for start in range(0, len(ordered), BATCH)]
-    workers = None if light and len(batches) >= FEWEST_BATCHES else 1
+    workers = None if light and len(batches) > 3 else 1  # other processes take some seconds to start
     parts = dict(run_jobs(partial(_read_all, light=light), batches, workers=workers))
     stored: dict[str, StoredRecord] = {}
-    for item in (item for place in range(len(batches)) for item in parts[place]):
-        stored.setdefault(item.record.identity if item.record else os.fspath(item.path), item)
-    return list(stored.values())
+    for place in reversed(range(len(batches))):  # of equal ones the first counts
+        stored |= parts[place]
+    return sorted(stored.values(), key=lambda record_file: record_file.path)
 
 
-def _read_all(paths: Sequence[Path], *, light: bool) -> list[StoredRecord]:
-    stored, shared = [], {}
+def _read_all(paths: Sequence[Path], *, light: bool) -> dict[str, StoredRecord]:
+    stored, shared = {}, {}
     for path in paths:
         try:
             record, digest = _read(path)
         except DataError as error:
-            stored.append(StoredRecord(path, None, str(error)))
-        else:
-            small = StoredRecord(path, lightened(record, shared), digest=digest) if light else None
-            stored.append(small or StoredRecord(path, record))
+            stored[os.fspath(path)] = StoredRecord(path, None, str(error))
+            continue
+        if record.identity not in stored:
+            small = (lightened(record, shared), None, digest) if light else (record,)
+            stored[record.identity] = StoredRecord(path, *small)
     return stored
 
 
