@@ -193,8 +193,8 @@ def _read_all(paths: Sequence[Path], *, light: bool) -> dict[str, StoredRecord]:
             stored[os.fspath(path)] = StoredRecord(path, None, str(error))
             continue
         if record.identity not in stored:
-            small = (lightened(record, shared), None, digest) if light else (record,)
-            stored[record.identity] = StoredRecord(path, *small)
+            small = StoredRecord(path, lightened(record, shared), digest=digest) if light else None
+            stored[record.identity] = small or StoredRecord(path, record)
     return stored
 
 
