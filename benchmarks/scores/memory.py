@@ -26,7 +26,6 @@ from tests.factories.recordings import LABELS
 TITLE = "Memory per job"
 UNITS, TRIALS, BIN = 1000, 600, 0.01
 SIZES = (40, 80, 160, 320, 1280)  # stimuli
-RECORDS = 1000
 
 
 def write_big(path: Path, *, seconds: float = 1.0, least: float = 1.0) -> None:
@@ -81,15 +80,6 @@ def generate_sweeps(folder: Path) -> None:
     from tests.factories.sweep_batches import small_plan
 
     generate(small_plan(("brick:24", "cone:24"), whiskers="C2,C3,D1", shard_size=32), folder / "set", workers=1)
-
-
-def build_board(folder: Path) -> None:
-    from leaderboards import build_leaderboard, read_records, write_record
-    from tests.factories.records import make_record
-
-    for index in range(RECORDS):
-        write_record(make_record(f"net-{index}", 0.3 + 0.0005 * index), folder / "records")
-    build_leaderboard(read_records(folder / "records"), folder / "site")
 
 
 def score_many(folder: Path, stimuli: int) -> dict[str, float]:
@@ -165,7 +155,6 @@ JOBS: dict[str, Callable[[Path], dict[str, float] | None]] = {
     "explain": partial(score_demo, metric="rsa-correlation", explain=True),
     "stimuli sweep (192 sweeps)": generate_sweeps,
     "train (small, 256 sweeps)": train_small,
-    f"leaderboard build ({RECORDS:,} records)": build_board,
 }
 
 
