@@ -458,8 +458,7 @@ class _HookedReader:
             self.fill = min(chunk, run.count)
             sketches = self._prove()
         self._run_sample(sketches)
-        chunk = max(1, min(chunk, rooms.memory // 2 // self.size))
-        self._run_all(chunk, sketches)
+        self._run_all(max(1, min(chunk, rooms.memory // 2 // self.size)), sketches)
         rooms.not_read = sketches.unequal() | rooms.not_read
         self._check(rooms.not_read)
 
