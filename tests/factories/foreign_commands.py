@@ -27,6 +27,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from tests.factories.structures import restructure
 
 FAILURES = ("traceback", "hang", "crash", "silent", "leaked", "half-written", "wordy")
@@ -377,6 +379,7 @@ def main() -> None:
     parser.add_argument("--cases", type=int, default=200)
     parser.add_argument("--before", type=Path, help="folder of an earlier tree")
     chosen = parser.parse_args()
+    torch.set_num_threads(1)  # a fork of a process whose threads have worked waits for them for ever
     folder = chosen.folder.absolute()
     folder.mkdir(parents=True, exist_ok=True)
     for door in DOORS:
