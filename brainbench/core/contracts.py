@@ -176,8 +176,8 @@ class Trials:
 
 
 MISSING_WORDS = ("nan", "nat")  # texts, in lower case, that programs write where a value is missing
-DOUBTFUL_WORDS = ("none", "na", "n/a", "null", "<na>")
-"""Texts, in lower case, that may mean a missing value, or a condition."""
+_DOUBTFUL = ("", "na", "nil", "none", "null", "nv", "missing", "undefined", "unknown")
+"""Texts, in lower case and without signs, that may mean a missing value, or a condition."""
 _DECIMAL = re.compile(r"-?(?:0|[1-9]\d{0,11})\.\d{1,12}")
 _DIGITS = {2: 3, 4: 7}  # digits that a number of so many bytes keeps through arithmetic; 12 for all others
 
@@ -214,18 +214,29 @@ def as_label(value: Any, digits: int = 12) -> str:
         text = f"{value:.{digits}g}"
         return str(int(value)) if value.is_integer() else str(int(float(text))) if float(text).is_integer() else text
     text = unicodedata.normalize("NFC", str(value).strip())
-    if text.lower() in MISSING_WORDS:
+    if text.lower().lstrip("+-") in MISSING_WORDS:
         return ""
     return as_label(float(text)) if _DECIMAL.fullmatch(text) else text
 
 
+def is_doubtful(label: str) -> bool:
+    """Return whether a label may mean a missing value, such as ``None``, ``#N/A`` or ``--``."""
+    return bool(label) and re.sub(r"[\W_]", "", label).lower() in _DOUBTFUL
+
+
+_SEPARATORS = re.compile(r"(?<=[^\W_])[-_./\s]+(?=[^\W\d_])|(?<=[^\W\d_])[-_./\s]+(?=[^\W_])")
+"""Signs between two words, or a word and a number: between numbers, and at an end, they are meant."""
+
+
 def near_labels(labels: Iterable[str]) -> list[list[str]]:
-    """Return the groups of labels that differ in case, blanks, leading zeros or the seventh digit alone."""
+    """Return the groups of labels that differ in case, blanks, separators, leading zeros or the seventh digit alone."""
     folded: dict[Any, list[str]] = {}
     for label in sorted({*labels} - {""}):
-        number = as_number(label)
+        number = as_number(label.replace(",", "."))
         rounded = number if number.is_integer() or not math.isfinite(number) else float(f"{number:.6g}")
-        folded.setdefault("".join(label.lower().split()) if math.isnan(number) else rounded, []).append(label)
+        letters = (sign for sign in unicodedata.normalize("NFKC", label) if unicodedata.category(sign) != "Cf")
+        words = "".join(_SEPARATORS.sub("", "".join(letters)).casefold().split())
+        folded.setdefault(words if math.isnan(number) else rounded, []).append(label)
     return [twins for twins in folded.values() if len(twins) > 1]
 
 
@@ -286,7 +297,7 @@ def join_labels(
         lonely = {"without a stimulus": alone, "without recordings": unused}
         words = "; ".join(f"{what}: {listing(names, limit=5)}" for what, names in lonely.items() if names)
         # What may mean a missing value is dropped, and only a label that has no equal is paired.
-        partner = "" if alone[0].lower() in DOUBTFUL_WORDS else next(iter(unused), "")
+        partner = "" if is_doubtful(alone[0]) else next(iter(unused), "")
         raise UsageError(
             f"The labels of recordings and stimuli do not match ({words}; equal on both sides: "
             f"{len(pairs) - len(alone)}). Pair them with --match FILE, a line for each label without a stimulus "

@@ -79,7 +79,9 @@ def export(
             for session, session_layout in each_session(file, path, layout):
                 subjects.add(session.subject)
                 if not session.has_spikes and not (signals := _signals(session, kind)):
-                    ledger.leave("sessions", no_units(session), lost=True)
+                    held = _signals(session, "temporaldata")
+                    reason = f"{session.source} holds {listing(held)}, for which copies in {kind} have no place"
+                    ledger.leave("sessions", reason if held else no_units(session), lost=True)
                 elif session.subject in (chosen.subjects or subjects):
                     ledgers.append(Ledger())
                     table = session_layout.conditions.table if session_layout else "trials"
@@ -137,7 +139,7 @@ def subset(
     for place, series in session.populations.items() if units is None else ():
         values = np.asarray(series.data[...])
         values = values if values.ndim > 1 else values[:, None]
-        cells = SessionTable("units", {"id": np.arange(values.shape[-1]), **series.columns}, session.source)
+        cells = series.cells
         columns = select_rows(cells, selection.units, "units", ledger)
         values = values[passing[series.table]] if series.table else values
         stamps = None if series.timestamps is None else np.asarray(series.timestamps[...])
@@ -172,10 +174,12 @@ def _plain(table: SessionTable, rows: NDArray[np.bool_]) -> dict[str, NDArray[An
         if name == OBSERVED:
             columns |= ragged(OBSERVED, [part for part, keep in zip(table.spans(), rows, strict=True) if keep])
             continue
-        if raw.ndim > 1 and 1 not in raw.shape:
-            continue
-        values = decode(raw[...])
+        values = decode(raw[...]) if raw.size == max(raw.shape, default=1) else np.zeros(0, object)
         if values.dtype.kind not in "biufU":
+            if table.name != "units":
+                _LOG.warning(
+                    "Not copied: column %r of %s, which has not one number or text per row.", name, table.label
+                )
             continue
         if name not in table.index:
             columns[name] = table.column(name)[rows]

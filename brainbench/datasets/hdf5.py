@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -210,6 +210,25 @@ def dead_link(group: h5py.Group, name: str, path: Path) -> str | None:
     place = f"{(group.name or '').rstrip('/')}/{name}"
     target = f"{link.path!r} of {link.filename!r}" if isinstance(link, h5py.ExternalLink) else repr(link.path)
     return f"{place} of {path} is a link to {target}, which is not there; put that in its place or remove the link."
+
+
+DEEPEST = 5  # levels of groups that are searched: links may run in circles
+
+
+def walk(
+    parent: h5py.Group, path: Path, into: Callable[[str, h5py.Group], bool], place: str = ""
+) -> Iterator[tuple[str, Any]]:
+    """Yield each group by its place, down to those that ``into`` does not open, and each dead link as a lost table."""
+    import h5py
+
+    for name in map(str, parent):
+        here = f"{place}/{name}" if place else name
+        if (reason := dead_link(parent, name, path)) is not None:
+            yield here, SessionTable(here, {}, str(path), reason)
+        elif isinstance(group := parent[name], h5py.Group):
+            yield here, group
+            if here.count("/") < DEEPEST and into(here, group):
+                yield from walk(group, path, into, here)
 
 
 def write_array(group: h5py.Group, name: str, values: Any) -> h5py.Dataset:

@@ -23,7 +23,7 @@ from brainbench.datasets import hdf5
 from brainbench.datasets.layouts.registry import RecordingLayout, counted_layout
 from brainbench.datasets.ledger import Ledger, balance_line
 from brainbench.datasets.reading import each_session, find_recordings, open_file, suitable_files
-from brainbench.datasets.sessions import SPIKES, Session, SessionTable
+from brainbench.datasets.sessions import SPIKES, Series, Session, SessionTable
 from brainbench.datasets.trials.counting import no_units, read_spikes, recorded_span, time_fault
 from brainbench.datasets.trials.selection import natural_vocabulary, select_rows
 from brainbench.datasets.trials.signals import response_series
@@ -170,9 +170,6 @@ def inspect(path: str | os.PathLike[str], *, strict: bool = False, progress: Pro
         path: What is described; ``LAYOUT:PATH`` names a layout, which is detected otherwise.
         strict: Refuse files among several that hold no recordings; they are skipped and named by default.
         progress: Called with (files read, files, what).
-
-    Raises:
-        DataFileNotFoundError: there is no such file.
     """
     summaries: list[SessionSummary] = []
     proposals: list[Proposal] = []
@@ -204,7 +201,8 @@ def inspect(path: str | os.PathLike[str], *, strict: bool = False, progress: Pro
     subjects = {summary.subject for summary in summaries}
     read = ledger.totals["files"] - len([entry for entry in ledger.left if entry.kind == "files"])
     for kind, number in (("files", read), ("sessions", len(summaries)), ("animals", len(subjects))):
-        ledger.take(kind, number)
+        left = sum(entry.kind == kind == "sessions" for entry in ledger.left)
+        ledger.take(kind, number - left)
         ledger.find(kind, number if kind != "files" else 0)
     ledger.close()
     return Inspection(
@@ -240,22 +238,21 @@ def _summary(session: Session, usable: bool, ledger: Ledger) -> SessionSummary:
             missing.append(f"no spikes: the responses of trials are means of {signal.name}, {shape} samples")
         elif units is None:
             missing.append(no_units(session))
+            if not any(isinstance(item, Series) for item in session.populations.values()):
+                ledger.leave("sessions", missing[0], lost=True)
     except DataError as error:
         missing.append(str(error))
     missing += [units.problem] if units is not None and units.problem else []
     missing += [f"table {table.name}: {table.problem}" for table in tables if table.problem]
     for table in tables:
-        ledger.find("tables")
-        if lost := session.tables[table.name].fault:
-            ledger.leave("tables", lost, lost=True)
-        else:
-            ledger.take("tables")
+        lost = session.tables[table.name].fault
+        ledger.find("tables", read=not lost)
+        ledger.leave("tables", lost, int(bool(lost)), lost=bool(lost))
     if units is not None:
-        ledger.find("units", units.units)
-        ledger.leave("units", units.problem, units.units, lost=True) if units.problem else ledger.take(
-            "units", units.units
-        )
-    missing += time_faults(session)
+        ledger.find("units", units.units, 0 if units.problem else units.units)
+        ledger.leave("units", units.problem, units.units if units.problem else 0, lost=bool(units.problem))
+    lost = [reason for table in (session.units, *session.tables.values()) if table is not None for reason in table.lost]
+    missing += [*lost, *time_faults(session)]
     if not session.tables:
         missing.append("no interval tables: nothing says when which stimulus was presented")
     elif not usable:
@@ -300,12 +297,13 @@ def _units(session: Session) -> UnitsSummary | None:
 
 def time_faults(session: Session) -> list[str]:
     """Return what speaks against seconds of one clock, once for all tables."""
+    faults: list[str] = []
     with contextlib.suppress(BrainbenchError):  # of spikes, which is told already
         if session.units is not None and session.has_spikes:
-            spikes = read_spikes(session.units, [])
+            spikes = read_spikes(session.units, faults)
             tables = (table for table in session.tables.values() if not table.fault)
-            return [fault for table in tables if (fault := time_fault(spikes, table))][:1]
-    return []
+            faults += [fault for table in tables if (fault := time_fault(spikes, table))][:1]
+    return faults
 
 
 def _table(table: SessionTable) -> TableSummary:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Hashable, Iterable, Iterator, Mapping
+from collections.abc import Hashable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -47,9 +47,10 @@ class Ledger:
     seen: dict[Hashable, set[str]] = field(default_factory=dict)
     """Rule → the values that its column has."""
 
-    def find(self, kind: str, number: int = 1) -> None:
-        """Note that so many were found."""
+    def find(self, kind: str, number: int = 1, read: int = 0) -> None:
+        """Note that so many were found, and perhaps how many of them were read."""
         self.totals[kind] += number
+        self.read[kind] += read
 
     def take(self, kind: str, number: int = 1) -> None:
         """Note that so many were read."""
@@ -92,20 +93,17 @@ class Ledger:
             self.leave(entry.kind, entry.reason, entry.number, lost=entry.lost)
         return self
 
-    def unbalanced(self) -> list[str]:
-        """Return a sentence for each kind whose numbers do not add up."""
+    def close(self) -> list[str]:
+        """Return a sentence for each kind whose numbers do not add up; a strict ledger raises DataError for them."""
         out = Counter[str]()
         for entry in self.left:
             out[entry.kind] += entry.number
-        return [
+        faults = [
             f"{self.totals[kind]:,} {kind} were found, {self.read[kind]:,} read and {out[kind]:,} left out"
             for kind in KINDS
             if self.totals[kind] != self.read[kind] + out[kind]
         ]
-
-    def close(self) -> list[str]:
-        """Return what does not add up; a strict ledger raises DataError for it."""
-        if (faults := self.unbalanced()) and self.strict:
+        if faults and self.strict:
             raise DataError(f"The balance of the recordings does not close: {'; '.join(faults)}.")
         return faults
 
@@ -116,26 +114,22 @@ class Ledger:
 
     def stated(self) -> dict[str, Any]:
         """Return the balance as a record states it: kind → found, read, and what was left out."""
+        numbers = Counter[tuple[str, str, bool]]()
+        for entry in self.left:
+            numbers[entry.kind, entry.reason, entry.lost] += entry.number
         return {
             kind: {
                 "found": self.totals[kind],
                 "read": self.read[kind],
                 "left_out": [
                     {"reason": reason, "number": number, "lost": lost}
-                    for (reason, lost), number in _joined(self.left, kind).items()
+                    for (of, reason, lost), number in numbers.items()
+                    if of == kind and number
                 ],
             }
             for kind in KINDS
             if self.totals[kind]
         }
-
-
-def _joined(entries: Iterable[LeftOut], kind: str) -> dict[tuple[str, bool], int]:
-    numbers: dict[tuple[str, bool], int] = {}
-    for entry in (entry for entry in entries if entry.kind == kind and entry.number):
-        key = (entry.reason, entry.lost)
-        numbers[key] = numbers.get(key, 0) + entry.number
-    return numbers
 
 
 def balance_line(stated: Mapping[str, Any]) -> str:

@@ -6,12 +6,11 @@ Needs no NWB schema and touches no raw data. Tables are known by their type, whe
 
 from __future__ import annotations
 
-import contextlib
 import math
 import os
 import re
 import uuid
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,7 +20,7 @@ import numpy as np
 from brainbench.core.contracts import as_labels
 from brainbench.core.errors import DataError
 from brainbench.core.files import create_hdf5
-from brainbench.datasets.hdf5 import columns_of, dead_link, write_array
+from brainbench.datasets.hdf5 import columns_of, walk, write_array
 from brainbench.datasets.sessions import SPIKES, Series, Session, SessionTable, decode, neurodata_type, text
 from brainbench.datasets.trials.counting import LICKS, OTHER_NAMES
 from brainbench.datasets.trials.selection import CONTACTS
@@ -47,7 +46,6 @@ def read_nwb(file: h5py.File, path: Path) -> Session:
     session likewise (``/general/session_id``, ``ses-``, stem). What was guessed is said in ``notes``. Raises DataError:
     the file is NWB 1.x, whose layout differs.
     """
-
     version = text(file.attrs.get("nwb_version", "")) or _string(file, "nwb_version")
     if version.removeprefix("NWB-").startswith("1"):
         raise DataError(f"{path} is NWB {version}; brainbench reads NWB 2.x: convert it first (e.g. with MatNWB).")
@@ -59,11 +57,11 @@ def read_nwb(file: h5py.File, path: Path) -> Session:
     session = _string(file, "general/session_id") or named_by_file(path, "ses")
     description = _string(file, "session_description")
     keywords = file.get("general/keywords")
-    tables, units, signals = _tables(file, path)
-    # Licks are processed data with their own times.
-    processed = (item for _, module in _groups(file.get("processing")) for item in _series(module))
-    licks = [item for item in processed if item[0].rpartition("/")[2] == LICKS]
-    acquired = [neurodata_type(group) for _, group in _groups(file.get("acquisition"))]
+    every = dict(walk(file, path, lambda place, group: not _is_table(place, group)))
+    tables, units, signals = _tables(every, path)
+    groups = {place: group for place, group in every.items() if not isinstance(group, SessionTable)}
+    inside = {place: group for place, group in groups.items() if place.count("/") == 1}
+    acquired = [neurodata_type(group) for place, group in inside.items() if place.startswith("acquisition/")]
     stimuli = _string(file, "general/stimulus")
     return Session(
         subject=subject,
@@ -76,20 +74,26 @@ def read_nwb(file: h5py.File, path: Path) -> Session:
         format=f"NWB {version}",
         synthetic=description.lower().startswith("synthetic") or "synthetic" in _words(keywords),
         intracellular={kind: acquired.count(kind) for kind in _INTRACELLULAR if kind in acquired},
-        modules={name: tuple(module) for name, module in _groups(file.get("processing"))},
+        modules={place[11:]: tuple(module) for place, module in inside.items() if place.startswith("processing/")},
         notes=tuple(notes),
-        series=dict([*_series(file.get("acquisition")), *licks]),
+        series={place: _one_series(group) for place, group in groups.items() if _is_acquired(place, group)},
         stimuli=stimuli.removeprefix(STIMULI) if stimuli.startswith(STIMULI) else "",
         guessed=bool(notes) and subject == path.stem,
         populations={**units, **signals},
     )
 
 
-_ROOTS = ("units", "intervals", "processing", "events", "stimulus", "analysis", "scratch", "acquisition")
-"""Where tables may stand; the rest of a file holds devices, electrodes and notes."""
+def _is_acquired(place: str, group: Any) -> bool:
+    """Return whether a group is an acquired signal, or the licks, which are processed data with their own times."""
+    import h5py
+
+    licks = place.startswith("processing/") and place.rpartition("/")[2] == LICKS
+    return (licks or place.startswith("acquisition/")) and isinstance(group.get("data"), h5py.Dataset)
 
 
-def _tables(file: h5py.File, path: Path) -> tuple[dict[str, SessionTable], dict[str, SessionTable], dict[str, Series]]:
+def _tables(
+    every: Mapping[str, Any], path: Path
+) -> tuple[dict[str, SessionTable], dict[str, SessionTable], dict[str, Series]]:
     """Return the tables of intervals and of units, and the signals of cells, wherever they stand, by what they are.
 
     A table is called by its own name, or with the group around it where that is taken. ``/units`` goes before others.
@@ -97,15 +101,18 @@ def _tables(file: h5py.File, path: Path) -> tuple[dict[str, SessionTable], dict[
     intervals: dict[str, SessionTable] = {}
     units: dict[str, SessionTable] = {}
     signals: dict[str, Series] = {}
-    for place, group in _walk(file, path):
+    for place, group in sorted(
+        every.items(), key=lambda entry: entry[0].partition("/")[0] not in ("units", "intervals")
+    ):
+        kind, name, root = neurodata_type(group), place.rpartition("/")[2], place.partition("/")[0]
         if isinstance(group, SessionTable):  # a dead link
-            name = group.name
             if place == "units":
                 units[place] = group
-            elif place.startswith(("intervals/", "events/")) or CONTACTS.match(name) or name == LICKS:
-                intervals.setdefault(name, group)
+            elif root in ("intervals", "events") or CONTACTS.match(name) or name == LICKS:
+                intervals.setdefault(name, replace(group, name=name))
             continue
-        kind, name = neurodata_type(group), place.rpartition("/")[2]
+        if not _is_table(place, group):
+            continue
         if kind == "Units" or place == "units":
             if "units" not in units:
                 units[place] = _with_areas(_table(group, "units", path), group)
@@ -173,29 +180,10 @@ def _cells(group: h5py.Group) -> dict[str, Any]:
     return columns if len(rows) == (data.shape[1] if data.ndim > 1 else 1) else {}
 
 
-def _walk(parent: h5py.Group, path: Path, place: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield the groups that may be tables by place, and each dead link as a table that says so."""
-    import h5py
-
-    roots = [root for root in _ROOTS if root in parent or parent.get(root, getlink=True)]
-    for name in map(str, parent if place else roots):
-        here = f"{place}/{name}" if place else name
-        if (reason := dead_link(parent, name, path)) is not None:
-            yield here, SessionTable(name, {}, str(path), reason)
-        elif isinstance(group := parent[name], h5py.Group):
-            if (
-                neurodata_type(group) in _SIGNALS
-                or "colnames" in group.attrs
-                or "id" in group
-                or place == "intervals"
-                or here == "units"
-            ):
-                yield here, group
-            elif here.count("/") < _DEEPEST:
-                yield from _walk(group, path, here)
-
-
-_DEEPEST = 5  # levels of groups that are searched for tables: links may run in circles
+def _is_table(place: str, group: Any) -> bool:
+    """Return whether a group is a table or a signal, whose inner groups are none."""
+    kinds = neurodata_type(group) in _SIGNALS, "colnames" in group.attrs, "id" in group
+    return place == "units" or place.rpartition("/")[0] == "intervals" or any(kinds)
 
 
 def _table(group: h5py.Group, name: str, path: Path) -> SessionTable:
@@ -213,18 +201,6 @@ def _table(group: h5py.Group, name: str, path: Path) -> SessionTable:
     return SessionTable(name, {key: columns[key] for key in order}, str(path))
 
 
-def _series(parent: Any) -> Iterator[tuple[str, Series]]:
-    """Yield acquired signals by path, also those inside containers such as BehavioralTimeSeries."""
-    import h5py
-
-    for _, group in _groups(parent):
-        if not isinstance(group.get("data"), h5py.Dataset):
-            yield from _series(group)
-            continue
-        series = _one_series(group)
-        yield series.name, series
-
-
 def _one_series(group: h5py.Group) -> Series:
     import h5py
 
@@ -236,21 +212,6 @@ def _one_series(group: h5py.Group) -> Series:
     if isinstance(channels := group.get("channel_conversion"), h5py.Dataset):
         conversion = conversion * channels[...]
     return Series(path, neurodata_type(group), data, group.get("timestamps"), start, rate, conversion=conversion)
-
-
-def _groups(parent: Any) -> list[tuple[str, h5py.Group]]:
-    import h5py
-
-    groups: list[tuple[str, h5py.Group]] = []
-    if parent is None:
-        return groups
-    for name in parent:
-        # A link into a file that is not there (raw data kept apart) must not hide the rest.
-        with contextlib.suppress(KeyError, OSError):
-            child = parent[name]
-            if isinstance(child, h5py.Group):
-                groups.append((name, child))
-    return groups
 
 
 def _string(file: h5py.Group, name: str) -> str:

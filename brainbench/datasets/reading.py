@@ -18,6 +18,7 @@ from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError,
 from brainbench.core.plugins import load_optional
 from brainbench.core.reading.hdf5 import open_hdf5
 from brainbench.core.reading.regular import check_file
+from brainbench.core.reading.texts import read_text
 from brainbench.datasets import hdf5, nwb, rdm_files, temporaldata
 from brainbench.datasets.layouts.registry import (
     ENTRY_POINTS,
@@ -54,11 +55,9 @@ def find_recordings(source: Source, ledger: Ledger | None = None) -> tuple[Recor
     """
     if not isinstance(source, (str, os.PathLike, Sequence)):
         raise UsageError(f"Recordings are a file, a folder, a glob or a list of these; received {brief(source)}.")
-    if isinstance(source, str):
-        _refuse_address(source)
     prefix, colon, rest = source.partition(":") if isinstance(source, str) else ("", "", "")
     in_file = prefix.endswith(".py")
-    if not colon or not (in_file or is_name(prefix)) or Path(str(source)).exists():
+    if not (in_file or is_name(prefix)) or rest.startswith("//") or not colon or Path(str(source)).exists():
         return None, find_files(source, ledger)
     layout = load_layout(prefix) if in_file else None
     if not rest:
@@ -72,9 +71,6 @@ def find_files(source: Source, ledger: Ledger | None = None) -> list[Path]:
     """Return the recording files a source names, sorted and without repetition.
 
     A folder is searched at every depth for ``.nwb``, ``.h5`` and ``.hdf5``; hidden files are skipped.
-
-    Raises:
-        DataFileNotFoundError: a path does not exist, or a folder or glob holds no recording file.
     """
     items = [source] if isinstance(source, (str, os.PathLike)) else source
     ledger = Ledger() if ledger is None else ledger
@@ -164,27 +160,18 @@ def _check_kind(file: h5py.File, path: Path) -> None:
     )
 
 
-_ADDRESS = re.compile(r"([a-z][a-z0-9+.-]+)://", re.IGNORECASE)
+_ADDRESS = re.compile(r"([a-z][a-z0-9+.-]+):/", re.IGNORECASE)
 _ARRAYS = (
     "arrays of a sorter (.npy); make sessions of them with brainbench.datasets.sessions.make_session and write these "
     "with brainbench.datasets.write_recordings (docs/recordings.md)"
 )
 
 
-def _refuse_address(source: str) -> None:
-    if match := _ADDRESS.match(source):
-        fetch = "`brainbench recordings fetch` takes data sets of the DANDI archive; else download it first"
-        raise UsageError(
-            f"{brief(source)} is an address of {match[1]}://, and recordings are read from files of this machine only: "
-            f"{fetch}."
-        )
-
-
 def unread(path: Path) -> str:
     """Return one sentence on what looks like a recording and is none that can be read; empty for all else."""
     suffixes = {suffix.lower() for suffix in path.suffixes}
     if path.is_symlink() and not path.exists():
-        if suffixes & {*ENDINGS, ".zarr"} or "annex" in os.fspath(path.readlink()):
+        if suffixes & {*ENDINGS, ".zarr"} or not suffixes or "annex" in os.fspath(path.readlink()):
             target = brief(os.fspath(path.readlink()))
             get = f"as git-annex and DataLad leave it: get the content first (datalad get {path.name})"
             return f"{path} is a link to {target}, which is not there, {get}."
@@ -195,9 +182,23 @@ def unread(path: Path) -> str:
             return f"{path} is a folder called .nwb, and no HDF5 file."
         if path.is_symlink() and any(item.suffix.lower() in ENDINGS for item in path.rglob("*")):
             return f"{path} is a link to a folder, which is not searched; name that folder too."
+        if not any(path.iterdir()) and _is_subdataset(path.absolute()):
+            return f"{path} is a data set of DataLad that is not there yet: get it first (datalad get {path.name})."
     elif suffixes & _LIKE and path.suffix.lower() not in ENDINGS:
         return f"{path} ends in {path.suffix}, which is not read; brainbench reads .nwb, .h5 and .hdf5."
+    elif path.is_file() and not path.suffix and os.access(path, os.R_OK):
+        with path.open("rb") as file:
+            if file.read(8) == b"\x89HDF\r\n\x1a\n":
+                return f"{path} is HDF5 and its name has no ending, so it is not read; call it {path.name}.nwb or .h5."
     return ""
+
+
+def _is_subdataset(folder: Path) -> bool:
+    """Return whether a folder is the place of a data set inside another one, as git keeps it."""
+    for parent in folder.parents:
+        if (modules := parent / ".gitmodules").is_file():
+            return f"path = {folder.relative_to(parent).as_posix()}\n" in read_text(modules) + "\n"
+    return False
 
 
 _LIKE = {".nwb", ".hdf", ".he5", ".h5", ".hdf5", ".nix", ".plx", ".pl2", ".nev", ".abf", ".smr", ".smrx", ".mat"}
@@ -220,10 +221,20 @@ def _search(folder: Path, ledger: Ledger) -> list[Path]:
     return files
 
 
-def _expand(source: str, ledger: Ledger) -> list[Path]:
-    path = Path(source).expanduser()
+def _refuse(source: str, path: Path) -> None:
+    """Raise the error for a source that is no recording of this machine, or one of its arrays alone."""
+    if (match := _ADDRESS.match(source)) and not path.exists():
+        raise UsageError(
+            f"{brief(source)} is an address of {match[1]}://, and recordings are read from files of this machine only: "
+            "`brainbench recordings fetch` takes data sets of the DANDI archive; else download it first."
+        )
     if path.suffix == ".npy":
         raise DataError(f"{path} is one of the {_ARRAYS}.")
+
+
+def _expand(source: str, ledger: Ledger) -> list[Path]:
+    path = Path(source).expanduser()
+    _refuse(source, path)
     if path.is_file():
         return [path]
     if reason := unread(path):

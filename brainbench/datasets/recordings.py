@@ -75,9 +75,6 @@ def open_recordings(
         removed, each counted once, in the order of the rules), missing (subject → labels without a trial), sessions,
         notes, doubts (notes that every result must state), overlap (share of trials whose window overlaps with that of
         an earlier one of their label), skipped (why a file is left out), sizes, source, synthetic, content_hash.
-
-    Raises:
-        DataFileNotFoundError: the source names nothing.
     """
     ledger = Ledger(strict=strict)
     layout, paths = find_recordings(source, ledger)
@@ -222,15 +219,14 @@ class _Reader:
     def _balance(self, parts: list[SessionCounts], joined: xr.Dataset) -> None:
         """Close the ledger over the sessions that were counted, and write it into the data set."""
         ledger, read = self.ledger, {*joined["subject"].values.tolist()}
-        ledger.find("animals", len(self.subjects))
-        ledger.take("animals", len(read))
+        ledger.find("animals", len(self.subjects), len(read))
         for name, reason in self.subjects.items():
             if name not in read:
-                chosen = not reason or reason.endswith("chosen animals")
+                chosen = reason.endswith("chosen animals")
                 ledger.leave("animals", reason or f"{name}: no trial is left", lost=not chosen)
         labels = frozenset[str]().union(*(part.found_labels for part in parts))
-        ledger.find("labels", len(labels))
-        ledger.take("labels", len(present := labels & {*joined["stimulus"].values.tolist()}))
+        present = labels & {*joined["stimulus"].values.tolist()}
+        ledger.find("labels", len(labels), len(present))
         for label in sorted(labels - present):
             ledger.leave("labels", f"{label}: no trial is left")
         for part in parts:

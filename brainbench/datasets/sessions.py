@@ -109,7 +109,7 @@ class SessionTable:
             words = [word_of.get(number, str(number)) for number in values.ravel().tolist()]
             values = np.array(words, dtype=str).reshape(values.shape)
         values = decode(values)
-        if values.ndim == 2 and 1 in values.shape and values.size == len(self):
+        if values.ndim > 1 and values.size == max(values.shape) == len(self):
             values = values.ravel()
         if values.ndim != 1 or values.dtype.kind not in "biufU":
             raise DataError(
@@ -133,6 +133,8 @@ class SessionTable:
 
     def ends(self, name: str) -> NDArray[np.int64]:
         """Return the checked row ends [rows] of a ragged column."""
+        if name not in self.data:
+            raise DataError(f"{self.label} has {name}_index without {name}; the values of its rows are missing.")
         if name not in self.index:
             what = name.replace("_", " ")
             raise DataError(f"{self.label} has {name} without {name}_index; the {what} belong to no row.")
@@ -153,7 +155,7 @@ class SessionTable:
         """Read a ragged column of numbers: one array per row."""
         ends = self.ends(name)
         flat = np.asarray(self.data[name][...], dtype=np.float64)
-        flat = flat.ravel() if flat.ndim == 2 and 1 in flat.shape else flat
+        flat = flat.ravel() if flat.size == max(flat.shape) else flat
         bad = ~np.isfinite(flat)
         if bad.any():
             row = int(np.searchsorted(ends, np.flatnonzero(bad)[0], side="right"))
@@ -177,6 +179,11 @@ class SessionTable:
     def with_columns(self, **columns: NDArray[Any]) -> SessionTable:
         """Return the table with further columns [rows]."""
         return replace(self, data={**self.data, **columns})
+
+    @property
+    def lost(self) -> list[str]:
+        """Why columns are not there, though the file names them."""
+        return [column.reason for column in self.data.values() if isinstance(column, LostColumn)]
 
     def require(self, column: str) -> None:
         """Raise the error for an unknown column, naming the nearest one."""
@@ -211,7 +218,7 @@ def _target(index: Any) -> str:
 def _length(values: Any, width: int = 1) -> int:
     """Return the number of rows, each of so many values; a single axis may lie in two, as MATLAB writes it."""
     shape = tuple(values.shape)
-    if len(shape) == 2 and (width in shape if width > 1 else 1 in shape):
+    if (len(shape) == 2 and width in shape) if width > 1 else math.prod(shape) == max(shape, default=0):
         return math.prod(shape) // width
     return shape[0] if shape else 1
 
@@ -238,6 +245,12 @@ class Series:
     """Table of the rows of ``data`` [trial, time, unit]; times then count from the start of each."""
     columns: Mapping[str, Any] = field(default_factory=dict)
     """What is known of each column of the samples, such as whether it is a cell: name → [units]."""
+
+    @property
+    def cells(self) -> SessionTable:
+        """What is known of each column of the samples, their numbers at least."""
+        number = self.data.shape[-1] if len(self.data.shape) > 1 else 1
+        return SessionTable("units", {"id": np.arange(number), **self.columns}, self.name)
 
     @property
     def gigabytes(self) -> float:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from brainbench.core.errors import DataError, brief
 from brainbench.core.files import create_hdf5
-from brainbench.datasets.hdf5 import as_ascii, columns_of, dead_link
+from brainbench.datasets.hdf5 import as_ascii, columns_of, walk
 from brainbench.datasets.nwb import named_by_file
 from brainbench.datasets.sessions import OBSERVED, SPIKES, Series, Session, SessionTable, decode, ragged, text
 from brainbench.datasets.trials.counting import merged
@@ -31,7 +31,6 @@ if TYPE_CHECKING:
 IRREGULAR, REGULAR = "IrregularTimeSeries", "RegularTimeSeries"
 _CLASSES = ("Data", "ArrayDict", "Interval", IRREGULAR, REGULAR)
 _TIMES = {"start": "start_time", "end": "stop_time"}  # columns of every interval → their names here
-_DEEPEST = 5  # levels of groups that are searched: links may run in circles
 _LONGEST = 1e7  # seconds of a session, each of which gets an entry; more are other units of time
 
 
@@ -44,8 +43,12 @@ def read_temporaldata(file: h5py.File, path: Path) -> Session:
     """Describe the session in an open file; tables and signals are read later, while it stays open."""
     units, tables, groups = dict[str, SessionTable](), dict[str, SessionTable](), dict[str, Any]()
     signals, others = dict[str, Series](), dict[str, Series]()
-    for place, group in _walk(file, path):
-        (tables if isinstance(group, SessionTable) else groups)[place] = group
+    for place, group in walk(file, path, lambda _, group: _class(group) == "Data"):
+        if isinstance(group, SessionTable) or (kind := _class(group)) in _CLASSES:
+            (tables if isinstance(group, SessionTable) else groups)[place] = group
+        else:
+            reason = f"{place} of {path} is of the class {brief(kind)}, which is none of {', '.join(_CLASSES)}."
+            tables[place] = SessionTable(place, {}, str(path), reason)
     dicts = {place: columns_of(group, path) for place, group in groups.items() if _class(group) == "ArrayDict"}
     for place, group in groups.items():
         kind = _class(group)
@@ -86,24 +89,6 @@ def read_temporaldata(file: h5py.File, path: Path) -> Session:
 
 def _class(group: Any) -> str:
     return text(group.attrs.get("object", ""))
-
-
-def _walk(parent: h5py.Group, path: Path, place: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield the group of every object by its place, and what cannot be read as a table that says why."""
-    import h5py
-
-    for name in map(str, parent):
-        here = f"{place}/{name}" if place else name
-        if (reason := dead_link(parent, name, path)) is not None:
-            yield here, SessionTable(here, {}, str(path), reason)
-        elif isinstance(group := parent[name], h5py.Group):
-            if (kind := _class(group)) in _CLASSES:
-                yield here, group
-            else:
-                reason = f"{here} of {path} is of the class {brief(kind)}, which is none of {', '.join(_CLASSES)}."
-                yield here, SessionTable(here, {}, str(path), reason)
-            if kind == "Data" and here.count("/") < _DEEPEST:
-                yield from _walk(group, path, here)
 
 
 def _units(group: Any, place: str, dicts: dict[str, dict[str, Any]], observed: Any, path: Path) -> SessionTable:
@@ -224,7 +209,7 @@ def _write_table(group: h5py.Group, table: SessionTable, session: Session) -> ND
     for series in session.populations.values() if session.units is None else ():
         if isinstance(series, Series) and series.table == table.name:
             group.create_dataset(series.name, data=np.asarray(series.data[...])[order]).attrs["unit"] = series.unit
-            _columns(_group(group.file, f"{series.name}_cells", "ArrayDict"), _plain(series))
+            _columns(_group(group.file, f"{series.name}_cells", "ArrayDict"), _cells(series))
             if series.timestamps is not None:
                 _columns(_group(group.file, f"{series.name}_samples", "ArrayDict"), {"time": series.timestamps[...]})
     return edges
@@ -238,14 +223,12 @@ def _write_signal(file: h5py.File, series: Series) -> NDArray[np.float64]:
     data.attrs.update({"unit": series.unit, "kind": series.kind, "conversion": series.conversion})
     _columns(group, {"timestamps": times}, ["timestamps"])
     _grid(group, times, edges := times[[[0, -1]]])
-    _columns(_group(file, f"{series.name}_cells", "ArrayDict"), _plain(series))
+    _columns(_group(file, f"{series.name}_cells", "ArrayDict"), _cells(series))
     return edges
 
 
-def _plain(series: Series) -> dict[str, NDArray[Any]]:
-    """Return what is known of each column of a signal, their numbers at least."""
-    number = series.data.shape[-1] if len(series.data.shape) > 1 else 1
-    return {"id": np.arange(number), **{name: decode(values[...]) for name, values in series.columns.items()}}
+def _cells(series: Series) -> dict[str, NDArray[Any]]:
+    return {name: decode(values[...]) for name, values in series.cells.data.items()}
 
 
 def _grid(group: h5py.Group, times: NDArray[np.float64], edges: NDArray[np.float64]) -> None:

@@ -99,9 +99,18 @@ def packed(code):
 
 
 SHAPES = {"n1": lambda values: values[:, None], "1n": lambda values: values[None]}
+SHAPES |= {"n11": lambda values: values[:, None, None]}
 SHAPED = [f"{TRIALS}/{name}" for name in ("start_time", "stop_time", "stimulus", "id")]
 SHAPED += [f"units/{name}" for name in ("spike_times", "spike_times_index", "id")]
-PLACES = ("processing/behavior", "stimulus/presentation", "analysis", "scratch", "acquisition", "processing/a/b")
+PLACES = (
+    "processing/behavior",
+    "stimulus/presentation",
+    "analysis",
+    "scratch",
+    "acquisition",
+    "processing/a/b",
+    "general",
+)
 NEEDED = [f"{TRIALS}/stimulus", f"{TRIALS}/start_time", f"{TRIALS}/id", TRIALS, "units", "intervals/invalid_times"]
 NEEDED += ["units/spike_times", "units/spike_times_index", "units/obs_intervals", "units/obs_intervals_index"]
 UNNEEDED = ("units/electrodes", "acquisition/raw", "general/extracellular_ephys", "units/waveform_mean")
@@ -132,6 +141,8 @@ FILE = {
     **{f"{place} {form}": (shaped(place, turn), "same") for place in SHAPED for form, turn in SHAPES.items()},
     "spans": (spans, "same"),
     "spans 2n": (lambda file: spans(file, np.transpose), "same"),
+    "index without spans": (lambda file: (spans(file), file.pop("units/obs_intervals")), r"without obs_intervals;"),
+    "trials at the root": (lambda file: file.move(TRIALS, "trials"), "same"),
     "spans without index": (lambda file: spans(file, index=False), r"obs_intervals without obs_intervals_index"),
     "number beside": (number_beside, "same"),
     "index of any name": (index_of_any_name, "same"),
@@ -156,8 +167,11 @@ LABELS = {
     "NFD": (np.array([unicodedata.normalize("NFD", "\u00e9"), "b", "c"]), "count as one"),
     "blanks": (np.array(["\u00e9 ", "b", "c"]), "count as one"),
     "case": (np.array(["\u00e9", "B", "c"]), "count as different stimuli"),
-    **{word: (np.array(["a", "b", word]), "no value of stimulus") for word in ("nan", "NaN", "NaT", "")},
-    **{word: (np.array(["a", "b", word]), "may mean a missing value") for word in ("None", "NA", "n/a", "<NA>")},
+    **{word: (np.array(["a", "b", word]), "no value of stimulus") for word in ("nan", "NaN", "-nan", "NaT", "")},
+    **{
+        word: (np.array(["a", "b", word]), "may mean a missing value")
+        for word in ("None", "NA", "n/a", "<NA>", "#N/A", "--", "unknown", "\u2014")
+    },
 }
 TIMES = {
     "milliseconds": (lambda times: 1000 * times, "look like milliseconds"),
@@ -167,6 +181,7 @@ TIMES = {
     "restart": (lambda times: np.concatenate([times[:60], times[:60]]), "start anew"),
     "of trials": (lambda times: np.concatenate([np.linspace(0, 0.4, 12)] * 10), "start anew"),
     "of trials, sorted": (lambda times: np.sort(times % 0.5), "count from the start of each trial"),
+    "minutes": (lambda times: 60 * times + 1200, "not on one clock"),
     "unsorted": (np.random.default_rng(0).permutation, "have been sorted"),
 }
 

@@ -32,7 +32,7 @@ from brainbench.datasets.ledger import Ledger
 from brainbench.datasets.reading import Source, each_session, find_recordings, open_file
 from brainbench.datasets.sessions import Series, Session
 from brainbench.datasets.trials.counting import ReadingOptions, count_session, no_units, read_spikes, time_fault
-from brainbench.datasets.trials.selection import DEFAULT, WHOLE, Conditions, joined_labels, label_doubts
+from brainbench.datasets.trials.selection import DEFAULT, WHOLE, Conditions, divided_labels, joined_labels, label_doubts
 from brainbench.datasets.trials.session_trials import Copies
 
 _NUMBER = re.compile(r"\d+(?:,\d{3})*(?:\.\d+)?")
@@ -97,9 +97,6 @@ def check(source: Source, *, conditions: str | Conditions | None = None, progres
         source: as in :func:`~brainbench.datasets.open_recordings`.
         conditions: table and columns that label the trials, to check the labels; the layout's by default.
         progress: called with (files checked, files, what).
-
-    Raises:
-        DataFileNotFoundError: the source names nothing.
     """
     ledger = Ledger()
     layout, paths = find_recordings(source, ledger)
@@ -115,7 +112,8 @@ def check(source: Source, *, conditions: str | Conditions | None = None, progres
             severity: Severity = "note" if beside and path.suffix != ".nwb" else "error"
             findings.append(Finding(severity, "file", str(error), where=path.name))
     singly = {finding.message for finding in findings}
-    across = (doubt for doubt in label_doubts(every.forms, every.labels) if doubt not in singly)
+    doubts = [*label_doubts(every.forms, {label for _, label in every.labels}), *divided_labels(every.labels)]
+    across = (doubt for doubt in doubts if doubt not in singly)
     findings += [Finding("warning", "labels", doubt, _LABELS, where="all sessions") for doubt in across]
     place = str(source) if not isinstance(source, (list, tuple)) else ", ".join(map(str, source))
     worst_first = sorted(findings, key=lambda finding: SEVERITIES.index(finding.severity))
@@ -131,7 +129,8 @@ class _Everything:
 
     copies: Copies = field(default_factory=Copies)
     forms: dict[tuple[str, str], set[str]] = field(default_factory=dict)
-    labels: set[str] = field(default_factory=set)
+    labels: set[tuple[str, str]] = field(default_factory=set)
+    """Each animal with each of its labels."""
 
 
 def _check_file(
@@ -179,7 +178,8 @@ def check_session(
             for key, written in conditions.forms(table).items():
                 every.forms.setdefault(key, set()).update(written)
             fixed = layout is not None and layout.vocabulary(conditions) is not None
-            every.labels |= set() if fixed else {*joined_labels(conditions.values(table))}
+            labels = set() if fixed else {*joined_labels(conditions.values(table))} - {""}
+            every.labels |= {(session.subject, label) for label in labels}
     notes: list[str] = []
     try:
         spikes = read_spikes(session.units, notes)

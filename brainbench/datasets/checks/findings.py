@@ -105,7 +105,7 @@ def _order(table: SessionTable, values: NDArray[np.str_]) -> Iterator[Finding]:
     """Labels in blocks: slow changes over the session then pass for differences between stimuli."""
     labels = np.array(joined_labels(values))
     present = labels != ""
-    with contextlib.suppress(DataError):
+    with contextlib.suppress(BrainbenchError):
         order = presentation_order(table.times("start_time")[present], labels[present])
         if order is not None and order.confounded:
             message = f"stimulus and time are confounded: {order}"
@@ -171,8 +171,6 @@ def _answers(table: SessionTable) -> Iterator[Finding]:
         yield Finding("error", "labels", message, advice)
 
 
-_LONGEST_TRIAL = 600.0
-_MANY_ROWS = 10  # a table of few long rows may be one of epochs
 _SHIFTS = range(-5, 6)  # rows by which a column is tried against the trials
 _GAP = 30.0  # a silence of all units this long (s) is a break in the recording
 
@@ -182,6 +180,8 @@ def check_tables(session: Session) -> Iterator[Finding]:
     if not session.tables:
         message = "there are no interval tables: nothing says when which stimulus was presented"
         yield Finding("error", "tables", message)
+    for reason in [] if session.units is None or session.units.fault else session.units.lost:
+        yield Finding("warning", "units", reason, "Scores that ask for this column are refused.")
     for table in session.tables.values():
         if table.fault:
             yield Finding("error", "tables", table.fault)
@@ -231,14 +231,6 @@ def _times(table: SessionTable) -> Iterator[Finding]:
         if bad.any():
             message = f"{share(int(bad.sum()), rows)} rows of {name} have {what}"
             yield Finding(severity, "times", message, "Such rows cannot be counted.")
-    duration = stop - start
-    finite = np.isfinite(duration)
-    if not finite.any():
-        return
-    middle, last = float(np.median(duration[finite])), float(stop[finite].max())
-    if (rows >= _MANY_ROWS and middle > _LONGEST_TRIAL) or last > LONGEST_SESSION:
-        message = f"{name} runs to {last:g} s with rows of {middle:g} s (median)"
-        yield Finding("error", "times", message, "Its times look like milliseconds or samples, not seconds.")
     if table.name == "trials" and np.any(np.diff(start) < 0):
         message = f"{name} is not in the order of time"
         yield Finding("note", "tables", message, "Trials are sorted when they are read; nothing is lost.")
@@ -313,6 +305,9 @@ def check_coverage(
     span = recorded_span(spikes)
     if table is None or span is None or table.fault or "start_time" not in table or not len(table):
         return
+    if layout is None and "stop_time" not in table:
+        advice = "Name the end of the window: --window start..+SECONDS."
+        yield Finding("warning", "coverage", f"{table.label} has no stop_time, and by default it ends windows", advice)
     # Without ends of trials only their beginnings can be held against the recorded span.
     window = layout.window if layout else WHOLE if "stop_time" in table else Window("start", length=1e-3)
     try:
@@ -553,22 +548,11 @@ def _silent(spikes: Spikes, names: list[str]) -> Iterator[Finding]:
 
 
 def _impossible(spikes: Spikes, names: list[str]) -> Iterator[Finding]:
-    span = recorded_span(spikes)
-    if span is None:
-        return
-    low, high = span
+    low = min((float(times[0]) for times in spikes if len(times)), default=0.0)
     if low < 0:
         early = [name for name, times in zip(names, spikes, strict=True) if len(times) and times[0] < 0]
         message = f"{share(len(early), len(names))} units have spikes before the session began (first at {low:.3f} s)"
         yield Finding("warning", "times", message, "Was a starting time subtracted twice?", {"first": low})
-    # Times in seconds hardly ever fall on whole numbers, numbers of samples always do.
-    whole = all(np.all(times == np.round(times)) for times in spikes)
-    if whole and sum(map(len, spikes)) >= _FEWEST_SPIKES:
-        message = f"all spike times are whole numbers, up to {high:g}"
-        yield Finding("error", "times", message, "They look like samples, not seconds: divide by the sampling rate.")
-    elif high - low > LONGEST_SESSION:
-        message = f"spikes span {(high - low) / 3600:.0f} hours ({low:g} to {high:g} s)"
-        yield Finding("error", "times", message, "They look like milliseconds or samples, not seconds.")
 
 
 def _refractory(spikes: Spikes, names: list[str]) -> Iterator[Finding]:

@@ -159,11 +159,7 @@ def detect_layout(session: Session) -> RecordingLayout | None:
 
 
 def load_layout(path: str) -> RecordingLayout:
-    """Run a Python file and register the layout that it calls ``LAYOUT`` (or ``RECIPE``).
-
-    Raises:
-        DataFileNotFoundError: there is no such file.
-    """
+    """Run a Python file and register the layout that it calls ``LAYOUT`` (or ``RECIPE``)."""
     module = load_module(path)
     candidate = getattr(module, "LAYOUT", getattr(module, "RECIPE", None))
     if not isinstance(candidate, RecordingLayout):
@@ -183,13 +179,10 @@ def _known() -> dict[str, RecordingLayout]:
     """Return the registry with the layouts of other packages."""
     if ENTRY_POINTS not in _loaded:
         _loaded.append(ENTRY_POINTS)
-        load_entry_points(ENTRY_POINTS, _take)
+        load_entry_points(
+            ENTRY_POINTS, lambda _, loaded: isinstance(loaded, RecordingLayout) and register_layout(loaded)
+        )
     return _LAYOUTS
-
-
-def _take(_: str, candidate: Any) -> None:
-    if isinstance(candidate, RecordingLayout):
-        register_layout(candidate)
 
 
 SYNTHETIC = RecordingLayout(

@@ -176,8 +176,7 @@ def count_session(
         counts = (counts - rates * duration[:, :, None]).astype(np.float32)
         measure += f" minus their mean in {options.window.baseline}"
     for kind, number, total in (("trials", len(rows), len(table)), ("units", len(units), len(source.units))):
-        ledger.find(kind, total)
-        ledger.take(kind, number)
+        ledger.find(kind, total, number)
     _enter_tables(ledger, session, options.conditions.table)
     stated = ("subject", "session", "source", "synthetic", "stimuli", "guessed")
     columns = UNIT_COLUMNS.items()
@@ -208,14 +207,14 @@ def _windows(
     keep = ledger.apply(keep, labels != "", "trials", f"no value of {','.join(options.conditions.columns)}")
     if options.vocabulary is not None:
         keep = ledger.apply(keep, np.isin(labels, options.vocabulary), "trials", "label outside the vocabulary")
-    edges = options.window.edges(session, table, ledger.notes)
-    keep = ledger.apply(keep, np.isfinite(edges).all(axis=1), "trials", f"no event for the window {options.window}")
-    keep = ledger.apply(keep, ~(edges[:, 1] <= edges[:, 0]), "trials", "window of no length")
-    parts = [edges]
-    if (baseline := options.window.baseline) is not None:
-        parts.append(baseline.edges(session, table, ledger.notes))
-        keep = ledger.apply(keep, np.isfinite(parts[1]).all(axis=1), "trials", f"no event for the baseline {baseline}")
-        keep = ledger.apply(keep, ~(parts[1][:, 1] <= parts[1][:, 0]), "trials", f"baseline {baseline} of no length")
+    parts = []
+    for what, window in {"window": options.window, "baseline": options.window.baseline}.items():
+        if window is not None:
+            edges = window.edges(session, table, ledger.notes)
+            keep = ledger.apply(keep, np.isfinite(edges).all(axis=1), "trials", f"no event for the {what} {window}")
+            name = f"{what} {window}" if parts else what
+            keep = ledger.apply(keep, ~(edges[:, 1] <= edges[:, 0]), "trials", f"{name} of no length")
+            parts.append(edges)
     invalid = session.tables.get("invalid_times")
     if invalid is not None:
         begin, end = invalid.times("start_time"), invalid.times("stop_time")
@@ -308,8 +307,7 @@ class SpikeTrains:
 
 def _enter_tables(ledger: Ledger, session: Session, conditions: str) -> None:
     used = {name for name in session.tables if name in (conditions, "invalid_times", LICKS) or CONTACTS.match(name)}
-    ledger.find("tables", len(session.tables))
-    ledger.take("tables", len(used))
+    ledger.find("tables", len(session.tables), len(used))
     for name, table in session.tables.items():
         if name not in used:
             ledger.leave("tables", table.fault or "not asked for", lost=bool(table.fault))
@@ -389,17 +387,28 @@ def time_fault(spikes: list[NDArray[np.float64]], table: SessionTable) -> str:
     if len(starts) < 5 or not (end > starts[0] and span[1] > span[0] and span[1] > 0 and end > 0):
         return ""
     number, last = sum(map(len, spikes)), span[1]
+    rate, interval = number / len(spikes) / (last - span[0]), float(np.median(np.diff(starts)))
     where = f"spikes run to {last:g} and trials to {end:g}"
     for unit, factor in _UNITS_OF_TIME.items():
         # Neurons fire more than once in ten seconds, and a recording lasts no longer than some times its trials.
         least = 0.35 if factor == 2.5e4 else 0.9
-        if number / len(spikes) / (last - span[0]) < 0.1 and least <= last / end / factor <= 5:
+        if rate < 0.1 and least <= last / end / factor <= 5:
             return f"{where} s, so the spike times look like {unit}"
         if 0.2 <= end / last / factor <= 1.2 / (least if least < 0.5 else 1.0):
             return f"spikes run to {last:g} s and trials to {end:g}, so the times of the trials look like {unit}"
-    longest = 1.5 * float(np.median(np.diff(starts)))
+    longest = 1.5 * interval
     if number > 20 and span[0] >= -longest and last <= longest and end > 5 * last:
         return f"{where} s, so the spike times seem to count from the start of each trial: add its start_time"
+    if end < span[0] or starts[0] > last:
+        return (
+            f"spikes run from {span[0]:g} to {last:g} s and trials from {starts[0]:g} to {end:g} s, so they are not on "
+            "one clock, or not in seconds"
+        )
+    if rate < 0.1 and interval > 300:
+        return (
+            f"trials begin every {interval:g} s and units fire {rate:.2g} times a second, so all times look like "
+            "milliseconds or samples: write seconds"
+        )
     return ""
 
 
@@ -448,7 +457,7 @@ def mask_missing(
 
 def inside_observed_spans(units: SessionTable, edges: NDArray[np.float64]) -> NDArray[np.bool_] | None:
     """Return which windows [R, 2] (s) lie in the spans in which each unit was observed [R, U]; None without spans."""
-    if OBSERVED not in units:
+    if OBSERVED not in units and f"{OBSERVED}_index" not in units:
         return None
     inside = np.zeros((len(edges), len(units)), dtype=bool)
     # Units of one probe share their spans, so each distinct list is looked at once.

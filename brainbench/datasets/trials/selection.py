@@ -6,17 +6,19 @@ import math
 import re
 from collections.abc import Collection, Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from difflib import SequenceMatcher
+from itertools import combinations
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.contracts import (
-    DOUBTFUL_WORDS,
     MISSING_WORDS,
     as_label,
     as_labels,
     as_number,
+    is_doubtful,
     natural_key,
     near_labels,
 )
@@ -81,11 +83,26 @@ def label_doubts(forms: Mapping[tuple[str, str], Collection[str]], vocabulary: I
     if merged:
         texts = (f"{label} of {name} ({', '.join(written[:3])})" for name, label, written in merged)
         yield f"values that are written differently count as one label: {listing(texts, limit=3, quoted=False)}"
-    for twins in near_labels(vocabulary):
-        yield f"labels that differ only in case, blanks or digits count as different stimuli: {listing(twins)}"
-    words = sorted({part for label in vocabulary for part in label.split("-") if part.lower() in DOUBTFUL_WORDS})
+    if near := [listing(twins) for twins in near_labels(vocabulary)]:
+        texts = "; ".join(near[:3]) + f" and {len(near) - 3} more" * (len(near) > 3)
+        yield f"labels that differ only in case, blanks, signs or digits count as different stimuli: {texts}"
+    words = sorted({part for label in vocabulary for part in (label, *label.split("-")) if is_doubtful(part)})
     if words:
         yield f"the label {listing(words)} may mean a missing value, and counts as a stimulus"
+
+
+def divided_labels(pairs: Iterable[tuple[str, str]]) -> Iterator[str]:
+    """Say which labels, of pairs (animal, label), differ in one letter and are in no animal both: misspelt ones."""
+    animals: dict[str, set[str]] = {}
+    for animal, label in pairs:
+        animals.setdefault(label, set()).add(animal)
+    everyone = set[str]().union(*animals.values())
+    partial = sorted(label for label, names in animals.items() if len(label) > 2 and names != everyone)
+    for left, right in combinations(partial, 2):
+        letters, others = (re.sub(r"\d", "", label).lower() for label in (left, right))
+        near = SequenceMatcher(None, left, right).ratio() >= 1 - 1 / min(len(left), len(right))
+        if near and letters != others and max(len(left), len(right)) > 3 and not animals[left] & animals[right]:
+            yield f"{left!r} and {right!r} are spelt alike and in no animal both, and count as different stimuli"
 
 
 def joined_labels(values: NDArray[np.str_]) -> list[str]:

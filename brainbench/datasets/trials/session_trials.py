@@ -20,7 +20,7 @@ from brainbench.core.files import content_hash, hash_arrays
 from brainbench.datasets.ledger import Ledger
 from brainbench.datasets.sessions import Session
 from brainbench.datasets.trials.counting import COVARIATES, GROUPS, UNIT_COLUMNS, ReadingOptions, SessionCounts
-from brainbench.datasets.trials.selection import check_values, label_doubts, natural_vocabulary
+from brainbench.datasets.trials.selection import check_values, divided_labels, label_doubts, natural_vocabulary
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -190,10 +190,9 @@ def _average(rates: Floats, seconds: Floats) -> Floats:
 
 def _unique(keys: list[str]) -> tuple[str, ...]:
     """Return the keys, repeated ones numbered in the canonical (time) order of the trials."""
-    seen: dict[str, int] = {}
-    result = []
+    seen, result = Counter[str](), []
     for key in keys:
-        seen[key] = seen.get(key, 0) + 1
+        seen[key] += 1
         result.append(key if seen[key] == 1 else f"{key}#{seen[key]}")
     return tuple(result)
 
@@ -246,6 +245,7 @@ def join_sessions(
         for key, written in part.forms.items():
             forms.setdefault(key, set()).update(written)
     doubts += label_doubts(forms, vocabulary)
+    doubts += divided_labels((part.subject, label) for part in parts for label in {*part.labels})
     if len(present) < 2:
         raise DataError(
             f"All {trials} trials of {source} that remain have the one condition {next(iter(present))!r} "
@@ -366,41 +366,55 @@ def _about(part: SessionCounts) -> dict[str, Any]:
     }
 
 
-_FEWEST_SPIKES = 6  # spikes that a unit needs to be recognised
-_COMPARED = 32  # intervals that are compared; so many that agree to a tenth of a millisecond are no chance
-_EQUAL = 1e-4  # intervals (s) that differ by less are equal
+_RUN, _MILLISECOND = 8, 1e-3
+"""Intervals in a row by which spikes are known: so many that agree to a millisecond are no chance."""
+_SKETCH = 64  # runs that are kept of a unit: those of the lowest codes, which copies of it have too
+
+
+def _runs(times: Floats) -> tuple[list[int], bool]:
+    """Return codes of runs of intervals of a unit, wherever they stand, and whether few are all it has."""
+    steps = np.rint(np.diff(times) / _MILLISECOND).astype(np.uint64)
+    number = max(len(steps) - _RUN + 1, 0)
+    codes = np.zeros(number, np.uint64)
+    for place in range(_RUN):
+        # Each step mixes all bits, so that the lowest codes are a fair sample of all.
+        codes = (codes ^ (codes >> np.uint64(31))) * np.uint64(0x9E3779B97F4A7C15) + steps[place : place + number]
+    codes = np.unique((codes ^ (codes >> np.uint64(31))) * np.uint64(0x9E3779B97F4A7C15))
+    return codes[:_SKETCH].tolist(), 2 * len(codes) <= number
 
 
 @dataclass
 class Copies:
-    """Looks for spikes that were read before, on whatever clock and under whatever name."""
+    """Looks for spikes that were read before, on whatever clock, in whatever part and under whatever name."""
 
-    seen: dict[int, list[tuple[Floats, Session]]] = field(default_factory=dict)
-    """Number of spikes → first intervals and session of each unit."""
-    judged: dict[str, int] = field(default_factory=dict)
-    """Source → its units that can be recognised."""
+    seen: dict[int, list[tuple[str, int]]] = field(default_factory=dict)
+    """Run of intervals → source and number of the units that have it."""
+    lengths: dict[tuple[str, int], int] = field(default_factory=dict)
+    """Unit that can be recognised → its runs."""
+    sessions: dict[str, Session] = field(default_factory=dict)
 
     def compare(self, session: Session, spikes: Sequence[Floats]) -> str:
         """Take the units [U] of a session, and return a doubt where some were read before.
 
         Raises DataError where most of the units of one are among those of the other.
         """
-        source = session.source
-        signatures = [(len(times), np.diff(times[: _COMPARED + 1])) for times in spikes if len(times) >= _FEWEST_SPIKES]
-        repeated: dict[str, int] = {}
-        for number, steps in signatures:
-            alike = (earlier for before, earlier in self.seen.get(number, ()) if np.abs(before - steps).max() < _EQUAL)
+        source, repeated, judged = session.source, Counter[str](), Counter(name for name, _ in self.lengths)
+        for number, (runs, regular) in enumerate(map(_runs, spikes)):
+            if not runs:
+                continue
+            shared = Counter(unit for run in runs for unit in self.seen.get(run, ()) if unit[0] != source)
+            alike = {unit[0] for unit, same in shared.items() if 8 * same >= min(len(runs), self.lengths[unit])}
             # A regular train, as of a program, is like any other one unless the names agree too.
-            regular = np.ptp(steps) < _EQUAL
-            for name in {earlier.source for earlier in alike if not regular or _may_be_one(earlier, session)}:
-                repeated[name] = repeated.get(name, 0) + 1
-        for number, steps in signatures:
-            self.seen.setdefault(number, []).append((steps, session))
-        self.judged[source] = len(signatures)
+            repeated.update(name for name in alike if not regular or _may_be_one(self.sessions[name], session))
+            self.lengths[source, number] = len(runs)
+            for run in runs:
+                self.seen.setdefault(run, []).append((source, number))
+        self.sessions[source] = session
         if not repeated:
             return ""
-        name = max(sorted(repeated), key=lambda key: repeated[key] / min(len(signatures), self.judged[key]))
-        least = min(len(signatures), self.judged[name])
+        units = sum(name == source for name, _ in self.lengths)
+        name = max(sorted(repeated), key=lambda key: repeated[key] / min(units, judged[key]))
+        least = min(units, judged[name])
         what = f"{name} and {source} hold the same spikes ({repeated[name]} of {least} units)"
         if 2 * repeated[name] > least:
             raise DataError(f"{what}; they would count twice, so leave one of the files out.")

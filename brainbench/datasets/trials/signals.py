@@ -6,8 +6,7 @@ The response of a trial is the mean of each cell or channel over the window.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -38,7 +37,8 @@ def response_series(session: Session, window: Window | None = None) -> Series | 
     if wanted:
         matching = [place for place in every if f"/{wanted}/".lower() in f"/{place}/".lower()]
         if not matching:
-            raise unknown_name("signal", wanted, _names(every), hint=f"(in {session.source})")
+            names = sorted({name for place in every for name in place.split("/")[-2:]})
+            raise unknown_name("signal", wanted, names, hint=f"(in {session.source})")
         series = {place: item for place, item in series.items() if place in matching}
         if not series:
             advice = "is no voltage: leave the band out" if banded else f"needs a band in Hz, such as {wanted}@70..150"
@@ -54,11 +54,6 @@ def response_series(session: Session, window: Window | None = None) -> Series | 
             )
         return series[preferred[0]]
     return next(iter(series.values()), None)
-
-
-def _names(places: Iterable[str]) -> list[str]:
-    """Return the names by which signals can be called: their own, and that of the container around each."""
-    return sorted({name for place in places for name in place.split("/")[-2:]})
 
 
 @dataclass(frozen=True)
@@ -80,7 +75,7 @@ class Samples:
     def of(cls, session: Session, series: Series, table: SessionTable, window: Window, bin: float | None) -> Samples:
         """Take a signal of a session whose trials stand in a table."""
         name, shape = f"{series.name} of {session.source}", tuple(series.data.shape)
-        cells = SessionTable("cells", {"id": np.arange(shape[-1] if len(shape) > 1 else 1), **series.columns}, name)
+        cells = replace(series.cells, where=name)
         if len(cells) != (shape[-1] if len(shape) > 1 else 1):
             raise DataError(f"{name} has the shape {shape}, and {len(cells)} units are named.")
         if not series.table:

@@ -299,8 +299,8 @@ def test_refractory_violations_are_graded(tmp_path):
     ("change", "severity", "message"),
     [
         (lambda times: times - 5.0, "warning", "spikes before the session began"),
-        (lambda times: np.unique(np.round(times * 30000)), "error", "all spike times are whole numbers"),
-        (lambda times: times * 30000.1, "error", "spikes span"),
+        (lambda times: np.unique(np.round(times * 30000)), "error", "look like samples"),
+        (lambda times: times * 30000.1, "error", "look like samples"),
     ],
 )
 def test_impossible_spike_times_are_named(tmp_path, change, severity, message):

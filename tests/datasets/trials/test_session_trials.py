@@ -9,7 +9,7 @@ import xarray as xr
 from brainbench.core.errors import DataError, UsageError
 from brainbench.datasets import export, open_recordings, write_recordings
 from brainbench.datasets.sessions import make_session
-from brainbench.datasets.trials.session_trials import pooled, same_trials, trials_by_subject
+from brainbench.datasets.trials.session_trials import Copies, pooled, same_trials, trials_by_subject
 from brainbench.metrics.reliability.subject_rdm import subject_rdm
 from tests.factories.recordings import make_simple_session
 
@@ -229,3 +229,29 @@ def test_sessions_of_one_name_with_other_trials_stay_apart_and_are_said(tmp_path
     opened = open_recordings(tmp_path, conditions="trials:stimulus")
     assert sorted(set(opened["session"].values)) == ["1 (day0)", "1 (day1)"]
     assert any("called '1'" in doubt for doubt in opened.attrs["doubts"])
+
+
+def test_spikes_are_known_again_when_parts_of_them_are_left_out_or_rounded():
+    random = np.random.default_rng(0)
+    times = np.cumsum(random.exponential(0.1, 2000))
+    changes = {
+        "later": times + 3600,
+        "no first spikes": times[2:],
+        "first half": times[:1000],
+        "rounded": np.round(times, 4),
+        "single precision": times.astype(np.float32).astype(float),
+        "some lost": np.delete(times, random.integers(0, 2000, 20)),
+    }
+    for name, changed in changes.items():
+        copies = Copies()
+        copies.compare(make_session("m1", "1", [times], {}), [times])
+        with pytest.raises(DataError, match="hold the same spikes"):
+            copies.compare(make_session("m2", name, [changed], {}), [changed])
+    others = [np.cumsum(random.exponential(0.1, 2000)) for _ in range(20)]
+    assert not Copies().compare(make_session("m2", "2", others, {}), others)
+
+
+def test_regular_trains_of_two_animals_are_no_copies():
+    copies, times = Copies(), np.arange(500) * 0.1
+    assert not copies.compare(make_session("m1", "1", [times], {}), [times])
+    assert not copies.compare(make_session("m2", "2", [times], {}), [times])
