@@ -176,8 +176,7 @@ class Trials:
 
 
 MISSING_WORDS = ("nan", "nat")  # texts, in lower case, that programs write where a value is missing
-_DOUBTFUL = ("", "na", "nil", "none", "null", "nv", "missing", "undefined", "unknown")
-"""Texts, in lower case and without signs, that may mean a missing value, or a condition."""
+_DOUBTFUL = ("", "na", "nil", "none", "null", "nv", "missing", "undefined", "unknown")  # without signs
 _DECIMAL = re.compile(r"-?(?:0|[1-9]\d{0,11})\.\d{1,12}")
 _DIGITS = {2: 3, 4: 7}  # digits that a number of so many bytes keeps through arithmetic; 12 for all others
 
@@ -225,7 +224,7 @@ def is_doubtful(label: str) -> bool:
 
 
 _SEPARATORS = re.compile(r"(?<=[^\W_])[-_./\s]+(?=[^\W\d_])|(?<=[^\W\d_])[-_./\s]+(?=[^\W_])")
-"""Signs between two words, or a word and a number: between numbers, and at an end, they are meant."""
+# Between two numbers, and at an end, such signs are meant.
 
 
 def near_labels(labels: Iterable[str]) -> list[list[str]]:
@@ -234,8 +233,8 @@ def near_labels(labels: Iterable[str]) -> list[list[str]]:
     for label in sorted({*labels} - {""}):
         number = as_number(label.replace(",", "."))
         rounded = number if number.is_integer() or not math.isfinite(number) else float(f"{number:.6g}")
-        letters = (sign for sign in unicodedata.normalize("NFKC", label) if unicodedata.category(sign) != "Cf")
-        words = "".join(_SEPARATORS.sub("", "".join(letters)).casefold().split())
+        seen = "".join(sign for sign in unicodedata.normalize("NFKC", label) if unicodedata.category(sign) != "Cf")
+        words = "".join(_SEPARATORS.sub("", seen).casefold().split())
         folded.setdefault(words if math.isnan(number) else rounded, []).append(label)
     return [twins for twins in folded.values() if len(twins) > 1]
 
