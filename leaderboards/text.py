@@ -100,11 +100,10 @@ def unique_sentence(score: Score) -> str:
         return f"No unique part: {visible('; '.join(part.reasons) or 'no number is stated')}."
     ends = f" [{number(part.low, 2)}, {number(part.high, 2)}]" if math.isfinite(part.low + part.high) else ""
     doubt = "" if part.status == "ok" else f"; {visible(part.status)}: {visible('; '.join(part.reasons))}"
-    controls = visible(listing(part.controls, quoted=False))
     nothing = "the mean response" if score.metric.startswith("ridge") else "equal distances"
     return (
-        f"Unique part {number(part.unique, 2)}{ends}, beyond {controls}; shared with "
-        f"them {number(part.shared, 2)} (0 = {nothing}, 1 = all that is reliable){doubt}."
+        f"Unique part {number(part.unique, 2)}{ends}, beyond {visible(listing(part.controls, quoted=False))}; shared "
+        f"with them {number(part.shared, 2)} (0 = {nothing}, 1 = all that is reliable){doubt}."
     )
 
 
