@@ -20,8 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.errors import UsageError
 from brainbench.core.rotations import to_matrices
-from brainbench.stimuli.engines.protocol import MILLI
-from brainbench.stimuli.motion.jobs import Follicle
+from brainbench.stimuli.motion.jobs import MILLI, Follicle
 from brainbench.stimuli.objects.obstacle import Obstacle, RigidMotion
 
 KNOT = 1e-3  # length of a cell (s); one cubic piece follows whisking at 20 Hz to 1e-7 of its way

@@ -25,7 +25,6 @@ from numpy.typing import NDArray
 
 from brainbench.core.errors import MissingDependencyError
 from brainbench.core.rotations import base_rotation, euler_matrix, to_matrices
-from brainbench.stimuli.engines.protocol import MICRO, MILLI
 from brainbench.stimuli.engines.reach import LARGEST_SLIDE, Reach, stays_in_plane
 from brainbench.stimuli.engines.stepping import (
     LEAST_TAPER,
@@ -45,7 +44,7 @@ from brainbench.stimuli.engines.trust import (
     step_travel,
     strongest_force,
 )
-from brainbench.stimuli.motion.jobs import Job, Trace
+from brainbench.stimuli.motion.jobs import MICRO, MILLI, Job, Trace
 from brainbench.stimuli.objects.obstacle import Box, ConvexPart, Obstacle, Part, Sphere
 from brainbench.stimuli.whiskers.whisker import Chain, Whisker
 

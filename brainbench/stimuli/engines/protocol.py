@@ -1,31 +1,31 @@
 """What every physics engine does: whisker jobs (:mod:`brainbench.stimuli.motion.jobs`) go in, traces come out.
 
-Here too: the results of many sweeps at once, threads that share jobs, and the units in which engines calculate: mm, ms
-and mg, so mN and µN·m, keep every number near one.
+Here too: the results of many sweeps at once, and threads that share jobs.
 """
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.errors import UsageError
+from brainbench.core.devices import usable_processors
+from brainbench.core.errors import UsageError, listing
 from brainbench.core.progress import Progress as NamedProgress
+from brainbench.core.reading.ranges import check_number
+from brainbench.stimuli.engines.error_estimates import with_errors
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.motion.jobs import Job, StillFollicle, Trace  # noqa: F401, what a script gives an engine
 
 if TYPE_CHECKING:
     from brainbench.stimuli.objects.solid import Solid
     from brainbench.stimuli.whiskers.array import WhiskerArray
-
-MILLI = 1e3  # millimetres in a metre, milliseconds in a second, millinewtons in a newton
-MICRO = 1e6  # milligrams in a kilogram, µN·m in a newton metre
 
 
 def run_groups(
@@ -143,7 +143,7 @@ Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)
-class WhiskerEngine(ABC):
+class WhiskerEngine:
     """A physics engine that runs whisker jobs; its fields say what it can do."""
 
     device: str = "cpu"
@@ -175,15 +175,55 @@ class WhiskerEngine(ABC):
     batches: ClassVar[bool] = False
     """True when :meth:`run_sweeps` simulates many passive sweeps at once, without a scene for each."""
 
-    def prepare(  # noqa: B027 — engines that have nothing to prepare keep this one
-        self, lengths: Iterable[float], fidelity: Fidelity, *, progress: NamedProgress | None = None
-    ) -> None:
+    def prepare(self, lengths: Iterable[float], fidelity: Fidelity, *, progress: NamedProgress | None = None) -> None:
         """Do, in a thread before :meth:`run`, what the first run would wait for, such as compiling; most need nothing.
 
         ``lengths`` are the arc lengths of the whiskers [m]; ``progress`` is called as ``progress(done, total, what)``.
         """
 
-    @abstractmethod
+    def session(self) -> AbstractContextManager[None]:
+        """Return what surrounds a run; without the engine's package it is a :class:`MissingDependencyError`."""
+        return nullcontext()
+
+    def groups(self, jobs: Sequence[Job], fidelity: Fidelity) -> list[list[int]]:
+        """Return the jobs that are simulated together, by their index."""
+        return [[index] for index in range(len(jobs))]
+
+    def threads(self, workers: int | None) -> int:
+        """Return how many groups are simulated at a time, given the ``workers`` of a run."""
+        return workers or usable_processors()
+
+    def simulate_group(self, jobs: Sequence[Job], fidelity: Fidelity, *, record_shape: bool) -> list[Trace]:
+        """Simulate the jobs of one group, each as often as it takes to be trusted; for :meth:`run`."""
+        raise NotImplementedError(f"The engine {self.name!r} has a run of its own.")
+
+    def check(self, jobs: Sequence[Job], fidelity: Fidelity, workers: int | None = None) -> None:
+        """Refuse jobs, solvers and workers that the engine cannot run."""
+        if workers is not None:
+            check_number("workers", workers, least=1, whole=True)
+        if fidelity.solver not in self.solvers:
+            raise UsageError(
+                f"The backend {self.name!r} has no solver {fidelity.solver!r}, only {listing(self.solvers)}; use the "
+                "backend 'rod' for it."
+            )
+        if fidelity.twist and not self.twists:
+            raise UsageError(
+                f"Whiskers of the backend {self.name!r} bend but do not twist; leave twist out, or use the backend"
+                " 'rod'."
+            )
+        if not self.yields and any(job.whisker.follicle is not None for job in jobs):
+            raise UsageError(
+                f"Whiskers of the backend {self.name!r} have rigid follicles; leave follicle out, or use the backend"
+                " 'rod' or 'mujoco'."
+            )
+        for obstacle in {id(item): item for job in jobs for item in job.obstacles}.values():
+            if obstacle.surface is not None and not obstacle.parts and not self.surfaces:
+                raise UsageError(
+                    f"The backend {self.name!r} collides convex bodies only, and an object here is a concave surface"
+                    f" of {len(obstacle.surface.faces)} triangles; give the object collision = 'decomposition' (convex"
+                    " pieces, whose deviation is stated) or use the backend 'rod', which touches the surface itself."
+                )
+
     def run(
         self,
         jobs: Sequence[Job],
@@ -201,13 +241,22 @@ class WhiskerEngine(ABC):
         Args:
             jobs, fidelity: whiskers to simulate, independent of one another, and the knobs of accuracy.
             progress: called as ``progress(done, total)`` when a job is finished.
-            workers: native threads; all usable processors when None.
+            workers: native threads; all usable processors when None. On a GPU they mean nothing.
             record_shape: fill :attr:`Trace.link_positions`.
         """
+        simulate = partial(self.simulate_group, record_shape=record_shape)
 
-    def prepare_sweeps(  # noqa: B027 — as for prepare
-        self, scenes: PassiveSweeps, fidelity: Fidelity
-    ) -> None:
+        def run(group: Sequence[int]) -> dict[int, Trace]:
+            some = [jobs[index] for index in group]
+            traces = with_errors(simulate, some, fidelity) if self.errors else simulate(some, fidelity)
+            return dict(zip(group, traces, strict=True))
+
+        with self.session():
+            self.check(jobs, fidelity, workers)
+            groups, threads = self.groups(jobs, fidelity), self.threads(workers)
+            return run_groups(groups, run, threads=threads, progress=progress)
+
+    def prepare_sweeps(self, scenes: PassiveSweeps, fidelity: Fidelity) -> None:
         """Do, in a thread, what the first :meth:`run_sweeps` would wait for, such as compiling; no object is loaded."""
 
     def pack(self, solid: Solid) -> Any:

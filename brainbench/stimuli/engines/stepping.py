@@ -3,23 +3,19 @@
 from __future__ import annotations
 
 import time
-from abc import abstractmethod
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
-from brainbench.core.devices import usable_processors
 from brainbench.core.rotations import base_rotation, to_matrices
-from brainbench.stimuli.engines.error_estimates import with_errors
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.motion_pieces import Cutting
-from brainbench.stimuli.engines.protocol import Progress, WhiskerEngine, run_groups
+from brainbench.stimuli.engines.protocol import WhiskerEngine
 from brainbench.stimuli.engines.reach import Reach, reachable, to_obstacle_frame
 from brainbench.stimuli.engines.trust import (
     AT_BASE,
@@ -27,7 +23,6 @@ from brainbench.stimuli.engines.trust import (
     LARGEST_OVERLAP,
     LARGEST_START_OVERLAP,
     STARTED_INSIDE,
-    check_jobs,
     fault,
     passed_unseen,
     without_escape,
@@ -220,6 +215,10 @@ class SteppedJob:
         """First step at which the whisker starts in an object or one reaches its base, why, and overlap at first."""
         return overlap_fault(self.reach.obstacles, self.chain, *self.pose, self.times)
 
+    def silence(self) -> Trace:
+        """Return the trace of a job that is silent."""
+        return silent_trace(self.job, self.fidelity, self.record_shape, time.thread_time() - self.started)
+
     def end(self, failed: int, reason: str) -> tuple[int, str]:
         """Return the first step that cannot be trusted and why, given what the integration found."""
         missed = passed_unseen(self.job, self.reach, *self.pose, self.times)
@@ -301,47 +300,17 @@ def driven(position: NDArray, after: NDArray, step: float) -> PrescribedMotion:
     return PrescribedMotion(position, after - step * acceleration, acceleration)
 
 
-class SteppedEngine(WhiskerEngine):
+class SteppedEngine(WhiskerEngine, ABC):
     """An engine that takes every job by itself, in equal time steps."""
-
-    threads: ClassVar[int | None] = None
-    """Jobs at a time; as many as there are ``workers`` when None."""
-
-    @abstractmethod
-    def session(self) -> AbstractContextManager[None]:
-        """Return what surrounds a run; without the engine's package it is a :class:`MissingDependencyError`."""
 
     @abstractmethod
     def simulate(self, stepped: SteppedJob) -> Trace:
         """Simulate one job that is not silent; return what :meth:`SteppedJob.trace` does."""
 
-    def _trace(self, stepped: SteppedJob) -> Trace:
-        """Return the trace of a job, without simulation where it is silent."""
-        if is_silent(stepped.job, stepped.reach, *stepped.pose):
-            seconds = time.thread_time() - stepped.started
-            return silent_trace(stepped.job, stepped.fidelity, stepped.record_shape, seconds)
-        return self.simulate(stepped)
-
-    def run(
-        self,
-        jobs: Sequence[Job],
-        fidelity: Fidelity,
-        *,
-        progress: Progress | None = None,
-        workers: int | None = None,
-        record_shape: bool = False,
-    ) -> list[Trace]:
-        """Simulate every job; see :meth:`brainbench.stimuli.engines.protocol.WhiskerEngine.run`."""
-
-        def simulate(some: Sequence[Job], setting: Fidelity) -> list[Trace]:
-            return [self._trace(SteppedJob(job, setting, record_shape)) for job in some]
-
-        def run(group: Sequence[int]) -> dict[int, Trace]:
-            some = [jobs[index] for index in group]
-            traces = with_errors(simulate, some, fidelity) if self.errors else simulate(some, fidelity)
-            return dict(zip(group, traces, strict=True))
-
-        with self.session():
-            check_jobs(self, jobs, fidelity, workers)
-            threads = self.threads or workers or usable_processors()
-            return run_groups([[index] for index in range(len(jobs))], run, threads=threads, progress=progress)
+    def simulate_group(self, jobs: Sequence[Job], fidelity: Fidelity, *, record_shape: bool) -> list[Trace]:
+        """Simulate jobs one after the other, but for those that are silent."""
+        traces = []
+        for stepped in (SteppedJob(job, fidelity, record_shape) for job in jobs):
+            silent = is_silent(stepped.job, stepped.reach, *stepped.pose)
+            traces.append(stepped.silence() if silent else self.simulate(stepped))
+        return traces

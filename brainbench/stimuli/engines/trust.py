@@ -2,24 +2,17 @@
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.errors import UsageError, listing
-from brainbench.core.reading.ranges import check_number
 from brainbench.core.rotations import base_rotation
-from brainbench.stimuli.engines.fidelity import Fidelity
-from brainbench.stimuli.engines.protocol import MILLI, WhiskerEngine
 from brainbench.stimuli.engines.reach import LARGEST_SLIDE, Reach, distances
-from brainbench.stimuli.motion.jobs import Job
+from brainbench.stimuli.motion.jobs import MILLI, Job
 from brainbench.stimuli.objects.obstacle import Obstacle
 from brainbench.stimuli.whiskers.whisker import Whisker
-
-logger = logging.getLogger(__name__)
 
 LARGEST_BEND = 1.5
 """Angle between two links (rad) that no intact whisker reaches; beyond it a simulation counts as unstable."""
@@ -56,8 +49,6 @@ LARGEST_STRUCK_CHANGE = 0.1
 """The same in rigid contacts with a :data:`BLOW`, when the step is cut to a fifth: contacts may cut a step and its half
 to the same. Of 555 whiskers it finds 99 of the 105 that err by more than a fifth, and 48 others; nothing that a single
 run tells does (benchmarks/whiskers/struck.py)."""
-LARGEST_DAMPING = 1.15
-"""Damping ratio of the steps over what was asked for beyond which a warning comes."""
 BLOW = 0.15
 """Speed (m/s) of an object against the base from which it counts as a blow. At .2 to .7 m/s 4 to 11 % of the whiskers
 err by more than a fifth with ``balanced``, at .1 m/s 2 %."""
@@ -366,58 +357,3 @@ def passed_unseen(job: Job, reach: Reach, position: NDArray, euler: NDArray, tim
                 "felt; choose a smaller time step"
             )
     return first, reason
-
-
-def check_jobs(engine: WhiskerEngine, jobs: Sequence[Job], fidelity: Fidelity, workers: int | None) -> None:
-    """Refuse jobs, solvers and workers that an engine cannot run, and warn of steps that damp whiskers too much."""
-    if workers is not None:
-        check_number("workers", workers, least=1, whole=True)
-    if fidelity.solver not in engine.solvers:
-        raise UsageError(
-            f"The backend {engine.name!r} has no solver {fidelity.solver!r}, only {listing(engine.solvers)}; use the "
-            "backend 'rod' for it."
-        )
-    if fidelity.twist and not engine.twists:
-        raise UsageError(
-            f"Whiskers of the backend {engine.name!r} bend but do not twist; leave twist out, or use the backend 'rod'."
-        )
-    if not engine.yields and any(job.whisker.follicle is not None for job in jobs):
-        raise UsageError(
-            f"Whiskers of the backend {engine.name!r} have rigid follicles; leave follicle out, or use the backend"
-            " 'rod' or 'mujoco'."
-        )
-    if not engine.surfaces:
-        require_parts(jobs, engine.name)
-    warn_overdamped(jobs, fidelity)
-
-
-def require_parts(jobs: Sequence[Job], backend: str) -> None:
-    """Refuse obstacles with a surface and no convex parts, which only engines that collide surfaces can touch."""
-    for obstacle in {id(item): item for job in jobs for item in job.obstacles}.values():
-        if obstacle.surface is not None and not obstacle.parts:
-            raise UsageError(
-                f"The backend {backend!r} collides convex bodies only, and an object here is a concave surface of"
-                f" {len(obstacle.surface.faces)} triangles; give the object collision = 'decomposition' (convex pieces,"
-                " whose deviation is stated) or use the backend 'rod', which touches the surface itself."
-            )
-
-
-def warn_overdamped(jobs: Sequence[Job], fidelity: Fidelity) -> None:
-    """Warn of time steps that damp a whisker by :data:`LARGEST_DAMPING` of what was asked for, or more."""
-    ratios = {}
-    for job in jobs:
-        place = job.whisker, job.spacing
-        if place not in ratios:
-            ratios[place] = fidelity.damping_of(job)
-    over = [
-        (ratio, whisker) for (whisker, _), ratio in ratios.items() if ratio > LARGEST_DAMPING * whisker.damping_ratio
-    ]
-    if over:
-        worst, whisker = max(over, key=lambda pair: pair[0])
-        logger.warning(
-            "The time step of %g s damps the first mode of at least one whisker with ratio %.2f instead of %.2f; "
-            "its ringing is lost, slow bending is not; choose a smaller step to keep it.",
-            fidelity.time_step,
-            worst,
-            whisker.damping_ratio,
-        )

@@ -24,7 +24,7 @@ from brainbench.core.files import atomic_path
 from brainbench.core.limits import Limit, Positive, Share, limited
 from brainbench.core.progress import Progress, track
 from brainbench.stimuli.engines.fidelity import DEFAULT_ENGINE, Fidelity
-from brainbench.stimuli.engines.protocol import MILLI, WhiskerEngine
+from brainbench.stimuli.engines.protocol import WhiskerEngine
 from brainbench.stimuli.figures.surfaces import (
     Camera,
     DrawnSurface,
@@ -41,6 +41,7 @@ from brainbench.stimuli.figures.surfaces import (
     smoothed,
     tube,
 )
+from brainbench.stimuli.motion.jobs import MILLI
 from brainbench.stimuli.motion.trajectories import Whisking
 from brainbench.stimuli.scenes.scene import Scene
 from brainbench.stimuli.simulation import Recording, record

@@ -27,7 +27,6 @@ from brainbench.core.rotations import base_rotation
 from brainbench.geometry import Mesh
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.motion_pieces import carried_pose
-from brainbench.stimuli.engines.protocol import MILLI
 from brainbench.stimuli.engines.reach import reachable, stays_in_plane
 from brainbench.stimuli.engines.rod.engine import RodEngine, trace_of
 from brainbench.stimuli.engines.rod.limits import LIGHT
@@ -40,10 +39,9 @@ from brainbench.stimuli.engines.rod.packing import (
     rotation_vectors,
 )
 from brainbench.stimuli.engines.rod.tasks import JobTask, PackedTasks, make_task
-from brainbench.stimuli.engines.trust import check_jobs
 from brainbench.stimuli.fitting.parameters import JobParameters
 from brainbench.stimuli.fitting.recorded_run import RecordingSolver
-from brainbench.stimuli.motion.jobs import Job, Trace
+from brainbench.stimuli.motion.jobs import MILLI, Job, Trace
 from brainbench.stimuli.objects.obstacle import ConvexPart, Obstacle
 from brainbench.stimuli.whiskers.whisker import Chain, Whisker, build_chain
 
@@ -387,7 +385,7 @@ class GradientRun:
         self.fidelity = replace(Fidelity.of(fidelity), precision="double")
         self.jobs = tuple(build(self.values.copy()))
         self.device = pick_device(device)
-        check_jobs(RodEngine(device), self.jobs, self.fidelity, None)
+        RodEngine(device).check(self.jobs, self.fidelity)
         if any(job.whisker.follicle is not None for job in self.jobs):
             raise UsageError("Derivatives know rigid follicles only; leave follicle out of the whisker.")
         # Two jobs a parameter, a little below and above: how packed numbers change is their difference.

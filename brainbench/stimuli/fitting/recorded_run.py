@@ -43,11 +43,11 @@ from numpy.typing import NDArray
 
 from brainbench.core.devices import warp
 from brainbench.stimuli.engines.fidelity import Fidelity
-from brainbench.stimuli.engines.protocol import MICRO, MILLI
 from brainbench.stimuli.engines.rod.launch import WhiskerSolver
 from brainbench.stimuli.engines.rod.limits import contacts_for
 from brainbench.stimuli.engines.rod.packing import PackedJobs
 from brainbench.stimuli.engines.rod.slices import allocate, lock_of, parts_of
+from brainbench.stimuli.motion.jobs import MICRO, MILLI
 from brainbench.stimuli.whiskers.whisker import Chain
 
 KERNELS = f"{__package__}.kernels"  # package that writes steps down

@@ -1,6 +1,7 @@
 """Input and output of every physics engine: one whisker on a prescribed follicle among obstacles, and its forces.
 
 Whiskers never touch one another, so the unit of simulation is one whisker. Letters: n output frame.
+Inside engines calculate in mm, ms and mg, so in mN and µN·m, which keep every number near one.
 """
 
 from __future__ import annotations
@@ -19,6 +20,8 @@ from brainbench.core.rotations import Length, Point
 from brainbench.stimuli.objects.obstacle import Obstacle
 from brainbench.stimuli.whiskers.whisker import Whisker
 
+MILLI = 1e3  # millimetres in a metre, milliseconds in a second, millinewtons in a newton
+MICRO = 1e6  # milligrams in a kilogram, µN·m in a newton metre
 _Radians = Annotated[float, Limit(unit="rad")]
 _Newtons = Annotated[float, Limit(unit="N")]
 _PerSquareSecond = Annotated[float, Limit(unit="m/s²")]

@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from brainbench.core.errors import UsageError
 from brainbench.geometry import Mesh
 from brainbench.stimuli import WhiskerArray, references
 from brainbench.stimuli.engines import get_engine
@@ -19,12 +18,10 @@ from brainbench.stimuli.engines.trust import (
     GOT_INSIDE,
     LOST,
     STARTED_INSIDE,
-    check_jobs,
     force_change,
     halved,
     judge,
     passed_unseen,
-    require_parts,
     residual,
     step_travel,
     strongest_force,
@@ -86,14 +83,6 @@ def test_an_object_that_flies_farther_than_half_its_thickness_may_pass_unfelt(ob
 def test_the_force_that_no_whisker_bears_stretches_its_base_by_a_hundredth():
     # .01 E A = .01 × 4e9 Pa × π (50 µm)²; keratin yields at some .02.
     assert strongest_force(WHISKER) == pytest.approx(0.314159, rel=1e-4)
-
-
-def test_a_surface_without_parts_is_refused_in_words():
-    parts = Obstacle((Sphere((0, 0, 0), 1e-3),), surface=TETRAHEDRON)
-    require_parts([Job(WHISKER, StillFollicle(), (parts,), TIMES[1:])], "mujoco")
-    bare = Obstacle((), surface=TETRAHEDRON)
-    with pytest.raises(UsageError, match=r"'mujoco' .* 4 triangles.*'rod'"):
-        require_parts([Job(WHISKER, StillFollicle(), (parts, bare), TIMES[1:])], "mujoco")
 
 
 @pytest.mark.parametrize(
@@ -162,15 +151,6 @@ def test_a_force_that_changes_by_a_fifth_with_half_the_step_is_flagged_and_tried
     force[..., 0] = 1.0
     np.testing.assert_allclose(force_change(force, force * [[1.25], [0.8]]), [[0.2, 0.2]])
     assert force_change(force, -force).tolist() == [[2.0, 2.0]]
-
-
-def test_an_engine_whose_whiskers_only_bend_refuses_twist():
-    jobs = [Job(WHISKER, StillFollicle(), (), TIMES[1:])]
-    engine = get_engine("bullet")
-    check_jobs(engine, jobs, Fidelity(), None)
-    check_jobs(engine, jobs, Fidelity(twist=False), None)
-    with pytest.raises(UsageError, match=r"'bullet'.*'rod'"):
-        check_jobs(engine, jobs, Fidelity(twist=True), None)
 
 
 def test_forces_that_do_not_matter_do_not_change_by_any_share():

@@ -28,11 +28,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.errors import MissingDependencyError, UsageError, install_command, missing_dependency
 from brainbench.core.rotations import base_rotation, from_z_axis, to_matrices
-from brainbench.stimuli.engines.protocol import MICRO, MILLI
 from brainbench.stimuli.engines.reach import Reach
 from brainbench.stimuli.engines.stepping import LEAST_TAPER, SteppedEngine, SteppedJob, cone_vertices, drive_scalars
 from brainbench.stimuli.engines.trust import state_fault
-from brainbench.stimuli.motion.jobs import Trace
+from brainbench.stimuli.motion.jobs import MICRO, MILLI, Trace
 from brainbench.stimuli.objects.obstacle import Box, Capsule, ConvexPart, Cylinder, Obstacle, Part, Sphere
 from brainbench.stimuli.whiskers.whisker import Chain
 
@@ -404,7 +403,10 @@ class BulletEngine(SteppedEngine):
 
     name = "bullet"
     package = "pybullet"
-    threads = 1
+
+    def threads(self, workers: int | None) -> int:
+        """Return one, however many workers there are."""
+        return 1
 
     def session(self) -> AbstractContextManager[None]:
         """See :meth:`SteppedEngine.session`."""

@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.devices import pick_device, usable_processors, warp
+from brainbench.core.devices import pick_device, warp
 from brainbench.core.progress import Progress as NamedProgress
 from brainbench.core.rotations import base_rotation
-from brainbench.stimuli.engines.error_estimates import MORE, MOST, with_errors
+from brainbench.stimuli.engines.error_estimates import MORE, MOST
 from brainbench.stimuli.engines.fidelity import Fidelity
-from brainbench.stimuli.engines.protocol import PassiveSweeps, Progress, SweepBatch, WhiskerEngine, run_groups
+from brainbench.stimuli.engines.protocol import PassiveSweeps, SweepBatch, WhiskerEngine
 from brainbench.stimuli.engines.rod.launch import (
     LaunchResult,
     Try,
@@ -30,7 +30,7 @@ from brainbench.stimuli.engines.rod.launch import (
 from brainbench.stimuli.engines.rod.packing import PackedSurface, Track, capacity_for
 from brainbench.stimuli.engines.rod.tasks import JobTask, PackedTasks, make_task
 from brainbench.stimuli.engines.stepping import silent_trace
-from brainbench.stimuli.engines.trust import check_jobs, without_escape
+from brainbench.stimuli.engines.trust import without_escape
 from brainbench.stimuli.motion.jobs import Job, Trace
 from brainbench.stimuli.objects.solid import Solid
 
@@ -77,40 +77,24 @@ class RodEngine(WhiskerEngine):
         with ThreadPoolExecutor(max_workers=max(1, len(sizes))) as pool:
             list(pool.map(load, sizes))
 
-    def run(
-        self,
-        jobs: Sequence[Job],
-        fidelity: Fidelity,
-        *,
-        progress: Progress | None = None,
-        workers: int | None = None,
-        record_shape: bool = False,
-    ) -> list[Trace]:
-        """Simulate every job; see :meth:`brainbench.stimuli.engines.protocol.WhiskerEngine.run`.
+    def threads(self, workers: int | None) -> int:
+        """See :meth:`brainbench.stimuli.engines.protocol.WhiskerEngine.threads`; one on a GPU."""
+        return 1 if pick_device(self.device).is_cuda else super().threads(workers)
 
-        On a GPU ``workers`` means nothing.
-        """
-        check_jobs(self, jobs, fidelity, workers)
-        device = pick_device(self.device)
+    def groups(self, jobs: Sequence[Job], fidelity: Fidelity) -> list[list[int]]:
+        """Return jobs with the same readings and capacity together, on a processor one by one."""
         groups: dict[Any, list[int]] = {}
         for index, job in enumerate(jobs):
             links = fidelity.link_count(job.whisker.arc_length)
             key = (capacity_for(links), job.times.tobytes(), job.start, tuple(job.gravity))
             groups.setdefault(key, []).append(index)
-        size = SLICE if device.is_cuda else 1
+        size = SLICE if pick_device(self.device).is_cuda else 1
+        return [some[i : i + size] for some in groups.values() for i in range(0, len(some), size)]
 
-        def simulate(some: Sequence[Job], setting: Fidelity) -> list[Trace]:
-            traces = _simulate(dict(enumerate(some)), self.retry, setting, device, record_shape)
-            return [traces[index] for index in range(len(some))]
-
-        def run(group: Sequence[int]) -> dict[int, Trace]:
-            some = [jobs[index] for index in group]
-            traces = with_errors(simulate, some, fidelity) if self.errors else simulate(some, fidelity)
-            return dict(zip(group, traces, strict=True))
-
-        slices = [some[i : i + size] for some in groups.values() for i in range(0, len(some), size)]
-        threads = 1 if device.is_cuda else workers or usable_processors()
-        return run_groups(slices, run, threads=threads, progress=progress)
+    def simulate_group(self, jobs: Sequence[Job], fidelity: Fidelity, *, record_shape: bool) -> list[Trace]:
+        """See :meth:`brainbench.stimuli.engines.protocol.WhiskerEngine.simulate_group`."""
+        traces = _simulate(dict(enumerate(jobs)), self.retry, fidelity, pick_device(self.device), record_shape)
+        return [traces[index] for index in range(len(jobs))]
 
     def prepare_sweeps(self, scenes: PassiveSweeps, fidelity: Fidelity) -> None:
         """See :meth:`brainbench.stimuli.engines.protocol.WhiskerEngine.prepare_sweeps`."""

@@ -26,7 +26,6 @@ from numpy.typing import NDArray
 
 from brainbench.core.devices import to_struct, warp
 from brainbench.stimuli.engines.fidelity import Fidelity
-from brainbench.stimuli.engines.protocol import MILLI
 from brainbench.stimuli.engines.rod.limits import (
     CONTACT_BOUNDS,
     DISTANCE_BOUNDS,
@@ -55,6 +54,7 @@ from brainbench.stimuli.engines.trust import (
     residual,
     strongest_force,
 )
+from brainbench.stimuli.motion.jobs import MILLI
 from brainbench.stimuli.whiskers.whisker import Chain
 
 

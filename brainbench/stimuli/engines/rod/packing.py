@@ -18,10 +18,9 @@ from brainbench.core.errors import UsageError
 from brainbench.core.rotations import base_rotation
 from brainbench.geometry.mesh import Mesh, hull_faces
 from brainbench.stimuli.engines.motion_pieces import Cutting, MotionPieces, Pose, carried_pose, side_of
-from brainbench.stimuli.engines.protocol import MICRO, MILLI
 from brainbench.stimuli.engines.rod import limits
 from brainbench.stimuli.engines.rod.limits import LIGHT, WIDE
-from brainbench.stimuli.motion.jobs import Follicle, Load
+from brainbench.stimuli.motion.jobs import MICRO, MILLI, Follicle, Load
 from brainbench.stimuli.objects.obstacle import Box, Capsule, ConvexPart, Cylinder, Obstacle, Sphere
 from brainbench.stimuli.whiskers.whisker import Chain
 

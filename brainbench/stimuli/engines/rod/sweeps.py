@@ -22,7 +22,7 @@ from brainbench.core.errors import UsageError
 from brainbench.core.rotations import base_rotation, euler_matrix, from_matrices
 from brainbench.stimuli.engines.error_estimates import HALF_STEP, MORE_LINKS, changes, halved_step, more_links
 from brainbench.stimuli.engines.fidelity import Fidelity
-from brainbench.stimuli.engines.protocol import MILLI, PassiveSweeps, SweepBatch, describe_unstable, join_batches
+from brainbench.stimuli.engines.protocol import PassiveSweeps, SweepBatch, describe_unstable, join_batches
 from brainbench.stimuli.engines.rod.launch import (
     Ahead,
     Approach,
@@ -45,6 +45,7 @@ from brainbench.stimuli.engines.rod.packing import (
 )
 from brainbench.stimuli.engines.rod.tasks import followed
 from brainbench.stimuli.engines.trust import BLOW
+from brainbench.stimuli.motion.jobs import MILLI
 from brainbench.stimuli.objects.solid import Solid
 
 BLOCK = 64  # threads of one block on a GPU

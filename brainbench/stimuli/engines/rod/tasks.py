@@ -11,7 +11,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.motion_pieces import KNOT, Cutting
-from brainbench.stimuli.engines.protocol import MILLI
 from brainbench.stimuli.engines.reach import Reach, reachable, stays_in_plane
 from brainbench.stimuli.engines.rod.launch import Approach, Launch, LaunchResult, WhiskerSolver
 from brainbench.stimuli.engines.rod.limits import FINEST, WIDEST
@@ -28,7 +27,7 @@ from brainbench.stimuli.engines.rod.packing import (
 )
 from brainbench.stimuli.engines.stepping import is_silent
 from brainbench.stimuli.engines.trust import BLOW, BLOW_STRIDE, HARD_BLOW, near_travel, step_travel
-from brainbench.stimuli.motion.jobs import Job
+from brainbench.stimuli.motion.jobs import MILLI, Job
 from brainbench.stimuli.whiskers.whisker import Chain
 
 

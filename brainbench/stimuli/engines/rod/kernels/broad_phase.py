@@ -8,7 +8,6 @@ only the nearest are looked at; a bound tells when another may have come near (`
 
 import warp as wp
 
-from brainbench.stimuli.engines.protocol import MILLI
 from brainbench.stimuli.engines.rod.limits import (
     AT_BASE,
     CAPSULE,
@@ -22,6 +21,7 @@ from brainbench.stimuli.engines.rod.limits import (
     STARTED_INSIDE,
     WIDEST,
 )
+from brainbench.stimuli.motion.jobs import MILLI
 
 from .algebra import first_axis, rotate, vec3
 from .articulated_body import ChainState, ProximityState, hinge_direction
