@@ -37,7 +37,7 @@ from brainbench.core.version import __version__
 from brainbench.datasets.whisking.dataset import FOLDERS, Shard
 from brainbench.stimuli.objects.collections import NamedObject
 from brainbench.stimuli.objects.solid import Solid
-from brainbench.stimuli.scenes.frames import Frames
+from brainbench.stimuli.scenes.scene import Frames
 from brainbench.stimuli.stimulus_set import hash_stimulus_set, new_stimulus_set
 from brainbench.stimuli.sweeps.generation import write_data_set
 from brainbench.stimuli.sweeps.plan import SPLITS, USUAL_SHARD, PlannedShard

@@ -33,7 +33,7 @@ from brainbench.core.reading.ranges import check_number
 from brainbench.core.reading.tables import read_numbers
 from brainbench.core.reading.texts import read_text
 from brainbench.published.conversion import FRAME_STATUSES, LARGEST, SCALE, assemble_stimulus_set
-from brainbench.stimuli.scenes.frames import Frames
+from brainbench.stimuli.scenes.scene import Frames
 from brainbench.stimuli.whiskers.array import ROWS, MountedWhisker, WhiskerArray, published_whisker
 
 if TYPE_CHECKING:

@@ -16,9 +16,8 @@ if TYPE_CHECKING:
     from brainbench.stimuli.engines.fidelity import Fidelity
     from brainbench.stimuli.motion.trajectories import Whisking
     from brainbench.stimuli.objects.solid import PlacedObject, Solid
-    from brainbench.stimuli.scenes.frames import Frames
     from brainbench.stimuli.scenes.recipes import get_recipe, list_recipes
-    from brainbench.stimuli.scenes.scene import Head, Scene
+    from brainbench.stimuli.scenes.scene import Frames, Head, Scene
     from brainbench.stimuli.scenes.scene_files import load_scene
     from brainbench.stimuli.simulation import simulate
     from brainbench.stimuli.sources import Stimuli, load_stimuli

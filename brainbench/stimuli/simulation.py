@@ -32,8 +32,7 @@ from brainbench.stimuli.engines.fidelity import DEFAULT_ENGINE, Fidelity, steps_
 from brainbench.stimuli.engines.protocol import WhiskerEngine
 from brainbench.stimuli.explain import ATTRIBUTE, SECONDS, explain, plan
 from brainbench.stimuli.motion.jobs import Job, Trace
-from brainbench.stimuli.scenes.frames import clip_wrenches
-from brainbench.stimuli.scenes.scene import Scene
+from brainbench.stimuli.scenes.scene import Scene, clip_wrenches
 from brainbench.stimuli.stimulus_set import (
     ORIENTATION,
     find_entry,

@@ -99,7 +99,7 @@ def load_stimuli(
     if _is_array_file(source):
         with open_hdf5(Path(source), "stimulus file") as file:
             return _read_arrays(file, os.fspath(source), whiskers)
-    dataset, description = _stimulus_set(
+    dataset, description = load_stimulus_set(
         source, whiskers=whiskers, fidelity=fidelity, backend=backend, progress=progress, cache=cache
     )
     labels = tuple(str(label) for label in dataset["stimulus"].values)
@@ -125,14 +125,6 @@ def load_stimulus_set(
     """
     if _is_array_file(source):
         raise UsageError(f"{os.fspath(source)!r} holds arrays, not forces of whiskers with names.")
-    return _stimulus_set(source, whiskers=whiskers, fidelity=fidelity, backend=backend, progress=progress, cache=cache)
-
-
-def _stimulus_set(
-    source: str | os.PathLike[str] | xr.Dataset, *, whiskers: str, fidelity: Fidelity | str | None,
-    backend: WhiskerEngine | str, progress: Progress | None, cache: bool,
-) -> tuple[xr.Dataset, str]:  # fmt: skip
-    """Return what :func:`load_stimulus_set` does of a source that is known to be no file of arrays."""
     if not isinstance(source, (str, os.PathLike)):
         dataset = check_stimulus_set(source)
         if (numbers := hash_stimulus_set(dataset)) != dataset.attrs["content_hash"]:

@@ -24,8 +24,8 @@ from brainbench.core.version import __version__
 from brainbench.stimuli.engines import PHYSICS_VERSION
 from brainbench.stimuli.engines.error_estimates import remark_on
 from brainbench.stimuli.engines.fidelity import DEFAULT_ENGINE, Fidelity
-from brainbench.stimuli.scenes.frames import Axes
 from brainbench.stimuli.scenes.recipes import describe_recipe, recipe_file
+from brainbench.stimuli.scenes.scene import Axes
 from brainbench.stimuli.whiskers.array import ROWS
 
 if TYPE_CHECKING:
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     import xarray as xr
     from xarray.backends import H5NetCDFStore
 
-    from brainbench.stimuli.scenes.frames import Frames
+    from brainbench.stimuli.scenes.scene import Frames
 
 _CELL = re.compile(rf"(?:.*:)?[LR]?([{ROWS}])(\d+)")
 

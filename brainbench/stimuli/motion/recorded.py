@@ -41,7 +41,7 @@ from brainbench.core.limits import Limit, NotNegative, Positive, limited
 from brainbench.core.reading.ranges import check_numbers
 from brainbench.core.reading.tables import read_columns, read_numbers
 from brainbench.core.rotations import TURN, Angle, Vector, base_rotation
-from brainbench.stimuli.motion.trajectories import ROTATIONS, Rotations, follow_angles
+from brainbench.stimuli.motion.trajectories import ROTATIONS, Rotations, follow_angles, low_pass
 from brainbench.stimuli.tracks.readers import TrackOptions, read_shapes
 from brainbench.stimuli.whiskers.array import ROWS, MountedWhisker
 
@@ -269,7 +269,6 @@ def _names(path: str | os.PathLike[str], lines: int, layout: str | None) -> tupl
 
 Array = NDArray[np.float64]
 NEAR = 0.25  # share of the traced length, from the base, whose chord is the direction of the base
-_ORDER = 4
 _AXES = ("theta", "phi", "zeta")
 
 
@@ -549,8 +548,6 @@ def _filled(path: str | os.PathLike[str], times: Array, values: Array, longest: 
 
 
 def _smooth(values: Array, rate: float, lowpass: float | None) -> Array:
-    from scipy.signal import butter, sosfiltfilt
-
     if lowpass is None:
         return values
     if lowpass >= rate / 2:
@@ -558,5 +555,4 @@ def _smooth(values: Array, rate: float, lowpass: float | None) -> Array:
             f"lowpass of tracked whisking (Hz) must be below half of the frame rate, {rate / 2:g} Hz; received "
             f"{lowpass:g}."
         )
-    edge = min(values.shape[1] - 1, math.ceil(2 * rate / lowpass))
-    return sosfiltfilt(butter(_ORDER, lowpass, fs=rate, output="sos"), values, axis=1, padlen=edge)
+    return low_pass(values.swapaxes(0, 1), rate, lowpass).swapaxes(0, 1)

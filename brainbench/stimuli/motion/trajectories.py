@@ -1,4 +1,4 @@
-"""Motions of whiskers, heads and objects, and the hinge angles that they give a follicle. In rad, m and s.
+"""Motions of whiskers, heads and objects, the hinge angles that they give a follicle, and a filter. In rad, m and s.
 
 Letters: n time.
 """
@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Annotated, Any, ClassVar, Protocol
+from typing import Annotated, Any, ClassVar, Literal, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -354,3 +354,35 @@ def smooth_step(times: NDArray[np.float64], duration: float) -> NDArray[np.float
     u = np.clip(np.asarray(times, dtype=float) / duration, 0.0, 1.0)
     # Quintic: velocity and acceleration are 0 at both ends, so no step of the acceleration makes whiskers ring.
     return u**3 * (u * (6 * u - 15) + 10)
+
+
+Phase = Literal["zero", "causal"]
+"""``zero``: the filter runs forwards and backwards, so that nothing is delayed and frames know a little of the
+future. ``causal``: it runs forwards, as a sensor would, and delays."""
+# Periods of the cut-off that are looked at beyond the ends for the backward pass; order of the filter.
+FILTER_EDGE = 2.0
+FILTER_ORDER = 4
+
+
+def low_pass(values: NDArray[np.float64], rate: float, cutoff: float, *, phase: Phase = "zero") -> NDArray[np.float64]:
+    """Filter signals [n, …] sampled at ``rate`` (Hz) by a fourth-order Butterworth low-pass at ``cutoff`` (Hz).
+
+    From the first value of a signal that is not finite on, it is NaN; before, it is filtered as if it ended there.
+    """
+    from scipy.signal import butter, sosfilt, sosfiltfilt
+
+    # Second-order sections: the coefficients of one polynomial lose digits at low cut-offs.
+    sections = butter(FILTER_ORDER, cutoff, fs=rate, output="sos")
+    flat = np.asarray(values, dtype=float).reshape(len(values), -1)
+    # Readings before the first one that is not finite; signals with as many are filtered together.
+    lengths = np.where(np.isfinite(flat).all(axis=0), len(flat), np.argmin(np.isfinite(flat), axis=0))
+    result = np.full_like(flat, np.nan)
+    for end in np.unique(lengths[lengths > 0]).tolist():
+        columns = lengths == end
+        signal = flat[:end, columns]
+        if phase == "causal":
+            result[:end, columns] = sosfilt(sections, signal, axis=0)
+        else:
+            edge = min(end - 1, math.ceil(FILTER_EDGE * rate / cutoff))
+            result[:end, columns] = sosfiltfilt(sections, signal, axis=0, padlen=edge)
+    return result.reshape(np.shape(values))

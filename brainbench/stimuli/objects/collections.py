@@ -317,8 +317,6 @@ def _files(pattern: str, unit: str | None, collision: str) -> Iterator[NamedObje
 
 
 def _shapenet(text: str, collision: str) -> Iterator[NamedObject]:
-    from brainbench.stimuli.objects.collections import load_shapenet
-
     folder, _, number = text.rpartition(":") if re.search(r":\d+$", text) else (text, "", "")
     models = load_shapenet(Path(folder).absolute()).models
     if number and int(number) > len(models):

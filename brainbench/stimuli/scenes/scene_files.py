@@ -105,8 +105,7 @@ from brainbench.stimuli.objects.solid import (
     shape_solid,
     sphere,
 )
-from brainbench.stimuli.scenes.frames import Frames
-from brainbench.stimuli.scenes.scene import Animal, Head, Scene, WhiskerMotion
+from brainbench.stimuli.scenes.scene import Animal, Frames, Head, Scene, WhiskerMotion
 from brainbench.stimuli.sweeps.sweep_scenes import SweepScenes
 from brainbench.stimuli.tracks.readers import TrackOptions
 from brainbench.stimuli.whiskers.array import WhiskerArray

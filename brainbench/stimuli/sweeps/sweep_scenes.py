@@ -22,8 +22,7 @@ from brainbench.core.rotations import Angle, euler_matrix
 from brainbench.stimuli.motion.trajectories import Still, Translation
 from brainbench.stimuli.objects.obstacle import Obstacle
 from brainbench.stimuli.objects.solid import PlacedObject, Solid
-from brainbench.stimuli.scenes.frames import Frames
-from brainbench.stimuli.scenes.scene import Head, Scene
+from brainbench.stimuli.scenes.scene import Frames, Head, Scene
 from brainbench.stimuli.whiskers.array import WhiskerArray
 
 _HEAD_ONSET = 0.01  # smooth start [s] of a travelling head, whose whiskers would feel a jump of velocity as a blow

@@ -13,7 +13,7 @@ from brainbench.core.errors import DataError, UsageError
 from brainbench.datasets.whisking.dataset import WhiskingDataset
 from brainbench.stimuli import Fidelity, SweepGrid, simulate, to_grid
 from brainbench.stimuli.objects.collections import resolve_objects
-from brainbench.stimuli.scenes.frames import Frames
+from brainbench.stimuli.scenes.scene import Frames
 from brainbench.stimuli.sweeps.generation import generate
 from brainbench.stimuli.sweeps.plan import GenerationPlan, GenerationSettings
 from brainbench.stimuli.sweeps.sweep_scenes import SweepScenes

@@ -17,7 +17,7 @@ from brainbench.scoring.recovery.motion import _Evaluator, _judge, _Network
 from brainbench.stimuli import PlacedObject, Scene, WhiskerArray, Whisking, simulate, to_grid
 from brainbench.stimuli.fitting.design import DesignOptions
 from brainbench.stimuli.objects.solid import cylinder
-from brainbench.stimuli.scenes.frames import Frames
+from brainbench.stimuli.scenes.scene import Frames
 
 pytest.importorskip("warp")
 

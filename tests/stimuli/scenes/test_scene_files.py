@@ -9,7 +9,7 @@ from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError
 from brainbench.stimuli import simulate
 from brainbench.stimuli.motion.trajectories import ROTATIONS, Path, Spin, Still, Translation
 from brainbench.stimuli.objects.obstacle import Cylinder
-from brainbench.stimuli.scenes.frames import Frames
+from brainbench.stimuli.scenes.scene import Frames
 from brainbench.stimuli.scenes.scene_files import load_scene
 from brainbench.stimuli.whiskers.whisker import build_chain
 from tests.factories.scene_files import POLE

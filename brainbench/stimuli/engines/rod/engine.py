@@ -92,8 +92,22 @@ class RodEngine(WhiskerEngine):
         return [some[i : i + size] for some in groups.values() for i in range(0, len(some), size)]
 
     def simulate_group(self, jobs: Sequence[Job], fidelity: Fidelity, *, record_shape: bool) -> list[Trace]:
-        """See :meth:`brainbench.stimuli.engines.protocol.WhiskerEngine.simulate_group`."""
-        traces = _simulate(dict(enumerate(jobs)), self.retry, fidelity, pick_device(self.device), record_shape)
+        """See :meth:`brainbench.stimuli.engines.protocol.WhiskerEngine.simulate_group`: a launch for each kind."""
+        traces: dict[int, Trace] = {}
+        tasks: dict[Any, dict[int, JobTask]] = {}
+        bodies: dict[Any, tuple[NDArray, Track]] = {}
+        seconds = np.zeros(len(jobs))
+        for index, job in enumerate(jobs):
+            started = time.thread_time()
+            task = make_task(job, fidelity, bodies)
+            seconds[index] = time.thread_time() - started
+            if task is None:
+                traces[index] = silent_trace(job, fidelity, record_shape, seconds[index])
+            else:
+                tasks.setdefault(task.kind, {})[index] = task
+        for _, alike in sorted(tasks.items()):
+            spent = seconds[list(alike)]
+            traces |= _simulate(alike, spent, self.retry, fidelity, pick_device(self.device), record_shape)
         return [traces[index] for index in range(len(jobs))]
 
     def prepare_sweeps(self, scenes: PassiveSweeps, fidelity: Fidelity) -> None:
@@ -134,29 +148,6 @@ class RodEngine(WhiskerEngine):
 
 
 def _simulate(
-    jobs: dict[int, Job], retry: int, fidelity: Fidelity, device: Any, record_shape: bool
-) -> dict[int, Trace]:
-    """Run jobs that share their readings and their capacity in one launch, and return their traces."""
-    tasks: dict[int, JobTask] = {}
-    traces: dict[int, Trace] = {}
-    bodies: dict[Any, tuple[NDArray, Track]] = {}
-    spent: dict[int, float] = {}
-    for index, job in jobs.items():
-        started = time.thread_time()
-        task = make_task(job, fidelity, bodies)
-        if task is None:
-            traces[index] = silent_trace(job, fidelity, record_shape, time.thread_time() - started)
-        else:
-            tasks[index] = task
-            spent[index] = time.thread_time() - started
-    for alike in sorted({task.kind for task in tasks.values()}):
-        some = {index: task for index, task in tasks.items() if task.kind == alike}
-        seconds = np.array([spent[index] for index in some])
-        traces |= _simulate_alike(some, seconds, retry, fidelity, device, record_shape) if some else {}
-    return traces
-
-
-def _simulate_alike(
     tasks: dict[int, JobTask], seconds: NDArray, retry: int, fidelity: Fidelity, device: Any, record_shape: bool
 ) -> dict[int, Trace]:
     """Run tasks of one kind in one launch; ``seconds`` [task] is the processor time of each so far."""

@@ -155,9 +155,8 @@ class Launch:
     """Whether shapes and contact wrenches are results too; jobs then stand in their rows in order."""
 
 
-_NUMBERS = ("depth", "failed", "miss", "load")
 _COUNTS = ("status", "steps", "touching", "crowded", "unsolved")
-"""Results of each job besides its readings."""
+"""Counts of each job, of those that its kernel keeps."""
 
 
 @dataclass(eq=False)
@@ -311,16 +310,17 @@ class WhiskerSolver:
             whole[jobs.row, jobs.column] = column
             return whole
 
-        counts = {name: table(values[name]) for name in _COUNTS}
-        wrench, missed = values["wrench"], table(residual(values["miss"], values["load"]))
-        depth = table(values["depth"].astype(float)) / MILLI
+        state = values["state"]
+        counts = {name: table(state[name]) for name in _COUNTS}
+        wrench, missed = values["wrench"], table(residual(state["miss"], state["load"]))
+        depth = table(state["depth"].astype(float)) / MILLI
         force = np.sqrt(np.einsum("...d,...d", wrench[..., :3], wrench[..., :3]))
         peak, strongest = force.max(axis=1), table(self.strongest[jobs.whisker])
         strength, strong_at = _first_beyond(strongest, force, given.readings)
         facts = RunFacts(
             status=counts["status"],
             # Single precision rounds a late time; the reading at it must not pass for one before it.
-            failed=given.start + table(values["failed"].astype(float)) * (1 - 2e-7) / MILLI,
+            failed=given.start + table(state["failed_at"].astype(float)) * (1 - 2e-7) / MILLI,
             strength=strength,
             strong_at=strong_at,
             strongest=strongest,
@@ -364,7 +364,8 @@ class WhiskerSolver:
             "jobs": (structs.JobArrays, jobs.arrays(self.chains, steps, given.start)),
             "readings": (structs.ReadingArrays, _readings(given.readings - given.start)),
         }
-        shapes_of = dict.fromkeys((*_NUMBERS, *_COUNTS), count) | {
+        shapes_of = {
+            "state": count,
             "wrench": (size[0], frames, size[1], 6),
             "points": (frames, self.capacity + 1, count) if given.record_shape else (1, 1, 1),
             "contact_wrench": (frames, 2, count) if given.record_shape else (1, 1, 1),

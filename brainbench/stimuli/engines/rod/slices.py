@@ -1,8 +1,8 @@
 """Whiskers in slices: on a GPU a whisker pauses where it needs distances from a mesh, which are found for all at once.
 
 Every whisker takes steps until it needs to know what is near, or what its contacts do; further kernels answer these
-questions (``kernels.pausing`` says why); then the whiskers go on, those with like answers side by side. Results do not
-depend on the slicing.
+questions (``kernels.broad_phase`` says why); then the whiskers go on, those with like answers side by side. Results do
+not depend on the slicing.
 
 Threads simulate on one GPU side by side, each with streams of its own: a launch of few whiskers, whose slices follow
 one another however idle the GPU is, then costs the others next to nothing. Warp's streams, recordings and memory know

@@ -2,7 +2,7 @@
 modules are therefore ``..algebra``, ``..state`` and so on (``brainbench.stimuli.engines.rod.kernels.specialize``).
 
 The engine calls ``recording``, which writes steps down, and ``newton``, which solves their contact forces to rounding.
-``tangent`` goes over the steps again: ``chain`` takes a step as it was and carries changes along the chain,
-``contacts`` finds what the contacts add, ``pose`` how the tracks of bodies move. The equations are those of
+``tangent`` goes over the steps again: ``chain`` takes a step as it was and carries changes along the chain, and
+``contacts`` finds what the contacts add. The equations are those of
 :mod:`brainbench.stimuli.fitting.recorded_run`.
 """

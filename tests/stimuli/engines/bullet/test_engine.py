@@ -28,7 +28,7 @@ from brainbench.stimuli.engines.bullet.engine import (
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.motion.jobs import Job, Load, StillFollicle
 from brainbench.stimuli.objects.obstacle import Box, Capsule, ConvexPart, Cylinder, Obstacle, Sphere
-from brainbench.stimuli.scenes.frames import Frames
+from brainbench.stimuli.scenes.scene import Frames
 from brainbench.stimuli.validation import bench_tests
 from brainbench.stimuli.whiskers.whisker import Whisker, build_chain
 from tests.factories.obstacles import post

@@ -2,7 +2,7 @@
 
 ``step`` runs whiskers from reading to reading. In each step ``articulated_body`` finds the motion of the chain and its
 accelerations without contact, ``broad_phase`` and ``narrow_phase`` (with ``distances``) where it may touch something,
-``contact_solver`` and ``delassus`` the contact forces. ``pausing`` skips whiskers at rest; on a GPU it pauses whiskers
+``contact_solver`` and ``delassus`` the contact forces. Whiskers at rest are skipped; on a GPU whiskers pause
 while kernels of ``narrow_phase`` and ``contact_solver`` find the distances and forces that they wait for. Steps may be
 written down by the kernels of another package, the recorder.
 
@@ -108,7 +108,7 @@ def build_kernels(
     return Kernels(
         run,
         structs,
-        specialize("pausing", **whole).swap_queues,
+        specialize("broad_phase", **whole).swap_queues,
         specialize("narrow_phase", group_size=group, **common).measure_distances,
         group,
         tuple(

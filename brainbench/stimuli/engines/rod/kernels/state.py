@@ -197,41 +197,6 @@ def scene_of(
 
 
 @wp.struct
-class ResultArrays:
-    """Results of all jobs."""
-
-    wrench: wp.array4d(dtype=real)
-    """[row, reading, column, 6] action of the whisker on its base (N, N m)."""
-    if yields:
-        displacement: wp.array4d(dtype=real)
-        """[row, reading, column, 6] slide (m) and rotation vector (rad) of the follicle along its own axes."""
-    contact: wp.array3d(dtype=real)
-    """[row, reading, column] arc of the contact (m), negative without."""
-    points: wp.array3d(dtype=vec3)
-    """[reading, node, job] when shapes are recorded."""
-    contact_wrench: wp.array3d(dtype=vec3)
-    """[reading, 2, job] force and moment about the base point of all contacts, when shapes are recorded."""
-    depth: wp.array(dtype=real)
-    """[job] deepest overlap."""
-    status: wp.array(dtype=wp.int32)
-    """[job] 0, or why it ended early."""
-    failed: wp.array(dtype=real)
-    """[job] time at which it failed."""
-    steps: wp.array(dtype=wp.int32)
-    """[job] steps computed."""
-    touching: wp.array(dtype=wp.int32)
-    """[job] steps with contact."""
-    crowded: wp.array(dtype=wp.int32)
-    """[job] steps in which a contact found no place."""
-    unsolved: wp.array(dtype=wp.int32)
-    """[job] steps whose contact forces were not solved to the tolerance."""
-    miss: wp.array(dtype=real)
-    """[job] sum over the steps of the square of what the last iteration changed in the forces (mN²)."""
-    load: wp.array(dtype=real)
-    """[job] sum over the steps of the square of the contact forces (mN²)."""
-
-
-@wp.struct
 class WhiskerJob:
     """Constants of a job."""
 
@@ -335,14 +300,37 @@ class WhiskerState:
     largest_change: real
     """Largest bend or rate in a step."""
     status: wp.int32
+    """0, or why it ended early, at the time ``failed_at``."""
     failed_at: real
     depth: real
+    """Deepest overlap."""
     steps: wp.int32
+    """Steps computed; with contact; in which a contact found no place; with forces not solved to the tolerance."""
     touching: wp.int32
     crowded: wp.int32
     unsolved: wp.int32
     miss: real
+    """Sums over the steps of the square of what the last iteration changed in the forces, and of the forces (mN²)."""
     load: real
+
+
+@wp.struct
+class ResultArrays:
+    """Results of all jobs."""
+
+    wrench: wp.array4d(dtype=real)
+    """[row, reading, column, 6] action of the whisker on its base (N, N m)."""
+    if yields:
+        displacement: wp.array4d(dtype=real)
+        """[row, reading, column, 6] slide (m) and rotation vector (rad) of the follicle along its own axes."""
+    contact: wp.array3d(dtype=real)
+    """[row, reading, column] arc of the contact (m), negative without."""
+    points: wp.array3d(dtype=vec3)
+    """[reading, node, job] when shapes are recorded."""
+    contact_wrench: wp.array3d(dtype=vec3)
+    """[reading, 2, job] force and moment about the base point of all contacts, when shapes are recorded."""
+    state: wp.array(dtype=WhiskerState)
+    """[job] at its end, with the totals of its steps."""
 
 
 @wp.struct

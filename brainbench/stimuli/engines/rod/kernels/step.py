@@ -21,11 +21,22 @@ from .articulated_body import (
     joint_accelerations,
     yield_base,
 )
-from .broad_phase import NearShapes, count_near_links, find_candidates, lower_clearance, query_distances, search_range
+from .broad_phase import (
+    NearShapes,
+    check_rest,
+    count_near_links,
+    find_candidates,
+    keep,
+    lower_clearance,
+    next_job,
+    query_distances,
+    resume,
+    search_range,
+    stand_in_queue,
+)
 from .contact_solver import any_gap_closes, queue_problem, read_solution, solve_contacts, write_problem
 from .motion import cell_at, elapsed, instant
 from .parameters import against, bounds, module_options, real, recorded, sliced, yields
-from .pausing import check_rest, keep, next_job, resume, stand_in_queue
 from .state import (
     ENDED,
     WAIT_DISTANCES,
@@ -388,12 +399,4 @@ def run(
             state.waiting_for = wait
             paused.ended[index] = 0
         keep(paused, index, job.links, chain, proximity, state)
-    results.depth[index] = state.depth
-    results.status[index] = state.status
-    results.failed[index] = state.failed_at
-    results.steps[index] = state.steps
-    results.touching[index] = state.touching
-    results.crowded[index] = state.crowded
-    results.unsolved[index] = state.unsolved
-    results.miss[index] = state.miss
-    results.load[index] = state.load
+    results.state[index] = state
