@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from brainbench.core.rotations import base_rotation
 from brainbench.geometry import Mesh
 from brainbench.stimuli.engines.fidelity import Fidelity
+from brainbench.stimuli.engines.rod.engine import make_task
 from brainbench.stimuli.engines.rod.packing import knots_alike
-from brainbench.stimuli.engines.rod.tasks import make_task
 from brainbench.stimuli.fitting.gradients import GradientRun, JobParameters
 from brainbench.stimuli.motion.jobs import Job, StillFollicle, Trace
 from brainbench.stimuli.objects.obstacle import Obstacle, Part

@@ -28,7 +28,7 @@ from brainbench.geometry import Mesh
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.motion_pieces import carried_pose
 from brainbench.stimuli.engines.reach import reachable, stays_in_plane
-from brainbench.stimuli.engines.rod.engine import RodEngine, trace_of
+from brainbench.stimuli.engines.rod.engine import JobTask, PackedTasks, RodEngine, make_task, trace_of
 from brainbench.stimuli.engines.rod.limits import LIGHT
 from brainbench.stimuli.engines.rod.packing import (
     PackedShapes,
@@ -38,7 +38,6 @@ from brainbench.stimuli.engines.rod.packing import (
     pack_chains,
     rotation_vectors,
 )
-from brainbench.stimuli.engines.rod.tasks import JobTask, PackedTasks, make_task
 from brainbench.stimuli.fitting.parameters import JobParameters
 from brainbench.stimuli.fitting.recorded_run import RecordingSolver
 from brainbench.stimuli.motion.jobs import MILLI, Job, Trace

@@ -11,7 +11,7 @@ from brainbench.core.errors import UsageError
 from brainbench.core.rotations import euler_matrix
 from brainbench.geometry import Mesh
 from brainbench.stimuli.engines.fidelity import Fidelity
-from brainbench.stimuli.engines.rod.tasks import PackedTasks, make_task
+from brainbench.stimuli.engines.rod.engine import PackedTasks, make_task
 from brainbench.stimuli.fitting.gradients import (
     GradientRun,
     JobParameters,

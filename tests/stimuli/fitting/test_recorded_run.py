@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from brainbench.core.devices import pick_device
-from brainbench.stimuli.engines.rod.engine import RodEngine
-from brainbench.stimuli.engines.rod.tasks import PackedTasks, make_task
+from brainbench.stimuli.engines.rod.engine import PackedTasks, RodEngine, make_task
 from brainbench.stimuli.fitting.recorded_run import RecordingSolver
 from brainbench.stimuli.objects.obstacle import Capsule
 from brainbench.stimuli.validation.bench_tests import contact_jobs

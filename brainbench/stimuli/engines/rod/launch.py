@@ -22,17 +22,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.devices import to_struct, warp
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.rod.limits import (
     CONTACT_BOUNDS,
     DISTANCE_BOUNDS,
+    FINEST,
     LIGHT,
     LONGEST_SPAN,
     MESHES,
     TO_ROUNDING,
+    WIDEST,
     contact_iterations,
 )
 from brainbench.stimuli.engines.rod.packing import (
@@ -45,7 +47,9 @@ from brainbench.stimuli.engines.rod.packing import (
 )
 from brainbench.stimuli.engines.rod.slices import Slices, allocate, download, lock_of, make_problems, parts_of
 from brainbench.stimuli.engines.trust import (
+    BLOW_STRIDE,
     FEWEST_READINGS,
+    HARD_BLOW,
     RunFacts,
     Verdict,
     force_change,
@@ -129,6 +133,19 @@ class Approach:
         """Return those of jobs as arrays [job, 1]."""
         names = [each.name for each in fields(cls)]
         return cls(**{name: np.array([[getattr(approach, name)] for approach in approaches]) for name in names})
+
+
+def followed(
+    speed: NDArray[np.float64], blow: NDArray[np.float64], step: NDArray[np.float64], radius: ArrayLike
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return ways (m) of objects in a step (s), and up to which way contact is followed.
+
+    ``speed`` (m/s) is that against any point of the whisker, ``blow`` that against its base while the object is near.
+    """
+    # The shortest step that contacts may ask for finds them; blows are cut to one way by it, whose force is not right.
+    stride = np.multiply(BLOW_STRIDE, radius)
+    hard = (blow > HARD_BLOW) & (blow * step > stride)
+    return np.where(hard, blow * step, speed * step / FINEST), np.where(hard, stride, WIDEST / MILLI)
 
 
 @dataclass(frozen=True, eq=False)

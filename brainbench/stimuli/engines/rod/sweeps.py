@@ -31,6 +31,7 @@ from brainbench.stimuli.engines.rod.launch import (
     Try,
     WhiskerSolver,
     first_simulation,
+    followed,
     run_with_retries,
     tries_ahead,
 )
@@ -43,7 +44,6 @@ from brainbench.stimuli.engines.rod.packing import (
     PackedSurface,
     still_knots,
 )
-from brainbench.stimuli.engines.rod.tasks import followed
 from brainbench.stimuli.engines.trust import BLOW
 from brainbench.stimuli.motion.jobs import MILLI
 from brainbench.stimuli.objects.solid import Solid

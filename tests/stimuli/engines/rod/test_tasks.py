@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from brainbench.stimuli.engines.rod.launch import Approach
-from brainbench.stimuli.engines.rod.tasks import PackedTasks, followed, make_task
+from brainbench.stimuli.engines.rod.engine import PackedTasks, make_task
+from brainbench.stimuli.engines.rod.launch import Approach, followed
 from brainbench.stimuli.objects.obstacle import Capsule
 from tests.factories.gradients import COARSE, touching_job
 
