@@ -102,11 +102,11 @@ def plot(
 
     from brainbench.core.errors import check_name
     from brainbench.core.figures import check_format
-    from brainbench.stimuli.figures.traces import FORMATS, QUANTITIES
-    from brainbench.stimuli.figures.traces import plot as draw
+    from brainbench.stimuli.figures.pictures import PLOT_FORMATS, QUANTITIES
+    from brainbench.stimuli.figures.pictures import plot as draw
     from brainbench.stimuli.sources import load_stimulus_set
 
-    check_format(out, FORMATS)
+    check_format(out, PLOT_FORMATS)
     check_name("channel", channel, QUANTITIES)
     with progress_bar() as progress:
         dataset, _ = load_stimulus_set(source, whiskers=whiskers, fidelity=fidelity, backend=backend, progress=progress)
