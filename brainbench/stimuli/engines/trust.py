@@ -219,15 +219,12 @@ def halved(verdict: Verdict, change: NDArray[np.floating], which: NDArray[np.boo
     # NaN fails the comparison and counts as changed.
     changed, reasons = which & ~(change <= verdict.allowed), verdict.reasons.copy()
     for index in zip(*np.nonzero(changed), strict=True):
-        reasons[index] = changes_words(float(change[index]))
+        by = f"by {change[index]:.0%}" if np.isfinite(change[index]) else "beyond what can be trusted"
+        reasons[index] = (
+            f"the base force changes {by} (root mean square) with half the step; choose a smaller time step"
+        )
     until = np.where(changed, -np.inf, verdict.until)
     return Verdict(until, verdict.retryable | changed, reasons, np.where(which, np.inf, verdict.allowed))
-
-
-def changes_words(change: float) -> str:
-    """Return in words that the base force changes with half the step; NaN where the finer run is not reliable."""
-    by = f"by {change:.0%}" if np.isfinite(change) else "beyond what can be trusted"
-    return f"the base force changes {by} (root mean square) with half the step; choose a smaller time step"
 
 
 def force_change(force: NDArray[np.floating], half: NDArray[np.floating]) -> NDArray[np.floating]:
