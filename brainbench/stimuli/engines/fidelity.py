@@ -6,7 +6,9 @@ Errors and costs are measured, not assumed: ``fidelity_table.json`` beside this 
 
 from __future__ import annotations
 
+import logging
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
 from importlib import resources
@@ -16,14 +18,18 @@ from brainbench.core.errors import UsageError, brief, check_name
 from brainbench.core.limits import Limit, Positive, limited, read_pairs, read_value, with_changes
 from brainbench.core.reading.ranges import check_number
 from brainbench.core.tradeoffs import TradeoffPoint, cheapest
-from brainbench.stimuli.whiskers.whisker import Chain, Whisker
+from brainbench.stimuli.whiskers.whisker import Chain, Whisker, build_chain
 
 if TYPE_CHECKING:
     from brainbench.stimuli.motion.jobs import Job
 
+logger = logging.getLogger(__name__)
+
 DEFAULT_ENGINE = "rod"  # engine of whatever does not ask for one; it needs no GPU
 MOST_LINKS = 100
 """Links per whisker that are allowed; error is far below 0.1 % before. MuJoCo's cost grows with their square."""
+LARGEST_DAMPING = 1.15
+"""Damping ratio of the steps over what was asked for beyond which a warning comes."""
 
 
 @dataclass(frozen=True)
@@ -108,8 +114,6 @@ class Fidelity:
 
     def chain(self, whisker: Whisker) -> Chain:
         """Return the chain of links that stands for a whisker; errors as for :meth:`link_count`."""
-        from brainbench.stimuli.whiskers.whisker import build_chain
-
         return build_chain(whisker, self.link_count(whisker.arc_length))
 
     def step_of(self, chain: Chain) -> float:
@@ -133,6 +137,19 @@ class Fidelity:
         step = self.step_of(chain)
         # Readings end a step.
         return chain.achieved_damping_ratio(step if between == math.inf else between / math.ceil(between / step - 1e-3))
+
+    def warn_overdamped(self, jobs: Sequence[Job]) -> None:
+        """Warn of time steps that damp a whisker by :data:`LARGEST_DAMPING` of what was asked for, or more."""
+        found = {(job.whisker, job.spacing): job for job in jobs}
+        ratios = [(self.damping_of(job), job.whisker.damping_ratio) for job in found.values()]
+        over = [pair for pair in ratios if pair[0] > LARGEST_DAMPING * pair[1]]
+        if over:
+            logger.warning(
+                "The time step of %g s damps the first mode of at least one whisker with ratio %.2f instead of %.2f; "
+                "its ringing is lost, slow bending is not; choose a smaller step to keep it.",
+                self.time_step,
+                *max(over),
+            )
 
     def link_count(self, arc_length: float) -> int:
         """Return the number of links of a whisker of this arc length [m]; too many are a :class:`UsageError`."""

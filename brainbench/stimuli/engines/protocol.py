@@ -198,7 +198,7 @@ class WhiskerEngine:
         raise NotImplementedError(f"The engine {self.name!r} has a run of its own.")
 
     def check(self, jobs: Sequence[Job], fidelity: Fidelity, workers: int | None = None) -> None:
-        """Refuse jobs, solvers and workers that the engine cannot run."""
+        """Refuse jobs, solvers and workers that the engine cannot run; warn of steps that damp too much."""
         if workers is not None:
             check_number("workers", workers, least=1, whole=True)
         if fidelity.solver not in self.solvers:
@@ -223,6 +223,7 @@ class WhiskerEngine:
                     f" of {len(obstacle.surface.faces)} triangles; give the object collision = 'decomposition' (convex"
                     " pieces, whose deviation is stated) or use the backend 'rod', which touches the surface itself."
                 )
+        fidelity.warn_overdamped(jobs)
 
     def run(
         self,

@@ -252,7 +252,7 @@ def test_a_short_whisker_rings_with_the_damping_that_it_was_given(spacing):
 
 def test_steps_that_damp_too_much_are_warned_of_and_stored(caplog):
     job = Job(replace(C2, damping_ratio=0.1), StillFollicle(), (), TIMES, loads=(Load(0.01, (0, 1e-6, 0)),))
-    with caplog.at_level(logging.WARNING, "brainbench.stimuli.engines.trust"):
+    with caplog.at_level(logging.WARNING, "brainbench.stimuli.engines.fidelity"):
         (held,) = get_engine("rod", errors=True).run([job], Fidelity.of("fast"))
         assert not caplog.records
         (lost,) = get_engine("rod", errors=True).run([job], Fidelity(links=8, time_step=1e-3))
