@@ -149,7 +149,7 @@ WAYS = (
     Way(
         "A record, to a page",
         (
-            "leaderboards.store:read_record",
+            "leaderboards.store:_read",
             "leaderboards.boards:rank",
             "leaderboards.ranking:told_apart",
             "leaderboards.site.table:page_board",
