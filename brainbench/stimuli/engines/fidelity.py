@@ -140,8 +140,8 @@ class Fidelity:
 
     def warn_overdamped(self, jobs: Sequence[Job]) -> None:
         """Warn of time steps that damp a whisker by :data:`LARGEST_DAMPING` of what was asked for, or more."""
-        found = {(job.whisker, job.spacing): job for job in jobs}
-        ratios = [(self.damping_of(job), job.whisker.damping_ratio) for job in found.values()]
+        places = {(job.whisker, job.spacing): job for job in jobs}
+        ratios = [(self.damping_of(job), job.whisker.damping_ratio) for job in places.values()]
         over = [pair for pair in ratios if pair[0] > LARGEST_DAMPING * pair[1]]
         if over:
             logger.warning(
