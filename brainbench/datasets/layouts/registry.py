@@ -179,10 +179,13 @@ def _known() -> dict[str, RecordingLayout]:
     """Return the registry with the layouts of other packages."""
     if ENTRY_POINTS not in _loaded:
         _loaded.append(ENTRY_POINTS)
-        load_entry_points(
-            ENTRY_POINTS, lambda _, loaded: isinstance(loaded, RecordingLayout) and register_layout(loaded)
-        )
+        load_entry_points(ENTRY_POINTS, _take)
     return _LAYOUTS
+
+
+def _take(_: str, candidate: Any) -> None:
+    if isinstance(candidate, RecordingLayout):
+        register_layout(candidate)
 
 
 SYNTHETIC = RecordingLayout(
