@@ -43,6 +43,9 @@ SHORTEST = 10
 """Readings of the shortest episode that is used."""
 LARGEST = 1e12
 """Magnitude of times and readings beyond which a log is taken to be damaged."""
+FARTHEST = 2.0
+"""Distance (m) of the ball from its link above which numbers look like millimetres."""
+_PLACE = ("x", "y", "z")
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,12 +62,15 @@ class Log:
     """[T] number of the episode; None for one."""
     probes: tuple[str, ...] = ()
     """Names [N]."""
+    ball: NDArray[np.float64] | None = None
+    """[T, 3] centre of the ball that presses the device (m, frame of its link); None where none is known."""
 
     def __post_init__(self) -> None:
-        for name in ("time", "readings", "reference", "episode"):
+        for name in ("time", "readings", "reference", "episode", "ball"):
             if (values := getattr(self, name)) is not None:
                 object.__setattr__(self, name, values := np.asarray(values))
-                if values.shape[:1] != np.shape(self.time)[:1] or (values.ndim != 1 and name != "readings"):
+                flat = values.ndim == 1 or name in ("readings", "ball")
+                if values.shape[:1] != np.shape(self.time)[:1] or not flat:
                     raise UsageError(f"{name} has the shape {values.shape}, time {np.shape(self.time)}.")
                 if not np.isfinite(values).all():
                     raise UsageError(f"{name} of a log must be finite numbers; leave out the rows of the others.")
@@ -74,6 +80,10 @@ class Log:
             raise UsageError(f"{self.readings.shape[1]} probes have as many names; received {len(self.probes)}.")
         if len(self.time) > 1 and not self.step > 0:
             raise UsageError(f"Times of a log (s) rise; received steps of {self.step:g} s.")
+        if self.ball is not None and self.ball.shape[1:] != (3,):
+            raise UsageError(f"ball is [T, 3] (m); received {self.ball.shape}.")
+        if self.ball is not None and (far := float(np.abs(self.ball).max())) > FARTHEST:
+            raise UsageError(f"The ball lies {far:g} m from the origin of its link; scale millimetres by 1e-3.")
 
     @property
     def step(self) -> float:
@@ -82,14 +92,17 @@ class Log:
 
 
 def read_log(path: str | os.PathLike[str]) -> Log:
-    """Read a CSV file with a header: ``time`` (s), optionally ``reference`` and ``episode``, else probes.
+    """Read a CSV file with a header: ``time`` (s), optionally ``reference``, ``episode``, ``x``, ``y`` and ``z`` (the
+    centre of a ball, m), else probes.
 
     Raises:
         DataFileNotFoundError: the file is missing.
     """
     name = Path(path).name
     header, table = read_columns(path, "log")
-    probes = [cell for cell in header if cell.lower() not in ("time", "reference", "episode")]
+    pressed = set(_PLACE) <= set(header)
+    others = ("time", "reference", "episode", *(_PLACE if pressed else ()))
+    probes = [cell for cell in header if cell.lower() not in others]
     if "time" not in [cell.lower() for cell in header] or not probes:
         raise DataError(
             f"{name} needs a header with 'time' (s) and at least one column of readings; found {listing(header)}."
@@ -112,7 +125,8 @@ def read_log(path: str | os.PathLike[str]) -> Log:
             f"{name}: times must rise in equal steps within an episode; found "
             f"{f'{gaps.min():g}…{gaps.max():g} s' if len(gaps) else 'no two rows of one episode'}."
         )
-    return Log(time, readings, columns.get("reference"), episode, tuple(probes))
+    ball = np.stack([columns[name] for name in _PLACE], axis=1) if pressed else None
+    return Log(time, readings, columns.get("reference"), episode, tuple(probes), ball)
 
 
 def segments(log: Log) -> list[Episode]:

@@ -1,0 +1,52 @@
+"""A device that a ball presses is recovered, and what is wrong with it is named."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from brainbench.core.errors import DataError
+from robotics_bridge.sensors.calibration.devices import fit_device
+from robotics_bridge.sensors.calibration.presses import Presses
+from robotics_bridge.sensors.noise.model import Noise
+from tests.factories.pressed_devices import FAULTS, outcomes, plant, tilts
+
+
+def test_a_device_is_recovered_within_its_intervals_and_not_accused(tmp_path) -> None:
+    planted = plant(0, side=2, touches=12)
+    fit = fit_device(planted.presses)
+    assert fit.held_out < 0.05
+    assert tilts(planted, fit).max() < 2
+    assert np.mean([np.mean(values) for values in outcomes(planted, fit).values()]) > 0.8
+    assert not fit.faults
+    fit.save(tmp_path / "device.json", "pad")
+    assert Noise.load(tmp_path / "device.json") == fit.noise
+    draws = fit.draws(40)
+    spread = np.std([np.log(draw.law()["stiffness"]) for draw in draws])
+    assert spread == pytest.approx(np.sqrt(fit.spread[0, 0]), rel=0.4)
+    assert draws[0].law() == fit.draws(1)[0].law()
+
+
+@pytest.mark.parametrize("fault", ["axes", *(pytest.param(fault, marks=pytest.mark.slow) for fault in FAULTS)])
+def test_a_planted_fault_is_named(fault: str) -> None:
+    assert fault in {entry.kind for entry in fit_device(plant(10_001, fault, side=2, touches=12).presses).faults}
+
+
+def test_a_device_of_one_channel_is_recovered() -> None:
+    planted = plant(3, side=2, touches=12, axes=1)
+    fit = fit_device(planted.presses)
+    assert fit.held_out < 0.05
+    assert not fit.faults
+
+
+def test_stuck_taxels_and_too_few_presses_are_told() -> None:
+    presses = plant(0, side=2, touches=6).presses
+    few = np.arange(len(presses.log.time)) < 100
+    log = presses.log
+    with pytest.raises(DataError, match=r"holds \d touches of the ball; a fit of a device needs 5"):
+        fit_device(Presses(replace(log, time=log.time[few], readings=log.readings[few], ball=presses.ball[few]),
+                           presses.probes, presses.radius))  # fmt: skip
+    with pytest.raises(DataError, match="stuck at one value"):
+        fit_device(Presses(replace(log, readings=0 * log.readings), presses.probes, presses.radius))
