@@ -21,7 +21,7 @@ MOST_LINES = 700
 """Lines of a module, which is cut by idea; 150 to 450 are usual."""
 BUDGETS = {
     "brainbench/stimuli": 26_480,  # the estimated error of every whisker, follicles that give way in two engines
-    "robotics_bridge": 24_220,  # newtons that no taxel has, trees of any hand, deadlines, replays, gel pictures
+    "robotics_bridge": 25_140,  # newtons that no taxel has, trees of any hand, replays, gel pictures, devices fitted
     "brainbench/models": 8_410,  # the proof that a layer is a response, ONNX files tried apart
     "brainbench/datasets": 7_900,  # the balance of a reading, signals; files of torch_brain and rsatoolbox, both ways
     "brainbench/metrics": 5_720,  # the unique part, drift over time, matching of units
@@ -34,13 +34,13 @@ BUDGETS = {
     "brainbench/published": 2_530,
     "brainbench/tradeoffs": 1_040,
     "brainbench/benchmarks": 760,
-    "benchmarks": 7_500,  # calibration, claims corrected together, students and the pages made of them
+    "benchmarks": 7_560,  # calibration, claims corrected together, students and their pages, devices that are fitted
 }
 """Folder → lines of Python that it may have: as the rooms stand, with two per cent to move in. Who adds a capability
 pays in the same folder, or raises the number in the commit that needs it, with the reason."""
-MOST_PRODUCT_LINES, MOST_PRODUCT_MODULES = 96_950, 424
+MOST_PRODUCT_LINES, MOST_PRODUCT_MODULES = 97_830, 424
 """Lines grew last by responses of any kind, errors of sweeps, boards of 10,000 records, ONNX files tried apart, drift
-over time, and files of torch_brain and rsatoolbox both ways."""
+over time, files of torch_brain and rsatoolbox both ways, and real tactile devices fitted jointly to presses."""
 VAGUE = frozenset(
     re.findall(r"\w+", "found told own kept known asked one other item shown made named taken usual"),
 )

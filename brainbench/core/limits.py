@@ -264,7 +264,7 @@ def _values(fixed: bool, kinds: Sequence[Any], limit: msgspec.Meta) -> Check | N
 
     def check(name: str, value: Any) -> None:
         several = isinstance(value, Iterable) and not isinstance(value, str | bytes | Mapping | Iterator)
-        values = list(value) if several else []
+        values: list[Any] = list(value) if several else []
         if not several or (fixed and len(values) != len(checks)):
             raise UsageError(f"{name} holds {f'{len(checks)} {noun}' if fixed else noun}; received {brief(value)}.")
         _check_length(name, values, limit, "values")

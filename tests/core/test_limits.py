@@ -100,8 +100,8 @@ def _good_value(annotation: Any, limit: msgspec.Meta | None = None) -> Any:
         return kinds[0]
     if origin in (Union, UnionType) and type(None) not in kinds:
         return _good_value(kinds[0])
-    if origin is tuple and kinds[-1] is not Ellipsis:
-        return tuple(map(_good_value, kinds))
+    if origin is tuple:
+        return tuple(map(_good_value, kinds[:1] if kinds[-1] is Ellipsis else kinds))
     if annotation in (int, float):
         least, most = (limit.ge, limit.le) if limit is not None else (None, None)
         above, below = (limit.gt, limit.lt) if limit is not None else (None, None)
