@@ -26,8 +26,9 @@ from numpy.typing import NDArray
 from benchmarks.report import publish, script_parser, table
 from brainbench.core.statistics import wilson_interval
 from robotics_bridge import tasks
-from robotics_bridge.deploy.driver import HandReading, LinkCounters
-from robotics_bridge.deploy.session import Clock, DeployedPolicy, PressureCalibration, Report, read_deployed
+from robotics_bridge.deploy.controller import Report
+from robotics_bridge.deploy.driver import Clock, HandReading, LinkCounters
+from robotics_bridge.deploy.session import DeployedPolicy, PressureCalibration, read_deployed
 from robotics_bridge.envs.env import Env
 from robotics_bridge.envs.step import VELOCITY
 from robotics_bridge.policies.evaluate import Policy, evaluate, mean_of_episodes

@@ -224,7 +224,7 @@ class Task:
     """
     rated_speed: bool = False
     """Whether targets move no faster than the rated speed of the joints, as those of a deployed policy do
-    (:class:`~robotics_bridge.deploy.driver.SafetyLimits`)."""
+    (:class:`~robotics_bridge.deploy.safety.SafetyLimits`)."""
     # --- randomness ---
     actuators: ActuatorRandomisation | None = ActuatorRandomisation()
     object_changes: ObjectRandomisation = ObjectRandomisation()

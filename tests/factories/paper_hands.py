@@ -25,8 +25,9 @@ from pathlib import Path
 
 import numpy as np
 
-from robotics_bridge.deploy.driver import HandReading, LinkCounters, SafetyLimits
-from robotics_bridge.deploy.session import Clock, Controller, Report
+from robotics_bridge.deploy.controller import Controller, Report
+from robotics_bridge.deploy.driver import Clock, HandReading, LinkCounters
+from robotics_bridge.deploy.safety import SafetyLimits
 from robotics_bridge.policies.contract import PolicyContract
 
 JOINTS = ("a", "b", "c")

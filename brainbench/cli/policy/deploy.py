@@ -43,7 +43,7 @@ def export(
     return Output(written, text)
 
 
-@with_options("robotics_bridge.deploy.driver:SafetyLimits", ("timeout", "pressure"), parameter="limits", build=False)
+@with_options("robotics_bridge.deploy.safety:SafetyLimits", ("timeout", "pressure"), parameter="limits", build=False)
 def deploy(
     policy: Annotated[Path, typer.Argument(help="A file of brainbench policy export; its contract lies beside it.")],
     limits: dict[str, Any],
@@ -77,8 +77,8 @@ def deploy(
     """
     from brainbench.core.plugins import require_optional
     from robotics_bridge.deploy import session
+    from robotics_bridge.deploy.controller import check_duration, realtime
     from robotics_bridge.deploy.driver import DriverRequest, open_driver
-    from robotics_bridge.deploy.session import check_duration, realtime
     from robotics_bridge.tasks.settings import contacts_name
 
     deployed = session.read_deployed(policy)

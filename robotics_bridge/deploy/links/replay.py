@@ -103,7 +103,7 @@ class SessionRecorder:
         return self
 
     def __call__(self, reading: HandReading, obs: Any, action: Any, targets: NDArray[np.floating]) -> None:
-        """Keep a tick, as a :class:`~robotics_bridge.deploy.session.Controller` reports it."""
+        """Keep a tick, as a :class:`~robotics_bridge.deploy.controller.Controller` reports it."""
         del obs, action
         # With the signs of the simulator, pressure is along outward normals with axes z, y, x (4.29); a force on the
         # skin points inward.

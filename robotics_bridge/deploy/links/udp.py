@@ -30,7 +30,8 @@ from numpy.typing import ArrayLike, NDArray
 from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, check_once
 from brainbench.core.reading.ranges import check_number
 from robotics_bridge import hands
-from robotics_bridge.deploy.driver import ClockOffset, DriverRequest, HandReading, LinkCounters
+from robotics_bridge.deploy.driver import DriverRequest, HandReading, LinkCounters
+from robotics_bridge.deploy.safety import ClockOffset
 
 MAGIC = b"BBH3"
 """Version of the frames; either end drops those of another one. In ``BBH2`` commands were targets alone."""

@@ -12,7 +12,7 @@ import torch
 
 from brainbench.core.errors import UsageError
 from robotics_bridge import hands, tasks
-from robotics_bridge.deploy.driver import SafetyLimits
+from robotics_bridge.deploy.safety import SafetyLimits
 from robotics_bridge.envs import Env, step
 from robotics_bridge.envs.step import step_context
 from robotics_bridge.tasks import terms

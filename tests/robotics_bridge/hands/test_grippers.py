@@ -15,7 +15,8 @@ import trimesh
 
 from brainbench.core.errors import UsageError
 from robotics_bridge import hands, tasks
-from robotics_bridge.deploy.driver import HandReading, SafetyLimits
+from robotics_bridge.deploy.driver import HandReading
+from robotics_bridge.deploy.safety import SafetyLimits
 from robotics_bridge.hands import Hand
 from robotics_bridge.hands.hand import LEVER
 from robotics_bridge.hands.scenes import closing

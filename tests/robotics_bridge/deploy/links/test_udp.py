@@ -17,7 +17,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from brainbench.core.errors import DataError, UsageError
-from robotics_bridge.deploy.driver import Command, SafeLink, SafetyLimits
+from robotics_bridge.deploy.controller import Controller
+from robotics_bridge.deploy.driver import Clock
 from robotics_bridge.deploy.links import udp
 from robotics_bridge.deploy.links.simulated_hand import Faults, SimulatedHand, serve, simulated_hand
 from robotics_bridge.deploy.links.udp import (
@@ -33,7 +34,7 @@ from robotics_bridge.deploy.links.udp import (
     pack_values,
     read_key,
 )
-from robotics_bridge.deploy.session import Clock, Controller
+from robotics_bridge.deploy.safety import Command, SafeLink, SafetyLimits
 from robotics_bridge.policies.contract import PolicyContract
 
 JOINTS, FINGERS, KEY = ("a", "b"), ("thumb",), new_key()

@@ -1,0 +1,148 @@
+"""No command comes from an old report, and none is beyond the limits, wherever time is lost."""
+
+from __future__ import annotations
+
+import os
+import re
+import time
+
+import numpy as np
+import pytest
+
+from brainbench.core.errors import UsageError
+from robotics_bridge.deploy.controller import Controller
+from robotics_bridge.deploy.driver import Clock
+from robotics_bridge.deploy.safety import SILENCE, ClockOffset, Command, SafeLink, SafetyLimits
+from tests.factories.paper_hands import (
+    PLACES,
+    OwnClock,
+    PaperHand,
+    jitter,
+    make_contract,
+    make_limits,
+    run_session,
+    stalls,
+    suspended,
+)
+
+
+def test_targets_keep_to_limits_of_joint_and_speed() -> None:
+    report, hand, _ = run_session(policy=lambda obs, forget: np.array([9.0, 9.0]))
+    sent = np.array(hand.sent)
+    assert np.abs(np.diff(sent, axis=0, prepend=np.zeros((1, 3)))).max() <= 8.0 / 40 + 1e-9
+    np.testing.assert_allclose(sent[-1], [1.0, 0.3, 0.4])
+    assert report.limited == 4  # until the slowest joint has come the 1 rad, 0.2 rad a tick
+
+
+def test_ages_are_told_without_a_common_clock() -> None:
+    offset = ClockOffset()
+    assert offset.age(5.0, 105.02, 105.02) == pytest.approx(0.0)
+    assert offset.age(5.1, 105.11, 105.11) == pytest.approx(0.0)  # came faster: the new zero
+    assert offset.age(5.2, 105.31, 105.35) == pytest.approx(0.14, abs=1e-3)
+
+
+def test_a_clock_that_runs_slow_makes_no_report_old() -> None:
+    offset = ClockOffset()
+    ages = [offset.age(0.9999 * t, t, t) for t in np.arange(0.0, 7200.0, 0.1)]  # 100 ppm
+    assert max(ages) < 1e-4
+    assert offset.age(0.9999 * 7200, 7200.15, 7200.15) == pytest.approx(0.15, abs=1e-3)
+
+
+def test_limits_are_of_the_joints_of_the_hand() -> None:
+    one = SafetyLimits(np.array([-1.0]), np.array([1.0]), np.array([8.0]))
+    clock = OwnClock()
+    with pytest.raises(UsageError, match="limits of 1 joints; the hand has 3"):
+        Controller(lambda obs, forget: np.zeros(2), PaperHand(clock), make_contract(), one, clock=clock)
+
+
+@pytest.mark.parametrize("place", PLACES)
+@pytest.mark.parametrize("call", [1, 30], ids=["first", "later"])
+def test_no_command_comes_from_an_old_report_wherever_time_is_lost(place: str, call: int) -> None:
+    for case in stalls(place, call):
+        assert (case.stale, case.stops) == (0, 1), case
+        if place != "record" and case.length > case.timeout:
+            # The place alone says in which words: a report that is old when it is read, or a command.
+            assert case.status == "stopped", case
+            words = rf"{1e3 * case.length:.0f} ms .*allowed {1e3 * case.timeout:.0f} ms"
+            assert re.search(words, case.reason), case
+            assert len(case.ages) == call - 1, case
+        elif case.length <= 0.1:
+            assert case.status == "finished", case
+
+
+def test_a_stall_before_every_command_sends_none() -> None:
+    clock = OwnClock()
+    hand = PaperHand(clock)
+
+    def slow(obs, forget):
+        clock.now += 0.101
+        return np.zeros(2)
+
+    report = Controller(slow, hand, make_contract(), make_limits(), clock=clock).run(5.0)
+    assert (report.status, hand.sent, hand.stops) == ("stopped", [], 1)
+    assert report.reason == "a command came 101 ms after the report it was decided from (allowed 100 ms)"
+
+
+@pytest.mark.parametrize("start", range(0, 250, 50))
+def test_no_command_comes_from_an_old_report_by_a_clock_that_jitters(start: int) -> None:
+    cases = list(jitter(range(start, start + 50)))
+    assert {(case.stale, case.stops) for case in cases} == {(0, 1)}
+    assert "stopped" in {case.status for case in cases}
+
+
+def _link(clock=None, **changes):
+    clock = clock or OwnClock()
+    hand = PaperHand(clock)
+    link = SafeLink(hand, make_limits(**changes), clock, 1 / 40)
+    reading = link.read()
+    assert link.fault(reading) is None
+    return link, hand, reading, clock
+
+
+@pytest.mark.parametrize(
+    ("targets", "words"),
+    [
+        ([0.0, np.nan, 0.0], "no numbers"), ([0.0, np.inf, 0.0], "no numbers"), ([0.0, 1e38, 0.0], "beyond"),
+        ([0.0, 0.0, -1.001], "beyond"), ([0.0, 0.3, 0.0], "joint 1 faster"),
+    ],
+)  # fmt: skip
+def test_the_link_itself_refuses_what_is_unsafe(targets, words) -> None:
+    link, hand, reading, _ = _link()
+    assert words in link.send(Command(np.array(targets), reading, link.deadline(reading)))
+    assert hand.sent == []
+
+
+def test_a_command_holds_until_its_deadline_and_a_stop_is_final() -> None:
+    link, hand, reading, clock = _link()
+    command = Command(np.zeros(3), reading, link.deadline(reading))
+    assert command.deadline == pytest.approx(clock.now + 0.1)
+    clock.now = command.deadline
+    assert link.send(command) is None
+    clock.now += 1e-6
+    assert "after the report" in link.send(command)
+    assert "no numbers" not in link.send(Command(np.zeros(3), reading, np.nan))
+    link.stop()
+    assert link.send(Command(np.zeros(3), reading, clock.now + 1)) == "the hand was stopped"
+    assert len(hand.sent) == 1
+
+
+def test_the_link_stops_the_hand_while_the_loop_hangs() -> None:
+    link, hand, reading, _ = _link(Clock())
+    with link.watched():
+        assert link.send(Command(np.zeros(3), reading, link.deadline(reading))) is None
+        time.sleep(0.1)
+        assert hand.stops == 0
+        time.sleep(2 * SILENCE)
+        assert hand.stops == 1
+        reading = link.read()
+        assert "no command came for" in link.fault(reading)
+        assert "no command came for" in link.send(Command(np.zeros(3), reading, link.deadline(reading)))
+    assert len(hand.sent) == 1
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(os.name != "posix", reason="signals")
+def test_a_session_that_was_suspended_stops_when_it_goes_on() -> None:
+    case = suspended(0.4)
+    assert (case.stale, case.status) == (0, "stopped"), case
+    assert case.stops >= 1
