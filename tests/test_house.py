@@ -21,7 +21,7 @@ MOST_LINES = 700
 """Lines of a module, which is cut by idea; 150 to 450 are usual."""
 BUDGETS = {
     "brainbench/stimuli": 26_480,  # the estimated error of every whisker, follicles that give way in two engines
-    "robotics_bridge": 25_140,  # newtons that no taxel has, trees of any hand, replays, gel pictures, devices fitted
+    "robotics_bridge": 25_180,  # newtons that no taxel has, trees of any hand, replays, gel pictures, devices fitted
     "brainbench/models": 8_410,  # the proof that a layer is a response, ONNX files tried apart
     "brainbench/datasets": 7_900,  # the balance of a reading, signals; files of torch_brain and rsatoolbox, both ways
     "brainbench/metrics": 5_720,  # the unique part, drift over time, matching of units
@@ -38,7 +38,7 @@ BUDGETS = {
 }
 """Folder → lines of Python that it may have: as the rooms stand, with two per cent to move in. Who adds a capability
 pays in the same folder, or raises the number in the commit that needs it, with the reason."""
-MOST_PRODUCT_LINES, MOST_PRODUCT_MODULES = 97_830, 424
+MOST_PRODUCT_LINES, MOST_PRODUCT_MODULES = 97_910, 424
 """Lines grew last by responses of any kind, errors of sweeps, boards of 10,000 records, ONNX files tried apart, drift
 over time, files of torch_brain and rsatoolbox both ways, and real tactile devices fitted jointly to presses."""
 VAGUE = frozenset(
