@@ -12,6 +12,7 @@ from pathlib import PurePath
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from brainbench.core.contracts import Trials, check_recordings, natural_key
@@ -367,7 +368,7 @@ def _about(part: SessionCounts) -> dict[str, Any]:
 
 
 _RUN, _MILLISECOND = 8, 1e-3
-"""Intervals in a row by which spikes are known: so many that agree to a millisecond are no chance."""
+"""Intervals in a row, no two alike, by which spikes are known: so many that agree to a millisecond are no chance."""
 _SKETCH = 64  # runs that are kept of a unit: those of the lowest codes, which copies of it have too
 
 
@@ -379,8 +380,12 @@ def _runs(times: Floats) -> tuple[list[int], bool]:
     for place in range(_RUN):
         # Each step mixes all bits, so that the lowest codes are a fair sample of all.
         codes = (codes ^ (codes >> np.uint64(31))) * np.uint64(0x9E3779B97F4A7C15) + steps[place : place + number]
-    codes = np.unique((codes ^ (codes >> np.uint64(31))) * np.uint64(0x9E3779B97F4A7C15))
-    return codes[:_SKETCH].tolist(), 2 * len(codes) <= number
+    codes = (codes ^ (codes >> np.uint64(31))) * np.uint64(0x9E3779B97F4A7C15)
+    # Equal intervals are those of a program, which spaces the spikes of a trial evenly: they recognise nobody.
+    if number:
+        codes = codes[np.all(np.diff(np.sort(sliding_window_view(steps, _RUN)), axis=1) > 0, axis=1)]
+    different = np.unique(codes)
+    return different[:_SKETCH].tolist(), 2 * len(different) <= len(codes)
 
 
 @dataclass
