@@ -381,11 +381,13 @@ def _runs(times: Floats) -> tuple[list[int], bool]:
         # Each step mixes all bits, so that the lowest codes are a fair sample of all.
         codes = (codes ^ (codes >> np.uint64(31))) * np.uint64(0x9E3779B97F4A7C15) + steps[place : place + number]
     codes = (codes ^ (codes >> np.uint64(31))) * np.uint64(0x9E3779B97F4A7C15)
-    # Equal intervals are those of a program, which spaces the spikes of a trial evenly: they recognise nobody.
+    # Equal intervals are those of a program, which spaces the spikes of a trial evenly: they recognise nobody alone.
+    uneven = codes
     if number:
-        codes = codes[np.all(np.diff(np.sort(sliding_window_view(steps, _RUN)), axis=1) > 0, axis=1)]
-    different = np.unique(codes)
-    return different[:_SKETCH].tolist(), 2 * len(different) <= len(codes)
+        uneven = codes[np.all(np.diff(np.sort(sliding_window_view(steps, _RUN)), axis=1) > 0, axis=1)]
+    different = np.unique(uneven)
+    regular = 2 * len(different) <= len(uneven)
+    return (np.unique(codes) if regular else different)[:_SKETCH].tolist(), regular
 
 
 @dataclass
