@@ -167,7 +167,7 @@ class DrawnSession:
     """[R] stimulus of each trial."""
     expected: NDArray[np.float64]
     """[K, U] expected rate, Hz."""
-    window: Positive
+    window: float
     """Duration in which spikes are counted, s."""
 
     @property
@@ -256,7 +256,7 @@ def draw_counts(
     random: np.random.Generator,
     design: PopulationDesign,
     rates: NDArray[np.float64],
-    window: Positive | NDArray[np.float64],
+    window: float | NDArray[np.float64],
 ) -> NDArray[np.int64]:
     """Draw spike counts [R, U] around expected rates [R, U] (Hz) in windows of one length or one each [R, 1], s."""
     # Drift is linear from the first trial to the last, with a mean of one.
