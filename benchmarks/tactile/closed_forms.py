@@ -130,20 +130,15 @@ def planted() -> list[list[str]]:
     return rows
 
 
-def classifier() -> list[list[str]]:
-    from sklearn.linear_model import LogisticRegression
-    from sklearn.pipeline import make_pipeline
-    from sklearn.preprocessing import StandardScaler
-
-    model = mujoco.MjModel.from_xml_string("""
+def impact_sounds(half: tuple[float, float, float], seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return band powers, material and whether the impact was slow, of a ball that bounces and rolls on a slab."""
+    model = mujoco.MjModel.from_xml_string(f"""
     <mujoco><option timestep="0.005"/><worldbody>
-      <body name="slab"><geom type="box" size="0.15 0.1 0.015"/></body>
-      <body name="ball" pos="0.03 0.02 0.036"><freejoint/><geom size="0.02" mass="0.05"/></body>
+      <body name="slab"><geom type="box" size="{half[0]} {half[1]} {half[2]}"/></body>
+      <body name="ball" pos="0.03 0.02 {half[2] + 0.021}"><freejoint/><geom size="0.02" mass="0.05"/></body>
     </worldbody></mujoco>""")
-    envs, rng = 96, np.random.default_rng(1)
-    names = ("wood", "metal", "glass")
-    solid = _solid("box", 0.15, 0.1, 0.015)
-    sensors = {name: ContactAudio(link="slab", modes=find_modes(solid, name, cells=8)) for name in names}
+    names, envs, rng = ("wood", "metal", "glass"), 96, np.random.default_rng(seed)
+    sensors = {name: ContactAudio(link="slab", modes=find_modes(_solid("box", *half), name, cells=8)) for name in names}
     engine = MujocoEngine(model, envs, threads=1)
     suite = SensorSuite(engine.scene, sensors, num_envs=envs)
     velocity = np.zeros((envs, 6))
@@ -160,13 +155,28 @@ def classifier() -> list[list[str]]:
         power = np.abs(np.fft.rfft(np.concatenate(blocks[name], axis=1), axis=1)[:, 1:]) ** 2
         bands = np.log(power[:, : power.shape[1] // 64 * 64].reshape(envs, 64, -1).mean(axis=2) + 1e-20)
         features.append(bands - bands.mean(axis=1, keepdims=True))
-    x, y = np.concatenate(features), np.repeat(range(3), envs)
     slow = np.tile(-velocity[:, 2] < np.median(-velocity[:, 2]), 3)
-    rows = []
-    for train, text in ((slow, "slow → fast impacts"), (~slow, "fast → slow impacts")):
-        rule = make_pipeline(StandardScaler(), LogisticRegression(max_iter=1000)).fit(x[train], y[train])
-        rows.append([text, f"{rule.score(x[~train], y[~train]):.1%}", f"{(~train).sum()} sounds"])
-    return rows
+    return np.concatenate(features), np.repeat(range(3), envs), slow
+
+
+def classifier() -> list[list[str]]:
+    from sklearn.linear_model import LogisticRegression
+    from sklearn.pipeline import make_pipeline
+    from sklearn.preprocessing import StandardScaler
+
+    def right(train: tuple[np.ndarray, np.ndarray], test: tuple[np.ndarray, np.ndarray]) -> float:
+        return make_pipeline(StandardScaler(), LogisticRegression(max_iter=1000)).fit(*train).score(*test)
+
+    x, y, slow = impact_sounds((0.15, 0.1, 0.015), 1)
+    other, materials, _ = impact_sounds((0.12, 0.12, 0.02), 2)
+    draws = (np.random.default_rng(seed).permutation(y) for seed in range(20))
+    chance = [right((x[slow], drawn[slow]), (x[~slow], drawn[~slow])) for drawn in draws]
+    return [
+        ["slow → fast impacts", f"{right((x[slow], y[slow]), (x[~slow], y[~slow])):.1%}", f"{(~slow).sum()} sounds"],
+        ["fast → slow impacts", f"{right((x[~slow], y[~slow]), (x[slow], y[slow])):.1%}", f"{slow.sum()} sounds"],
+        ["this slab → another shape", f"{right((x, y), (other, materials)):.1%}", f"{len(other)} sounds"],
+        ["slow → fast, labels shuffled", f"{np.mean(chance):.1%}, at most {max(chance):.1%}", "20 shuffles"],
+    ]
 
 
 def main() -> None:

@@ -26,6 +26,7 @@ def replay(
     """
     import numpy as np
 
+    from brainbench.core.files import atomic_path
     from robotics_bridge import hands
     from robotics_bridge.deploy.links import replay as replays
 
@@ -34,10 +35,10 @@ def replay(
     result = replays.replay(record, hand)
     rows = result.rows()
     if out is not None:
-        names = [row["taxel"] for row in rows]
-        header = ",".join(["time", *(f"{name} {side}" for name in names for side in ("real", "simulated"))])
+        header = ",".join(["time", *(f"{name} {side}" for name in record.taxels for side in ("real", "simulated"))])
         pairs = np.stack([record.force, result.simulated], axis=-1).reshape(len(record.time), -1)
-        np.savetxt(out, np.c_[record.time, pairs], delimiter=",", fmt="%.6g", header=header, comments="")
+        with atomic_path(out) as path:
+            np.savetxt(path, np.c_[record.time, pairs], delimiter=",", fmt="%.6g", header=header, comments="")
     touched = [row for row in rows if row["real_peak"] > 0 or row["simulated_peak"] > 0]
     columns = {
         "taxel": "{0[taxel]}",

@@ -15,9 +15,11 @@ J joint, N point or taxel.
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections import Counter, defaultdict
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -257,8 +259,9 @@ def _write_frames(path: Path, table: Mapping[str, NDArray], shapes: Mapping[str,
 RADIUS = 4e-3  # sensing radius of a taxel whose log does not say (m)
 _LARGEST = 1.0  # distance of a taxel from the origin of its link above which it looks like millimetres (m)
 _STRONGEST = 1e9  # largest reading of a taxel, in any unit; beyond it the number is damaged
-_TURN = 2 * np.pi  # largest joint angle (rad); beyond it angles look like degrees
 _RATE = 200.0  # least physics reports per second
+_STEPS = (1e-4, 1.0)  # shortest and longest median step of a log (s); beyond them time looks like ms, µs or frames
+_GAP = 60.0  # longest gap of a log (s), through which the simulated hand waits
 _MOST = 1_000_000  # most frames of an episode
 
 
@@ -291,17 +294,28 @@ class TouchLog:
         if len(self.time) < 2 or (late := np.flatnonzero(np.diff(self.time) <= 0)).size:
             where = f"frame {late[0] + 1} does not come after the one before" if len(self.time) > 1 else "one frame"
             raise DataError(f"{self.name}: time stamps must rise from frame to frame; {where}.")
+        steps = np.diff(self.time)
+        if not _STEPS[0] <= (step := float(np.median(steps))) <= _STEPS[1] or steps.max() > _GAP:
+            raise DataError(
+                f"{self.name}: frames come every {step:g} s (allowed: {_STEPS[0]:g} to {_STEPS[1]:g}), and the longest "
+                f"gap is {steps.max():g} s (at most {_GAP:g}); give time in seconds, and cut the log at a gap."
+            )
         if not self.joints or not self.points.links:
-            raise DataError(
-                f"{self.name} needs joints and taxels; it has {len(self.joints)} and {self.force.shape[1]}."
-            )
+            counts = f"{len(self.joints)} and {self.force.shape[1]}"
+            raise DataError(f"{self.name} needs joints and taxels; it has {counts}.")
         if (most := float(np.abs(self.force).max(initial=0.0))) > _STRONGEST:
-            raise DataError(
-                f"{self.name}: a taxel reads {most:g}, more than any hand feels ({_STRONGEST:g}); correct it."
-            )
+            raise DataError(f"{self.name}: a taxel reads {most:g}, more than any hand feels ({_STRONGEST:g}).")
+        taxel, times = Counter(self.taxels).most_common(1)[0]
+        if times > 1:
+            raise DataError(f"{self.name}: the taxel {taxel} stands in it {times} times.")
         far = float(np.abs(self.points.position).max())
-        if far > _LARGEST:
+        if not far <= _LARGEST:
             raise DataError(f"{self.name}: a taxel lies {far:g} m from its link; scale millimetres by 1e-3.")
+        lengths = np.linalg.norm(self.points.normal, axis=1)
+        if not np.allclose(lengths, 1.0, atol=0.01):
+            raise DataError(
+                f"{self.name}: normals are {lengths.min():g} to {lengths.max():g} long; they must be 1 long."
+            )
 
 
 @dataclass(frozen=True, eq=False)
@@ -336,12 +350,8 @@ class Replay:
 
 def taxel_names(links: Sequence[str]) -> list[str]:
     """Return ``LINK:NUMBER`` of taxels in their order."""
-    count: dict[str, int] = {}
-    names = []
-    for link in links:
-        names.append(f"{link}:{count.get(link, 0)}")
-        count[link] = count.get(link, 0) + 1
-    return names
+    numbers = defaultdict[str, Iterator[int]](count)
+    return [f"{link}:{next(numbers[link])}" for link in links]
 
 
 def read_touch_log(path: str | os.PathLike[str], hand: Hand, layout: Layout, episode: int = 0) -> TouchLog:
@@ -355,21 +365,22 @@ def read_touch_log(path: str | os.PathLike[str], hand: Hand, layout: Layout, epi
         except BrainbenchError:
             raise
         except (KeyError, IndexError, TypeError, AttributeError, ValueError) as error:
-            what = brief(f"{type(error).__name__}: {error}")
-            raise DataError(f"The descriptions in {path.name}/meta are not as LeRobot writes them ({what}).") from None
-    angles = [n for n, name in enumerate(log.joints) if hand.model.joint(name).type[0] == 3]
-    widest = float(np.abs(log.position[:, angles]).max(initial=0.0))
-    if widest > _TURN:
-        raise DataError(f"{log.name}: a joint is at {widest:g} rad; angles are in radians, so scale degrees by π/180.")
+            raise DataError(f"{path.name}/meta is not as LeRobot writes it ({brief(repr(error))}).") from None
+    for name, positions in zip(log.joints, log.position.T, strict=True):
+        joint = hand.model.joint(name)
+        unit, wrong = ("rad", "degrees") if joint.type[0] == 3 else ("m", "millimetres")
+        low, high = joint.range if hand.model.jnt_limited[joint.id] else (-np.pi, np.pi)
+        # An encoder's offset may lead out of a range, and never as far again as the range is wide.
+        if positions.max() - high > (far := max(high - low, 0.1)) or low - positions.min() > far:
+            far = positions[np.argmax(np.abs(positions))]
+            raise DataError(f"{log.name}: {name} is at {far:g} {unit}, of {low:.3g} to {high:.3g}; are these {wrong}?")
     return log
 
 
 def _of_hand(name: str, joints: Sequence[str], links: Sequence[str], hand: Hand) -> None:
     for kind, names, choices in (("joint", joints, hand.joints), ("link", links, hand.links())):
         if strange := [word for word in names if word not in choices]:
-            raise DataError(
-                f"{name} is a log of another hand than {hand.name!r}: {unknown_name(kind, strange[0], choices)}"
-            )
+            raise DataError(f"{name} is of another hand than {hand.name!r}: {unknown_name(kind, strange[0], choices)}")
 
 
 def _placed(links: Sequence[str], numbers: Sequence[int], layout: Layout, name: str) -> TactilePoints:
@@ -394,11 +405,13 @@ def _read_table(path: Path, hand: Hand, layout: Layout) -> TouchLog:
     if wrong := [name for name, word in zip(taxels, words, strict=True) if not word.isdecimal() or len(word) > 6]:
         raise DataError(f"{path.name}: a taxel's column is LINK:NUMBER, such as 'tip:0'; received {wrong[0]!r}.")
     _of_hand(path.name, joints, links, hand)
-    points = _placed(links, [int(word) for word in words], layout, path.name)
+    numbers = [int(word) for word in words]
+    points = _placed(links, numbers, layout, path.name)
     position = table[:, [header.index(name) for name in joints]]
     force = table[:, [header.index(name) for name in taxels]]
+    names = tuple(f"{link}:{number}" for link, number in zip(links, numbers, strict=True))
     time = table[:, header.index("time")]
-    return TouchLog(path.name, time, tuple(joints), position, position, points, force, taxels=tuple(taxels))
+    return TouchLog(path.name, time, tuple(joints), position, position, points, force, taxels=names)
 
 
 def _read_episode(folder: Path, hand: Hand, layout: Layout, episode: int) -> TouchLog:
@@ -407,9 +420,9 @@ def _read_episode(folder: Path, hand: Hand, layout: Layout, episode: int) -> Tou
     version = str(info.get("codebase_version", "")) if isinstance(info, dict) else ""
     if version[:2] not in ("v2", "v3"):
         raise DataError(f"{name} is no LeRobot data set of layout v2 or v3; its codebase_version is {version!r}.")
-    features, count = info.get("features", {}), info.get("total_episodes", 0)
-    if not 0 <= episode < count:
-        raise UsageError(f"{name} has {count} episodes, from 0; received {episode}.")
+    features, episodes = info.get("features", {}), info.get("total_episodes", 0)
+    if not 0 <= episode < episodes:
+        raise UsageError(f"{name} has {episodes} episodes, from 0; received {episode}.")
     if absent := {"observation.state", "observation.tactile"} - set(features):
         raise DataError(f"{name} lacks {listing(sorted(absent))}: joints and touch are what is replayed.")
     frames = _frames(folder, version, episode, info)
@@ -424,12 +437,14 @@ def _read_episode(folder: Path, hand: Hand, layout: Layout, episode: int) -> Tou
     unit, described = "N", folder / "meta" / "tactile.json"
     if described.is_file():
         places = read_json(described, "places of tactile points")
+        if any(number < 0 for number in places["link"]):
+            raise DataError(f"{name}: meta/tactile.json numbers its links from 0; received {min(places['link'])}.")
         links = [places["links"][number] for number in places["link"]]
         points = TactilePoints(tuple(links), *(np.array(places[key], float) for key in ("position", "normal")))
         unit = str(places.get("units", ["N"])[0])
     else:
-        links = [link for link, probes in layout.items() for _ in range(int(probes.active.sum()))]
-        numbers = [int(word.rsplit(":", 1)[1]) for word in taxel_names(links)]
+        taxels = [(link, number) for link, probes in layout.items() for number in range(probes.active.sum())]
+        links, numbers = zip(*taxels, strict=True)
         points = _placed(links, numbers, layout, name)
     _of_hand(name, joints, links, hand)
     if tactile.shape[1] != len(links):
@@ -459,6 +474,8 @@ def _stacked(frames: Any, column: str, name: str) -> NDArray[np.float64]:
 
 def _frames(folder: Path, version: str, episode: int, info: dict[str, Any]) -> Any:
     """Return the table of an episode's frames."""
+    import pandas
+
     try:
         from pyarrow import parquet
     except ImportError:
@@ -471,15 +488,17 @@ def _frames(folder: Path, version: str, episode: int, info: dict[str, Any]) -> A
     parts = []
     for file in files:
         try:
-            if (rows := parquet.read_metadata(file).num_rows) > 100 * _MOST:
-                raise DataError(f"{file.name} has {rows} frames, more than can be read at once.")
-            table = parquet.read_table(file, filters=[("episode_index", "=", episode)])
+            if (rows := parquet.read_metadata(file).num_rows) <= 100 * _MOST:
+                table = parquet.read_table(file, filters=[("episode_index", "=", episode)])
+                rows = table.num_rows
         except (OSError, ValueError) as error:
             raise DataError(f"{file.name} of {folder.name} cannot be read: {str(error)[:100]}.") from None
-        parts += [table.to_pandas()] if 0 < table.num_rows <= _MOST else []
+        if rows > _MOST:
+            raise DataError(f"{file.name} has {rows} frames; more than {_MOST} are not replayed.")
+        parts += [table.to_pandas()] if rows else []
     if not parts:
         raise DataError(f"{folder.name} holds no frames of episode {episode}.")
-    return parts[0].sort_values("timestamp", kind="stable")
+    return pandas.concat(parts).sort_values("timestamp", kind="stable")
 
 
 def replay(log: TouchLog, hand: str) -> Replay:
@@ -492,8 +511,8 @@ def replay(log: TouchLog, hand: str) -> Replay:
     substeps = int(np.ceil(_RATE * step))
     body = SimulatedHand(hand, substeps / step)
     sensors = {}
-    for link in dict.fromkeys(log.points.links):
-        rows = np.array(log.points.links) == link
+    rows_of = {link: np.array(log.points.links) == link for link in log.points.links}
+    for link, rows in rows_of.items():
         probes = Probes(log.points.position[rows], log.points.normal[rows], np.full(rows.sum(), RADIUS))
         sensors[link] = KinematicTaxel(link=link, probes=probes, total="engine", friction=1.0)
     suite = SensorSuite(body.engine.scene, sensors, num_envs=1)
@@ -511,8 +530,7 @@ def replay(log: TouchLog, hand: str) -> Replay:
             body.step()
         suite.update(body.engine.state, step)
         position[frame] = body.position[columns]
-        for link in sensors:
-            rows = np.array(log.points.links) == link
+        for link, rows in rows_of.items():
             force = suite.read(link)[0, :, :3].numpy()
             simulated[frame, rows] = -(force * log.points.normal[rows]).sum(axis=-1)
     return Replay(log, simulated, position)

@@ -244,6 +244,7 @@ def test_episodes_of_both_layouts_and_tables_are_read_alike(recorded, jaws, tmp_
         ({"left:0": "left:9999"}, "has .* taxels on 'left'"),
         ({"left:0": "left:x"}, "LINK:NUMBER"),
         ({"time": "t"}, "'time'"),
+        ({"left:1": "left:00"}, "left:0 stands in it 2 times"),
     ],
 )
 def test_tables_of_another_hand_are_refused(change, sentence, recorded, jaws, tmp_path) -> None:
@@ -257,11 +258,40 @@ def test_numbers_that_are_none_repeated_times_and_millimetres_are_refused(record
     log = recorded.log
     spoilt, late = log.force.copy(), log.time.copy()
     spoilt[7, 0], late[5] = np.nan, late[4]
-    far = replace(log.points, position=1e3 * log.points.position)
+    far, nowhere = (replace(log.points, position=scale * log.points.position) for scale in (1e3, np.nan))
     for change, sentence in (
         ({"force": spoilt}, "force of frame 7 is no finite number"),
         ({"time": late}, "frame 5 does not come after"),
+        ({"time": 1e3 * log.time}, "every 20 s .* give time in seconds"),
+        ({"time": np.arange(FRAMES) * 1e-9}, "every 1e-09 s"),
+        ({"time": log.time + 3600 * (log.time > 0.1)}, "longest gap is 3600.02 s .*cut the log"),
         ({"points": far}, "scale millimetres"),
+        ({"points": nowhere}, "lies nan m"),
+        ({"points": replace(log.points, normal=2 * log.points.normal)}, "normals are 2 to 2 long"),
     ):
         with pytest.raises(DataError, match=sentence):
             replace(log, **change)
+
+
+def test_joints_far_out_of_their_range_are_in_another_unit(recorded, jaws, tmp_path) -> None:
+    for name, unit in ((jaws, "millimetres"), ("xhand1", "degrees")):
+        hand = hands.load(name)
+        layout = hand.layout("low", "tips")
+        table = {
+            "time": np.arange(3) / 50,
+            hand.joints[0]: np.linspace(0, 40.0, 3),
+            f"{next(iter(layout))}:0": np.ones(3),
+        }
+        pd.DataFrame(table).to_csv(tmp_path / "log.csv", index=False)
+        with pytest.raises(DataError, match=f"are these {unit}"):
+            read_touch_log(tmp_path / "log.csv", hand, layout)
+
+
+def test_an_episode_in_two_files_is_read_whole(recorded, jaws, tmp_path) -> None:
+    hand, folder = hands.load(jaws), _episode(tmp_path / "v3", recorded.log)
+    first = folder / "data" / "chunk-000" / "file-000.parquet"
+    frames = pd.read_parquet(first)
+    frames[12:].to_parquet(first.with_name("file-001.parquet"))
+    frames[:12].to_parquet(first)
+    log = read_touch_log(folder, hand, hand.layout("low", "tips"))
+    np.testing.assert_allclose(log.force, recorded.log.force, atol=1e-6)
