@@ -250,9 +250,8 @@ def _leaves(where: str, value: Any) -> Iterator[tuple[str, Any]]:
     if isinstance(value, Mapping):
         layer = value.get("layer") if where.endswith("]") and "layer" in value and "subject" not in value else None
         for name, part in value.items():
-            if name == "method":
-                continue
-            yield from _leaves(f"{where}.{name}" if layer is None else f"{where}({layer}).{name}", part)
+            if name != "method":
+                yield from _leaves(f"{where}.{name}" if layer is None else f"{where}({layer}).{name}", part)
     elif isinstance(value, list):
         for index, part in enumerate(value):
             yield from _leaves(f"{where}[{index}]", part)
@@ -267,6 +266,4 @@ def _equal(left: Any, right: Any, tolerance: float) -> bool:
 
 def in_short(value: Any) -> str:
     """Write a statement of a record in few characters."""
-    if value is None:
-        return "none"
-    return f"{value:.5g}" if isinstance(value, float) else str(value)
+    return f"{value:.5g}" if isinstance(value, float) else "none" if value is None else str(value)

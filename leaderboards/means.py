@@ -8,13 +8,16 @@ every benchmark, they add up as if they always erred alike: the interval is then
 from __future__ import annotations
 
 import math
-from collections import Counter, defaultdict
+import re
+from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
+from brainbench.core.contracts import natural_key
+from brainbench.core.files import content_hash
 from brainbench.core.identity import unusual_settings
 from brainbench.core.records import Interval
 from brainbench.core.statistics import LEVEL
@@ -45,23 +48,28 @@ class Mean:
         return rank_in_print(self.first, self.last)
 
 
+_EDITION = ("benchmark", "recordings_hash", "metric", "estimator", "time", "conditions")
+"""What one benchmark has in common, beside its stimuli."""
+
+
 def means_over(boards: Iterable[Board]) -> tuple[tuple[str, ...], list[Mean]]:
     """Return the benchmarks of boards, and every model over them, the highest mean first; nothing for fewer than two.
 
     A model that misses a benchmark, or has no rank on one, is not ranked; nor is any where no two are told apart.
     """
     groups: dict[tuple[Any, ...], list[Board]] = defaultdict(list)
-    for board in boards:
-        if board.benchmark:
-            # Features that were computed elsewhere have a board of their own, since they name no stimuli.
-            groups[board.benchmark, board.recordings_hash, board.metric, board.estimator].append(board)
+    for board in sorted((board for board in boards if board.benchmark), key=lambda board: board.stimuli_hash is None):
+        edition = tuple(getattr(board, name) for name in _EDITION)
+        # Features that were computed elsewhere have a board of their own, since they name no stimuli.
+        stimuli = board.stimuli_hash or next((key[-1] for key in groups if key[:-1] == edition), None)
+        groups[*edition, stimuli].append(board)
+    groups = dict(sorted(groups.items(), key=lambda pair: natural_key(str(pair[0]))))
     names = _labels([*groups])
     if len(names) < 2:
         return (), []
     models: dict[tuple[str, str], dict[str, Entry]] = defaultdict(dict)
     for label, group in zip(names, groups.values(), strict=True):
-        entries = sorted((entry for board in group for entry in board.entries), key=_age)
-        for entry in entries:
+        for entry in sorted((entry for board in group for entry in board.entries), key=_age):
             models[entry.name, str(unusual_settings(entry.score.provenance.settings))][label] = entry
     means = [_mean(name, entries, names) for (name, _), entries in models.items()]
     able = [pair for pair in zip(means, models.values(), strict=True) if not pair[0].unranked_because]
@@ -72,12 +80,18 @@ def means_over(boards: Iterable[Board]) -> tuple[tuple[str, ...], list[Mean]]:
 
 
 def _labels(keys: Sequence[tuple[Any, ...]]) -> tuple[str, ...]:
-    """Return a name for each benchmark; those of one name are told apart by their recordings and metric."""
-    counts = Counter(key[0] for key in keys)
-    return tuple(
-        name if counts[name] == 1 else f"{name} ({(digest or 'unknown')[:6]}, {metric or 'metric not stated'})"
-        for name, digest, metric, _ in keys
-    )
+    """Return a name for each benchmark; those of one name are told apart by all in which they differ."""
+    labels = []
+    for name, *rest in keys:
+        columns = zip(*(rival[1:] for rival in keys if rival[0] == name), strict=True)
+        parts = [_short(part) for part, column in zip(rest, columns, strict=True) if len({*column}) > 1]
+        labels.append(f"{name} ({', '.join(parts)})" if parts else name)
+    return tuple(labels)
+
+
+def _short(part: Any) -> str:
+    text = f"{len(part)} labels {content_hash(part)}" if isinstance(part, tuple) else part or "not stated"
+    return re.sub(r"\b([0-9a-f]{6})[0-9a-f]{8,}\b", r"\1", text)
 
 
 def _age(entry: Entry) -> tuple[bool, str]:
@@ -89,21 +103,19 @@ def _mean(name: str, entries: dict[str, Entry], names: Sequence[str]) -> Mean:
     scores = {label: entries[label].scaled for label in names if label in entries}
     if missing := [label for label in names if not math.isfinite(scores.get(label, math.nan))]:
         return Mean(name, scores, unranked_because=f"no score on {', '.join(missing)}")
+    from scipy.special import stdtrit
+
     row = [entries[label] for label in names]
     value = math.fsum(scores.values()) / len(names)
     error, freedom = (float(part) for part in _combined([entry.sample.error for entry in row], dependent(row)))
     reasons = (f"{label}: {reason}" for label, entry in entries.items() if (reason := entry.unranked_because))
     unranked = next(reasons, "")
-    return Mean(name, scores, value, _interval(value, error, freedom, len(names)), unranked_because=unranked)
-
-
-def _interval(value: float, error: float, freedom: float, benchmarks: int) -> Interval | None:
-    from scipy.special import stdtrit
-
-    if not math.isfinite(error):
-        return None
-    half = float(stdtrit(freedom, (1 + LEVEL) / 2) * error)
-    return Interval(value - half, value + half, LEVEL, f"t over animals and stimuli of {benchmarks} benchmarks")
+    half, method = (
+        float(stdtrit(freedom, (1 + LEVEL) / 2) * error),
+        f"t over animals and stimuli of {len(names)} benchmarks",
+    )
+    interval = Interval(value - half, value + half, LEVEL, method) if math.isfinite(error) else None
+    return Mean(name, scores, value, interval, unranked_because=unranked)
 
 
 def dependent(entries: Sequence[Entry]) -> list[list[int]]:
@@ -148,27 +160,19 @@ def _ranks(models: Sequence[Sequence[Entry]]) -> list[tuple[int | None, int | No
     return [*rank_ranges(above)] if above.any() else [(None, None)] * len(models)
 
 
-def columns_of(names: Sequence[str]) -> tuple[str, ...]:
-    """Return the columns of a table of means."""
-    return ("model", "rank", "mean", "interval", *names, "standing")
-
-
-def rows_of(names: Sequence[str], means: Sequence[Mean]) -> list[tuple[str, ...]]:
-    """Return the table of means as texts."""
-    return [
+def table_of(names: Sequence[str], means: Sequence[Mean]) -> tuple[str, tuple[str, ...], tuple[tuple[str, ...], ...]]:
+    """Return what a table of means shows, in words, its columns and its rows, as texts."""
+    rows = [
         (
             mean.name, mean.rank, "–" if math.isnan(mean.value) else number(mean.value), span(mean.interval),
             *(number(mean.scores[name]) if name in mean.scores else "–" for name in names),
-            f"not ranked: {mean.unranked_because}" if mean.unranked_because else "",
+            f"not ranked: {mean.unranked_because or 'not told apart from any other'}" if mean.first is None else "",
         )
         for mean in means
     ]  # fmt: skip
-
-
-def caption_of(names: Sequence[str]) -> str:
-    """Return what a table of means shows, in words."""
-    return (
+    caption = (
         f"Mean over {plural(len(names), 'benchmark')}, between chance (0) and all that is reliable (1), with its 95 % "
         "interval over animals and stimuli. Models are told apart by paired tests over all of them; one that misses a "
         "benchmark is not ranked."
     )
+    return caption, ("model", "rank", "mean", "interval", *names, "standing"), tuple(rows)

@@ -215,7 +215,7 @@ def provenance_rows(provenance: Mapping[str, Any]) -> list[tuple[str, str]]:
         if isinstance(value, Mapping) and key not in ("packages", "pairs"):
             # Each layer's p stands in the table of layers; other statistics are measured, so few digits say all.
             stated = {name: item for name, item in value.items() if (key, name) != ("statistics", "layer_tests")}
-            stated = with_floats(stated, _three_digits) if key == "statistics" else stated
+            stated = with_floats(stated, lambda value: float(f"{value:.3g}")) if key == "statistics" else stated
             rows += [(f"{key}: {name}", item) for name, item in stated.items()]
         elif key != "command":
             rows.append((key, value))
@@ -229,10 +229,6 @@ def with_floats(value: Any, change: Callable[[float], Any]) -> Any:
     if isinstance(value, (list, tuple)):
         return [with_floats(entry, change) for entry in value]
     return change(value) if isinstance(value, float) else value
-
-
-def _three_digits(value: float) -> float:
-    return float(f"{value:.3g}")
 
 
 def _inline(value: Any) -> str:

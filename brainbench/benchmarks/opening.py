@@ -554,6 +554,9 @@ def _measure(options: ScoreOptions, progress: Progress | None) -> tuple[str, Cei
     if labels is None:
         how: dict[str, Any] = {"whiskers": options.whiskers, "fidelity": options.fidelity, "progress": progress}
         labels = load_stimuli(source, **how).labels
+    unnamed = source is DEFAULT_STIMULI and options.match is None and not brain.label_doubt
+    if unnamed and not {*labels} & {*brain.vocabulary}:
+        labels = brain.vocabulary  # nobody names stimuli: models are scored by features that were computed elsewhere
     paired = tuple(brain.pairs(labels, options.match))
     digest = recordings_hash(brain) or ""
     if brain.published and options.estimator != "default":

@@ -140,9 +140,15 @@ class Provenance(Mapping[str, Any]):
 
     @property
     def citations(self) -> list[str]:
-        """Works that the recordings and the benchmark ask to cite, in their own words."""
-        stated = (_text(origin.get("citation")) for origin in (self.recordings, self.benchmark))
-        return [*dict.fromkeys(filter(None, stated))]
+        """Works that the recordings and the benchmark ask to cite, in their own words, and the benchmark's data."""
+        works = [_text(origin.get("citation")) for origin in (self.recordings, self.benchmark)]
+        source, doi, version = (_text(self.benchmark.get(name)) for name in ("source", "doi", "version"))
+        doi = doi.rpartition("doi.org/")[2].removeprefix("doi:").strip()
+        if doi and not any(doi.lower() in work.lower() for work in works):
+            works.append(
+                ", ".join(filter(None, (f"Recordings of {self.benchmark_name}", source, version, f"doi:{doi}")))
+            )
+        return [*dict.fromkeys(filter(None, works))]
 
     @property
     def stimuli_name(self) -> str:

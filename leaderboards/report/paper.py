@@ -8,14 +8,15 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterable, Sequence
+import unicodedata
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 from brainbench.core.errors import DataError, check_name, listing, missing_dependency, visible
-from brainbench.core.files import write_together
+from brainbench.core.files import content_hash, write_together
 from brainbench.core.records import ResultRecord
 from brainbench.core.version import __version__
 from leaderboards import text as words
@@ -24,7 +25,7 @@ from leaderboards.entries import Entry
 from leaderboards.figures.charts import Figure, board_figures
 from leaderboards.figures.record import diagram, layers
 from leaderboards.figures.svg import STYLE, standalone
-from leaderboards.means import caption_of, columns_of, means_over, rows_of
+from leaderboards.means import means_over, table_of
 from leaderboards.site.score_page import render, render_markdown
 from leaderboards.site.table import board_label
 from leaderboards.store import StoredRecord
@@ -43,15 +44,15 @@ class Reference:
 @cache
 def _works() -> dict[str, Reference]:
     """Return the entries of ``references.bib`` by key: one field a line, entries set apart by an empty line."""
-    entries = Path(__file__).with_name("references.bib").read_text(encoding="utf-8").strip().split("\n\n")
-    return {work.key: work for work in map(_work, entries)}
+    text = Path(__file__).with_name("references.bib").read_text(encoding="utf-8").replace("VERSION", __version__)
+    return {work.key: work for work in map(_work, text.strip().split("\n\n"))}
 
 
 def _work(bibtex: str) -> Reference:
     fields = dict(re.findall(r"^  (\w+) = \{(.*)\},?$", bibtex, re.MULTILINE))
-    names = [name.partition(",")[0] for name in fields["author"].split(" and ")]
+    names = [name.strip("{}").partition(",")[0] for name in fields["author"].split(" and ")]
     who = " and ".join(names) if len(names) < 3 else f"{names[0]} et al."
-    place = fields.get("journal") or fields["booktitle"]
+    place = fields.get("journal") or fields.get("booktitle") or f"Version {fields['version']}"
     place += f" {fields['volume']}" if "volume" in fields else ""
     key = bibtex.partition("{")[2].partition(",")[0]
     return Reference(key, f"{who} ({fields['year']}). {fields['title'].strip('{}')}. {place}.", bibtex)
@@ -78,20 +79,15 @@ def references(records: Iterable[ResultRecord]) -> list[Reference]:
 
     An architecture's citation that is not known here is kept in its own words as an entry ``@misc``.
     """
-    references: dict[str, Reference] = {"brainbench": _toolkit()}
+    references: dict[str, Reference] = {"brainbench": _works()["brainbench"]}
     for record in records:
         score, card = record.score, record.card
-        keys = []
+        keys, works = [], score.provenance.citations
         if "RSA" in score.metric:
             keys += ["kriegeskorte2008", "spearman1910", "brown1910"]
         if score.ceiling is not None:
             keys.append("nili2014")
         keys += [key for word, key in _METRICS.items() if word in score.metric.lower()]
-        for work in score.provenance.citations:
-            if "Rodgers C. C., Scientific Data 9:620" in work:
-                keys.append("rodgers2022")
-            else:
-                references.setdefault((reference := _other(work)).key, reference)
         if "rodgers" in f"{score.provenance.stimuli_name} {score.provenance.recordings_name}".lower():
             keys.append("rodgers2022")
         if card is not None:
@@ -99,28 +95,35 @@ def references(records: Iterable[ResultRecord]) -> list[Reference]:
             keys += [_OBJECTIVES[card.objective]] if card.objective in _OBJECTIVES else []
             keys += ["wilson1927"] if card.accuracy_interval is not None else []
             if card.citation and not any(words in card.citation for words in _ARCHITECTURES):
-                reference = _other(card.citation)
-                references.setdefault(reference.key, reference)
+                works = [*works, card.citation]
+        for work in works:
+            if work.startswith("Rodgers C. C., Scientific Data 9:620"):
+                keys.append("rodgers2022")
+            else:
+                references.setdefault((reference := _other(work, references)).key, reference)
         for key in keys:
             references.setdefault(key, _works()[key])
     return list(references.values())
 
 
-def _toolkit() -> Reference:
-    title = "brainbench: which artificial networks process touch the way a brain does"
-    body = f"  author = {{{{The brainbench developers}}}},\n  title = {{{{{title}}}}},\n  year = {{2026}},\n"
-    return Reference(
-        "brainbench",
-        f"The brainbench developers (2026). {title}. Version {__version__}.",
-        f"@software{{brainbench,\n{body}  version = {{{__version__}}}\n}}",
-    )
+_TEX = str.maketrans(
+    {sign: f"\\{sign}" for sign in "&%$#_"}
+    | {"\\": r"\textbackslash{}", "{": r"\textbraceleft{}", "}": r"\textbraceright{}"}
+    | {"~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
+)
+"""Signs that TeX would obey → what prints them."""
 
 
-def _other(text: str) -> Reference:
-    key = re.sub(r"[^a-z0-9]+", "", text.lower())[:24] or "other"
-    safe = re.sub(r"[{}\\]", " ", visible(text))
-    doi = re.search(r"\b10\.\d{4,9}/[^\s,;{}\\]+", safe)
-    fields = f"  note = {{{safe}}}" + (f",\n  doi = {{{doi[0].rstrip('.')}}}" if doi else "")
+def _other(text: str, references: Mapping[str, Reference]) -> Reference:
+    """Return a work in its own words, under a key that no other work has."""
+    plain = unicodedata.normalize("NFKD", text).encode("ascii", "ignore").decode().lower()
+    key = re.sub(r"[^a-z0-9]+", "", plain)[:24]
+    key = key if key[:1].isalpha() else f"work{key}"
+    if key in (works := {**_works(), **references}) and works[key].text != text:
+        key += f"-{content_hash(text)[:6]}"
+    fields = f"  note = {{{visible(text).translate(_TEX)}}}"
+    if doi := re.search(r"\b10\.\d{4,9}/(?:[^\s,;<>\"{}\\()\[\]]|\([^\s()]*\))+", visible(text)):
+        fields += f",\n  doi = {{{doi[0].rstrip('.')}}}"
     return Reference(key, text, f"@misc{{{key},\n{fields}\n}}")
 
 
@@ -158,8 +161,7 @@ def write_paper(
     path = Path(path)
     kind = format or path.suffix.removeprefix(".").lower()
     check_name("report format", kind, FORMATS)
-    given = [item.record if isinstance(item, StoredRecord) else item for item in records]
-    usable = [record for record in given if record is not None]
+    usable = [*filter(None, (item.record if isinstance(item, StoredRecord) else item for item in records))]
     if not usable:
         raise DataError("There are no usable result records for a report; make one with: brainbench score MODEL")
     boards = rank(usable)
@@ -207,7 +209,7 @@ def _over_benchmarks(boards: Sequence[Board], path: Path) -> list[dict[str, Any]
     names, means = means_over(boards)
     if not names:
         return []
-    table = PaperTable(caption_of(names), columns_of(names), tuple(rows_of(names, means)))
+    table = PaperTable(*table_of(names, means))
     empty = {"conclusions": [], "figures": [], "absent": [], "folder": path.parent}
     methods = f"The benchmarks are {listing(names, limit=20, quoted=False)}. Each has a section of its own below."
     return [{"title": "Mean over benchmarks", "methods": methods, "tables": [table], **empty}]

@@ -41,7 +41,7 @@ from leaderboards import text as words
 from leaderboards.audit import remarks
 from leaderboards.boards import Board, conclusions, rank
 from leaderboards.figures.charts import board_figures
-from leaderboards.means import caption_of, columns_of, means_over, rows_of
+from leaderboards.means import means_over, table_of
 from leaderboards.site.score_page import model_page, render, script_json
 from leaderboards.site.table import COLUMNS, board_label, page_board, table_csv, table_rows
 from leaderboards.store import MAKE_ONE, SCHEMA_PATH, StoredRecord, record_text
@@ -227,7 +227,7 @@ def _pages(stored: Sequence[StoredRecord], title: str) -> Iterator[tuple[str, _C
             labels=[board_label(board) for board in boards],
             concluded=[conclusions(board) for board in boards],
             synthetic=synthetic,
-            benchmarks=benchmarks and (caption_of(benchmarks), columns_of(benchmarks), rows_of(benchmarks, means)),
+            benchmarks=benchmarks and table_of(benchmarks, means),
             problems=[item for item in stored if item.record is None],
             downloads=DOWNLOADS.items(),
             data=script_json({"boards": columns, "columns": table, "page": PAGE}),

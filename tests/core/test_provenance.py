@@ -48,6 +48,13 @@ def test_works_to_cite_are_read_as_texts_each_once():
     stated = {"recordings": {"citation": "Doe (2026)"}, "benchmark": {"name": "lab", "citation": "Doe (2026)"}}
     origin = Provenance.of(stated)
     assert (origin.benchmark_name, origin.citations) == ("lab", ["Doe (2026)"])
+    data = {"name": "lab", "source": "DANDI:1", "version": "2", "doi": "https://doi.org/10.1/AB"}
+    assert Provenance.of(stated | {"benchmark": data}).citations == [
+        "Doe (2026)",
+        "Recordings of lab, DANDI:1, 2, doi:10.1/AB",
+    ]
+    layout = {"recordings": {"citation": "Doe (2026), doi:10.1/ab"}, "benchmark": data}
+    assert Provenance.of(layout).citations == ["Doe (2026), doi:10.1/ab"]
     # Anyone may write a record.
     assert Provenance.of({"benchmark": {"name": 3, "citation": ["x"]}}).citations == []
     assert Provenance.of({"benchmark": "lab"}).benchmark_name == ""

@@ -12,7 +12,7 @@ import pytest
 from brainbench.core.records import ResultRecord
 from brainbench.core.statistics import two_factor_error
 from leaderboards.boards import rank
-from leaderboards.means import _combined, means_over, rows_of
+from leaderboards.means import _combined, means_over, table_of
 from leaderboards.report.paper import references, write_paper
 from leaderboards.site.build import build_leaderboard
 from leaderboards.site.table import table_rows
@@ -79,7 +79,7 @@ def test_a_model_that_misses_a_benchmark_is_listed_without_a_rank():
     assert (means["best"].rank, means["best"].unranked_because) == ("–", "no score on other")
     assert math.isnan(means["best"].value)
     assert means["fair"].rank == "1"
-    assert rows_of(names, [means["best"]])[0][-1] == "not ranked: no score on other"
+    assert table_of(names, [means["best"]])[2][0][-1] == "not ranked: no score on other"
 
 
 def test_a_score_that_is_not_reliable_has_a_mean_and_no_rank():
@@ -104,6 +104,20 @@ def test_two_benchmarks_of_one_name_are_told_apart():
         for record in records
     ]
     assert all(name.startswith("lab (") for name in means_over(rank(renamed))[0])
+
+
+def test_editions_of_a_benchmark_with_other_stimuli_are_not_one():
+    records = _records("lab")
+    stated = replace(records[0].score.provenance, stimuli={"content_hash": "other"})
+    later = [replace(record, score=replace(record.score, provenance=stated)) for record in records]
+    names, means = _means([*records, *later[:2]])
+    assert all(name.startswith("lab (") for name in names)
+    assert len({*names}) == 2
+    assert sorted(mean.unranked_because[:11] for mean in means.values()) == ["", "", "no score on"]
+    # Features that were computed elsewhere name no stimuli: they are of the edition with equal labels.
+    elsewhere = replace(later[0].score.provenance, stimuli={})
+    more = [replace(item, score=replace(item.score, provenance=elsewhere)) for item in _records("other", "lab")[-1:]]
+    assert [*_means([*records, *_records("other"), *more])[0]] == ["lab", "other"]
 
 
 def test_of_a_model_scored_twice_the_newest_record_counts():

@@ -72,11 +72,37 @@ def test_an_unknown_format_and_no_records_are_errors(make_record, tmp_path):
         write_paper([], tmp_path / "a.md")
 
 
-def test_an_architecture_from_elsewhere_is_cited_in_its_own_words(make_record):
+CITATIONS = {
+    "Doe {2020}, A network": ("doe2020anetwork", r"Doe \textbraceleft{}2020\textbraceright{}, A network", None),
+    r"Doe & Roe, 5 % of $a_b #1 \x ~^": (
+        "doeroe5ofab1x", r"Doe \& Roe, 5 \% of \$a\_b \#1 \textbackslash{}x \textasciitilde{}\textasciicircum{}", None,
+    ),
+    "田中 太郎 (2020)": ("work2020", "田中 太郎 (2020)", None),
+    "Dœ J. (doi:10.1000/x_y(1)).": ("djdoi101000xy1", r"Dœ J. (doi:10.1000/x\_y(1)).", "10.1000/x_y(1)"),
+    "Nili 2014": (None, "Nili 2014", None),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("citation", CITATIONS)
+def test_a_citation_is_kept_in_its_own_words_with_the_signs_of_tex_as_text(make_record, citation):
+    key, note, doi = CITATIONS[citation]
     record = make_record()
-    record = replace(record, card=replace(record.card, citation="Doe {2020}, A network"))
-    (found,) = [item for item in references([record]) if item.key.startswith("doe")]
-    assert found.bibtex == "@misc{doe2020anetwork,\n  note = {Doe  2020 , A network}\n}"
+    works = references([replace(record, card=replace(record.card, citation=citation))])
+    (work,) = [item for item in works if item.text == citation]
+    assert key in (None, work.key)
+    assert f"  note = {{{note}}}" in work.bibtex
+    assert ("doi = " in work.bibtex) == bool(doi)
+    assert doi is None or f"doi = {{{doi}}}" in work.bibtex
+
+
+def test_works_whose_first_words_agree_are_two_entries(make_record):
+    record, first = make_record(), "Doe J., On the whiskers of rats and mice, part one"
+    both = (first, first.replace("one", "two"), first, "Nili 2014")
+    records = [replace(record, card=replace(record.card, citation=text)) for text in both]
+    works = references(records)
+    assert [work.text for work in works if work.text in both] == [both[0], both[1], both[3]]
+    assert len({work.key for work in works}) == len(works)
+    assert "nili2014" not in [work.key for work in works if work.text == both[3]]
 
 
 def test_without_the_library_the_error_says_what_to_install_and_no_file_is_touched(make_record, tmp_path, monkeypatch):
