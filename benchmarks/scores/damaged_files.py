@@ -20,7 +20,7 @@ from pathlib import Path
 
 from benchmarks.report import measure_once, publish, read_sections, script_parser, table
 from tests.factories.reading_surfaces import SURFACES
-from tests.factories.reading_trials import attempt
+from tests.factories.reading_trials import LONGEST, attempt
 
 FAILURES = ("traceback", "memory", "hang", "silent", "wordy", "crash", "half-written")
 STUCK = 60.0
@@ -107,7 +107,7 @@ NOTE = (
     "attributes in HDF5; other headers, values and objects in archives of arrays and weights; and a folder, FIFO, "
     "endless device or broken link in place of the file. *memory*: more than 2 GiB beyond the process; *hang*: more "
     "than 10 s of work, or 30 s by the clock; *silent*: a number that is not finite or out of range was accepted; "
-    "*wordy*: an error of more than 1,000 characters; *half-written*: refused, and something new was left in the "
+    f"*wordy*: an error of more than {LONGEST} characters; *half-written*: refused, and something new was left in the "
     "folder. Few readers write (copies of recordings, imported weights, training); others have none by nature. "
     "Before is the code of 2026-11-21; for surfaces that came later (site manifest, commitment, trainings, and all "
     "after the seeds text) it is commit ad20c3f; where no arrow stands, nothing was counted before. That of the "

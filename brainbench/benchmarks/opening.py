@@ -35,7 +35,7 @@ from brainbench.core.plugins import load_entry_points
 from brainbench.core.progress import Progress
 from brainbench.core.provenance import Provenance
 from brainbench.core.reading.archives import check_archive
-from brainbench.core.reading.regular import check_file, readable
+from brainbench.core.reading.regular import check_file, readable, user_path
 from brainbench.core.reading.texts import parse_toml, read_text, read_toml
 from brainbench.core.reading.values import typed_values
 from brainbench.core.records import ResultRecord
@@ -239,7 +239,7 @@ def open_benchmark(source: str | os.PathLike[str]) -> tuple[Benchmark, Path]:
     name = os.fspath(path)
     text = read_text(path, "benchmark", most=MOST_DEFINITION)
     benchmark = Benchmark.stated_by(parse_toml(text, name), f"The benchmark {brief(name)}", sealed=False)
-    folder = path.expanduser().absolute().parent
+    folder = user_path(path).absolute().parent
     for file in benchmark.files:
         _compare(benchmark, folder, file)
     return benchmark, folder
@@ -534,7 +534,7 @@ def make(
 
 def _inside(path: Path, folder: Path) -> str:
     """Return the name of a file from the folder of the benchmark."""
-    place = path.expanduser().absolute()
+    place = user_path(path).absolute()
     if not place.is_relative_to(folder):
         raise UsageError(
             f"{brief(str(path))} lies outside the folder {brief(str(folder))} of --out, where a benchmark has its "

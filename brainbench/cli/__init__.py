@@ -36,6 +36,11 @@ def main() -> None:
     # (six times the processor time for --metric cka, where other work keeps the processors busy). Torch has its own.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    for number, (name, mode) in enumerate((("stdin", "r"), ("stdout", "w"), ("stderr", "w"))):
+        if getattr(sys, name) is None:
+            # Closed by whoever started the command (>&-): no file of ours may take its number.
+            os.dup2(os.open(os.devnull, os.O_RDWR), number)
+            setattr(sys, name, os.fdopen(number, mode))
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")  # characters that a terminal lacks
@@ -69,11 +74,6 @@ def _run() -> None:
     except BrainbenchError as error:
         print(f"brainbench: {visible_lines(str(error))}", file=sys.stderr)
         sys.exit(error.exit_code)
-    except RuntimeError as error:
-        if "home directory" not in str(error):  # pathlib's word for the ~ of nobody
-            raise
-        print("brainbench: A path begins with the ~ of a user that there is not; write it out.", file=sys.stderr)
-        sys.exit(2)
     except OSError as error:
         if error.errno in (errno.ENAMETOOLONG, errno.EACCES, errno.EPERM, errno.EROFS, errno.ELOOP) and error.filename:
             print(f"brainbench: {brief(str(error.filename))} cannot be opened ({error.strerror}).", file=sys.stderr)

@@ -26,6 +26,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from brainbench.core.errors import DataError, FileWriteError, UsageError, brief
+from brainbench.core.reading.regular import user_path
 from brainbench.core.reading.texts import read_json, read_mapping  # noqa: F401 - also imported from here
 
 if TYPE_CHECKING:
@@ -144,7 +145,7 @@ def cache_dir(*parts: str) -> Path:
         import platformdirs
 
         root = platformdirs.user_cache_dir("brainbench", appauthor=False)
-    path = Path(root).expanduser().joinpath(*parts)
+    path = user_path(root).joinpath(*parts)
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -162,7 +163,7 @@ def settings_dir() -> Path:
         import platformdirs
 
         folder = platformdirs.user_config_dir("brainbench", appauthor=False)
-    return Path(folder).expanduser()
+    return user_path(folder)
 
 
 def check_folder(path: str | os.PathLike[str], option: str) -> None:
@@ -172,7 +173,7 @@ def check_folder(path: str | os.PathLike[str], option: str) -> None:
         path: the folder.
         option: what names it, for the message.
     """
-    place = Path(path).expanduser().absolute()
+    place = user_path(path).absolute()
     while not os.path.lexists(place):
         place = place.parent
     fault = "is no folder" if not place.is_dir() else "may not be written by this user"

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, brief, nearest, unknown_name
 from brainbench.core.plugins import load_optional
 from brainbench.core.reading.hdf5 import open_hdf5
-from brainbench.core.reading.regular import check_file
+from brainbench.core.reading.regular import check_file, user_path
 from brainbench.core.reading.texts import read_text
 from brainbench.datasets import hdf5, nwb, rdm_files, temporaldata
 from brainbench.datasets.layouts.registry import (
@@ -233,7 +233,7 @@ def _refuse(source: str, path: Path) -> None:
 
 
 def _expand(source: str, ledger: Ledger) -> list[Path]:
-    path = Path(source).expanduser()
+    path = user_path(source)
     _refuse(source, path)
     if path.is_file():
         return [path]

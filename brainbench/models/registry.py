@@ -34,6 +34,7 @@ from brainbench.core.files import (
     write_json,
 )
 from brainbench.core.plugins import files_of, foreign_code, load_entry_points, load_object
+from brainbench.core.reading.regular import user_path
 from brainbench.models.recipes import OBJECTIVES, Architecture, check_new_name
 from brainbench.models.training.checkpoints import PREFIXES, WEIGHTS, find_folder, load_weights, read_config, shipped
 
@@ -145,7 +146,7 @@ def add_user_model(target: str, name: str, *, names: Collection[str]) -> UserMod
         raise UsageError(f"There is already a model named {name!r}; choose another name{hint}.")
     place, _, part = target.rpartition(":")
     if place.endswith(".py"):
-        place = str(Path(place).expanduser().resolve())
+        place = str(user_path(place).resolve())
         target = f"{place}:{part}"
     check_folder(settings_file().parent, CONFIG_VARIABLE)
     load_user_model(target)
@@ -193,9 +194,7 @@ class ModelRecord(ModelFacts):
     def source(self) -> str:
         """Top-level package that the code comes from."""
         function = self.build.func if isinstance(self.build, partial) else self.build
-        if self.family == FAMILY:
-            return "user"
-        return function.__module__.partition(".")[0]
+        return "user" if self.family == FAMILY else function.__module__.partition(".")[0]
 
 
 @dataclass(frozen=True)

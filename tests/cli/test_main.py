@@ -151,6 +151,15 @@ def test_a_full_output_is_one_sentence(boards, words):
     assert done.stderr == "brainbench: The output cannot be written (No space left on device).\n"
 
 
+@pytest.mark.skipif(os.name != "posix", reason="no shell that closes streams")
+def test_streams_that_are_closed_are_as_if_nobody_reads_them():
+    command = [sys.executable, "-m", "brainbench", "models", "show"]
+    shown = subprocess.run(["sh", "-c", '"$@" <&- >&-', "-", *command, "zhuang"], stderr=subprocess.PIPE, check=False)
+    assert (shown.returncode, shown.stderr) == (0, b"")
+    refused = subprocess.run(["sh", "-c", '"$@" 2>&-', "-", *command, "none"], stdout=subprocess.PIPE, check=False)
+    assert (refused.returncode, refused.stdout) == (2, b"")
+
+
 @pytest.mark.parametrize(
     "words",
     [

@@ -148,7 +148,7 @@ def test_match_files_of_three_kinds_say_the_same(tmp_path: Path):
         ("m.json", "[1]", "holds a list"),
         ("m.csv", "a,x\nb,y\na,z\n", "'a' more than once"),
         ("m.json", '{"a": "x", "b": "y", "a": "z"}', "'a' twice"),
-        ("m.toml", "= 3", "not valid TOML"),
+        ("m.toml", "= 3", "not a readable TOML text"),
     ],
 )
 def test_a_wrong_match_file_is_refused(tmp_path: Path, name: str, text: str, message: str):

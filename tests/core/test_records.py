@@ -67,7 +67,7 @@ def test_identity_ignores_when_and_where_but_not_what():
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("{", "not valid JSON"),
+        ("{", "not a readable JSON text"),
         ("[1]", "the record is \\[1\\]"),
         ('{"schema": 99}', "schema version 99"),
         ('{"schema": 2}', "lacks 'score'"),

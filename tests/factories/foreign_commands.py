@@ -8,6 +8,7 @@ input stands in the folder or is made there, so that another version of the pack
 from __future__ import annotations
 
 import argparse
+import faulthandler
 import gc
 import json
 import math
@@ -56,8 +57,6 @@ class Door:
     """Words of the command line, with ``{file}`` and ``{folder}``."""
     read: Callable[[Path], Any] | None = None
     """Without words: a public function; what it imports may not be there."""
-    modules: tuple[str, ...] = ()
-    """Loaded once, before the cases."""
     after: Callable[[Path], None] | None = None
     """What whoever changes a file can do to make it pass for whole, such as sealing it again."""
 
@@ -73,30 +72,31 @@ class Verdict:
 
 
 def cases(door: Door, folder: Path, seeds: range) -> Iterator[Verdict]:
-    """Yield what becomes of each change (seeds below zero: none); each case is a fork, after the modules are loaded.
+    """Yield what becomes of the good input, and then of each change; each case is a fork.
 
-    The good input stands in the folder, where an earlier call has made it.
+    The good input stands in the folder, where an earlier call has made it. What its case imports is loaded for all.
     """
     note = folder / "name.txt"
     if not note.is_file():
         (folder / "good").mkdir(parents=True)
         path = getattr(import_module("tests.factories.foreign_goods"), door.make)(folder / "good")
         note.write_text(path.relative_to(folder / "good").as_posix())
-    for module in door.modules:
-        with suppress(ImportError):
-            import_module(module)
-    gc.freeze()  # a fork copies what the collector touches
     root = folder / f"cases-{os.getpid()}"
-    for seed in seeds:
+    for seed in (None, *seeds):
         (root / "etc").mkdir(parents=True)
         (root / "etc" / "passwd").write_text(f'{{"{SECRET}": 1}}\n')
         place = root / "a" / "case"
         shutil.copytree(folder / "good", place)
         path = place / note.read_text()
-        what = "nothing" if seed < 0 else restructure(path, seed)
+        what = "nothing" if seed is None else restructure(path, seed)
         if door.after is not None and path.is_file():
             door.after(path)
         verdict = _judge(door, path, place, what)
+        if seed is None:
+            for module in _text(root / "a" / "modules").splitlines():
+                with suppress(Exception, SystemExit):
+                    import_module(module)
+            gc.freeze()  # a fork copies what the collector touches
         shutil.rmtree(root, ignore_errors=True)
         yield verdict
 
@@ -145,6 +145,7 @@ def _run(door: Door, path: Path, place: Path, streams: tuple[Path, Path]) -> Non
         os.environ["BRAINBENCH_CONFIG"] = str(place)
         os.setpgid(0, 0)
         resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
+        faulthandler.dump_traceback_later(SECONDS - 5, file=sys.stderr)
         status = _call(door, path, place)
     except SystemExit as end:
         status = end.code if isinstance(end.code, int) else int(end.code is not None)
@@ -156,6 +157,7 @@ def _run(door: Door, path: Path, place: Path, streams: tuple[Path, Path]) -> Non
         with suppress(BaseException):
             sys.stdout.flush()
             sys.stderr.flush()
+            (place.parent / "modules").write_text("\n".join(sys.modules))
         os._exit(status)
 
 
@@ -287,67 +289,54 @@ def _hub(path: Path) -> Any:
     return math.nan if odd or (orders and ".." in folder.parts) else str(folder)
 
 
-_CLI = ("torch", "h5py", "numpy", "brainbench.cli.application")
-_STIMULI = (*_CLI, "brainbench.stimuli", "warp", "scipy.optimize", "xarray")
-_HANDS = (*_CLI, "mujoco", "robotics_bridge.hands", "robotics_bridge.policies", "robotics_bridge.tasks")
 _FIT = "stimuli fit {file} --most-iterations 1 --links 4 --steps-per-period 20 --json"
 _TRACK = f"{_FIT} --whisker mouse:C2 --metres-per-pixel 5e-5 --frame-rate 500"
 _REPLAY = "tactile replay {folder}/set --hand {folder}/jaws.urdf --json"
 _IMPORT = "--out {folder}/imported --json"
-_MODELS = (*_CLI, "brainbench.models", "brainbench.models.zoo")
 
 DOORS = (
-    Door(
-        "contract", "contract", "policy deploy {stem} --seconds 0.05 --input command=0 --json",
-        modules=(*_HANDS, "onnxruntime", "robotics_bridge.deploy"),
-    ),
-    Door("student, configuration", "student", read=_student, modules=_HANDS),
-    Door("student, weights", "student_weights", read=_student, modules=_HANDS),
-    Door("probe layout", "layout", read=_layout, modules=_HANDS),
-    Door("calibration log", "log", "tactile calibrate {file} --out {folder}/preset.json --json", modules=_HANDS),
-    Door("fit table", "wrenches", f"{_FIT} --whisker mouse:C2 --parameters young_modulus", modules=_STIMULI),
-    Door("track, points", "points", _TRACK, modules=_STIMULI),
-    Door("track, DeepLabCut", "deeplabcut", _TRACK, modules=_STIMULI),
-    Door("track, DeepLabCut HDF5", "deeplabcut_hdf5", _TRACK, modules=_STIMULI),
-    Door("track, whisk", "whisk", _TRACK, modules=_STIMULI),
+    Door("contract", "contract", "policy deploy {stem} --seconds 0.05 --input command=0 --json"),
+    Door("student, configuration", "student", read=_student),
+    Door("student, weights", "student_weights", read=_student),
+    Door("probe layout", "layout", read=_layout),
+    Door("calibration log", "log", "tactile calibrate {file} --out {folder}/preset.json --json"),
+    Door("fit table", "wrenches", f"{_FIT} --whisker mouse:C2 --parameters young_modulus"),
+    Door("track, points", "points", _TRACK),
+    Door("track, DeepLabCut", "deeplabcut", _TRACK),
+    Door("track, DeepLabCut HDF5", "deeplabcut_hdf5", _TRACK),
+    Door("track, whisk", "whisk", _TRACK),
     Door(
         "track, whisk's measurements", "whisk_labels",
-        f"{_TRACK} --track 0 --identities {{file}}".replace("{file}", "{folder}/track.whiskers", 1), modules=_STIMULI,
+        f"{_TRACK} --track 0 --identities {{file}}".replace("{file}", "{folder}/track.whiskers", 1),
     ),
-    Door("track, WhiskiWrap", "whiskiwrap", _TRACK, modules=_STIMULI),
-    Door("track, WhiskerMan", "whiskerman", f"{_TRACK} --track 1", modules=_STIMULI),
-    Door("track, angles", "angles", "stimuli show {folder}/scene.toml --json", modules=_STIMULI),
-    Door("episode, table", "replayed", "tactile replay {file} --hand {folder}/jaws.urdf --json", modules=_HANDS),
-    Door("episode, LeRobot", "lerobot", _REPLAY, modules=_HANDS),
-    Door("episode, places", "lerobot_places", _REPLAY, modules=_HANDS),
-    Door("episode, frames", "lerobot_frames", _REPLAY, modules=_HANDS),
-    Door("models add, file", "model", "models add {file}:Mine --name mine --json", modules=_MODELS),
-    Door("models add, settings", "settings", "models show mine --json", modules=_MODELS),
-    Door(
-        "models import", "checkpoint",
-        f"models import {{file}} --architecture zhuang-gru-small {_IMPORT}", modules=_MODELS,
-    ),
+    Door("track, WhiskiWrap", "whiskiwrap", _TRACK),
+    Door("track, WhiskerMan", "whiskerman", f"{_TRACK} --track 1"),
+    Door("track, angles", "angles", "stimuli show {folder}/scene.toml --json"),
+    Door("episode, table", "replayed", "tactile replay {file} --hand {folder}/jaws.urdf --json"),
+    Door("episode, LeRobot", "lerobot", _REPLAY),
+    Door("episode, places", "lerobot_places", _REPLAY),
+    Door("episode, frames", "lerobot_frames", _REPLAY),
+    Door("models add, file", "model", "models add {file}:Mine --name mine --json"),
+    Door("models add, settings", "settings", "models show mine --json"),
+    Door("models import", "checkpoint", f"models import {{file}} --architecture zhuang-gru-small {_IMPORT}"),
     Door(
         "models import, graph", "graph",
         f"models import {{folder}}/best.ckpt --architecture zhuang-gru-small --config {{file}} {_IMPORT}",
-        modules=_MODELS,
     ),
     Door(
         "models import, settings", "run_settings",
         f"models import {{folder}}/best.ckpt --architecture zhuang-gru-small --config {{file}} {_IMPORT}",
-        modules=_MODELS,
     ),
-    Door("batch file", "batch", read=_batch, modules=_MODELS),
-    Door("sweep of students", "sweep", read=_sweep, modules=_HANDS),
+    Door("batch file", "batch", read=_batch),
+    Door("sweep of students", "sweep", read=_sweep),
     Door(
         "task file", "task",
         "policy evaluate foreign --task-file {file} --envs 1 --episodes 1 --seeds 1 --change episode=0.2 --json",
-        modules=_HANDS,
     ),
-    Door("plan", "plan", read=_plan, modules=_CLI, after=_seal),
-    Door("benchmark", "benchmark", "benchmark check {file} --json", modules=(*_STIMULI, *_MODELS)),
-    Door("benchmark, packed", "packed", "benchmark check {file} --json", modules=(*_STIMULI, *_MODELS)),
-    Door("hub name", "hub", read=_hub, modules=_MODELS),
+    Door("plan", "plan", read=_plan, after=_seal),
+    Door("benchmark", "benchmark", "benchmark check {file} --json"),
+    Door("benchmark, packed", "packed", "benchmark check {file} --json"),
+    Door("hub name", "hub", read=_hub),
 )  # fmt: skip
 
 
@@ -385,10 +374,11 @@ def main() -> None:
     for door in DOORS:
         if not chosen.names or door.name in chosen.names:
             first = len(_outcomes(folder).get(door.name, ()))
-            if not first and (good := next(cases(door, folder / door.name, range(-1, 0)))).kind != "accepted":
+            verdicts = cases(door, folder / door.name, range(first, chosen.cases))
+            if (good := next(verdicts)).kind != "accepted":
                 raise SystemExit(f"{door.name}: what is whole is not accepted: {good}")
             with (folder / f"{door.name}.jsonl").open("a") as stream:
-                for seed, verdict in enumerate(cases(door, folder / door.name, range(first, chosen.cases)), first):
+                for seed, verdict in enumerate(verdicts, first):
                     print(json.dumps({"seed": seed, **vars(verdict)}), file=stream, flush=True)
     sys.stdout.write(tabulate(_outcomes(folder), _outcomes(chosen.before) if chosen.before else {}))
 

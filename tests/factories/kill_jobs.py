@@ -101,8 +101,9 @@ def measure(job: KillJob, folder: Path, kills: int, signals: Sequence[str] = ("K
     _finish(_fork(lambda: job.run(inputs, folder / "first"), folder / "first.log"), folder / "first.log")
     begin = time.monotonic()
     child = _fork(lambda: job.run(inputs, whole), folder / "whole.log")
-    first = _wait_for_part(whole, job.part) - begin
-    _finish(child, folder / "whole.log")
+    _wait_for_part(whole, job.part)
+    first = _work(child)
+    work = _finish(child, folder / "whole.log")
     outcome = Outcome(job.name, time.monotonic() - begin)
     expected = content(whole, job)
     outcome.different += [f"two unbroken runs: {name}" for name in _differ(content(folder / "first", job), expected)]
@@ -115,7 +116,7 @@ def measure(job: KillJob, folder: Path, kills: int, signals: Sequence[str] = ("K
         late = bool(job.part) and place % 2 == 1
         if late:
             _wait_for_part(out, job.part)
-        time.sleep(draw.uniform(0.0, outcome.seconds - first * late))
+        _let_work(child, draw.uniform(first * late, work))
         sent = signals[outcome.kills % len(signals)]
         os.kill(child, signal.Signals[f"SIG{sent}"])
         if sent == "STOP":
@@ -140,11 +141,22 @@ def measure(job: KillJob, folder: Path, kills: int, signals: Sequence[str] = ("K
     return outcome
 
 
-def _wait_for_part(out: Path, part: str) -> float:
-    """Wait until a run has finished its first part, and return the time."""
+def _wait_for_part(out: Path, part: str) -> None:
+    """Wait until a run has finished its first part."""
     while part and not any(out.glob(part)):
         time.sleep(0.01)
-    return time.monotonic()
+
+
+def _work(child: int) -> float:
+    """Return the processor time [s] that a process has taken, which a busy machine does not stretch."""
+    values = Path(f"/proc/{child}/stat").read_text().rpartition(")")[2].split()
+    return (int(values[11]) + int(values[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def _let_work(child: int, seconds: float) -> None:
+    """Wait until a process has worked so long, or has ended."""
+    while _work(child) < seconds and not os.waitid(os.P_PID, child, os.WEXITED | os.WNOHANG | os.WNOWAIT):
+        time.sleep(0.002)
 
 
 def _run_together(job: KillJob, inputs: Path, folder: Path, expected: dict[str, Any], outcome: Outcome) -> None:
@@ -184,9 +196,12 @@ def _fork(run: Callable[[], None], log: Path) -> int:
         os._exit(status)
 
 
-def _finish(child: int, log: Path) -> None:
-    if os.waitpid(child, 0)[1]:
+def _finish(child: int, log: Path) -> float:
+    """Wait for an unbroken run, and return its processor time [s]."""
+    _, status, used = os.wait4(child, 0)
+    if status:
         raise SystemExit(f"An unbroken run failed: {log.read_text(errors='replace')[-2000:]}")
+    return used.ru_utime + used.ru_stime
 
 
 def _differ(one: dict[str, Any], other: dict[str, Any]) -> list[str]:

@@ -178,7 +178,7 @@ def test_names_that_share_a_slug_do_not_share_a_file(make_record, tmp_path):
     [
         (lambda text: text.replace("0.523", "0.923"), "was edited or renamed"),
         (lambda text: text.replace("mouse-a", "mouse-z"), "was edited or renamed"),
-        (lambda text: text[:-40], "is not valid JSON"),
+        (lambda text: text[:-40], "is not a readable JSON text"),
         (lambda text: text.replace("0.0127", "NaN"), "is nan"),
         (lambda text: text.replace("0.0127", "1e999"), "is inf"),
         (

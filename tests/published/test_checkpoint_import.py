@@ -114,7 +114,7 @@ def test_settings_are_yaml_too(tmp_path):
     path.write_text("train:\n  ssl: AutoEncoderLoss\n")
     assert read_settings(path) == Settings(None, "ae")
     path.write_text("a: [1\n")
-    with pytest.raises(DataError, match="not valid YAML"):
+    with pytest.raises(DataError, match="not a readable YAML text"):
         read_settings(path)
     path.write_text("learning_rate: 0.1\n")
     with pytest.raises(DataError, match="learning_rate"):

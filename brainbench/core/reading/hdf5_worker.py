@@ -58,8 +58,6 @@ def fault_of(path: str, folders: list[str] | tuple[str, ...] = (), copy: str = "
         return _why(path, (str(error).strip().splitlines() or [""])[0]), False
     except MemoryError:
         return "is damaged (it declares more data than there is memory)", False
-    except RecursionError:
-        return "is nested too deeply", False
     except Exception as error:  # noqa: BLE001 - h5py raises anything on damage, and this process must go on
         return f"is damaged ({type(error).__name__}: {str(error)[:120]})", False
 

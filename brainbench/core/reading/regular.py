@@ -8,11 +8,20 @@ import stat
 from collections.abc import Iterator
 from pathlib import Path
 
-from brainbench.core.errors import BrainbenchError, DataError, DataFileNotFoundError, brief, nearest
+from brainbench.core.errors import BrainbenchError, DataError, DataFileNotFoundError, UsageError, brief, nearest
 
 MOST_TEXT = 64 << 20  # bytes of a text file that is parsed; nested lists take about twenty times as much memory
 MOST_TABLE = 256 << 20  # bytes of a table of comma-separated numbers
 MOST_PART = 512 << 20  # bytes of a file that another names: a mesh, a buffer, a picture
+
+
+def user_path(path: str | os.PathLike[str]) -> Path:
+    """Return the path that a user wrote; ``~`` is a home folder."""
+    try:
+        return Path(path).expanduser()
+    except RuntimeError as error:
+        name = brief(os.fspath(path))
+        raise UsageError(f"{name} begins with the ~ of a user that there is not; write the folder out.") from error
 
 
 def check_file(path: str | os.PathLike[str], kind: str = "file", *, most: int | None = None) -> Path:
@@ -26,17 +35,16 @@ def check_file(path: str | os.PathLike[str], kind: str = "file", *, most: int | 
     Raises:
         DataFileNotFoundError: there is nothing of this name.
     """
-    name = brief(os.fspath(path))
+    name, file = brief(os.fspath(path)), user_path(path)
     try:
-        status = Path(path).expanduser().stat()
+        status = file.stat()
     except (FileNotFoundError, NotADirectoryError) as error:
-        wanted, guess = Path(path).expanduser(), None
+        guess = None
         with contextlib.suppress(OSError):
-            alike = (item.name for item in wanted.parent.iterdir() if item.suffix == wanted.suffix)
-            guess = nearest(wanted.name, alike)
+            guess = nearest(file.name, (item.name for item in file.parent.iterdir() if item.suffix == file.suffix))
         hint = f"; did you mean {brief(str(Path(path).with_name(guess)))}?" if guess else "."
         raise DataFileNotFoundError(f"There is no {kind} {name}{hint}") from error
-    except (OSError, ValueError, RuntimeError) as error:
+    except (OSError, ValueError) as error:
         raise DataError(f"The {kind} {name} cannot be opened ({reason(error)}).") from error
     if stat.S_ISDIR(status.st_mode):
         raise DataError(f"{name} is a folder; a {kind} is needed: name a file in it.")
@@ -45,9 +53,9 @@ def check_file(path: str | os.PathLike[str], kind: str = "file", *, most: int | 
         raise DataError(f"{name} is a pipe or a device; a {kind} is needed: copy its content into a file.")
     if most is not None and status.st_size > most:
         raise DataError(f"{name} has {status.st_size:,} bytes; a {kind} of at most {most:,} bytes is read.")
-    if not os.access(Path(path).expanduser(), os.R_OK):
+    if not os.access(file, os.R_OK):
         raise DataError(f"{name} may not be read by this user; change its permissions.")
-    return Path(path).expanduser()
+    return file
 
 
 def part_of(folder: Path, name: str, kind: str = "file") -> Path:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from brainbench.core.errors import DataError, brief, listing, needing, repeats
-from brainbench.core.reading.regular import MOST_TEXT, check_file, readable, reason
+from brainbench.core.reading.regular import MOST_TEXT, check_file, readable
 
 MOST_LEVELS = 64  # levels of nesting
 LARGEST_WHOLE = 2**63 - 1  # largest magnitude of a whole number
@@ -32,22 +32,16 @@ def parse_json(text: str, name: str) -> Any:
         return values
 
     # Python's parser takes NaN and Infinity, which JSON does not know, and 1e400, which is infinite.
-    with readable(name, "JSON"):
-        try:
-            return check_values(json.loads(text, object_pairs_hook=unique), name)
-        except json.JSONDecodeError as error:
-            raise DataError(f"{brief(name)} is not valid JSON ({reason(error)}).") from error
+    with readable(name, "JSON text"):
+        return check_values(json.loads(text, object_pairs_hook=unique), name)
 
 
 def parse_toml(text: str, name: str) -> dict[str, Any]:
     """Parse TOML text; ``name`` is that of its file in messages. Errors are those of :func:`parse_json`."""
     import tomllib
 
-    with readable(name, "TOML"):
-        try:
-            return check_values(tomllib.loads(text), name)
-        except tomllib.TOMLDecodeError as error:
-            raise DataError(f"{brief(name)} is not valid TOML ({reason(error)}).") from error
+    with readable(name, "TOML text"):
+        return check_values(tomllib.loads(text), name)
 
 
 def read_json(path: str | os.PathLike[str], kind: str = "file") -> Any:
@@ -65,20 +59,17 @@ def read_yaml(path: str | os.PathLike[str], kind: str = "file") -> Any:
     with needing("pyyaml", extra="hub", purpose="Reading YAML settings"):
         import yaml
     text, name = read_text(path, kind), os.fspath(path)
-    with readable(path, "YAML"):
-        try:
-            # Deep texts take the time of their depth squared; a few aliases of aliases stand for any number of values.
-            level = 0
-            for event in yaml.parse(text, yaml.SafeLoader):
-                level += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
-                if level > MOST_LEVELS:
-                    raise DataError(f"{brief(name)} is nested too deeply: more than {MOST_LEVELS} levels.")
-                if isinstance(event, yaml.AliasEvent):
-                    raise DataError(f"{brief(name)} repeats values by alias (*name); write them out instead.")
-            _check_keys(yaml.compose(text, yaml.SafeLoader), name)
-            return check_values(yaml.safe_load(text), name)
-        except yaml.YAMLError as error:
-            raise DataError(f"{brief(name)} is not valid YAML ({reason(error)}).") from error
+    with readable(path, "YAML text"):
+        # Deep texts take the time of their depth squared; a few aliases of aliases stand for any number of values.
+        level = 0
+        for event in yaml.parse(text, yaml.SafeLoader):
+            level += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+            if level > MOST_LEVELS:
+                raise DataError(f"{brief(name)} is nested too deeply: more than {MOST_LEVELS} levels.")
+            if isinstance(event, yaml.AliasEvent):
+                raise DataError(f"{brief(name)} repeats values by alias (*name); write them out instead.")
+        _check_keys(yaml.compose(text, yaml.SafeLoader), name)
+        return check_values(yaml.safe_load(text), name)
 
 
 def _check_keys(node: Any, name: str) -> None:
@@ -102,13 +93,8 @@ def read_mapping(path: str | os.PathLike[str], kind: str = "file") -> dict[str, 
     return values
 
 
-def check_values(value: Any, name: str) -> Any:
-    """Return nested plain data whose numbers are all finite and not too large."""
-    _check(value, name, ())
-    return value
-
-
-def _check(value: Any, name: str, place: tuple[str | int, ...]) -> None:
+def check_values(value: Any, name: str, place: tuple[str | int, ...] = ()) -> Any:
+    """Return nested plain data whose numbers are all finite and not too large; ``place`` is where it stands."""
     if type(value) is float:
         if not math.isfinite(value):
             raise DataError(f"{_place(name, place)} is {value}; a finite number is needed.")
@@ -124,12 +110,13 @@ def _check(value: Any, name: str, place: tuple[str | int, ...]) -> None:
             for key in value:
                 _encode(str(key), name, place)
         elif value and type(value[0]) is float and {*map(type, value)} == {float} and math.isfinite(sum(value)):
-            return  # Most of a large file are numbers in order.
+            return value  # Most of a large file are numbers in order.
         for key, inner in value.items() if isinstance(value, Mapping) else enumerate(value):
             kind = type(inner)
             plain = inner is None or kind is bool or (kind is float and math.isfinite(inner))
             if not (plain or (isinstance(inner, str) and inner.isascii())):
-                _check(inner, name, (*place, key))
+                check_values(inner, name, (*place, key))
+    return value
 
 
 def _encode(text: str, name: str, place: tuple[str | int, ...]) -> None:

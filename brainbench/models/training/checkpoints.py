@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 
 from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, check_name, listing, needing
 from brainbench.core.plugins import load_optional
+from brainbench.core.reading.regular import user_path
 from brainbench.models.recipes import Architecture
 
 if TYPE_CHECKING:
@@ -126,7 +127,7 @@ def find_folder(source: str) -> Path:
         DataFileNotFoundError: there is no such folder or repository.
     """
     if source.startswith(LOCAL):
-        folder = Path(source.removeprefix(LOCAL)).expanduser()
+        folder = user_path(source.removeprefix(LOCAL))
         if not folder.is_dir():
             raise DataFileNotFoundError(f"There is no folder {os.fspath(folder)!r}.")
         return _imported(folder, source)
@@ -140,12 +141,11 @@ def find_folder(source: str) -> Path:
 
     def download(*names: str) -> Path:
         patterns = ["/".join((*inner, item)) for item in names]
-        repository = f"{owner}/{name}"
         try:
-            root = snapshot_download(repository, revision=revision or None, allow_patterns=patterns)
+            root = snapshot_download(f"{owner}/{name}", revision=revision or None, allow_patterns=patterns)
         except Exception as error:
             reason = str(error).strip().partition("\n")[0] or type(error).__name__
-            raise DataFileNotFoundError(f"{repository!r} could not be had from the hub: {reason}") from error
+            raise DataFileNotFoundError(f"{source!r} could not be had from the hub: {reason}") from error
         return Path(root).joinpath(*inner)
 
     folder = download(WEIGHTS, CONFIG, CARD)
