@@ -33,8 +33,10 @@ import torch
 from tests.factories.structures import restructure
 
 FAILURES = ("traceback", "hang", "crash", "silent", "leaked", "half-written", "wordy")
-SECONDS = 60.0
-"""Time of a case by the clock, on a busy machine."""
+SECONDS = 60
+"""Processor time of a case."""
+PATIENCE = 300.0
+"""Time of a case by the clock, which a busy machine stretches."""
 MEMORY = 16 << 30
 """Address space [bytes] of a case; libraries reserve much more than they use."""
 LONGEST = 400
@@ -111,7 +113,7 @@ def _judge(door: Door, path: Path, place: Path, what: str) -> Verdict:
     error = re.sub(r"\s+", " ", err).strip().removeprefix("brainbench: ")
     written = _files(place) - before
     verdict = partial(Verdict, what=what, detail=error[-600:])
-    if status is None:
+    if status in (None, -signal.SIGXCPU):
         return verdict("hang")
     if status == ABSENT:
         return verdict("absent")
@@ -145,7 +147,8 @@ def _run(door: Door, path: Path, place: Path, streams: tuple[Path, Path]) -> Non
         os.environ["BRAINBENCH_CONFIG"] = str(place)
         os.setpgid(0, 0)
         resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
-        faulthandler.dump_traceback_later(SECONDS - 5, file=sys.stderr)
+        resource.setrlimit(resource.RLIMIT_CPU, (SECONDS, SECONDS + 5))
+        faulthandler.enable(sys.stderr)
         status = _call(door, path, place)
     except SystemExit as end:
         status = end.code if isinstance(end.code, int) else int(end.code is not None)
@@ -191,13 +194,15 @@ def _text(path: Path) -> str:
 
 def _wait(child: int) -> int | None:
     """Return the exit status of a process, negative for a signal; None where its time was over."""
-    end, pause = time.monotonic() + SECONDS, 0.002
+    end, pause = time.monotonic() + PATIENCE, 0.002
     while time.monotonic() < end:
         ended, status = os.waitpid(child, os.WNOHANG)
         if ended:
             return os.waitstatus_to_exitcode(status)
         time.sleep(pause := min(2 * pause, 0.05))
     with suppress(ProcessLookupError):
+        os.kill(child, signal.SIGABRT)  # it says where it stands
+        time.sleep(1)
         os.killpg(child, signal.SIGKILL)
     os.waitpid(child, 0)
     return None
