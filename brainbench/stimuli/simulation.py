@@ -89,7 +89,9 @@ def simulate(
     if path is not None and (dataset := read_entry(path)) is not None:
         return dataset
     dataset = simulate_uncached(chosen, fidelity, engine, progress=progress)
-    _warn_unstable(dataset)
+    for i, j in np.argwhere(dataset["status"].values != "ok"):
+        words = dataset["whisker"].values[j], dataset["stimulus"].values[i], dataset["reason"].values[i, j]
+        _LOG.warning("whisker %s became unstable in %s: %s", *words)
     if path is not None:
         keep_entry(path, "stimuli", lambda file: write_stimulus_set(dataset, file))
     return dataset
@@ -228,7 +230,9 @@ def _assemble(
 
     touched = [[frames.readings[trace.contact] for trace in row] for row in traces]
     first = np.array([[times[0] if len(times) else math.nan for times in row] for row in touched])
-    arc = _mean_of_known(readings("contact_arc")).astype(np.float32)
+    arcs = readings("contact_arc")
+    count = np.isfinite(arcs).sum(axis=2)
+    arc = np.where(count > 0, np.nansum(arcs, axis=2) / np.maximum(count, 1), np.nan).astype(np.float32)
     # Scenes may differ in material; the hash beside this covers every number of every scene's array.
     about = {"species": array.species, "side": array.side, "whiskers": list(names), "citation": array.citation}
     meanings = {
@@ -296,24 +300,6 @@ def _count_clipped(dataset: xr.Dataset, clipped: NDArray[np.bool_], limit: float
         for label, part in zip(dataset["stimulus"].values, clipped, strict=True)
     }
     return to_json({"limit_N": limit, "components": counts}, indent=None)
-
-
-def _mean_of_known(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Mean over axis 2 of what is not NaN; NaN where nothing is known."""
-    finite = np.isfinite(values)
-    count = finite.sum(axis=2)
-    total = np.where(finite, values, 0.0).sum(axis=2)
-    return np.divide(total, count, out=np.full(total.shape, np.nan), where=count > 0)
-
-
-def _warn_unstable(dataset: xr.Dataset) -> None:
-    for i, j in np.argwhere(dataset["status"].values != "ok"):
-        _LOG.warning(
-            "whisker %s became unstable in %s: %s",
-            dataset["whisker"].values[j],
-            dataset["stimulus"].values[i],
-            dataset["reason"].values[i, j],
-        )
 
 
 def config_hash(scenes: Sequence[Scene], fidelity: Fidelity, backend: str) -> str:

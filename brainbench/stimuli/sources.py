@@ -202,7 +202,7 @@ def prepare_stimuli(
 def _recipe(source: str | os.PathLike[str], whiskers: str) -> Recipe | None:
     """Return the scenes that a recipe name or the path of a scene file names; None for anything else."""
     if is_packaged(source):
-        return _packaged(source, whiskers)
+        return _packaged(source, whiskers=whiskers)
     if isinstance(source, str) and is_recipe(source):
         return get_recipe(source, whiskers=whiskers)
     if Path(source).suffix != ".toml":
@@ -212,10 +212,8 @@ def _recipe(source: str | os.PathLike[str], whiskers: str) -> Recipe | None:
     return load_scene(source, whiskers=whiskers)
 
 
-@functools.lru_cache(maxsize=1)
-def _packaged(name: str, whiskers: str) -> Recipe:
-    """Return a recipe of the package, whose meshes take longest of all; a score asks for it several times."""
-    return get_recipe(name, whiskers=whiskers)
+# A recipe of the package, whose meshes take longest of all; a score asks for it several times.
+_packaged = functools.lru_cache(maxsize=1)(get_recipe)
 
 
 def _select(dataset: xr.Dataset, whiskers: str) -> xr.Dataset:

@@ -66,16 +66,16 @@ def whisker(
         ">contacts to": lambda row: _number(row.get("contact_tolerance"), "g"),
     }
     cost = {">processor s / whisker-s": lambda row: _number(row["cost"], ".3g")}
-    error = {">error": lambda row: _number(row[whiskers.ERROR], ".2%")}
+    error = {f">{name}": lambda row, key=key: _number(row.get(key), ".2%") for name, key in whiskers.TAILS.items()}
     text = table_of(
-        f"{len(rows)} settings measured; those that no other beats in cost and error (90 % of whiskers stay below):",
-        [point.settings | {whiskers.ERROR: point.error, "cost": point.cost} for point in best],
+        f"{len(rows)} settings measured; those that no other beats in cost and the error that 90 % stay below:",
+        [point.settings | {"cost": point.cost} for point in best],
         {**error, **cost, **setting, "backend": "{0[backend]}"},
     )
     if still := [row for row in rows if row.get("solver") == "quasistatic"]:
         columns = {**error, ">pegs": "{0[static_error]:.2%}", **cost, **setting}
         text += "\n\n" + table_of("without inertia (rod, quasistatic):", still, columns)
-    if hollow := whiskers.collision_rows(rows):
+    if hollow := [row for row in rows if row.get("collision")]:
         pieces = {"collision": "{0[collision]}", ">pieces": lambda row: row.get("pieces", "")}
         columns = {**error, **cost, **pieces, **setting, "backend": "{0[backend]}", "note": "{0[note]}"}
         text += "\n\n" + table_of("whisking into the hollow of concave objects:", hollow, columns)

@@ -10,7 +10,6 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
 from typing import Annotated, Any
 
 import numpy as np
@@ -52,7 +51,10 @@ def study(data: SyntheticData, splits: Sequence[int] = SPLITS, permutations: Seq
     (standard deviation over seeds ``of`` the score or the p value) and the median ``seconds`` for all animals.
     """
     metric = RSA()
-    (blocks, features), threshold = _data(data), _threshold()
+    (blocks, features), random = _data(data), np.random.default_rng(1)
+    # RDMs of a model and a brain, of more stimuli than are permuted exactly, and the comparison whose p is .05.
+    model, brain = (rdm(random.normal(size=(_STIMULI, 10))) for _ in range(2))
+    threshold = np.quantile(_permuted(model, brain, 20_000, 2), 0.95)
 
     def value(seed: int, count: int) -> float:
         prepared = [metric.animal(str(i), [block], 6, seed=seed, splits=count) for i, block in enumerate(blocks)]
@@ -60,7 +62,7 @@ def study(data: SyntheticData, splits: Sequence[int] = SPLITS, permutations: Seq
 
     def p(seed: int, count: int) -> float:
         # (b + 1)/(n + 1): the given order counts among the random ones.
-        return (1 + int((_permuted(*_rdms(), count, seed) >= threshold).sum())) / (count + 1)
+        return (1 + int((_permuted(model, brain, count, seed) >= threshold).sum())) / (count + 1)
 
     jobs = {"splits": (value, "score", metric.splits), "permutations": (p, "p near .05", metric.orders)}
 
@@ -77,19 +79,6 @@ def study(data: SyntheticData, splits: Sequence[int] = SPLITS, permutations: Seq
     rows = [{"quantity": "splits", "count": count} for count in splits]
     rows += [{"quantity": "permutations", "count": count} for count in permutations]
     return Study("brainbench tradeoff score", rows, measure)
-
-
-@cache
-def _rdms() -> tuple[Floats, Floats]:
-    """Return the RDMs of a model and a brain, of more stimuli than are permuted exactly."""
-    rng = np.random.default_rng(1)
-    model, brain = (rdm(rng.normal(size=(_STIMULI, 10))) for _ in range(2))
-    return model, brain
-
-
-def _threshold() -> float:
-    """Return the comparison whose p is .05."""
-    return float(np.quantile(_permuted(*_rdms(), 20_000, 2), 0.95))
 
 
 def _permuted(model: Floats, brain: Floats, count: int, seed: int) -> Floats:

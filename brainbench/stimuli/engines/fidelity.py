@@ -199,8 +199,9 @@ def measured(backend: str = DEFAULT_ENGINE) -> tuple[TradeoffPoint, ...]:
     points: dict[str, list[TradeoffPoint]] = {}
     for point in json.loads(text)["points"]:
         if not point.get("collision") and point.get("solver", "dynamic") == "dynamic":
-            error, cost = (math.inf if point[name] is None else point[name] for name in ("error_50", "cost"))
+            names = ("error_50", "hard_50", "cost")
+            *errors, cost = (math.inf if point[name] is None else point[name] for name in names if name in point)
             settings = {name: point.get(name) for name in RESOLUTION}
-            points.setdefault(point["backend"], []).append(TradeoffPoint(error, cost, settings))
+            points.setdefault(point["backend"], []).append(TradeoffPoint(max(errors), cost, settings))
     check_name("measured backend", backend, points)
     return tuple(points[backend])

@@ -48,7 +48,7 @@ SMALL_FORCE = 1e-9
 LARGEST_STRUCK_CHANGE = 0.1
 """The same in rigid contacts with a :data:`BLOW`, when the step is cut to a fifth: contacts may cut a step and its half
 to the same. Of 555 whiskers it finds 99 of the 105 that err by more than a fifth, and 48 others; nothing that a single
-run tells does (benchmarks/whiskers/struck.py)."""
+run tells does (benchmarks/whiskers/struck.py of commit 7ff301f7)."""
 BLOW = 0.15
 """Speed (m/s) of an object against the base from which it counts as a blow. At .2 to .7 m/s 4 to 11 % of the whiskers
 err by more than a fifth with ``balanced``, at .1 m/s 2 %."""

@@ -109,8 +109,11 @@ def load_shapenet(
         raise DataFileNotFoundError(f"There is no ShapeNet folder {os.fspath(root)!r}.")
     if isinstance(ids, (str, os.PathLike)):
         names = read_ids(ids)
+    elif ids is None:
+        places = {path.relative_to(folder).parts[:2] for mesh in MESHES for path in folder.glob(f"*/*/{mesh}")}
+        names = tuple("/".join(parts) for parts in sorted(places))
     else:
-        names = _everything(folder) if ids is None else _checked(ids, "the ids")
+        names = _checked(ids, "the ids")
     given = read_categories(categories) if isinstance(categories, (str, os.PathLike)) else categories
     labels = SYNSETS if given is None else given
     models, missing = [], []
@@ -155,11 +158,6 @@ def read_categories(path: str | os.PathLike[str]) -> dict[str, str]:
                 f"Row {number} of {os.fspath(path)!r} must be a name and a label; it is {brief(','.join(row))}."
             )
     return {name: label for name, label in rows if _is_name(name.partition("/")[0])}
-
-
-def _everything(folder: Path) -> tuple[str, ...]:
-    places = {path.relative_to(folder).parts[:2] for mesh in MESHES for path in folder.glob(f"*/*/{mesh}")}
-    return tuple("/".join(parts) for parts in sorted(places))
 
 
 def _checked(names: Iterable[str], where: str) -> tuple[str, ...]:

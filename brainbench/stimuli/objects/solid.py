@@ -72,15 +72,12 @@ class Solid:
         if self.origin is not None:
             return content_hash(self.origin, round(self.diagonal, 12))
         parts = [{"kind": type(part).__name__, **portable(part)} for part in self.parts]
-        if self.surface is None or _through_corners(self.surface, self.parts):
+        convex = [part for part in self.parts if isinstance(part, ConvexPart)]
+        corners = {tuple(corner) for part in convex for corner in part.vertices.tolist()}
+        # Parts tell a surface that runs through corners of convex ones alone.
+        if self.surface is None or all(tuple(vertex) in corners for vertex in self.surface.vertices.tolist()):
             return content_hash(parts)
         return content_hash(parts, portable({"vertices": self.surface.vertices, "faces": self.surface.faces}))
-
-
-def _through_corners(surface: Mesh, parts: tuple[Part, ...]) -> bool:
-    """Return whether the surface runs through corners of the convex parts alone, so that the parts tell it."""
-    corners = {tuple(corner) for part in parts if isinstance(part, ConvexPart) for corner in part.vertices.tolist()}
-    return all(tuple(vertex) in corners for vertex in surface.vertices.tolist())
 
 
 RODGERS_CONTROL = ((-0.720943, 0.195148), (-0.167777, 0.219684), (0.235608, -0.057831), (0.631506, -0.409149))

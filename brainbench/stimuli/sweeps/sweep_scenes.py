@@ -13,7 +13,6 @@ from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal, overload
 
 import numpy as np
-from numpy.typing import NDArray
 
 from brainbench.core.errors import UsageError, listing, repeats
 from brainbench.core.files import content_hash
@@ -173,7 +172,8 @@ class SweepGrid:
         """
         scaled = solid.to_diagonal(sweep.size)
         angles = (0.0, 0.0, sweep.rotation)
-        low = _turned_bounds(scaled, euler_matrix(angles))[0]
+        body = Obstacle(scaled.parts, surface=scaled.surface if scaled.mesh is None else scaled.mesh)
+        low = body.moved(euler_matrix(angles), np.zeros(3)).bounds[0]
         # Objects travel towards −y, so their lowest y leads.
         y = self.start - low[1] if self.placing == "clear" else self.start + low[1]
         forward = Translation((0.0, sweep.speed, 0.0), _HEAD_ONSET)
@@ -202,13 +202,6 @@ def _choices(values: Sequence[float] | Span) -> int:
 
 def _values(values: tuple[float, ...] | Span, generator: np.random.Generator) -> tuple[float, ...]:
     return (values.draw(generator),) if isinstance(values, Span) else values
-
-
-def _turned_bounds(solid: Solid, rotation: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return lowest and highest corner [2, 3] (m) of the solid turned about its origin."""
-    if solid.mesh is not None:
-        return solid.mesh.transformed(rotation).bounds
-    return Obstacle(solid.parts, surface=solid.surface).moved(rotation, np.zeros(3)).bounds
 
 
 class SweepScenes(Sequence[Scene]):

@@ -24,18 +24,22 @@ from brainbench.stimuli.engines import get_engine
 from brainbench.stimuli.engines.fidelity import DEFAULT_ENGINE, Fidelity
 from brainbench.stimuli.motion.jobs import Job, Load, StillFollicle, Trace
 from brainbench.stimuli.motion.trajectories import ArrayFollicle, Whisking, smooth_step
-from brainbench.stimuli.objects.obstacle import Capsule, Cylinder, Obstacle, RigidMotion
+from brainbench.stimuli.objects.obstacle import Box, Capsule, Cylinder, Obstacle, Part, RigidMotion
 from brainbench.stimuli.objects.solid import Solid, box, capsule, rodgers_solid, sphere
 from brainbench.stimuli.validation import references
 from brainbench.stimuli.whiskers.array import SPECIES, MountedWhisker, WhiskerArray
 from brainbench.stimuli.whiskers.whisker import Whisker, build_chain
 
 OBJECTS = ("post", "ball", "edge", "hollow")
+"""One object on one side of a whisker, which stays in contact until it retracts."""
+HARD_OBJECTS = ("opposed", "slot", "comb", "slip-off", "release")
+"""Contacts from both sides (two posts, the second farther out; two bars; six posts), a post that the whisker slips past
+with its tip, and one that is pulled away from it."""
 FRICTIONS = (0.0, 0.4, 0.8)
 FREQUENCIES = (5.0, 10.0, 20.0)  # whisks per second [Hz]
-CELLS = len(SPECIES) * len(OBJECTS) * len(FRICTIONS) * len(FREQUENCIES)
-"""Combinations of species, object, friction and speed."""
 _RETRACTION = math.radians(12)
+_PULL = 0.01
+"""Time in which an object of the kind ``release`` is pulled away [s]."""
 
 
 def contact_jobs(
@@ -43,11 +47,12 @@ def contact_jobs(
 ) -> list[Job]:
     """Return jobs of one whisker that whisks against one object, ``each`` of every combination, in a random order.
 
-    Whisker, point of contact (.4 to .85 of the length), azimuth of first contact (−3° to 3°), depth (4° to 14° beyond
-    it), size and turn of the object are drawn. Read every ms. Other seeds are other scenes of the same kinds.
+    Whisker, point of contact (.4 to .85 of the length; .9 to .97 to slip off), azimuth of first contact (−3° to 3°; .1°
+    to .6° between objects on both sides), depth (4° to 14° beyond it; three times as much to slip off), size and turn
+    of the object are drawn. Read every ms. Other seeds are other scenes of the same kinds.
 
     Args:
-        objects: kinds of objects, of :data:`OBJECTS`.
+        objects: kinds of objects, of :data:`OBJECTS` and :data:`HARD_OBJECTS`.
         hollow: another solid of the shape and size of :func:`rodgers_solid`, touched in its place.
     """
     random = np.random.default_rng(seed)
@@ -83,16 +88,43 @@ def _draw(
     random: np.random.Generator,
 ) -> Job:
     mount = mounts[random.integers(len(mounts))]
-    touch, depth = np.radians(random.uniform((-3, 4), (3, 14)))
-    whisking = Whisking(frequency, touch + depth, _RETRACTION, onset=0.025)
-    point, axes = _contact(mount, whisking, touch, random.uniform(0.4, 0.85))
+    around, past = kind in ("opposed", "slot", "comb"), kind == "slip-off"
+    touch, depth = np.radians(random.uniform((0.1 if around else -3, 4), (0.6 if around else 3, 14)))
+    # Whiskers between objects rest there.
+    whisking = Whisking(frequency, touch + (3 if past else 1) * depth, 0 if around else _RETRACTION, onset=0.025)
+    point, axes = _contact(mount, whisking, touch, random.uniform(*((0.9, 0.97) if past else (0.4, 0.85))))
     scale = mount.whisker.arc_length / 0.02
-    solid, turn, place = _object(kind, scale, hollow, random)
-    rotation = axes @ turn
-    body = Obstacle(solid.parts, friction=friction, surface=solid.surface)
-    obstacle = body.moved(rotation, point - rotation @ place)
+    if kind in HARD_OBJECTS:
+        gap = 2 * (abs(touch) * float(np.linalg.norm(point - mount.position)) + mount.whisker.base_radius)
+        parts = _hard_parts(kind, scale, gap, random)
+        obstacle = Obstacle(parts, friction=friction).moved(axes, point)
+        if kind == "release":
+            # Against the whisker's way, near the end of the protraction, when it is bent most.
+            start, way = 0.4 / frequency, 0.005 * scale * axes[:, 1]
+            motion = _sliding(lambda times: np.outer(smooth_step(times - start, _PULL), way))
+            motion.finest = _PULL  # type: ignore[attr-defined]
+            obstacle = replace(obstacle, motion=motion)
+    else:
+        solid, turn, place = _object(kind, scale, hollow, random)
+        rotation = axes @ turn
+        body = Obstacle(solid.parts, friction=friction, surface=solid.surface)
+        obstacle = body.moved(rotation, point - rotation @ place)
     duration = max(0.15, 1.5 / frequency)
     return Job(mount.whisker, ArrayFollicle(mount, whisking), (obstacle,), np.arange(1e-3, duration, 1e-3))
+
+
+def _hard_parts(kind: str, scale: float, gap: float, random: np.random.Generator) -> tuple[Part, ...]:
+    """Return parts that touch at the origin of the axes of the contact: the whisker comes along y and lies along x."""
+    radius, half, way = 2e-4 * scale * random.uniform(1, 3), 0.015 * scale, scale * random.uniform(0.5e-3, 3e-3)
+    ahead, behind = radius, -radius - gap
+    if kind == "slot":
+        return tuple(Box((0.0, y, 0.0), (way, radius, half)) for y in (ahead, behind))
+    places = [(0.0, ahead)]
+    if kind == "opposed":
+        places.append((way, behind))
+    elif kind == "comb":
+        places = [(x * way, y) for x in (-1, 0, 1) for y in (ahead, behind)]
+    return tuple(Capsule((x, y, -half), (x, y, half), radius) for x, y in places)
 
 
 def _contact(
@@ -300,10 +332,11 @@ def job_at_rest(whisker: Whisker, times: NDArray[np.float64], *obstacles: Obstac
 
 
 def _sliding(place: Callable[[NDArray[np.float64]], NDArray[np.float64]]) -> RigidMotion:
-    """Return the motion of a body that does not turn through points [n, 2] (m) of the plane of bending."""
+    """Return the motion of a body that does not turn, through points [n, 3] (m), or [n, 2] in the plane of bending."""
 
     def motion(times: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        return np.pad(place(times), ((0, 0), (0, 1))), np.tile([1.0, 0.0, 0.0, 0.0], (len(times), 1))
+        points = place(times)
+        return np.pad(points, ((0, 0), (0, 3 - points.shape[1]))), np.tile([1.0, 0.0, 0.0, 0.0], (len(times), 1))
 
     return motion
 

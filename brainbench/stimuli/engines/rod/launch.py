@@ -92,8 +92,12 @@ def load_kernels(
         else:
             kernels = build_kernels(real, capacity, sliced=options.get("sliced", False), **kind)
     if device.is_cuda and options.get("sliced"):
-        with kernels.loading, lock_of(device):
-            _load_together(kernels, options["bounds"][0], device)
+        blocks = {kernels.run: options["bounds"][0], kernels.swap_queues: None}
+        blocks[kernels.measure_distances] = DISTANCE_BOUNDS[0]
+        blocks |= {kernel: CONTACT_BOUNDS[0] for kernel, _ in kernels.solve_contacts}
+        # Those that this machine does not have yet compile side by side.
+        with kernels.loading, lock_of(device), ThreadPoolExecutor(len(blocks)) as pool:
+            list(pool.map(lambda kernel: kernel.module.load(device, block_dim=blocks[kernel]), blocks))
         return kernels
     if device.is_cuda and options:  # compiled at their launch, for the blocks that it asks for
         return kernels
@@ -106,14 +110,6 @@ def load_kernels(
         module.load(device, block_dim=block)
         tell(False)
     return kernels
-
-
-def _load_together(kernels: Any, block: int, device: Any) -> None:
-    """Load the kernels of whiskers in slices; those that this machine does not have yet compile side by side."""
-    blocks = {kernels.run: block, kernels.swap_queues: None, kernels.measure_distances: DISTANCE_BOUNDS[0]}
-    blocks |= {kernel: CONTACT_BOUNDS[0] for kernel, _ in kernels.solve_contacts}
-    with ThreadPoolExecutor(len(blocks)) as pool:
-        list(pool.map(lambda kernel: kernel.module.load(device, block_dim=blocks[kernel]), blocks))
 
 
 @dataclass(frozen=True, eq=False)

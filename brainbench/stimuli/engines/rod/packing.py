@@ -203,7 +203,10 @@ def _knots(pose: Pose, to_matrices: Callable[[NDArray], NDArray], times: NDArray
     knots = np.empty(len(times), dtype=KNOT)
     knots["place"] = place * MILLI
     knots["velocity"] = velocity
-    knots["quaternion"] = _continuous(rotations.from_matrices(rotation))
+    quaternion = rotations.from_matrices(rotation)
+    # q and −q are the same rotation, but a cubic from one to the other would turn all the way round or vanish.
+    flips = np.cumprod(np.where(np.sum(quaternion[1:] * quaternion[:-1], axis=1) < 0, -1.0, 1.0))
+    knots["quaternion"] = quaternion * np.append(1.0, flips)[:, None]
     knots["spin"] = (spin0 + spin1) / 2 / MILLI
     knots["surge"] = (spin1 - spin0) / span / MILLI**2
     return knots
@@ -214,13 +217,6 @@ def rotation_vectors(before: NDArray, after: NDArray) -> NDArray[np.float64]:
     relative = after @ np.swapaxes(before, -1, -2)
     # Antisymmetric part of the relative rotation, sin(angle) times the axis; angles between neighbours are tiny.
     return np.stack([relative[:, k, j] - relative[:, j, k] for j, k in ((1, 2), (2, 0), (0, 1))], axis=-1) / 2
-
-
-def _continuous(quaternion: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Choose signs so that neighbours never jump to the antipode."""
-    # q and −q are the same rotation, but a cubic from one to the other would turn all the way round or vanish.
-    flips = np.cumprod(np.where(np.sum(quaternion[1:] * quaternion[:-1], axis=1) < 0, -1.0, 1.0))
-    return quaternion * np.concatenate([[1.0], flips])[:, None]
 
 
 def pack_chains(capacity: int, chains: Sequence[Chain], quasistatic: bool, hinges: int) -> dict[str, NDArray]:

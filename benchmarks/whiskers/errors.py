@@ -1,0 +1,124 @@
+"""Estimated errors of whiskers beside their true ones, in scenes that no table was measured on.
+
+``python -m benchmarks.whiskers.errors [--seed 1] [--settings fast,auto=0.1] [--groups hard] [--write]``
+
+The scenes are those of :mod:`brainbench.stimuli.validation.bench_tests`, one of each kind, and whiskers at rest that
+objects strike. The truth is the converged simulation of the trade-off, for blows with steps of 1 µs. The promise is
+that of ``Fidelity.auto(error=…)``: kept where the true error is no larger, or where a remark says that it is.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from benchmarks.report import publish, script_parser, table
+from brainbench.core.statistics import wilson_interval
+from brainbench.stimuli.engines import get_engine
+from brainbench.stimuli.engines.error_estimates import difference
+from brainbench.stimuli.engines.fidelity import Fidelity
+from brainbench.stimuli.motion.jobs import Job, StillFollicle, Trace
+from brainbench.stimuli.motion.trajectories import Translation
+from brainbench.stimuli.objects.solid import PlacedObject, box, capsule, sphere
+from brainbench.stimuli.validation.bench_tests import HARD_OBJECTS, OBJECTS, contact_jobs
+from brainbench.stimuli.whiskers.array import SPECIES, WhiskerArray
+from brainbench.tradeoffs.whiskers import REFERENCE
+
+SPEEDS = (0.2, 0.7, 1.5, 2.9)
+"""Speeds of the objects that strike [m/s]."""
+LARGE = 0.2  # error that no whisker in good order may have
+
+
+def struck_jobs(seed: int, count: int) -> list[Job]:
+    """Return whiskers at rest that a post, a ball or a box strikes from a random side, with and without friction."""
+    rng, jobs = np.random.default_rng(seed), []
+    arrays = [WhiskerArray.of(species).mounts for species in SPECIES]
+    for k in range(count):
+        whisker, speed = arrays[k % 2][rng.integers(len(arrays[k % 2]))].whisker, SPEEDS[k % len(SPEEDS)]
+        size = whisker.arc_length / 0.02 * rng.uniform(1, 2)
+        kinds = capsule(4e-4 * size, 0.03), sphere(2e-3 * size), box((3e-3 * size, 3e-3 * size, 3e-3 * size))
+        which = rng.integers(3)
+        solid, half = kinds[which], (4e-4, 2e-3, 2.7e-3)[which] * size
+        tilt = rng.uniform(-0.4, 0.4)
+        way = np.array([math.sin(tilt) / 2, rng.choice([-1, 1]) * math.cos(tilt), rng.uniform(-0.5, 0.5)])
+        way = speed * way / np.linalg.norm(way)
+        place = np.append(whisker.centre_line(rng.uniform(0.4, 0.85) * whisker.arc_length), 0.0)
+        # It is there after 2.3 ms.
+        start, motion = place - way * ((half + whisker.base_radius) / speed + 2.3e-3), Translation(tuple(way), 0)
+        struck = PlacedObject(solid, tuple(start), motion=motion, friction=float(rng.choice([0.0, 0.4])))
+        times = np.arange(1e-3, max(0.03, 0.01 / speed), 1e-3)
+        jobs.append(Job(whisker, StillFollicle(), (struck.obstacle(),), times))
+    return jobs
+
+
+def converged(jobs: Sequence[Job], fidelity: Fidelity) -> list[tuple[Job, Trace]]:
+    """Return the jobs whose converged simulation can be trusted and touches something."""
+    traces = get_engine(REFERENCE.backend).run(jobs, fidelity.resolved(True))
+    return [pair for pair in zip(jobs, traces, strict=True) if pair[1].status == "ok" and pair[1].contact.any()]
+
+
+def measure(backend: str, setting: str, group: str, scenes: Sequence[tuple[Job, Trace]]) -> list[str]:
+    """Return a row of the table: true errors, and how many estimates cover them."""
+    fidelity = Fidelity.parse(setting)
+    traces = get_engine(backend, errors=True).run([job for job, _ in scenes], fidelity)
+    trusted = [
+        (trace, true_error(job, trace, reference))
+        for (job, reference), trace in zip(scenes, traces, strict=True)
+        if trace.status == "ok"
+    ]
+    errors, estimates = np.array([(error, trace.error) for trace, error in trusted]).T
+    silent = np.array([not trace.remark for trace, _ in trusted])
+    covered = int((estimates >= errors).sum())
+    interval = wilson_interval(covered, len(errors))
+    return [
+        setting, group, f"{len(errors)} of {len(scenes)}",
+        *(f"{100 * np.quantile(errors, share):.2g}" for share in (0.5, 0.9, 1.0)),
+        f"{covered / len(errors):.1%} [{interval.low:.1%}, {interval.high:.1%}]",
+        *(f"{np.quantile(estimates / errors, share, method='higher'):.2g}" for share in (0.5, 0.9)),
+        str(int((silent & (errors > LARGE)).sum())),
+        str(int((silent & (errors > fidelity.error)).sum())) if fidelity.error else "–",
+    ]  # fmt: skip
+
+
+def true_error(job: Job, trace: Trace, reference: Trace) -> float:
+    """Return the larger of the errors of base force and moment, as the estimate defines them."""
+    touching = (trace.contact | reference.contact)[None]
+    pair = difference(trace.wrench[None], reference.wrench[None], touching, np.array([job.whisker.arc_length]))
+    return float(pair[0].max())
+
+
+def main() -> None:
+    parser = script_parser(__doc__)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--settings", default="fast,balanced,accurate,auto=0.2,auto=0.1,auto=0.05")
+    parser.add_argument("--groups", default="one-side,hard,struck")
+    parser.add_argument("--backend", default="rod")
+    args = parser.parse_args()
+    makers = {
+        "one-side": lambda: converged(contact_jobs(args.seed, each=1), REFERENCE.fidelity),
+        "hard": lambda: converged(contact_jobs(args.seed, each=1, objects=HARD_OBJECTS), REFERENCE.fidelity),
+        "struck": lambda: converged(struck_jobs(args.seed, 72), replace(REFERENCE.fidelity, time_step=1e-6)),
+    }
+    groups = {name: makers[name]() for name in args.groups.split(",")}
+    rows = []
+    for setting in args.settings.split(","):
+        for group, scenes in groups.items():
+            rows.append(measure(args.backend, setting, group, scenes))
+            print(rows[-1], flush=True)
+    text = (
+        f"Engine `{args.backend}`, seed {args.seed}. One side: {', '.join(OBJECTS)}. Hard: {', '.join(HARD_OBJECTS)}. "
+        f"Struck: at {', '.join(f'{speed:g}' for speed in SPEEDS)} m/s. Left out: what touches nothing or cannot be "
+        "trusted at the finest setting. True error, in %, of base force or moment (root mean square over the "
+        f"readings in contact, the larger) against `{REFERENCE.fidelity}`, for blows with steps of 1 µs. Covered: the "
+        "estimate is no smaller. In silence: without a remark.\n\n"
+    )
+    head = ["setting", "scenes", "trusted", "error %, median", "90 %", "worst", "covered", "estimate/error, median"]
+    head += ["90 %", f"above {LARGE:.0%} in silence", "above the promise in silence"]
+    publish(args, "Errors of whiskers and their estimates", text + table(head, rows))
+
+
+if __name__ == "__main__":
+    main()
