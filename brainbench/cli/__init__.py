@@ -36,13 +36,12 @@ def main() -> None:
     # (six times the processor time for --metric cka, where other work keeps the processors busy). Torch has its own.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    for number, (name, mode) in enumerate((("stdin", "r"), ("stdout", "w"), ("stderr", "w"))):
-        if getattr(sys, name) is None:
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        if (stream := getattr(sys, name)) is None:
             # Closed by whoever started the command (>&-): no file of ours may take its number.
             os.dup2(os.open(os.devnull, os.O_RDWR), number)
-            setattr(sys, name, os.fdopen(number, mode))
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):
+            setattr(sys, name, os.fdopen(number, "w" if number else "r"))
+        elif number and isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")  # characters that a terminal lacks
     try:
         _run()
@@ -78,7 +77,9 @@ def _run() -> None:
         if error.errno in (errno.ENAMETOOLONG, errno.EACCES, errno.EPERM, errno.EROFS, errno.ELOOP) and error.filename:
             print(f"brainbench: {brief(str(error.filename))} cannot be opened ({error.strerror}).", file=sys.stderr)
             sys.exit(2)
-        if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EIO):
+        # Where all folders for temporary files are full, Python finds none: ENOENT without a name.
+        full = (errno.ENOSPC, errno.EDQUOT, errno.EIO)
+        if error.errno not in full and (error.errno, error.filename) != (errno.ENOENT, None):
             raise
         # It would be tried again, and fail again, when Python ends.
         with contextlib.suppress(OSError, ValueError):

@@ -140,12 +140,7 @@ _UNWRITABLE = (
 
 def cache_dir(*parts: str) -> Path:
     """Return (and create) the cache folder, ``$BRAINBENCH_CACHE`` or the platform's own."""
-    root = os.environ.get(CACHE_VARIABLE)
-    if not root:
-        import platformdirs
-
-        root = platformdirs.user_cache_dir("brainbench", appauthor=False)
-    path = user_path(root).joinpath(*parts)
+    path = _user_folder(CACHE_VARIABLE, "user_cache_dir").joinpath(*parts)
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -158,12 +153,18 @@ def cache_dir(*parts: str) -> Path:
 
 def settings_dir() -> Path:
     """Return the folder of the user's settings, ``$BRAINBENCH_CONFIG`` or the platform's own; it may be missing."""
-    folder = os.environ.get(CONFIG_VARIABLE)
-    if not folder:
-        import platformdirs
+    return _user_folder(CONFIG_VARIABLE, "user_config_dir")
 
-        folder = platformdirs.user_config_dir("brainbench", appauthor=False)
-    return user_path(folder)
+
+def _user_folder(variable: str, kind: str) -> Path:
+    if folder := os.environ.get(variable):
+        return user_path(folder)
+    import platformdirs
+
+    try:
+        return Path(getattr(platformdirs, kind)("brainbench", appauthor=False)).expanduser()
+    except RuntimeError as error:  # as in containers
+        raise UsageError(f"This user has no home folder: set HOME, or name a folder with {variable}.") from error
 
 
 def check_folder(path: str | os.PathLike[str], option: str) -> None:

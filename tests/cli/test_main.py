@@ -3,9 +3,11 @@ import os
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from pathlib import Path
 
+import h5py
 import pytest
 
 import brainbench
@@ -173,6 +175,17 @@ def test_a_name_longer_than_the_system_allows_is_one_sentence(run, words):
     assert (outcome.status in (1, 2), outcome.out, outcome.err.count("\n")) == (True, "", 1)
     assert "File name too long" in outcome.err
     assert len(outcome.err) < 420
+
+
+def test_no_place_for_temporary_files_is_one_sentence(run, tmp_path, monkeypatch):
+    # A full disk looks like this, too: Python tries to write a file.
+    monkeypatch.setattr(tempfile, "tempdir", None)
+    monkeypatch.setattr(tempfile, "_candidate_tempdir_list", lambda: [str(tmp_path / "none")])
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["x"] = [1.0]
+    ended = run("recordings", "inspect", str(tmp_path / "a.h5"))
+    assert (ended.status, ended.out, ended.err.count("\n")) == (1, "", 1)
+    assert "No usable temporary directory" in ended.err
 
 
 @pytest.mark.parametrize("words", [("models", "show", "local-dir:~nobody9/x"), ("recordings", "inspect", "~nobody9/x")])

@@ -22,7 +22,7 @@ from hypothesis import strategies as st
 from safetensors import safe_open
 
 from brainbench.core import files
-from brainbench.core.errors import DataError, DataFileNotFoundError, FileWriteError
+from brainbench.core.errors import DataError, DataFileNotFoundError, FileWriteError, UsageError
 from brainbench.core.files import (
     create_hdf5,
     lock_folder,
@@ -190,6 +190,17 @@ def test_an_empty_variable_does_not_make_the_working_folder_the_cache(tmp_path: 
     monkeypatch.setenv(files.CACHE_VARIABLE, "")
     assert tmp_path / "usual" in files.cache_dir("stimuli").parents
     assert not (tmp_path / "stimuli").exists()
+
+
+@pytest.mark.skipif(os.name != "posix", reason="home folders are found otherwise")
+def test_a_user_without_a_home_folder_is_told_what_to_set(monkeypatch: pytest.MonkeyPatch):
+    for name in ("HOME", "XDG_CACHE_HOME", "XDG_CONFIG_HOME", files.CACHE_VARIABLE, files.CONFIG_VARIABLE):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr("pwd.getpwuid", lambda user: {}[user])
+    with pytest.raises(UsageError, match="no home folder: set HOME, or name a folder with BRAINBENCH_CACHE"):
+        files.cache_dir("stimuli")
+    with pytest.raises(UsageError, match="or name a folder with BRAINBENCH_CONFIG"):
+        files.settings_dir()
 
 
 def test_provenance_names_version_packages_and_time():

@@ -297,22 +297,20 @@ def _selected(space: Any, shape: tuple[int, ...]) -> Any:
     if kind != h5s.SEL_HYPERSLABS or len(space.shape) != len(shape):
         return None
     if not space.is_regular_hyperslab():
-        blocks = [(low, high + 1) for low, high in space.get_select_hyper_blocklist()]
-    else:
-        sides = []
-        for start, stride, count, block, size in zip(*space.get_regular_hyperslab(), shape, strict=True):
-            # What has no end takes all that there is.
-            count = -(-(size - start) // stride) if count == h5s.UNLIMITED else count
-            block = size - start if block == h5s.UNLIMITED else block
-            if start + stride * (count - 1) + block > size:
+        for low, last in space.get_select_hyper_blocklist():
+            if (last >= shape).any():
                 return None
-            sides.append(np.add.outer(start + stride * np.arange(count), np.arange(block)).ravel())
-        mask[np.ix_(*sides)] = True
+            mask[tuple(map(slice, low, last + 1))] = True
         return mask
-    for low, high in blocks:
-        if (high > shape).any():
+    sides = []
+    for start, stride, count, block, size in zip(*space.get_regular_hyperslab(), shape, strict=True):
+        # What has no end takes all that there is.
+        count = -(-(size - start) // stride) if count == h5s.UNLIMITED else count
+        block = size - start if block == h5s.UNLIMITED else block
+        if start + stride * (count - 1) + block > size:
             return None
-        mask[tuple(map(slice, low, high))] = True
+        sides.append(np.add.outer(start + stride * np.arange(count), np.arange(block)).ravel())
+    mask[np.ix_(*sides)] = True
     return mask
 
 
