@@ -197,11 +197,12 @@ def _fork(run: Callable[[], None], log: Path) -> int:
 
 
 def _finish(child: int, log: Path) -> float:
-    """Wait for an unbroken run, and return its processor time [s]."""
-    _, status, used = os.wait4(child, 0)
-    if status:
+    """Wait for an unbroken run, and return its processor time [s] without that of its own processes."""
+    os.waitid(os.P_PID, child, os.WEXITED | os.WNOWAIT)
+    work = _work(child)
+    if os.waitpid(child, 0)[1]:
         raise SystemExit(f"An unbroken run failed: {log.read_text(errors='replace')[-2000:]}")
-    return used.ru_utime + used.ru_stime
+    return work
 
 
 def _differ(one: dict[str, Any], other: dict[str, Any]) -> list[str]:
