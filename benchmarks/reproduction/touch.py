@@ -32,6 +32,8 @@ EQUAL, PUBLISHED = "students-placement-and-type.json", "students-published-encod
 """Students of equal size of all types; students with the published encoder of each type."""
 LATER = "students-noise-resolution-law.json"
 """Students of equal size with noise, another resolution or the published law."""
+SCREWDRIVER = "students-screwdriver.json"
+"""Students of equal size that spin a screwdriver, with taxels on the fingers."""
 SURE, EARLY = "new", "seen"
 """Groups of types: students trained after the claims were written, and before."""
 KINDS = {
@@ -39,7 +41,7 @@ KINDS = {
     "depth": "depth", "force": "force", "force_torque": "force and torque", "elastomer": "gel markers",
     "proximity": "proximity", "center_of_pressure": "centres of pressure",
 }  # fmt: skip
-PLACES = {"hand": "whole hand", "tips": "finger tips"}
+PLACES = {"hand": "whole hand", "tips": "finger tips", "fingers": "fingers"}
 VARIANTS = {"noisy": "with noise", "low": "90 taxels", "high": "667 taxels", "law": "published law"}
 TOUCH_PAGE, FIGURE = "which-touch.md", "images/what-reproduces/students.svg"
 RULE = (
@@ -104,14 +106,19 @@ def judge_claim(claim: Mapping[str, Any], types: Sequence[str], arms: Arms, leve
     pairs = pairs_of(claim, types, arms)
     if not pairs:
         return None
-    if claim["rule"] == "mean":
-        effect, margin = difference(arms, pairs, level), claim.get("margin", 0.0)
+    margin = claim.get("margin", 0.0)
+
+    def verdict_of(effect: Effect) -> Verdict:
         bounds = effect.interval
         moved = bounds and replace(bounds, low=bounds.low + margin, high=bounds.high + margin)
-        return Judged(effect, judge(replace(effect, value=effect.value + margin, interval=moved), 1))
+        return judge(replace(effect, value=effect.value + margin, interval=moved), 1)
+
+    if claim["rule"] == "mean":
+        effect = difference(arms, pairs, level)
+        return Judged(effect, verdict_of(effect))
     effects = {" less ".join(map(in_words, pair)): difference(arms, [pair], level) for pair in pairs}
     weakest = min(effects, key=lambda name: effects[name].value)
-    verdicts: list[Verdict] = [judge(effect, 1) for effect in effects.values()]
+    verdicts = [verdict_of(effect) for effect in effects.values()]
     order = ["does not hold", "undecided", "holds"]
     verdict = min(verdicts, key=order.index)
     return Judged(effects[weakest], verdict, weakest)
@@ -128,11 +135,12 @@ def claim_rows() -> tuple[list[str], list[list[str]]]:
     document = read_json(Path(__file__).with_name("touch.json"))
     groups, published = document["groups"], arms_of(record_of(PUBLISHED))
     equal = arms_of(record_of(EQUAL), record_of(LATER))
-    everything = [*groups[SURE], *groups[EARLY]]
+    everything, other_tasks = [*groups[SURE], *groups[EARLY]], {"screwdriver": arms_of(record_of(SCREWDRIVER))}
 
     def sets_of(claim: Mapping[str, Any]) -> tuple[tuple[Sequence[str], Arms], ...]:
         if "group" in claim:
-            return ((groups[claim["group"]], equal), ((), equal), ((), published))
+            group = claim["group"]
+            return ((groups[group], other_tasks.get(group, equal)), ((), equal), ((), published))
         return ((groups[SURE], equal), (groups[EARLY], equal), (everything, published))
 
     tested = sum(bool(pairs_of(claim, *kinds)) for claim in document["claims"] for kinds in sets_of(claim))

@@ -143,7 +143,7 @@ def sweep(
     changes: dict[str, Any],
     file: Annotated[
         Path | None,
-        typer.Argument(help="TOML file, placement-and-type, noise-resolution-law, or table-4.10 (default)."),
+        typer.Argument(help="TOML file, or a shipped sweep: placement-and-type, … (docs/students.md); table-4.10."),
     ] = None,
     subset: Annotated[str, typer.Option(help="all, types, encoders, or an observation type.")] = "all",
     count: Annotated[bool, typer.Option("--count", help="Print how many students there are, and stop.")] = False,

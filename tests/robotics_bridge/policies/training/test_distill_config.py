@@ -155,8 +155,10 @@ def test_students_of_the_comparison_of_touch_have_equally_many_parameters() -> N
     assert {student.law for student in later} == {"task", "published"}
     arms = {(student.observe, student.placement) for student in students if student.observe != "none"}
     assert arms == {(kind, place) for kind in OBSERVATIONS if kind != "none" for place in ("hand", "tips")}
+    other = [student for student in read_sweep("screwdriver-fingers").students() if student.seed == 0]
+    assert {student.observe for student in other} == set(OBSERVATIONS)
     counts = []
-    for student in (*students, *later):
+    for student in (*students, *later, *other):
         shapes = {"proprio": (29,), "command": (1,)}
         if student.tactile is not None:
             shapes["tactile"] = student.tactile.build().shape
