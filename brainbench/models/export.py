@@ -19,6 +19,7 @@ import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -328,20 +329,29 @@ def _write(step: Any, path: Path, format: str) -> None:
     program.save(str(path), external_data=False)
 
 
+_SOUND: set[str] = set()
+"""Hashes of ONNX files that were tried in this process."""
+_TRYING = Lock()
+
+
 def onnx_session(path: str | Path, threads: int | None = None) -> Any:
     """Return ONNX Runtime's session of a file on the CPU, with its own choice of threads if None.
 
-    Another process with limits computes a step of zeros with it first: damage ends that one.
+    Another process with limits computes a step of zeros with it first: damage ends that one. Bytes that passed are not
+    tried again.
     """
     file = check_file(path, "ONNX file", most=MOST_ONNX)
-    name = brief(os.fspath(path))
-    fault, digest = call_apart(f"{__name__}:try_onnx", [os.fspath(file.absolute())], SECONDS) or (CRASHED, "")
-    if fault:
-        raise DataError(f"{name} {fault}.")
-    # What was tried and no other bytes; without a folder, so that it names no files beside it.
-    content = file.read_bytes()
-    if hashlib.sha256(content).hexdigest() != digest:
-        raise DataError(f"{name} changed while it was read; wait until it is complete.")
+    name, content = brief(os.fspath(path)), file.read_bytes()
+    digest = hashlib.sha256(content).hexdigest()
+    with _TRYING:
+        if digest not in _SOUND:
+            fault, tried = call_apart(f"{__name__}:try_onnx", [os.fspath(file.absolute())], SECONDS) or (CRASHED, "")
+            if fault:
+                raise DataError(f"{name} {fault}.")
+            # What was tried and no other bytes; without a folder, so that it names no files beside it.
+            if tried != digest:
+                raise DataError(f"{name} changed while it was read; wait until it is complete.")
+            _SOUND.add(digest)
     return _session(content, threads)
 
 
