@@ -34,6 +34,8 @@ LATER = "students-noise-resolution-law.json"
 """Students of equal size with noise, another resolution or the published law."""
 SCREWDRIVER = "students-screwdriver.json"
 """Students of equal size that spin a screwdriver, with taxels on the fingers."""
+LONG, TAUGHT = "students-four-times-as-long.json", "students-of-other-teachers.json"
+"""Success in training of six arms that went on; students of equal size of two more teachers."""
 SURE, EARLY = "new", "seen"
 """Groups of types: students trained after the claims were written, and before."""
 KINDS = {
@@ -217,7 +219,8 @@ def student_table(record: Mapping[str, Any]) -> str:
         gain = "" if arm.startswith("none") else f"{(effect.value - low) / (high - low):.0%}"
         bounds = f" [{effect.interval.low:.2f}, {effect.interval.high:.2f}]" if is_finite(effect.interval) else ""
         rows.append([in_words(arm), str(len(of)), f"{effect.value:.2f}{bounds}", single, turns, gain])
-    names = ["what it feels", "students", "success", "each", "quarter turns in 10 s", "of the way to the teacher"]
+    counted = record.get("counted", "quarter turns in 10 s")
+    names = ["what it feels", "students", "success", "each", counted, "of the way to the teacher"]
     return table(names, rows)
 
 
@@ -238,8 +241,18 @@ def order_table(records: Sequence[Mapping[str, Any]]) -> str:
                     sides = [[curves[arm, seed][step] for arm in shared] for seed in (left, right)]
                     values.append(float(np.array(kendalltau(*sides))[0]))
             last = float(np.array(kendalltau(means[step], means[steps[-1]]))[0])
-            rows.append([record["name"], step, f"{fmean(values):.2f}", f"{last:.2f}"])
+            rows.append([record["name"], step, f"{fmean(values):.2f}" if values else "–", f"{last:.2f}"])
     return table(["students", "iterations", "τ of two seeds (mean)", "τ with the last"], rows)
+
+
+def teacher_table(record: Mapping[str, Any]) -> str:
+    """Return success of the arms whose students had several teachers, those of the first one as a mean."""
+    first, rows = arms_of(record_of(EQUAL)), []
+    for arm in dict.fromkeys(row["arm"] for row in record["students"]):
+        others = [f"{row['success']:.3f}" for row in record["students"] if row["arm"] == arm]
+        rows.append([in_words(arm), f"{fmean(first[arm]):.3f} ({len(first[arm])})", *others])
+    own = ["success of the teacher", *(f"{success:.3f}" for success in record["teachers"].values())]
+    return table(["students", *record["teachers"]], [*rows, own])
 
 
 def figure(records: Sequence[Mapping[str, Any]]) -> Drawing:
@@ -283,22 +296,28 @@ def stimuli_table() -> str:
 
 def write_pages(out: Path, decorate: Callable[[Drawing], str] = standalone) -> list[Path]:
     """Write the page "Which touch should my hand have?" and figure 4.6 into a folder; return the files."""
-    records = [record_of(EQUAL), compared(), record_of(PUBLISHED)]
+    records = [record_of(EQUAL), compared(), record_of(SCREWDRIVER), record_of(PUBLISHED)]
     template = Template(Path(__file__).with_name("which-touch.md").read_text(encoding="utf-8"))
-    students, later, published = map(student_table, records)
-    text = template.substitute(students=students, later=later, published=published)
+    tables = dict(zip(("students", "later", "screwdriver", "published"), map(student_table, records), strict=True))
+    text = template.substitute(tables, teachers=teacher_table(record_of(TAUGHT)))
     return [write_text(out / TOUCH_PAGE, text), write_text(out / FIGURE, decorate(figure(records)))]
 
 
 def main() -> None:
     options = script_parser(__doc__).parse_args()
-    records, more = [record_of(EQUAL), record_of(PUBLISHED)], compared()
+    records, more = [record_of(EQUAL), record_of(PUBLISHED), record_of(SCREWDRIVER)], compared()
     head, rows = claim_rows()
     parts = [
         f"{start}: `{record['command']}`, {record['where']}; {record['notes']}\n\n{student_table(record)}"
-        for start, record in (("Students", records[0]), ("Noise, resolution and law", more))
+        for start, record in (
+            ("Students", records[0]),
+            ("Noise, resolution and law", more),
+            ("Screwdriver", records[2]),
+        )
     ]
-    orders = f"Order of the arms by success in training:\n\n{order_table(records)}"
+    taught = record_of(TAUGHT)
+    parts.append(f"Teachers: `{taught['command']}`; {taught['notes']}\n\n{teacher_table(taught)}")
+    orders = f"Order of the arms by success in training:\n\n{order_table([*records, record_of(LONG)])}"
     body = "\n\n".join([*parts, table(head, rows), RULE, orders])
     publish(options, "Students by what they feel", body, subject="policies", where="records, no simulation")
 

@@ -19,7 +19,6 @@ import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -236,6 +235,7 @@ MOST_ONNX = 2 << 30  # bytes of an ONNX file, which Protocol Buffers allow
 MOST_INPUT = 1 << 26  # numbers of one input
 TOLERANCE = 1e-4  # largest difference between the file and the network, relative to the largest feature
 _STEPS = 8
+_SOUND: set[str] = set()  # hashes of ONNX files that were tried in this process
 
 
 @dataclass(frozen=True)
@@ -329,29 +329,19 @@ def _write(step: Any, path: Path, format: str) -> None:
     program.save(str(path), external_data=False)
 
 
-_SOUND: set[str] = set()
-"""Hashes of ONNX files that were tried in this process."""
-_TRYING = Lock()
-
-
 def onnx_session(path: str | Path, threads: int | None = None) -> Any:
     """Return ONNX Runtime's session of a file on the CPU, with its own choice of threads if None.
 
-    Another process with limits computes a step of zeros with it first: damage ends that one. Bytes that passed are not
-    tried again.
+    Another process with limits computes a step of zeros with it first, once for the same bytes: damage ends that one.
     """
     file = check_file(path, "ONNX file", most=MOST_ONNX)
     name, content = brief(os.fspath(path)), file.read_bytes()
-    digest = hashlib.sha256(content).hexdigest()
-    with _TRYING:
-        if digest not in _SOUND:
-            fault, tried = call_apart(f"{__name__}:try_onnx", [os.fspath(file.absolute())], SECONDS) or (CRASHED, "")
-            if fault:
-                raise DataError(f"{name} {fault}.")
-            # What was tried and no other bytes; without a folder, so that it names no files beside it.
-            if tried != digest:
-                raise DataError(f"{name} changed while it was read; wait until it is complete.")
-            _SOUND.add(digest)
+    if (digest := hashlib.sha256(content).hexdigest()) not in _SOUND:
+        fault, tried = call_apart(f"{__name__}:try_onnx", [os.fspath(file.absolute())], SECONDS) or (CRASHED, "")
+        # What was tried and no other bytes; without a folder, so that it names no files beside it.
+        if fault or tried != digest:
+            raise DataError(f"{name} {fault or 'changed while it was read; wait until it is complete'}.")
+        _SOUND.add(digest)
     return _session(content, threads)
 
 

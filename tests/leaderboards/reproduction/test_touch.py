@@ -24,6 +24,13 @@ PLACEMENT = {"rule": "mean", "pairs": [["{} hand", "{} tips"]]}
 FELT = {"rule": "least", "pairs": [["{} hand", "none, memory"], ["{} tips", "none, memory"]]}
 
 
+def test_a_claim_of_likeness_holds_within_its_margin():
+    alike = {"rule": "least", "pairs": [["{} hand", "depth hand"], ["depth hand", "{} hand"]], "margin": 0.1}
+    for ahead, verdict in ((0.0, "holds"), (0.3, "does not hold")):
+        arms = _arms(0.5, 0.5) | {"bool hand": [0.495 + ahead, 0.505 + ahead]}
+        assert TOUCH.judge_claim(alike, TYPES, arms, 0.95).verdict == verdict
+
+
 @pytest.mark.parametrize(
     ("hand", "tips", "verdict"), [(0.8, 0.5, "holds"), (0.5, 0.8, "does not hold"), (0.6, 0.6, "undecided")]
 )
@@ -73,8 +80,8 @@ def test_claims_name_arms_of_the_records_and_say_what_a_test_would_take():
 def test_page_and_figure_hold_every_arm_in_words(tmp_path):
     page, figure = TOUCH.write_pages(tmp_path)
     text, words = page.read_text(encoding="utf-8"), "".join(ElementTree.parse(figure).getroot().itertext())
-    arms = {row["arm"] for row in TOUCH.record_of(TOUCH.EQUAL)["students"]}
-    assert len(arms) == 20
+    arms = {row["arm"] for name in (TOUCH.EQUAL, TOUCH.SCREWDRIVER) for row in TOUCH.record_of(name)["students"]}
+    assert len(arms) == 29
     for arm in arms:
         assert "_" not in TOUCH.in_words(arm)
         assert f"| {TOUCH.in_words(arm)} |" in text
