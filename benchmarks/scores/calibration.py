@@ -285,15 +285,7 @@ def corrections(run: Run) -> Result:
                 both = np.concatenate([other[None], one[1:]])
                 found.append(step_down(both)[0] <= 0.05)
                 alone.append((other >= other[0] - 1e-12).mean() <= 0.05)
-        rows.append(
-            [
-                str(count),
-                share(np.array(alarms)),
-                share(np.array(naive)),
-                share(np.array(found)),
-                share(np.array(alone)),
-            ]
-        )
+        rows.append([str(count), *(share(np.array(hits)) for hits in (alarms, naive, found, alone))])
     return Result(
         "Many models at once: P(any model called significant) when none is, and finding the one that is",
         ["models", "corrected", "uncorrected", "true model found, corrected", "alone"],

@@ -23,22 +23,13 @@ from brainbench.stimuli.whiskers.array import WhiskerArray
 from brainbench.stimuli.whiskers.whisker import build_chain
 
 
-def free(
-    device_name: str,
-    lanes: int,
-    links: int,
-    steps: int,
-    block: int,
-    bounds: tuple[int, int] | None = None,
-    precision: str = "single",
-    twists: bool = False,
-) -> None:
+def free(device_name: str, lanes: int, links: int, steps: int, twists: bool) -> None:
     """Whiskers that swing under gravity, nothing near: pure integration; in their plane, or out of it, which twists."""
     step = 1e-4
-    fidelity = Fidelity(links=links, time_step=step, precision=precision)
+    fidelity = Fidelity(links=links, time_step=step, precision="single")
     chains = [build_chain(mount.whisker, links) for mount in WhiskerArray.mouse()]
     device, gravity = pick_device(device_name), (0.0, 0.0, -9.81) if twists else (0.0, -9.81, 0.0)
-    solver = WhiskerSolver(chains, fidelity, device, NOTHING, twists=twists, block=block, bounds=bounds)
+    solver = WhiskerSolver(chains, fidelity, device, NOTHING, twists=twists, block=BLOCK)
     motions, shapes = PackedMotions(), PackedShapes()
     motions.add_straight(still_knots(np.zeros(3), np.array([1.0, 0, 0, 0])))
     shapes.first.append(0)
@@ -51,35 +42,22 @@ def free(
         kernels.append(result.seconds["kernel"])
     seconds = statistics.median(kernels[1:])
     print(
-        f"free  N={links} {'twist' if twists else 'bending'} {precision} lanes={lanes} block={block} bounds={bounds}: "
+        f"free  N={links} {'twist' if twists else 'bending'} single lanes={lanes}: "
         f"{int(result.steps.astype(np.int64).sum()) / seconds:.3e} whisker-steps/s "
         f"({seconds:.3f} s, {int((result.counts['status'] != 0).sum())} failed)",
         flush=True,
     )
 
 
-def _bounds(words: str) -> tuple[int, int] | None:
-    if words == "0":
-        return None
-    threads, blocks = words.split("x")
-    return int(threads), int(blocks)
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--device", default="cuda")
     parser.add_argument("--lanes", type=int, default=262_144)
-    parser.add_argument("--blocks", default=str(BLOCK), help="threads of a block, several by commas")
-    parser.add_argument("--bounds", default="0", help="CUDA launch bounds such as 64x6, several by commas; 0 = none")
     args = parser.parse_args()
     small = args.device == "cpu"
-    blocks = [int(words) for words in args.blocks.split(",")]
-    limits = [_bounds(words) for words in args.bounds.split(",")]
     lanes, steps = (60, 200) if small else (args.lanes, 100)
-    for links, twists, block, bounds in itertools.product((10, 20), (False, True), blocks, limits):
-        # CUDA refuses blocks of more threads than a kernel was compiled for.
-        if bounds is None or block <= bounds[0]:
-            free(args.device, lanes, links, steps, block, bounds, twists=twists)
+    for links, twists in itertools.product((10, 20), (False, True)):
+        free(args.device, lanes, links, steps, twists)
 
 
 if __name__ == "__main__":
