@@ -364,17 +364,9 @@ def recovery(run: Run) -> Result:
             value = raw / np.sqrt(np.where(reliability > 0, reliability, np.nan))
         trusted = reliability >= 0.5
         kept = value[trusted]
-        rows.append(
-            [
-                f"{reliability.mean():.3f}",
-                f"{pool.truth.mean():.3f}",
-                f"{raw.mean():.3f}",
-                f"{np.nanmean(value):.3f}",
-                f"{kept.mean():.3f} ± {kept.std() / math.sqrt(len(kept)):.3f}" if len(kept) > 1 else "–",
-                f"{1 - trusted.mean():.1%}",
-            ]
-        )
-
+        means = (reliability.mean(), pool.truth.mean(), raw.mean(), np.nanmean(value))
+        sure = f"{kept.mean():.3f} ± {kept.std() / math.sqrt(len(kept)):.3f}" if len(kept) > 1 else "–"
+        rows.append([*map("{:.3f}".format, means), sure, f"{1 - trusted.mean():.1%}"])
     return Result(
         "A true comparison near .954, corrected for noise",
         ["mean reliability", "truth", "raw r", "corrected, everyone", "corrected, reliable ones", "flagged"],
@@ -421,17 +413,10 @@ def ceiling(run: Run) -> Result:
                 true[index] = raw[pick].mean()
             expected = bounds.mean(axis=0)
             inside = expected[0] <= raw.mean() <= expected[1]
-            rows.append(
-                [
-                    f"{np.mean([s.reliability for s in pool.subjects]):.2f}",
-                    str(animals),
-                    f"{expected[0]:.3f}",
-                    f"{raw.mean():.3f}",
-                    f"{expected[1]:.3f}",
-                    "yes" if inside else "no",
-                    share((bounds[:, 0] <= true) & (true <= bounds[:, 1])),
-                ]
-            )
+            reliability = f"{np.mean([s.reliability for s in pool.subjects]):.2f}"
+            means = map("{:.3f}".format, (expected[0], raw.mean(), expected[1]))
+            within = share((bounds[:, 0] <= true) & (true <= bounds[:, 1]))
+            rows.append([reliability, str(animals), *means, "yes" if inside else "no", within])
     columns = ["reliability", "animals", "mean lower", "true model", "mean upper", "between", "between in one study"]
     return Result("Noise ceilings and what the shared geometry itself reaches (raw r)", columns, rows)
 
