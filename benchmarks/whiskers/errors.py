@@ -75,7 +75,7 @@ def measure(backend: str, setting: str, group: str, scenes: Sequence[tuple[Job, 
     interval = wilson_interval(covered, len(errors))
     return [
         setting, group, f"{len(errors)} of {len(scenes)}",
-        *(f"{100 * np.quantile(errors, share):.2g}" for share in (0.5, 0.9, 1.0)),
+        *(f"{100 * np.quantile(errors, share):.3g}" for share in (0.5, 0.9, 1.0)),
         f"{covered / len(errors):.1%} [{interval.low:.1%}, {interval.high:.1%}]",
         *(f"{np.quantile(estimates / errors, share, method='higher'):.2g}" for share in (0.5, 0.9)),
         str(int((silent & (errors > LARGE)).sum())),

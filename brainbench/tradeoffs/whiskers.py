@@ -161,7 +161,7 @@ def charts(rows: Sequence[Row]) -> list[Panel]:
     presets = {tuple(vars(Fidelity.preset(name))[item] for item in RESOLUTION): name for name in list_presets()}
     bench, hollow = ([row for row in rows if bool(row.get("collision")) is concave] for concave in (False, True))
     in_contact = Panel(
-        "whiskers in contact, against a converged simulation", *words, bench,
+        "an object on one side", *words, bench,
         series=lambda row: row["backend"] + ("" if _moves(row) else ", without inertia"),
         label=lambda row: presets.get(tuple(row.get(item) for item in RESOLUTION), ""),
     )  # fmt: skip
@@ -169,7 +169,9 @@ def charts(rows: Sequence[Row]) -> list[Panel]:
         "hollow objects, by collision surface", *words, hollow,
         series=lambda row: f"{row['collision']}, {row['backend']}",
     )  # fmt: skip
-    return [in_contact, by_surface] if hollow else [in_contact]
+    hard = [row for row in bench if row.get("hard_90")]
+    both = replace(in_contact, title="both sides, slips and releases", error="hard_90", rows=hard)
+    return [in_contact, *([both] if hard else []), *([by_surface] if hollow else [])]
 
 
 def _fields(setting: SimulationSetting) -> Row:

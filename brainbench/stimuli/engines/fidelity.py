@@ -191,7 +191,8 @@ def list_presets() -> tuple[str, ...]:
 def measured(backend: str = DEFAULT_ENGINE) -> tuple[TradeoffPoint, ...]:
     """Return the measured settings of a backend: the error below which half of the whiskers stay, and the cost.
 
-    Cost is in processor s per whisker-second. A backend that was not measured is a :class:`UsageError`.
+    Both with an object on one side; what errs more elsewhere is for the estimate of each whisker to find. Cost is in
+    processor s per whisker-second. A backend that was not measured is a :class:`UsageError`.
     """
     import json
 
@@ -199,9 +200,8 @@ def measured(backend: str = DEFAULT_ENGINE) -> tuple[TradeoffPoint, ...]:
     points: dict[str, list[TradeoffPoint]] = {}
     for point in json.loads(text)["points"]:
         if not point.get("collision") and point.get("solver", "dynamic") == "dynamic":
-            names = ("error_50", "hard_50", "cost")
-            *errors, cost = (math.inf if point[name] is None else point[name] for name in names if name in point)
+            error, cost = (math.inf if point[name] is None else point[name] for name in ("error_50", "cost"))
             settings = {name: point.get(name) for name in RESOLUTION}
-            points.setdefault(point["backend"], []).append(TradeoffPoint(max(errors), cost, settings))
+            points.setdefault(point["backend"], []).append(TradeoffPoint(error, cost, settings))
     check_name("measured backend", backend, points)
     return tuple(points[backend])

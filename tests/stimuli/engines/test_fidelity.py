@@ -1,12 +1,14 @@
 """Presets and the measured table behind them."""
 
+import json
 from dataclasses import replace
+from importlib import resources
 
 import pytest
 
 from brainbench.core.errors import UsageError
 from brainbench.core.files import to_plain
-from brainbench.stimuli.engines.fidelity import Fidelity, list_presets, measured
+from brainbench.stimuli.engines.fidelity import RESOLUTION, Fidelity, list_presets, measured
 
 
 def _table():
@@ -16,6 +18,27 @@ def _table():
 def test_presets_are_on_record_as_accurate_as_they_promise():
     for name, promise in zip(list_presets(), (0.04, 0.02, 0.008), strict=True):
         assert _table()[Fidelity.preset(name)].error <= promise
+
+
+TAILS = {
+    "fast": (0.052, 0.29, 4.2),
+    "balanced": (0.033, 0.2, 1.0),
+    "accurate": (0.02, 0.17, 0.52),
+}
+"""Errors between objects, on slipping off and on release as the documentation says: median, 90 %, worst."""
+
+
+def test_tails_of_presets_are_on_record_as_the_documentation_says():
+    text = resources.files("brainbench.stimuli").joinpath("fidelity_table.json").read_text(encoding="utf-8")
+    points = {_setting(point): point for point in json.loads(text)["points"] if not point.get("collision")}
+    for preset, tails in TAILS.items():
+        point = points["rod", Fidelity.preset(preset)]
+        assert [point[f"hard_{name}"] for name in ("50", "90", "worst")] == pytest.approx(tails, rel=0.05)
+        assert point["error_50"] < point["hard_50"]
+
+
+def _setting(point):
+    return point["backend"], Fidelity(**{name: point.get(name) for name in RESOLUTION} | {"solver": point["solver"]})
 
 
 def test_presets_cost_more_as_they_get_more_accurate():
