@@ -37,12 +37,14 @@ def inspect(
 ) -> Output:
     """Show what a file holds and which --conditions could label its trials."""
     from brainbench.datasets import inspect as inspect_file
+    from brainbench.datasets.rdm_files import HoldsRDMsError
 
-    if (stored := _stored(path)) is not None:
-        return Output(stored, f"{path} (rsatoolbox)\n{_described(stored)}\n{facts(stored.contents)}")
     files = _found(path)
-    with progress_bar() as progress:
-        inspection = inspect_file(files, strict=strict, progress=progress)
+    try:
+        with progress_bar() as progress:
+            inspection = inspect_file(files, strict=strict, progress=progress)
+    except HoldsRDMsError as error:
+        return Output(error.rdms, f"{path} (rsatoolbox)\n{_described(error.rdms)}\n{facts(error.rdms.contents)}")
     return Output(inspection, str(inspection))
 
 
@@ -63,6 +65,7 @@ def rdm(
 
     from brainbench.core.errors import UsageError
     from brainbench.datasets import StoredRDMs, write_rdms
+    from brainbench.datasets.rdm_files import HoldsRDMsError
     from brainbench.datasets.trials.session_trials import pooled
     from brainbench.scoring.neural_responses import open_neural_responses
     from brainbench.scoring.options import ScoreOptions
@@ -72,12 +75,14 @@ def rdm(
         raise UsageError(
             f"--out is a file that ends in .h5, from which rsatoolbox tells its kind; received {out.name!r}."
         )
-    if (stored := _stored(source)) is not None:
+    try:
+        with progress_bar() as progress:
+            brain = open_neural_responses(source, **options, progress=progress)
+    except HoldsRDMsError as error:
         if out is not None or any(options.values()):
-            raise UsageError(f"{source} holds RDMs and no trials; leave out what chooses trials, and --out.")
+            raise UsageError(f"{source} holds RDMs and no trials; leave out what chooses trials, and --out.") from error
+        stored = error.rdms
         return Output(stored, _described(stored) + _matrices("RDM", stored.stimuli, stored.names, stored.values))
-    with progress_bar() as progress:
-        brain = open_neural_responses(source, **options, progress=progress)
     brain = replace(brain, dataset=pooled(brain.dataset, pool))
     labels = brain.vocabulary
     animals = brain.animals(labels, measure, ScoreOptions(seed=seed))
@@ -179,10 +184,11 @@ def _of_rdms(metric: str) -> RSA:
 
 def _stored(source: str) -> StoredRDMs | None:
     """Return the RDMs that a file of rsatoolbox holds; None of whatever is no such file."""
+    import h5py
+
     from brainbench.datasets import read_rdms
 
-    path = Path(source)
-    return read_rdms(path) if path.suffix.lower() in (".h5", ".hdf5") and path.is_file() else None
+    return read_rdms(source) if Path(source).is_file() and h5py.is_hdf5(source) else None
 
 
 def _described(stored: StoredRDMs) -> str:

@@ -58,20 +58,29 @@ def is_rdms(file: h5py.File) -> bool:
     return {"dissimilarities", "pattern_descriptors", "rdm_descriptors"} <= {*file}
 
 
+class HoldsRDMsError(DataError):
+    """A file where recordings were expected holds RDMs, ``rdms``."""
+
+    rdms: StoredRDMs
+
+
 def read_rdms(path: str | os.PathLike[str]) -> StoredRDMs | None:
     """Return the RDMs of a file; None of any other HDF5 file. ``stimulus`` names the stimuli, else the only text that
     differs for all of them, else their number.
     """
     with open_hdf5(path, "file of RDMs") as file:
-        if not is_rdms(file):
-            return None
-        node: Any = file["dissimilarities"]
-        values: Any = np.asarray(node[...]) if hasattr(node, "dtype") else np.zeros(0)
-        if values.ndim != 2 or values.dtype.kind not in "fiu" or not values.size:
-            raise DataError(f"{path} has dissimilarities of the shape {list(values.shape)}; expected [RDMs, pairs].")
-        patterns, rdms = (_descriptors(file[f"{name}_descriptors"]) for name in ("pattern", "rdm"))
-        about = _descriptors(file["descriptors"]) if "descriptors" in file else {}
-        measure = text(file.attrs.get("dissimilarity_measure", ""))
+        return rdms_of(file, path) if is_rdms(file) else None
+
+
+def rdms_of(file: h5py.File, path: str | os.PathLike[str]) -> StoredRDMs:
+    """Return the RDMs of an open file."""
+    node: Any = file["dissimilarities"]
+    values: Any = np.asarray(node[...]) if hasattr(node, "dtype") else np.zeros(0)
+    if values.ndim != 2 or values.dtype.kind not in "fiu" or not values.size:
+        raise DataError(f"{path} has dissimilarities of the shape {list(values.shape)}; expected [RDMs, pairs].")
+    patterns, rdms = (_descriptors(file[f"{name}_descriptors"]) for name in ("pattern", "rdm"))
+    about = _descriptors(file["descriptors"]) if "descriptors" in file else {}
+    measure = text(file.attrs.get("dissimilarity_measure", ""))
     number = round((1 + np.sqrt(1 + 8 * values.shape[1])) / 2)
     if number * (number - 1) // 2 != values.shape[1] or number < 3:
         raise DataError(f"{path} has {values.shape[1]} dissimilarities in an RDM, which are no pairs of three or more.")
@@ -80,9 +89,14 @@ def read_rdms(path: str | os.PathLike[str]) -> StoredRDMs | None:
             if len(entries) != size:
                 raise DataError(f"The descriptor {name!r} of {path} has {len(entries)} values for {size} {what}.")
     labels, note = _names(patterns, LABELS, number)
-    names, _ = _names(rdms, NAMES, len(values))
+    names = _names(rdms, NAMES, len(values))[0]
+    if repeats(animals := as_labels(rdms.get(NAMES, ())).tolist()):  # several sessions of an animal, say
+        names = tuple(f"{name} ({animals[: place + 1].count(name)})" for place, name in enumerate(animals))
     columns = {name: entries for name, entries in rdms.items() if name not in ("index", NAMES)}
-    stated = {name: ", ".join(map(str, entries)) for name, entries in about.items()}
+    parts = {name: np.ravel(entries).tolist() for name, entries in about.items()}
+    stated = {
+        name: listing(map(str, entries), limit=8, quoted=False) if entries else "" for name, entries in parts.items()
+    }
     if np.isinf(values).any():
         raise DataError(f"{path} has infinite dissimilarities; NaN stands for a missing one.")
     return StoredRDMs(values.astype(np.float64), labels, names, measure, columns, stated, note)
@@ -110,19 +124,26 @@ def _descriptors(group: Any) -> dict[str, list[Any]]:
     columns: dict[str, list[Any]] = {name: [text(value)] for name, value in group.attrs.items()}
     for name, node in group.items():
         parts = [node[str(place)] for place in range(len(node))] if hasattr(node, "keys") else [node]
-        values = [decode(part[...]).ravel().tolist() for part in parts if part.shape is not None]
+        values = [decode(np.atleast_1d(part[...])).tolist() for part in parts if part.shape is not None]
         columns[name] = values[0] if len(parts) == 1 and values else [str(entry) for entry in values]
     return columns
 
 
 def _names(columns: Mapping[str, list[Any]], wanted: str, number: int) -> tuple[tuple[str, ...], str]:
     """Return a name for each of so many, and a note where others would do."""
-    labels = {name: tuple(as_labels(np.array(values)).tolist()) for name, values in columns.items() if name != "index"}
+    flat = {name: np.array(values) for name, values in columns.items() if name != "index"}
+    labels = {name: tuple(as_labels(values).tolist()) for name, values in flat.items() if values.ndim == 1}
     distinct = {name: texts for name, texts in labels.items() if all(texts) and not repeats(texts)}
     texts = [name for name in distinct if np.array(columns[name]).dtype.kind == "U"]
     chosen = wanted if wanted in distinct else next(iter(sorted(texts) or sorted(distinct)), None)
     if chosen is None:
-        return tuple(map(str, range(1, number + 1))), ""
+        note = f"stimuli are numbered, since {listing(labels)} does not tell all of them apart" if labels else ""
+        return tuple(map(str, range(1, number + 1))), note
     others = sorted({*texts} - {chosen})
     note = f"stimuli are called by {chosen!r} of {listing([chosen, *others])}" if others and chosen != wanted else ""
+    note = (
+        f"stimuli are called by {chosen!r}, since {wanted!r} does not tell all of them apart"
+        if wanted in {*labels} - {*distinct}
+        else note
+    )
     return distinct[chosen], note

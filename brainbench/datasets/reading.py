@@ -149,10 +149,12 @@ def _check_kind(file: h5py.File, path: Path) -> None:
     if hdf5.is_ours(file) or nwb.is_nwb(file) or temporaldata.is_temporaldata(file):
         return
     if rdm_files.is_rdms(file):
-        raise DataError(
+        error = rdm_files.HoldsRDMsError(
             f"{path} holds RDMs without trials, whose noise nobody can estimate, so no score on it would be honest; "
             f"compare them with a model as they are: brainbench recordings compare {path} MODEL."
         )
+        error.rdms = rdm_files.rdms_of(file, path)
+        raise error
     inside = ", ".join(list(file)[:8]) or "nothing"
     raise DataError(
         f"{path} is HDF5 but neither NWB nor temporaldata nor the {hdf5.FORMAT} layout: it holds {inside}. "

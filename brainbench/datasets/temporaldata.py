@@ -8,6 +8,7 @@ tables are ``Interval``, signals are columns [time, cell] of series, and ``Data`
 
 from __future__ import annotations
 
+import logging
 import math
 import os
 from collections.abc import Iterator
@@ -28,9 +29,11 @@ from brainbench.datasets.trials.counting import merged
 if TYPE_CHECKING:
     import h5py
 
+_LOG = logging.getLogger(__name__)
 IRREGULAR, REGULAR = "IrregularTimeSeries", "RegularTimeSeries"
 _CLASSES = ("Data", "ArrayDict", "Interval", IRREGULAR, REGULAR)
 _TIMES = {"start": "start_time", "end": "stop_time"}  # columns of every interval → their names here
+_PARTS = ("brainset", "subject", "session", "spikes", "units", OBSERVED)  # of every file
 _LONGEST = 1e7  # seconds of a session, each of which gets an entry; more are other units of time
 
 
@@ -66,8 +69,8 @@ def read_temporaldata(file: h5py.File, path: Path) -> Session:
                 # Columns that a table describes are cells; all else is behaviour.
                 columns = _cells_of(series, dicts)
                 (signals if columns else others)[series.name] = replace(series, columns=columns)
-    about = {name: getattr(groups.get(name), "attrs", {}) for name in ("subject", "session")}
-    subject, session = (text(attributes.get("id", "")).strip() for attributes in about.values())
+    about = {name: getattr(groups.get(name), "attrs", {}) for name in ("subject", "session", "brainset")}
+    subject, session, _ = (text(attributes.get("id", "")).strip() for attributes in about.values())
     name = subject or named_by_file(path, "sub")
     note = f"{path.name}: no id of a subject; the subject {name!r} was taken from the file name"
     return Session(
@@ -78,10 +81,10 @@ def read_temporaldata(file: h5py.File, path: Path) -> Session:
         source=str(path),
         start=text(about["session"].get("recording_date", "")),
         format="temporaldata",
-        synthetic=bool(file.attrs.get("synthetic", False)),
+        synthetic=bool(about["brainset"].get("synthetic", False)),
         notes=() if subject else (note,),
         series=others,
-        stimuli=text(file.attrs.get("stimuli", "")),
+        stimuli=text(about["brainset"].get("stimuli", "")),
         guessed=not subject and name == path.stem,
         populations={**units, **signals},
     )
@@ -150,26 +153,38 @@ def write_temporaldata(path: str | os.PathLike[str], session: Session) -> Path:
     """Write one session: its spikes, else its signals, with its tables, as ``temporaldata.Data.load`` reads them."""
     with create_hdf5(path) as file:
         _object(file, "Data")
-        file.attrs.update({"synthetic": session.synthetic, "stimuli": session.stimuli})
         about = {"brainset": "brainbench", "subject": session.subject, "session": session.session}
         for name, identity in about.items():
             _group(file, name, "Data").attrs["id"] = identity
+        # Not of the file: temporaldata shows one of an attribute and a table of the same name.
+        file["brainset"].attrs.update({"synthetic": session.synthetic, "stimuli": session.stimuli})
         if session.start:
             file["session"].attrs["recording_date"] = session.start
         spans = [_write_spikes(file, session)] if session.units is not None else []
-        for name, table in session.tables.items():
+        tables = {_place(name, session): table for name, table in session.tables.items()}
+        for name, table in tables.items():
             spans.append(_write_table(_group(file, name, "Interval"), table, session))
         if session.units is None:
             signals = (item for item in session.populations.values() if isinstance(item, Series) and not item.table)
             spans += [_write_signal(file, series) for series in signals]
         edges = np.concatenate([span for span in spans if len(span)] or [np.zeros((1, 2))])
-        places = (PurePosixPath(name) for name in {**session.tables, **session.populations})
+        places = (PurePosixPath(name) for name in {**tables, **session.populations})
         # Whatever holds others needs the time over which these are known.
         for parent in {parent.as_posix() for place in places for parent in place.parents} | {"."}:
             if parent in file:
                 holder: Any = file[parent]
                 _interval(holder, "domain", np.array([[edges[:, 0].min(), edges[:, 1].max()]]))
     return Path(path)
+
+
+def _place(name: str, session: Session) -> str:
+    """Return where a table stands: below ``intervals`` where it would be in a table, or a part of every file."""
+    inside = any(name.startswith(f"{table}/") for table in session.tables)
+    if name.partition("/")[0] not in _PARTS and name.rpartition("/")[2] != "domain" and not inside:
+        return name
+    place = f"intervals/{name}_table"
+    _LOG.warning("The table %r of %s is called %r in the copy.", name, session.source, place)
+    return place
 
 
 def _write_spikes(file: h5py.File, session: Session) -> NDArray[np.float64]:

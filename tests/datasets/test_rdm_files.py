@@ -40,16 +40,43 @@ def test_rsatoolbox_reads_what_we_write_and_we_what_it_writes(tmp_path):
         ({"conds": ["x", "y", "z"], "name": ["p", "q", "r"]}, ("x", "y", "z"), "'conds' of 'conds', 'name'"),
         ({"angle": [0.5, 1.0, 90.0]}, ("0.5", "1", "90"), ""),
         ({}, ("1", "2", "3"), ""),
+        ({"stimulus": ["x", "x", "z"]}, ("1", "2", "3"), "numbered, since 'stimulus' does not tell all of them apart"),
+        ({"stimulus": ["x", "nan", "z"]}, ("1", "2", "3"), "numbered, since 'stimulus' does not tell"),
+        ({"stimulus": ["x", "x", "z"], "name": ["p", "q", "r"]}, ("p", "q", "r"), "by 'name', since 'stimulus'"),
+        ({"place": [[0, 1], [0, 2], [3, 4]], "name": ["p", "q", "r"]}, ("p", "q", "r"), ""),
     ],
 )
 def test_stimuli_have_the_names_of_the_descriptor_that_tells_them_apart(tmp_path, descriptors, names, note):
-    data = Dataset(np.random.default_rng(0).normal(size=(3, 8)), obs_descriptors=descriptors)
-    rsatoolbox.rdm.calc_rdm(data, method="euclidean").save(str(tmp_path / "a.h5"))
+    values = np.random.default_rng(0).normal(size=(1, 3))
+    rsatoolbox.rdm.RDMs(values, pattern_descriptors=descriptors).save(str(tmp_path / "a.h5"))
     rdms = read_rdms(tmp_path / "a.h5")
     assert rdms.stimuli == names
     assert note in rdms.note
     assert bool(note) == bool(rdms.note)
     assert rdms.names == ("1",)
+
+
+def test_several_rdms_of_an_animal_keep_its_name(tmp_path):
+    values = np.random.default_rng(0).normal(size=(3, 6))
+    descriptors = {"subject": ["m1", "m2", "m1"], "session": [1, 1, 2]}
+    rsatoolbox.rdm.RDMs(values, rdm_descriptors=descriptors).save(str(tmp_path / "a.h5"))
+    rdms = read_rdms(tmp_path / "a.h5")
+    assert rdms.names == ("m1 (1)", "m2 (1)", "m1 (2)")
+    assert rdms.columns == {"session": [1, 1, 2]}
+
+
+@pytest.mark.filterwarnings("ignore:invalid value encountered in cast")  # of rsatoolbox
+@pytest.mark.parametrize("method", ["euclidean", "correlation", "mahalanobis", "crossnobis", "poisson"])
+def test_every_dissimilarity_of_rsatoolbox_is_read_as_it_is_and_long_facts_are_cut(tmp_path, method):
+    folds = {"stimulus": np.repeat([*"abcd"], 4), "run": np.tile(range(4), 4)}
+    data = Dataset(np.random.default_rng(0).uniform(1, 2, size=(16, 5)), obs_descriptors=folds)
+    more = {"cv_descriptor": "run", "noise": np.eye(5)} if method == "crossnobis" else {}
+    theirs = rsatoolbox.rdm.calc_rdm(data, method=method, descriptor="stimulus", **more)
+    theirs.save(str(tmp_path / "rdms.pkl"))  # the ending says nothing: it writes HDF5 by default
+    ours = read_rdms(tmp_path / "rdms.pkl")
+    np.testing.assert_array_equal(ours.values, theirs.dissimilarities)
+    assert (ours.measure, ours.stimuli) == (theirs.dissimilarity_measure, (*"abcd",))
+    assert all(len(text) < 80 for text in ours.about.values())
 
 
 def replaced(place, values):

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import h5py
 import numpy as np
 import pytest
@@ -170,6 +172,31 @@ def test_what_temporaldata_cannot_hold_is_refused(tmp_path):
     with pytest.raises(DataError, match="rows without start_time or stop_time"):
         write_temporaldata(tmp_path / "a.h5", session)
     assert [*tmp_path.iterdir()] == []
+
+
+@pytest.mark.parametrize(
+    ("name", "place"),
+    [
+        ("stimuli", "stimuli"),
+        ("synthetic", "synthetic"),
+        ("a/b", "a/b"),
+        ("session", "intervals/session_table"),
+        ("units/x", "intervals/units/x_table"),
+        ("domain", "intervals/domain_table"),
+        ("trials/inner", "intervals/trials/inner_table"),
+        ("obs_intervals", "intervals/obs_intervals_table"),
+    ],
+)
+def test_a_table_of_any_name_is_in_the_copy(tmp_path, caplog, name, place):
+    session = make_simple_session(stimuli="objects", synthetic=True)
+    path = write_temporaldata(
+        tmp_path / "a.h5",
+        replace(session, tables=session.tables | {name: replace(session.tables["trials"], name=name)}),
+    )
+    copy = open_recordings(path, conditions=f"{place}:stimulus")
+    same(copy, counted(path))
+    assert (copy.attrs["stimuli"], bool(copy.attrs["synthetic"])) == ("objects", True)
+    assert (f"is called {place!r} in the copy" in caplog.text) == (name != place)
 
 
 def test_formats_mix_in_a_folder_and_the_same_spikes_twice_are_refused(tmp_path):
