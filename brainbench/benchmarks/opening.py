@@ -10,10 +10,12 @@ import os
 import re
 import shutil
 import stat
+import unicodedata
 import zipfile
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Annotated, Any, Literal
 
 from brainbench.core.contracts import read_match
@@ -62,6 +64,7 @@ SCHEMA = 1
 Words = Annotated[str, Limit(longest=2_000)]
 Place = Annotated[str, Limit(shortest=1, longest=400)]
 Digest = Annotated[str, Limit(shortest=64, longest=64)]
+_DEVICE = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\.|$)", re.IGNORECASE)  # of Windows, in every folder
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,79}")
 
 
@@ -130,6 +133,15 @@ class Benchmark:
         check_each("option of a benchmark", self.options, OPTIONS)
         for name in self.files:
             check_inside(name)
+        forms = [unicodedata.normalize("NFC", name).casefold() for name in (DEFINITION, *self.files)]
+        counts, folders = Counter(forms), {str(folder) for form in forms for folder in PurePosixPath(form).parents}
+        if wrong := [
+            name for name, form in zip(self.files, forms[1:], strict=True) if counts[form] > 1 or form in folders
+        ]:
+            raise UsageError(
+                f"A benchmark lists {listing(wrong, limit=3)}, which is one with another of its files, or a folder of "
+                "them, on systems that do not tell capitals and forms of letters apart; rename one."
+            )
         check_inside(self.recordings.path.rpartition(":")[2])
 
     @property
@@ -180,10 +192,12 @@ class Benchmark:
 def check_inside(name: str) -> None:
     """Raise a :class:`UsageError` unless a name of a file stays in the folder of the benchmark, on every system."""
     parts = name.split("/")
-    if {"", ".", ".."} & {*parts} or re.search(r'[\\:"|<>]', name) or visible(name) != name:
+    wrong = any(part[-1:] in (*". ", "") or len(part.encode()) > 240 or _DEVICE.match(part) for part in parts)
+    if wrong or re.search(r'[\\:"|<>]', name) or visible(name) != name:
+        near = re.sub(r"[^\w.-]+", "", parts[-1]).strip(".")[:60] or "data"
         raise UsageError(
             f"A benchmark names {brief(name)}, which is no place in its own folder; its files lie there, and are named "
-            f"from there, such as {brief(parts[-1].strip('.') or 'data')}."
+            f"from there, such as {brief(f'file-{near}' if _DEVICE.match(near) else near)}."
         )
 
 

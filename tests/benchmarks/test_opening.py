@@ -99,10 +99,39 @@ def test_a_wrong_entry_is_one_sentence(before, after, sentence):
     assert len(str(error.value)) < 400
 
 
-@pytest.mark.parametrize("name", ["/a", "../a", "a/../b", "a//b", "c:\\a", "a\\b", "a\nb", "", "a/.", "~\u202ea"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "/a",
+        "../a",
+        "a/../b",
+        "a//b",
+        "c:\\a",
+        "a\\b",
+        "a\nb",
+        "",
+        "a/.",
+        "~\u202ea",
+        "a.",
+        "a /b",
+        "aux.nwb",
+        "a" * 250,
+    ],
+)
 def test_a_name_that_leaves_the_folder_is_refused(name):
     with pytest.raises(UsageError, match=r"no place in its own folder"):
         check_inside(name)
+
+
+@pytest.mark.parametrize(
+    "names",
+    [("data/A.nwb", "data/a.nwb"), ("data/é", "data/e\u0301"), ("data", "data/a.nwb"), ("Benchmark.toml",)],
+    ids=["capitals", "Unicode", "folder", "definition"],
+)
+def test_files_that_are_one_on_some_system_are_refused(names):
+    with pytest.raises(UsageError, match=r"which is one with another of its files, or a folder of them") as error:
+        _benchmark(files=dict.fromkeys(names, DIGEST))
+    assert repr(names[0]) in str(error.value)
 
 
 def test_names_within_the_folder_pass():
