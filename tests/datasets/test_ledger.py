@@ -2,7 +2,7 @@ import h5py
 import pytest
 
 from brainbench.core.errors import DataError
-from brainbench.datasets import inspect, open_recordings, write_recordings
+from brainbench.datasets import check, inspect, open_recordings, write_recordings
 from brainbench.datasets.ledger import Ledger, balance_line
 from tests.factories.recording_files import write_nwb
 from tests.factories.recordings import make_simple_session
@@ -67,3 +67,52 @@ def test_files_of_another_tool_beside_nwb_are_no_loss(tmp_path):
         file["x"] = [1]
     opened = open_recordings(tmp_path, conditions="trials:texture", strict=True)
     assert "pose.h5 is HDF5 but neither" in balance_line(opened.attrs["ledger"])
+
+
+def _animals(folder, **labels):
+    """Animals of different spikes whose twelve trials have the labels given, in turn."""
+    folder.mkdir()
+    for seed, (name, stimuli) in enumerate(labels.items()):
+        session = make_simple_session(subject=name, columns={"stimulus": stimuli * (12 // len(stimuli))}, seed=seed)
+        write_recordings(folder / f"{name}.h5", session)
+    return folder
+
+
+def test_data_sets_that_are_not_installed_are_named_and_other_empty_folders_are_not(tmp_path):
+    folder = _animals(tmp_path / "data", m1=["a", "b", "c"])
+    for name in ("sub-m2", "empty"):
+        (folder / name).mkdir()
+    (tmp_path / ".gitmodules").write_text('[submodule "x"]\n\tpath = data/sub-m2\n\turl = ./x\n')
+    recordings = open_recordings(folder, conditions="trials:stimulus")
+    (reason,) = recordings.attrs["skipped"]
+    assert "sub-m2 is a data set of DataLad that is not there yet" in reason
+    assert "datalad get sub-m2" in str(inspect(folder))
+    with pytest.raises(DataError, match="not there yet"):
+        open_recordings(folder, conditions="trials:stimulus", strict=True)
+
+
+@pytest.mark.parametrize(
+    ("labels", "doubted"),
+    [
+        ({"m1": ["ball", "comb"], "m2": ["bal", "comb"]}, True),
+        ({"m1": ["ball", "bal"], "m2": ["ball", "bal"]}, False),  # somebody told them apart
+        ({"m1": ["ball1", "comb"], "m2": ["ball2", "comb"]}, False),  # numbered
+        ({"m1": ["ball", "comb"], "m2": ["fork", "comb"]}, False),
+    ],
+)
+def test_labels_that_differ_in_a_letter_and_are_in_no_animal_both_are_doubted(tmp_path, labels, doubted):
+    folder = _animals(tmp_path / "data", **labels)
+    doubts = open_recordings(folder, conditions="trials:stimulus").attrs["doubts"]
+    assert any("'bal' and 'ball' are spelt alike" in doubt for doubt in doubts) == doubted
+    assert ("spelt alike" in str(check(folder, conditions="trials:stimulus"))) == doubted
+
+
+def test_an_animal_of_which_no_trial_is_left_is_lost(tmp_path):
+    folder = _animals(tmp_path / "data", m1=["a", "b", "c"], m2=["nan"])
+    recordings = open_recordings(folder, conditions="trials:stimulus")
+    animals = recordings.attrs["ledger"]["animals"]
+    assert (animals["found"], animals["read"], animals["left_out"][0]["lost"]) == (2, 1, True)
+    with pytest.raises(DataError, match="m2: no trial is left"):
+        open_recordings(folder, conditions="trials:stimulus", strict=True)
+    chosen = open_recordings(folder, conditions="trials:stimulus", select="subjects=m1", strict=True)
+    assert {*chosen["subject"].values.tolist()} == {"m1"}

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from brainbench.core.errors import DataError, UsageError
+from brainbench.datasets import open_recordings, write_recordings
 from brainbench.datasets.ledger import Ledger
 from brainbench.datasets.sessions import SessionTable, make_session
 from brainbench.datasets.trials.selection import (
@@ -19,6 +20,7 @@ from brainbench.datasets.trials.selection import (
     natural_vocabulary,
     select_rows,
 )
+from tests.factories.recordings import make_simple_session
 
 
 def test_conditions_are_a_table_and_columns():
@@ -313,3 +315,9 @@ def test_an_event_without_its_column_does_not_suggest_itself():
 def test_settings_that_mean_nothing_to_a_window_are_refused(options, told):
     with pytest.raises(UsageError, match=told):
         Window("start", **options)
+
+
+def test_an_area_that_names_no_unit_is_answered_with_the_nearest(tmp_path):
+    path = write_recordings(tmp_path / "a.h5", make_simple_session(unit_columns={"area": ["S1", "S1", "M1"]}))
+    with pytest.raises(UsageError, match=r"Unknown area value 'S2'; did you mean 'S1'\?"):
+        open_recordings(path, conditions="trials:stimulus", select="units.area=S2")
