@@ -219,8 +219,8 @@ def as_label(value: Any, digits: int = 12) -> str:
 
 
 def is_doubtful(label: str) -> bool:
-    """Return whether a label may mean a missing value, such as ``None``, ``#N/A`` or ``--``."""
-    return bool(label) and re.sub(r"[\W_]", "", label).lower() in _DOUBTFUL
+    """Return whether a label may mean a missing value, such as ``None``, ``#N/A``, ``--`` or ``-999``."""
+    return label in ("-99", "-999", "-9999") or (bool(label) and re.sub(r"[\W_]", "", label).lower() in _DOUBTFUL)
 
 
 _SEPARATORS = re.compile(r"(?<=[^\W_])[-_./\s]+(?=[^\W\d_])|(?<=[^\W\d_])[-_./\s]+(?=[^\W_])")

@@ -122,6 +122,7 @@ def _tables(
             continue
         if name in intervals:
             name = place.partition("/")[2] if place.count("/") > 1 else place
+            name = f"/{place}" if name in intervals else name
         if kind == "TimeIntervals" or "start_time" in group or place.count("/") == place.startswith("intervals/") == 1:
             intervals[name] = _table(group, name, path)
         elif kind == "EventsTable" or "timestamp" in group:
@@ -193,8 +194,8 @@ def _table(group: h5py.Group, name: str, path: Path) -> SessionTable:
             continue
         # Numbers follow the first appearance in each file, so only the names mean the same in all files.
         names, numbers = decode(columns.pop(f"{key}_elements")[...]), columns[key][...]
-        if len(numbers) and not int(numbers.max()) < len(names):
-            raise DataError(f"Column {key!r} of table {name!r} of {path} has the number {numbers.max()} of no element.")
+        if wrong := sorted({*np.ravel(numbers).tolist()} - {*range(len(names))}):
+            raise DataError(f"Column {key!r} of table {name!r} of {path} has the number {wrong[0]} of no element.")
         columns[key] = names[numbers]
     declared = [text(key) for key in group.attrs.get("colnames", ())]
     order = [key for key in declared if key in columns] + [key for key in columns if key not in declared]

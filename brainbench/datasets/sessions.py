@@ -102,6 +102,8 @@ class SessionTable:
         self.require(name)
         if name in self.index:
             raise DataError(f"Column {name!r} of {self.label} holds a list per row; choose one with a single value.")
+        if neurodata_type(self.data[name]) == "DynamicTableRegion":
+            raise DataError(f"Column {name!r} of {self.label} holds rows of another table; choose a column of values.")
         values = self.data[name][...]
         if (names := (values.dtype.metadata or {}).get("enum")) is not None:
             # The numbers of an HDF5 enumeration may differ between files; its names are what was meant.
@@ -125,6 +127,13 @@ class SessionTable:
         values = self.column(name)
         if values.dtype.kind == "U":
             raise DataError(f"Column {name!r} of {self.label} holds text ({values[0]!r}); expected times in seconds.")
+        return self._exact(name, values)
+
+    def _exact(self, name: str, values: NDArray[Any]) -> NDArray[np.float64]:
+        """Return times as float64, if their type tells them apart to some milliseconds."""
+        sizes = np.abs(values[np.isfinite(values)])
+        if values.dtype.kind == "f" and len(sizes) and (step := float(np.spacing(sizes.max()))) > 5e-3:
+            raise DataError(f"{name} of {self.label} are {values.dtype}, in steps of {step:.2g} s; write float64.")
         return values.astype(np.float64)
 
     def ids(self) -> NDArray[Any]:
@@ -154,7 +163,8 @@ class SessionTable:
     def rows(self, name: str) -> list[NDArray[np.float64]]:
         """Read a ragged column of numbers: one array per row."""
         ends = self.ends(name)
-        flat = np.asarray(self.data[name][...], dtype=np.float64)
+        flat = np.asarray(self.data[name][...])
+        flat = self._exact(name, flat) if name == SPIKES else flat.astype(np.float64)
         flat = flat.ravel() if flat.size == max(flat.shape) else flat
         bad = ~np.isfinite(flat)
         if bad.any():

@@ -136,6 +136,45 @@ def template(file):
     file["identifier"][()] = "template"
 
 
+def elements(*numbers):
+    def edit(file):
+        put(file, f"{TRIALS}/stimulus", np.array([2, 0, 1, *numbers])[np.arange(12) % (3 + len(numbers))], "EnumData")
+        put(file, f"{TRIALS}/stimulus_elements", NAMES[[1, 2, 0]])
+
+    return edit
+
+
+def rows_of_a_table(file):
+    put(file, "general/tools/name", NAMES)
+    put(file, f"{TRIALS}/stimulus", np.arange(12) % 3, "DynamicTableRegion", table=file["general/tools"].ref)
+
+
+def invalid(start, stop):
+    def edit(file):
+        for name, value in {"id": 0, "start_time": start, "stop_time": stop}.items():
+            put(file, f"intervals/invalid_times/{name}", np.array([value]))
+        file["intervals/invalid_times"].attrs["neurodata_type"] = "TimeIntervals"
+
+    return edit
+
+
+def trials_twice(file):
+    file.copy(TRIALS, "trials")
+    put(file, "trials/start_time", file["trials/start_time"][...] + 0.3)
+
+
+def unit_twice(file):
+    times, ends = file["units/spike_times"][...], file["units/spike_times_index"][...]
+    put(file, "units/spike_times", np.append(times, times[: ends[0]]))
+    put(file, "units/spike_times_index", np.append(ends, ends[-1] + ends[0]))
+    put(file, "units/id", np.arange(5))
+
+
+def spikes_twice(file):
+    put(file, "units/spike_times", np.repeat(file["units/spike_times"][...], 2))
+    put(file, "units/spike_times_index", 2 * file["units/spike_times_index"][...])
+
+
 FILE = {
     "plain": (lambda file: None, "same"),
     **{f"{place} {form}": (shaped(place, turn), "same") for place in SHAPED for form, turn in SHAPES.items()},
@@ -158,6 +197,21 @@ FILE = {
     **{f"dead {place}, not needed": (linked(place), "same") for place in UNNEEDED},
     **{f"filter {code}": (packed(code), rf"filter {code}.*hdf5plugin") for code in (32001, 32004, 32013, 32015)},
     "template identifier": (template, "same"),
+    "elements": (elements(), "same"),
+    "element of no name": (elements(-1), r"has the number -1 of no element"),
+    "rows of a table": (rows_of_a_table, r"holds rows of another table"),
+    "float32 times": (shaped(f"{TRIALS}/start_time", lambda values: values.astype("f4").astype("f8")), "same"),
+    "float16 times": (shaped(f"{TRIALS}/start_time", lambda values: values.astype("f2")), r"in steps of 0\.\d+ s"),
+    "float32 times of Unix": (
+        shaped(f"{TRIALS}/start_time", lambda values: (values + 1.7e9).astype("f4")),
+        r"in steps of 1\.3e\+02 s",
+    ),
+    "invalid backwards": (invalid(20.0, 3.0), r"end before they begin"),
+    "invalid at no time": (invalid(20.0, np.nan), r"end before they begin, or at no time"),
+    "invalid later": (invalid(900.0, 990.0), "same"),
+    "two tables of trials": (trials_twice, "same"),
+    "a unit twice": (unit_twice, r"1 of 5 units have all spikes of another one"),
+    "spikes twice": (spikes_twice, r"spikes stand twice in their unit"),
 }
 LABELS = {
     "float32": (np.array([0.1, 0.2, 0.3], np.float32), "count as one"),

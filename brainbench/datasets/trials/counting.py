@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -218,6 +219,8 @@ def _windows(
     invalid = session.tables.get("invalid_times")
     if invalid is not None:
         begin, end = invalid.times("start_time"), invalid.times("stop_time")
+        if wrong := int((~(end >= begin)).sum()):
+            raise DataError(f"{wrong} of {len(end)} rows of {invalid.label} end before they begin, or at no time.")
         overlap = np.any([((part[:, :1] < end) & (part[:, 1:] > begin)).any(axis=1) for part in parts], axis=0)
         keep = ledger.apply(keep, ~overlap, "trials", "overlap with invalid_times")
     return keep, parts
@@ -356,6 +359,12 @@ def read_spikes(units: SessionTable, doubts: list[str]) -> list[NDArray[np.float
         doubts.append(f"{units.label}: spike times of {len(unsorted)} units were not in order and have been sorted")
         for index in unsorted:
             spikes[index] = np.sort(spikes[index])
+    number, equal = sum(map(len, spikes)), sum(int((np.diff(times) == 0).sum()) for times in spikes)
+    if equal > 0.1 * number:
+        doubts.append(f"{units.label}: {equal:,} of {number:,} spikes stand twice in their unit, and count twice")
+    trains = Counter(times.tobytes() for times in spikes if len(times) >= 8)
+    if copies := sum(trains.values()) - len(trains):
+        doubts.append(f"{units.label}: {copies} of {len(spikes)} units have all spikes of another one, and count twice")
     return spikes
 
 
