@@ -202,8 +202,7 @@ def inspect(path: str | os.PathLike[str], *, strict: bool = False, progress: Pro
     read = ledger.totals["files"] - len([entry for entry in ledger.left if entry.kind == "files"])
     for kind, number in (("files", read), ("sessions", len(summaries)), ("animals", len(subjects))):
         left = sum(entry.kind == kind == "sessions" for entry in ledger.left)
-        ledger.take(kind, number - left)
-        ledger.find(kind, number if kind != "files" else 0)
+        ledger.find(kind, number if kind != "files" else 0, number - left)
     ledger.close()
     return Inspection(
         os.fspath(path),

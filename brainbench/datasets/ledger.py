@@ -52,10 +52,6 @@ class Ledger:
         self.totals[kind] += number
         self.read[kind] += read
 
-    def take(self, kind: str, number: int = 1) -> None:
-        """Note that so many were read."""
-        self.read[kind] += number
-
     def leave(self, kind: str, reason: str, number: int = 1, *, lost: bool = False) -> None:
         """Note that so many were not read, and why. Raises DataError for a lost one if the ledger is strict."""
         if lost and self.strict:

@@ -134,7 +134,7 @@ class _Reader:
                         why = reason, lost
                         self.subjects.setdefault(session.subject, reason)
                     else:
-                        self.ledger.take("sessions")
+                        self.ledger.find("sessions", 0, 1)
                         self.subjects[session.subject] = ""
         except MissingFilterError as error:
             if not self.lenient:
@@ -143,7 +143,7 @@ class _Reader:
             self.ledger.leave("sessions", str(error), lost=True)
             return
         if len(self.counted) > number:
-            self.ledger.take("files")
+            self.ledger.find("files", 0, 1)
         else:
             self.ledger.leave("files", why[0], lost=why[1])
 

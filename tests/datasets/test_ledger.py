@@ -11,7 +11,7 @@ from tests.factories.recordings import make_simple_session
 def test_a_balance_that_does_not_close_is_said_and_refused_when_strict():
     ledger = Ledger()
     ledger.find("units", 5)
-    ledger.take("units", 3)
+    ledger.find("units", 0, 3)
     ledger.leave("units", "too deep")
     ledger.leave("trials", "spoiled", 0)
     assert ledger.close() == ["5 units were found, 3 read and 1 left out"]

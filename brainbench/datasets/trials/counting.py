@@ -305,7 +305,7 @@ class SpikeTrains:
         begin, end = edges[np.argsort(edges[:, 0])].T
         # A spike in two windows is counted in both; else the counts themselves must add up.
         apart = bool((begin[1:] >= end[:-1]).all())
-        to.take("spikes", int(np.nansum(counts, dtype=np.float64)) if apart else inside)
+        to.find("spikes", 0, int(np.nansum(counts, dtype=np.float64)) if apart else inside)
 
 
 def _enter_tables(ledger: Ledger, session: Session, conditions: str) -> None:

@@ -276,7 +276,11 @@ def join_sessions(
         "unit_session": ("unit", [part.session for part in parts for _ in part.unit_ids]),
         "unit_id": ("unit", [name for part in parts for name in part.unit_ids]),
         **{name: ("unit", np.concatenate([part.columns[name] for part in parts])) for name in UNIT_COLUMNS},
-        **{name: ("trial", _covariate(parts, name)) for name in COVARIATES if any(name in p.covariates for p in parts)},
+        **{
+            name: ("trial", np.concatenate([p.covariates.get(name, np.full(len(p.labels), np.nan)) for p in parts]))
+            for name in COVARIATES
+            if any(name in p.covariates for p in parts)
+        },
     }
     variables = {"counts": (("trial", "time", "unit"), counts), "duration": (("trial", "time"), duration)}
     dataset = xr.Dataset(variables, coordinates)
@@ -346,11 +350,6 @@ def _overlaps(part: SessionCounts) -> tuple[int, int]:
 
     labels = np.array(part.labels)
     return count(part.edges), sum(count(part.edges[labels == label]) for label in set(part.labels))
-
-
-def _covariate(parts: list[SessionCounts], name: str) -> NDArray[np.float64]:
-    """Return one covariate of all trials; NaN in sessions that do not tell it."""
-    return np.concatenate([part.covariates.get(name, np.full(len(part.labels), np.nan)) for part in parts])
 
 
 def _about(part: SessionCounts) -> dict[str, Any]:
