@@ -64,25 +64,22 @@ def rdm(
     import numpy as np
 
     from brainbench.core.errors import UsageError
-    from brainbench.datasets import StoredRDMs, write_rdms
-    from brainbench.datasets.rdm_files import HoldsRDMsError
+    from brainbench.datasets.rdm_files import HoldsRDMsError, StoredRDMs, write_rdms
     from brainbench.datasets.trials.session_trials import pooled
     from brainbench.scoring.neural_responses import open_neural_responses
     from brainbench.scoring.options import ScoreOptions
 
     measure = _of_rdms(metric)
     if out is not None and out.suffix.lower() not in (".h5", ".hdf5"):
-        raise UsageError(
-            f"--out is a file that ends in .h5, from which rsatoolbox tells its kind; received {out.name!r}."
-        )
+        raise UsageError(f"--out ends in .h5, from which rsatoolbox tells its kind; received {out.name!r}.")
     try:
         with progress_bar() as progress:
             brain = open_neural_responses(source, **options, progress=progress)
     except HoldsRDMsError as error:
         if out is not None or any(options.values()):
             raise UsageError(f"{source} holds RDMs and no trials; leave out what chooses trials, and --out.") from error
-        stored = error.rdms
-        return Output(stored, _described(stored) + _matrices("RDM", stored.stimuli, stored.names, stored.values))
+        read = error.rdms
+        return Output(read, _described(read) + _matrices("RDM", read.stimuli, read.names, read.values))
     brain = replace(brain, dataset=pooled(brain.dataset, pool))
     labels = brain.vocabulary
     animals = brain.animals(labels, measure, ScoreOptions(seed=seed))
@@ -160,15 +157,12 @@ def compare(
     title = f"{measure.comparison} of {len(pairs)} stimuli, {_described(stored)}"
     columns = {"": "{0[0]}", **{f">{name}": f"{{0[1][{place}]:.3f}}" for place, name in enumerate(stored.names)}}
     text = table_of(title, list(zip(layers, values.tolist(), strict=True)), columns)
-    text += f"\n{_UNCORRECTED}"
+    text += (
+        "\nNothing is corrected for noise or tested, since a file of RDMs has no trials; the largest of many layers is "
+        "no finding."
+    )
     data = {"comparison": measure.comparison, "stimuli": pairs, "rdms": stored.names, "noise": "unknown"}
     return Output({**data, "values": dict(zip(layers, values.tolist(), strict=True))}, text)
-
-
-_UNCORRECTED = (
-    "Nothing is corrected for noise or tested, since a file of RDMs has no trials; the largest of many layers is no "
-    "finding."
-)
 
 
 def _of_rdms(metric: str) -> RSA:
@@ -186,7 +180,7 @@ def _stored(source: str) -> StoredRDMs | None:
     """Return the RDMs that a file of rsatoolbox holds; None of whatever is no such file."""
     import h5py
 
-    from brainbench.datasets import read_rdms
+    from brainbench.datasets.rdm_files import read_rdms
 
     return read_rdms(source) if Path(source).is_file() and h5py.is_hdf5(source) else None
 
