@@ -2,15 +2,19 @@
 
 The best of many layers looks good by luck alone: with six stimuli the largest of 40 unrelated comparisons is expected
 near .56. So the layer for an animal is the one that compares best with the *other* animals, unless one was committed to
-beforehand. Comparisons vote raw: dividing by reliability would give the noisiest animals the loudest vote. Ties go to
-the first layer.
+beforehand. Comparisons are not divided by reliability before they vote, which would give the noisiest animals the
+loudest vote. Ties go to the first layer.
+
+Layers compete on a common scale (:class:`Scale`). Raw values would not do: a layer of many unrelated features has
+nearly equal distances, which by themselves have a cosine of .4 and more with those of any animal, and would win against
+layers that know something.
 
 Other animals saw the same few stimuli, so what they share by luck is not held out: ten layers that know nothing score
 .41 on average against animals of one geometry and six stimuli. The permutation p-value does account for it, because the
 rules here broadcast over leading axes and a test repeats the whole choice inside every permutation; the mean score
 under permutation is a score's ``chance``. A layer that has no value for some stimuli is compared over the rest, in
-every order alike, but chosen only where no layer has them all: over fewer stimuli it reaches more by luck, which every
-layer would have to beat.
+every order alike, but chosen only where no layer has a value for more: over fewer stimuli it reaches more by luck,
+which every layer would have to beat.
 """
 
 from __future__ import annotations
@@ -26,6 +30,7 @@ import numpy as np
 from brainbench.core.errors import UsageError, check_name, repeats
 from brainbench.core.records import Ceiling, Interval
 from brainbench.core.statistics import t_interval
+from brainbench.metrics.arrays import finite_mean
 from brainbench.metrics.hooks import MetricHooks
 from brainbench.metrics.inference.permutation import (
     SMALLEST_STIMULI,
@@ -266,9 +271,9 @@ class LayerComparisons:
         """[L, K] where a layer has a value for a stimulus."""
         return np.stack([self.metric.defined(layer) for layer in self.layers])
 
-    def among(self, layers: Sequence[Floats], animals: Sequence[SubjectRDM]) -> LayerComparisons:
-        """Return the comparisons of some layers with some animals."""
-        return LayerComparisons(self.metric, layers, animals, self.device)
+    def among(self, rows: Iterable[int], animals: Sequence[SubjectRDM]) -> LayerComparisons:
+        """Return the comparisons of the layers in some rows with some animals."""
+        return LayerComparisons(self.metric, [self.layers[row] for row in rows], animals, self.device)
 
     def given(self) -> Floats:
         """Return comparisons [L, A] of the stimuli as they are."""
@@ -311,7 +316,25 @@ class LayerComparisons:
         return values
 
 
+@dataclass(frozen=True)
+class Scale:
+    """What chance and a perfect model reach by each layer: brings comparisons to the scale of one of them."""
+
+    chance: Floats
+    """[L] mean over orders of the stimuli."""
+    span: Floats
+    """[L] what a perfect model reaches above chance; infinite where it does not."""
+    layer: int = 0
+    """The layer whose comparisons stay as they are."""
+
+    def __call__(self, r: Floats, rows: Any = slice(None)) -> Floats:
+        """Return raw comparisons [..., L, A] of all layers, or of some, on the scale."""
+        factor = self.span[self.layer] / self.span[rows, None]
+        return r * factor + (self.chance[self.layer] - factor * self.chance[rows, None])
+
+
 _CHUNK_ELEMENTS = 1 << 22
+_KEPT_ELEMENTS = 1 << 23  # comparisons under permutation that are kept; more are computed again
 _HALVES_IN_PERMUTATIONS = 100  # splits of a single animal that every permutation repeats; more only cost time
 
 
@@ -336,6 +359,9 @@ class LayerEvaluation:
     """[N, L] mean of every layer under the orders of the stimuli; empty without a test."""
     competing: Ints
     """Layers among which was chosen."""
+    scale: Scale
+    attainable: float
+    """Value of a perfect model."""
 
 
 def defined_layers(metric: MetricHooks, layers: Mapping[str, Floats]) -> list[str]:
@@ -366,7 +392,7 @@ def evaluate(
     names, r = [names[row] for row in rows], r[rows]
     if not names or (committed is not None and committed not in names) or (each and len(names) < len(every.animals)):
         return None, names, ()
-    compared = every.among([every.layers[row] for row in rows], every.animals)
+    compared = every.among(rows, every.animals)
     voters = 1 if metric.of_model_alone else len(factors)
     rule = EACH if each else layer_rule(names, voters, committed=committed, estimator=estimator, factors=factors)
     votes = _Votes(rule, compared, r, compared, factors)
@@ -377,25 +403,36 @@ def evaluate(
             if not parts:
                 return None, names, ()
             votes = _Votes.of_halves(compared, parts, factor)
-    # Those with a value for the most stimuli, for the same ones where none has all.
-    competing = np.flatnonzero((compared.defined == max(compared.defined, key=np.sum)).all(axis=1))
-    rule, weights = replace(votes.rule, competing=competing), votes.weights
-    chosen = rule.choose(votes.r)
-    chosen_r = rule.held(votes.r)
-    values = chosen_r * weights
+    null, weights, counts = votes.null(seed), votes.weights, compared.defined.sum(axis=1)
+    some = weights[: len(votes.permuted.animals)]
+    ceilings, competing = _ceilings(compared, animals, seed), np.flatnonzero(counts == counts.max())
+    scale = Scale(np.zeros(len(names)), np.ones(len(names)))
+    if estimator == "default" and len(names) > 1 and not each:
+        chance = finite_mean(np.concatenate([(r * some).mean(axis=-1) for r in null()]), axis=0) / some.mean()
+        span = ceilings / weights.mean() - chance
+        able = competing[span[competing] > 0]
+        # Where a perfect model is no better than chance, there is no scale.
+        if len(able) and (rule.kind != "fixed" or span[rule.fixed] > 0):
+            scale, competing = Scale(chance, np.where(span > 0, span, np.inf), able[0]), able
+    rule = replace(votes.rule, competing=competing)
+    chosen = rule.choose(scale(votes.r))
+    scale = replace(scale, layer=most_chosen(chosen))
+    chosen_r, values = take_layers(votes.r, chosen), take_layers(scale(votes.r), chosen) * weights
     # The layers of the data serve without a stimulus too: where the choice jumps between layers that are nearly alike,
     # a jackknife that repeats it measures the jumps instead of the stimuli.
     single = rule.kind == "halves" or estimator != "default"
     factors_without = weights if single else metric.factors_without(votes.compared.animals, weights)
-    some, place = np.unique(chosen, return_inverse=True)
-    jackknife = votes.compared.among([votes.compared.layers[layer] for layer in some], votes.compared.animals)
-    without = (take_layers(jackknife.without_each(), place) * factors_without).mean(axis=-1)
-    test, null = _test(votes.permuted, rule, weights[: len(votes.permuted.animals)], seed)
+    ever, place = np.unique(chosen, return_inverse=True)
+    jackknife = votes.compared.among(ever, votes.compared.animals).without_each()
+    without = (take_layers(scale(jackknife, ever), place) * factors_without).mean(axis=-1)
+    test, layer_null = _test(null, metric, compared.animals[0].count, scale, rule, some)
+    # The halves of an animal are noisier than the animal.
+    whole = replace(scale, chance=scale.chance * weights.mean() / factors.mean())
     if rule.kind == "halves":
         values, chosen_r = values.mean(keepdims=True), chosen_r.mean(keepdims=True)
         chosen = np.array([most_chosen(chosen)])
-    evaluation = LayerEvaluation(rule, values, chosen_r, chosen, r * factors, r, without, test, null, competing)
-    return evaluation, names, _partly(compared, names)
+    parts = values, chosen_r, chosen, whole(r) * factors, r, without, test, layer_null, competing, whole
+    return LayerEvaluation(rule, *parts, float(ceilings[scale.layer])), names, _partly(compared, names)
 
 
 @dataclass(frozen=True)
@@ -411,39 +448,64 @@ class _Votes:
     @classmethod
     def of_halves(cls, compared: LayerComparisons, halves: Sequence[SubjectRDM], factor: float) -> _Votes:
         """Let the halves of an animal's splits stand for animals; fewer of them serve the permutations."""
-        parts = compared.among(compared.layers, halves)
-        some = compared.among(compared.layers, halves[: 2 * _HALVES_IN_PERMUTATIONS])
+        parts = replace(compared, animals=halves)
+        some = replace(compared, animals=halves[: 2 * _HALVES_IN_PERMUTATIONS])
         return cls(HALVES, parts, parts.given(), some, np.full(len(halves), factor))
 
+    def null(self, seed: int) -> Callable[[], Iterable[Floats]]:
+        """Return what gives the comparisons [N, L, A] under the orders of the stimuli, in chunks, as often as asked."""
+        judged, draws = self.permuted, self.permuted.metric.orders
+        count, size, exact = judged.animals[0].count, len(judged.layers) * len(judged.animals), most_exact(draws)
+        # Of many stimuli no more than one order is held at a time.
+        step = max(1, _CHUNK_ELEMENTS // max(len(judged.layers) * min(count, 64) ** 2, size))
+        orders = partial(label_orders, count, seed, exact=exact, draws=draws, step=step)
+        number = math.factorial(count) if count <= exact else draws + 1
+        kept = list(judged.under(orders)) if number * size <= _KEPT_ELEMENTS else None
+        return lambda: judged.under(orders) if kept is None else kept
 
-def _test(judged: LayerComparisons, rule: LayerRule, weights: Floats, seed: int) -> tuple[PermutationTest, Floats]:
+
+def _test(
+    null: Callable[[], Iterable[Floats]],
+    metric: MetricHooks,
+    count: int,
+    scale: Scale,
+    rule: LayerRule,
+    weights: Floats,
+) -> tuple[PermutationTest, Floats]:
     """Test the score by orders of the stimuli, the choice of layer repeated in each; also return layers' means."""
-    metric, count = judged.metric, judged.animals[0].count
-    exact, draws = most_exact(metric.orders), metric.orders
-    smallest = smallest_p(count, draws)
+    smallest = smallest_p(count, metric.orders)
     if count < SMALLEST_STIMULI:
         reason = f"{count} stimuli allow no p below {smallest:.3g}; at least {SMALLEST_STIMULI} are needed"
         return PermutationTest(math.nan, smallest, True, 0, math.nan, np.empty(0), reason), np.empty((0, 0))
-    # Of many stimuli no more than one order is held at a time.
-    step = max(1, _CHUNK_ELEMENTS // (len(judged.layers) * max(min(count, 64) ** 2, len(judged.animals))))
-    null, means = [], []
-    for r in judged.under(partial(label_orders, count, seed, exact=exact, draws=draws, step=step)):
-        null.append(rule.held(r) @ weights / len(weights))
+    scores, means = [], []
+    for r in map(scale, null()):
+        scores.append(rule.held(r) @ weights / len(weights))
         means.append((r * weights).mean(axis=-1))
-    scores = np.concatenate(null)
+    every = np.concatenate(scores)
     # An order under which a comparison has no value says nothing.
-    scores = np.where(np.isfinite(scores), scores, -np.inf)
-    return make_test(scores, exact=count <= exact, smallest=smallest), np.concatenate(means)
+    every = np.where(np.isfinite(every), every, -np.inf)
+    return make_test(every, exact=count <= most_exact(metric.orders), smallest=smallest), np.concatenate(means)
 
 
-def attainable_value(metric: MetricHooks, animals: Animals, result: LayerEvaluation, seed: int) -> tuple[float, str]:
-    """Return the value of a perfect model, NaN where chance reaches it in one of twenty orders, and why."""
-    raw = metric.attainable([animals.subjects[i] for i in animals.scored], seed)
-    value = float((raw * animals.factors(animals.scored)).mean())
+def without_scale(result: LayerEvaluation) -> str:
+    """Return why a score has no scale: chance reaches a perfect model in one of twenty orders; empty if it has one."""
     null = result.test.null[np.isfinite(result.test.null)]
-    if null.size and not value > (reached := float(np.quantile(null, 0.95))):
-        return math.nan, f"no scale: a perfect model would score {value:.2f}, which chance reaches ({reached:.2f})"
-    return value, ""
+    if null.size and not result.attainable > (reached := float(np.quantile(null, 0.95))):
+        return f"no scale: a perfect model would score {result.attainable:.2f}, which chance reaches ({reached:.2f})"
+    return ""
+
+
+def _ceilings(compared: LayerComparisons, animals: Animals, seed: int) -> Floats:
+    """Return the value [L] of a perfect model over the stimuli that each layer has a value for."""
+    patterns, group = np.unique(compared.defined, axis=0, return_inverse=True)
+    values = []
+    for stimuli in (animals.order[present] for present in patterns):
+        metric, subjects = compared.metric, [animals.subjects[i] for i in animals.scored]
+        # The reliability of an RDM is stated for all stimuli.
+        if len(stimuli) < len(animals.order) and not metric.of_rdms:
+            metric, subjects = metric.among(stimuli), [subject.take(stimuli) for subject in subjects]
+        values.append(float((metric.attainable(subjects, seed) * animals.factors(animals.scored)).mean()))
+    return np.array(values)[group.ravel()]
 
 
 def _partly(compared: LayerComparisons, names: Sequence[str]) -> tuple[str, ...]:
@@ -451,5 +513,5 @@ def _partly(compared: LayerComparisons, names: Sequence[str]) -> tuple[str, ...]
     lacking = [f"{name} ({number} of {count})" for name, number, count in counts if number]
     if not lacking:
         return ()
-    text = "layers without a value for some stimuli, compared over the others and chosen only where no layer has them"
+    text = "layers without a value for some stimuli, compared over the others and chosen only where no layer has more"
     return (f"{text}: {', '.join(lacking)}",)

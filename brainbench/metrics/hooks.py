@@ -131,6 +131,10 @@ class MetricHooks:
             means.append(float(np.nanmean(values)) if np.isfinite(values).any() else np.nan)
         return np.array(means)
 
+    def among(self, stimuli: Ints) -> MetricHooks:
+        """Return the metric of some stimuli; itself where it knows nothing of single ones."""
+        return self
+
     def halves(self, animal: SubjectRDM, order: Ints) -> tuple[list[SubjectRDM], float] | None:
         """Return an animal's halves (both of each split) as animals, stimuli in an order, and their correction.
 

@@ -23,7 +23,6 @@ from brainbench.metrics.evaluation import (
     Animals,
     LayerComparisons,
     LayerEvaluation,
-    attainable_value,
     ceiling_of,
     defined_layers,
     evaluate,
@@ -33,6 +32,7 @@ from brainbench.metrics.evaluation import (
     mean_reliability,
     most_chosen,
     recorded_rdm,
+    without_scale,
 )
 from brainbench.metrics.hooks import MetricHooks
 from brainbench.metrics.inference.permutation import (
@@ -138,7 +138,8 @@ def score_layers(
     best = int(result.competing[first_best(means[result.competing, None]).item()])
     chosen = most_chosen(result.chosen)
     layer, scored = layers[defined[chosen]], [animals.subjects[i] for i in animals.scored]
-    attainable, hopeless = attainable_value(metric, animals, result, seed)
+    hopeless = without_scale(result)
+    attainable = math.nan if hopeless else result.attainable
     if hopeless:
         earlier = about["reasons"]
         about |= {"status": "unreliable", "reasons": (hopeless, *earlier) if status == "ok" else (*earlier, hopeless)}
@@ -238,8 +239,9 @@ def _subjects(
             row = animals.scored.index(index)
             part = float(result.values[row]), float(result.r[row]), names[int(result.chosen[row])]
         elif index in animals.usable:
-            r = float(LayerComparisons(metric, [layers[overall]], [subject]).given()[0, 0])
-            part = r * animals.corrections[index].value, r, overall
+            r = LayerComparisons(metric, [layers[overall]], [subject]).given()
+            value = float(result.scale(r, [names.index(overall)])[0, 0]) * animals.corrections[index].value
+            part = value, float(r[0, 0]), overall
         else:
             part = math.nan, math.nan, None
         parts.append(_subject(animals, index, *part))

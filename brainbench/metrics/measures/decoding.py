@@ -297,6 +297,10 @@ class _BoundDecoding(LabelDecoding):
     def layer(self, features: ArrayLike) -> Any:
         return LabelledFeatures(usable_features(features), self._classes)
 
+    def among(self, stimuli: Ints) -> LabelDecoding:
+        """Return the decoding of the same properties of some stimuli."""
+        return _BoundDecoding({name: codes[stimuli] for name, codes in self._classes.items()})
+
     def attainable(self, animals: Sequence[SubjectRDM], seed: int) -> Floats:
         """Return the accuracy [A] of each animal's responses without their noise."""
         layers = [LabelledFeatures(denoised(animal.patterns, animal.noise), self._classes) for animal in animals]
