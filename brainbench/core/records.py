@@ -130,7 +130,7 @@ class LayerScore(_NullIsNaN):
 
     layer: str
     value: Number
-    """Mean noise-corrected score over the animals whose RDM is reliable."""
+    """Mean noise-corrected score over the animals whose RDM is reliable, on the scale of the layer that was chosen."""
     r: Number
     """Mean raw comparison over the same animals."""
     status: Status = "ok"

@@ -425,7 +425,7 @@ def evaluate(
     ever, place = np.unique(chosen, return_inverse=True)
     jackknife = votes.compared.among(ever, votes.compared.animals).without_each()
     without = (take_layers(scale(jackknife, ever), place) * factors_without).mean(axis=-1)
-    test, layer_null = _test(null, metric, compared.animals[0].count, scale, rule, some)
+    test, layer_null = _test(null, votes.permuted, scale, rule, some)
     # The halves of an animal are noisier than the animal.
     whole = replace(scale, chance=scale.chance * weights.mean() / factors.mean())
     if rule.kind == "halves":
@@ -465,14 +465,10 @@ class _Votes:
 
 
 def _test(
-    null: Callable[[], Iterable[Floats]],
-    metric: MetricHooks,
-    count: int,
-    scale: Scale,
-    rule: LayerRule,
-    weights: Floats,
+    null: Callable[[], Iterable[Floats]], judged: LayerComparisons, scale: Scale, rule: LayerRule, weights: Floats
 ) -> tuple[PermutationTest, Floats]:
     """Test the score by orders of the stimuli, the choice of layer repeated in each; also return layers' means."""
+    metric, count = judged.metric, judged.animals[0].count
     smallest = smallest_p(count, metric.orders)
     if count < SMALLEST_STIMULI:
         reason = f"{count} stimuli allow no p below {smallest:.3g}; at least {SMALLEST_STIMULI} are needed"
