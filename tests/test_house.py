@@ -38,7 +38,7 @@ BUDGETS = {
 }
 """Folder → lines of Python that it may have: as the rooms stand, with two per cent to move in. Who adds a capability
 pays in the same folder, or raises the number in the commit that needs it, with the reason."""
-MOST_PRODUCT_LINES, MOST_PRODUCT_MODULES = 97_910, 424
+MOST_PRODUCT_LINES, MOST_PRODUCT_MODULES = 97_980, 424
 """Lines grew last by responses of any kind, errors of sweeps, boards of 10,000 records, ONNX files tried apart, drift
 over time, files of torch_brain and rsatoolbox both ways, and real tactile devices fitted jointly to presses."""
 VAGUE = frozenset(
