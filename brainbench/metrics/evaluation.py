@@ -5,7 +5,7 @@ near .56. So the layer for an animal is the one that compares best with the *oth
 beforehand. Comparisons are not divided by reliability before they vote, which would give the noisiest animals the
 loudest vote. Ties go to the first layer.
 
-Layers compete on a common scale (:class:`Scale`). Raw values would not do: a layer of many unrelated features has
+Layers compete on a common scale (:class:`CommonScale`). Raw values would not do: a layer of many unrelated features has
 nearly equal distances, which by themselves have a cosine of .4 and more with those of any animal, and would win against
 layers that know something.
 
@@ -317,7 +317,7 @@ class LayerComparisons:
 
 
 @dataclass(frozen=True)
-class Scale:
+class CommonScale:
     """What chance and a perfect model reach by each layer: brings comparisons to the scale of one of them."""
 
     chance: Floats
@@ -359,7 +359,7 @@ class LayerEvaluation:
     """[N, L] mean of every layer under the orders of the stimuli; empty without a test."""
     competing: Ints
     """Layers among which was chosen."""
-    scale: Scale
+    scale: CommonScale
     attainable: float
     """Value of a perfect model."""
 
@@ -406,14 +406,14 @@ def evaluate(
     null, weights, counts = votes.null(seed), votes.weights, compared.defined.sum(axis=1)
     some = weights[: len(votes.permuted.animals)]
     ceilings, competing = _ceilings(compared, animals, seed), np.flatnonzero(counts == counts.max())
-    scale = Scale(np.zeros(len(names)), np.ones(len(names)))
+    scale = CommonScale(np.zeros(len(names)), np.ones(len(names)))
     if estimator == "default" and len(names) > 1 and not each:
         chance = finite_mean(np.concatenate([(r * some).mean(axis=-1) for r in null()]), axis=0) / some.mean()
         span = ceilings / weights.mean() - chance
         able = competing[span[competing] > 0]
         # Where a perfect model is no better than chance, there is no scale.
         if len(able) and (rule.kind != "fixed" or span[rule.fixed] > 0):
-            scale, competing = Scale(chance, np.where(span > 0, span, np.inf), able[0]), able
+            scale, competing = CommonScale(chance, np.where(span > 0, span, np.inf), able[0]), able
     rule = replace(votes.rule, competing=competing)
     chosen = rule.choose(scale(votes.r))
     scale = replace(scale, layer=most_chosen(chosen))
@@ -460,12 +460,12 @@ class _Votes:
         step = max(1, _CHUNK_ELEMENTS // max(len(judged.layers) * min(count, 64) ** 2, size))
         orders = partial(label_orders, count, seed, exact=exact, draws=draws, step=step)
         number = math.factorial(count) if count <= exact else draws + 1
-        kept = list(judged.under(orders)) if number * size <= _KEPT_ELEMENTS else None
-        return lambda: judged.under(orders) if kept is None else kept
+        stored = list(judged.under(orders)) if number * size <= _KEPT_ELEMENTS else None
+        return lambda: judged.under(orders) if stored is None else stored
 
 
 def _test(
-    null: Callable[[], Iterable[Floats]], judged: LayerComparisons, scale: Scale, rule: LayerRule, weights: Floats
+    null: Callable[[], Iterable[Floats]], judged: LayerComparisons, scale: CommonScale, rule: LayerRule, weights: Floats
 ) -> tuple[PermutationTest, Floats]:
     """Test the score by orders of the stimuli, the choice of layer repeated in each; also return layers' means."""
     metric, count = judged.metric, judged.animals[0].count
