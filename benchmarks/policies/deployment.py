@@ -28,7 +28,7 @@ from brainbench.core.statistics import wilson_interval
 from robotics_bridge import tasks
 from robotics_bridge.deploy.controller import Report
 from robotics_bridge.deploy.driver import Clock, HandReading, LinkCounters
-from robotics_bridge.deploy.session import DeployedPolicy, PressureCalibration, read_deployed
+from robotics_bridge.deploy.session import REAL_TYPES, DeployedPolicy, PressureCalibration, read_deployed
 from robotics_bridge.envs.env import Env
 from robotics_bridge.envs.step import VELOCITY
 from robotics_bridge.policies.evaluate import Policy, evaluate, mean_of_episodes
@@ -47,13 +47,13 @@ class Faults:
     drop: float = 0.0
     """Share of reports that are lost; the last one stands."""
     drift: float = 0.0
-    """How far readings of joints and of finger forces have drifted at the end of an episode, either way (rad, N)."""
+    """How far readings have drifted at the end of an episode, either way: joints (rad), pressures (thresholds)."""
 
 
 TITLE = "Evaluation and deployment of a student"
 FAULTY = {
     "deployed": Faults(), "one step late": Faults(lag=1), "two steps late": Faults(lag=2),
-    "a fifth of the reports lost": Faults(drop=0.2), "drift to ±.1 rad and N": Faults(drift=0.1),
+    "a fifth of the reports lost": Faults(drop=0.2), "drift to ±.1 rad and thresholds": Faults(drift=0.1),
     "one late, a fifth lost, drift": Faults(1, 0.2, 0.1),
 }  # fmt: skip
 
@@ -68,8 +68,10 @@ class Hands(Clock):
         self.env, self.steps, self.faults = env, 0, faults
         self.random = np.random.default_rng(seed)
         self.reports: list[tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]] = []
-        """Joint positions, velocities and finger forces of all environments, of the first step and those since."""
+        """Joint positions, velocities and finger pressures of all environments, of the first step and those since."""
         joints, fingers = len(env.joint_names), len(env.hand.fingers)
+        self._calibration = PressureCalibration()
+        self._touched = [env.hand.tips.index(link) for link in env.touch.links if link in env.hand.tips]
         self.drift = [self.random.uniform(-1, 1, (env.num_envs, *shape)) for shape in ((joints,), (fingers, 3))]
         self.lost = self.random.random((env.max_episode_length + 1, env.num_envs)) < faults.drop
         self.lost[0] = False
@@ -82,12 +84,16 @@ class Hands(Clock):
 
     def _report(self) -> None:
         proprio, count = self.env.observations["proprio"].double().numpy(), len(self.env.joint_names)
-        force = self.env.state.contacts.tip_force.double().numpy()
+        fingers, pressure = tuple(self.env.hand.fingers), np.zeros_like(self.drift[1])
+        if self.env.options.observe in REAL_TYPES:
+            # What the skin of the tips gives in the last physics step; a bit is a pressure of twice the threshold.
+            felt = self.env.observations["tactile"][:, -1].double().numpy()[:, : len(self._touched)]
+            scale = self._calibration.pressure(fingers, np.ones((len(fingers), 3)))[self._touched]
+            pressure[:, self._touched] = felt * (scale if felt.shape[2] == 3 else 2 * self._calibration.threshold)
         amount = self.faults.drift * self.steps / self.env.max_episode_length
-        position, force = (
-            values + amount * way for values, way in zip((proprio[:, :count], force), self.drift, strict=True)
-        )
-        self.reports.append((position, proprio[:, count : 2 * count] / VELOCITY, force))
+        position = proprio[:, :count] + amount * self.drift[0]
+        pressure += amount * self._calibration.threshold * self.drift[1]
+        self.reports.append((position, proprio[:, count : 2 * count] / VELOCITY, pressure))
 
     def __call__(self) -> float:
         return self.steps * self.env.step_dt
@@ -113,7 +119,7 @@ class HandOfTask:
         self.hands, self.row, self.counters = hands, row, LinkCounters()
         self.joints, self.fingers = env.joint_names, tuple(env.hand.fingers)
         self._columns = [self.joints.index(name) for name in env.action_names]
-        self._map, self._calibration = env.action_map, PressureCalibration()
+        self._map = env.action_map
 
     def read(self) -> HandReading:
         hands, row = self.hands, self.row
@@ -121,11 +127,11 @@ class HandOfTask:
         while hands.lost[arrived, row]:
             arrived -= 1
         number = max(arrived - hands.faults.lag, 0)
-        position, velocity, force = (values[row] for values in hands.reports[number])
+        position, velocity, pressure = (values[row] for values in hands.reports[number])
         step = hands.env.step_dt
         return HandReading(
             sequence=arrived, time=number * step, arrived=arrived * step, position=position.copy(), velocity=velocity,
-            pressure=self._calibration.pressure(self.fingers, force),
+            pressure=pressure,
         )  # fmt: skip
 
     def send(self, targets: NDArray[np.float64]) -> None:
