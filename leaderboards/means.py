@@ -110,10 +110,8 @@ def _mean(name: str, entries: dict[str, Entry], names: Sequence[str]) -> Mean:
     error, freedom = (float(part) for part in _combined([entry.sample.error for entry in row], dependent(row)))
     reasons = (f"{label}: {reason}" for label, entry in entries.items() if (reason := entry.unranked_because))
     unranked = next(reasons, "")
-    half, method = (
-        float(stdtrit(freedom, (1 + LEVEL) / 2) * error),
-        f"t over animals and stimuli of {len(names)} benchmarks",
-    )
+    half = float(stdtrit(freedom, (1 + LEVEL) / 2) * error)
+    method = f"t over animals and stimuli of {len(names)} benchmarks"
     interval = Interval(value - half, value + half, LEVEL, method) if math.isfinite(error) else None
     return Mean(name, scores, value, interval, unranked_because=unranked)
 
