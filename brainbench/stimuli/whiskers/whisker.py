@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, fields
+from functools import lru_cache
 from typing import Annotated, Any
 
 import numpy as np
@@ -312,8 +313,9 @@ class Chain:
         return (arm * self.masses[:, None]).T @ arm + lower.T @ (lower * self.inertias[:, 1:])
 
 
+@lru_cache(maxsize=512)
 def build_chain(whisker: Whisker, links: int) -> Chain:
-    """Cut ``whisker`` into at least two ``links`` of equal arc length."""
+    """Cut ``whisker`` into at least two ``links`` of equal arc length; callers share the result."""
     check_number("The number of links", links, least=2, whole=True)
     nodes = np.linspace(0.0, whisker.arc_length, links + 1)
     points = whisker.centre_line(nodes)
