@@ -22,7 +22,7 @@ MOST_LINES = 700
 BUDGETS = {
     "brainbench/stimuli": 26_480,  # the estimated error of every whisker, follicles that give way in two engines
     "robotics_bridge": 25_180,  # newtons that no taxel has, trees of any hand, replays, gel pictures, devices fitted
-    "brainbench/models": 8_410,  # the proof that a layer is a response, ONNX files tried apart
+    "brainbench/models": 8_450,  # the proof that a layer is a response, its probes in files, ONNX files tried apart
     "brainbench/datasets": 7_900,  # the balance of a reading, signals; files of torch_brain and rsatoolbox, both ways
     "brainbench/metrics": 5_790,  # the unique part, drift over time, matching of units, layers on their own chance
     "brainbench/cli": 4_990,  # check-submission, options of benchmarks, names of the registry, RDMs of others compared
@@ -38,7 +38,7 @@ BUDGETS = {
 }
 """Folder → lines of Python that it may have: as the rooms stand, with two per cent to move in. Who adds a capability
 pays in the same folder, or raises the number in the commit that needs it, with the reason."""
-MOST_PRODUCT_LINES, MOST_PRODUCT_MODULES = 97_980, 424
+MOST_PRODUCT_LINES, MOST_PRODUCT_MODULES = 98_020, 424
 """Lines grew last by responses of any kind, errors of sweeps, boards of 10,000 records, ONNX files tried apart, drift
 over time, files of torch_brain and rsatoolbox both ways, and real tactile devices fitted jointly to presses."""
 VAGUE = frozenset(

@@ -14,7 +14,7 @@ import shutil
 import tempfile
 import weakref
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -107,7 +107,8 @@ def extract(
     what was not read, and why.
 
     The model runs in evaluation mode without gradients on copies of the stimuli; modes are put back and no hook stays.
-    The proof runs a copy of it on 8 probes and an eighth of the stimuli. Memory beyond the result is that copy and
+    The proof runs a copy of it on 7 probes and an eighth of the stimuli; probes beyond an eighth of ``memory`` lie in
+    temporary files. Memory beyond the result is that copy, which is gone before all stimuli run, and
     half of ``memory``, or one stimulus and the probes where these need more.
 
     Args:
@@ -435,6 +436,7 @@ class _HookedReader:
             run.notes.append("parts that run in TorchScript cannot be read: give the module that was scripted")
         self.places: dict[tuple[str, int], _Place] = {}
         self.calls: dict[str, int] = {}
+        self.held = 0  # bytes of probes
         self.size = 1  # bytes of all layers for a stimulus
         self.fill = 1  # stimuli that a batch has at least; more where a model takes no others
 
@@ -458,6 +460,7 @@ class _HookedReader:
             self.fill = min(chunk, run.count)
             sketches = self._prove()
         self._run_sample(sketches)
+        self.fresh = None  # its memory is that of the layers from here on
         self._run_all(max(1, min(chunk, rooms.memory // 2 // self.size)), sketches)
         rooms.not_read = sketches.unequal() | rooms.not_read
         self._check(rooms.not_read)
@@ -507,39 +510,45 @@ class _HookedReader:
         rows = proof.probes(stimuli.cpu(), run.steps)
         least, sketches = min(_PROBED, len(stimuli)), _Sketches(run.sample)
         batches = []
-        for batch, more in ((proof.FIRST, 0), (proof.SECOND, least)):
-            filling = [stimuli[place % len(stimuli)] for place in range(max(self.fill - len(batch), more))]
-            probes = [stimuli[0] if row is None else rows[row].to(stimuli) for row in batch]
-            batches.append(torch.stack([*probes, *filling]))
+        for batch, length in ((proof.FIRST, 0), (proof.SECOND, len(proof.SECOND) - 1 + least)):
+            length = max(self.fill, length, len(batch))
+            sampled = iter(stimuli[np.arange(length) % len(stimuli)])
+            order = (*batch, *[None] * (length - len(batch)))
+            batches.append(torch.stack([next(sampled) if row is None else rows[row].to(stimuli) for row in order]))
         sizes = (len(batches[0]), len(batches[1]))
         calls: dict[str, list[Any]] = {}
-        proven: dict[str, list[Any]] = {}
+        proofs: dict[str, list[Any]] = {}
+        samples = [place for place in range(sizes[1]) if proof.SECOND[place : place + 1] in ((), (None,))][:least]
         sketched: dict[tuple[str, int, Layout], np.ndarray] = {}
+
+        def keep(tensor: torch.Tensor) -> Any:
+            self.held += tensor.nbytes
+            return tensor if self.held <= self.rooms.memory // 8 else proof.spilled(tensor, files)
 
         def capture(name: str, index: int, tensor: Any) -> None:
             # A later operation in place must not change what was captured.
-            calls.setdefault(name, []).append(None if tensor is None else tensor.cpu().clone())
+            calls.setdefault(name, []).append(None if tensor is None else keep(tensor.cpu().clone()))
 
         def compare(name: str, index: int, tensor: Any) -> None:
             first = calls[name][index] if index < len(calls.get(name, ())) else None
             result: Any = [], "gives no tensor of numbers"
             if first is not None and tensor is not None:
-                result = proof.stimulus_layouts(first, tensor.cpu(), sizes)
+                result = proof.stimulus_layouts(proof.restored(first), tensor.cpu(), sizes)
                 for layout, _ in result[0]:
-                    rows = layout.split(tensor, sizes[1])[len(proof.SECOND) :]
-                    sketched[name, index, layout] = proof.sketch(rows[:least])
-            proven.setdefault(name, []).append(result)
+                    sketched[name, index, layout] = proof.sketch(layout.split(tensor, sizes[1])[samples])
+            proofs.setdefault(name, []).append(result)
 
-        self._forward(model, batches[0], capture)
-        self._forward(model, batches[1], compare)
-        self.places, self.rooms.not_read, self.size = {}, {}, 1
-        for name in [name for name in self.modules if name in calls or name in proven]:
-            self.rooms.called.add(name)
-            tensors = calls.pop(name, [])
-            if len(tensors) != len(proven.get(name, ())):
-                self.rooms.not_read[name] = "does not run alike in every batch"
-                continue
-            self._place(name, tensors, proven[name], sizes[0])
+        with ExitStack() as files:
+            self._forward(model, batches[0], capture)
+            self._forward(model, batches[1], compare)
+            self.places, self.rooms.not_read, self.size = {}, {}, 1
+            for name in [name for name in self.modules if name in calls or name in proofs]:
+                self.rooms.called.add(name)
+                tensors = calls.pop(name, [])
+                if len(tensors) != len(proofs.get(name, ())):
+                    self.rooms.not_read[name] = "does not run alike in every batch"
+                    continue
+                self._place(name, list(map(proof.restored, tensors)), proofs[name], sizes[0])
         for key, place in self.places.items():
             sketches.keep(1, (place.layer, place.step), sketched[*key, replace(place.layout, time=None)], slice(least))
         return sketches

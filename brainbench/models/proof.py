@@ -13,12 +13,13 @@ from __future__ import annotations
 
 import copy
 import math
+import tempfile
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 import torch
@@ -33,6 +34,7 @@ NO_AXIS = "no axis of it follows the stimuli"
 UNMOVED = "does not move with the stimuli"
 DEPENDENT = "its rows depend on the batch: on other stimuli, their place, chance or what ran before"
 SHIFT = 0.7  # change by a shift that the shift explains leaves less than this of what it is without it
+_LARGE = 1 << 24  # numbers of which no second copy is made
 _BLOCKS = 256  # numbers that stand for a row where two runs are compared
 
 
@@ -112,19 +114,23 @@ def probes(stimuli: torch.Tensor, steps: int) -> dict[int, torch.Tensor]:
 
 def same(left: torch.Tensor, right: torch.Tensor, spread: float) -> bool:
     """Return whether tensors are equal but for rounding; ``spread`` is how far rows of unequal stimuli lie apart."""
-    limit = tolerance(left.dtype) * spread + rounding(left)
-    change = float((left - right).abs().max()) if left.numel() else 0.0
-    if math.isfinite(change):
-        return change <= limit
-    return torch.equal(left.isfinite(), right.isfinite()) and largest(left - right) <= limit
+    change, limit = left - right, tolerance(left.dtype) * spread + rounding(left)
+    if math.isfinite(size := _extreme(change)):
+        return size <= limit
+    return torch.equal(left.isfinite(), right.isfinite()) and largest(change) <= limit
 
 
 def largest(values: torch.Tensor) -> float:
     """Return the largest absolute value that is finite; 0 for none."""
+    size = _extreme(values)
+    return size if math.isfinite(size) else _extreme(values.nan_to_num(0.0, 0.0, 0.0))
+
+
+def _extreme(values: torch.Tensor) -> float:
     if not values.numel():
         return 0.0
-    size = float(values.abs().max())
-    return size if math.isfinite(size) else float(values.abs().nan_to_num(0.0, 0.0, 0.0).max())
+    low, high = values.aminmax()  # in place of the largest of absolute values, which are a copy
+    return max(-float(low), float(high))
 
 
 def tolerance(kind: torch.dtype) -> float:
@@ -149,7 +155,7 @@ def stimulus_layouts(
     places = [(place, SECOND.index(row)) for place, row in enumerate(FIRST) if row in SECOND]
     for layout in layouts(tuple(first.shape), tuple(second.shape), batches):
         before, after = layout.split(first, batches[0]), layout.split(second, batches[1])
-        spread = largest(before[: len(FIRST)] - before[:1])
+        spread = max(largest(row - before[0]) for row in before[1 : len(FIRST)])
         if all(same(before[left], after[right], spread) for left, right in places):
             proven.append((layout, spread > rounding(before)))
         elif reason == NO_AXIS:
@@ -212,6 +218,8 @@ def sketch(rows: torch.Tensor) -> np.ndarray:
 def _block_sums(flat: torch.Tensor) -> torch.Tensor:
     if (length := flat.shape[1]) <= _BLOCKS:
         return flat
+    if len(flat) > 1 and flat.numel() > _LARGE:  # each row by itself, for the memory of what is between
+        return torch.cat([_block_sums(row) for row in flat.split(1)])
     width = -(-length // _BLOCKS)
     weighted = flat * _weights(length).to(flat.device)
     if width * _BLOCKS != length:
@@ -247,6 +255,21 @@ def draw_sample(count: int) -> np.ndarray:
     edges = np.linspace(0, count, size + 1).astype(int)
     picks = [int(generator.integers(low, max(high, low + 1))) for low, high in pairwise(edges)]
     return generator.permutation(np.minimum(picks, count - 1))
+
+
+def spilled(tensor: torch.Tensor, files: ExitStack) -> IO[bytes]:
+    """Return a temporary file that holds a tensor."""
+    file = files.enter_context(tempfile.TemporaryFile())  # noqa: SIM115 - the stack closes it
+    torch.save(tensor, file)
+    return file
+
+
+def restored(place: Any) -> Any:
+    """Return the tensor in a file, anything else as it is."""
+    if place is None or isinstance(place, torch.Tensor):
+        return place
+    place.seek(0)
+    return torch.load(place, weights_only=True)
 
 
 def fresh_copy(model: nn.Module) -> nn.Module | None:
