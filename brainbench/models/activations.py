@@ -107,7 +107,7 @@ def extract(
     what was not read, and why.
 
     The model runs in evaluation mode without gradients on copies of the stimuli; modes are put back and no hook stays.
-    The proof runs a copy of it on 7 probes and an eighth of the stimuli; probes beyond an eighth of ``memory`` lie in
+    The proof runs a copy of it on 8 probes and an eighth of the stimuli; probes beyond an eighth of ``memory`` lie in
     temporary files. Memory beyond the result is that copy, which is gone before all stimuli run, and
     half of ``memory``, or one stimulus and the probes where these need more.
 
@@ -510,15 +510,13 @@ class _HookedReader:
         rows = proof.probes(stimuli.cpu(), run.steps)
         least, sketches = min(_PROBED, len(stimuli)), _Sketches(run.sample)
         batches = []
-        for batch, length in ((proof.FIRST, 0), (proof.SECOND, len(proof.SECOND) - 1 + least)):
-            length = max(self.fill, length, len(batch))
-            sampled = iter(stimuli[np.arange(length) % len(stimuli)])
-            order = (*batch, *[None] * (length - len(batch)))
-            batches.append(torch.stack([next(sampled) if row is None else rows[row].to(stimuli) for row in order]))
+        for batch, more in ((proof.FIRST, 0), (proof.SECOND, least)):
+            filling = [stimuli[place % len(stimuli)] for place in range(max(self.fill - len(batch), more))]
+            probes = [stimuli[0] if row is None else rows[row].to(stimuli) for row in batch]
+            batches.append(torch.stack([*probes, *filling]))
         sizes = (len(batches[0]), len(batches[1]))
         calls: dict[str, list[Any]] = {}
         proofs: dict[str, list[Any]] = {}
-        samples = [place for place in range(sizes[1]) if proof.SECOND[place : place + 1] in ((), (None,))][:least]
         sketched: dict[tuple[str, int, Layout], np.ndarray] = {}
 
         def keep(tensor: torch.Tensor) -> Any:
@@ -535,7 +533,8 @@ class _HookedReader:
             if first is not None and tensor is not None:
                 result = proof.stimulus_layouts(proof.restored(first), tensor.cpu(), sizes)
                 for layout, _ in result[0]:
-                    sketched[name, index, layout] = proof.sketch(layout.split(tensor, sizes[1])[samples])
+                    rows = layout.split(tensor, sizes[1])[len(proof.SECOND) :]
+                    sketched[name, index, layout] = proof.sketch(rows[:least])
             proofs.setdefault(name, []).append(result)
 
         with ExitStack() as files:

@@ -541,7 +541,7 @@ def test_stimuli_run_once_beyond_the_proof():
             return x.flatten(2)
 
     extract(Counted(), torch.randn(40, 4, 6, 5, 7))
-    assert Counted.rows == 40 + 5 + 7
+    assert Counted.rows == 40 + 8 + 5
 
 
 def test_a_model_of_one_batch_size_is_read_in_it():
