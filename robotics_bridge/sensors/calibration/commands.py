@@ -81,9 +81,11 @@ def _device(
         ">gain": "{0[gain]:.3f} ± {0[gain_error]:.3f}",
     }
     text += "\n\n" + table_of("", fit.taxels, columns) + f"\n\nOn held-out presses the law errs by {fit.held_out:.1%}."
+    text += f"\nStatus: {fit.status}." + "".join(f"\n{doubt}" for doubt in fit.doubts)
     text += "".join(f"\nFault: {fault.text}." for fault in fit.faults) + "".join(f"\n{note}" for note in fit.notes)
     data = {"law": fit.law(), "noise": fit.noise, "estimates": fit.estimates, "taxels": fit.taxels,
-            "faults": fit.faults, "notes": fit.notes, "held_out": fit.held_out, "preset": out}  # fmt: skip
+            "status": fit.status, "doubts": fit.doubts, "faults": fit.faults, "notes": fit.notes,
+            "held_out": fit.held_out, "preset": out}  # fmt: skip
     return Output(data, text + (f"\nWrote {out}." if out is not None else ""))
 
 

@@ -16,10 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
+from scipy.stats import chi2, norm
 
-from brainbench.core.errors import DataError
+from brainbench.core.errors import DataError, listing
 from robotics_bridge.hands.layouts import write_probes
-from robotics_bridge.sensors.calibration.calibrate import SHORTEST, find_quantum
+from robotics_bridge.sensors.calibration.calibrate import find_quantum
 from robotics_bridge.sensors.calibration.likelihood import Z95, Estimate, find_delays, fit_dynamics
 from robotics_bridge.sensors.calibration.presses import (
     SHARED,
@@ -69,15 +70,21 @@ UNTOLD = 0.7
 """Part of its prior's width above which an interval tells nothing."""
 TOLERANCES = {"place": 7.5e-4, "turn": np.radians(8.0), "gain": np.log(1.25), "friction": 0.05, "delay": 0.5}
 """What still counts as right: place (m), turn (rad), logarithm of a gain, least friction, readings of delay."""
-_SURE = 3.3
-"""Standard errors by which a number must lie beyond its tolerance."""
+ACCUSED = 0.01
+"""Chance that a device all of whose numbers lie at the edge of their tolerances is accused of anything."""
+TRUSTED = {"law": 0.05, "normal": 2.0}
+"""Error of the law on held-out presses, and half width of the interval of a normal (°), of a fit that is ``ok``."""
 _HELD = 0.2  # part of the touches that is held out
 _TAIL = 5.0  # degrees of freedom of Student's distribution of the residuals
 _GAUGE = 1e8  # weight with which the mean gain is held at nought, since it is the stiffness
 _LEAST = 1e-4  # share of crosstalk below which neighbours are left out of derivatives
 _ROUNDS, _STEPS, _SETTLED = 6, 25, 0.01  # of noise; of the numbers, and the gain of cost at which they are settled
-_CHANNELS, _LONG = 60, 100  # columns of which the noise is fitted; readings at rest that are enough for it
-_CROSSINGS, _SOFT, _STRIDES = 4, 6, (-2.0, -0.7, 0.7, 2.0)  # rounds, directions and standard errors of a look around
+_CHANNELS = 60  # columns of which the noise is fitted
+_SUSPECT, _DOUBTED, _TOUCH = 1.5, 3.0, 2.5
+"""Standard errors by which a taxel is explained worse than the median one: to try other places; to doubt the fit."""
+_NUDGES = (-3e-5, 3e-5, -1e-4, 1e-4)
+"""Moves (m) of such a taxel along its normal, by which its touches begin a reading sooner or later."""
+_CHANCE = 0.02  # part of the readings that a wrong order of axes may explain more than the right one
 _MOVES = (-2e-3, 0.0, 2e-3)  # places (m) beside its own at which a taxel that nothing else explains is tried
 
 
@@ -104,10 +111,17 @@ class DeviceFit:
     taxels: list[dict[str, Any]]
     faults: list[Fault]
     notes: list[str]
+    doubts: list[str]
+    """Why the fit is not to be trusted, with what would decide it; empty for one that is ``ok``."""
     held_out: float
     """Error of the law on presses that were not fitted, as a part of the readings (rms, less the noise)."""
     spread: NDArray[np.float64]
     """[P, P] covariance: shared numbers, then place, turn, gain and bias of each taxel."""
+
+    @property
+    def status(self) -> str:
+        """``ok``, or ``uncertain`` where there are doubts."""
+        return "uncertain" if self.doubts else "ok"
 
     def law(self) -> dict[str, float]:
         """Return the settings of ``KinematicTaxel``."""
@@ -119,7 +133,8 @@ class DeviceFit:
     def save(self, path: str | os.PathLike[str], link: str, **about: Any) -> None:
         """Write the noise as a preset with law and intervals beside it, and ``NAME-probes.json`` with the places."""
         self.noise.save(path, law=self.law(), estimates=self.estimates, taxels=self.taxels, faults=self.faults,
-                        notes=self.notes, held_out=self.held_out, **about)  # fmt: skip
+                        notes=self.notes, status=self.status, doubts=self.doubts,
+                        held_out=self.held_out, **about)  # fmt: skip
         write_probes(os.fspath(path).removesuffix(".json") + "-probes.json", {link: self.probes})
 
     def draws(self, count: int, seed: int = 0) -> list[DeviceFit]:
@@ -164,8 +179,7 @@ def fit_device(presses: Presses, *, max_delay: float = 0.5, names: tuple[str, ..
     estimates, notes = _estimates(search, spread, noise)
     if mixing is None:
         notes.append("Crosstalk was not fitted: it needs taxels on a grid.")
-    if (idle := (search.reply.felt[3] == 0).all(axis=(0, 2)) & ~stuck).any():
-        notes.append(f"Never touched, and left where they should be: {', '.join(np.array(names)[idle])}.")
+    idle = (search.reply.felt[3] == 0).all(axis=(0, 2)) & ~stuck
     reply = answer(presses, device, mixing).readings
     rest = (readings - reply)[cut:]
     near = presses.near.T[cut:] & touched
@@ -174,7 +188,10 @@ def fit_device(presses: Presses, *, max_delay: float = 0.5, names: tuple[str, ..
     signal = np.mean((reply[cut:] - device.bias)[near] ** 2) if near.any() else np.nan
     held = float(np.sqrt(max(np.mean(rest[near] ** 2) - still, 0.0) / signal)) if signal > 0 else np.nan
     taxels = _rows(device, spread, presses, names)
-    return DeviceFit(device, probes, _noise_of(device, estimates), estimates, taxels, faults, notes, held, spread)
+    doubts = _doubts(search, held, taxels, idle)
+    return DeviceFit(
+        device, probes, _noise_of(device, estimates), estimates, taxels, faults, notes, doubts, held, spread
+    )
 
 
 def _part(presses: Presses, rows: slice) -> Presses:
@@ -253,24 +270,6 @@ class _Search:
         widths = np.r_[[PLACE] * 3, [TURN] * 3, GAIN, [BIAS * self.white] * device.bias.shape[1]]
         spreads = np.r_[[PRIORS[name].spread for name in SHARED], np.tile(widths, len(local))]
         return np.r_[shared, local.ravel()], spreads**-2.0
-
-    def refine(self) -> None:
-        """Look for less cost along the directions that are told worst: a taxel takes hold of the ball at one reading or
-        the next, so that the cost has edges, which steps by derivatives do not cross."""
-        for _ in range(_CROSSINGS):
-            spread = self.covariance()
-            width = np.sqrt(np.diag(spread))
-            roots, axes = np.linalg.eigh(spread / np.outer(width, width))
-            best, least = self.device, self.cost(self.reply.readings, self.device)
-            for way, stride in itertools.product((axes * np.sqrt(roots)).T[-_SOFT:], _STRIDES):
-                trial = _moved(self.device, stride * way * width)
-                cost = self.cost(readings_of(self.presses, trial, self.mixing), trial)
-                if cost < least:
-                    best, least = trial, cost
-            if best is self.device:
-                break
-            self.device = best
-            self.descend()
 
     def cost(self, readings: NDArray[np.float64], device: Device) -> float:
         """Return minus the logarithm of the posterior of a device that gives ``readings``."""
@@ -364,27 +363,27 @@ class _Search:
         estimates: dict[str, Estimate] = {}
         for _ in range(2):
             rest = (self.readings - self.reply.readings)[:, self.touched].reshape(len(self.readings), -1)[:, :_CHANNELS]
-            idle = (self.reply.felt[3] == 0).all(axis=(1, 2))
-            blocks = [block for block in self.presses.stretches(idle) if len(block) >= SHORTEST]
-            if sum(map(len, blocks)) < _LONG:
-                blocks = [np.arange(span.start, span.stop) for span in self.presses.spans]
-                rest = np.clip(rest, -4 * self.white, 4 * self.white)
-            parts = [(np.zeros(len(block)), rest[block], np.arange(len(block))) for block in blocks]
+            rest = np.clip(rest, -4 * self.white, 4 * self.white)
+            parts = [(np.zeros(len(rest[span])), rest[span], np.arange(len(rest[span]))) for span in self.presses.spans]
             fit = fit_dynamics(parts, self.presses.log.step, self.quantum, moving=False)
-            estimates = {name: fit.estimates[name] for name in ("white", "walk")}
+            # What the fitted numbers explain of the noise is missing in the residuals.
+            taxels, channels = self.readings[0, self.touched].shape
+            freed = 1 - (len(SHARED) + taxels * (7 + channels)) / (len(self.readings) * taxels * channels)
+            white, more = fit.estimates["white"], max(freed, 0.1) ** -0.5
+            white = Estimate(more * white.value, more * white.low, more * white.high, white.how)
+            estimates = {"white": white, "walk": fit.estimates["walk"]}
             self.white, self.walk = fit.dynamics.white, fit.dynamics.walk if estimates["walk"].value else 0.0
             self.descend()
-        self.refine()
         return estimates
 
     def covariance(self) -> NDArray[np.float64]:
         """Return that of all numbers [P, P]."""
         return np.linalg.inv(self.normal_equations(self.reply, self.device, robust=False)[0])
 
-    def straighten(self, suspects: NDArray[np.int64], moves: NDArray[np.float64], chance: float = 0.02) -> None:
-        """Give suspects the order and sense of axes and the place that explain them best; ``moves`` [K, 3] (m) of their
-        places are tried."""
+    def straightened(self, suspects: NDArray[np.int64]) -> Device:
+        """Return the device with the order and sense of axes and the place of suspects that explain them best."""
         device, nominal = self.device, self.presses.axes
+        moves = np.array([*itertools.product(_MOVES, repeat=3)])
         turn = device.turn.as_matrix()
         turn[suspects] = np.eye(3)
         upright = replace(device, turn=Rotation.from_matrix(turn), axes=np.tile(np.eye(3), (len(turn), 1, 1)))
@@ -401,7 +400,7 @@ class _Search:
             gains[index] = match / np.maximum(power, 1e-300)
             scores[index] = np.maximum(match, 0) * gains[index]
         # Another order must explain more than the right one by what chance may do.
-        scores[:, 0] += chance * (seen**2).sum(axis=(0, 2))
+        scores[:, 0] += _CHANCE * (seen**2).sum(axis=(0, 2))
         axes, place, gain = device.axes.copy(), device.place.copy(), device.gain.copy()
         for n in suspects:
             index, order = np.unravel_index(int(scores[:, :, n].argmax()), scores.shape[:2])
@@ -410,41 +409,43 @@ class _Search:
         change = gain[self.touched].mean()
         gain[self.touched] -= change
         shared = device.shared | {"stiffness": device.shared["stiffness"] + change}
-        self.device = Device(shared, place, axes, upright.turn, gain, device.bias)
+        return Device(shared, place, axes, upright.turn, gain, device.bias)
 
     def search(self) -> None:
-        """Fit everything from the best of several starts."""
-        # The way in which a ball pushes a taxel aside is told without friction, whatever that is.
-        friction = self.device.shared["friction"]
-        self.change(friction=0.0)
-        self.straighten(np.flatnonzero(self.touched), np.zeros((1, 3)), chance=0.1)
-        self.change(friction=friction)
+        """Fit everything, then from other places of the taxels that are explained badly."""
         self.settle()
         step, late = self.presses.log.step, self.device.shared["read_delay"]
         if (whole := step * round(late / step)) != late:
-            before = self.device, self.white
-            self.change(read_delay=whole)
-            self.settle()
-            self.keep_better(*before)
-        misfit = np.log1p(self.rest(self.reply.readings) ** 2 / _TAIL).mean(axis=(0, 2))
-        suspects = np.flatnonzero(self.touched)[misfit > 1.5 * np.median(misfit)]
-        if len(suspects):
-            before = self.device, self.white
-            self.straighten(suspects, np.array([*itertools.product(_MOVES, repeat=3)]))
-            self.settle()
-            self.keep_better(*before)
+            self.attempt(replace(self.device, shared=self.device.shared | {"read_delay": whole}))
+        for nudge in (0.0, *_NUDGES):
+            if not len(suspects := self.suspects(_SUSPECT)):
+                break
+            place = self.device.place.copy()
+            place[suspects] += nudge * np.array(self.presses.probes.normal)[suspects]
+            self.attempt(replace(self.device, place=place) if nudge else self.straightened(suspects))
 
-    def change(self, **shared: float) -> None:
-        """Set shared numbers."""
-        self.device = replace(self.device, shared=self.device.shared | shared)
+    def suspects(self, sure: float) -> NDArray[np.int64]:
+        """Return the taxels that are explained worse than the median one by ``sure`` standard errors, or worse in one
+        touch by :data:`_TOUCH` more."""
+        cost = np.log1p(self.rest(self.reply.readings) ** 2 / _TAIL).mean(axis=2)
+        level, chance = float(np.median(cost.mean(axis=0))), float(np.median(cost.std(axis=0)))
+        worse = cost.mean(axis=0) - level > sure * chance / np.sqrt(len(cost))
+        numbers = np.flatnonzero(self.touched)
+        for number, n in enumerate(numbers):
+            for rows in self.presses.stretches(self.presses.near[n]):
+                worse[number] |= cost[rows, number].mean() - level > (sure + _TOUCH) * chance / np.sqrt(len(rows))
+        return numbers[worse]
 
-    def keep_better(self, device: Device, white: float) -> None:
-        """Return to a device if it explains more than the present one."""
-        levels = self.white, white
+    def attempt(self, start: Device) -> None:
+        """Fit from another start, and return to the present device if that explains more."""
+        device, levels = self.device, [self.white]
+        self.device = start
+        self.settle()
+        levels.append(self.white)
         self.white = min(levels)
-        costs = [self.cost(readings_of(self.presses, each, self.mixing), each) for each in (self.device, device)]
-        self.white = levels[int(np.argmin(costs))]
-        if costs[1] < costs[0]:
+        costs = [self.cost(readings_of(self.presses, each, self.mixing), each) for each in (device, self.device)]
+        self.white = levels[int(costs[1] <= costs[0])]
+        if costs[0] < costs[1]:
             self.device, self.reply = device, answer(self.presses, device, self.mixing)
 
 
@@ -481,7 +482,7 @@ def _errors(device: Device, spread: NDArray[np.float64]) -> tuple[NDArray, NDArr
 def _estimates(search: _Search, spread: NDArray, noise: dict[str, Estimate]) -> tuple[dict[str, Estimate], list[str]]:
     """Return the shared numbers and the noise with intervals, and words for those that cannot be told."""
     device = search.device
-    errors, local = _errors(device, spread)
+    errors, _ = _errors(device, spread)
     estimates, notes = {}, []
     for index, (name, error) in enumerate(zip(SHARED, errors, strict=True)):
         prior = PRIORS[name]
@@ -502,7 +503,10 @@ def _estimates(search: _Search, spread: NDArray, noise: dict[str, Estimate]) -> 
             notes.append(f"{name} cannot be told: {prior.remedy}.")
         estimates[name] = Estimate(float(value), low, high, how)
     bias, quantum = device.bias[search.touched], search.quantum
-    half = Z95 * float(local[search.touched, -bias.shape[1] :].mean() / np.sqrt(bias.size))
+    mean = np.zeros((len(device.place), 7 + bias.shape[1]))
+    mean[search.touched, 7:] = 1 / bias.size
+    mean = np.r_[np.zeros(len(SHARED)), mean.ravel()]
+    half = Z95 * float(np.sqrt(mean @ spread @ mean))
     middle = float(bias.mean())
     estimates |= noise | {
         "quantum": Estimate(quantum, quantum, quantum, "all readings are its multiples" if quantum else "none found"),
@@ -512,24 +516,57 @@ def _estimates(search: _Search, spread: NDArray, noise: dict[str, Estimate]) -> 
 
 
 def _rows(device: Device, spread: NDArray, presses: Presses, names: tuple[str, ...]) -> list[dict[str, Any]]:
-    """Return place, normal and gain of each taxel with the half widths of their 95 % intervals."""
+    """Return place, normal and gain of each taxel with the half widths of their 95 % intervals; of a normal, the
+    half angle of a cone."""
     _, local = _errors(device, spread)
     normal = device.turn.apply(np.array(presses.probes.normal))
+    blocks = len(SHARED) + local.shape[1] * np.arange(len(names))[:, None] + [3, 4, 5]
+    # A turn about the normal itself does not tilt it.
+    across = np.cross(normal[:, None], np.eye(3))
+    tilts = across @ spread[blocks[:, :, None], blocks[:, None]] @ across.swapaxes(1, 2)
+    circle = np.degrees(np.sqrt(chi2.ppf(0.95, 2) * np.maximum(np.linalg.eigvalsh(tilts)[:, -1], 0)))
     tilt = np.degrees(np.arccos(np.clip((normal * presses.probes.normal).sum(axis=1), -1, 1)))
     return [
         {
             "taxel": names[n], "place": device.place[n], "place_error": Z95 * local[n, :3],
             "shift": float(np.linalg.norm(device.place[n] - presses.probes.position[n])), "normal": normal[n],
-            "normal_error": float(np.degrees(Z95 * local[n, 3:6].max())), "tilt": float(tilt[n]),
+            "normal_error": float(circle[n]), "tilt": float(tilt[n]),
             "gain": float(np.exp(device.gain[n])), "gain_error": float(Z95 * local[n, 6]),
         }
         for n in range(len(names))
     ]  # fmt: skip
 
 
+def _doubts(search: _Search, held: float, taxels: list[dict[str, Any]], idle: NDArray[np.bool_]) -> list[str]:
+    """Say why a fit is not to be trusted, and which presses would decide it."""
+    doubts: list[str] = []
+    if not held <= TRUSTED["law"]:
+        size = "no taxel was touched" if np.isnan(held) else f"the law errs by {held:.1%}"
+        doubts.append(f"On the presses that were held out {size} (at most {TRUSTED['law']:.0%}): log more presses.")
+    if idle.any():
+        untouched = listing(taxels[n]["taxel"] for n in np.flatnonzero(idle))
+        doubts.append(f"Never touched, and left where they should be: {untouched}; press there.")
+    wide = [n for n in np.flatnonzero(search.touched & ~idle) if taxels[n]["normal_error"] > TRUSTED["normal"]]
+    doubts += [
+        f"The normal of taxel {row['taxel']} is told to ± {row['normal_error']:.1f}° only (at most "
+        f"{TRUSTED['normal']:g}°): press it more, and let the ball slide."
+        for row in (taxels[n] for n in wide)
+    ]
+    sizes = np.full(len(taxels), np.nan)
+    sizes[search.touched] = np.sqrt(np.mean(search.rest(search.reply.readings) ** 2, axis=(0, 2)))
+    doubts += [
+        f"Taxel {taxels[n]['taxel']} is explained worse than the others (to {sizes[n]:.2f} times the noise) by more "
+        "than chance: its numbers may be wrong; press it more."
+        for n in search.suspects(_DOUBTED)
+    ]
+    return doubts
+
+
 def _faults(device: Device, spread: NDArray, presses: Presses, touched: NDArray, names: tuple[str, ...]) -> list[Fault]:
     """Name the numbers that lie beyond their tolerance for certain."""
     errors, local = _errors(device, spread)
+    # Standard errors beyond a tolerance, corrected for the number of comparisons.
+    sure = float(norm.isf(ACCUSED / (3 * touched.sum() + 2)))
     faults = []
     for n in np.flatnonzero((device.axes != presses.axes).any(axis=(1, 2))):
         text = f"taxel {names[n]} falls where it is pressed"
@@ -546,19 +583,19 @@ def _faults(device: Device, spread: NDArray, presses: Presses, touched: NDArray,
     turn = device.turn.as_rotvec()
     for n in np.flatnonzero(touched):
         away = float(np.linalg.norm(shift[n] - common))
-        if away - _SURE * float(local[n, :3].max()) > TOLERANCES["place"]:
+        if away - sure * float(local[n, :3].max()) > TOLERANCES["place"]:
             faults.append(Fault("shifted", names[n], f"taxel {names[n]} lies {1e3 * away:.2g} mm beside its place"))
         angle = float(np.linalg.norm(turn[n]))
-        if angle - _SURE * float(local[n, 3:6].max()) > TOLERANCES["turn"]:
+        if angle - sure * float(local[n, 3:6].max()) > TOLERANCES["turn"]:
             faults.append(Fault("turned", names[n], f"taxel {names[n]} is turned by {np.degrees(angle):.2g}°"))
         gain = float(device.gain[n]) - middle
-        if abs(gain) - _SURE * float(local[n, 6]) > TOLERANCES["gain"]:
+        if abs(gain) - sure * float(local[n, 6]) > TOLERANCES["gain"]:
             faults.append(Fault("gain", names[n], f"taxel {names[n]} reads {np.exp(gain):.2g} times what it should"))
     at = {name: index for index, name in enumerate(SHARED)}
-    if device.shared["friction"] + _SURE * errors[at["friction"]] < TOLERANCES["friction"]:
+    if device.shared["friction"] + sure * errors[at["friction"]] < TOLERANCES["friction"]:
         faults.append(Fault("friction", "", "no friction, although the ball slides"))
     delay, step = device.shared["read_delay"], presses.log.step
-    if delay - _SURE * errors[at["read_delay"]] > TOLERANCES["delay"] * step:
+    if delay - sure * errors[at["read_delay"]] > TOLERANCES["delay"] * step:
         faults.append(Fault("delay", "", f"readings come {delay:.3g} s after the ball"))
     return faults
 

@@ -139,7 +139,7 @@ class Device:
 
 def crosstalk_of(probes: Probes) -> NDArray[np.float64] | None:
     """Return the share [N, N] of each taxel's signal in each other's (4.28), or None for taxels that form no grid."""
-    if len(probes.shape) != 2 or not probes.active.all():
+    if len(probes.shape) != 2 or len(probes) == 1 or not probes.active.all():
         return None
     half = max(probes.shape)
     weight = np.pad(gaussian_weights(1.0, max(half, 4)), (0, half))
@@ -175,7 +175,8 @@ def forces(presses: Presses, device: Device, *, slopes: bool = True) -> NDArray[
         way = (way + move[index]) * held
         drag = (way - np.einsum("vqi,vqi->vq", way, across)[..., None] * across) * (ratio / deep)
         size = np.sqrt(np.einsum("vqi,vqi->vq", drag, drag))[..., None]
-        slips = size > most
+        # A derivative keeps the readings at which a taxel slips: there the way loses its part along the normal.
+        slips = np.broadcast_to((size > most)[:1], size.shape)
         drag = np.where(slips, drag * (most / np.where(slips, size, 1.0)), drag)
         way = np.where(slips, drag * (deep / ratio), way)
         sigma[:, index] = drag

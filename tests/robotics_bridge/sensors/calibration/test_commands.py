@@ -31,7 +31,7 @@ def test_calibrate_prints_intervals_and_writes_a_preset(run, tmp_path):
 
 
 def test_calibrate_fits_a_device_that_a_ball_pressed(run, tmp_path):
-    presses = plant(0, side=2, touches=8).presses
+    presses = plant(0, shape=(2, 2), touches=8).presses
     log, probes, out = (tmp_path / name for name in ("log.csv", "pad.json", "device.json"))
     header = ["time", "x", "y", "z", *(f"{n}:{axis}" for n in range(4) for axis in "xyz")]
     table = np.column_stack([presses.log.time, presses.ball, presses.log.readings])

@@ -11,16 +11,17 @@ from brainbench.core.errors import DataError
 from robotics_bridge.sensors.calibration.devices import fit_device
 from robotics_bridge.sensors.calibration.presses import Presses
 from robotics_bridge.sensors.noise.model import Noise
-from tests.factories.pressed_devices import FAULTS, outcomes, plant, tilts
+from tests.factories.pressed_devices import FAULTS, KINDS, outcomes, plant, tilts
 
 
 def test_a_device_is_recovered_within_its_intervals_and_not_accused(tmp_path) -> None:
-    planted = plant(0, side=2, touches=12)
+    planted = plant(0, shape=(2, 2), touches=12)
     fit = fit_device(planted.presses)
     assert fit.held_out < 0.05
     assert tilts(planted, fit).max() < 2
     assert np.mean([np.mean(values) for values in outcomes(planted, fit).values()]) > 0.8
     assert not fit.faults
+    assert fit.status == "ok"
     fit.save(tmp_path / "device.json", "pad")
     assert Noise.load(tmp_path / "device.json") == fit.noise
     draws = fit.draws(40)
@@ -29,20 +30,56 @@ def test_a_device_is_recovered_within_its_intervals_and_not_accused(tmp_path) ->
     assert draws[0].law() == fit.draws(1)[0].law()
 
 
+@pytest.mark.parametrize(
+    ("seed", "kind"),
+    [
+        (20_000, "1 × 1"),
+        (91, "3 × 3 taxels"),
+        pytest.param(43, "3 × 3 taxels", marks=pytest.mark.slow),
+        pytest.param(20_000, "ball of 3 mm", marks=pytest.mark.slow),
+    ],
+)
+def test_a_fit_finds_its_way_out_of_a_wrong_place(seed: int, kind: str) -> None:
+    # From one start these end with reversed axes, at an edge of the touches, or with intervals of a false slope.
+    planted = plant(seed, **KINDS[kind])
+    fit = fit_device(planted.presses)
+    assert fit.held_out < 0.05
+    assert tilts(planted, fit).max() < 2
+    assert not fit.faults
+    error = np.array([row["place"] - planted.device.place[n] for n, row in enumerate(fit.taxels)])
+    assert np.abs(error / [row["place_error"] for row in fit.taxels]).max() < 2.5
+
+
+def test_a_fit_that_cannot_be_trusted_is_uncertain_and_says_which_presses_decide() -> None:
+    planted = plant(0, shape=(2, 2), touches=12)
+    probes = planted.presses.probes
+    far = np.array(probes.position)
+    far[3] += [0.05, 0, 0]
+    fit = fit_device(Presses(planted.presses.log, replace(probes, position=far, pitch=None), planted.presses.radius))
+    assert fit.status == "uncertain"
+    assert any("Never touched, and left where they should be: '3'; press there" in doubt for doubt in fit.doubts)
+    log = planted.presses.log
+    rows = np.arange(len(log.time)) > 0.85 * len(log.time)
+    other = np.where(rows[:, None], 1.6 * log.readings, log.readings)
+    fit = fit_device(Presses(replace(log, readings=other), probes, planted.presses.radius))
+    assert fit.status == "uncertain"
+    assert any("held out the law errs by" in doubt for doubt in fit.doubts)
+
+
 @pytest.mark.parametrize("fault", ["axes", *(pytest.param(fault, marks=pytest.mark.slow) for fault in FAULTS)])
 def test_a_planted_fault_is_named(fault: str) -> None:
-    assert fault in {entry.kind for entry in fit_device(plant(10_001, fault, side=2, touches=12).presses).faults}
+    assert fault in {entry.kind for entry in fit_device(plant(10_001, fault, shape=(2, 2), touches=12).presses).faults}
 
 
 def test_a_device_of_one_channel_is_recovered() -> None:
-    planted = plant(3, side=2, touches=12, axes=1)
+    planted = plant(3, shape=(2, 2), touches=12, axes=1)
     fit = fit_device(planted.presses)
     assert fit.held_out < 0.05
     assert not fit.faults
 
 
 def test_stuck_taxels_and_too_few_presses_are_told() -> None:
-    presses = plant(0, side=2, touches=6).presses
+    presses = plant(0, shape=(2, 2), touches=6).presses
     few = np.arange(len(presses.log.time)) < 100
     log = presses.log
     with pytest.raises(DataError, match=r"holds \d touches of the ball; a fit of a device needs 5"):

@@ -23,7 +23,7 @@ from tests.factories.pressed_devices import Planted, plant, respond
 
 @pytest.fixture(scope="module")
 def planted() -> Planted:
-    return plant(0, side=2, touches=4)
+    return plant(0, shape=(2, 2), touches=4)
 
 
 def test_the_law_is_that_of_the_simulated_taxels(planted: Planted) -> None:
@@ -42,7 +42,7 @@ def test_readings_lack_nothing_but_noise(planted: Planted) -> None:
 
 @pytest.mark.parametrize("axes", [1, 3])
 def test_derivatives_are_those_of_the_readings(axes: int) -> None:
-    planted = plant(1, side=2, touches=2, axes=axes)
+    planted = plant(1, shape=(2, 2), touches=2, axes=axes)
     presses, mixing = planted.presses, crosstalk_of(planted.presses.probes)
     device = replace(planted.device, axes=presses.axes)
     reply = answer(presses, device, mixing)
