@@ -158,20 +158,22 @@ def noise(run: Run) -> Result:
     return Result("Coverage of 95 % intervals of studies that are ok, eight animals", columns, rows)
 
 
-def unique(
-    run: Run, study: Any = simulated_boards.unique_study, sides: tuple[str, ...] = ("",), designs: Any = None
-) -> Result:
+UNIQUE_DESIGNS = ((12, 0.5), (12, 0.8), (24, 0.5), (24, 0.8), (40, 0.5), (40, 0.8))
+"""Stimuli and reliability of the animals."""
+
+
+def unique(run: Run, study: Any = simulated_boards.unique_study, sides: tuple[str, ...] = ("",)) -> Result:
     """Coverage of the interval of the unique part, and how often it is found where there is one and where not."""
     rows = []
-    for stimuli, reliability in designs or product((12, 24, 40), (0.5, 0.8)):
+    for stimuli, reliability in UNIQUE_DESIGNS:
         studies = run.each(study, [NoisyStudy(seed, stimuli, 10, reliability) for seed in run.seeds()])
         labels = [f"{kind}, {hidden:g}{side}" for kind, hidden in simulated_boards.UNIQUE_CASES for side in sides]
         for label, (part, low, high, truth) in zip(labels, np.moveaxis(np.array(studies), 0, 2), strict=True):
             known = np.isfinite(part)
             true, part, low, high = np.nanmean(truth), part[known], low[known], high[known]
             numbers = f"{true:.3f}", f"{part.mean():.3f}", share((low <= true) & (true <= high)), share(low > 0)
-            rows.append([str(stimuli), f"{reliability:g}", label, *numbers])
-    columns = ["stimuli", "reliability", "network, hidden share", "true", "mean", "coverage", "found above 0"]
+            rows.append([str(stimuli), f"{reliability:g}", label, *numbers, str(len(part))])
+    columns = ["stimuli", "reliability", "network, hidden share", "true", "mean", "coverage", "found above 0", "ok"]
     return Result("Unique part of networks of six layers, eight animals, ten trials", columns, rows)
 
 
@@ -451,9 +453,7 @@ JOBS: dict[str, Callable[[Run], Result]] = {
     "coverage": coverage,
     "noise": noise,
     "unique": unique,
-    "ridge": partial(
-        unique, study=simulated_boards.ridge_study, sides=(": score", ": unique part"), designs=((12, 0.8), (24, 0.5))
-    ),
+    "ridge": partial(unique, study=simulated_boards.ridge_study, sides=(": score", ": unique part")),
     "pairs": pairs,
     "over-time": over_time,
     "dimensions": dimensions,

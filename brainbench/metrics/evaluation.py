@@ -418,13 +418,16 @@ def evaluate(
     chosen = rule.choose(scale(votes.r))
     scale = replace(scale, layer=most_chosen(chosen))
     chosen_r, values = take_layers(votes.r, chosen), take_layers(scale(votes.r), chosen) * weights
-    # The layers of the data serve without a stimulus too: where the choice jumps between layers that are nearly alike,
-    # a jackknife that repeats it measures the jumps instead of the stimuli.
+    # The layers of the data serve without a stimulus too, unless a metric repeats the choice: where it jumps between
+    # layers that are nearly alike, a jackknife that repeats it measures the jumps instead of the stimuli.
     single = rule.kind == "halves" or estimator != "default"
     factors_without = weights if single else metric.factors_without(votes.compared.animals, weights)
-    ever, place = np.unique(chosen, return_inverse=True)
-    jackknife = votes.compared.among(ever, votes.compared.animals).without_each()
-    without = (take_layers(scale(jackknife, ever), place) * factors_without).mean(axis=-1)
+    anew = metric.chooses_anew and rule.kind in ("others", "maximum")
+    ever, place = np.unique(competing if anew else chosen, return_inverse=True)
+    jackknife = scale(votes.compared.among(ever, votes.compared.animals).without_each(), ever)
+    if anew:
+        place = replace(rule, competing=None).choose(jackknife)
+    without = (take_layers(jackknife, place) * factors_without).mean(axis=-1)
     test, layer_null = _test(null, votes.permuted, scale, rule, some)
     # The halves of an animal are noisier than the animal.
     whole = replace(scale, chance=scale.chance * weights.mean() / factors.mean())

@@ -64,6 +64,8 @@ class MetricHooks:
     """True when :meth:`unique` says what layers explain beyond controls."""
     of_model_alone = False
     """True when a comparison says nothing of the animal."""
+    chooses_anew = False
+    """True when the interval repeats the choice of layers without each stimulus in turn."""
     of_covariates = False
     """True when a comparison also takes what else was measured in the trials: contacts, licks and choices."""
     reasons: tuple[str, ...] = ()

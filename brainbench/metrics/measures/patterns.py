@@ -153,6 +153,7 @@ class RidgeEncoding(PatternMetric):
     title = "share of explainable variance that ridge regression predicts for stimuli left out"
     orders_between = 39
     of_unique_parts = True
+    chooses_anew = True
 
     def correction(self, animal: SubjectRDM, estimator: str) -> Corrected:
         """Return the ratio of all variance to that without noise."""
@@ -164,14 +165,34 @@ class RidgeEncoding(PatternMetric):
 
     def compare_orders(self, model: Floats, animals: Sequence[SubjectRDM], orders: Ints) -> Floats:
         """Return raw values [N, A] with the model's stimuli in each order [N, K]."""
-        error, base = _errors(model, animals, orders, _folds(len(model)))
-        return _share(error, base, animals) * _explainable(animals)
+        count, kernel, folds = len(model), centred_products(model), _folds(len(model))
+        # Brain stimulus i stands at the model's stimulus order[i]: products are moved to the model's places.
+        place = np.argsort(orders, axis=1)
+        products = np.stack([centred_products(animal.patterns) for animal in animals])
+        flat = products[:, place[:, :, None], place[:, None, :]].swapaxes(0, 1).reshape(-1, count * count)
+        # Squared errors of the prediction and of the training mean.
+        error, base = np.zeros((2, len(flat)))
+        for fold in np.unique(folds):
+            test, train = np.flatnonzero(folds == fold), np.flatnonzero(folds != fold)
+            residuals, combinations = _fits(kernel[None], train, test)
+            inner = residuals.swapaxes(1, 2) @ residuals
+            # The penalty with the least squared error over left-out training stimuli serves the fold, chosen anew for
+            # every order.
+            chosen = np.argmin(flat @ inner.reshape(len(PENALTIES), -1).T, axis=1)
+            for index in np.unique(chosen):
+                rows = np.flatnonzero(chosen == index)
+                error[rows] += flat[rows] @ (combinations[index].T @ combinations[index]).ravel()
+            means = _means(count, train, test)
+            base += flat @ (means.T @ means).ravel()
+        noise = np.array([animal.noise.sum() for animal in animals])
+        error, base = (part.reshape(len(orders), -1) - noise for part in (error, base))
+        return (1 - error / np.where(base > 0, base, np.nan)) * _explainable(animals)
 
     def compare_without(self, layers: Sequence[Floats], animals: Sequence[SubjectRDM]) -> Floats:
-        """Return raw values [K, L, A] without each stimulus in turn; the others keep their folds and penalties.
+        """Return raw values [K, L, A] without each stimulus in turn; the others keep their folds.
 
-        A stimulus also leaves the training of the others: without that, intervals of 14 stimuli were a quarter too
-        narrow.
+        A stimulus also leaves the training of the others and the choice of their penalties: intervals of given ones are
+        too narrow where little is to be found.
         """
         parts = [
             _banded(animals, np.zeros_like(kernel), [kernel], BANDS[-1:]) for kernel in map(centred_products, layers)
@@ -204,6 +225,7 @@ class RidgeEncoding(PatternMetric):
 
 BANDS = (0.0, 0.05, 0.2, 0.5, 0.8, 0.95, 1.0)
 """Weights of a layer's kernel beside that of the controls, both of unit trace, from which both together choose."""
+_TIE = 1e-9
 
 
 def _banded(
@@ -212,7 +234,7 @@ def _banded(
     """Return shares [3, A] by both bands, controls and layer, those without each stimulus [3, A, K], and the layers."""
     count, folds, weights = len(control), _folds(len(control)), np.array(bands)[:, None, None]
     products = np.stack([centred_products(animal.patterns) for animal in animals])
-    flat, size = products.reshape(len(animals), -1), np.trace(products, axis1=1, axis2=2)
+    size = np.trace(products, axis1=1, axis2=2)
     last = len(PENALTIES)
     candidates = np.arange(len(bands) * last)
     sides = (candidates, candidates[:last], candidates[-last:])
@@ -221,29 +243,44 @@ def _banded(
     for fold in np.unique(folds):
         test, train = np.flatnonzero(folds == fold), np.flatnonzero(folds != fold)
         fits = [_fits((1 - weights) * control + weights * kernel, train, test) for kernel in kernels]
-        losses = [
-            (residuals.swapaxes(1, 2) @ residuals).reshape(len(residuals), -1) @ flat.T / size for residuals, _ in fits
-        ]
+        losses = np.stack([_losses_without(residuals, products) for residuals, _ in fits]) / size[:, None, None]
         # Rounding chooses between no two layers that are equal.
-        totals = np.array([loss.min(axis=0).sum() for loss in losses])
-        layer = int(np.flatnonzero(totals <= totals.min() * (1 + _TIE))[0])
-        chosen.append(layer)
-        (residuals, combinations), loss = fits[layer], losses[layer]
+        totals = losses.min(axis=2).sum(axis=1)
+        layer = np.argmax(totals <= totals.min(axis=0) * (1 + _TIE), axis=0)
+        chosen.append(layer[0])
         mean = np.zeros((count, count))
         mean[train] = _means(count, train, train) * len(train) / (len(train) - 1)
         for index, product in enumerate(products):
-            best = [side[int(np.argmin(loss[side, index]))] for side in sides]
-            pairs = [(residuals[place], combinations[place]) for place in best] + [(mean, _means(count, train, test))]
-            for side, pair in enumerate(pairs):
-                sums[side, index] += _errors_without(*pair, product, test)
-    noise = np.array([animal.noise.sum(axis=1) for animal in animals])
-    noise = noise.sum(axis=1, keepdims=True) - np.concatenate([np.zeros((len(noise), 1)), noise], axis=1)
-    sums -= noise
+            sums[-1, index] += _errors_without(mean, _means(count, train, test), product, test)
+            for side, some in enumerate(sides):
+                best = losses[layer, index, :, np.arange(1 + count)][:, some].argmin(axis=1) + some[0]
+                for winner in {*zip(layer.tolist(), best.tolist(), strict=True)}:
+                    rows = np.flatnonzero((layer == winner[0]) & (best == winner[1]))
+                    pair = (part[winner[1]] for part in fits[winner[0]])
+                    sums[side, index, rows] += _errors_without(*pair, product, test)[rows]
+    # The noise of all stimuli, and of all but each.
+    sums -= np.stack([animal.noise.sum(axis=1) for animal in animals]) @ (1 - np.eye(count, 1 + count, 1))
     shares = 1 - sums[:-1] / np.where(sums[-1] > 0, sums[-1], np.nan)
     return shares[..., 0], shares[..., 1:], np.array(chosen)
 
 
-_TIE = 1e-9
+def _losses_without(residuals: Floats, products: Floats) -> Floats:
+    """Return squared errors [A, M, 1 + K] of training stimuli, each predicted from the others, of all and without each.
+
+    Left out in pairs, stimulus i has the residual (rᵢ − Rᵢₖ rₖ) / (1 − Rᵢₖ Rₖᵢ) by residuals R of single ones.
+    """
+    places = np.arange(residuals.shape[-1])
+    weights = 1 - residuals * residuals.swapaxes(1, 2)
+    weights[:, places, places] = np.inf
+    weights = weights**-2.0
+    crossed, turned = residuals * weights, residuals.swapaxes(1, 2)
+    squares, losses = (residuals * crossed).sum(axis=1), []
+    for product in products:
+        moved = residuals @ product @ turned
+        size = np.diagonal(moved, axis1=1, axis2=2)
+        pairs = (size[:, None] @ weights)[:, 0] - 2 * np.einsum("mik,mik->mk", crossed, moved) + squares * size
+        losses.append(np.concatenate([size.sum(axis=1, keepdims=True), pairs], axis=1))
+    return np.stack(losses)
 
 
 def _errors_without(residuals: Floats, combinations: Floats, products: Floats, test: Ints) -> Floats:
@@ -259,14 +296,6 @@ def _errors_without(residuals: Floats, combinations: Floats, products: Floats, t
     return np.concatenate([errors.sum(keepdims=True), without.sum(axis=1)])
 
 
-def _share(error: Floats, base: Floats, animals: Sequence[SubjectRDM]) -> Floats:
-    """Return the share [..., A] of the explainable variance that is predicted, of squared errors [..., A, K]."""
-    noise = np.array([animal.noise.sum() for animal in animals])
-    with np.errstate(invalid="ignore", divide="ignore"):
-        explainable = base.sum(axis=-1) - noise
-        return 1 - (error.sum(axis=-1) - noise) / np.where(explainable > 0, explainable, np.nan)
-
-
 def _explainable(animals: Sequence[SubjectRDM]) -> Floats:
     """Return the share [A] of each animal's variance between stimuli that is not noise, whatever the folds."""
     # Deviations from the mean of the K − 1 other stimuli are K/(K − 1) of those from the mean of all.
@@ -279,32 +308,6 @@ def _explainable(animals: Sequence[SubjectRDM]) -> Floats:
 def _folds(count: int) -> Ints:
     """Return the fold [K] of each stimulus: every tenth, in the order that the animals give them, is of one fold."""
     return np.arange(count) % min(count, FOLDS)
-
-
-def _errors(model: Floats, animals: Sequence[SubjectRDM], orders: Ints, folds: Ints) -> tuple[Floats, Floats]:
-    """Return squared errors of the prediction and of the training mean [N, A, K], by the stimulus of the model."""
-    count, kernel = len(model), centred_products(model)
-    # Brain stimulus i stands at the model's stimulus order[i]: products are moved to the model's places.
-    place = np.argsort(orders, axis=1)
-    products = np.stack([centred_products(animal.patterns) for animal in animals])
-    moved = products[:, place[:, :, None], place[:, None, :]].swapaxes(0, 1)
-    flat = moved.reshape(-1, count * count)
-    error, base = np.empty((len(flat), count)), np.empty((len(flat), count))
-    for fold in np.unique(folds):
-        test, train = np.flatnonzero(folds == fold), np.flatnonzero(folds != fold)
-        residuals, combinations = _fits(kernel[None], train, test)
-        inner = residuals.swapaxes(1, 2) @ residuals
-        # The penalty with the least squared error over left-out training stimuli serves the fold, chosen anew for
-        # every order.
-        chosen = np.argmin(flat @ inner.reshape(len(PENALTIES), -1).T, axis=1)
-        for index in np.unique(chosen):
-            rows = np.flatnonzero(chosen == index)
-            outer = np.einsum("ti,tj->tij", combinations[index], combinations[index]).reshape(len(test), -1)
-            error[np.ix_(rows, test)] = flat[rows] @ outer.T
-        means = _means(count, train, test)
-        base[:, test] = flat @ np.einsum("ti,tj->tij", means, means).reshape(len(test), -1).T
-    shape = (len(orders), len(animals), count)
-    return error.reshape(shape), base.reshape(shape)
 
 
 def _means(count: int, train: Ints, test: Ints) -> Floats:

@@ -16,6 +16,7 @@ from brainbench.metrics.measures.patterns import (
     RidgeEncoding,
     _errors_without,
     _fits,
+    _losses_without,
     centred_products,
     variance_partition,
 )
@@ -312,22 +313,43 @@ def test_the_unique_part_of_ridge_says_what_it_lacks_and_does_not_depend_on_the_
     assert (second.unique, second.low) == pytest.approx((first.unique, first.low), abs=1e-9)
 
 
-def test_errors_without_a_training_stimulus_are_those_of_a_fit_that_never_had_it():
+def test_errors_and_losses_without_a_stimulus_are_those_of_fits_that_never_had_it():
     rng = np.random.default_rng(2)
     features, responses = rng.normal(size=(12, 5)), rng.normal(size=(12, 3))
-    train, test, place = np.arange(3, 12), np.arange(3), 4
-    kernel = features @ features.T
-    residuals, combinations = (part[place] for part in _fits(kernel[None], train, test))
-    errors = _errors_without(residuals, combinations, centred_products(responses), test)
+    train, test = np.arange(3, 12), np.arange(3)
+    every, combinations = _fits((features @ features.T)[None], train, test)
+    products = centred_products(responses)
+    losses = _losses_without(every, products[None])[0]
     centred = features[train] - features[train].mean(axis=0)
-    penalty = PENALTIES[place] * (centred**2).sum() / len(train)
-    for without in (None, 3, 7, 1):
-        rest, judged = (side[side != without] for side in (train, test))
+
+    def error(rest, judged, penalty):
         x, y = (part[rest] - part[rest].mean(axis=0) for part in (features, responses))
         slope = np.linalg.solve(x.T @ x + penalty * np.eye(5), x.T @ y)
         predicted = (features[judged] - features[rest].mean(axis=0)) @ slope + responses[rest].mean(axis=0)
-        expected = ((responses[judged] - predicted) ** 2).sum()
-        assert errors[0 if without is None else 1 + without] == pytest.approx(expected)
+        return ((responses[judged] - predicted) ** 2).sum()
+
+    for place in (2, 4):
+        penalty = PENALTIES[place] * (centred**2).sum() / len(train)
+        errors = _errors_without(every[place], combinations[place], products, test)
+        for without in (None, 3, 7, 1):
+            column = 0 if without is None else 1 + without
+            rest, judged = (side[side != without] for side in (train, test))
+            assert errors[column] == pytest.approx(error(rest, judged, penalty))
+            expected = sum(error(np.setdiff1d(rest, t), np.array([t]), penalty) for t in rest)
+            assert losses[place, column] == pytest.approx(expected)
+
+
+def test_the_interval_of_ridge_repeats_the_choice_of_penalties_and_layers(monkeypatch):
+    """Where a network knows little, most of the uncertainty is whether its penalty and its layer are chosen."""
+    rng = np.random.default_rng(3)
+    hidden, raw = rng.normal(size=(2, 14, 4))
+    layers = {"hidden": hidden, **{str(index): rng.normal(size=(14, 4)) for index in range(3)}}
+    widths = []
+    for anew in (True, False):
+        monkeypatch.setattr(RidgeEncoding, "chooses_anew", anew)
+        score = get_metric("ridge").score(layers, _mixing(hidden, raw, 0.2), name="", stimuli=list(map(str, range(14))))
+        widths.append(score.interval.high - score.interval.low)
+    assert widths[0] > 1.2 * widths[1]
 
 
 def _r2(y, *x):
