@@ -256,8 +256,8 @@ def _banded(
                 best = losses[layer, index, :, np.arange(1 + count)][:, some].argmin(axis=1) + some[0]
                 for winner in {*zip(layer.tolist(), best.tolist(), strict=True)}:
                     rows = np.flatnonzero((layer == winner[0]) & (best == winner[1]))
-                    pair = (part[winner[1]] for part in fits[winner[0]])
-                    sums[side, index, rows] += _errors_without(*pair, product, test)[rows]
+                    residuals, combinations = (part[winner[1]] for part in fits[winner[0]])
+                    sums[side, index, rows] += _errors_without(residuals, combinations, product, test)[rows]
     # The noise of all stimuli, and of all but each.
     sums -= np.stack([animal.noise.sum(axis=1) for animal in animals]) @ (1 - np.eye(count, 1 + count, 1))
     shares = 1 - sums[:-1] / np.where(sums[-1] > 0, sums[-1], np.nan)
