@@ -77,9 +77,7 @@ def _run() -> None:
         if error.errno in (errno.ENAMETOOLONG, errno.EACCES, errno.EPERM, errno.EROFS, errno.ELOOP) and error.filename:
             print(f"brainbench: {brief(str(error.filename))} cannot be opened ({error.strerror}).", file=sys.stderr)
             sys.exit(2)
-        # Where all folders for temporary files are full, Python finds none: ENOENT without a name.
-        full = (errno.ENOSPC, errno.EDQUOT, errno.EIO)
-        if error.errno not in full and (error.errno, error.filename) != (errno.ENOENT, None):
+        if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EIO):
             raise
         # It would be tried again, and fail again, when Python ends.
         with contextlib.suppress(OSError, ValueError):

@@ -7,17 +7,18 @@ import gc
 import logging
 import os
 import re
-import tempfile
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from functools import cache
 from importlib import import_module
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
 from brainbench.core.errors import MissingDependencyError, UsageError, brief
+from brainbench.core.reading.regular import temporary_folder
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -64,7 +65,7 @@ def _without_driver_warning() -> Iterator[None]:
         yield
         return
     try:
-        with tempfile.TemporaryFile() as said:
+        with temporary_folder() as folder, Path(folder, "stderr").open("w+b") as said:
             os.dup2(said.fileno(), 2)
             try:
                 yield

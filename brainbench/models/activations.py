@@ -10,8 +10,6 @@ from __future__ import annotations
 
 import logging
 import os
-import shutil
-import tempfile
 import weakref
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
@@ -25,6 +23,7 @@ import numpy as np
 from brainbench.core.errors import BrainbenchError, UsageError, check_each, listing, unknown_name
 from brainbench.core.plugins import load_optional, optional_parts
 from brainbench.core.reading.ranges import check_number
+from brainbench.core.reading.regular import temporary_folder
 
 if TYPE_CHECKING:
     import torch
@@ -357,8 +356,9 @@ class _Rooms:
         folder = self.folder
         if folder is None and self.used + size > self.memory:
             if self.spill is None:
-                self.spill = tempfile.mkdtemp(prefix="brainbench-layers-")
-                weakref.finalize(self.result, shutil.rmtree, self.spill, ignore_errors=True)
+                spill = temporary_folder()
+                self.spill = spill.name
+                weakref.finalize(self.result, spill.cleanup)
             folder = self.spill
         if folder is None:
             self.used += size

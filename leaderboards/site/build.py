@@ -14,7 +14,6 @@ from __future__ import annotations
 import hashlib
 import os
 import shutil
-import tempfile
 import zipfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
@@ -35,6 +34,7 @@ from brainbench.core.files import (
     writable,
     write_json,
 )
+from brainbench.core.reading.regular import temporary_folder
 from brainbench.core.reading.values import typed_values
 from brainbench.core.records import ResultRecord
 from leaderboards import text as words
@@ -247,7 +247,7 @@ def _pages(stored: Sequence[StoredRecord], title: str) -> Iterator[tuple[str, _C
     for entry in (entry for board in boards for entry in board.entries if entry.page):
         whole = (files[record.identity].whole for record in entry.records)
         yield f"models/{entry.page}", model_page(replace(entry, records=tuple(filter(None, whole))))
-    with tempfile.TemporaryFile() as stream:
+    with temporary_folder() as folder, Path(folder, "records.zip").open("w+b") as stream:
         with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
             # Their names are those of their content, so that unpacking into a folder merges them.
             for name, file in sorted((file.record.file_name, file) for file in files.values() if file.record):

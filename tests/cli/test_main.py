@@ -186,7 +186,7 @@ def test_no_place_for_temporary_files_is_one_sentence(run, tmp_path, monkeypatch
         file["x"] = [1.0]
     ended = run("recordings", "inspect", str(tmp_path / "a.h5"))
     assert (ended.status, ended.out, ended.err.count("\n")) == (1, "", 1)
-    assert "No usable temporary directory" in ended.err
+    assert "No folder for temporary files has room; name one" in ended.err
 
 
 @pytest.mark.parametrize("words", [("models", "show", "local-dir:~nobody9/x"), ("recordings", "inspect", "~nobody9/x")])

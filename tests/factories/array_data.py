@@ -82,7 +82,7 @@ class ArrayData:
 
     def __init__(self, classes: tuple[str, ...], **splits: tuple[Any, Any]) -> None:
         self.classes, self.splits = tuple(classes), splits
-        self.summary = {}
+        self.summary: Mapping[str, Any] = {}
 
     def batches(self, split: str, options: BatchOptions) -> ArrayBatches | None:
         """Return a split's batches, None if there is no such split; they are moved by whoever reads them."""

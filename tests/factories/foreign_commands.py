@@ -370,7 +370,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("folder", type=Path)
     parser.add_argument("names", nargs="*", help="entrances; all of them by default")
-    parser.add_argument("--cases", type=int, default=200)
+    parser.add_argument("--cases", type=int, default=200, help="seeds up to this one")
+    parser.add_argument("--first", type=int, default=0, help="first seed, where several processes share an entrance")
     parser.add_argument("--before", type=Path, help="folder of an earlier tree")
     chosen = parser.parse_args()
     torch.set_num_threads(1)  # a fork of a process whose threads have worked waits for them for ever
@@ -378,7 +379,7 @@ def main() -> None:
     folder.mkdir(parents=True, exist_ok=True)
     for door in DOORS:
         if not chosen.names or door.name in chosen.names:
-            first = len(_outcomes(folder).get(door.name, ()))
+            first = chosen.first + len(_outcomes(folder).get(door.name, ()))
             verdicts = cases(door, folder / door.name, range(first, chosen.cases))
             if (good := next(verdicts)).kind != "accepted":
                 raise SystemExit(f"{door.name}: what is whole is not accepted: {good}")

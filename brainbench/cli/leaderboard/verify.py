@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 import secrets
 import subprocess
-import tempfile
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -23,6 +22,7 @@ from brainbench.cli.output import Output, progress_bar, table_of, tracked
 from brainbench.core.errors import BrainbenchError, DataError, UsageError, brief, look_alike, visible
 from brainbench.core.files import content_hash, private_folder, write_json
 from brainbench.core.reading.ranges import check_number
+from brainbench.core.reading.regular import temporary_folder
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -358,7 +358,7 @@ def check_submission(
     added = [file for file in changes if file.path not in {item["path"] for item in refused}]
     checked = Output([], "no new record")
     if added:
-        with tempfile.TemporaryDirectory() as temporary:
+        with temporary_folder() as temporary:
             # Each in a folder of its own, so that no name takes the place of another.
             files = [Path(temporary, str(number), _name(file.path)) for number, file in enumerate(added)]
             for file, path in zip(added, files, strict=True):

@@ -13,7 +13,6 @@ import os
 import signal
 import subprocess
 import sys
-import tempfile
 import threading
 from collections.abc import Sequence
 from pathlib import Path
@@ -24,7 +23,7 @@ from numpy.typing import NDArray
 
 from brainbench.core.errors import BrainbenchError, DataError, brief
 from brainbench.core.reading.archives import read_npz
-from brainbench.core.reading.regular import check_file, readable
+from brainbench.core.reading.regular import check_file, readable, temporary_folder
 
 SECONDS = 60.0
 """Processor time for a file, by default."""
@@ -42,7 +41,7 @@ def read_apart(function: str, path: str | os.PathLike[str], kind: str) -> dict[s
     ``kind`` is what the file shall be, in words.
     """
     file = check_file(path, kind).absolute()
-    with tempfile.TemporaryDirectory(prefix="brainbench-") as folder:
+    with temporary_folder() as folder:
         arrays = Path(folder) / "arrays.npz"
         fault = call_apart(f"{__name__}:save_arrays", [function, os.fspath(file), os.fspath(arrays)], SECONDS)
         if fault != "":

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from brainbench.core.errors import DataError, brief
 from brainbench.core.reading.apart import CRASHED, call_apart
 from brainbench.core.reading.hdf5_worker import lacking_filters
-from brainbench.core.reading.regular import check_file, readable
+from brainbench.core.reading.regular import check_file, readable, temporary_folder
 
 if TYPE_CHECKING:
     import h5py
@@ -54,7 +53,7 @@ def open_hdf5(path: str | os.PathLike[str], kind: str = "HDF5 file", hint: str =
     state = _state(place)
     with contextlib.ExitStack() as stack:
         if state not in _TRUSTED:
-            folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="brainbench-"))
+            folder = stack.enter_context(temporary_folder())
             allowed = [name for name in os.environ.get(LINKED_VARIABLE, "").split(os.pathsep) if name]
             request, seconds = [str(place), allowed, f"{folder}/{place.name}"], SECONDS + state[2] / RATE
             answer = call_apart(WALK, request, seconds + (600 if allowed else 0))

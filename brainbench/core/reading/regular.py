@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import stat
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -22,6 +23,16 @@ def user_path(path: str | os.PathLike[str]) -> Path:
     except RuntimeError as error:
         name = brief(os.fspath(path))
         raise UsageError(f"{name} begins with the ~ of a user that there is not; write the folder out.") from error
+
+
+def temporary_folder() -> tempfile.TemporaryDirectory[str]:
+    """Make a folder for temporary files, which goes with its context or its :meth:`cleanup`."""
+    try:
+        return tempfile.TemporaryDirectory(prefix="brainbench-", ignore_cleanup_errors=True)
+    except FileNotFoundError as error:
+        raise DataError(
+            "No folder for temporary files has room; name one that can be written to with TMPDIR."
+        ) from error
 
 
 def check_file(path: str | os.PathLike[str], kind: str = "file", *, most: int | None = None) -> Path:

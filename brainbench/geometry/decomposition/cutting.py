@@ -6,7 +6,6 @@ import logging
 import os
 import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Sequence
 from importlib import metadata
@@ -18,6 +17,7 @@ import numpy as np
 
 from brainbench.core.errors import DataError, missing_dependency
 from brainbench.core.files import cache_dir, content_hash
+from brainbench.core.reading.regular import temporary_folder
 from brainbench.core.reading.sealed import read_sealed, write_sealed
 from brainbench.geometry.mesh import Deviation, Mesh, convex_hull, deviation, hausdorff
 from brainbench.geometry.pieces import Decomposition, DecompositionSettings
@@ -96,7 +96,7 @@ def _decimated(mesh: Mesh, most: int) -> tuple[Mesh, float]:
 
 def _run(mesh: Mesh, settings: DecompositionSettings) -> list[np.ndarray]:
     worker = Path(__file__).with_name("worker.py")
-    with tempfile.TemporaryDirectory(prefix="brainbench-") as folder:
+    with temporary_folder() as folder:
         source, target = Path(folder, "mesh.npz"), Path(folder, "pieces.npz")
         np.savez(source, vertices=mesh.vertices, faces=mesh.faces)
         words = [settings.method, settings.threshold, settings.most_pieces or -1, settings.seed, int(settings.memory)]

@@ -33,6 +33,14 @@ LARGEST_FORCE = 1e3  # magnitude [N, N·m] that no base of a whisker feels
 _NOISE = "noise of a measurement (standard deviation, SI units)"
 
 
+def real_numbers(values: ArrayLike) -> NDArray[np.float64]:
+    """Return numbers in double precision; complex ones, of which a part would be lost, are a :class:`DataError`."""
+    array = np.asarray(values)
+    if array.dtype.kind == "c":
+        raise DataError("Measurements are real numbers; received complex ones.")
+    return array.astype(float)
+
+
 def new_shapes(times: ArrayLike, points: ArrayLike, *, noise: float | None = None, **attributes: Any) -> xr.Dataset:
     """Return traced shapes as a data set.
 
@@ -44,7 +52,7 @@ def new_shapes(times: ArrayLike, points: ArrayLike, *, noise: float | None = Non
     """
     import xarray as xr
 
-    values = np.asarray(points, dtype=float)
+    values = real_numbers(points)
     if values.ndim != 3 or values.shape[2] not in (2, 3) or not values.shape[1]:
         raise DataError(
             f"Traced shapes are points [time, point, 2 or 3], at least one point a frame; received {values.shape}."
@@ -90,7 +98,7 @@ def new_wrenches(
 
     check_each("channel of a wrench", channels, CHANNELS)
     check_once("A wrench", channels)
-    array = np.asarray(values, dtype=float)
+    array = real_numbers(values)
     if array.ndim != 2 or array.shape[1] != len(channels):
         raise DataError(f"Wrenches are numbers [time, {len(channels)}]; received an array of shape {array.shape}.")
     if not np.isfinite(array).any():
@@ -121,7 +129,7 @@ def _check_largest(what: str, values: NDArray[np.float64], most: float, hint: st
 
 def check_times(times: ArrayLike, count: int) -> NDArray[np.float64]:
     """Return times [n] (s) that increase and are as many as there are rows; others are a :class:`DataError`."""
-    values = np.asarray(times, dtype=float)
+    values = real_numbers(times)
     if values.shape != (count,):
         raise DataError(f"{count} rows of measurements need {count} times; received an array of shape {values.shape}.")
     good = np.isfinite(values) & (np.diff(values, prepend=-np.inf) > 0)

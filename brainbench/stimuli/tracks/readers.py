@@ -26,7 +26,7 @@ from brainbench.core.reading.apart import read_apart
 from brainbench.core.reading.hdf5 import open_hdf5
 from brainbench.core.reading.regular import MOST_TABLE, MOST_TEXT, check_file, readable
 from brainbench.core.reading.tables import read_columns, read_rows, to_numbers
-from brainbench.stimuli.tracks.contract import check_track, every_frame, new_shapes
+from brainbench.stimuli.tracks.contract import check_track, every_frame, new_shapes, real_numbers
 
 Array = NDArray[np.float64]
 Segments = dict[tuple[int, int], Array]  # points [k, 2] (pixels) of each trace by frame and number within the frame
@@ -194,11 +194,11 @@ def _read_whiskiwrap(
         summary = arrays["summary"]
         # Older files call frame, number and follicle otherwise.
         renamed = {"time": "fid", "id": "wid", "fol_x": "follicle_x", "fol_y": "follicle_y"}
-        columns = {str(renamed.get(name, name)): summary[name].astype(float) for name in summary.dtype.names or ()}
+        columns = {str(renamed.get(name, name)): real_numbers(summary[name]) for name in summary.dtype.names or ()}
         if not {"fid", "wid"} <= set(columns):
             raise DataError(f"The summary of {brief(os.fspath(path))} has no frame and no number of each trace.")
         pairs = zip(arrays["pixels_x"], arrays["pixels_y"], strict=True)
-        points = [np.stack([np.asarray(x, dtype=float), np.asarray(y, dtype=float)], axis=1) for x, y in pairs]
+        points = [np.stack([real_numbers(x), real_numbers(y)], axis=1) for x, y in pairs]
     return dict(zip(_keys(columns, path), points, strict=True)), *_identities(columns, path)
 
 
@@ -298,9 +298,9 @@ def _read_hdf5(path: str | os.PathLike[str]) -> tuple[NDArray[np.int_], Columns]
             table = group["table"]
             rows = table[()]
             names = pickled_names(bytes(table.attrs["values_block_0_kind"]), brief(os.fspath(path)))
-            index, values = rows["index"].astype(float), rows["values_block_0"].astype(float)
+            index, values = real_numbers(rows["index"]), real_numbers(rows["values_block_0"])
         else:
-            index, values = group["axis1"][()].astype(float), group["block0_values"][()].astype(float)
+            index, values = real_numbers(group["axis1"][()]), real_numbers(group["block0_values"][()])
             levels = int(group.attrs["block0_items_nlevels"])
             words = [
                 [group[f"block0_items_level{level}"][code].decode() for code in group[f"block0_items_label{level}"][()]]
@@ -368,7 +368,7 @@ def read_whiskerman(path: str | os.PathLike[str], options: TrackOptions) -> tupl
     numbers = [str(number) for number in range(1, len(whiskers) + 1)]
     wanted = choose_name(f"whisker of {name}", options.track, numbers, how="as track")
     fields = whiskers[int(wanted) - 1]
-    control = np.asarray(fields["r3all"], dtype=float)
+    control = real_numbers(fields["r3all"])
     if control.ndim != 3 or control.shape[1] != 3:
         raise DataError(f"'r3all' of {name} has the shape {control.shape}; [frame, 3, control point] is needed.")
     tracked = np.asarray(fields["tracked"], dtype=bool).ravel()
@@ -377,7 +377,7 @@ def read_whiskerman(path: str | os.PathLike[str], options: TrackOptions) -> tupl
     # Without a second view there is no third axis.
     axes = 3 if np.nan_to_num(control[tracked, 2]).any() else 2
     points = bezier(control, control.shape[2])[..., :axes]
-    follicle = np.asarray(fields["fp3_all"], dtype=float).reshape(len(control), -1)[:, :axes]
+    follicle = real_numbers(fields["fp3_all"]).reshape(len(control), -1)[:, :axes]
     far = np.linalg.norm(points[:, [0, -1]] - follicle[:, None], axis=-1)
     backward = far[:, 1] < far[:, 0]
     points[backward] = points[backward, ::-1]
@@ -417,7 +417,7 @@ def matlab_arrays(path: str) -> dict[str, Array]:
         raise DataError(f"{brief(path)} is no track of WhiskerMan: the struct 'whisker' is missing.")
     _need(data["whisker"].dtype.names, path)
     structs = enumerate(data["whisker"].ravel())
-    return {f"{name}{place}": np.asarray(one[name], float) for place, one in structs for name in _STRUCT_FIELDS}
+    return {f"{name}{place}": real_numbers(one[name]) for place, one in structs for name in _STRUCT_FIELDS}
 
 
 def _structs_of_hdf5(path: str | os.PathLike[str]) -> list[dict[str, Any]]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pickle
 
+import h5py
 import numpy as np
 import pytest
 
@@ -141,6 +142,21 @@ def test_whiskerman_curves_are_evaluated_from_the_follicle(tmp_path, write):
     expected[3] = np.nan
     np.testing.assert_allclose(found["shape"].values, expected, atol=1e-9)
     assert "1 of 7 frames" in found.attrs["faults"][0]
+
+
+@pytest.mark.filterwarnings("error")
+def test_complex_numbers_are_refused(tmp_path):
+    # Their real part alone, with a warning of NumPy, were numbers that nobody wrote.
+    traces = {(frame, 0): points for frame, points in enumerate(PIXELS)}
+    path = tracks.write_whiskiwrap(tmp_path / "a.hdf5", traces, {key: points[0] for key, points in traces.items()})
+    with h5py.File(path, "a") as file:
+        del file["pixels_x"]
+        file["pixels_x"] = np.ones((len(traces), 10), complex)
+    with pytest.raises(DataError, match="complex"):
+        read_shapes(path, _options())
+    curves = tracks.write_whiskerman(tmp_path / "a.tr4", np.ones((8, 3, 3), complex), np.ones((8, 3)), np.ones(8))
+    with pytest.raises(DataError, match="complex"):
+        read_shapes(curves, _options(track="1", rows_down=False))
 
 
 def test_files_that_are_no_tracks_are_refused(tmp_path):
