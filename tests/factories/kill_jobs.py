@@ -16,6 +16,7 @@ import sys
 import time
 import traceback
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from importlib import import_module
 from pathlib import Path
@@ -330,9 +331,37 @@ def _convert_set(inputs: Path, out: Path) -> None:
     _command("stimuli", "convert", inputs / "set.h5", out / "run", "-s", "00000000", "--json")
 
 
+def _write_study(inputs: Path) -> None:
+    from tests.factories.scored_files import write_study
+
+    write_study(inputs)
+
+
+def _write_benchmark(inputs: Path) -> None:
+    from tests.factories.foreign_goods import benchmark
+
+    benchmark(inputs)
+
+
+def _make_benchmark(inputs: Path, out: Path) -> None:
+    for path in (inputs / "eight.h5", *(inputs / "data").iterdir()):
+        place = out / path.relative_to(inputs)
+        place.parent.mkdir(parents=True, exist_ok=True)
+        with suppress(FileExistsError):
+            place.hardlink_to(path)
+    os.environ["BRAINBENCH_CACHE"] = str(out.with_name(f"cache-{out.name}"))
+    words = ("-r", out / "data", "--conditions", "trials:texture", "--stimuli", out / "eight.h5", "--citation", "Doe")
+    _command("benchmark", "make", *words, "--out", out / "lab.toml", "--json")
+
+
+def _pack_benchmark(inputs: Path, out: Path) -> None:
+    _command("benchmark", "pack", inputs / "lab.toml", "--out", out / "lab.zip", "--json")
+
+
 _CLI = ("torch", "brainbench.cli")
 _TRAINER = ("brainbench.models.training.trainer", "tests.factories.training_sweeps")
 _SCORE = ("brainbench.scoring.scores", "brainbench.stimuli", "brainbench.models.zoo", "brainbench.datasets", "warp")
+_BENCHMARK = ("brainbench.benchmarks.commands", "brainbench.scoring.scores", "brainbench.datasets", "h5py")
 _TEACHER = ("mujoco", "robotics_bridge.envs", "robotics_bridge.policies.training.teacher", "rsl_rl")
 
 JOBS = (
@@ -355,6 +384,8 @@ JOBS = (
     KillJob("models export", 8, _export, modules=(*_CLI, "torch.export", "brainbench.models.export")),
     KillJob("stimuli convert, sweeps", 12, _convert, _write_tree, (*_CLI, "h5py", "brainbench.stimuli"), resumes=True),
     KillJob("stimuli convert, a run", 8, _convert_set, _write_set, (*_CLI, "h5netcdf", "brainbench.stimuli")),
+    KillJob("benchmark make", 8, _make_benchmark, _write_study, (*_CLI, *_BENCHMARK)),
+    KillJob("benchmark pack", 8, _pack_benchmark, _write_benchmark, (*_CLI, *_BENCHMARK)),
     KillJob("models import", 12, _import, _write_checkpoint, (*_CLI, "brainbench.published.checkpoint_import")),
 )  # fmt: skip
 
