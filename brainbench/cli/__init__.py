@@ -66,6 +66,11 @@ def _run() -> None:
     # A shell that completes words asks for all of them.
     completing = "_BRAINBENCH_COMPLETE" in os.environ
     try:
+        os.getcwd()
+    except FileNotFoundError:
+        print("brainbench: The current folder was deleted; change into one that exists.", file=sys.stderr)
+        sys.exit(2)
+    try:
         try:
             build(None if completing else sys.argv[1:])()
         finally:

@@ -189,6 +189,16 @@ def test_no_place_for_temporary_files_is_one_sentence(run, tmp_path, monkeypatch
     assert "No folder for temporary files has room; name one" in ended.err
 
 
+@pytest.mark.skipif(os.name != "posix", reason="a folder in use cannot be deleted")
+def test_a_deleted_working_folder_is_one_sentence(run, tmp_path, monkeypatch):
+    (tmp_path / "gone").mkdir()
+    monkeypatch.chdir(tmp_path / "gone")
+    (tmp_path / "gone").rmdir()
+    ended = run("leaderboard", "add", "records", "--to", "board")
+    assert (ended.status, ended.out) == (2, "")
+    assert ended.err == "brainbench: The current folder was deleted; change into one that exists.\n"
+
+
 @pytest.mark.parametrize("words", [("models", "show", "local-dir:~nobody9/x"), ("recordings", "inspect", "~nobody9/x")])
 def test_a_home_that_nobody_has_is_one_sentence(run, words):
     ended = run(*words)
