@@ -60,13 +60,15 @@ def main() -> None:
 
 
 def _run() -> None:
+    from pathlib import Path
+
     from brainbench.cli.application import build
     from brainbench.core.errors import BrainbenchError, brief, visible_lines
 
     # A shell that completes words asks for all of them.
     completing = "_BRAINBENCH_COMPLETE" in os.environ
     try:
-        os.getcwd()
+        Path.cwd()
     except FileNotFoundError:
         print("brainbench: The current folder was deleted; change into one that exists.", file=sys.stderr)
         sys.exit(2)

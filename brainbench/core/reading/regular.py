@@ -30,9 +30,8 @@ def temporary_folder() -> tempfile.TemporaryDirectory[str]:
     try:
         return tempfile.TemporaryDirectory(prefix="brainbench-", ignore_cleanup_errors=True)
     except FileNotFoundError as error:
-        raise DataError(
-            "No folder for temporary files has room; name one that can be written to with TMPDIR."
-        ) from error
+        # No fault of a file that is read.
+        raise BrainbenchError("No folder for temporary files has room; name one with TMPDIR.") from error
 
 
 def check_file(path: str | os.PathLike[str], kind: str = "file", *, most: int | None = None) -> Path:
