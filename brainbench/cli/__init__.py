@@ -60,21 +60,17 @@ def main() -> None:
 
 
 def _run() -> None:
-    from pathlib import Path
-
     from brainbench.cli.application import build
     from brainbench.core.errors import BrainbenchError, brief, visible_lines
 
-    # A shell that completes words asks for all of them.
-    completing = "_BRAINBENCH_COMPLETE" in os.environ
     try:
-        Path.cwd()
+        os.getcwd()  # noqa: PTH109
     except FileNotFoundError:
-        print("brainbench: The current folder was deleted; change into one that exists.", file=sys.stderr)
-        sys.exit(2)
+        sys.exit("brainbench: The current folder was deleted; change into one that exists.")
     try:
         try:
-            build(None if completing else sys.argv[1:])()
+            # A shell that completes words asks for all of them.
+            build(None if "_BRAINBENCH_COMPLETE" in os.environ else sys.argv[1:])()
         finally:
             sys.stdout.flush()  # what cannot be written fails here, where it can be said
     except BrainbenchError as error:

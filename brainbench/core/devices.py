@@ -8,8 +8,7 @@ import logging
 import os
 import re
 import threading
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cache
 from importlib import import_module
 from pathlib import Path
@@ -18,11 +17,10 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from brainbench.core.errors import MissingDependencyError, UsageError, brief
+from brainbench.core.files import cache_dir, check_folder
 from brainbench.core.reading.regular import temporary_folder
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
-
     import torch
 
 _STARTING = threading.Lock()
@@ -36,6 +34,8 @@ def warp() -> Any:
 
 @cache
 def _start() -> Any:
+    import platformdirs
+
     try:
         import warp as wp
     except ImportError as error:
@@ -45,6 +45,10 @@ def _start() -> Any:
     # Only errors: a user need not hear which devices there are, nor that kernels were compiled.
     wp.config.log_level = wp.LOG_ERROR
     wp.config.enable_backward = False
+    try:
+        check_folder(os.environ.get("WARP_CACHE_PATH") or platformdirs.user_cache_dir("warp"), "Warp")
+    except UsageError:  # no home folder, or a read-only one
+        wp.config.kernel_cache_dir = str(cache_dir("kernels"))
     with _without_driver_warning():
         wp.init()
     return wp
@@ -53,30 +57,26 @@ def _start() -> Any:
 _NO_DRIVER = b"Could not find or load the NVIDIA CUDA driver"
 
 
-@contextmanager
+@contextlib.contextmanager
 def _without_driver_warning() -> Iterator[None]:
     """Keep back the line that Warp's native library writes to stderr on machines without an NVIDIA driver.
 
     Whoever asks for ``cuda`` there is told by :func:`pick_device`. All else that is written meanwhile follows after.
     """
-    try:
-        stderr = os.dup(2)
-    except OSError:  # no stderr at all
-        yield
-        return
-    try:
-        with temporary_folder() as folder, Path(folder, "stderr").open("w+b") as said:
-            os.dup2(said.fileno(), 2)
-            try:
-                yield
-            finally:
-                os.dup2(stderr, 2)
-                said.seek(0)
-                rest = b"".join(line for line in said if _NO_DRIVER not in line)
-                if rest:
-                    os.write(2, rest)
-    finally:
-        os.close(stderr)
+    with temporary_folder() as folder, Path(folder, "stderr").open("w+b") as said:
+        try:
+            stderr = os.dup(2)
+        except OSError:  # no stderr at all
+            yield
+            return
+        os.dup2(said.fileno(), 2)
+        try:
+            yield
+        finally:
+            os.dup2(stderr, 2)
+            os.close(stderr)
+            said.seek(0)
+            os.write(2, b"".join(line for line in said if _NO_DRIVER not in line))
 
 
 def usable_processors() -> int:
@@ -277,7 +277,7 @@ class CudaGraphStep:
         if self._graph is None and not self.failed and not warming:
             self._record(lambda: self.work(*subjects))
         if self._graph is None:
-            with side_stream() if self._aside and warming else nullcontext():
+            with side_stream() if self._aside and warming else contextlib.nullcontext():
                 return self.work(*subjects)
         self._graph.replay()
         return self._result if self._kept is None else _copied(self._result, self._kept)
@@ -323,7 +323,7 @@ def record_step(
         generators: Random numbers it draws, beside torch's own on the device.
         warm_up: Runs before the recording; what they change (weights, counters) stays changed.
     """
-    with side_stream(device) if device.type == "cuda" else nullcontext() as side:
+    with side_stream(device) if device.type == "cuda" else contextlib.nullcontext() as side:
         for _ in range(warm_up):
             work()
     if side is None:

@@ -11,6 +11,7 @@ import h5py
 import pytest
 
 import brainbench
+from brainbench.cli import main
 from leaderboards.store import write_record
 from tests.factories.records import make_record
 
@@ -191,13 +192,15 @@ def test_no_place_for_temporary_files_is_one_sentence(run, tmp_path, monkeypatch
 
 
 @pytest.mark.skipif(os.name != "posix", reason="a folder in use cannot be deleted")
-def test_a_deleted_working_folder_is_one_sentence(run, tmp_path, monkeypatch):
+def test_a_deleted_working_folder_is_one_sentence(tmp_path, monkeypatch):
     (tmp_path / "gone").mkdir()
     monkeypatch.chdir(tmp_path / "gone")
     (tmp_path / "gone").rmdir()
-    ended = run("leaderboard", "add", "records", "--to", "board")
-    assert (ended.status, ended.out) == (2, "")
-    assert ended.err == "brainbench: The current folder was deleted; change into one that exists.\n"
+    monkeypatch.setattr("sys.argv", ["brainbench", "leaderboard", "add", "records", "--to", "board"])
+    with pytest.raises(
+        SystemExit, match=r"^brainbench: The current folder was deleted; change into one that exists\.$"
+    ):
+        main()
 
 
 @pytest.mark.parametrize("words", [("models", "show", "local-dir:~nobody9/x"), ("recordings", "inspect", "~nobody9/x")])

@@ -13,6 +13,7 @@ import torch
 from brainbench.core import devices as _device
 from brainbench.core.devices import CudaGraphStep, record_step
 from brainbench.core.errors import UsageError
+from brainbench.core.files import CACHE_VARIABLE
 
 
 def test_a_warp_without_a_compiler_for_processors_says_what_to_do(monkeypatch):
@@ -30,6 +31,16 @@ def test_a_device_that_is_not_there_is_told_in_one_sentence(monkeypatch, name):
     monkeypatch.setattr(_device.warp(), "get_cuda_device_count", lambda: 1)
     with pytest.raises(UsageError, match=f"'{name}'"):
         _device.pick_device(name)
+
+
+def test_kernels_are_kept_in_our_cache_where_the_home_folder_is_read_only(monkeypatch, tmp_path):
+    config = _device.warp().config
+    (tmp_path / "file").touch()
+    for name, value in {"WARP_CACHE_PATH": tmp_path / "file" / "kernels", CACHE_VARIABLE: tmp_path / "cache"}.items():
+        monkeypatch.setenv(name, str(value))
+    monkeypatch.setattr(config, "kernel_cache_dir", before := config.kernel_cache_dir)
+    _device._start.__wrapped__()
+    assert config.kernel_cache_dir == str(tmp_path / "cache" / "kernels") != before
 
 
 def test_the_automatic_device_is_the_processor_wherever_that_works():
