@@ -18,8 +18,8 @@ from typing import Annotated, Any
 import typer
 
 from brainbench.cli.output import Output, printed
-from brainbench.core.errors import FileWriteError, UsageError, brief, missing_dependency
-from brainbench.core.files import CACHE_VARIABLE, cache_dir
+from brainbench.core.errors import UsageError, missing_dependency
+from brainbench.core.files import CACHE_VARIABLE, cache_dir, check_folder
 from brainbench.core.reading.hdf5 import LINKED_VARIABLE
 
 
@@ -117,21 +117,12 @@ def needs_of(name: str, command: Callable[..., Any] | None) -> Needs:
     return getattr(command, "needs", Needs(EXTRAS.get(name, ()), name in CACHED))
 
 
-def check_cache() -> None:
-    """Raise :class:`FileWriteError` unless files can be written into the cache folder."""
-    folder = cache_dir()
-    if not os.access(folder, os.W_OK | os.X_OK):
-        raise FileWriteError(
-            f"The cache folder {brief(str(folder))} may not be written by this user; name another with the environment "
-            f"variable {CACHE_VARIABLE}."
-        )
-
-
 def check_requirements(needs: Needs, values: Mapping[str, Any]) -> None:
     """Check what a command needs for the values of its parameters.
 
     Raises:
-        FileWriteError: the cache cannot be made or written.
+        FileWriteError: the cache cannot be made.
+        UsageError: it cannot be written, or a number is none.
     """
     for name, value in values.items():
         for number in value if isinstance(value, (list, tuple)) else [value]:
@@ -147,7 +138,7 @@ def check_requirements(needs: Needs, values: Mapping[str, Any]) -> None:
         extras = ",".join(dict.fromkeys(item.extra for item in lacking.values()))
         raise missing_dependency(*lacking, extra=extras, purpose=next(iter(lacking.values())).purpose)
     if needs.cache:
-        check_cache()
+        check_folder(cache_dir(), CACHE_VARIABLE)
 
 
 def guard(app: typer.Typer) -> None:

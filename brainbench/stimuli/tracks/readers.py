@@ -30,6 +30,7 @@ from brainbench.stimuli.tracks.contract import check_track, every_frame, new_sha
 
 Array = NDArray[np.float64]
 Segments = dict[tuple[int, int], Array]  # points [k, 2] (pixels) of each trace by frame and number within the frame
+Identities = tuple[dict[tuple[int, int], int], dict[tuple[int, int], Array]]  # label and follicle (pixels) of each
 _HEADER = b"bwhiskbin1\0\0"
 _MOST_POINTS = 100_000
 
@@ -84,7 +85,7 @@ def read_whisk(path: str | os.PathLike[str], options: TrackOptions) -> tuple[NDA
     """Return frame numbers [n] and points [n, k, 2] (pixels) of one whisker."""
     name = brief(os.fspath(path))
     if Path(path).suffix in (".h5", ".hdf5"):
-        segments, labels, follicles = _read_whiskiwrap(path)
+        segments, (labels, follicles) = _read_whiskiwrap(path)
     else:
         segments, labels, follicles = _read_segments(path), {}, {}
     if options.identities is not None:
@@ -154,7 +155,7 @@ def _parse_text(rows: list[list[str]], name: str) -> Segments:
     return segments
 
 
-def _read_identities(path: str) -> tuple[dict[tuple[int, int], int], dict[tuple[int, int], Array]]:
+def _read_identities(path: str) -> Identities:
     """Return the label and the follicle (pixels) of each trace, by frame and number."""
     names, table = read_columns(path, "table of whisk's measurements", gaps=True)
     if missing := [name for name in ("fid", "wid", "label") if name not in names]:
@@ -171,9 +172,7 @@ def _keys(columns: Mapping[str, Array], path: str | os.PathLike[str]) -> list[tu
     return list(zip(*(frame_numbers(columns[name], path).tolist() for name in ("fid", "wid")), strict=True))
 
 
-def _identities(
-    columns: dict[str, Array], path: str | os.PathLike[str]
-) -> tuple[dict[tuple[int, int], int], dict[tuple[int, int], Array]]:
+def _identities(columns: dict[str, Array], path: str | os.PathLike[str]) -> Identities:
     keys = _keys(columns, path)
     labels: dict[tuple[int, int], int] = {}
     if "label" in columns:
@@ -184,9 +183,7 @@ def _identities(
     return labels, {key: place for key, place in zip(keys, places, strict=True) if np.isfinite(place).all()}
 
 
-def _read_whiskiwrap(
-    path: str | os.PathLike[str],
-) -> tuple[Segments, dict[tuple[int, int], int], dict[tuple[int, int], Array]]:
+def _read_whiskiwrap(path: str | os.PathLike[str]) -> tuple[Segments, Identities]:
     with open_hdf5(path, "HDF5 file of WhiskiWrap") as file:
         if missing := [name for name in ("summary", "pixels_x", "pixels_y") if name not in file]:
             raise DataError(f"{brief(os.fspath(path))} is no file of WhiskiWrap: {missing[0]!r} is missing.")
@@ -199,7 +196,7 @@ def _read_whiskiwrap(
             raise DataError(f"The summary of {brief(os.fspath(path))} has no frame and no number of each trace.")
         pairs = zip(arrays["pixels_x"], arrays["pixels_y"], strict=True)
         points = [np.stack([real_numbers(x), real_numbers(y)], axis=1) for x, y in pairs]
-    return dict(zip(_keys(columns, path), points, strict=True)), *_identities(columns, path)
+    return dict(zip(_keys(columns, path), points, strict=True)), _identities(columns, path)
 
 
 def _stack(traces: Mapping[int, Array], frames: NDArray[np.int_], follicles: Mapping[int, Array], most: int) -> Array:
