@@ -12,6 +12,7 @@ Letters: B batch, S numbers of state.
 from __future__ import annotations
 
 import hashlib
+import io
 import logging
 import math
 import os
@@ -29,7 +30,7 @@ from torch.nn import functional
 from brainbench.core.errors import DataError, UsageError, brief, check_name, needing
 from brainbench.core.reading.apart import CRASHED, SECONDS, call_apart
 from brainbench.core.reading.ranges import check_number
-from brainbench.core.reading.regular import check_file, reason
+from brainbench.core.reading.regular import check_file, reason, temporary_folder
 from brainbench.core.reading.tensors import check_finite
 from brainbench.models.attenders import GPTAttender, MambaAttender, MambaMemory
 from brainbench.models.encoders import S4Encoder
@@ -309,18 +310,18 @@ def require_onnx() -> None:
 
 
 def _write(step: Any, path: Path, format: str) -> None:
-    import torch
-
     example = torch.zeros(2, *step.model.spec.input_shape), step.init_state(2)
     batch = torch.export.Dim("batch", min=1, max=4096)
     shapes: dict[str, Any] = {"dynamic_shapes": ({0: batch}, {0: batch})}
-    with warnings.catch_warnings(), torch.no_grad():
+    # PyTorch's compiler looks for a folder for temporary files.
+    with temporary_folder(), warnings.catch_warnings(), torch.no_grad():
         # The exporters warn of their own parts' deprecations, which nobody here can act on.
         warnings.simplefilter("ignore")
         if format == "torch":
-            # Given a name, PyTorch writes it into the file, and this one is temporary.
-            with path.open("wb") as file:
-                torch.export.save(torch.export.export(step, example, **shapes), file)
+            # Into memory: PyTorch writes the name of a file into it, and ends the process where the disk is full.
+            content = io.BytesIO()
+            torch.export.save(torch.export.export(step, example, **shapes), content)
+            path.write_bytes(content.getvalue())
             return
         names: dict[str, Any] = {"input_names": list(INPUTS), "output_names": list(OUTPUTS)}
         program = torch.onnx.export(step, example, dynamo=True, opset_version=OPSET, verbose=False, **names, **shapes)

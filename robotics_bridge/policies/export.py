@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from brainbench.core.errors import BrainbenchError, DataError
 from brainbench.core.files import atomic_path, file_hash, provenance, write_json
+from brainbench.core.reading.regular import temporary_folder
 from brainbench.models.activations import evaluating
 from brainbench.models.export import onnx_session, require_onnx
 from robotics_bridge.policies.contract import MOST_NUMBERS, check_contract
@@ -117,7 +118,7 @@ def export_policy(
         "provenance": provenance(),
     }
     check_contract(contract, target.name)
-    with atomic_path(target) as temporary, warnings.catch_warnings():
+    with temporary_folder(), atomic_path(target) as temporary, warnings.catch_warnings():
         # The exporters warn of their own parts' deprecations, which nobody here can act on.
         warnings.simplefilter("ignore")
         _write(policy, temporary)

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -165,6 +166,14 @@ def test_every_kind_of_network_can_be_an_onnx_file(name, tmp_path):
 @pytest.mark.parametrize("name", ["s4-small", pytest.param("zhuang-small+mamba", marks=pytest.mark.slow)])
 def test_an_exported_program_computes_what_the_network_does(name, tmp_path):
     assert _streams_alike(name, tmp_path / "model.pt2", "torch").path.suffix == ".pt2"
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device that is always full")
+def test_a_full_disk_is_an_error_and_not_the_end_of_the_process():
+    # PyTorch's own writer of files ends the process where it cannot finish one.
+    step = StreamingStep(load_model("zhuang-small").eval()).eval()
+    with pytest.raises(OSError, match="No space left"):
+        export._write(step, Path("/dev/full"), "torch")
 
 
 def test_a_file_that_differs_is_not_kept(tmp_path, monkeypatch):
