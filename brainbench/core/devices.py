@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from brainbench.core.errors import MissingDependencyError, UsageError, brief
-from brainbench.core.files import cache_dir, check_folder
+from brainbench.core.files import cache_dir, check_folder, user_folder
 from brainbench.core.reading.regular import temporary_folder
 
 if TYPE_CHECKING:
@@ -34,8 +34,6 @@ def warp() -> Any:
 
 @cache
 def _start() -> Any:
-    import platformdirs
-
     try:
         import warp as wp
     except ImportError as error:
@@ -46,7 +44,7 @@ def _start() -> Any:
     wp.config.log_level = wp.LOG_ERROR
     wp.config.enable_backward = False
     try:
-        check_folder(os.environ.get("WARP_CACHE_PATH") or platformdirs.user_cache_dir("warp"), "Warp")
+        check_folder(user_folder("WARP_CACHE_PATH", "user_cache_dir", "warp"), "Warp")
     except UsageError:  # no home folder, or a read-only one
         wp.config.kernel_cache_dir = str(cache_dir("kernels"))
     with _without_driver_warning():

@@ -140,7 +140,7 @@ _UNWRITABLE = (
 
 def cache_dir(*parts: str) -> Path:
     """Return (and create) the cache folder, ``$BRAINBENCH_CACHE`` or the platform's own."""
-    path = _user_folder(CACHE_VARIABLE, "user_cache_dir").joinpath(*parts)
+    path = user_folder(CACHE_VARIABLE, "user_cache_dir").joinpath(*parts)
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -153,16 +153,17 @@ def cache_dir(*parts: str) -> Path:
 
 def settings_dir() -> Path:
     """Return the folder of the user's settings, ``$BRAINBENCH_CONFIG`` or the platform's own; it may be missing."""
-    return _user_folder(CONFIG_VARIABLE, "user_config_dir")
+    return user_folder(CONFIG_VARIABLE, "user_config_dir")
 
 
-def _user_folder(variable: str, kind: str) -> Path:
+def user_folder(variable: str, kind: str, name: str = "brainbench") -> Path:
+    """Return the folder that an environment variable names, or the platform's for an application of this name."""
     if folder := os.environ.get(variable):
         return user_path(folder)
     import platformdirs
 
     try:
-        return Path(getattr(platformdirs, kind)("brainbench", appauthor=False)).expanduser()
+        return Path(getattr(platformdirs, kind)(name, appauthor=False)).expanduser()
     except RuntimeError as error:  # as in containers
         raise UsageError(f"This user has no home folder: set HOME, or name a folder with {variable}.") from error
 
