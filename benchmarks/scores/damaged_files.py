@@ -111,7 +111,7 @@ NOTE = (
     "folder. Few readers write (copies of recordings, imported weights, training); others have none by nature. "
     "Before is the code of 2026-11-21; for surfaces that came later (site manifest, commitment, trainings, and all "
     "after the seeds text) it is commit ad20c3f; where no arrow stands, nothing was counted before. That of the "
-    "calibration log is not comparable: the log was also fitted then. *Wordy* before the arrow is more than 1,000."
+    "calibration log is not comparable: the log was also fitted then. Before: 500 cases each, *wordy* above 1,000."
 )
 
 
