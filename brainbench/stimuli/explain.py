@@ -64,8 +64,9 @@ def plan(scenes: Sequence[Scene], *, surfaces: bool = False) -> JobSchedule:
             if what not in digests:
                 seen = owner.config() if travels or reach else {"whisking": owner.whisking.config()}
                 digests[what] = content_hash({**seen, "label": None})
-            # A head that is turned otherwise feels gravity in another direction.
+            # A head that is turned otherwise feels gravity and air in another direction.
             pull = {"pull": job.gravity} if any(job.gravity) else {}
+            pull |= {} if job.air_flow is None else {"air": job.air_flow}
             key = content_hash(mount, digests[what], pull)
             if key not in distinct:
                 distinct[key] = len(jobs)

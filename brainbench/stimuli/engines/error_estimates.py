@@ -5,8 +5,6 @@ again. What each changes says how far the limit is. Contacts push along straight
 forces between opposed contacts at random, and no change of the step shows it.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -88,7 +86,9 @@ def calm_error(job: Job, trace: Trace, fidelity: Fidelity) -> float:
 
     Its forces are those of carrying its mass along, which only the number of links changes.
     """
-    if trace.contact.any() or job.loads or any(job.gravity) or fidelity.solver == "quasistatic":
+    if trace.contact.any() or job.loads or any(job.gravity) or job.air_flow is not None:
+        return math.nan
+    if fidelity.solver == "quasistatic":
         return math.nan
     chain = fidelity.chain(job.whisker)
     period = 2 * math.pi / float(chain.frequencies()[0])

@@ -19,6 +19,7 @@ from brainbench.core.devices import usable_processors
 from brainbench.core.errors import UsageError, listing
 from brainbench.core.progress import Progress as NamedProgress
 from brainbench.core.reading.ranges import check_number
+from brainbench.stimuli.engines.air import check_air
 from brainbench.stimuli.engines.error_estimates import with_errors
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.motion.jobs import Job, StillFollicle, Trace  # noqa: F401, what a script gives an engine
@@ -170,6 +171,8 @@ class WhiskerEngine:
     """True when whiskers can twist about their axis; in other engines they only bend."""
     yields: ClassVar[bool] = False
     """True when follicles can give way (:class:`brainbench.stimuli.whiskers.whisker.FollicleSprings`)."""
+    flows: ClassVar[bool] = False
+    """True when whiskers feel moving air (:mod:`brainbench.stimuli.engines.air`)."""
     surfaces: ClassVar[bool] = False
     """True when it collides the exact surface of obstacles that have one; others collide convex parts."""
     batches: ClassVar[bool] = False
@@ -216,6 +219,11 @@ class WhiskerEngine:
                 f"Whiskers of the backend {self.name!r} have rigid follicles; leave follicle out, or use the backend"
                 " 'rod' or 'mujoco'."
             )
+        if not self.flows and any(job.air_flow is not None for job in jobs):
+            raise UsageError(
+                f"Whiskers of the backend {self.name!r} feel no air; leave air_flow out, or use the backend 'rod'."
+            )
+        check_air(jobs)
         for obstacle in {id(item): item for job in jobs for item in job.obstacles}.values():
             if obstacle.surface is not None and not obstacle.parts and not self.surfaces:
                 raise UsageError(

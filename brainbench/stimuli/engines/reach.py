@@ -1,7 +1,5 @@
 """What a whisker could ever touch of its obstacles, so that a scene costs only what it uses, and planes it stays in."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -157,7 +155,11 @@ def stays_in_plane(
     """
     turns = base_rotation(euler)
     paths = [None if obstacle.motion is None else obstacle.motion(times) for obstacle in reach.obstacles]
-    forces = [np.asarray(job.gravity, dtype=float), *(np.asarray(load.force, dtype=float) for load in job.loads)]
+    pulls = (job.gravity,) if job.air_flow is None else (job.gravity, job.air_flow)
+    forces = [
+        *(np.asarray(pull, dtype=float) for pull in pulls),
+        *(np.asarray(load.force, dtype=float) for load in job.loads),
+    ]
     length = job.whisker.arc_length
     for normal in _normals(job, reach, turns[0], forces):
         if (

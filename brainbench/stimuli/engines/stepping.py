@@ -1,7 +1,5 @@
 """Jobs that need no simulation, jobs in equal time steps, and engines that take these. Letters: n frame, s step."""
 
-from __future__ import annotations
-
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
@@ -108,12 +106,12 @@ def overlap_fault(
 
 
 def is_silent(job: Job, reach: Reach, position: NDArray[np.float64], euler: NDArray[np.float64]) -> bool:
-    """Return True for a whisker that can feel nothing: nothing in reach, a still base, no gravity and no loads.
+    """Return True for a whisker that can feel nothing: nothing in reach, a still base, no gravity, air or loads.
 
     ``position`` and ``euler`` are base points [n, 3] and angles [n, 3] over the whole job.
     """
     moves = np.ptp(position, axis=0).any() or np.ptp(euler, axis=0).any()
-    return not (reach or moves or job.loads or np.any(job.gravity))
+    return not (reach or moves or job.loads or np.any(job.gravity) or job.air_flow is not None)
 
 
 def silent_trace(job: Job, fidelity: Fidelity, record_shape: bool, seconds: float) -> Trace:

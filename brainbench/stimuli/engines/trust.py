@@ -1,7 +1,5 @@
 """The one rule of which simulated whiskers can be trusted."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

@@ -385,8 +385,8 @@ class GradientRun:
         self.jobs = tuple(build(self.values.copy()))
         self.device = pick_device(device)
         RodEngine(device).check(self.jobs, self.fidelity)
-        if any(job.whisker.follicle is not None for job in self.jobs):
-            raise UsageError("Derivatives know rigid follicles only; leave follicle out of the whisker.")
+        if any(job.whisker.follicle is not None or job.air_flow is not None for job in self.jobs):
+            raise UsageError("Derivatives know rigid follicles and no air; leave follicle and air_flow out.")
         # Two jobs a parameter, a little below and above: how packed numbers change is their difference.
         self._changed = [
             tuple(tuple(build(self.values + sign * width * (np.arange(len(self.values)) == p))) for sign in (-1, 1))

@@ -4,8 +4,6 @@ Whiskers never touch one another, so the unit of simulation is one whisker. Lett
 Inside engines calculate in mm, ms and mg, so in mN and µN·m, which keep every number near one.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Annotated, ClassVar, Literal, Protocol
@@ -26,6 +24,8 @@ _Radians = Annotated[float, Limit(unit="rad")]
 _Newtons = Annotated[float, Limit(unit="N")]
 _PerSquareSecond = Annotated[float, Limit(unit="m/s²")]
 Acceleration = tuple[_PerSquareSecond, _PerSquareSecond, _PerSquareSecond]
+_PerSecond = Annotated[float, Limit(unit="m/s")]
+Velocity = tuple[_PerSecond, _PerSecond, _PerSecond]
 
 
 class Follicle(Protocol):
@@ -88,6 +88,9 @@ class Job:
     """Gravitational acceleration [m/s², world]; off by default: a whisker weighs micrograms."""
     loads: tuple[Load, ...] = ()
     """Point forces on the whisker, beside the contacts."""
+    air_flow: Velocity | None = None
+    """Velocity of the air [m/s, world], whose drag the whisker feels (:mod:`brainbench.stimuli.engines.air`); no air
+    when None, air at rest when zero."""
 
     def __post_init__(self) -> None:
         times = np.array(self.times, dtype=float)

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from brainbench.core.errors import UsageError
 from brainbench.core.limits import Count, Limit, limited
 from brainbench.core.rotations import Angles, Point, base_rotation, euler_matrix
-from brainbench.stimuli.motion.jobs import Acceleration, Job
+from brainbench.stimuli.motion.jobs import Acceleration, Job, Velocity
 from brainbench.stimuli.motion.recorded import Recorded, Tracked
 from brainbench.stimuli.motion.trajectories import (
     FILTER_EDGE,
@@ -209,6 +209,8 @@ class Scene:
     networks, which were made before whiskers could twist."""
     gravity: Acceleration = (0.0, 0.0, 0.0)
     """Gravitational acceleration [m/s², world axes]; none by default, since a whisker weighs micrograms."""
+    air_flow: Velocity | None = None
+    """Velocity of uniform air [m/s, world axes]; no air by default."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "objects", tuple(self.objects))
@@ -287,6 +289,7 @@ class Scene:
         turn = (lambda times: axes.T @ motion.turn(times) @ axes) if isinstance(motion, Path) else None
         finest = min(self.whisking.finest, motion.finest)
         x, y, z = (np.asarray(self.gravity) @ axes).tolist() if any(self.gravity) else (0.0, 0.0, 0.0)
+        flow: Any = None if self.air_flow is None else tuple((np.asarray(self.air_flow) @ axes).tolist())
         return [
             Job(
                 mount.whisker,
@@ -294,6 +297,7 @@ class Scene:
                 obstacles,
                 self.frames.readings,
                 gravity=(x, y, z),
+                air_flow=flow,
             )
             for mount in self.array
         ]
@@ -323,6 +327,8 @@ class Scene:
         # What was added later appears only where it is used, so that older hashes hold.
         if any(self.gravity):
             config["gravity"] = list(self.gravity)
+        if self.air_flow is not None:
+            config["air_flow"] = list(self.air_flow)
         if self.others:
             config["animal"] = self.animal
             config["others"] = [

@@ -40,6 +40,7 @@
     [[scene]]                    # a scene's own [scene.head], [scene.whisking] win key by key
     label = "pole"
     gravity_m_s2 = [0, 0, -9.81] # optional, in world axes; at the top level for all scenes; without it nothing weighs
+    air_flow_m_s = [0, -2, 0]    # likewise: uniform air whose drag whiskers feel; without it there is no air
     [[scene.object]]             # position and rotation as for the head
     shape = "cylinder"
     radius_mm = 0.5
@@ -63,8 +64,6 @@ whiskers of the array that were tracked, each with its label in the file (empty 
 names: ``brainbench stimuli objects``). A decomposition takes ``method`` = "coacd" | "vhacd", ``threshold`` and
 ``most_pieces``.
 """
-
-from __future__ import annotations
 
 import glob
 import math
@@ -113,8 +112,8 @@ from brainbench.stimuli.whiskers.array import WhiskerArray
 MILLI = 1e-3
 """Metres in a millimetre, seconds in a millisecond."""
 _UNITS = {
-    "_mm_s": MILLI, "_deg_s": math.pi / 180, "_m_s2": 1, "_mm": MILLI, "_ms": MILLI, "_deg": math.pi / 180, "_hz": 1,
-    "_newton": 1,
+    "_mm_s": MILLI, "_deg_s": math.pi / 180, "_m_s2": 1, "_m_s": 1, "_mm": MILLI, "_ms": MILLI,
+    "_deg": math.pi / 180, "_hz": 1, "_newton": 1,
 }  # fmt: skip
 """Ends of keys → what their numbers are multiplied by to be in SI units."""
 _FAMILY = "family:"
@@ -232,6 +231,7 @@ class _Scene(Table):
     whisking: dict[str, Any] = {}
     object: list[dict[str, Any]] = []
     gravity_m_s2: Vector | None = None
+    air_flow_m_s: Vector | None = None
 
 
 class _File(Table):
@@ -244,6 +244,7 @@ class _File(Table):
     animal: list[dict[str, Any]] = []
     object: list[dict[str, Any]] = []
     gravity_m_s2: Vector | None = None
+    air_flow_m_s: Vector | None = None
     scene: list[dict[str, Any]] = []
 
 
@@ -347,7 +348,7 @@ def _recipe(path: Path, data: dict[str, Any], whiskers: str) -> Recipe:
             frames=_frames(file.frames),
             others=others,
             twist=file.twist,
-            **{**file.si("gravity_m_s2"), **table.si("gravity_m_s2")},
+            **{**file.si("gravity_m_s2", "air_flow_m_s"), **table.si("gravity_m_s2", "air_flow_m_s")},
         )
         scenes.append(scene.select(whiskers))
     if twice := repeats(scene.label for scene in scenes):

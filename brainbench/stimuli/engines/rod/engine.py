@@ -75,9 +75,9 @@ class JobTask:
     """Whether it may leave its plane, and may twist at this fidelity."""
 
     @property
-    def kind(self) -> tuple[bool, bool]:
-        """Whether it twists, and whether its follicle gives way: tasks of one launch are alike."""
-        return self.twists, self.job.whisker.follicle is not None
+    def kind(self) -> tuple[bool, bool, bool]:
+        """Whether it twists, feels air, and whether its follicle gives way: tasks of one launch are alike."""
+        return self.twists, self.job.air_flow is not None, self.job.whisker.follicle is not None
 
 
 def make_task(
@@ -134,7 +134,7 @@ def make_task(
 
 @dataclass(frozen=True, eq=False)
 class PackedTasks:
-    """Tasks of one launch: those of one time and gravity, of which all or none twist."""
+    """Tasks of one launch: those of one time, gravity and air flow, of which all or none twist."""
 
     tasks: Sequence[JobTask]
     chains: list[Chain]
@@ -177,6 +177,7 @@ class PackedTasks:
             (len(self.tasks), 1),
             start=first.start,
             gravity=first.gravity,
+            air_flow=first.air_flow,
             approach=Approach.table([task.approach for task in self.tasks]),
             record_shape=record_shape,
         )
@@ -228,6 +229,7 @@ class RodEngine(WhiskerEngine):
     solvers = ("dynamic", "quasistatic")
     twists = True
     yields = True
+    flows = True
     surfaces = True
     batches = True
 
@@ -262,7 +264,7 @@ class RodEngine(WhiskerEngine):
         groups: dict[Any, list[int]] = {}
         for index, job in enumerate(jobs):
             links = fidelity.link_count(job.whisker.arc_length)
-            key = (capacity_for(links), job.times.tobytes(), job.start, tuple(job.gravity))
+            key = (capacity_for(links), job.times.tobytes(), job.start, tuple(job.gravity), job.air_flow)
             groups.setdefault(key, []).append(index)
         size = SLICE if pick_device(self.device).is_cuda else 1
         return [some[i : i + size] for some in groups.values() for i in range(0, len(some), size)]
@@ -337,7 +339,8 @@ def _simulate(
         packed = PackedTasks.of([given[row] for row in rows], finer)
         # Compiling is done once; it is no cost of a whisker.
         paused = time.thread_time()
-        solver = WhiskerSolver(packed.chains, fidelity, device, packed.shapes.needs, twists=given[0].twists)
+        twists, flows, _ = given[0].kind
+        solver = WhiskerSolver(packed.chains, fidelity, device, packed.shapes.needs, twists=twists, flows=flows)
         started += time.thread_time() - paused
         result = packed.launch(solver, record_shape=record_shape)
         np.add.at(seconds, rows, (time.thread_time() - started) / len(rows))

@@ -70,7 +70,7 @@ def load_kernels(
     *,
     hinges: int = 2,
     recorder: str = "",
-    yields: bool = False,
+    features: tuple[str, ...] = (),
     compiling: Callable[[bool], None] | None = None,
     **options: Any,
 ) -> Any:
@@ -85,7 +85,7 @@ def load_kernels(
     """
     from brainbench.stimuli.engines.rod.kernels import BUILDING, build_kernels
 
-    kind = {"hinges": hinges, "recorder": recorder} | ({"yields": True} if yields else {})
+    kind: dict[str, Any] = {"hinges": hinges, "recorder": recorder, "features": features}
     with BUILDING:
         if device.is_cuda:
             kernels = build_kernels(real, capacity, needs, cuda=True, **kind, **options)
@@ -161,6 +161,8 @@ class Launch:
     """Beginning of the simulation (s)."""
     gravity: Sequence[float] = (0.0, 0.0, 0.0)
     """[3] m/s²."""
+    air_flow: Sequence[float] | None = None
+    """[3] m/s; given to solvers whose whiskers feel air, and to no others."""
     axes: NDArray[np.float64] | None = None
     """Rotation [3, 3] of the results; none when None."""
     approach: Approach = field(default_factory=Approach)
@@ -259,6 +261,7 @@ class WhiskerSolver:
         needs: int,
         *,
         twists: bool | None = None,
+        flows: bool = False,
         block: int | None = None,
         sliced: bool = False,
         **options: Any,
@@ -270,6 +273,7 @@ class WhiskerSolver:
             device, needs, options: as for :func:`brainbench.stimuli.engines.rod.launch.load_kernels`.
             twists: False when nothing twists the whiskers: their joints then have two hinges instead of three. As the
                 fidelity says when None.
+            flows: True when whiskers feel air.
             block: threads of a block on a GPU; Warp's choice when None.
             sliced: True when whiskers pause for distances and contact forces (:class:`.slices.Slices`).
         """
@@ -282,8 +286,10 @@ class WhiskerSolver:
         if options:
             options["sliced"] = sliced
         self.yields = any(chain.whisker.follicle is not None for chain in self.chains)
+        uses = {"yields": self.yields, "flows": flows}
+        features = tuple(name for name, used in uses.items() if used)
         self.kernels = load_kernels(
-            device, self.real, self.capacity, needs, hinges=hinges, yields=self.yields, **options
+            device, self.real, self.capacity, needs, hinges=hinges, features=features, **options
         )
         packed = pack_chains(self.capacity, self.chains, self.quasistatic, hinges)
         if self.yields:
@@ -365,6 +371,8 @@ class WhiskerSolver:
         weight = LIGHT if self.quasistatic else 1.0
         # Quasistatic whiskers have masses that are scaled by LIGHT; gravity is scaled back, so that their weight stays.
         options.gravity = structs.vec3(*np.divide(given.gravity, MILLI * weight).tolist())
+        if given.air_flow is not None:  # m/s is mm/ms
+            options.air_flow = structs.vec3(*given.air_flow)
         options.axes = structs.mat33(*(np.eye(3) if given.axes is None else given.axes).ravel().tolist())
         options.shape = int(given.record_shape)
         # Readings end a step: where they are nearer than a step, a part of it could be the same step once more.

@@ -50,7 +50,9 @@ def specialize(module: str, *, recorder: str = "", **parameters: Any) -> ModuleT
 
     ``recorder`` is the package of kernels whose modules stand beside these as ``recorder.…``.
     """
-    label = "_".join(str(getattr(value, "__name__", value)) for _, value in sorted(parameters.items()))
+    label = "_".join(
+        name if value is True else str(getattr(value, "__name__", value)) for name, value in sorted(parameters.items())
+    )
     package = f"{__name__}_{label}"
     if package not in sys.modules:
         template = sys.modules[package] = ModuleType(package)
@@ -77,7 +79,7 @@ def build_kernels(
     cuda: bool = False,
     hinges: int = 2,
     recorder: str = "",
-    yields: bool = False,
+    features: tuple[str, ...] = (),
 ) -> Kernels:
     """Return the kernels for chains of at most ``capacity`` links in one precision; each is compiled by itself.
 
@@ -91,11 +93,11 @@ def build_kernels(
         hinges: hinges of a joint, 2 for bending alone or 3 for bending and twist.
         recorder: package of the kernels that write steps down (``recording``, ``records``) and solve their contact
             forces to rounding (``newton``); whiskers then pause after some steps. Not with ``sliced``.
-        yields: whether follicles give way; not with a ``recorder``.
+        features: those of ``yields`` and ``flows`` (``parameters``) that a scene uses; none with a ``recorder``.
     """
     most = contacts_for(capacity)
     common = {"real": real, "capacity": capacity, "against": against, "sliced": sliced, "cuda": cuda, "hinges": hinges}
-    common |= {"yields": True} if yields else {}
+    common |= dict.fromkeys(features, True)
     whole = {"max_contacts": most, "bounds": bounds, **common}
     if recorder:
         whole |= {"recorded": True, "recorder": recorder}

@@ -11,6 +11,7 @@ D = SᵀU + h d + h² k, with stiffness k and damping d = βk, and stiffness lim
 
 import warp as wp
 
+from brainbench.stimuli.engines.air import DENSITY, VISCOSITY
 from brainbench.stimuli.engines.rod.limits import BENT, FOLD, GAVE_WAY, LARGEST_BEND, LARGEST_SLIDE, LOST, STOP
 
 from .algebra import (
@@ -45,7 +46,7 @@ from .algebra import (
     vec6,
 )
 from .motion import BodyMotion, elapsed
-from .parameters import hinges, real, yields
+from .parameters import flows, hinges, real, yields
 from .state import (
     ChainArrays,
     ContactCandidates,
@@ -332,6 +333,39 @@ def turned_symmetric(axes: mat33, a: mat33) -> vec6:
 
 
 @wp.func
+def add_drag(
+    scene: SceneArrays, job: WhiskerJob, chain: wp.ref[ChainState], body: wp.ref[ArticulatedBody], i: int, h: real
+):
+    """Add the drag of the air on a link (:mod:`brainbench.stimuli.engines.air`), as at its middle.
+
+    The force c (u − v) acts at the end of the step as springs do: h c joins the inertia of the link, across it.
+    """
+    taper = scene.chains.taper[i, job.whisker]
+    at = row(chain.node, i)
+    end = row(chain.node, i + 1)
+    x = wp.normalize(end - at)
+    middle = (at + end) * real(0.5)
+    across = wp.identity(n=3, dtype=real) - wp.outer(x, x)
+    wind = across * (scene.options.air_flow - body.twist.v - wp.cross(body.twist.w, middle))
+    # Diameter times speed over ν; in mm, ms and mg the viscosity has the same number, and densities a thousandth.
+    number = (taper.start_radius + taper.end_radius) * wp.length(wind)
+    number = number * real(wp.static(1e-3 * DENSITY / VISCOSITY))
+    # Drag over speed, ½ ρ C_d d u = ½ μ C_d Re.
+    drag = real(1.18) * number + real(6.8) * wp.pow(number, real(0.11)) + real(1.96) * wp.sqrt(number)
+    drag = drag - real(0.0004) * number * number / (real(1.0) + real(3.64e-7) * number * number)
+    drag = drag * real(wp.static(VISCOSITY / 2)) * taper.arc_length
+    # Gravity was added to the base's acceleration; it moves nothing by itself.
+    push = wind * drag - across * scene.options.gravity * (h * drag)
+    body.bias.w = body.bias.w - wp.cross(middle, push)
+    body.bias.v = body.bias.v - push
+    held = across * (h * drag)
+    lever = wp.skew(middle)
+    body.inertia.a = body.inertia.a + turned_symmetric(lever, held)
+    body.inertia.b = body.inertia.b + lever * held
+    body.inertia.c = body.inertia.c + vec6(held[0, 0], held[1, 1], held[2, 2], held[0, 1], held[0, 2], held[1, 2])
+
+
+@wp.func
 def full(a: vec6) -> mat33:
     """Return a symmetric matrix with all its elements."""
     return mat33(a[0], a[3], a[4], a[3], a[1], a[5], a[4], a[5], a[2])
@@ -487,6 +521,8 @@ def articulated_inertia(
     for back in range(job.links):
         i = job.links - 1 - back
         x = add_link(scene, job, chain, body, i, elapsed(step.now))
+        if wp.static(flows):
+            add_drag(scene, job, chain, body, i, h)
         inertia = scene.chains.inertia[i, job.whisker]
         at = row(chain.node, i)
         angle = row(chain.angle, i)

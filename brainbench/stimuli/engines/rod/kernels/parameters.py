@@ -13,6 +13,8 @@ hinges = 2
 """Hinges of a joint: two for bending; with three, the last lets the whisker twist."""
 yields = False
 """True: follicles give way, see ``FollicleConstants``."""
+flows = False
+"""True: air flows, whose drag whiskers feel."""
 against = MESHES
 """Kinds of shapes that there are to touch, see ``limits``."""
 sliced = False

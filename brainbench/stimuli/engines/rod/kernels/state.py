@@ -15,7 +15,7 @@ from brainbench.stimuli.engines.rod.limits import LISTED, SPARE, WIDE, contacts_
 
 from .algebra import JointInverse, JointVector, Spatial, SpatialInertia, mat33, reader, vec3, vec4
 from .motion import BodyMotion, Instant, JobArrays, MotionArrays, ReadingArrays, instant, pose_at
-from .parameters import capacity, hinges, real, recorded, yields
+from .parameters import capacity, flows, hinges, real, recorded, yields
 
 if recorded:
     from .recorder.records import StepRecords
@@ -162,6 +162,8 @@ class StepOptions:
     """1: rates are forgotten after each step, and a reading takes the wrench of the step that ends at it."""
     shape: wp.int32
     """1: shapes and contact wrenches are recorded."""
+    if flows:
+        air_flow: vec3
 
 
 @wp.struct

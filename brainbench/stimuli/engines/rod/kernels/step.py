@@ -36,7 +36,7 @@ from .broad_phase import (
 )
 from .contact_solver import any_gap_closes, queue_problem, read_solution, solve_contacts, write_problem
 from .motion import cell_at, elapsed, instant
-from .parameters import against, bounds, module_options, real, recorded, sliced, yields
+from .parameters import against, bounds, flows, module_options, real, recorded, sliced, yields
 from .state import (
     ENDED,
     WAIT_DISTANCES,
@@ -93,6 +93,8 @@ def load_job(scene: SceneArrays, index: int) -> WhiskerJob:
     ):
         if job.first_load == job.end_load and wp.length_sq(scene.options.gravity) == zero and scene.options.shape == 0:
             job.can_rest = 1
+    if wp.static(flows):
+        job.can_rest = 0
     return job
 
 
