@@ -37,10 +37,16 @@ def test_the_scene_files_of_the_stimuli_page_are_valid(tmp_path: Path):
     from brainbench.stimuli import load_scene
     from tests.factories.whisker_tracks import bent_shapes, write_points
 
-    poles, measured, trials = (tmp_path / name for name in ("pole.toml", "measured.toml", "trials.toml"))
-    scene_file, tables, filmed = _blocks("docs/stimuli.md", "toml")
-    for path, block in ((poles, scene_file), (measured, scene_file + tables), (trials, filmed)):
+    poles, measured, bent, trials = (tmp_path / f"{name}.toml" for name in ("pole", "measured", "bent", "trials"))
+    scene_file, tables, bends, filmed = _blocks("docs/stimuli.md", "toml")
+    for path, block in (
+        (poles, scene_file),
+        (measured, scene_file + tables),
+        (bent, scene_file + bends),
+        (trials, filmed),
+    ):
         path.write_text(block)
+    assert load_scene(bent).scenes[0].array["C2"].whisker.rest_points([0.015])[0, 2] > 5e-5
     assert [scene.label for scene in load_scene(poles).scenes] == ["near", "far"]
     array = load_scene(measured).scenes[0].array
     assert array["C2"].whisker.radius(0.005) == pytest.approx(31e-6)

@@ -349,7 +349,7 @@ class Recording:
         """Return joints and tip [N + 1, 3] (m, world) of a whisker that nothing bends, at one instant."""
         job, axes = self.scene.jobs()[whisker], self.scene.axes[whisker]
         place, euler = job.follicle.pose(self.times[instant : instant + 1])
-        rest = np.pad(build_chain(job.whisker, self.joints[whisker].shape[1] - 1).points, ((0, 0), (0, 1)))
+        rest = build_chain(job.whisker, self.joints[whisker].shape[1] - 1).points
         return (rest @ base_rotation(euler)[0].T + place[0]) @ axes.T + self.scene.origins[whisker]
 
 
@@ -395,22 +395,22 @@ def bending_moments(job: Job, joints: NDArray[np.float64]) -> NDArray[np.float64
     """Return the elastic moment [n, N + 1] (N·m) at each joint of a chain; zero at the tip.
 
     The moment is the hinge's stiffness times the angle by which the link after the joint is turned from its rest
-    direction (:class:`~.whisker.Chain`); damping and twist carry none of it. ``joints`` are [n, N + 1, 3]
-    (m) in the frame of the job, at its times [n].
+    direction (:class:`~.whisker.Chain`); damping and twist carry none of it. NaN of a rest
+    shape in space, whose twist joints do not tell. ``joints`` are [n, N + 1, 3] (m) in the frame of the job, at its
+    times [n].
     """
     links = joints.shape[1] - 1
     chain = build_chain(job.whisker, links)
     along = np.diff(joints, axis=1)
     along = along / np.linalg.norm(along, axis=-1, keepdims=True)
     frame = base_rotation(job.follicle.pose(job.times)[1])
-    moments = np.zeros(joints.shape[:2])
-    for link in range(links):
-        cosine, sine = np.cos(chain.rest_angles[link]), np.sin(chain.rest_angles[link])
-        frame = frame @ np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+    moments = np.full(joints.shape[:2], np.nan if chain.rest_rolls.any() else 0.0)
+    for link, at_rest in enumerate(chain.rest_turns):
+        frame = frame @ at_rest
         # Turned by a about y and b about z, the x axis is (cos a cos b, sin b, −sin a cos b).
         x, y, z = np.moveaxis(np.einsum("nji,nj->ni", frame, along[:, link]), -1, 0)
         about_y, about_z = np.arctan2(-z, x), np.arctan2(y, np.hypot(x, z))
-        moments[:, link] = chain.stiffness[link] * np.hypot(about_y, about_z)
+        moments[:, link] += chain.stiffness[link] * np.hypot(about_y, about_z)
         # The new link's axes: x along it, turned by the hinges about y and z without twist.
         across = np.stack([-np.cos(about_y) * np.sin(about_z), np.cos(about_z), np.sin(about_y) * np.sin(about_z)], -1)
         second = np.einsum("nij,nj->ni", frame, across)

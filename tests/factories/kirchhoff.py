@@ -2,7 +2,7 @@
 
 With the centre line r(s), the cross-section's axes R(s) (first column the tangent t), force N and moment M in it::
 
-    r' = t,   R' = R [u]×,   u = (M₁/GJ, M₂/EI, κ₀ + M₃/EI),   N' = 0,   M' = N × t
+    r' = t,   R' = R [u]×,   u = (τ₀ + M₁/GJ, M₂/EI, κ₀ + M₃/EI),   N' = 0,   M' = N × t
 
 where Mᵢ are the components of M along the axes (Antman, Nonlinear Problems of Elasticity, 2005, chapter 8; Audoly &
 Pomeau, Elasticity and Geometry, 2010, chapter 3). The base is clamped along x, the rest shape lies in the x-y plane. No
@@ -39,6 +39,8 @@ class KirchhoffRod:
     """Flexural rigidity E I(s) [N·m²]."""
     torsion: OfArc
     """Torsional rigidity G J(s) [N·m²]."""
+    twist: OfArc = lambda s: 0.0
+    """Torsion τ₀(s) of the rest shape [1/m]; 0 where that lies in the x-y plane."""
     radius: OfArc = lambda s: 0.0
     """Radius [m], by which a contact stands off the centre line."""
 
@@ -49,8 +51,15 @@ class KirchhoffRod:
 
         s = np.linspace(0, whisker.arc_length, 401)
         # Of the parabola y = A x²: κ₀ = 2A cos³ψ with the tangent's angle ψ.
-        curvature = CubicSpline(s, 2 * whisker.curvature * np.cos(whisker.tangent_angle(s)) ** 3)
-        laws = (curvature, whisker.bending_stiffness, whisker.torsional_stiffness, whisker.radius)
+        if whisker.bends:
+            arcs, bends, turns = np.transpose(whisker.bends)
+            curvature, twist = (lambda s: np.interp(s, arcs, bends)), (lambda s: np.interp(s, arcs, turns))
+        else:
+            curvature, twist = (
+                CubicSpline(s, 2 * whisker.curvature * np.cos(whisker.tangent_angle(s)) ** 3),
+                np.zeros_like,
+            )
+        laws = (curvature, whisker.bending_stiffness, whisker.torsional_stiffness, twist, whisker.radius)
         return cls(whisker.arc_length, *(lambda s, law=law: float(law(s)) for law in laws))
 
 
@@ -172,7 +181,7 @@ def _paths(rod: KirchhoffRod, force: Array, moment: Array, arcs: Array) -> tuple
         at = s * rod.length
         torsion, bending = rod.torsion(at), rod.bending(at)
         # What shooting tries may coil a soft tip up without end.
-        rates = (local[0] / torsion, local[1] / bending, rod.curvature(at) + local[2] / bending)
+        rates = (rod.twist(at) + local[0] / torsion, local[1] / bending, rod.curvature(at) + local[2] / bending)
         u1, u2, u3 = (max(-most, min(most, rate)) for rate in rates)
         t, n, b = turn.T
         change = np.stack([u3 * n - u2 * b, u1 * b - u3 * t, u2 * t - u1 * n], axis=1)

@@ -258,7 +258,10 @@ def _add_links(
 ) -> None:
     body, end = base, 0.0
     for i in range(chain.links):
-        body = _add(body, "body", pos=(end, 0, 0), quat=_quaternion(chain.rest_angles[i], (0.0, 0.0, 1.0)))
+        # Roll about x, then bend about z: the product of their quaternions.
+        (c, s), bent = _quaternion(chain.rest_rolls[i], (1.0, 0.0, 0.0))[:2], np.array(chain.rest_angles[i] / 2)
+        turn = c * np.cos(bent), s * np.cos(bent), -s * np.sin(bent), c * np.sin(bent)
+        body = _add(body, "body", pos=(end, 0, 0), quat=turn)
         end = chain.lengths[i] * MILLI
         # Bending about two axes across the rod with the chain's lumped stiffness, then twist. A joint that twists has
         # its axes halfway between both links: turned back from the body's by half the rest bend.
@@ -410,6 +413,7 @@ class MujocoWhiskerEngine(SteppedEngine):
     name = "mujoco"
     twists = True
     yields = True
+    coils = True
     package = "mujoco-core"
     revision = "+1"  # one contact for a pair of convex bodies
 
@@ -573,6 +577,8 @@ def _joints(built: WhiskerModel, chain: Chain, hinges: NDArray, steps: NDArray) 
     for i, twists in enumerate(built.twisting):
         # Rest bend about z, then the hinges about y and z, as in the model; twist comes before half of the rest bend.
         half = chain.rest_angles[i] / 2 if twists else 0.0
+        if chain.rest_rolls[i]:
+            frame = frame @ euler_matrix((chain.rest_rolls[i], 0.0, 0.0))
         frame = frame @ _rotation_zyz(chain.rest_angles[i] - half, hinges[:, first], hinges[:, first + 1])
         if twists:
             # Rotations about x turn y and z; two columns are combined in place of a matrix product.

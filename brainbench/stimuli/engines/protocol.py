@@ -173,6 +173,8 @@ class WhiskerEngine:
     """True when follicles can give way (:class:`brainbench.stimuli.whiskers.whisker.FollicleSprings`)."""
     flows: ClassVar[bool] = False
     """True when whiskers feel moving air (:mod:`brainbench.stimuli.engines.air`)."""
+    coils: ClassVar[bool] = False
+    """True when rest shapes may have ``bends`` (:class:`brainbench.stimuli.whiskers.whisker.Whisker`)."""
     surfaces: ClassVar[bool] = False
     """True when it collides the exact surface of obstacles that have one; others collide convex parts."""
     batches: ClassVar[bool] = False
@@ -214,15 +216,13 @@ class WhiskerEngine:
                 f"Whiskers of the backend {self.name!r} bend but do not twist; leave twist out, or use the backend"
                 " 'rod'."
             )
-        if not self.yields and any(job.whisker.follicle is not None for job in jobs):
-            raise UsageError(
-                f"Whiskers of the backend {self.name!r} have rigid follicles; leave follicle out, or use the backend"
-                " 'rod' or 'mujoco'."
-            )
-        if not self.flows and any(job.air_flow is not None for job in jobs):
-            raise UsageError(
-                f"Whiskers of the backend {self.name!r} feel no air; leave air_flow out, or use the backend 'rod'."
-            )
+        for able, used, words in (
+            (self.yields, any(job.whisker.follicle for job in jobs), "have rigid follicles; leave follicle out"),
+            (self.coils, any(job.whisker.bends for job in jobs), "rest as parabolas; leave bends out"),
+            (self.flows, any(job.air_flow is not None for job in jobs), "feel no air; leave air_flow out"),
+        ):
+            if used and not able:
+                raise UsageError(f"Whiskers of the backend {self.name!r} {words}, or use the backend 'rod'.")
         check_air(jobs)
         for obstacle in {id(item): item for job in jobs for item in job.obstacles}.values():
             if obstacle.surface is not None and not obstacle.parts and not self.surfaces:

@@ -153,6 +153,8 @@ def stays_in_plane(
 
     ``position`` [n, 3] (m) and ``euler`` [n, 3] (rad) are the base at ``times`` [n] (s), ``reach`` what it may touch.
     """
+    if any(torsion for _, _, torsion in job.whisker.bends):
+        return False
     turns = base_rotation(euler)
     paths = [None if obstacle.motion is None else obstacle.motion(times) for obstacle in reach.obstacles]
     pulls = (job.gravity,) if job.air_flow is None else (job.gravity, job.air_flow)
@@ -179,7 +181,7 @@ def _normals(job: Job, reach: Reach, turn: NDArray, forces: list[NDArray]) -> It
     """Yield the normals of the planes that contain the unbent whisker and are worth a try."""
     along, _, across = turn.T
     yield across
-    if job.whisker.curvature == 0:
+    if job.whisker.straight:
         axes = [_axis(part) for item in reach.obstacles for part in item.parts if isinstance(part, (Capsule, Cylinder))]
         for vector in (*(np.cross(along, force) for force in forces), *axes[:1]):
             vector = vector - along * (along @ vector)

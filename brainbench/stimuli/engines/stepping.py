@@ -91,7 +91,7 @@ def overlap_fault(
     """
     share = np.linspace(0, 1, PARTS * chain.links + 1)
     arcs = np.interp(share, np.linspace(0, 1, chain.links + 1), chain.nodes)
-    rest = np.stack([np.interp(arcs, chain.nodes, axis) for axis in (*chain.points.T, np.zeros(chain.links + 1))], 1)
+    rest = np.stack([np.interp(arcs, chain.nodes, axis) for axis in chain.points.T], 1)
     line = rest @ base_rotation(euler[0]).T + position[0]
     first, reason, depth = len(times) - 1, "", 0.0
     for obstacle in obstacles:
@@ -119,8 +119,7 @@ def silent_trace(job: Job, fidelity: Fidelity, record_shape: bool, seconds: floa
     count, shape = len(job.times), None
     if record_shape:
         position, euler = job.follicle.pose(job.times[:1])
-        # The rest shape lies in the x-y plane of the base frame.
-        rest = np.pad(fidelity.chain(job.whisker).points, ((0, 0), (0, 1))) @ base_rotation(euler)[0].T + position[0]
+        rest = fidelity.chain(job.whisker).points @ base_rotation(euler)[0].T + position[0]
         shape = np.repeat(rest[None], count, axis=0)
     return Trace(
         wrench=np.zeros((count, 6)),

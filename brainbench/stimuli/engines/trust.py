@@ -305,7 +305,7 @@ def without_escape(reason: str, job: Job, time: float) -> str:
 
     Such a whisker cannot give way, and no step is short enough for it.
     """
-    if not reason or job.whisker.curvature or not np.isfinite(time):
+    if not reason or not job.whisker.straight or not np.isfinite(time):
         return reason
     times = np.array([time - 1e-4, time])
     position, euler = job.follicle.pose(times)

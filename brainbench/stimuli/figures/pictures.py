@@ -184,7 +184,7 @@ class Picture:
             radii = self.style.thickness * mount.whisker.radius(share * mount.whisker.arc_length)
             thinnest = _THINNEST * self.style.supersampling * lens.pixel_size(line)
             colors = np.broadcast_to(row, line.shape)
-            if self.style.color == "moment" and finite:
+            if self.style.color == "moment" and finite and np.isfinite(moments[index]).all():
                 colors = colormaps[MOMENT_MAP](np.clip(bending / self.moment_limit, 0, 1))[:, :3]
             parts.append(tube(line, np.maximum(radii, thinnest), colors))
             ink = 0.45 * row if self.style.color == "row" else np.full(3, 0.25)

@@ -385,8 +385,10 @@ class GradientRun:
         self.jobs = tuple(build(self.values.copy()))
         self.device = pick_device(device)
         RodEngine(device).check(self.jobs, self.fidelity)
-        if any(job.whisker.follicle is not None or job.air_flow is not None for job in self.jobs):
-            raise UsageError("Derivatives know rigid follicles and no air; leave follicle and air_flow out.")
+        if any(job.whisker.follicle or job.whisker.bends or job.air_flow for job in self.jobs):
+            raise UsageError(
+                "Derivatives know rigid follicles, no bends and no air; leave follicle, bends, air_flow out."
+            )
         # Two jobs a parameter, a little below and above: how packed numbers change is their difference.
         self._changed = [
             tuple(tuple(build(self.values + sign * width * (np.arange(len(self.values)) == p))) for sign in (-1, 1))
@@ -551,7 +553,7 @@ def _leaves_plane(task: JobTask, job: Job) -> bool:
     nominal = task.job
     parts = zip((job.follicle, *job.obstacles), (nominal.follicle, *nominal.obstacles), strict=True)
     same = job.loads is nominal.loads and job.gravity == nominal.gravity and all(one is other for one, other in parts)
-    if same and (job.whisker.curvature == 0) == (nominal.whisker.curvature == 0):
+    if same and job.whisker.straight == nominal.whisker.straight:
         return False
     times = np.unique(np.concatenate([_span(job), task.base.times, *(body.track.times for body in task.bodies)]))
     position, euler = (np.asarray(values, dtype=float) for values in job.follicle.pose(times))

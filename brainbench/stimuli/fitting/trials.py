@@ -71,7 +71,7 @@ class Pluck:
         whisker = condition.whisker
         arc = min(self.arc, whisker.arc_length)
         # The small-bending closed form is that of the straight whisker; curvature changes it by second order.
-        straight = replace(whisker, curvature=0.0)
+        straight = replace(whisker, curvature=0.0, bends=())
         force = condition["deflection"] / references.point_load_deflection(straight, 1.0, arc)
         whole = force * np.asarray(self.direction, dtype=float) / math.hypot(*self.direction)
         ratio, omega = min(whisker.damping_ratio, 0.9), float(build_chain(whisker, 16).frequencies()[0])

@@ -1,69 +1,4 @@
-"""Scene files: one TOML file describes one or several labelled scenes. Units stand in the keys.
-
-::
-
-    description = "A pole in front of two whiskers"
-    twist = true                 # optional: false computes whiskers that bend but do not twist, as of old
-
-    [array]                      # species = "mouse" | "rat"; side = "right" | "left" | "both"
-    species = "mouse"
-    whiskers = "C1,C2"
-    [array.replace.C2]           # optional: other whisker properties, SI units, by selection
-    young_modulus = 3.3e9        # along the whisker: moduli = [[0, 3e9], [0.0153, 4.5e9]], radii likewise
-    follicle = { about_z = [2e-6, 2e-9] }  # gives way: stiffness and damping along_x … about_z, N/m or N·m/rad
-
-    [head]                       # the array frame in the world; rotation about x, then y, then z
-    position_mm = [0, 0, 0]
-    rotation_deg = [0, 0, 0]
-    velocity_mm_s = [0, 10, 0]   # optional; or keyframes since t = 0: times_ms, path_mm and path_deg, a list each
-
-    [whisking]                   # kind = "sinusoid" | "still" | "recorded"
-    frequency_hz = 20
-    protraction_deg = 30
-    retraction_deg = 10
-    onset_ms = 50
-    rotations = "knutsen"
-    # recorded: path = "whisking.csv", rate_hz = 1000, layout = "rat-60", start_deg = -10, initial_path = "angles.csv"
-    # track: path = "tracks/{trial}.csv", whiskers = { C2 = "0" }, frame_rate_hz = 500, mm_per_pixel = 0.05; see below
-
-    [frames]
-    first_ms = 1
-    interval_ms = 9
-    count = 110
-    average = 18                 # readings per frame; 1 = instantaneous
-    # instead of interval_ms: rate_hz = 1000. lowpass_hz = 50 filters the readings instead of averaging them;
-    # phase = "zero" | "causal". axes = "world" | "follicle". clip_newton = 1 (moments: 1 mm times that)
-
-    [[animal]]                   # optional: more animals, then whiskers are named "a:C2", "b:C2"
-    name = "b"                   # with [animal.array], [animal.head] and [animal.whisking] as above
-
-    [[scene]]                    # a scene's own [scene.head], [scene.whisking] win key by key
-    label = "pole"
-    gravity_m_s2 = [0, 0, -9.81] # optional, in world axes; at the top level for all scenes; without it nothing weighs
-    air_flow_m_s = [0, -2, 0]    # likewise: uniform air whose drag whiskers feel; without it there is no air
-    [[scene.object]]             # position and rotation as for the head
-    shape = "cylinder"
-    radius_mm = 0.5
-    height_mm = 20
-    position_mm = [14, 5, 0]
-    friction = 0.3               # optional
-    velocity_mm_s = [0, -30, 0]  # optional; or spin_deg_s = [0, 0, 90] about its position; or keyframes as for the head
-
-``kind = "track"`` plays what a video showed (:mod:`brainbench.stimuli.motion.recorded`): ``whiskers`` names the
-whiskers of the array that were tracked, each with its label in the file (empty where it holds one). ``layout``,
-``zero_frame``, ``parts``, ``least_likelihood`` and ``identities_path`` are those of ``stimuli fit``, ``rest_deg``,
-``view``, ``rostral_deg``, ``longest_gap_ms`` and ``lowpass_hz`` those of
-:class:`~brainbench.stimuli.motion.recorded.PlayOptions`; ``lowpass_hz = 0`` filters nothing. A file of ``layout =
-"angles"`` is a table of angles. A scene whose label holds ``{trial}`` stands for as many scenes as there are files at
-``path``, where ``{trial}`` is any text; it may also stand in other texts of the scene.
-
-``[[object]]`` at the top level stands in every scene. Other shapes: ``sphere`` (``radius_mm``), ``box``
-(``size_mm``), ``capsule`` (``radius_mm``, ``length_mm``), ``rodgers`` (``diagonal_mm``, ``segments``) and
-``mesh`` (``path`` relative to the file, ``unit``, ``diagonal_mm``, ``collision`` = "hull" | "exact" | "pieces" |
-"decomposition") and ``family:NAME`` for a procedural shape (``seed``, ``diagonal_mm``, ``detail``, ``collision``;
-names: ``brainbench stimuli objects``). A decomposition takes ``method`` = "coacd" | "vhacd", ``threshold`` and
-``most_pieces``.
-"""
+"""Scene files: one TOML file describes one or several labelled scenes. Units stand in the keys: docs/scene-files.md."""
 
 import glob
 import math
@@ -280,7 +215,7 @@ class Recipe:
 
 
 def load_scene(path: str | os.PathLike[str], *, whiskers: str = "all") -> Recipe:
-    """Read a scene file; the module's documentation lists the keys.
+    """Read a scene file; docs/scene-files.md lists the keys.
 
     Args:
         path: a ``.toml`` file.

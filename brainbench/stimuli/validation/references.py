@@ -49,7 +49,7 @@ def point_load_deflection(whisker: Whisker, force: float, at: float) -> float:
     δ = F a³/(3 E I_b) · r_b/r(a), exact for a linear taper.
     """
     _check_at(whisker, at)
-    if whisker.curvature:
+    if not whisker.straight:
         raise UsageError(
             f"This closed form is for a straight whisker; this one has curvature {whisker.curvature:g} 1/m; "
             "use elastica, which takes any curvature."

@@ -99,12 +99,13 @@ class MountedWhisker:
         return self.side[0].upper() + self.name
 
     def mirrored(self) -> MountedWhisker:
-        """Return the whisker of the other side: x, θ and ζ change sign, the curvature does not."""
+        """Return the whisker of the other side: x, θ, ζ and torsion change sign, the curvature does not."""
         (x, y, z), (theta, phi, zeta) = self.position, self.angles
         # A mirrored base frame is left-handed. A whisker is symmetric about its x-y plane, so reversing z makes the
         # frame right-handed again: that is (−θ, φ, −ζ).
         side = "left" if self.side == "right" else "right"
-        return dataclasses.replace(self, side=side, position=(-x, y, z), angles=(-theta, phi, -zeta))
+        rod = dataclasses.replace(self.whisker, bends=tuple((s, bend, -turn) for s, bend, turn in self.whisker.bends))
+        return dataclasses.replace(self, side=side, position=(-x, y, z), angles=(-theta, phi, -zeta), whisker=rod)
 
 
 @dataclass(frozen=True)

@@ -67,7 +67,7 @@ class Whisker:
 
     Radius and density vary linearly with arc length, unless tables say how radius and Young's modulus run.
     The cross-section is a solid circle. The rest shape is the parabola y = A x² (A = ``curvature``), measured along its
-    arc.
+    arc, or what ``bends`` says, in space.
     """
 
     arc_length: Length
@@ -95,12 +95,21 @@ class Whisker:
     moduli: tuple[tuple[float, float], ...] = field(default=(), metadata={"later": True})
     """Rows (arc length [m], Young's modulus [Pa]) likewise, in place of ``young_modulus``, then that at the base."""
 
+    bends: tuple[tuple[float, float, float], ...] = field(default=(), metadata={"later": True})
+    """Rows (arc length [m], curvature κ, torsion τ [1/m]) likewise, in place of ``curvature``: at rest the tangent t,
+    normal n and binormal b, first x, y and z, turn by t' = κ n, n' = τ b − κ t, b' = −τ n. κ < 0 bends back."""
+
     follicle: FollicleSprings | None = field(default=None, metadata={"later": True})
     """What gives way at the base; nothing when None."""
 
     def __post_init__(self) -> None:
-        for name, what, least in (("radii", "radius", 0.0), ("moduli", "Young's modulus", SOFTEST)):
-            rows = tuple((float(arc), float(value)) for arc, value in getattr(self, name))
+        tables = (
+            ("radii", "radius", 0.0),
+            ("moduli", "Young's modulus", SOFTEST),
+            ("bends", "curvature, torsion", -np.inf),
+        )
+        for name, what, least in tables:
+            rows = tuple(tuple(map(float, row)) for row in getattr(self, name))
             object.__setattr__(self, name, rows)
             if rows:
                 self._check_table(name, what, least)
@@ -109,6 +118,8 @@ class Whisker:
             object.__setattr__(self, "tip_radius", self.radii[-1][1])
         if self.moduli:
             object.__setattr__(self, "young_modulus", self.moduli[0][1])
+        if self.bends and self.curvature:
+            raise UsageError("A whisker has a rest shape by its curvature or by its table of bends, not both.")
         if isinstance(self.follicle, dict):
             check_each("follicle axis", self.follicle, [axis.name for axis in fields(FollicleSprings)])
             springs: Any = {axis: tuple(map(float, pair)) for axis, pair in self.follicle.items()}
@@ -123,23 +134,28 @@ class Whisker:
             )
 
     def _check_table(self, name: str, what: str, least: float) -> None:
-        arcs, values = np.transpose(getattr(self, name))
+        arcs, *values = np.transpose(getattr(self, name))
         ascends = len(arcs) > 1 and (np.diff(arcs) > 0).all()
         if not (ascends and arcs[0] == 0 and math.isclose(arcs[-1], self.arc_length, rel_tol=1e-9)):
             raise UsageError(
                 f"{name} of a whisker are rows (arc length, {what}) whose arc lengths (m) ascend from 0 to that of the"
                 f" whisker, {self.arc_length:g}; received arc lengths {brief(arcs.tolist())}."
             )
-        if not (values > least).all():
+        if not np.greater(values, least).all():
             raise UsageError(
                 f"Every {what} in the {name} of a whisker is above {least:g}, in SI units; received"
-                f" {brief(values.tolist())}."
+                f" {brief(np.concatenate(values).tolist())}."
             )
 
     @property
     def thickest(self) -> float:
         """Largest radius [m]."""
         return max(self.base_radius, self.tip_radius, *(radius for _, radius in self.radii))
+
+    @property
+    def straight(self) -> bool:
+        """True without any curvature at rest."""
+        return self.curvature == 0 and not any(bend for _, bend, _ in self.bends)
 
     @property
     def breaks(self) -> NDArray[np.float64]:
@@ -187,8 +203,14 @@ class Whisker:
         base, tip = self.densities
         return (base + (tip - base) * self._fraction(s)) * np.pi * self.radius(s) ** 2
 
+    def rest_points(self, s: ArrayLike) -> NDArray[np.float64]:
+        """Return the rest positions [n, 3] in the base frame [m] at arc lengths ``s`` [n] [m]."""
+        if self.bends:
+            return _path(self.bends)(np.asarray(s, dtype=float))[:3].T
+        return np.pad(self.centre_line(s), ((0, 0), (0, 1)))
+
     def centre_line(self, s: ArrayLike) -> NDArray[np.float64]:
-        """Return the rest positions (x, y) [..., 2] in the base frame [m] at arc length ``s`` [m]."""
+        """Return the rest positions (x, y) [..., 2] in the base frame [m] at arc length ``s`` [m] of a parabola."""
         x = self._abscissa(s)
         return np.stack([x, self.curvature * x**2], axis=-1)
 
@@ -198,6 +220,8 @@ class Whisker:
 
     def _abscissa(self, s: ArrayLike) -> NDArray[np.float64]:
         """Invert s(x) = (u √(1+u²) + asinh u)/(4A), u = 2 A x, by Newton's method."""
+        if self.bends:
+            raise UsageError("Only whiskers whose rest shape is y = A x² can be used here; leave bends out.")
         s = np.asarray(s, dtype=float)
         target = 4 * self.curvature * s
         # So nearly straight, arc and abscissa are equal to rounding, and the end of this function would divide by 0.
@@ -222,6 +246,26 @@ def _along(rows: tuple[tuple[float, float], ...], s: ArrayLike) -> NDArray[np.fl
     return np.asarray(np.interp(np.asarray(s, dtype=float), *np.transpose(rows)))
 
 
+@lru_cache(maxsize=64)
+def _path(bends: tuple[tuple[float, float, float], ...]) -> Any:
+    """Return the function from arc lengths [n] (m) to place (m), tangent, normal and binormal [12, n] at rest."""
+    from scipy.integrate import solve_ivp
+
+    arcs, curvatures, torsions = np.transpose(bends)
+
+    def slope(s: float, state: NDArray[np.float64]) -> NDArray[np.float64]:
+        tangent, normal, binormal = state[3:].reshape(3, 3)
+        bend, turn = np.interp(s, arcs, curvatures), np.interp(s, arcs, torsions)
+        return np.concatenate([tangent, bend * normal, turn * binormal - bend * tangent, -turn * normal])
+
+    start = np.concatenate([np.zeros(3), np.eye(3).ravel()])
+    step = float(np.diff(arcs).min())
+    solution = solve_ivp(
+        slope, (0.0, arcs[-1]), start, "DOP853", rtol=1e-12, atol=1e-15, dense_output=True, max_step=step
+    )
+    return solution.sol
+
+
 def quadrature(low: float, high: float, breaks: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return points and weights that integrate over [low, high] what is smooth between ``breaks`` (Gauss-Legendre)."""
     edges = np.array([low, *breaks[(breaks > low) & (breaks < high)], high])
@@ -241,11 +285,13 @@ class Chain:
     nodes: NDArray[np.float64]
     """[N + 1] arc lengths of the joints and of the tip (m)."""
     points: NDArray[np.float64]
-    """[N + 1, 2] rest positions of the nodes in the base frame (m)."""
+    """[N + 1, 3] rest positions of the nodes in the base frame (m)."""
     lengths: NDArray[np.float64]
     """[N] chord lengths of the links (m)."""
     rest_angles: NDArray[np.float64]
     """[N] rest rotation about z of each link against the one before, the first against the base (rad)."""
+    rest_rolls: NDArray[np.float64]
+    """[N] rotation about the link before, ahead of that, which leads the rest shape out of a plane (rad)."""
     radii: NDArray[np.float64]
     """[N] mean radius of each link (m)."""
     masses: NDArray[np.float64]
@@ -263,6 +309,13 @@ class Chain:
     def links(self) -> int:
         """Number of links N."""
         return len(self.lengths)
+
+    @property
+    def rest_turns(self) -> NDArray[np.float64]:
+        """[N, 3, 3] rest rotation of each link against the one before, the first against the base."""
+        from scipy.spatial.transform import Rotation
+
+        return Rotation.from_euler("XZ", np.stack([self.rest_rolls, self.rest_angles], axis=1)).as_matrix()
 
     def locate(self, arc: float) -> tuple[int, float]:
         """Return the link at an arc length (m), at a joint the one before it, and the share of the link up to there."""
@@ -316,14 +369,30 @@ def build_chain(whisker: Whisker, links: int) -> Chain:
     """Cut ``whisker`` into at least two ``links`` of equal arc length; callers share the result."""
     check_number("The number of links", links, least=2, whole=True)
     nodes = np.linspace(0.0, whisker.arc_length, links + 1)
-    points = whisker.centre_line(nodes)
+    points = whisker.rest_points(nodes)
     chords = np.diff(points, axis=0)
-    angles = np.arctan2(chords[:, 1], chords[:, 0])
     lengths = np.linalg.norm(chords, axis=1)
-    rest_angles, radii = np.diff(angles, prepend=0.0), whisker.radius((nodes[:-1] + nodes[1:]) / 2)
+    rest_rolls, rest_angles = _turns(chords)
+    radii = whisker.radius((nodes[:-1] + nodes[1:]) / 2)
     frusta, compliance = _frusta(whisker, nodes, lengths), _compliance(whisker, links)
     stiffness, torsion = 1 / compliance, whisker.torsion_ratio * _shared_stiffness(compliance)
-    return Chain(whisker, nodes, points, lengths, rest_angles, radii, *frusta, stiffness, torsion)
+    return Chain(whisker, nodes, points, lengths, rest_angles, rest_rolls, radii, *frusta, stiffness, torsion)
+
+
+def _turns(chords: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the rolls about x and the bends about z [N] (rad) that lead from each chord [N, 3] to the next."""
+    if not chords[:, 2].any():
+        return np.zeros(len(chords)), np.diff(np.arctan2(chords[:, 1], chords[:, 0]), prepend=0.0)
+    from scipy.spatial.transform import Rotation
+
+    turns, frame = np.zeros((len(chords), 2)), np.eye(3)
+    for link, chord in enumerate(chords):
+        x, y, z = chord @ frame
+        # The nearer of both ways: a plane S bends to either side, without a roll.
+        roll = math.atan(z / y) if y else math.copysign(math.pi / 2, z) if z else 0.0
+        turns[link] = roll, math.atan2(y * math.cos(roll) + z * math.sin(roll), x)
+        frame = frame @ Rotation.from_euler("XZ", turns[link]).as_matrix()
+    return turns[:, 0], turns[:, 1]
 
 
 def _compliance(whisker: Whisker, links: int) -> NDArray[np.float64]:

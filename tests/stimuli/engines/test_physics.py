@@ -309,7 +309,7 @@ def test_the_recorded_shape_at_rest_is_the_rest_curve(engine):
     still = StillFollicle(position=(0.001, 0.002, 0.003), euler=(0.4, 0.2, 0.9))
     trace = _run(engine, Job(curved, still, (), np.array([0.01])), record_shape=True)[0]
     chain = build_chain(curved, engine.coarse.links)
-    expected = np.column_stack([chain.points, np.zeros(len(chain.points))]) @ base_rotation(still.euler).T
+    expected = chain.points @ base_rotation(still.euler).T
     np.testing.assert_allclose(trace.link_positions[0], expected + still.position, atol=1e-9)
 
 

@@ -19,7 +19,7 @@ WHISKER = WhiskerArray.of("rat")["C2"].whisker
 
 def _joints(links):
     chain = build_chain(WHISKER, links)
-    return chain.nodes, chain.points[None]
+    return chain.nodes, chain.points[None, :, :2]
 
 
 @pytest.mark.parametrize("links", [10, 20])

@@ -75,9 +75,10 @@ class JobTask:
     """Whether it may leave its plane, and may twist at this fidelity."""
 
     @property
-    def kind(self) -> tuple[bool, bool, bool]:
-        """Whether it twists, feels air, and whether its follicle gives way: tasks of one launch are alike."""
-        return self.twists, self.job.air_flow is not None, self.job.whisker.follicle is not None
+    def kind(self) -> tuple[bool, ...]:
+        """Whether it twists, feels air, has a follicle that gives way, bends in space: tasks of a launch are alike."""
+        whisker = self.job.whisker
+        return self.twists, self.job.air_flow is not None, whisker.follicle is not None, bool(whisker.bends)
 
 
 def make_task(
@@ -230,6 +231,7 @@ class RodEngine(WhiskerEngine):
     twists = True
     yields = True
     flows = True
+    coils = True
     surfaces = True
     batches = True
 
@@ -339,7 +341,7 @@ def _simulate(
         packed = PackedTasks.of([given[row] for row in rows], finer)
         # Compiling is done once; it is no cost of a whisker.
         paused = time.thread_time()
-        twists, flows, _ = given[0].kind
+        twists, flows = given[0].kind[:2]
         solver = WhiskerSolver(packed.chains, fidelity, device, packed.shapes.needs, twists=twists, flows=flows)
         started += time.thread_time() - paused
         result = packed.launch(solver, record_shape=record_shape)

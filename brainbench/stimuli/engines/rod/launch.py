@@ -286,12 +286,13 @@ class WhiskerSolver:
         if options:
             options["sliced"] = sliced
         self.yields = any(chain.whisker.follicle is not None for chain in self.chains)
-        uses = {"yields": self.yields, "flows": flows}
+        rolls = any(chain.rest_rolls.any() for chain in self.chains)
+        uses = {"yields": self.yields, "rolls": rolls, "flows": flows}
         features = tuple(name for name, used in uses.items() if used)
         self.kernels = load_kernels(
             device, self.real, self.capacity, needs, hinges=hinges, features=features, **options
         )
-        packed = pack_chains(self.capacity, self.chains, self.quasistatic, hinges)
+        packed = pack_chains(self.capacity, self.chains, self.quasistatic, hinges, rolls=rolls)
         if self.yields:
             packed["follicle"] = pack_follicles(self.chains, self.quasistatic)
         with lock_of(device):

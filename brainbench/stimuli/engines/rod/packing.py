@@ -219,12 +219,15 @@ def rotation_vectors(before: NDArray, after: NDArray) -> NDArray[np.float64]:
     return np.stack([relative[:, k, j] - relative[:, j, k] for j, k in ((1, 2), (2, 0), (0, 1))], axis=-1) / 2
 
 
-def pack_chains(capacity: int, chains: Sequence[Chain], quasistatic: bool, hinges: int) -> dict[str, NDArray]:
+def pack_chains(
+    capacity: int, chains: Sequence[Chain], quasistatic: bool, hinges: int, *, rolls: bool = False
+) -> dict[str, NDArray]:
     """Return what the kernel's ``ChainArrays`` hold: whiskers as chains, [link, whisker] of ``capacity`` links."""
     count = len(chains)
     mass = LIGHT if quasistatic else 1.0
     springs = ("stiffness", "torsion")[: hinges - 1]
-    build = _links(capacity, count, "length", "bend_cosine", "bend_sine", "mass")
+    turns = ("roll_cosine", "roll_sine") if rolls else ()
+    build = _links(capacity, count, "length", "bend_cosine", "bend_sine", "mass", *turns)
     inertia = _links(capacity, count, "centre", "axial", "transverse", *springs)
     taper = _links(capacity, count, "start_radius", "end_radius", "arc", "arc_length")
     for w, chain in enumerate(chains):
@@ -233,6 +236,8 @@ def pack_chains(capacity: int, chains: Sequence[Chain], quasistatic: bool, hinge
         bends = chain.rest_angles / np.where((chain.torsion > 0) & (hinges == 3), 2, 1)
         build["length"][:n, w] = chain.lengths * MILLI
         build["bend_cosine"][:n, w], build["bend_sine"][:n, w] = np.cos(bends), np.sin(bends)
+        for name, law in zip(turns, (np.cos, np.sin), strict=False):
+            build[name][:n, w] = law(chain.rest_rolls)
         # kg to mg, kg·m² to mg·mm², N·m to µN·m.
         build["mass"][:n, w] = chain.masses * (mass * MICRO)
         inertia["centre"][:n, w] = chain.centres * MILLI

@@ -35,7 +35,7 @@ def _depths(scene, fidelity=COARSE):
     corners = surface.vertices[surface.faces] + shift
     found = []
     for mount in scene.array:
-        nodes = np.pad(fidelity.chain(mount.whisker).points, ((0, 0), (0, 1)))
+        nodes = fidelity.chain(mount.whisker).points
         share = np.linspace(0, 1, 9)[:, None]
         points = np.concatenate([a + share * (b - a) for a, b in itertools.pairwise(nodes)])
         local = points @ base_rotation(mount.angles).T + mount.position

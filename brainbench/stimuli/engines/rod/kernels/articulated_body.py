@@ -46,7 +46,7 @@ from .algebra import (
     vec6,
 )
 from .motion import BodyMotion, elapsed
-from .parameters import flows, hinges, real, yields
+from .parameters import flows, hinges, real, rolls, yields
 from .state import (
     ChainArrays,
     ContactCandidates,
@@ -215,6 +215,10 @@ def forward_kinematics(
     fastest = speed
     for i in range(job.links):
         link = chains.build[i, job.whisker]
+        if wp.static(rolls):
+            rolled = y * link.roll_cosine + z * link.roll_sine
+            z = z * link.roll_cosine - y * link.roll_sine
+            y = rolled
         # Bend at rest about z, then the hinge about y, then the one about z.
         turned = x * link.bend_cosine + y * link.bend_sine
         y = y * link.bend_cosine - x * link.bend_sine

@@ -13,6 +13,8 @@ hinges = 2
 """Hinges of a joint: two for bending; with three, the last lets the whisker twist."""
 yields = False
 """True: follicles give way, see ``FollicleConstants``."""
+rolls = False
+"""True: rest shapes leave their plane."""
 flows = False
 """True: air flows, whose drag whiskers feel."""
 against = MESHES

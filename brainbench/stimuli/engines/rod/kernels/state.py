@@ -15,7 +15,7 @@ from brainbench.stimuli.engines.rod.limits import LISTED, SPARE, WIDE, contacts_
 
 from .algebra import JointInverse, JointVector, Spatial, SpatialInertia, mat33, reader, vec3, vec4
 from .motion import BodyMotion, Instant, JobArrays, MotionArrays, ReadingArrays, instant, pose_at
-from .parameters import capacity, flows, hinges, real, recorded, yields
+from .parameters import capacity, flows, hinges, real, recorded, rolls, yields
 
 if recorded:
     from .recorder.records import StepRecords
@@ -54,6 +54,10 @@ class LinkBuild:
     """Cosine and sine of the angle at rest to the link before; of half that angle at a joint that twists."""
     bend_sine: real
     mass: real
+    if rolls:
+        roll_cosine: real
+        """Of the angle about the link before by which the plane of the bend is turned."""
+        roll_sine: real
 
 
 @wp.struct
