@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from brainbench.core.contracts import join_labels, natural_key
+from brainbench.core.contracts import as_label, join_labels, natural_key
 from brainbench.core.errors import DataError, UsageError, check_each, check_name, check_once, listing
 from brainbench.core.files import content_hash
 from brainbench.core.progress import Progress, track
@@ -26,6 +26,8 @@ if TYPE_CHECKING:
     from brainbench.metrics import Metric
     from brainbench.scoring.options import ScoreOptions
 
+BY_TRIAL = "trial"
+"""Value of ``match`` that joins each trial to a stimulus of its own."""
 PUBLISHED_LAYOUT = "published-npz"  # layout of files of rates whose zeros the published estimators count
 
 
@@ -149,7 +151,13 @@ class NeuralResponses:
         return {label: pairs.get(label) for label in self.vocabulary}
 
     def pairs(self, stimuli: tuple[str, ...], match: Any) -> dict[str, str]:
-        """Pair recording labels with stimuli; slots without names one by one, as the published code does."""
+        """Pair recording labels with stimuli; slots without names one by one, as the published code does.
+
+        Labels that are joined by trial are those of their trials.
+        """
+        if match == BY_TRIAL:
+            names = self.dataset["stimulus"].values.astype(str)[self.stimulus_rows(stimuli) >= 0]
+            return {label: label for label in self.vocabulary if label in names}
         if self.label_doubt and match is None:
             if len(stimuli) != len(self.vocabulary):
                 raise UsageError(
@@ -159,6 +167,24 @@ class NeuralResponses:
                 )
             match = dict(zip(self.vocabulary, stimuli, strict=True))
         return join_labels(self.vocabulary, stimuli, match)
+
+    def stimulus_rows(self, labels: tuple[str, ...]) -> NDArray[np.int64]:
+        """Return the row of each trial's own stimulus [trial]; −1 where it has none."""
+        columns = [self.dataset[name].values.astype(str).tolist() for name in ("subject", "session", "trial_id")]
+        parts = [tuple(map(as_label, row)) for row in zip(*columns, strict=True)]
+        places = {as_label(label.replace("/", "_")): row for row, label in enumerate(labels)}
+        best = np.full(len(parts), -1)
+        for depth in (1, 2, 3):
+            names = ["_".join(row[-depth:]) for row in parts]
+            rows = np.array([places.get(name, -1) for name in names], dtype=np.int64)
+            if len({*names}) == len(names) and (rows >= 0).sum() > (best >= 0).sum():
+                best = rows
+        if (best < 0).all():
+            raise UsageError(
+                f"No trial has a stimulus of its own: trials are {listing('_'.join(row) for row in parts)}, stimuli are"
+                f" {listing(labels)}. Name each track after its trial (TRIAL, SESSION_TRIAL or ANIMAL_SESSION_TRIAL)."
+            )
+        return best
 
     def reliable_trials(
         self, labels: tuple[str, ...], options: ScoreOptions, *, averaged: bool = False

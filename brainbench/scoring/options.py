@@ -52,7 +52,8 @@ class ScoreOptions:
     conditions: str | None = None
     """TABLE:COLUMN[,COLUMN] of the recordings that labels the trials; see 'recordings inspect'."""
     match: Path | str | Mapping[str, str | None] | None = None
-    """JSON, TOML or CSV file: recording label → stimulus label (null drops one); equal labels need none."""
+    """JSON, TOML or CSV file: recording label → stimulus label (null drops one); equal labels need none. 'trial': each
+    trial has a stimulus of its own, named after it."""
     select: str | Selection | None = None
     """Trials and units to use, e.g. 'outcome=correct; units.layer=4', or a name."""
     window: str | Window | None = None

@@ -21,7 +21,9 @@ from brainbench.core.progress import Progress, stages, track
 from brainbench.core.provenance import Provenance
 from brainbench.core.records import ESTIMATOR_VERSION, ResultRecord, Score
 from brainbench.scoring.influence import influence_of
+from brainbench.scoring.neural_responses import BY_TRIAL
 from brainbench.scoring.options import ScoreOptions
+from brainbench.scoring.own_stimuli import joined
 from brainbench.scoring.presentation import presentation_of
 
 if TYPE_CHECKING:
@@ -128,7 +130,7 @@ def score_record(
     _check_inputs(resolved, brain, options)
     network = resolved.respond(options, progress=progress)
     stage_done()
-    pairs = brain.pairs(network.labels, options.match)
+    brain, network, pairs = joined(brain, network, options)
     labels = tuple(pairs)
     if plan is not None:
         plan.check_stimuli((*labels, *pairs.values()))
@@ -139,7 +141,8 @@ def score_record(
 
     scores, between = _compare(inputs, baselines=baselines, progress=progress)
     stage_done()
-    settings = {"estimator_version": ESTIMATOR_VERSION, "model": model if isinstance(model, str) else None}
+    by_trial = {"match": BY_TRIAL} if options.match == BY_TRIAL else {}
+    settings = {"estimator_version": ESTIMATOR_VERSION, "model": model if isinstance(model, str) else None, **by_trial}
     # Features with labels of their own were computed elsewhere, of stimuli unknown here.
     if resolved.labels is not None:
         settings |= dict.fromkeys(("stimuli", "whiskers", "fidelity"))

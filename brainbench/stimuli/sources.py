@@ -175,7 +175,8 @@ def known_labels(source: object) -> tuple[str, ...] | None:
     with contextlib.suppress(BrainbenchError, OSError, KeyError, TypeError):
         path = Path(str(recipe_file(source))) if is_packaged(source) else source
         if isinstance(path, (str, os.PathLike)) and Path(path).suffix == ".toml":
-            return tuple(item["label"] for item in read_toml(path, "scene file")["scene"])
+            labels = tuple(item["label"] for item in read_toml(path, "scene file")["scene"])
+            return None if any("{trial}" in label for label in labels) else labels
     return None
 
 

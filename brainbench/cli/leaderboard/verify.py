@@ -236,7 +236,7 @@ def score_again(record: ResultRecord, how: Repetition) -> ResultRecord:
         raise UsageError(
             f"The record was made with recordings {str(source)[:80]!r}; give them with --recordings PATH{advice}."
         )
-    others = {"recordings": how.recordings or source, "match": origin.pairs or None}
+    others = {"recordings": how.recordings or source, "match": origin.settings.get("match") or origin.pairs or None}
     options = ScoreOptions.stated_in(origin.settings, **others, **({"stimuli": how.stimuli} if how.stimuli else {}))
     return score_record(model, options)
 
