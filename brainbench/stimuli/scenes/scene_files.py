@@ -1,8 +1,10 @@
 """Scene files: one TOML file describes one or several labelled scenes. Units stand in the keys: docs/scene-files.md."""
 
+import dataclasses
 import glob
 import math
 import os
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,7 +12,16 @@ from typing import Annotated, Any, TypeVar
 
 import msgspec
 
-from brainbench.core.errors import BrainbenchError, UsageError, brief, check_name, repeats, unknown_name
+from brainbench.core.errors import (
+    BrainbenchError,
+    UsageError,
+    brief,
+    check_each,
+    check_name,
+    listing,
+    repeats,
+    unknown_name,
+)
 from brainbench.core.limits import Limit, check_value
 from brainbench.core.reading.regular import readable
 from brainbench.core.reading.texts import read_toml
@@ -42,7 +53,8 @@ from brainbench.stimuli.objects.solid import (
 from brainbench.stimuli.scenes.scene import Animal, Frames, Head, Scene, WhiskerMotion
 from brainbench.stimuli.sweeps.sweep_scenes import SweepScenes
 from brainbench.stimuli.tracks.readers import TrackOptions
-from brainbench.stimuli.whiskers.array import WhiskerArray
+from brainbench.stimuli.whiskers.array import ROWS, SPECIES, MountedWhisker, WhiskerArray, published_whisker
+from brainbench.stimuli.whiskers.whisker import Whisker
 
 MILLI = 1e-3
 """Metres in a millimetre, seconds in a millisecond."""
@@ -151,6 +163,22 @@ class _Array(Table):
     side: str | None = None
     whiskers: str = "all"
     replace: dict[str, dict[str, Any]] = {}
+
+
+class _Mount(Table, kw_only=True):
+    name: str
+    position_mm: Vector
+    angles_deg: Vector
+    whisker: dict[str, Any] = {}
+
+
+class _Species(Table, kw_only=True):
+    species: str
+    citation: str = ""
+    side: str = "right"
+    rules: str | None = None
+    whisker: dict[str, Any] = {}
+    mount: list[dict[str, Any]]
 
 
 class _Animal(Table):
@@ -266,7 +294,7 @@ def _scaled(value: Any, factor: float | None) -> Any:
 
 def _recipe(path: Path, data: dict[str, Any], whiskers: str) -> Recipe:
     file = read_table(_File, data, "the scene file")
-    array = _array(file.array)
+    array = _array(file.array, path.parent)
     others = tuple(_animal(read_table(_Animal, animal, "[[animal]]"), path.parent) for animal in file.animal)
     side = array.mounts[0].full_name[0]
     if not file.scene:
@@ -292,7 +320,7 @@ def _recipe(path: Path, data: dict[str, Any], whiskers: str) -> Recipe:
 
 
 def _animal(table: _Animal, folder: Path) -> Animal:
-    array = _array(table.array)
+    array = _array(table.array, folder)
     whisking = _whisking(table.whisking, folder, array.mounts[0].full_name[0])
     return Animal(table.name, array, whisking, _head(table.head))
 
@@ -324,9 +352,49 @@ def _trials(file: _File, folder: Path) -> Iterator[_Scene]:
             yield read_table(_Scene, msgspec.json.decode(data), "[[scene]]")
 
 
-def _array(data: Mapping[str, Any]) -> WhiskerArray:
+def load_array(path: str | os.PathLike[str]) -> WhiskerArray:
+    """Read a species file, the whiskers of any animal; docs/scene-files.md lists the keys."""
+    table = read_table(_Species, read_toml(path, "species file"), f"the species file {brief(os.fspath(path))}")
+    check_name("side", table.side, ("right", "left"))
+    if table.rules is not None:
+        check_name("rules of a species file", table.rules, SPECIES)
+    mounts = [_mount(read_table(_Mount, entry, "[[mount]]"), table) for entry in table.mount]
+    twice = repeats(mount.name for mount in mounts)
+    if not mounts or twice:
+        raise UsageError(
+            f"A species file has one [[mount]] for each whisker; {brief(twice[0]) if twice else 'none'} has."
+        )
+    return WhiskerArray(table.species, tuple(mounts), table.citation)
+
+
+def _mount(table: _Mount, species: _Species) -> MountedWhisker:
+    name, given = table.name, {**species.whisker, **table.whisker}
+    if not re.fullmatch(rf"[{ROWS}]\d{{1,2}}", name):
+        raise UsageError(
+            f"A whisker is named by its row, one of {ROWS}, and its column, as C2; received {brief(name)}."
+        )
+    properties = dataclasses.fields(Whisker)
+    check_each(f"property of the whisker {name}", given, [field.name for field in properties])
+    needed = {field.name for field in properties if field.default is dataclasses.MISSING}
+    row, col = ROWS.index(name[0]), int(name[1:])
+    if species.rules is not None and "arc_length" in given:
+        # The rules of a species state what is not given: radii by arc length and place, and the material.
+        rod = published_whisker(given["arc_length"] / MILLI, 0.0, row, col, species=species.rules)
+        given = {**{name: getattr(rod, name) for name in needed}, "friction": rod.friction, **given}
+    if missing := sorted(needed - set(given)):
+        raise UsageError(f"The whisker {name} needs {listing(missing)}, in its own table or for all in [whisker].")
+    return MountedWhisker(
+        name, species.side, row, col, whisker=Whisker(**given), **table.si("position_mm", "angles_deg")
+    )
+
+
+def _array(data: Mapping[str, Any], folder: Path) -> WhiskerArray:
     table = read_table(_Array, data, "[array]")
-    array = WhiskerArray.of(**table.si("species", "side"))
+    if (table.species or "").endswith(".toml"):
+        array = load_array(folder / str(table.species))
+        array = array if table.side is None else array.on_side(table.side)  # type: ignore[arg-type]
+    else:
+        array = WhiskerArray.of(**table.si("species", "side"))
     for pattern, changes in table.replace.items():
         array = array.replace(pattern, **changes)
     return array.select(table.whiskers)

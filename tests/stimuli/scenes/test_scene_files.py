@@ -1,5 +1,6 @@
 import math
 import pathlib
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,7 +11,8 @@ from brainbench.stimuli import simulate
 from brainbench.stimuli.motion.trajectories import ROTATIONS, Path, Spin, Still, Translation
 from brainbench.stimuli.objects.obstacle import Cylinder
 from brainbench.stimuli.scenes.scene import Frames
-from brainbench.stimuli.scenes.scene_files import load_scene
+from brainbench.stimuli.scenes.scene_files import load_array, load_scene
+from brainbench.stimuli.whiskers.array import WhiskerArray
 from brainbench.stimuli.whiskers.whisker import build_chain
 from tests.factories.scene_files import POLE
 
@@ -311,3 +313,80 @@ def test_the_shipped_pole_stands_where_no_whisker_starts_in_it():
     pytest.importorskip("warp")
     scene = load_scene(pathlib.Path(__file__).parents[3] / "docs" / "scenes" / "pole.toml")
     assert (simulate(scene.scenes, fidelity="fast", cache=False)["status"] == "ok").all()
+
+
+def _species(tmp_path, text):
+    path = tmp_path / "animal.toml"
+    path.write_text(text)
+    return path
+
+
+def _rat_file(names):
+    rat = WhiskerArray.rat()
+    parts = ['species = "rat, in part"', 'rules = "rat"']
+    for name in names:
+        mount = rat[name]
+        place = [1e3 * value for value in mount.position]
+        angles = np.degrees(mount.angles).tolist()
+        rod = f"arc_length = {mount.whisker.arc_length!r}, curvature = {mount.whisker.curvature!r}"
+        parts += [
+            "[[mount]]",
+            f'name = "{name}"',
+            f"position_mm = {place}",
+            f"angles_deg = {angles}",
+            f"whisker = {{ {rod} }}",
+        ]
+    return "\n".join(parts)
+
+
+def test_species_file_with_the_numbers_of_the_rat_is_the_rat(tmp_path):
+    array = load_array(_species(tmp_path, _rat_file(WhiskerArray.rat().names)))
+    assert array.species == "rat, in part"
+    assert array.names == WhiskerArray.rat().names
+    for mount, published in zip(array, WhiskerArray.rat(), strict=True):
+        assert mount.position == pytest.approx(published.position)
+        assert mount.angles == pytest.approx(published.angles)
+        assert (mount.row, mount.col) == (published.row, published.col)
+        for name in ("base_radius", "tip_radius", "young_modulus", "damping_ratio", "friction", "curvature"):
+            assert getattr(mount.whisker, name) == pytest.approx(getattr(published.whisker, name)), name
+        assert mount.whisker.density == published.whisker.density
+
+
+def test_scene_takes_a_species_file_and_its_mirror_image(tmp_path):
+    _species(tmp_path, _rat_file(["C1", "C2"]))
+    path = tmp_path / "scene.toml"
+    path.write_text('[array]\nspecies = "animal.toml"\nside = "both"\nwhiskers = "C2"\n[[scene]]\nlabel = "x"\n')
+    (scene,) = load_scene(path).scenes
+    assert scene.names == ("RC2", "LC2")
+    assert scene.array["LC2"].position == pytest.approx(WhiskerArray.rat(side="left")["C2"].position)
+
+
+def test_the_species_file_of_the_page_is_valid(tmp_path):
+    page = (pathlib.Path(__file__).parents[3] / "docs" / "scene-files.md").read_text(encoding="utf-8")
+    block = page.split("## Species files")[1].split("```toml\n")[1].split("```")[0]
+    array = load_array(_species(tmp_path, block))
+    rat = WhiskerArray.rat()
+    assert array["A0"].angles == pytest.approx(rat["A0"].angles, abs=1e-4)
+    assert array["A0"].whisker == replace(rat["A0"].whisker, damping_ratio=0.15)
+    assert array["A1"].whisker.radius(0.02) == pytest.approx(35e-6)
+
+
+WHOLE = '[[mount]]\nname = "C2"\nposition_mm = [1, 2, 3]\nangles_deg = [10, 20, 30]\n'
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (WHOLE, "needs 'arc_length', 'base_radius', 'damping_ratio', 'density', 'tip_radius', 'young_modulus'"),
+        (WHOLE + "whisker = { lenght = 1 }", "property of the whisker C2.*'lenght'"),
+        (WHOLE.replace("C2", "F2"), "row, one of ABCDE, and its column, as C2; received 'F2'"),
+        (WHOLE.replace("position_mm = [1, 2, 3]\n", ""), "needs the key 'position_mm'"),
+        ('rules = "shrew"\n' + WHOLE, "shrew"),
+        ('side = "both"\n' + WHOLE, "both"),
+        ("mount = []", "none has"),
+        ('rules = "rat"\n' + 2 * (WHOLE + "whisker = { arc_length = 0.03 }\n"), "'C2' has"),
+    ],
+)
+def test_species_file_that_is_no_array_is_refused(tmp_path, text, words):
+    with pytest.raises(UsageError, match=words):
+        load_array(_species(tmp_path, 'species = "x"\n' + text))
