@@ -6,6 +6,8 @@
 few to tell models apart.
 """
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any

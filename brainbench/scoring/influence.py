@@ -3,6 +3,8 @@
 An effective number is (Σw)²/Σw² of shares w: as many as there are where all weigh the same, 1 where one has all.
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from typing import Any
 

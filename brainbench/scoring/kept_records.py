@@ -1,5 +1,7 @@
 """Records of scores that were made before on this machine, with the same code, network, recordings and options."""
 
+from __future__ import annotations
+
 import re
 from pathlib import Path
 

@@ -8,6 +8,8 @@ times of the permutations (maximum statistic, Nichols & Holmes 2002, doi:10.1002
 Letters: N permutation, L layer, G lag, T time bin, A animal, K stimulus, P RDM pair.
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace

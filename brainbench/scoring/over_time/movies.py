@@ -3,6 +3,8 @@
 Letters: K stimulus, T time bin, F feature, U unit, P = K(K−1)/2 RDM pair.
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace

@@ -7,6 +7,8 @@ Gaussian patterns in D dimensions, from the second moments of a Wishart matrix, 
 Letters: K stimulus, R trial, U unit, F feature.
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Iterable, Sequence
 from itertools import combinations

@@ -14,6 +14,8 @@ choice among ``layers`` of which one has the effect and the others know nothing.
 with the mean distance taken away, which has the same permutations as the whitened cosine and a chance of 0.
 """
 
+from __future__ import annotations
+
 import math
 from dataclasses import dataclass, replace
 from typing import Annotated

@@ -1,5 +1,7 @@
 """Summary of the boards of a recovery: how often the true candidate wins, ties and loses, and a picture of it."""
 
+from __future__ import annotations
+
 import os
 from dataclasses import dataclass
 from functools import cached_property

@@ -6,6 +6,8 @@ stimulus at a time. Rates must be measured on boards of other numbers (:data:`FI
 they are too good.
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise

@@ -3,6 +3,8 @@
 :func:`find_cheapest` repeats that with growing designs until the true candidate comes first often enough.
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial

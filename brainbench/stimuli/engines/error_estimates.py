@@ -5,6 +5,8 @@ again. What each changes says how far the limit is. Contacts push along straight
 forces between opposed contacts at random, and no change of the step shows it.
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace

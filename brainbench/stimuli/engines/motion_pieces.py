@@ -9,6 +9,8 @@ per time step where that is shorter; what lies wholly between two looks is not s
 its shortest period (s; twice the width of a pulse), is looked at 16 times in it. Letters: n time, c cell, k coordinate.
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -9,6 +9,8 @@ that move → base, which carries the force and torque sensors → link 0 → �
 third where the chain twists. Letters: n time step, N link.
 """
 
+from __future__ import annotations
+
 import contextlib
 import logging
 from collections.abc import Iterable, Iterator

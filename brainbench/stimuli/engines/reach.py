@@ -1,5 +1,7 @@
 """What a whisker could ever touch of its obstacles, so that a scene costs only what it uses, and planes it stays in."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace

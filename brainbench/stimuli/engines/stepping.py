@@ -1,5 +1,7 @@
 """Jobs that need no simulation, jobs in equal time steps, and engines that take these. Letters: n frame, s step."""
 
+from __future__ import annotations
+
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence

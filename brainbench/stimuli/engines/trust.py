@@ -1,5 +1,7 @@
 """The one rule of which simulated whiskers can be trusted."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from dataclasses import dataclass
 

@@ -3,6 +3,8 @@
 Letters: m residual, p parameter. Sums of squares S are of whitened residuals, priors included as residuals.
 """
 
+from __future__ import annotations
+
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence

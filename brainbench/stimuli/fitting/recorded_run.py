@@ -32,6 +32,8 @@ steps, where the state is kept; each segment is then run again from there and wr
 Step lengths are those that the run took: derivatives are at a fixed sequence of steps.
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any

@@ -4,6 +4,8 @@ Whiskers never touch one another, so the unit of simulation is one whisker. Lett
 Inside engines calculate in mm, ms and mg, so in mN and µN·m, which keep every number near one.
 """
 
+from __future__ import annotations
+
 import math
 from dataclasses import dataclass
 from typing import Annotated, ClassVar, Literal, Protocol

@@ -23,6 +23,8 @@ be turned in any way; a view from below mirrors the image. Displacements of base
 Letters: W whisker, n sample, k traced point.
 """
 
+from __future__ import annotations
+
 import logging
 import math
 import os

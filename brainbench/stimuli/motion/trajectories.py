@@ -3,6 +3,8 @@
 Letters: n time.
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field

@@ -1,5 +1,7 @@
 """Named, labelled objects that are built when they are needed: what ``--objects`` of a sweep names."""
 
+from __future__ import annotations
+
 import functools
 import glob
 import json

@@ -1,5 +1,7 @@
 """Scene files: one TOML file describes one or several labelled scenes. Units stand in the keys: docs/scene-files.md."""
 
+from __future__ import annotations
+
 import dataclasses
 import glob
 import math
@@ -383,9 +385,8 @@ def _mount(table: _Mount, species: _Species) -> MountedWhisker:
         given = {**{name: getattr(rod, name) for name in needed}, "friction": rod.friction, **given}
     if missing := sorted(needed - set(given)):
         raise UsageError(f"The whisker {name} needs {listing(missing)}, in its own table or for all in [whisker].")
-    return MountedWhisker(
-        name, species.side, row, col, whisker=Whisker(**given), **table.si("position_mm", "angles_deg")
-    )
+    mount = table.si("position_mm", "angles_deg")
+    return MountedWhisker(name, species.side, row, col, whisker=Whisker(**given), **mount)  # type: ignore[arg-type]
 
 
 def _array(data: Mapping[str, Any], folder: Path) -> WhiskerArray:

@@ -1,5 +1,7 @@
 """Run the shards of a data set here, on a pool, a GPU or a Dask cluster, and write the manifest of what came out."""
 
+from __future__ import annotations
+
 import logging
 import math
 import multiprocessing

@@ -3,6 +3,8 @@
 Nothing is built or simulated.
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields

@@ -3,6 +3,8 @@
 The bytes of a shard depend on what was asked for alone: no time, no machine and no version of a library is in it.
 """
 
+from __future__ import annotations
+
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields

@@ -4,6 +4,8 @@ The two grids of the thesis (chapter 3, table 3.1) are :data:`GRIDS`. Nothing is
 asked for.
 """
 
+from __future__ import annotations
+
 import itertools
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence

@@ -7,6 +7,8 @@ table (columns ``fid``, ``wid``, ``label`` and perhaps ``follicle_x``, ``follicl
 interfaces export; binary ``.measurements`` files are not read.
 """
 
+from __future__ import annotations
+
 import math
 import os
 import pickletools

@@ -6,6 +6,8 @@ bending in the x-y plane. Wrenches are the action of the whisker on its base, ab
 Here too: random scenes of whiskers in contact, in which settings are compared with a converged simulation.
 """
 
+from __future__ import annotations
+
 import itertools
 import math
 from collections.abc import Callable, Sequence

@@ -5,6 +5,8 @@ point at the origin, x along the whisker, bending in the x-y plane. SI units. Al
 against published tables and independent quadrature in the tests.
 """
 
+from __future__ import annotations
+
 import math
 from dataclasses import dataclass
 from functools import lru_cache

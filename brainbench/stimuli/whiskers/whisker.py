@@ -4,6 +4,8 @@ The base frame has its origin at the base point; the whisker leaves along +x and
 plane with its concave side towards +y. Arc length s runs from 0 at the base to L at the tip. SI units.
 """
 
+from __future__ import annotations
+
 import math
 from dataclasses import dataclass, field, fields
 from functools import lru_cache

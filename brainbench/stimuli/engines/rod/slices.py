@@ -9,6 +9,8 @@ one another however idle the GPU is, then costs the others next to nothing. Warp
 no threads, so a thread calls Warp while it holds :func:`lock_of`, and waits for the GPU without.
 """
 
+from __future__ import annotations
+
 import ctypes
 import sys
 import threading

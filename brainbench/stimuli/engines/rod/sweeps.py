@@ -3,6 +3,8 @@
 The object's surface is uploaded once and scaled, turned and moved inside the kernel.
 """
 
+from __future__ import annotations
+
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor

@@ -1,5 +1,7 @@
 """Families: round bodies from the lathe, outlines that are extruded, and things assembled from several bodies."""
 
+from __future__ import annotations
+
 import functools
 import math
 
