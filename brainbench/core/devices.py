@@ -334,7 +334,8 @@ def record_step(
 def record_launches(work: Callable[[], None], device: Any) -> Callable[[], None]:
     """Record launches of Warp on a CUDA device, which do not run, and return what launches them all."""
     wp = warp()
-    with wp.ScopedCapture(device=device) as capture:
+    # What Python throws away meanwhile could free device memory, which ends a recording.
+    with _no_collection(), wp.ScopedCapture(device=device) as capture:
         work()
     graph = capture.graph
     return lambda: wp.capture_launch(graph)
