@@ -145,11 +145,10 @@ class ProbeRuntime(Runtime):
         context: SuiteContext,
         *,
         reach: float | None = 0.0,
-        fusable: bool = True,
         others: bool = False,
     ) -> None:
         active = np.concatenate([sensor.probes.active for sensor in sensors.values()])
-        super().__init__(sensors, channels, context, fusable=fusable, active=active)
+        super().__init__(sensors, channels, context, active=active)
         tracked = {name: sensor.tracked(context.scene) for name, sensor in sensors.items()}
         members = sorted({g for members in tracked.values() for g in members})
         self.kinds = context.solids.kinds_of(members, others=others)

@@ -25,11 +25,24 @@ from typing import Any
 from brainbench.core.devices import warp
 from robotics_bridge.physics.kernels.state import StateArrays
 from robotics_bridge.sensors.kernels.distance import FAR, SIDED, SolidArrays, shape_functions
+from robotics_bridge.sensors.kernels.noise import episode_draw
 from robotics_bridge.sensors.kernels.pairs import PairArrays, SlotArrays
-from robotics_bridge.sensors.kernels.readout import ProbeArrays, ReadoutArrays, load_planes, silenced, store_planes
+from robotics_bridge.sensors.kernels.readout import (
+    FUSED,
+    ProbeArrays,
+    ReadoutArrays,
+    block_sum,
+    load_four,
+    load_planes,
+    readout_functions,
+    silenced,
+    store_planes,
+)
 
 wp = warp()
 
+SORTED, BEYOND = 8, 2**31 - 1  # nodes that a thread sorts at once, and a number beyond all
+Nodes = wp.types.vector(length=SORTED, dtype=wp.int32)
 ROUNDS = 6  # times that weights lean over at most
 STEEPEST = 10.0  # largest exponent of a weight
 TOUCH, BEHIND, NEAR = range(3)  # sources of carriers
@@ -62,59 +75,66 @@ class SpreadPlan:
 
 
 @wp.struct
+class Face:
+    """Contacts by which one body pushes a link from one side."""
+
+    next: wp.int32
+    """First node of the next face of the same link, −1 for none."""
+    last: wp.int32
+    """Last node of its own."""
+    other: wp.int32
+    """Link on the other side, −1 for what is no geometry."""
+    normal: wp.vec3f
+    """Unit, the way its first contact pushes the link."""
+    origin: wp.vec3f
+    """Point of its first contact."""
+    low: wp.vec3f
+    """Corner of the box around its points."""
+    high: wp.vec3f
+    """The opposite one."""
+    overlap: wp.float32
+    """Deepest (m)."""
+    load: wp.float32
+    """Sum of normal forces."""
+    force: wp.vec3f
+    """Sum of forces on the link, friction included."""
+    moment: wp.vec3f
+    """Of these about the origin (N·m)."""
+
+
+@wp.struct
 class ContactFaces:
     """Faces that push the links with sensors, each under the number of its first node."""
 
     head: wp.array2d(dtype=wp.int32)
     """[B, L] first face of a link, −1 for none."""
     listed: wp.array2d(dtype=wp.int32)
-    """[B, L] first node of a link in any order, −1 for none (on a GPU)."""
-    items: wp.array(dtype=wp.int32)
-    """[B M] places (environment, link) at which there is something to write (on a GPU)."""
+    """[B, L] first node of a link in any order, −1 for none."""
+    chain: wp.array(dtype=wp.int32)
+    """[2 C] next node of the same link in that order."""
+    items: wp.array2d(dtype=wp.vec2i)
+    """[2, B M] places (environment, link) with contacts, and their first face; of these, the places where a face needs
+    other carriers than those that touch (on a GPU)."""
     count: wp.array(dtype=wp.int32)
-    """[1] how many."""
-    stale: wp.array2d(dtype=wp.int32)
-    """[B, M] 1 where readings may be anything but zeros."""
+    """[2] how many."""
     filled: wp.array2d(dtype=wp.uint8)
     """[B, N] 1 where a reading is anything but zeros."""
     follower: wp.array(dtype=wp.int32)
     """[2 C] next node of the same face, −1 for none."""
     watched: wp.array(dtype=wp.int32)
     """[2 C] bit k: sensor k of the link looks at what pushes."""
-    next: wp.array(dtype=wp.int32)
-    """[2 C] next face of the same link, −1 for none."""
-    last: wp.array(dtype=wp.int32)
-    """[2 C] last node of a face."""
-    other: wp.array(dtype=wp.int32)
-    """[2 C] link on the other side, −1 for what is no geometry."""
-    normal: wp.array(dtype=wp.vec3f)
-    """[2 C] unit, the way its first contact pushes the link."""
-    origin: wp.array(dtype=wp.vec3f)
-    """[2 C] point of its first contact."""
-    low: wp.array(dtype=wp.vec3f)
-    """[2 C] corner of the box around its points."""
-    high: wp.array(dtype=wp.vec3f)
-    """[2 C] the opposite one."""
-    overlap: wp.array(dtype=wp.float32)
-    """[2 C] deepest (m)."""
-    load: wp.array(dtype=wp.float32)
-    """[2 C] sum of normal forces."""
-    force: wp.array(dtype=wp.vec3f)
-    """[2 C] sum of forces on the link, friction included."""
-    moment: wp.array(dtype=wp.vec3f)
-    """[2 C] of these about the origin (N·m)."""
+    face: wp.array(dtype=Face)
+    """[2 C]."""
 
 
 @wp.struct
 class PressArrays:
     """Contact of every taxel."""
 
-    weight: wp.array2d(dtype=wp.float32)
-    """[B, N] d^α."""
+    touch: wp.array2d(dtype=wp.vec4f)
+    """[B, N] outward normal m of what is touched, where a weight is above 0, and the weight d^α."""
     noisy: wp.array2d(dtype=wp.float32)
-    """[B, N] the same with radius noise and gain."""
-    normal: wp.array2d(dtype=wp.vec3f)
-    """[B, N] outward normal m of what is touched, where a weight is above 0."""
+    """[B, N] the same weight with radius noise and gain."""
     sigma: wp.array2d(dtype=wp.vec3f)
     """[B, N] σ: friction at rest over normal force, where taxels hold what they touch."""
     body: wp.array2d(dtype=wp.int32)
@@ -148,13 +168,13 @@ class Carrier:
 
 @wp.func
 def push_of(
-    plan: SpreadPlan, state: StateArrays, friction: wp.array(dtype=wp.vec3f), link: int, node: int
+    plan: SpreadPlan, state: StateArrays, friction: wp.array(dtype=wp.vec3f), env: int, link: int, node: int
 ) -> ContactPush:
     """Return what a node's contact does to its link."""
     c = node // 2
     # The normal leads from the first to the second, which it pushes away.
     sign = wp.where(node % 2 == 0, -1.0, 1.0)
-    here = state.pose[state.contact_env[c], link]
+    here = state.pose[env, link]
     turn = wp.transform_get_rotation(here)
     push = ContactPush()
     push.point = wp.quat_rotate_inv(turn, state.contact_position[c] - wp.transform_get_translation(here))
@@ -171,136 +191,119 @@ def join_face(
     faces: ContactFaces, env: int, link: int, node: int,
 ):  # fmt: skip
     """Add a node to the face of its body and side, or begin one."""
-    push = push_of(plan, state, friction, link, node)
+    push = push_of(plan, state, friction, env, link, node)
     geometry = state.contact_geom[node // 2][1 - node % 2]
     other = int(-1)
     if geometry >= 0:
         other = link_of[geometry]
     before = int(-1)
-    face = int(-1)
     at = faces.head[env, link]
-    while at >= 0:
+    while at >= 0 and not (faces.face[at].other == other and wp.dot(faces.face[at].normal, push.normal) > 0.5):
         before = at
-        if faces.other[at] == other and wp.dot(faces.normal[at], push.normal) > 0.5:
-            face = at
-            at = int(-1)
-        else:
-            at = faces.next[at]
-    faces.follower[node] = -1
-    if face < 0:
-        face = node
+        at = faces.face[at].next
+    face = Face()
+    if at < 0:
+        at = node
         if before < 0:
             faces.head[env, link] = node
         else:
-            faces.next[before] = node
-        faces.next[node] = -1
-        faces.other[node] = other
-        faces.normal[node] = push.normal
-        faces.origin[node] = push.point
-        faces.low[node] = push.point
-        faces.high[node] = push.point
-        faces.overlap[node] = push.overlap
-        faces.load[node] = push.load
-        faces.force[node] = push.force
-        faces.moment[node] = wp.vec3f()
+            faces.face[before].next = node
+        face.next = -1
+        face.last = node
+        face.other = other
+        face.normal = push.normal
+        face.origin = push.point
+        face.low = push.point
+        face.high = push.point
     else:
-        faces.follower[faces.last[face]] = node
-        faces.watched[face] = faces.watched[face] | faces.watched[node]
-        faces.low[face] = wp.min(faces.low[face], push.point)
-        faces.high[face] = wp.max(faces.high[face], push.point)
-        faces.overlap[face] = wp.max(faces.overlap[face], push.overlap)
-        faces.load[face] = faces.load[face] + push.load
-        faces.force[face] = faces.force[face] + push.force
-        faces.moment[face] = faces.moment[face] + wp.cross(push.point - faces.origin[face], push.force)
-    faces.last[face] = node
+        face = faces.face[at]
+        faces.watched[at] = faces.watched[at] | faces.watched[node]
+    faces.follower[face.last] = node
+    faces.follower[node] = -1
+    face.last = node
+    face.low = wp.min(face.low, push.point)
+    face.high = wp.max(face.high, push.point)
+    face.overlap = wp.max(face.overlap, push.overlap)
+    face.load = face.load + push.load
+    face.force = face.force + push.force
+    face.moment = face.moment + wp.cross(push.point - face.origin, push.force)
+    faces.face[at] = face
 
 
-@cache
-def list_kernel(cuda: bool) -> Any:
-    """Return the kernel ``list_contacts``. Thread: contacts [C], ``stride`` apart.
-
-    A processor takes all in one thread and joins faces at once; a GPU does so afterwards, in the order of contacts
-    (:func:`join_faces`), so that sums do not depend on threads.
-    """
-
-    @wp.kernel(module="unique", enable_backward=False)
-    def list_contacts(
-        plan: SpreadPlan, slots: SlotArrays, link_of: wp.array(dtype=wp.int32), state: StateArrays,
-        friction: wp.array(dtype=wp.vec3f), stride: int, faces: ContactFaces,
-    ):  # fmt: skip
-        c = wp.tid()
-        if c == 0:
-            faces.count[0] = 0
-        count = wp.min(state.contact_count[0], state.contact_env.shape[0])
-        while c < count:
-            pair = state.contact_geom[c]
-            # A state made by hand may hold numbers of no geometry; −1 stands for a flex. What the engine does not tell
-            # (NaN) is read as such.
-            if not (state.contact_force[c] <= 0.0) and wp.min(pair) >= -1 and wp.max(pair) < link_of.shape[0]:
-                env = state.contact_env[c]
-                for side in range(2):
-                    link = int(0)
-                    watched = int(0)
-                    other = pair[1 - side]
-                    if pair[side] >= 0:
-                        link = link_of[pair[side]]
-                        for k in range(plan.sensors.shape[1]):
-                            sensor = plan.sensors[link, k]
-                            if sensor >= 0:
-                                looks = plan.whole[sensor] == 1
-                                if other >= 0:
-                                    looks = slots.place[plan.spans[sensor][2], other] >= 0
-                                if looks:
-                                    watched = watched | (1 << k)
-                    if watched != 0:
-                        node = 2 * c + side
-                        faces.watched[node] = watched
-                        if wp.static(cuda):
-                            faces.follower[node] = wp.atomic_exch(faces.listed, env, link, node)
-                        else:
-                            join_face(plan, link_of, state, friction, faces, env, link, node)
-            c += stride
-
-    return list_contacts
+@wp.kernel(enable_backward=False)
+def list_contacts(
+    plan: SpreadPlan, slots: SlotArrays, link_of: wp.array(dtype=wp.int32), state: StateArrays, stride: int,
+    faces: ContactFaces,
+):  # fmt: skip
+    """List the contacts of every link with sensors, in any order. Thread: contacts [C], ``stride`` apart."""
+    c = wp.tid()
+    if c == 0:
+        faces.count[0] = 0
+        faces.count[1] = 0
+    count = wp.min(state.contact_count[0], state.contact_env.shape[0])
+    while c < count:
+        pair = state.contact_geom[c]
+        # A state made by hand may hold numbers of no geometry; −1 stands for a flex. What the engine does not tell
+        # (NaN) is read as such.
+        if not (state.contact_force[c] <= 0.0) and wp.min(pair) >= -1 and wp.max(pair) < link_of.shape[0]:
+            for side in range(2):
+                link = int(0)
+                watched = int(0)
+                other = pair[1 - side]
+                if pair[side] >= 0:
+                    link = link_of[pair[side]]
+                    for k in range(plan.sensors.shape[1]):
+                        sensor = plan.sensors[link, k]
+                        if sensor >= 0:
+                            looks = plan.whole[sensor] == 1
+                            if other >= 0:
+                                looks = slots.place[plan.spans[sensor][2], other] >= 0
+                            if looks:
+                                watched = watched | (1 << k)
+                if watched != 0:
+                    node = 2 * c + side
+                    faces.watched[node] = watched
+                    faces.chain[node] = wp.atomic_exch(faces.listed, state.contact_env[c], link, node)
+        c += stride
 
 
 @wp.kernel(enable_backward=False)
 def join_faces(
     plan: SpreadPlan, link_of: wp.array(dtype=wp.int32), state: StateArrays, friction: wp.array(dtype=wp.vec3f),
-    noisy: int, faces: ContactFaces, io: ReadoutArrays,
+    faces: ContactFaces, io: ReadoutArrays,
 ):  # fmt: skip
-    """Join the listed nodes to faces in their order, and list the links that have any. Thread: [B, M]."""
+    """Join the nodes to faces in their order, whatever that of threads was, and list links with any. Thread: [B, M]."""
     env, number = wp.tid()
     link = plan.links[number]
-    first = int(-1)
-    node = faces.listed[env, link]
-    while node >= 0:
-        later = faces.follower[node]
-        before = int(-1)
-        after = first
-        while after >= 0 and after < node:
-            before = after
-            after = faces.follower[after]
-        faces.follower[node] = after
-        if before < 0:
-            first = node
-        else:
-            faces.follower[before] = node
-        node = later
+    start = faces.listed[env, link]
     faces.listed[env, link] = -1
     faces.head[env, link] = -1
-    node = first
-    while node >= 0:
-        later = faces.follower[node]
-        join_face(plan, link_of, state, friction, faces, env, link, node)
-        node = later
-    full = first >= 0 or (io.status[env] & 1) != 0
-    if full or faces.stale[env, number] == 1:
-        faces.items[wp.atomic_add(faces.count, 0, 1)] = env * plan.links.shape[0] + number
-    elif plan.fresh[number] == 1:
+    latest = int(-1)
+    more = start >= 0
+    while more:
+        # The least numbers beyond the latest; what is sorted stays in registers.
+        least = Nodes(wp.static(BEYOND))
+        node = start
+        while node >= 0:
+            place = wp.where(node > latest, node, wp.static(BEYOND))
+            for k in range(wp.static(SORTED)):
+                lower = wp.min(least[k], place)
+                place = wp.max(least[k], place)
+                least[k] = lower
+            node = faces.chain[node]
+        more = least[wp.static(SORTED - 1)] != wp.static(BEYOND)
+        while least[0] != wp.static(BEYOND):
+            latest = least[0]
+            join_face(plan, link_of, state, friction, faces, env, link, latest)
+            for k in range(wp.static(SORTED - 1)):
+                least[k] = least[k + 1]
+            least[wp.static(SORTED - 1)] = wp.static(BEYOND)
+    if plan.fresh[number] == 1:
         plan.loads[0, env, link] = 0.0
         plan.loads[1, env, link] = 0.0
-    faces.stale[env, number] = wp.where(full or noisy == 1, 1, 0)
+    if start >= 0 and (io.status[env] & 1) == 0:
+        item = wp.vec2i(env * plan.links.shape[0] + number, faces.head[env, link])
+        faces.items[0, wp.atomic_add(faces.count, 0, 1)] = item
 
 
 @wp.func
@@ -311,12 +314,10 @@ def wrench_at(x: wp.vec3f, f: wp.vec3f) -> wp.spatial_vectorf:
 
 
 @wp.func
-def sphere_of(faces: ContactFaces, face: int) -> wp.vec4f:
+def sphere_of(face: Face) -> wp.vec4f:
     """Return centre and radius of the sphere around the points of a face: a flat one is reported at its corners."""
-    low = faces.low[face]
-    high = faces.high[face]
-    center = 0.5 * (low + high)
-    return wp.vec4f(center[0], center[1], center[2], 0.5 * wp.length(high - low) + faces.overlap[face])
+    center = 0.5 * (face.low + face.high)
+    return wp.vec4f(center[0], center[1], center[2], 0.5 * wp.length(face.high - face.low) + face.overlap)
 
 
 @wp.func
@@ -332,22 +333,43 @@ def belongs(faces: ContactFaces, head: int, face: int, x: wp.vec3f, m: wp.vec3f,
     nearest = int(-1)
     at = head
     while at >= 0:
-        if faces.other[at] == faces.other[face]:
-            facing = wp.dot(m, faces.normal[at])
-            away = wp.max(gap_to(sphere_of(faces, at), x), 0.0) / reach
+        there = faces.face[at]
+        if there.other == faces.face[face].other:
+            facing = wp.dot(m, there.normal)
+            away = wp.max(gap_to(sphere_of(there), x), 0.0) / reach
             if facing / (0.01 + away * away) > best:
                 best = facing / (0.01 + away * away)
                 nearest = at
-        at = faces.next[at]
+        at = there.next
     return nearest == face
 
 
+@wp.func
+def clear(faces: ContactFaces, io: ReadoutArrays, env: int, n: int, noisy: bool):
+    """Write a reading of zeros, if it is anything else."""
+    if faces.filled[env, n] != wp.uint8(0):
+        store_planes(io.truth, env, n, 6, wp.spatial_vectorf())
+        faces.filled[env, n] = wp.uint8(0)
+    # Stages after this one write into the measured readings, which are then never left alone.
+    if noisy:
+        store_planes(io.measured, env, n, 6, wp.spatial_vectorf())
+
+
 @cache
-def spread_kernel(kinds: frozenset[int], raycast: bool, noisy: bool, sticky: bool, cuda: bool) -> Any:
+def spread_kernel(kinds: frozenset[int], raycast: bool, noisy: bool, sticky: bool, cuda: bool, deep: bool) -> Any:
     """Return the kernel ``spread`` that writes readings and loads. Block: link of an environment, ``stride`` apart.
 
     The threads of a block share its taxels, and add up what each has found, so that a contact costs no more than the
     taxels of its link divided by them. A processor takes them in one thread.
+
+    Args:
+        kinds: of the geometries tracked.
+        raycast: ask triangles.
+        noisy: whether measured readings are another array.
+        sticky: taxels hold what they touch.
+        cuda: a GPU runs it.
+        deep: all sources of carriers; a GPU first takes the links where :data:`TOUCH` is enough, which needs fewer
+            registers.
     """
     distance = shape_functions(kinds, raycast).distance
 
@@ -380,62 +402,56 @@ def spread_kernel(kinds: frozenset[int], raycast: bool, noisy: bool, sticky: boo
     @wp.func
     def carrier_of(
         plan: SpreadPlan, probes: ProbeArrays, solids: SolidArrays, pairs: PairArrays, faces: ContactFaces,
-        press: PressArrays, push: ContactPush, env: int, n: int, slot: int, head: int, alone: bool, face: int,
-        source: int,
+        press: PressArrays, push: ContactPush, x: wp.vec3f, radius: float, env: int,
+        n: int, slot: int, head: int, alone: bool, face: int, body: int, side: wp.vec3f, source: int,
     ) -> Carrier:  # fmt: skip
         carrier = Carrier()
-        x = probes.position[n]
-        radius = probes.radius[n]
-        if radius > 0.0:
-            if source == wp.static(TOUCH):
-                weight = press.weight[env, n]
-                extra = float(0.0)
-                if wp.static(noisy):
-                    extra = press.noisy[env, n]
-                if weight + extra > 0.0:
-                    m = press.normal[env, n]
-                    mine = press.body[env, n] == faces.other[face]
-                    facing = wp.dot(m, faces.normal[face])
-                    if mine and not alone:
-                        mine = belongs(faces, head, face, x, m, plan.reach[n])
-                    if mine and facing > 0.0:
-                        carrier.weight = weight
-                        carrier.noisy = extra
-                        carrier.facing = facing
-                        carrier.way = m
-                        if wp.static(sticky):
-                            carrier.way = m + press.sigma[env, n]
-            elif source == wp.static(BEHIND):
-                touch = behind(solids, pairs, probes, env, n, slot, faces.other[face])
-                carrier.way = wp.vec3f(touch[0], touch[1], touch[2])
-                carrier.facing = wp.dot(carrier.way, faces.normal[face])
+        if source == wp.static(TOUCH):
+            # All is asked for at once; most links touch one body from one side. Fillers never touch.
+            touch = load_four(press.touch[env], n)
+            mine = press.body[env, n] == body
+            extra = float(0.0)
+            if wp.static(noisy):
+                extra = press.noisy[env, n]
+            m = wp.vec3f(touch[0], touch[1], touch[2])
+            facing = wp.dot(m, side)
+            if mine and touch[3] + extra > 0.0 and facing > 0.0:
+                if alone or belongs(faces, head, face, x, m, plan.reach[n]):
+                    carrier.weight = touch[3]
+                    carrier.noisy = extra
+                    carrier.facing = facing
+                    carrier.way = m
+                    if wp.static(sticky):
+                        carrier.way = m + press.sigma[env, n]
+        elif wp.static(deep):
+            if radius > 0.0 and source == wp.static(BEHIND):
+                back = behind(solids, pairs, probes, env, n, slot, body)
+                carrier.way = wp.vec3f(back[0], back[1], back[2])
+                carrier.facing = wp.dot(carrier.way, side)
                 if carrier.facing > 0.0:
-                    carrier.weight = wp.max(radius - touch[3], 0.0)
-            else:
+                    carrier.weight = wp.max(radius - back[3], 0.0)
+            elif radius > 0.0:
                 # Without a distance the taxel's own normal tells its side.
                 away = wp.length(x - push.point) / (plan.reach[n] + push.overlap)
                 if away <= 1.0 and wp.dot(probes.normal[n], push.normal) <= 0.1:
                     carrier.weight = 1.001 - away * away
                 carrier.facing = 1.0
                 carrier.way = push.normal
-            if source != wp.static(TOUCH):
-                carrier.noisy = carrier.weight
-            steep = wp.dot(push.lean, x - push.point)
-            if steep != 0.0 and carrier.weight + carrier.noisy > 0.0:
-                carrier.weight *= wp.exp(steep)
-                carrier.noisy *= wp.exp(steep)
+            carrier.noisy = carrier.weight
+        steep = wp.dot(push.lean, x - push.point)
+        if steep != 0.0 and carrier.weight + carrier.noisy > 0.0:
+            steep = wp.exp(steep)
+            carrier.weight *= steep
+            carrier.noisy *= steep
         return carrier
 
-    @wp.func
-    def clear(faces: ContactFaces, io: ReadoutArrays, env: int, n: int):
-        if faces.filled[env, n] != wp.uint8(0):
-            store_planes(io.truth, env, n, 6, wp.spatial_vectorf())
-            faces.filled[env, n] = wp.uint8(0)
-        # Stages after this one write into the measured readings, which are then never left alone.
-        if wp.static(noisy):
-            store_planes(io.measured, env, n, 6, wp.spatial_vectorf())
-
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(
+        module="unique",
+        enable_backward=False,
+        grid_stride=False,
+        launch_bounds=(128, 2 if deep else 4),
+        module_options={"fast_math": cuda and not raycast},
+    )
     def spread(
         plan: SpreadPlan,
         probes: ProbeArrays,
@@ -449,45 +465,32 @@ def spread_kernel(kinds: frozenset[int], raycast: bool, noisy: bool, sticky: boo
         stride: int,
         io: ReadoutArrays,
     ):
-        item, lane = wp.tid()
         threads = wp.block_dim()
+        item = int(wp.uint32(wp.tid()) // wp.uint32(threads))
+        lane = int(wp.uint32(wp.tid()) % wp.uint32(threads))
         many = plan.links.shape[0]
-        count = io.status.shape[0] * many
-        if wp.static(cuda):
-            count = faces.count[0]
+        count = faces.count[wp.static(int(cuda and deep))]
         while item < count:
-            at = item
-            if wp.static(cuda):
-                at = faces.items[item]
+            entry = faces.items[wp.static(int(cuda and deep)), item]
             item += stride
-            env = at // many
-            link = plan.links[at % many]
-            head = faces.head[env, link]
-            diverged = (io.status[env] & 1) != 0
-            if wp.static(not cuda):
-                full = head >= 0 or diverged
-                stale = faces.stale[env, at % many] == 1
-                faces.stale[env, at % many] = wp.where(full or wp.static(noisy), 1, 0)
-                # The next update lists anew.
-                faces.head[env, link] = -1
-                if not full and not stale:
-                    if plan.fresh[at % many] == 1:
-                        plan.loads[0, env, link] = 0.0
-                        plan.loads[1, env, link] = 0.0
-                    continue
+            head = entry[1]
+            env = entry[0] // many
+            link = plan.links[entry[0] % many]
             written = int(0)
             pushed = float(0.0)
             lost = float(0.0)
-            face = head
-            if diverged:
-                face = -1
-            while face >= 0:
-                alone = face == head and faces.next[face] < 0
-                sphere = sphere_of(faces, face)
-                size = wp.length(faces.force[face])
+            left = bool(False)
+            here = head
+            while here >= 0:
+                alone = here == head and faces.face[here].next < 0
+                sphere = sphere_of(faces.face[here])
+                normal = faces.face[here].normal
+                body = faces.face[here].other
+                size = wp.length(faces.face[here].force)
                 lack = size
+                watched = faces.watched[here]
                 for k in range(plan.sensors.shape[1]):
-                    if ((faces.watched[face] >> k) & 1) == 1:
+                    if ((watched >> k) & 1) == 1 and not left:
                         sensor = plan.sensors[link, k]
                         span = plan.spans[sensor]
                         # What this sensor does not carry of the face.
@@ -496,39 +499,37 @@ def spread_kernel(kinds: frozenset[int], raycast: bool, noisy: bool, sticky: boo
                         near = bool(False)
                         source = int(wp.static(TOUCH))
                         solved = bool(False)
-                        node = face
+                        node = here
                         rounds = int(0)
                         lean = wp.vec3f()
-                        tilt = wp.vec3f()
-                        even = wp.vec3f()
-                        center = wp.vec3f()
-                        scale = float(0.0)
+                        first = wp.vec3f()
+                        second = wp.mat33f()
                         while node >= 0:
                             push = ContactPush()
                             push.point = wp.vec3f(sphere[0], sphere[1], sphere[2])
-                            push.normal = faces.normal[face]
-                            push.load = faces.load[face]
-                            push.force = faces.force[face]
-                            moment = faces.moment[face] + wp.cross(faces.origin[face] - push.point, push.force)
-                            if source == wp.static(NEAR):
-                                push = push_of(plan, state, friction, link, node)
-                                moment = wp.vec3f()
+                            push.normal = normal
+                            if wp.static(deep):
+                                if source == wp.static(NEAR):
+                                    push = push_of(plan, state, friction, env, link, node)
                             push.lean = lean
-                            # Sums over taxels: y, y m · n and whether any is near; columns y q, y a, y a × q; y a aᵀ,
-                            # with a from the point.
-                            first = wp.vec3f()
-                            second = wp.mat33f()
-                            third = wp.mat33f()
+                            # Sums over taxels: y, y m · n and whether any is near; rows y q, y a, y a × q; of y a aᵀ
+                            # the diagonal and the rest, and the longest a, which leads from the point. Once they are
+                            # solved, the same registers hold s; rows b, θ and the middle; Σ f.
+                            if not solved:
+                                first = wp.vec3f()
+                                second = wp.mat33f()
+                            squares = wp.vec3f()
+                            products = wp.vec3f()
                             most = float(0.0)
-                            total = wp.vec3f()
                             n = span[0] + lane
                             while n < span[1]:
+                                packed = load_four(probes.packed, n)
+                                x = wp.vec3f(packed[0], packed[1], packed[2])
                                 # Called at one place alone, so that a processor's compiler copies no structures.
                                 c = carrier_of(
-                                    plan, probes, solids, pairs, faces, press, push, env, n, span[2], head, alone,
-                                    face, source,
+                                    plan, probes, solids, pairs, faces, press, push, x, packed[3], env, n,
+                                    span[2], head, alone, here, body, normal, source,
                                 )  # fmt: skip
-                                x = probes.position[n]
                                 if not solved:
                                     if not near and first[2] == 0.0 and gap_to(sphere, x) <= plan.reach[n]:
                                         first[2] = 1.0
@@ -536,11 +537,12 @@ def spread_kernel(kinds: frozenset[int], raycast: bool, noisy: bool, sticky: boo
                                         a = x - push.point
                                         most = wp.max(most, wp.length(a))
                                         first += c.weight * wp.vec3f(1.0, c.facing, 0.0)
-                                        second += c.weight * wp.matrix_from_cols(c.way, a, wp.cross(a, c.way))
-                                        third += c.weight * wp.outer(a, a)
+                                        second += c.weight * wp.matrix_from_rows(c.way, a, wp.cross(a, c.way))
+                                        squares += c.weight * wp.cw_mul(a, a)
+                                        products += c.weight * wp.vec3f(a[1] * a[2], a[2] * a[0], a[0] * a[1])
                                 elif c.weight + c.noisy > 0.0:
-                                    unit = scale * c.way + even + wp.cross(tilt, x - center)
-                                    total += c.weight * unit
+                                    unit = first[0] * c.way + second[0] + wp.cross(second[1], x - second[2])
+                                    squares += c.weight * unit
                                     reading = wrench_at(x, c.weight * unit)
                                     if not fresh:
                                         reading += load_planes(io.truth, env, n, 6)
@@ -552,36 +554,49 @@ def spread_kernel(kinds: frozenset[int], raycast: bool, noisy: bool, sticky: boo
                                         store_planes(io.measured, env, n, 6, reading)
                                     faces.filled[env, n] = wp.uint8(1)
                                 elif fresh:
-                                    clear(faces, io, env, n)
+                                    clear(faces, io, env, n, wp.static(noisy))
                                 n += threads
+                            if wp.static(cuda):
+                                sums = block_sum(first, second, squares, products, most)
+                                for axis in range(3):
+                                    first[axis] = sums[axis]
+                                    second[0, axis] = sums[3 + axis]
+                                    second[1, axis] = sums[6 + axis]
+                                    second[2, axis] = sums[9 + axis]
+                                    squares[axis] = sums[12 + axis]
+                                    products[axis] = sums[15 + axis]
+                                most = sums[18]
                             if not solved:
-                                first = wp.tile_sum(wp.tile(first, preserve_type=True))[0]
                                 whole = first[0]
                                 near = near or first[2] > 0.0
                                 if whole > 0.0 and (near or source == wp.static(NEAR)):
-                                    second = wp.tile_sum(wp.tile(second, preserve_type=True))[0]
-                                    third = wp.tile_sum(wp.tile(third, preserve_type=True))[0]
-                                    most = wp.tile_max(wp.tile(most))[0]
+                                    moment = wp.vec3f()
+                                    if source != wp.static(NEAR):
+                                        face = faces.face[here]
+                                        push.load = face.load
+                                        push.force = face.force
+                                        moment = face.moment + wp.cross(face.origin - push.point, push.force)
                                     # Taxels that face away by more than 60° on average would be stretched beyond all
                                     # measure; b then carries what is missing.
                                     scale = push.load / wp.max(first[1], 0.5 * whole)
                                     mean = push.load / whole
-                                    field = wp.vec3f(second[0, 0], second[1, 0], second[2, 0])
-                                    center = wp.vec3f(second[0, 1], second[1, 1], second[2, 1]) / whole
-                                    turning = wp.vec3f(second[0, 2], second[1, 2], second[2, 2])
-                                    even = (push.force - scale * field) / whole
-                                    moment -= scale * turning + whole * wp.cross(center, even)
+                                    center = second[1] / whole
+                                    even = (push.force - scale * second[0]) / whole
+                                    moment -= scale * second[2] + whole * wp.cross(center, even)
                                     # Shares of the weights and of their extent, lest squares of small numbers vanish.
                                     moment /= whole
-                                    third /= whole
-                                    extent = third[0, 0] + third[1, 1] + third[2, 2]
-                                    third -= wp.outer(center, center)
-                                    trace = third[0, 0] + third[1, 1] + third[2, 2]
+                                    extents = wp.mat33f(
+                                        squares[0], products[2], products[1], products[2], squares[1], products[0],
+                                        products[1], products[0], squares[2],
+                                    ) / whole  # fmt: skip
+                                    extent = extents[0, 0] + extents[1, 1] + extents[2, 2]
+                                    extents -= wp.outer(center, center)
+                                    trace = extents[0, 0] + extents[1, 1] + extents[2, 2]
                                     # A little more on its diagonal lets a row of taxels, which bears no moment along
                                     # it, be solved; what rounding leaves of taxels at one place is none.
                                     tilt = wp.vec3f()
                                     if trace > 1.0e-4 * extent:
-                                        inertia = 1.0001 * wp.identity(n=3, dtype=wp.float32) - third / trace
+                                        inertia = 1.0001 * wp.identity(n=3, dtype=wp.float32) - extents / trace
                                         tilt = wp.inverse(inertia) @ moment / trace
                                     # No taxel is pulled, however far it lies: what is beyond half of that moves into
                                     # the weights, y e^(λ · r) for y (1 + λ · r).
@@ -595,17 +610,22 @@ def spread_kernel(kinds: frozenset[int], raycast: bool, noisy: bool, sticky: boo
                                         if not solved:
                                             lean += (steepest - 0.5) / mean * wp.cross(push.normal, tilt)
                                             lean *= wp.min(wp.static(STEEPEST) / (far * wp.length(lean)), 1.0)
-                                    center += push.point
+                                    first = wp.vec3f(scale, 0.0, 0.0)
+                                    second = wp.matrix_from_rows(even, tilt, center + push.point)
                                 elif source == wp.static(NEAR):
                                     rest += wp.length(push.force)
                                     node = faces.follower[node]
-                                else:
+                                elif wp.static(deep):
                                     source = wp.where(near, source + 1, wp.static(NEAR))
+                                else:
+                                    left = True
+                                    node = -1
                             else:
                                 written = written | (1 << k)
                                 fresh = False
-                                total = wp.tile_sum(wp.tile(total, preserve_type=True))[0]
-                                gap = wp.length(push.force - total)
+                                if source != wp.static(NEAR):
+                                    push.force = faces.face[here].force
+                                gap = wp.length(push.force - squares)
                                 # Rounding of the sums is no loss.
                                 if not (gap <= 1.0e-4 * wp.length(push.force)):
                                     rest += gap
@@ -618,29 +638,53 @@ def spread_kernel(kinds: frozenset[int], raycast: bool, noisy: bool, sticky: boo
                             lack = rest
                 pushed += size
                 lost += lack
-                face = faces.next[face]
+                here = wp.where(left, -1, faces.face[here].next)
+            if wp.static(not deep):
+                if left:
+                    if lane == 0:
+                        faces.items[1, wp.atomic_add(faces.count, 1, 1)] = entry
+                    continue
             for k in range(plan.sensors.shape[1]):
                 sensor = plan.sensors[link, k]
                 if sensor >= 0 and ((written >> k) & 1) == 0:
                     span = plan.spans[sensor]
                     n = span[0] + lane
                     while n < span[1]:
-                        if diverged:
-                            silenced(io, 6, env, n, probes.radius[n])
-                            faces.filled[env, n] = wp.uint8(1)
-                        else:
-                            clear(faces, io, env, n)
+                        clear(faces, io, env, n, wp.static(noisy))
                         n += threads
             if lane == 0:
-                if plan.fresh[at % many] == 1:
-                    plan.loads[0, env, link] = 0.0
-                    plan.loads[1, env, link] = 0.0
                 # Sensors of several groups may sit on a link: the most that one of them lacks counts.
                 plan.loads[0, env, link] = wp.max(plan.loads[0, env, link], pushed)
-                if diverged:
-                    lost = wp.nan
                 plan.loads[1, env, link] = wp.where(wp.isnan(lost), lost, wp.max(plan.loads[1, env, link], lost))
-                if not diverged and not (lost <= 0.01 * pushed):
+                if not (lost <= 0.01 * pushed):
                     plan.told[0] = 1
 
     return spread
+
+
+@cache
+def measure_kernel(hysteresis: bool, walk: bool) -> Any:
+    """Return the kernel ``measure`` that applies the noise to what was spread. Dim [B N]."""
+    readout = readout_functions(FUSED, hysteresis, walk, exact=False)
+    recall_six, emit_six = readout.recall_six, readout.emit_six
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, launch_bounds=(256, 4))
+    def measure(plan: SpreadPlan, probes: ProbeArrays, faces: ContactFaces, io: ReadoutArrays):
+        tid = wp.uint32(wp.tid())
+        count = wp.uint32(probes.radius.shape[0])
+        env = int(tid // count)
+        n = int(tid % count)
+        if silenced(io, 6, env, n, probes.radius[n]):
+            return
+        age = io.age[env]
+        lag, drift = recall_six(io, env, n, age)
+        part = probes.part[n]
+        # What nothing touches was not written.
+        signal = wp.spatial_vectorf()
+        if faces.head[env, plan.link[part]] >= 0:
+            signal = load_planes(io.measured, env, n, 6)
+        probe = probes.probe[n]
+        fixed = episode_draw(io.knobs[part], env + io.env_offset, probe, io.episode[env])
+        emit_six(io, io.knobs[part], env, n, probe, age, io.episode[env], fixed, lag, drift, signal, signal)
+
+    return measure

@@ -12,7 +12,7 @@ from functools import cache
 from typing import Any
 
 from brainbench.core.devices import warp
-from robotics_bridge.sensors.kernels.contact_load import ContactFaces, PressArrays, SpreadPlan
+from robotics_bridge.sensors.kernels.contact_load import ContactFaces, PressArrays, SpreadPlan, clear
 from robotics_bridge.sensors.kernels.distance import FAR, SIDED, SolidArrays, SolidShape, shape_functions
 from robotics_bridge.sensors.kernels.noise import NoiseParams, episode_draw, radius_noise
 from robotics_bridge.sensors.kernels.noise import power as series_power
@@ -23,7 +23,6 @@ from robotics_bridge.sensors.kernels.readout import (
     STAGED,
     ProbeArrays,
     ReadoutArrays,
-    entry_of,
     load_four,
     readout_functions,
     silenced,
@@ -173,7 +172,7 @@ def kinematic_kernel(
         raycast: ask triangles.
         physical: convention of the forces.
         sticky: taxels hold what they touch.
-        summed: ``press`` is written in place of readings, for links with a contact (``contact_load``).
+        summed: ``press`` is written in place of the readings of links with a contact (``contact_load``).
         mode: of the readout.
         hysteresis: whether it is stored.
         walk: whether it is stored.
@@ -212,19 +211,24 @@ def kinematic_kernel(
         at_row = int(tid % count_rows)
         span = rows[at_row]
         part = span[3]
+        n = span[0]
+        if (io.status[env] & 1) != 0:
+            while n < span[1]:
+                silenced(io, 6, env, n, probes.radius[n])
+                if wp.static(summed):
+                    faces.filled[env, n] = wp.uint8(1)
+                n += span[2]
+            return
         if wp.static(summed):
-            if faces.head[env, plan.link[part]] < 0 or (io.status[env] & 1) != 0:
+            if faces.head[env, plan.link[part]] < 0:
+                while n < span[1]:
+                    clear(faces, io, env, n, wp.static(mode == STAGED))
+                    n += span[2]
                 return
         slot = probes.slot[span[0]]
         variant = int(0)
         if solids.kind.shape[0] > 1:
             variant = env
-        n = span[0]
-        if (io.status[env] & 1) != 0:
-            while n < span[1]:
-                silenced(io, 6, env, n, probes.radius[n])
-                n += span[2]
-            return
         first = pairs.first[slot]
         count = pairs.count[env, slot]
         law = laws[part]
@@ -288,14 +292,13 @@ def kinematic_kernel(
                     weight = float(0.0)
                     if best < radius:
                         weight = power(radius - best, law.exponent)
-                    press.weight[env, n] = weight
                     if wp.static(mode != CLEAN):
                         if noisy > 0.0:
                             noisy = power(noisy, law.exponent)
                         noisy = wp.max(noisy, 0.0)
                         press.noisy[env, n] = noisy
+                    press.touch[env, n] = wp.vec4f(normal[0], normal[1], normal[2], weight)
                     if weight + noisy > 0.0:
-                        press.normal[env, n] = normal
                         press.body[env, n] = solids.link[pairs.geometry[env, place]]
                         if wp.static(sticky):
                             press.sigma[env, n] = sigma
@@ -304,8 +307,8 @@ def kinematic_kernel(
                     signal = wp.spatial_vectorf()
                     # Most probes touch nothing: their velocities are never loaded.
                     if best < radius or noisy > 0.0:
-                        velocity = entry_of(pairs.velocity, env, place)
-                        spin = entry_of(pairs.spin, env, place)
+                        velocity = pairs.velocity[env, place]
+                        spin = pairs.spin[env, place]
                         if wp.static(mode == CLEAN):
                             truth = wrench(law, x, radius - best, normal, velocity, spin, sigma)
                         else:

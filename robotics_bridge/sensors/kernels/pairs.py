@@ -13,12 +13,8 @@ from typing import Any
 from brainbench.core.devices import warp
 from robotics_bridge.physics.kernels.state import StateArrays, in_scene, link_fails, status_of
 from robotics_bridge.sensors.kernels.distance import PLANE, SolidArrays
-from robotics_bridge.sensors.kernels.readout import entry, load_contacts, load_owners
 
 wp = warp()
-
-CONTACTS = 4
-"""Contacts that one thread looks at, so that it waits for memory once for all of them."""
 
 
 @wp.struct
@@ -104,7 +100,7 @@ def clear_readings(mask: wp.array(dtype=wp.bool), planes: wp.array3d(dtype=wp.fl
 def mark(slots: SlotArrays, env: int, link: int, other: int, words: int, bits: wp.array2d(dtype=wp.int32)):
     """Note in the bits of every slot of a link that it touches a geometry."""
     for slot in range(slots.link.shape[0]):
-        if entry(slots.felt, slot) == link:
+        if slots.felt[slot] == link:
             place = slots.place[slot, other]
             if place >= 0:
                 # One bit per geometry: a set of any size costs one atomic operation, and its order does not depend on
@@ -120,8 +116,8 @@ def mark(slots: SlotArrays, env: int, link: int, other: int, words: int, bits: w
 def start_kernel(contacts: bool, apart: bool) -> Any:
     """Return the kernel ``start`` of an update: counts it, checks the state and marks who touches whom.
 
-    One launch for three small tasks, since launches are what small updates cost. Dim [max(B, C / CONTACTS)], or [B]
-    without ``contacts``.
+    One launch for three small tasks, since launches are what small updates cost. Thread: environments [B] and contacts
+    [C], ``stride`` apart.
 
     Args:
         contacts: whether any slot looks at them.
@@ -136,6 +132,7 @@ def start_kernel(contacts: bool, apart: bool) -> Any:
         bits: wp.array2d(dtype=wp.int32),
         age: wp.array(dtype=wp.int32),
         status: wp.array(dtype=wp.int32),
+        stride: int,
     ):
         tid = wp.tid()
         room = state.contact_env.shape[0]
@@ -151,59 +148,15 @@ def start_kernel(contacts: bool, apart: bool) -> Any:
                 flags = flags | (status[tid] & 1)
             status[tid] = flags
         if wp.static(contacts):
-            # All is asked for before anything is looked at: two neighbouring contacts by each access of memory, and
-            # neighbouring threads read neighbouring ones.
-            threads = (room + wp.static(CONTACTS - 1)) // wp.static(CONTACTS)
-            if tid < threads:
-                found = wp.min(count, room)
-                one = wp.vec4i(-1)
-                two = wp.vec4i(-1)
-                envs = wp.vec4i(0)
-                for half in range(2):
-                    at = 2 * (tid + half * threads)
-                    if at + 1 < found:
-                        both = load_contacts(state.contact_geom, at)
-                        owners = load_owners(state.contact_env, at)
-                        one[2 * half] = both[0]
-                        two[2 * half] = both[1]
-                        one[2 * half + 1] = both[2]
-                        two[2 * half + 1] = both[3]
-                        envs[2 * half] = owners[0]
-                        envs[2 * half + 1] = owners[1]
-                    elif at < found:
-                        pair = state.contact_geom[at]
-                        one[2 * half] = pair[0]
-                        two[2 * half] = pair[1]
-                        envs[2 * half] = state.contact_env[at]
-                first = wp.vec4i(-1)
-                second = wp.vec4i(-1)
-                # Two bits for each contact: whose contact with what is to be marked.
-                todo = int(0)
-                for k in range(wp.static(CONTACTS)):
-                    if in_scene(wp.vec2i(one[k], two[k]), slots.watched.shape[0]):
-                        first[k] = entry(slots.watched, one[k])
-                        second[k] = entry(slots.watched, two[k])
-                        if first[k] >= 0:
-                            todo = todo | (1 << (2 * k))
-                        if second[k] >= 0:
-                            todo = todo | (2 << (2 * k))
-                # Few are: the threads of a warp take theirs together, whichever of the contacts they are.
-                while todo != 0:
-                    env = int(0)
-                    link = int(-1)
-                    other = int(0)
-                    lowest = todo & (-todo)
-                    todo = todo - lowest
-                    for k in range(wp.static(CONTACTS)):
-                        if lowest == (1 << (2 * k)):
-                            env = envs[k]
-                            link = first[k]
-                            other = two[k]
-                        if lowest == (2 << (2 * k)):
-                            env = envs[k]
-                            link = second[k]
-                            other = one[k]
-                    mark(slots, env, link, other, words, bits)
+            c = tid
+            while c < wp.min(count, room):
+                pair = state.contact_geom[c]
+                if in_scene(pair, slots.watched.shape[0]):
+                    for side in range(2):
+                        link = slots.watched[pair[side]]
+                        if link >= 0:
+                            mark(slots, state.contact_env[c], link, pair[1 - side], words, bits)
+                c += stride
 
     return start
 

@@ -31,50 +31,6 @@ def load_four(values: wp.array(dtype=wp.vec4f), n: int) -> wp.vec4f:
 
 @wp.func_native(
     """
-#if defined(__CUDA_ARCH__)
-    const int4 found = *reinterpret_cast<const int4*>(&index(pairs, n));
-    return wp::vec_t<4, int>(found.x, found.y, found.z, found.w);
-#else
-    const auto& one = index(pairs, n);
-    const auto& two = index(pairs, n + 1);
-    return wp::vec_t<4, int>(one[0], one[1], two[0], two[1]);
-#endif
-"""
-)
-def load_contacts(pairs: wp.array(dtype=wp.vec2i), n: int) -> wp.vec4i:
-    """Return the pairs n and n + 1 of geometries; n is even."""
-    ...
-
-
-@wp.func_native(
-    """
-#if defined(__CUDA_ARCH__)
-    const int2 found = *reinterpret_cast<const int2*>(&index(owners, n));
-    return wp::vec_t<2, int>(found.x, found.y);
-#else
-    return wp::vec_t<2, int>(index(owners, n), index(owners, n + 1));
-#endif
-"""
-)
-def load_owners(owners: wp.array(dtype=wp.int32), n: int) -> wp.vec2i:
-    """Return the numbers n and n + 1; n is even."""
-    ...
-
-
-@wp.func_native("return values.data[n];")
-def entry(values: wp.array(dtype=wp.int32), n: int) -> int:
-    """Return one number."""
-    ...
-
-
-@wp.func_native("return values.data[size_t(row) * values.shape[1] + n];")
-def entry_of(values: wp.array2d(dtype=wp.vec3f), row: int, n: int) -> wp.vec3f:
-    """Return one vector of a row."""
-    ...
-
-
-@wp.func_native(
-    """
     const float* at = planes.data + size_t(row) * planes.shape[2] + n;
     const size_t step = size_t(planes.shape[1]) * planes.shape[2];
     wp::vec_t<6, float> found;
@@ -96,6 +52,52 @@ def load_planes(planes: wp.array3d(dtype=wp.float32), row: int, n: int, count: i
 )
 def store_planes(planes: wp.array3d(dtype=wp.float32), row: int, n: int, count: int, value: wp.spatial_vectorf):
     """Write one place of the first planes, at most six."""
+    ...
+
+
+Sums = wp.types.vector(length=19, dtype=wp.float32)
+_SUMMED = [f"{name}[{k}]" for name in ("first", "second.data[0]", "second.data[1]", "second.data[2]") for k in range(3)]
+_SUMMED += [f"{name}[{k}]" for name in ("squares", "products") for k in range(3)]
+_HALVES = ((16, 18, 9), (8, 9, 5), (4, 5, 3), (2, 3, 2), (1, 2, 1))
+"""Distance of lanes that exchange, numbers that a lane holds, and those that it keeps."""
+
+
+def _exchange(half: int, held: int, rest: int) -> str:
+    lines = [f"upper = lane & {half};", f"most = max(most, __shfl_xor_sync(~0u, most, {half}));"]
+    for k in range(rest):
+        far = f"v{k + rest}" if k + rest < held else "0.0f"
+        lines.append(f"v{k} = (upper ? {far} : v{k}) + __shfl_xor_sync(~0u, upper ? v{k} : {far}, {half});")
+    return " ".join([*lines, f"place += upper ? {rest} : 0; mine = upper ? mine - {rest} : min(mine, {rest});"])
+
+
+@wp.func_native(
+    f"""
+    wp::vec_t<19, float> values;
+#if defined(__CUDA_ARCH__)
+    // Halves of the lanes take halves of the sums, five times: fewer shuffles than whole sums in every lane.
+    constexpr int warps = WP_TILE_BLOCK_DIM / 32;
+    __shared__ float parts[warps][19];
+    const int lane = threadIdx.x % 32;
+    int place = 0, mine = 18;
+    bool upper;
+    {" ".join(f"float v{k} = {name};" for k, name in enumerate(_SUMMED))}
+    {" ".join(_exchange(*numbers) for numbers in _HALVES)}
+    __syncthreads();
+    if (mine > 0) parts[threadIdx.x / 32][place] = v0;
+    if (lane == 0) parts[threadIdx.x / 32][18] = most;
+    __syncthreads();
+    #pragma unroll
+    for (int k = 0; k < 19; ++k) {{
+        values[k] = parts[0][k];
+        for (int warp = 1; warp < warps; ++warp)
+            values[k] = k < 18 ? values[k] + parts[warp][k] : max(values[k], parts[warp][k]);
+    }}
+#endif
+    return values;
+"""
+)
+def block_sum(first: wp.vec3f, second: wp.mat33f, squares: wp.vec3f, products: wp.vec3f, most: float) -> Sums:
+    """Return the sums over the threads of a block, and of the last the largest."""
     ...
 
 
@@ -162,7 +164,9 @@ def silenced(io: ReadoutArrays, channels: int, env: int, n: int, radius: float) 
 
 
 @cache
-def readout_functions(mode: int, hysteresis: bool, walk: bool, channels: int = 6) -> SimpleNamespace:
+def readout_functions(
+    mode: int, hysteresis: bool, walk: bool, channels: int = 6, exact: bool = True
+) -> SimpleNamespace:
     """Return the functions that write a reading, compiled for what the group stores.
 
     ``emit_six`` writes up to six channels, drawing all that they share once: ``fixed`` is what ``episode_draw`` gave,
@@ -174,6 +178,7 @@ def readout_functions(mode: int, hysteresis: bool, walk: bool, channels: int = 6
         hysteresis: whether the group stores hysteresis.
         walk: whether the group stores a drift.
         channels: that ``emit_six`` writes, known to the compiler so that vectors stay in registers.
+        exact: whether it writes the truth, too.
     """
     pairs = (channels + 1) // 2
     Normals = wp.types.matrix(shape=(pairs, 4), dtype=wp.float32)
@@ -205,7 +210,8 @@ def readout_functions(mode: int, hysteresis: bool, walk: bool, channels: int = 6
         truth: wp.spatial_vectorf,
         signal: wp.spatial_vectorf,
     ):
-        store_planes(io.truth, env, n, wp.static(channels), truth)
+        if wp.static(exact):
+            store_planes(io.truth, env, n, wp.static(channels), truth)
         if wp.static(mode == STAGED):
             store_planes(io.measured, env, n, wp.static(channels), signal)
         if wp.static(mode == FUSED):

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from brainbench.core.devices import to_struct, warp
 from robotics_bridge.physics.state import HandState
 from robotics_bridge.sensors.context import LaunchContext
-from robotics_bridge.sensors.kernels.pairs import CONTACTS, PairArrays, SlotArrays, pair_kernel, start_kernel
+from robotics_bridge.sensors.kernels.pairs import PairArrays, SlotArrays, pair_kernel, start_kernel
 from robotics_bridge.sensors.queries.solids import Solids
 
 DIVERGED = 1
@@ -135,8 +135,8 @@ class PairTable:
     def update(self, state: HandState) -> None:
         """Count an update, refresh the state's status, mark contacts, and list what every slot meets now."""
         c, envs, room = self._context, self._context.num_envs, state.contact_env.shape[0]
-        inputs = [self.plan, state.arrays, self._words, self._bits, c.age, self.status]
-        dim = max(envs, -(-room // CONTACTS)) if self._contacts else envs
+        dim = max(envs, room) if self._apart else envs
+        inputs = [self.plan, state.arrays, self._words, self._bits, c.age, self.status, dim]
         c.launch(start_kernel(self._contacts, self._apart), dim, *inputs)
         if self._slots:
             inputs = [self.plan, self._solids.struct, state.arrays, self._words, self._bits, self.struct]

@@ -13,10 +13,12 @@ from robotics_bridge.physics.state import HandState
 from robotics_bridge.sensors.context import fill
 from robotics_bridge.sensors.kernels.contact_load import (
     ContactFaces,
+    Face,
     PressArrays,
     SpreadPlan,
     join_faces,
-    list_kernel,
+    list_contacts,
+    measure_kernel,
     spread_kernel,
 )
 from robotics_bridge.sensors.kernels.kinematic import KinematicParams, StickArrays, kinematic_kernel
@@ -38,8 +40,7 @@ class KinematicRuntime(ProbeRuntime):
 
     def __init__(self, sensors: Mapping[str, KinematicTaxel], context: SuiteContext) -> None:
         first = next(iter(sensors.values()))
-        # Readings of a taxel whose forces are summed depend on others, so that none can be finished, noise included.
-        super().__init__(sensors, 6, context, fusable=not self.summed, others=self.summed)
+        super().__init__(sensors, 6, context, others=self.summed)
         rows = probe_rows(self.slices.values(), context, self.mode)
         self._kernel = kinematic_kernel(
             self.kinds, first.query == "raycast", first.convention == "physical", first.sticky, self.summed, self.mode,
@@ -105,8 +106,7 @@ class ContactLoadRuntime(KinematicRuntime):
         configs = list(sensors.values())
         links = [context.scene.link_index(sensor.link) for sensor in configs]
         order = [links[:number].count(link) for number, link in enumerate(links)]
-        self._most = max(order) + 1
-        places = np.full((len(context.scene.links), self._most), -1)
+        places = np.full((len(context.scene.links), max(order) + 1), -1)
         places[links, order] = np.arange(len(links))
         spans = [(p.start, p.start + p.count, slot) for p, slot in zip(self.slices.values(), self.slots, strict=True)]
         plan, cuda, envs = self.plan, context.device.is_cuda, context.num_envs
@@ -119,51 +119,47 @@ class ContactLoadRuntime(KinematicRuntime):
         plan.fresh, plan.told = context.array(fresh, int), context.pairs.told
         plan.slip = 1.0 if configs[0].convention == "physical" else -1.0
         sticky = configs[0].sticky
-        self._list, self._spread = (
-            list_kernel(cuda),
-            spread_kernel(self.kinds, configs[0].query == "raycast", self.noisy, sticky, cuda),
-        )
-        # One thread for a few taxels of a link; as many blocks as the GPU holds take the links in turn.
-        most = max(part.count for part in self.slices.values())
-        self._threads = 1 if not cuda else 32 if most <= 48 else 64 if most <= 256 else 128
-        items = envs * plan.links.shape[0]
-        self._blocks = min(items, 2048 // self._threads * context.device.sm_count) if cuda else 1
+        # A few threads for the taxels of a link; as many blocks as the GPU holds take the links in turn.
+        most, items = max(part.count for part in self.slices.values()), envs * plan.links.shape[0]
+        self._threads = 1 if not cuda else 32 if most <= 256 else 64
+        options = self.kinds, configs[0].query == "raycast", self.noisy, sticky, cuda
+        blocks = 2048 // self._threads * context.device.sm_count if cuda else 8
+        self._spread = [(spread_kernel(*options, True), min(items, blocks // 8))]
+        if cuda:
+            self._spread.insert(0, (spread_kernel(*options, False), min(items, blocks)))
         shape, press = (envs, self.count), self.press
-        press.weight, press.noisy = context.zeros(shape), context.zeros(shape if self.noisy else (1, 1))
-        press.normal, press.body = context.zeros(shape, wp.vec3f), context.zeros(shape, int)
+        press.touch, press.body = context.zeros(shape, wp.vec4f), context.zeros(shape, int)
+        press.noisy = context.zeros(shape if self.noisy else (1, 1))
         press.sigma = context.zeros(shape if sticky else (1, 1), wp.vec3f)
-        self.scratch = [press.weight, press.normal, press.body]
+        self.scratch = [press.touch, press.body]
         self.scratch += [press.noisy] * self.noisy + [press.sigma] * sticky
         faces = self.faces
         faces.head, faces.listed = (context.array(np.full((envs, len(places)), -1), int) for _ in range(2))
-        faces.items, faces.count = context.zeros(items if cuda else 1, int), context.zeros(1, int)
-        # Stages after this one write into the measured readings, which are then never left alone.
+        faces.items, faces.count = context.zeros((2, items), wp.vec2i), context.zeros(2, int)
         faces.filled = context.zeros(shape, wp.uint8)
-        faces.stale = context.array(np.full((envs, plan.links.shape[0]), int(self.noisy)), int)
         self._room(0)
 
     def _room(self, contacts: int) -> None:
-        for name in ("follower", "watched", "next", "last", "other"):
-            setattr(self.faces, name, self.context.zeros(2 * contacts, int))
-        for name in ("normal", "origin", "low", "high", "force", "moment"):
-            setattr(self.faces, name, self.context.zeros(2 * contacts, wp.vec3f))
-        self.faces.overlap, self.faces.load = (self.context.zeros(2 * contacts) for _ in range(2))
+        for name, dtype in (("follower", int), ("watched", int), ("chain", int), ("face", Face)):
+            setattr(self.faces, name, self.context.zeros(2 * contacts, dtype))
 
     def run_kernels(self, state: HandState, dt: float) -> None:
         """Run the kernels."""
         c, room, cuda = self.context, state.contact_env.shape[0], self.context.device.is_cuda
-        if self.faces.next.shape[0] != 2 * room:
+        if self.faces.face.shape[0] != 2 * room:
             self._room(room)
-        plan, faces, links = self.plan, self.faces, self.plan.links.shape[0]
-        scene = [c.solids.struct.link, state.arrays, state.contact_friction]
+        plan, faces, link_of = self.plan, self.faces, c.solids.struct.link
+        scene = [link_of, state.arrays, state.contact_friction]
         # A processor takes all contacts in one thread, so that the launch stays the same whatever their number.
         threads = max(room, 1) if cuda else 1
-        c.launch(self._list, threads, plan, c.pairs.plan, *scene, threads, faces)
-        if cuda:
-            c.launch(join_faces, (c.num_envs, links), plan, *scene, int(self.noisy), faces, self.io)
+        c.launch(list_contacts, threads, plan, c.pairs.plan, link_of, state.arrays, threads, faces)
+        c.launch(join_faces, (c.num_envs, plan.links.shape[0]), plan, *scene, faces, self.io, block=32)
         super().run_kernels(state, dt)
-        inputs = [plan, self.probes, *scene, c.solids.struct, c.pairs.struct, faces, self.press, self._blocks, self.io]
-        c.launch(self._spread, (self._blocks, self._threads), *inputs, block=self._threads)
+        for kernel, blocks in self._spread:
+            inputs = [plan, self.probes, *scene, c.solids.struct, c.pairs.struct, faces, self.press, blocks, self.io]
+            c.launch(kernel, blocks * self._threads, *inputs, block=self._threads)
+        if self.mode == FUSED:
+            c.launch(measure_kernel(*self.stores), c.num_envs * self.count, plan, self.probes, faces, self.io)
 
 
 def contact_reach(probes: Probes) -> np.ndarray:
