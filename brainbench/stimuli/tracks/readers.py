@@ -189,6 +189,8 @@ def _read_whiskiwrap(path: str | os.PathLike[str]) -> tuple[Segments, Identities
             raise DataError(f"{brief(os.fspath(path))} is no file of WhiskiWrap: {missing[0]!r} is missing.")
         arrays = {name: cast("Any", file[name])[()] for name in ("summary", "pixels_x", "pixels_y")}
         summary = arrays["summary"]
+        if {arrays[name].shape[:1] for name in arrays} != {summary.shape}:
+            raise DataError(f"{brief(os.fspath(path))} needs one row of summary, pixels_x, pixels_y for each trace.")
         # Older files call frame, number and follicle otherwise.
         renamed = {"time": "fid", "id": "wid", "fol_x": "follicle_x", "fol_y": "follicle_y"}
         columns = {str(renamed.get(name, name)): real_numbers(summary[name]) for name in summary.dtype.names or ()}

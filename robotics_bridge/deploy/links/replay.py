@@ -437,10 +437,10 @@ def _read_episode(folder: Path, hand: Hand, layout: Layout, episode: int) -> Tou
     unit, described = "N", folder / "meta" / "tactile.json"
     if described.is_file():
         places = read_json(described, "places of tactile points")
-        if any(number < 0 for number in places["link"]):
-            raise DataError(f"{name}: meta/tactile.json numbers its links from 0; received {min(places['link'])}.")
-        links = [places["links"][number] for number in places["link"]]
+        links = [places["links"][number] for number in places["link"] if number >= 0]
         points = TactilePoints(tuple(links), *(np.array(places[key], float) for key in ("position", "normal")))
+        if not (len(places["link"]), 3) == (len(links), 3) == points.position.shape == points.normal.shape:
+            raise DataError(f"{name}: meta/tactile.json gives each point a link (from 0), position [3] and normal [3].")
         unit = str(places.get("units", ["N"])[0])
     else:
         taxels = [(link, number) for link, probes in layout.items() for number in range(probes.active.sum())]

@@ -144,6 +144,18 @@ def test_whiskerman_curves_are_evaluated_from_the_follicle(tmp_path, write):
     assert "1 of 7 frames" in found.attrs["faults"][0]
 
 
+@pytest.mark.parametrize("shorter", [lambda rows: rows[:-1], lambda rows: rows[None]])
+def test_each_trace_of_whiskiwrap_has_one_row_of_the_summary(tmp_path, shorter):
+    traces = {(frame, 0): points for frame, points in enumerate(PIXELS)}
+    path = tracks.write_whiskiwrap(tmp_path / "a.hdf5", traces, {key: points[0] for key, points in traces.items()})
+    with h5py.File(path, "a") as file:
+        rows = file["summary"][()]
+        del file["summary"]
+        file["summary"] = shorter(rows)
+    with pytest.raises(DataError, match="one row of summary"):
+        read_shapes(path, _options())
+
+
 @pytest.mark.filterwarnings("error")
 def test_complex_numbers_are_refused(tmp_path):
     # Their real part alone, with a warning of NumPy, were numbers that nobody wrote.

@@ -254,6 +254,18 @@ def test_tables_of_another_hand_are_refused(change, sentence, recorded, jaws, tm
         read_touch_log(path, hand, hand.layout("low", "tips"))
 
 
+@pytest.mark.parametrize(
+    ("key", "change"), [("position", lambda rows: rows + rows[:1]), ("link", lambda rows: [-1, *rows[1:]])]
+)
+def test_points_without_a_place_each_are_refused(key, change, recorded, jaws, tmp_path) -> None:
+    hand, folder = hands.load(jaws), _episode(tmp_path / "v3", recorded.log)
+    described = folder / "meta" / "tactile.json"
+    places = json.loads(described.read_text())
+    described.write_text(json.dumps({**places, key: change(places[key])}))
+    with pytest.raises(DataError, match="gives each point a link"):
+        read_touch_log(folder, hand, hand.layout("low", "tips"))
+
+
 def test_numbers_that_are_none_repeated_times_and_millimetres_are_refused(recorded) -> None:
     log = recorded.log
     spoilt, late = log.force.copy(), log.time.copy()
