@@ -13,18 +13,20 @@ from __future__ import annotations
 
 import copy
 import math
-import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
-from typing import IO, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from torch import nn
 from torch.nn.utils.parametrize import is_parametrized
+
+from brainbench.core.reading.regular import temporary_folder
 
 BASE, LATE, SHIFTED, PAIR, PAIR_SHIFTED = range(5)
 """Rows of the first batch of probes: two probes, both of them shifted by one step, and the first one changed late."""
@@ -257,19 +259,16 @@ def draw_sample(count: int) -> np.ndarray:
     return generator.permutation(np.minimum(picks, count - 1))
 
 
-def spilled(tensor: torch.Tensor, files: ExitStack) -> IO[bytes]:
+def spilled(tensor: torch.Tensor, files: ExitStack) -> Path:
     """Return a temporary file that holds a tensor."""
-    file = files.enter_context(tempfile.TemporaryFile())  # noqa: SIM115 - the stack closes it
-    torch.save(tensor, file)
-    return file
+    path = Path(files.enter_context(temporary_folder()), "tensor.pt")
+    torch.save(tensor, path)
+    return path
 
 
 def restored(place: Any) -> Any:
-    """Return the tensor in a file, anything else as it is."""
-    if place is None or isinstance(place, torch.Tensor):
-        return place
-    place.seek(0)
-    return torch.load(place, weights_only=True)
+    """Return the tensor in a file, mapped and not read, and anything else as it is."""
+    return torch.load(place, weights_only=True, mmap=True) if isinstance(place, Path) else place
 
 
 def fresh_copy(model: nn.Module) -> nn.Module | None:
@@ -309,20 +308,19 @@ def layer_modules(model: nn.Module) -> dict[str, nn.Module]:
     Parametrisations are weights of the part that they stand in.
     """
     layers: dict[str, nn.Module] = {}
-    passed = {model}
-
-    def walk(module: nn.Module, prefix: str) -> None:
-        for label, part in module.named_children():
-            if part in passed or (label == "parametrizations" and is_parametrized(module)):
-                continue
+    passed, ahead = {model}, [(model, "", model.named_children())]
+    while ahead:  # no recursion: a function that names itself would keep the modules alive after it
+        module, prefix, parts = ahead[-1]
+        label, part = next(parts, ("", None))
+        if part is None:
+            ahead.pop()
+        elif part not in passed and not (label == "parametrizations" and is_parametrized(module)):
             passed.add(part)
             name = prefix if label == "_orig_mod" else f"{prefix}.{label}".strip(".")
             leaf = not any(True for _ in part.children())
             if leaf or is_parametrized(part) or any(True for _ in part.parameters(recurse=False)):
                 layers[name] = part
-            walk(part, name)
-
-    walk(model, "")
+            ahead.append((part, name, part.named_children()))
     return layers
 
 

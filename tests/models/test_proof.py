@@ -1,3 +1,6 @@
+import gc
+import weakref
+
 import numpy as np
 import pytest
 import torch
@@ -130,3 +133,15 @@ def test_a_copy_is_as_the_model_was():
     assert duplicate.held.data_ptr() != model.held.data_ptr()
     model.held = (part for part in ())
     assert proof.fresh_copy(model) is None
+
+
+def test_a_network_goes_when_nothing_but_its_layers_was_asked_for():
+    network = nn.Sequential(nn.Linear(3, 3), nn.Sequential(nn.ReLU()))
+    gone = weakref.ref(network)
+    gc.disable()
+    try:
+        assert list(proof.layer_modules(network)) == ["0", "1.0"]
+        del network
+        assert gone() is None
+    finally:
+        gc.enable()
