@@ -206,7 +206,7 @@ class Whisker:
         return (base + (tip - base) * self._fraction(s)) * np.pi * self.radius(s) ** 2
 
     def rest_points(self, s: ArrayLike) -> NDArray[np.float64]:
-        """Return the rest positions [n, 3] in the base frame [m] at arc lengths ``s`` [n] [m]."""
+        """Return the rest positions [n, 3] in the base frame [m] at n arc lengths ``s`` [m]."""
         if self.bends:
             return _path(self.bends)(np.asarray(s, dtype=float))[:3].T
         return np.pad(self.centre_line(s), ((0, 0), (0, 1)))
