@@ -205,7 +205,7 @@ def warp_recorder(device: Any, generators: Sequence[torch.Generator] = ()) -> Re
             graph.register_generator_state(generator)
         stream = wp.stream_from_torch(side)
         with contextlib.ExitStack() as scope:
-            scope.enter_context(_no_collection())
+            scope.enter_context(no_collection())
             scope.enter_context(torch.cuda.device(where))
             # A recording that breaks off leaves torch on its stream.
             scope.enter_context(torch.cuda.stream(torch.cuda.current_stream(where)))
@@ -334,8 +334,7 @@ def record_step(
 def record_launches(work: Callable[[], None], device: Any) -> Callable[[], None]:
     """Record launches of Warp on a CUDA device, which do not run, and return what launches them all."""
     wp = warp()
-    # What Python throws away meanwhile could free device memory, which ends a recording.
-    with _no_collection(), wp.ScopedCapture(device=device) as capture:
+    with no_collection(), wp.ScopedCapture(device=device) as capture:
         work()
     graph = capture.graph
     return lambda: wp.capture_launch(graph)
@@ -370,7 +369,8 @@ class _BetweenStreams:
 
 
 @contextlib.contextmanager
-def _no_collection() -> Iterator[None]:
+def no_collection() -> Iterator[None]:
+    """Put off the collection of garbage, which could free device memory and so end a recording."""
     enabled = gc.isenabled()
     gc.disable()
     try:

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.devices import warp
+from brainbench.core.devices import no_collection, warp
 from brainbench.core.runs.jobs import STOPPING
 from brainbench.stimuli.engines.rod import limits
 from brainbench.stimuli.engines.rod.limits import AFTER_OTHERS, WARP, contacts_for
@@ -186,7 +186,7 @@ class Slices:
                     # A graph launches as many threads as when it was recorded; it is renewed once half of many have no
                     # whisker.
                     if not graphs or (2 * left <= fits and fits > SMALL):
-                        with wp.ScopedCapture(stream=self.stream) as capture:
+                        with no_collection(), wp.ScopedCapture(stream=self.stream) as capture:
                             self._several(inputs, left, block)
                         fits = left
                         graphs.append(capture.graph)
