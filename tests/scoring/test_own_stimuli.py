@@ -93,6 +93,7 @@ def score_of(study, model=None, *, stimuli=None, **options):
     return score_record(model or Forces(), **{"baselines": False, **how, **given, **options})
 
 
+@pytest.mark.slow
 def test_recordings_meet_the_stimuli_of_their_own_trials(study, tmp_path):
     record = score_of(study)
     assert record.score.stimuli == LABELS
