@@ -153,8 +153,9 @@ def differences(samples: Sequence[Sample]) -> Row:
         if len(sample.without_stimulus) == size:
             row[:] = sample.without_stimulus
     variances = np.array([sample.seed_variance for sample in samples])
-    centred = [values - values.mean(axis=1, keepdims=True) for values in (table, left_out)]
-    whole = len(names) >= FEWEST_ANIMALS and size >= FEWEST_STIMULI and np.isfinite([*map(np.sum, centred)]).all()
+    whole = len(names) >= FEWEST_ANIMALS and size >= FEWEST_STIMULI
+    centred = [values - values.mean(axis=1, keepdims=True) for values in (table, left_out)] if whole else []
+    whole = whole and np.isfinite([*map(np.sum, centred)]).all()
 
     def row_of(place: int) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
         after = slice(place + 1, None)

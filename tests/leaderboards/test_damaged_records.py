@@ -115,6 +115,11 @@ def test_damaged_records_are_refused_or_shown(make_record, tmp_path):
     assert _faults(make_record(), tmp_path, 30, seed=0) == {}
 
 
+def test_a_board_whose_records_share_no_animal_is_built(make_record, tmp_path):
+    good = make_record()
+    assert outcome(damage(good, random.Random("1-244")), tmp_path / "board", good) == "shown"
+
+
 @pytest.mark.slow
 def test_many_damaged_records_are_refused_or_shown(make_record, tmp_path):
     assert _faults(make_record(), tmp_path, 500, seed=1) == {}
