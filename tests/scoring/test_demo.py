@@ -3,18 +3,20 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+import torch
 
 import brainbench
 from brainbench.core.errors import UsageError
 from brainbench.core.provenance import Provenance
 from brainbench.datasets import open_recordings
-from brainbench.datasets.synthetic import read_truth
+from brainbench.datasets.synthetic import PopulationDesign, ResponseGeometry, read_truth
+from brainbench.datasets.synthetic.populations import draw_sessions
 from brainbench.datasets.trials.session_trials import trials_by_subject
 from brainbench.metrics import compare, rdm
 from brainbench.models.activations import extract
 from brainbench.models.registry import locate_model
 from brainbench.models.training.checkpoints import shipped
-from brainbench.scoring.demo import DEMOS, HIDDEN_LAYER, HIDDEN_NETWORK, demo_identity, demo_recordings
+from brainbench.scoring.demo import DEMOS, HIDDEN_LAYER, HIDDEN_NETWORK, demo_identity, demo_recordings, hidden_features
 from brainbench.scoring.neural_responses import open_neural_responses
 from brainbench.stimuli import load_stimuli
 from leaderboards import read_records
@@ -122,6 +124,27 @@ def test_they_are_made_once(folder):
     stamp = folder.stat().st_mtime_ns
     assert demo_recordings() == folder
     assert folder.stat().st_mtime_ns == stamp
+
+
+@pytest.mark.filterwarnings("ignore:TF32 acceleration")
+def test_the_same_spikes_are_drawn_on_another_processor(stimuli):
+    """Other kernels and another number of threads stand for it; in single precision they give other features."""
+
+    def single():
+        network = locate_model(HIDDEN_NETWORK).build(0)
+        return extract(network, stimuli.input, layers=(HIDDEN_LAYER,))[HIDDEN_LAYER].mean(axis=1)
+
+    def counts(features):
+        geometry = ResponseGeometry.from_activations(features, stimuli.labels)
+        return np.concatenate([drawn.counts.ravel() for drawn in draw_sessions(geometry, PopulationDesign(), 18)])
+
+    here, features, threads = single(), hidden_features(stimuli.input), torch.get_num_threads()
+    with torch.backends.mkldnn.flags(enabled=False):
+        torch.set_num_threads(3 - min(threads, 2))
+        there, again = single(), hidden_features(stimuli.input)
+    torch.set_num_threads(threads)
+    assert not np.array_equal(here, there)
+    assert np.array_equal(counts(features), counts(again))
 
 
 def test_they_have_one_name_on_every_processor_that_of_the_shipped_board(folder):
