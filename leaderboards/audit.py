@@ -25,7 +25,8 @@ from leaderboards.boards import rank
 from leaderboards.store import StoredRecord, read_records
 
 TOLERANCE = 1e-3
-"""Two runs of one computation agree within this on every machine: float32 sums differ in their last digits."""
+"""Two runs of one computation agree within this on every machine, distances in shares of the largest of their RDM:
+processors differ in the last digits of single precision, which move scores by 1e-5."""
 MOST_NAMED = 3  # most contradicting records that are named for one
 
 
@@ -157,9 +158,11 @@ class Change:
 def differences(record: ResultRecord, again: ResultRecord, *, tolerance: float = TOLERANCE) -> list[Difference]:
     """Return what a repetition of a record's computation found otherwise, the inputs first.
 
-    Compared are the hashes of recordings, stimuli and weights, and every number, layer, animal, baseline and
-    status of the scores. Numbers count as equal within ``tolerance``. What only says when, where and with which
-    packages is not compared, nor the content hash of simulated stimuli whose configuration is the same.
+    Compared are the hashes of recordings, stimuli and trained weights, and every number, layer, animal, baseline and
+    status of the scores. Numbers count as equal within ``tolerance``, distances of an RDM within this share of its
+    largest. What only says when, where and with which packages is not compared, nor the content hash of simulated
+    stimuli whose configuration is the same, nor that of weights that both drew from a seed: the last digits of both are
+    the processor's.
     """
     stated, repeated = record.score.provenance, again.score.provenance
     versions = [origin.settings.get("estimator_version") for origin in (stated, repeated)]
@@ -169,12 +172,18 @@ def differences(record: ResultRecord, again: ResultRecord, *, tolerance: float =
         ("estimator version", versions[0], versions[1]),
     ]
     if record.card and again.card:
-        inputs.append(("card.weights", record.card.weights, again.card.weights))
+        if not record.card.objective == again.card.objective == "untrained":
+            inputs.append(("card.weights", record.card.weights, again.card.weights))
         inputs.append(("card.parameters", record.card.parameters, again.card.parameters))
     before, after = dict(_statements(record)), dict(_statements(again))
     numbers = [(name, before.get(name), after.get(name)) for name in dict.fromkeys([*before, *after])]
     unequal = [values for values in inputs if values[1] != values[2]]
-    unequal += [values for values in numbers if not _equal(*values[1:], tolerance)]
+    largest: dict[str, float] = defaultdict(float)
+    for name, value in before.items():
+        if "_rdm[" in name and isinstance(value, (int, float)):
+            largest[name.partition("[")[0]] = max(largest[name.partition("[")[0]], abs(value))
+    limits = {name: tolerance * largest.get(name.partition("[")[0], 1.0) for name, *_ in numbers}
+    unequal += [values for values in numbers if not _equal(*values[1:], limits[values[0]])]
     return [Difference(*values) for values in unequal]
 
 

@@ -163,6 +163,22 @@ def test_numbers_within_the_tolerance_are_equal(make_record):
     assert [item.what for item in differences(record, near, tolerance=1e-4)] == ["score.value"]
 
 
+@pytest.mark.parametrize("unit", [1.0, 1e6, 1e-6])
+def test_distances_count_in_shares_of_the_largest_whatever_their_unit(make_record, unit):
+    record = make_record(brain_rdm=(2.0 * unit, 8.0 * unit, 0.1 * unit))
+    for change, places in ((0.004, []), (0.02, ["score.brain_rdm[2]"])):
+        again = replace(record.score, brain_rdm=(2.0 * unit, 8.0 * unit, (0.1 + change) * unit))
+        assert [item.what for item in differences(record, replace(record, score=again))] == places
+
+
+def test_weights_drawn_from_a_seed_may_differ_in_the_last_digits_and_trained_ones_may_not(make_record):
+    record = make_record()
+    for objective, places in (("untrained", []), ("simclr", ["card.weights"])):
+        cards = [replace(record.card, objective=objective, weights=weights) for weights in ("abc", "def")]
+        left, right = (replace(record, card=card) for card in cards)
+        assert [item.what for item in differences(left, right)] == places
+
+
 def _named(truths, **design):
     return {record.score.name: record for record in draw_board(truths, spread=0.1, **design)}
 

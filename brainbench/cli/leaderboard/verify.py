@@ -143,7 +143,7 @@ class Repetition:
     score: bool = True
     """Score the model again and compare; else only read the files."""
     tolerance: float = 1e-3
-    """Numbers that differ by no more are equal."""
+    """Numbers that differ by no more are equal, distances by no more than this share of the largest."""
     trust_code: bool = False
     """Also run code and weights that do not come with this package."""
     held_out: str | None = None
