@@ -15,8 +15,8 @@ import hashlib
 import os
 import shutil
 import zipfile
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Container, Iterable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import BinaryIO
@@ -56,11 +56,12 @@ _MANY = 100  # files that are brought to disk together rather than one by one
 def rebuilt(root: Path) -> Iterator[Callable[[str, _Content], Path]]:
     """Yield a function that takes a file of the new site: its path there and its content.
 
-    The new files appear together when the block ends, the one given first last; after an error the old site is
-    unchanged. Another build of the same folder waits until this one has ended.
+    The new files appear together when the block ends, the one given first last; after an error the folder is as it was
+    before. Another build of the same folder waits until this one has ended.
     """
     check_site(root)
-    with writable(root), lock_folder(root):
+    before = {folder for folder, _, _ in os.walk(root)}
+    with writable(root), _unmade(root, before), lock_folder(root):
         listed, present = check_site(root)
         for folder, _, _ in os.walk(root):
             sweep(Path(folder))
@@ -93,6 +94,21 @@ def rebuilt(root: Path) -> Iterator[Callable[[str, _Content], Path]]:
         for name in present - new.keys():
             (root / name).unlink(missing_ok=True)
         _write_manifest(root, new)
+
+
+@contextmanager
+def _unmade(root: Path, before: Container[str]) -> Iterator[None]:
+    """After an error remove the folders that a build made, and a manifest that lists nothing."""
+    try:
+        yield
+    except BaseException:
+        if _read(root) == {}:
+            (root / MANIFEST).unlink()
+        for folder, _, _ in os.walk(root, topdown=False):
+            if folder not in before:
+                with suppress(OSError):
+                    os.rmdir(folder)
+        raise
 
 
 def check_site(root: Path) -> tuple[_Hashes, set[str]]:

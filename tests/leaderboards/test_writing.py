@@ -42,6 +42,18 @@ def test_a_size_limit_is_one_sentence_and_the_old_files_stay(make_record, tmp_pa
     assert files_of(tmp_path) == before
 
 
+@pytest.mark.parametrize("most", [1, 3000, 30_000])
+@pytest.mark.parametrize("present", [False, True])
+def test_a_first_site_that_has_no_room_leaves_nothing(make_record, tmp_path, most, present):
+    if present:
+        (tmp_path / "site" / "mine").mkdir(parents=True)
+    before = sorted(tmp_path.rglob("*"))
+    with _files_of_at_most(most), pytest.raises(DataError, match="File too large"):
+        build_leaderboard([make_record()], tmp_path / "site")
+    assert sorted(tmp_path.rglob("*")) == before
+    assert build_leaderboard([make_record()], tmp_path / "site").is_file()
+
+
 def test_a_file_in_the_way_is_one_sentence(make_record, tmp_path):
     (tmp_path / "file").write_text("")
     for write in (
