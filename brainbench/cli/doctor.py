@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from brainbench.cli.output import Output, table
-from brainbench.core.errors import install_command
+from brainbench.core.errors import BrainbenchError, install_command
 
 ENABLES = {
     "nwb": "checks of NWB files against the schema and best practice",
@@ -36,7 +36,7 @@ def doctor() -> Output:
     head = [
         f"brainbench {data['version']}, Python {data['python']}, {data['machine']}",
         f"processors {data['processors']}, CUDA {', '.join(data['cuda']) or 'none (not needed)'}",
-        f"cache {data['cache']} ({data['cache_bytes'] / 1e6:.1f} MB)",
+        data["cache_problem"] or f"cache {data['cache']} ({data['cache_bytes'] / 1e6:.1f} MB)",
     ]
     hint = f"\n\nAn extra is installed, in the checkout of brainbench, with: {install_command('EXTRA')}"
     text = "\n".join(head) + "\n\n" + table("", ["part", "version", "extra", "enables"], rows) + hint
@@ -48,15 +48,21 @@ def diagnose() -> dict[str, Any]:
     import torch
 
     from brainbench.core.devices import usable_processors
-    from brainbench.core.files import cache_dir, provenance
+    from brainbench.core.files import CACHE_VARIABLE, cache_dir, check_folder, provenance
 
-    cache, facts = cache_dir(), provenance()
+    cache, problem, facts = None, None, provenance()
+    try:
+        cache = cache_dir()
+        check_folder(cache, CACHE_VARIABLE)
+    except BrainbenchError as error:  # what is wrong here is what one wants to read
+        problem = str(error)
     return {
         **{name: facts[name] for name in ("version", "python", "machine")},
         "processors": usable_processors(),
         "cuda": [torch.cuda.get_device_name(index) for index in range(torch.cuda.device_count())],
-        "cache": str(cache),
-        "cache_bytes": sum(item.stat().st_size for item in cache.rglob("*") if item.is_file()),
+        "cache": str(cache) if cache else None,
+        "cache_problem": problem,
+        "cache_bytes": sum(item.stat().st_size for item in cache.rglob("*") if item.is_file()) if cache else 0,
         "required": {name: _version(name) for name in _packages("")},
         "optional": {
             name: {"version": _version(name), "extra": extra, "enables": purpose, "install": install_command(extra)}

@@ -20,6 +20,18 @@ def test_doctor_says_what_each_missing_part_would_enable(run, monkeypatch):
     assert {name: data["optional"][name]["extra"] for name in extras} == extras
 
 
+def test_doctor_says_that_the_cache_cannot_be_made(run, monkeypatch, tmp_path):
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("BRAINBENCH_CACHE", str(tmp_path / "file" / "cache"))
+    result = run("doctor")
+    assert result.status == 0
+    assert "cannot be made (Not a directory); name a folder" in result.out
+    assert "torch" in result.out
+    data = json.loads(run("doctor", "--json").out)
+    assert (data["cache"], data["cache_bytes"]) == (None, 0)
+    assert "BRAINBENCH_CACHE" in data["cache_problem"]
+
+
 def test_doctor_says_what_each_extra_of_users_enables():
     from brainbench.cli.doctor import ENABLES
     from tests.factories.installations import EXTRAS
