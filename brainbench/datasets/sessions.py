@@ -384,7 +384,7 @@ def make_session(
                 raise DataError(f"Column {name!r} of {table.label} has {len(table.data[name])} of {len(table)} rows.")
     if spikes is not None:
         units.rows(SPIKES)
-    if observed is not None:
+    if observed:
         units.ends(OBSERVED)
         if not (data[OBSERVED][:, 0] <= data[OBSERVED][:, 1]).all():
             raise DataError(f"Recorded spans of {units.label} must be [begin, end] in seconds, the earlier time first.")

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from brainbench.core.contracts import as_label, join_labels, natural_key
-from brainbench.core.errors import DataError, UsageError, check_each, check_name, check_once, listing
+from brainbench.core.errors import DataError, UsageError, brief, check_each, check_name, check_once, listing, repeats
 from brainbench.core.files import content_hash
 from brainbench.core.progress import Progress, track
 from brainbench.scoring.demo import DEMOS, HIDDEN_NETWORK, demo_identity, demo_recordings
@@ -168,21 +168,29 @@ class NeuralResponses:
             match = dict(zip(self.vocabulary, stimuli, strict=True))
         return join_labels(self.vocabulary, stimuli, match)
 
-    def stimulus_rows(self, labels: tuple[str, ...]) -> NDArray[np.int64]:
-        """Return the row of each trial's own stimulus [trial]; −1 where it has none."""
+    def stimulus_rows(self, labels: tuple[str, ...], *, step: int = 0) -> NDArray[np.int64]:
+        """Return the row of each trial's own stimulus [trial]; −1 where it has none.
+
+        With ``step`` trials have the numbers so many further, and none needs a stimulus.
+        """
         columns = [self.dataset[name].values.astype(str).tolist() for name in ("subject", "session", "trial_id")]
-        parts = [tuple(map(as_label, row)) for row in zip(*columns, strict=True)]
-        places = {as_label(label.replace("/", "_")): row for row, label in enumerate(labels)}
-        best = np.full(len(parts), -1)
+        trials, names = list(zip(*columns, strict=True)), [_trial_name(label) for label in labels]
+        if twice := repeats(names):
+            both = [label for label, name in zip(labels, names, strict=True) if name == twice[0]]
+            raise UsageError(f"The stimuli {listing(both)} are of one trial, {brief(twice[0])}; leave out one of them.")
+        places, best, shared = {name: row for row, name in enumerate(names)}, np.full(len(trials), -1), ""
         for depth in (1, 2, 3):
-            names = ["_".join(row[-depth:]) for row in parts]
-            rows = np.array([places.get(name, -1) for name in names], dtype=np.int64)
-            if len({*names}) == len(names) and (rows >= 0).sum() > (best >= 0).sum():
+            every = [_trial_name("_".join(trial[-depth:]), step) for trial in trials]
+            rows = np.array([places.get(name, -1) for name in every], dtype=np.int64)
+            if (rows >= 0).any() and (several := repeats(every)):
+                shared = f" {brief(several[0])} names several trials."
+            elif (rows >= 0).sum() > (best >= 0).sum():
                 best = rows
-        if (best < 0).all():
+        if (best < 0).all() and not step:
             raise UsageError(
-                f"No trial has a stimulus of its own: trials are {listing('_'.join(row) for row in parts)}, stimuli are"
-                f" {listing(labels)}. Name each track after its trial (TRIAL, SESSION_TRIAL or ANIMAL_SESSION_TRIAL)."
+                f"No trial has a stimulus of its own: trials are {listing(map('_'.join, trials), limit=3)}, stimuli are"
+                f" {listing(labels, limit=3)}.{shared} Name each track after its trial (TRIAL, SESSION_TRIAL or "
+                "ANIMAL_SESSION_TRIAL)."
             )
         return best
 
@@ -253,6 +261,15 @@ def open_neural_responses(recordings: Any, *, progress: Progress | None, **selec
     several = not isinstance(recordings, (str, os.PathLike))
     name = ", ".join(map(short_name, recordings if several else [recordings]))
     return NeuralResponses(open_recordings(recordings, **selection, progress=progress), name)
+
+
+def _trial_name(text: str, step: int = 0) -> str:
+    """Return the name of a trial as it is compared: no zeros before numbers, the last one ``step`` further."""
+    words = as_label(text.replace("/", "_")).split("_")
+    words = [word.lstrip("0") or "0" if word.isdecimal() else word for word in words]
+    if step and words[-1].isdecimal() and len(words[-1]) < 10:
+        words[-1] = str(int(words[-1]) + step)
+    return "_".join(words)
 
 
 def _flat(session: Trials, share: NDArray[np.float64]) -> Trials:

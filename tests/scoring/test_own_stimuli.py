@@ -10,6 +10,7 @@ from brainbench.core.errors import DataError, UsageError
 from brainbench.datasets import open_recordings, write_recordings
 from brainbench.datasets.sessions import make_session
 from brainbench.models.features import write_features
+from brainbench.scoring.own_stimuli import mean_rows, shared_variance
 from brainbench.scoring.scores import score_record
 from brainbench.stimuli import load_stimuli
 from leaderboards.audit import differences
@@ -166,3 +167,126 @@ def test_stimuli_of_no_trial_are_refused(study, tmp_path):
         brainbench.score(
             str(path), recordings=str(study[0] / "recordings"), conditions="trials:stimulus", match="trial"
         )
+
+
+def write_animals(folder, *, names=(("m0", "s"), ("m1", "s")), apart=False, ids=None):
+    """Write animals whose 40 units mix six features of each trial; return these by (animal, session, row)."""
+    rng, felt = np.random.default_rng(4), {}
+    shared = rng.normal(size=(8, 6))
+    for animal, session in names:
+        means = rng.normal(size=(8, 6)) if apart else shared
+        kinds = rng.permutation(np.repeat(np.arange(8), 10))
+        features = means[kinds] + 0.3 * rng.normal(size=(80, 6))
+        rates = 20 * np.exp(np.clip(0.6 * features @ rng.normal(size=(6, 40)) / np.sqrt(6), -2, 2))
+        starts = 1.0 + 1.5 * np.arange(80)
+        spikes = [
+            np.sort(np.concatenate([begin + rng.uniform(0, 1, rng.poisson(unit[k])) for k, begin in enumerate(starts)]))
+            for unit in rates.T
+        ]
+        table = {"start_time": starts, "stop_time": starts + 1.0, "stimulus": [f"k{kind}" for kind in kinds]}
+        table |= {} if ids is None else {"id": ids}
+        made = make_session(animal, session, spikes, {"trials": table}, observed=[np.array([[0.0, 125.0]])] * 40)
+        write_recordings(folder / f"{animal}-{session}.h5", made)
+        felt |= {(animal, session, row): values for row, values in enumerate(features)}
+    return felt
+
+
+def score_features(folder, labels, values, **options):
+    path = write_features(folder.parent / "features.h5", list(labels), {"layer": np.asarray(values)})
+    how = {"recordings": str(folder), "conditions": "trials:stimulus", "match": "trial", "baselines": False}
+    return score_record(str(path), **how, **options).score
+
+
+@pytest.fixture(scope="module")
+def felt(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("felt") / "recordings"
+    folder.mkdir()
+    return folder, write_animals(folder)
+
+
+NAMES = {
+    "as they are": "{}_{}_{}",
+    "with slashes": "{}/{}/{}",
+    "with zeros": "{}_{}_{:03d}",
+    "with blanks": " {}_{}_{} ",
+}
+
+
+def test_spellings_and_order_of_names_change_nothing(felt):
+    folder, values = felt
+    scores = [
+        score_features(folder, (name.format(*trial) for trial in reversed(values)), [*values.values()][::-1])
+        for name in NAMES.values()
+    ]
+    assert {score.status for score in scores} == {"ok"}
+    assert len({score.value for score in scores}) == 1
+    assert scores[0].value > 0.8
+
+
+@pytest.mark.parametrize(("first", "step", "word"), [(0, 1, "after"), (1, -1, "before")])
+def test_stimuli_that_count_from_another_number_are_not_trusted(tmp_path, first, step, word):
+    (tmp_path / "recordings").mkdir()
+    values = write_animals(tmp_path / "recordings", ids=np.arange(first, first + 80))
+    names = (f"{animal}_{session}_{first + row + step}" for animal, session, row in values)
+    score = score_features(tmp_path / "recordings", names, [*values.values()])
+    assert score.status == "unreliable"
+    assert f"160 trials have a stimulus of the number {word} theirs, 158 of their own" in score.reasons[0]
+
+
+def test_missing_trials_beside_unused_stimuli_put_the_names_in_doubt(felt):
+    folder, values = felt
+    names = [f"{animal}_{session}_{row if row < 70 else row + 500}" for animal, session, row in values]
+    score = score_features(folder, names, [*values.values()])
+    assert score.status == "unreliable"
+    assert "20 trials have no stimulus and 20 stimuli no trial" in score.reasons[0]
+
+
+def test_two_stimuli_of_one_trial_are_refused(felt):
+    folder, values = felt
+    names = [f"{animal}_{session}_{row}" for animal, session, row in values]
+    with pytest.raises(UsageError, match="'m0_s_0', 'm0/s/00' are of one trial"):
+        score_features(folder, [*names, "m0/s/00"], [*values.values(), np.zeros(6)])
+
+
+def test_numbers_of_several_sessions_are_named(felt):
+    folder, values = felt
+    with pytest.raises(UsageError, match="'0' names several trials"):
+        score_features(folder, map(str, range(80)), [*values.values()][:80])
+
+
+def test_animals_that_met_other_stimuli_under_one_label_are_scored_apart(tmp_path):
+    (tmp_path / "recordings").mkdir()
+    values = write_animals(tmp_path / "recordings", apart=True)
+    names = ["_".join(map(str, trial)) for trial in values]
+    together = score_features(tmp_path / "recordings", names, [*values.values()])
+    assert together.status == "unreliable"
+    assert "animals met other stimuli under one label: 0% of the variance" in together.reasons[0]
+    alone = score_features(tmp_path / "recordings", names, [*values.values()], select="subjects=m1")
+    assert alone.status == "ok"
+    assert alone.value > together.value + 0.05
+
+
+def test_whole_numbers_in_memory_keep_the_digits_of_their_means(felt):
+    folder, values = felt
+    data = open_recordings(folder, conditions="trials:stimulus")
+    whole = np.round(3 * np.stack([*values.values()]))
+    path = write_features(folder.parent / "names.h5", ["_".join(map(str, trial)) for trial in values], {"x": whole})
+    means = mean_rows(whole.astype(np.int16), [[0, 1], [2]])
+    assert means.dtype == np.float32
+    np.testing.assert_allclose(means[0], whole[:2].mean(axis=0))
+    assert brainbench.score(str(path), recordings=data, match="trial").status == "ok"
+
+
+def test_the_common_share_of_variance_is_that_of_its_model():
+    rng = np.random.default_rng(0)
+    animals, labels = np.repeat(list("wxyz"), 400).tolist(), np.tile(np.repeat(np.arange(20), 20), 4).astype(str)
+    for share in (0.0, 0.5, 0.9, 1.0):
+        common, single = rng.normal(size=(20, 30)), rng.normal(size=(4, 20, 30))
+        means = np.sqrt(share) * common + np.sqrt(1 - share) * single + 5 * rng.normal(size=(4, 1, 30))
+        values = np.repeat(means.reshape(80, 30), 20, axis=0) + rng.normal(size=(1600, 30))
+        order = rng.permutation(1600)
+        shuffled = values[order], [animals[row] for row in order], labels[order].tolist()
+        assert shared_variance(values, animals, labels.tolist()) == pytest.approx(share, abs=0.05)
+        assert shared_variance(*shuffled) == pytest.approx(shared_variance(values, animals, labels.tolist()))
+        assert shared_variance(1e3 * values, animals, labels.tolist()) == pytest.approx(share, abs=0.05)
+    assert np.isnan(shared_variance(values[:400], animals[:400], labels[:400].tolist()))
