@@ -107,7 +107,7 @@ def _unmade(root: Path, before: Container[str]) -> Iterator[None]:
         for folder, _, _ in os.walk(root, topdown=False):
             if folder not in before:
                 with suppress(OSError):
-                    os.rmdir(folder)
+                    Path(folder).rmdir()
         raise
 
 

@@ -88,7 +88,7 @@ def calm_error(job: Job, trace: Trace, fidelity: Fidelity) -> float:
 
     Its forces are those of carrying its mass along, which only the number of links changes.
     """
-    if trace.contact.any() or job.loads or any(job.gravity) or job.air_flow is not None:
+    if trace.contact.any() or job.loads or any(job.gravity) or job.air_flow is not None or job.whisker.bends:
         return math.nan
     if fidelity.solver == "quasistatic":
         return math.nan

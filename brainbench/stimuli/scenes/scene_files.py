@@ -14,6 +14,7 @@ from typing import Annotated, Any, TypeVar
 
 import msgspec
 
+from brainbench.core.contracts import GRID_SHAPE
 from brainbench.core.errors import (
     BrainbenchError,
     UsageError,
@@ -27,7 +28,7 @@ from brainbench.core.errors import (
 from brainbench.core.limits import Limit, check_value
 from brainbench.core.reading.regular import readable
 from brainbench.core.reading.texts import read_toml
-from brainbench.core.rotations import Vector
+from brainbench.core.rotations import Length, Vector
 from brainbench.geometry import DecompositionSettings
 from brainbench.stimuli.motion import trajectories
 from brainbench.stimuli.motion.recorded import (
@@ -278,6 +279,7 @@ def read_table(kind: type[Kind], data: Any, name: str) -> Kind:
             values[key] = msgspec.convert(value, fields[key].type)
         except msgspec.ValidationError as error:
             word = next(word for kind, word in _WORDS.items() if kind in str(fields[key].type))
+            word = "a table of tables, one for each name" if isinstance(value, Mapping) else word
             raise UsageError(f"{key!r} of {name} must be {word}; received {brief(value)}.") from error
     return kind(**values)
 
@@ -363,17 +365,17 @@ def load_array(path: str | os.PathLike[str]) -> WhiskerArray:
     mounts = [_mount(read_table(_Mount, entry, "[[mount]]"), table) for entry in table.mount]
     twice = repeats(mount.name for mount in mounts)
     if not mounts or twice:
-        raise UsageError(
-            f"A species file has one [[mount]] for each whisker; {brief(twice[0]) if twice else 'none'} has."
-        )
+        has = f"{brief(twice[0])} has several" if twice else "received none"
+        raise UsageError(f"A species file has one [[mount]] for each whisker; {has}.")
     return WhiskerArray(table.species, tuple(mounts), table.citation)
 
 
 def _mount(table: _Mount, species: _Species) -> MountedWhisker:
     name, given = table.name, {**species.whisker, **table.whisker}
-    if not re.fullmatch(rf"[{ROWS}]\d{{1,2}}", name):
+    if not re.fullmatch(rf"[{ROWS}][0-{GRID_SHAPE[1] - 1}]", name):
         raise UsageError(
-            f"A whisker is named by its row, one of {ROWS}, and its column, as C2; received {brief(name)}."
+            f"A whisker is named by its row, one of {ROWS}, and its column, 0 to {GRID_SHAPE[1] - 1}, as C2; received "
+            f"{brief(name)}."
         )
     properties = dataclasses.fields(Whisker)
     check_each(f"property of the whisker {name}", given, [field.name for field in properties])
@@ -381,6 +383,7 @@ def _mount(table: _Mount, species: _Species) -> MountedWhisker:
     row, col = ROWS.index(name[0]), int(name[1:])
     if species.rules is not None and "arc_length" in given:
         # The rules of a species state what is not given: radii by arc length and place, and the material.
+        check_value("arc_length of a whisker", given["arc_length"], Length)
         rod = published_whisker(given["arc_length"] / MILLI, 0.0, row, col, species=species.rules)
         given = {**{name: getattr(rod, name) for name in needed}, "friction": rod.friction, **given}
     if missing := sorted(needed - set(given)):

@@ -16,7 +16,7 @@ from functools import cache
 from importlib import resources
 from typing import Any, Literal
 
-from brainbench.core.errors import UsageError, check_each, check_name, unknown_name
+from brainbench.core.errors import UsageError, brief, check_each, check_name, unknown_name
 from brainbench.core.limits import limited
 from brainbench.core.rotations import Angles, Point
 from brainbench.stimuli.whiskers.whisker import Whisker
@@ -215,6 +215,11 @@ class WhiskerArray:
         mounted = {key: tuple(map(float, value)) for key, value in changes.items() if key in places}
         rod = {key: value for key, value in changes.items() if key not in places}
         chosen = set(self.select(pattern).mounts)
+        if len({mount.side for mount in chosen}) > 1 and (mounted or any(turn for *_, turn in rod.get("bends", ()))):
+            raise UsageError(
+                f"Places, angles and torsion have other signs on the other side, and {brief(pattern)} names whiskers of"
+                " both; name each side, as in RC2 and LC2."
+            )
         mounts = tuple(
             dataclasses.replace(mount, whisker=dataclasses.replace(mount.whisker, **rod), **mounted)
             if mount in chosen

@@ -9,13 +9,14 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field, fields
 from functools import lru_cache
+from itertools import pairwise
 from typing import Annotated, Any
 
 import numpy as np
 from numpy.polynomial import Polynomial
 from numpy.typing import ArrayLike, NDArray
 
-from brainbench.core.errors import UsageError, brief, check_each
+from brainbench.core.errors import UsageError, brief, check_each, check_kind
 from brainbench.core.limits import Limit, NotNegative, limited
 from brainbench.core.reading.ranges import check_number
 from brainbench.core.rotations import Length
@@ -53,6 +54,8 @@ class FollicleSprings:
     about_z: _Spring | None = None
 
     def __post_init__(self) -> None:
+        for axis, pair in ((axis.name, getattr(self, axis.name)) for axis in fields(self)):
+            object.__setattr__(self, axis, pair and tuple(map(float, pair)))
         if not self.constants.any():
             raise UsageError("A follicle that gives way has one spring at least, such as about_z = (1e-6, 1e-9).")
 
@@ -124,8 +127,9 @@ class Whisker:
             raise UsageError("A whisker has a rest shape by its curvature or by its table of bends, not both.")
         if isinstance(self.follicle, dict):
             check_each("follicle axis", self.follicle, [axis.name for axis in fields(FollicleSprings)])
-            springs: Any = {axis: tuple(map(float, pair)) for axis, pair in self.follicle.items()}
-            object.__setattr__(self, "follicle", FollicleSprings(**springs))
+            object.__setattr__(self, "follicle", FollicleSprings(**self.follicle))
+        elif self.follicle is not None:
+            check_kind("follicle of a whisker", self.follicle, FollicleSprings, "a table of its springs")
         if isinstance(self.density, (tuple, list)):
             object.__setattr__(self, "density", (float(self.density[0]), float(self.density[1])))
         thickest = self.thickest
@@ -133,6 +137,12 @@ class Whisker:
             raise UsageError(
                 f"A whisker of arc length {self.arc_length:g} m with radius {thickest:g} m"
                 " is no slender rod (radius above a fifth of the length); all lengths are in metres."
+            )
+        turn = max([2 * abs(self.curvature), *(math.hypot(bend, twist) for _, bend, twist in self.bends)])
+        if turn * thickest >= 1:
+            raise UsageError(
+                f"A whisker with radius {thickest:g} m cannot turn by {turn:g} rad/m at rest, since its sides would"
+                " meet; curvature and torsion are in 1/m."
             )
 
     def _check_table(self, name: str, what: str, least: float) -> None:
@@ -260,12 +270,19 @@ def _path(bends: tuple[tuple[float, float, float], ...]) -> Any:
         bend, turn = np.interp(s, arcs, curvatures), np.interp(s, arcs, torsions)
         return np.concatenate([tangent, bend * normal, turn * binormal - bend * tangent, -turn * normal])
 
-    start = np.concatenate([np.zeros(3), np.eye(3).ravel()])
-    step = float(np.diff(arcs).min())
-    solution = solve_ivp(
-        slope, (0.0, arcs[-1]), start, "DOP853", rtol=1e-12, atol=1e-15, dense_output=True, max_step=step
-    )
-    return solution.sol
+    state, pieces = np.concatenate([np.zeros(3), np.eye(3).ravel()]), []
+    for ends in pairwise(arcs):  # each by itself, so that rows may lie as near as they like
+        solution = solve_ivp(slope, ends, state, "DOP853", rtol=1e-12, atol=1e-15, dense_output=True)
+        state = solution.y[:, -1]
+        pieces.append(solution.sol)
+
+    def path(s: NDArray[np.float64]) -> NDArray[np.float64]:
+        rows = np.searchsorted(arcs[1:-1], s, side="right")
+        return np.stack([pieces[row](arc) for row, arc in zip(rows.flat, s.flat, strict=True)], -1).reshape(
+            12, *s.shape
+        )
+
+    return path
 
 
 def quadrature(low: float, high: float, breaks: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -366,6 +383,10 @@ class Chain:
         return (arm * self.masses[:, None]).T @ arm + lower.T @ (lower * self.inertias[:, 1:])
 
 
+_LEAST_CHORD = math.sin(0.75) / 0.75
+"""Length of a link over that of its arc where the rest shape turns by 1.5 rad within the link."""
+
+
 @lru_cache(maxsize=512)
 def build_chain(whisker: Whisker, links: int) -> Chain:
     """Cut ``whisker`` into at least two ``links`` of equal arc length; callers share the result."""
@@ -374,6 +395,12 @@ def build_chain(whisker: Whisker, links: int) -> Chain:
     points = whisker.rest_points(nodes)
     chords = np.diff(points, axis=0)
     lengths = np.linalg.norm(chords, axis=1)
+    if (lengths < _LEAST_CHORD * np.diff(nodes)).any():
+        tightest = max(abs(bend) for _, bend, _ in whisker.bends)
+        raise UsageError(
+            f"{links} links are too few for a whisker that turns by up to {tightest:g} rad/m at rest: more than 1.5 rad"
+            f" in one of them; choose {int(tightest * whisker.arc_length / 1.5) + 1} or more."
+        )
     rest_rolls, rest_angles = _turns(chords)
     radii = whisker.radius((nodes[:-1] + nodes[1:]) / 2)
     frusta, compliance = _frusta(whisker, nodes, lengths), _compliance(whisker, links)

@@ -53,6 +53,42 @@ def test_curvature_that_changes_sign_is_an_s():
     assert not build_chain(ESS, 20).rest_rolls.any()
 
 
+def test_rows_may_lie_as_near_as_they_like():
+    s = np.linspace(0, 0.03, 13)
+    doubled = replace(ROD, bends=((0.0, 90.0, 60.0), (1e-12, 90.0, 60.0), (0.03, 90.0, 60.0)))
+    np.testing.assert_allclose(doubled.rest_points(s), HELIX.rest_points(s), atol=1e-14)
+    np.testing.assert_array_equal(HELIX.rest_points(s[3]), HELIX.rest_points(s)[3])
+
+
+def test_a_whisker_is_no_tighter_than_it_is_thick():
+    for changes in ({"bends": ((0.0, 0.0, 0.0), (0.03, 0.0, 2.1e4))}, {"curvature": -1.1e4}):
+        with pytest.raises(UsageError, match=r"radius 5e-05 m cannot turn by 2[12]000 rad/m"):
+            replace(ROD, **changes)
+
+
+@pytest.mark.parametrize("curvature", [200.0, 1000.0, 5000.0])
+def test_links_that_wind_up_the_rest_shape_are_refused_with_a_number_that_does(curvature):
+    coil = replace(ROD, bends=((0.0, curvature, 0.0), (0.03, curvature, 0.0)))
+    least = int(0.03 * curvature / 1.5) + 1
+    with pytest.raises(UsageError, match=f"too few .* turns by up to {curvature:g} rad/m at rest.*choose {least} or"):
+        build_chain(coil, least - 2)
+    chain = build_chain(coil, least)
+    assert np.abs(chain.rest_angles).max() < 1.6
+
+
+def test_tables_with_torsion_belong_to_one_side():
+    rods = {"curvature": 0.0, "arc_length": 0.03, "bends": HELIX.bends}
+    both = WhiskerArray.of("rat", side="both", whiskers="C2")
+    for changes in (rods, {"position": (0.01, 0.0, 0.0)}):
+        with pytest.raises(UsageError, match=r"'C2' names whiskers of both; name each side, as in RC2 and LC2"):
+            both.replace("C2", **changes)
+    turned = both.replace("RC2", **rods)
+    mirrored = turned.replace("LC2", **rods | {"bends": turned["RC2"].mirrored().whisker.bends})
+    assert mirrored["LC2"].whisker == mirrored["RC2"].mirrored().whisker
+    plane = both.replace("C2", **rods | {"bends": ESS.bends})
+    assert plane["LC2"].whisker == plane["RC2"].whisker
+
+
 @SHAPES
 def test_links_lead_from_joint_to_joint(whisker):
     chain, frame, point = build_chain(whisker, 20), np.eye(3), np.zeros(3)

@@ -73,6 +73,20 @@ def test_a_file_holds_whiskers_as_they_were_measured_along_their_length(tmp_path
             load_scene(_write(tmp_path, POLE.replace("young_modulus = 3.3e9", f"arc_length = 0.02\nradii = {wrong}")))
 
 
+@pytest.mark.parametrize(
+    ("table", "words"),
+    [
+        ("[array.replace]\narc_length = 0.02", "a table of tables, one for each name"),
+        ("[array.replace.C2]\nfollicle = 3", "follicle of a whisker must be a table of its springs; received 3"),
+        ("[array.replace.C2]\nfollicle = { about_z = 1e-6 }", "about_z of a follicle holds 2 numbers"),
+        ("[array.replace.C2]\nfollicle = { about_z = ['a', 1] }", "about_z of a follicle .* received 'a'"),
+    ],
+)
+def test_properties_of_another_kind_are_named(tmp_path, table, words):
+    with pytest.raises(UsageError, match=rf"pole\.toml: .*{words}"):
+        load_scene(_write(tmp_path, POLE.replace("[array.replace.C2]\nyoung_modulus = 3.3e9", table)))
+
+
 def test_a_friction_below_zero_is_refused(tmp_path):
     with pytest.raises(UsageError, match=r"friction.*-1"):
         load_scene(_write(tmp_path, POLE.replace("friction = 0.3", "friction = -1")))
@@ -379,12 +393,15 @@ WHOLE = '[[mount]]\nname = "C2"\nposition_mm = [1, 2, 3]\nangles_deg = [10, 20, 
     [
         (WHOLE, "needs 'arc_length', 'base_radius', 'damping_ratio', 'density', 'tip_radius', 'young_modulus'"),
         (WHOLE + "whisker = { lenght = 1 }", "property of the whisker C2.*'lenght'"),
-        (WHOLE.replace("C2", "F2"), "row, one of ABCDE, and its column, as C2; received 'F2'"),
+        (WHOLE.replace("C2", "F2"), "row, one of ABCDE, and its column, 0 to 6, as C2; received 'F2'"),
+        # A set has a cell for each row and column, and A00 would be in that of A0.
+        *((WHOLE.replace("C2", name), f"received '{name}'") for name in ("C02", "C7", "c2")),
+        ('rules = "rat"\n' + WHOLE + "whisker = { arc_length = '0.03' }", "arc_length of a whisker .*finite.*'0.03'"),
         (WHOLE.replace("position_mm = [1, 2, 3]\n", ""), "needs the key 'position_mm'"),
         ('rules = "shrew"\n' + WHOLE, "shrew"),
         ('side = "both"\n' + WHOLE, "both"),
-        ("mount = []", "none has"),
-        ('rules = "rat"\n' + 2 * (WHOLE + "whisker = { arc_length = 0.03 }\n"), "'C2' has"),
+        ("mount = []", "received none"),
+        ('rules = "rat"\n' + 2 * (WHOLE + "whisker = { arc_length = 0.03 }\n"), "'C2' has several"),
     ],
 )
 def test_species_file_that_is_no_array_is_refused(tmp_path, text, words):
