@@ -411,7 +411,7 @@ def build_chain(whisker: Whisker, links: int) -> Chain:
 def _turns(chords: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the rolls about x and the bends about z [N] (rad) that lead from each chord [N, 3] to the next."""
     if not chords[:, 2].any():
-        return np.zeros(len(chords)), np.diff(np.arctan2(chords[:, 1], chords[:, 0]), prepend=0.0)
+        return np.zeros(len(chords)), np.diff(np.unwrap(np.arctan2(chords[:, 1], chords[:, 0])), prepend=0.0)
     from scipy.spatial.transform import Rotation
 
     turns, frame = np.zeros((len(chords), 2)), np.eye(3)
