@@ -232,7 +232,8 @@ def check_length(shapes: xr.Dataset, arc_length: float) -> None:
     lengths = traced_lengths(shapes["shape"].values)
     if not np.isfinite(lengths).any():  # single points, as of a tip, have no length
         return
-    length = float(np.nanmedian(lengths))
+    if not (length := float(np.nanmedian(lengths))):
+        raise DataError("The points of most traced shapes lie at one place; trace them along the whisker.")
     ratio = length / arc_length
     if not 1 / UNITS**2 < ratio < UNITS:
         near = 10.0 ** round(math.log10(ratio))
