@@ -27,6 +27,8 @@ if TYPE_CHECKING:
     import xarray as xr
 
 Array = NDArray[np.float64]
+UNEVEN = 1e-3
+"""Probability of a misfit as large, by chance, below which contacts of neighbouring frames change by no line."""
 PER_LINK = 8  # samples of the curve in each link
 
 
@@ -483,8 +485,10 @@ class ContactSolver:
 
         The logarithms of arc and force of some frames are fitted by straight lines in time, weighted by their
         covariance; the pose of the base follows its regression on them. Frames with forces of the other sign, or with
-        no sign of a force by themselves, have no part and stay as they are.
+        no sign of a force by themselves, have no part and stay as they are, as do frames that lie on no line.
         """
+        from scipy.special import chdtrc
+
         some = {k: logarithms for k, one in enumerate(fits) if (logarithms := self._logarithms(one)) is not None}
         half, smoothed = self.options.frames // 2, list(fits)
         for index, (value, spread, slope) in some.items():
@@ -498,6 +502,10 @@ class ContactSolver:
             weighted = sum(d.T @ w @ some[k][0] for d, w, k in zip(design, weights, use, strict=True))
             # Generalised least squares: each frame weighs by the inverse covariance of its own logarithms.
             line, covariance = np.linalg.solve(information, weighted), np.linalg.inv(information)[:2, :2]
+            off = [some[k][0] - d @ line for k, d in zip(use, design, strict=True)]
+            misfit = sum(float(part @ w @ part) for part, w in zip(off, weights, strict=True))
+            if chdtrc(2 * len(use) - 4, misfit) < UNEVEN:
+                continue
             # Unknowns given the logarithms: the Gaussian law of the frame's own fit, conditioned on them.
             gain = fits[index].covariance @ slope.T @ np.linalg.inv(spread)
             moved = fits[index].unknowns + gain @ (line[:2] - value)

@@ -142,6 +142,20 @@ def test_neighbouring_frames_of_one_contact_make_a_small_force_more_certain():
         ContactOptions(frames=4)
 
 
+def test_frames_whose_contacts_change_by_no_line_stay_as_they_are():
+    truths = [
+        _press(MOUSE, arc, depth) for arc, depth in [(0.4, 0.1), (0.7, 0.06), (0.5, 0.12), (0.6, 0.05), (0.45, 0.09)]
+    ]
+    points = np.stack([_shape(MOUSE, *truth)[0] for truth in truths])
+    shapes = new_shapes(np.arange(5) / 500, points + np.random.default_rng(4).normal(size=points.shape) * 1e-5)
+    alone, together = (
+        find_contacts(shapes, MOUSE, options=ContactOptions(noise=1e-5, frames=frames)) for frames in (1, 5)
+    )
+    np.testing.assert_array_equal(together["force"], alone["force"])
+    z = (together["force"] - [force for _, force in truths]) / together["force_deviation"]
+    assert np.abs(z).max() < 4
+
+
 @pytest.mark.slow
 def test_a_free_whisker_shows_no_contact_also_in_neighbouring_frames():
     points = np.tile(MOUSE.centre_line(np.linspace(0, 0.95 * MOUSE.arc_length, 50)), (6, 1, 1))
