@@ -31,6 +31,8 @@ if TYPE_CHECKING:
 CHANNELS = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
 """Order of the six channels of a base wrench: forces in N, then moments in N·m."""
 
+BY_TRIAL = "trial"
+"""Value of ``match`` that joins each trial to a stimulus of its own."""
 GRID_SHAPE = (5, 7)  # rows A–E and columns 0–6 of the whisker grid; whisker (row, col) sits at flat index row·7 + col
 
 SUB_STEPS, SUB_STEP_SECONDS = 5, 0.009  # frames within a time step of the networks, and the time between frames [s]
@@ -316,7 +318,8 @@ def read_match(path: str | os.PathLike[str]) -> dict[str, str | None]:
 
     path = Path(path)
     if not path.is_file():
-        raise UsageError(f"There is no match file {str(path)!r}.")
+        single = f"; {BY_TRIAL!r} joins the single trials of a score, and only that" if str(path) == BY_TRIAL else ""
+        raise UsageError(f"There is no match file {str(path)!r}{single}.")
     kind = path.suffix.lower()
     if kind in (".json", ".toml"):
         pairs = read_mapping(path)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from brainbench.core.contracts import as_label, join_labels, natural_key
+from brainbench.core.contracts import BY_TRIAL, as_label, join_labels, natural_key
 from brainbench.core.errors import DataError, UsageError, brief, check_each, check_name, check_once, listing, repeats
 from brainbench.core.files import content_hash
 from brainbench.core.progress import Progress, track
@@ -26,8 +26,6 @@ if TYPE_CHECKING:
     from brainbench.metrics import Metric
     from brainbench.scoring.options import ScoreOptions
 
-BY_TRIAL = "trial"
-"""Value of ``match`` that joins each trial to a stimulus of its own."""
 PUBLISHED_LAYOUT = "published-npz"  # layout of files of rates whose zeros the published estimators count
 
 

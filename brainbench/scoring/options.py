@@ -12,6 +12,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
+from brainbench.core.contracts import BY_TRIAL
 from brainbench.core.errors import UsageError, brief, check_each, check_once
 from brainbench.core.limits import Limit, Positive, Seed, limited
 
@@ -109,6 +110,8 @@ class ScoreOptions:
         for name in _NO_NUMBERS:
             if isinstance(getattr(self, name), (int, float)):
                 raise UsageError(f"{name} must be a text; received {brief(getattr(self, name))}.")
+        if isinstance(self.match, os.PathLike) and os.fspath(self.match) == BY_TRIAL:  # as the command line states it
+            object.__setattr__(self, "match", BY_TRIAL)
         if self.layers is not None:
             if not (isinstance(self.layers, (list, tuple)) and all(isinstance(name, str) for name in self.layers)):
                 raise UsageError(f"layers must be a list of names; received {brief(self.layers)}.")

@@ -14,9 +14,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from brainbench.core.contracts import BY_TRIAL
 from brainbench.core.errors import DataError, listing
 from brainbench.scoring.model_responses import reduce_time
-from brainbench.scoring.neural_responses import BY_TRIAL, NeuralResponses
+from brainbench.scoring.neural_responses import NeuralResponses
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

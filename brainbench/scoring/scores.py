@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
+from brainbench.core.contracts import BY_TRIAL
 from brainbench.core.errors import UsageError, check_name, listing
 from brainbench.core.files import provenance, to_plain
 from brainbench.core.identity import SealedPlan
@@ -21,7 +22,6 @@ from brainbench.core.progress import Progress, stages, track
 from brainbench.core.provenance import Provenance
 from brainbench.core.records import ESTIMATOR_VERSION, ResultRecord, Score
 from brainbench.scoring.influence import influence_of
-from brainbench.scoring.neural_responses import BY_TRIAL
 from brainbench.scoring.options import ScoreOptions
 from brainbench.scoring.own_stimuli import joined
 from brainbench.scoring.presentation import presentation_of

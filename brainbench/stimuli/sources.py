@@ -172,11 +172,16 @@ def is_finished(source: object) -> bool:
 
 def known_labels(source: object) -> tuple[str, ...] | None:
     """Return the labels of a packaged recipe or a scene file, before its scenes are built; None for anything else."""
+    labels = stated_labels(source)
+    return None if any("{trial}" in label for label in labels or ()) else labels
+
+
+def stated_labels(source: object) -> tuple[str, ...] | None:
+    """Return the same as the file writes them, with ``{trial}`` in place of the names of trials."""
     with contextlib.suppress(BrainbenchError, OSError, KeyError, TypeError):
         path = Path(str(recipe_file(source))) if is_packaged(source) else source
         if isinstance(path, (str, os.PathLike)) and Path(path).suffix == ".toml":
-            labels = tuple(item["label"] for item in read_toml(path, "scene file")["scene"])
-            return None if any("{trial}" in label for label in labels) else labels
+            return tuple(item["label"] for item in read_toml(path, "scene file")["scene"])
     return None
 
 

@@ -1,5 +1,7 @@
 """Recordings whose trials have tracks of their own meet what is simulated of these tracks, trial by trial."""
 
+import json
+
 import numpy as np
 import pytest
 from torch import nn
@@ -252,6 +254,23 @@ def test_numbers_of_several_sessions_are_named(felt):
     folder, values = felt
     with pytest.raises(UsageError, match="'0' names several trials"):
         score_features(folder, map(str, range(80)), [*values.values()][:80])
+
+
+def test_the_command_joins_by_trial_and_others_say_that_they_do_not(felt, run, tmp_path):
+    folder, values = felt
+    names = ["_".join(map(str, trial)) for trial in values]
+    path = write_features(tmp_path / "own.h5", names, {"layer": np.stack([*values.values()])})
+    how = ("--recordings", str(folder), "--conditions", "trials:stimulus", "--match", "trial")
+    found = run("score", str(path), *how, "--out", str(tmp_path), "--json")
+    assert found.status == 0, found.err
+    assert score_features(folder, names, [*values.values()]).value == pytest.approx(
+        json.loads(found.out)["record"]["score"]["value"], abs=1e-9
+    )
+    (tmp_path / "trials.toml").write_text(SCENES)
+    refused = run("recovery", "--stimuli", str(tmp_path / "trials.toml"))
+    assert (refused.status, "are single trials, and a recovery shows each" in refused.err) == (2, True)
+    made = run("benchmark", "make", *how, "--name", "x", "--out", str(folder / "b.toml"))
+    assert (made.status, "'trial' joins the single trials of a score, and only that" in made.err) == (2, True)
 
 
 def test_animals_that_met_other_stimuli_under_one_label_are_scored_apart(tmp_path):

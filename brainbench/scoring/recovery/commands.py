@@ -81,7 +81,13 @@ def recovery(
     from brainbench.scoring.options import ScoreOptions
     from brainbench.scoring.recovery import RecoveryDesign, find_cheapest, open_candidates, plot_confusion, recover
     from brainbench.scoring.recovery.boards import parse_trials
+    from brainbench.stimuli.sources import stated_labels
 
+    if any("{trial}" in label for label in stated_labels(pool or stimuli) or ()):
+        raise UsageError(
+            f"The scenes of {pool or stimuli!r} are single trials, and a recovery shows each stimulus in many; give "
+            "--stimuli with a scene for each label, such as the whisking of one trial of it."
+        )
     if (pool is None) is not (keep is None):
         raise UsageError("Stimuli are picked with both --pool STIMULI and --keep NUMBER; received one of them.")
     if keep is not None and show is not None:
