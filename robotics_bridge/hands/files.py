@@ -159,7 +159,8 @@ def read_mjspec(path: Path) -> Any:
     if path.suffix.lower() == ".urdf":
         spec.compiler.discardvisual = True
         # Fixed links join their parents, as their solids should; a sensor keeps the palm from joining the world.
-        base = spec.worldbody.first_body()
+        if (base := spec.worldbody.first_body()) is None:
+            raise DataError(f"{str(path)!r} holds no hand: it has no links.")
         kinds = {"type": mujoco.mjtSensor.mjSENS_FRAMEPOS, "objtype": mujoco.mjtObj.mjOBJ_BODY}
         spec.add_sensor(name="palm_pose", objname=base.name, **kinds)
     for joint in [joint for joint in spec.joints if joint.type == mujoco.mjtJoint.mjJNT_FREE]:

@@ -10,7 +10,7 @@ import typer
 from brainbench.cli.options import out_folder_option, with_options
 from brainbench.cli.output import Output, table, table_of, tracked
 from brainbench.cli.policy.options import ENV, ENVS_FLAG, DeviceOption, HandOption
-from brainbench.core.errors import UsageError
+from brainbench.core.errors import UsageError, brief
 
 _HAND_FILES = (".urdf", ".xml", ".mjcf")
 
@@ -159,7 +159,8 @@ def _check_hands(folder: Path, out: Path) -> Output:
 
     paths = [folder] if folder.is_file() else sorted(p for p in folder.rglob("*") if p.suffix in _HAND_FILES)
     if not paths:
-        raise UsageError(f"{str(folder)!r} holds no hand file ({', '.join(_HAND_FILES)}).")
+        what = f"holds no hand file ({', '.join(_HAND_FILES)})" if folder.is_dir() else "is no folder or hand file"
+        raise UsageError(f"{brief(str(folder))} {what}.")
     out.mkdir(parents=True, exist_ok=True)
     checks = [check for path in tracked(paths, "checking hands") for check in check_file(path, out)]
     columns = {

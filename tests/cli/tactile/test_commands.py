@@ -61,3 +61,10 @@ def test_bench_refuses_an_empty_batch(run):
     found = run("tactile", "bench", "--envs", "0")
     assert found.status == 2
     assert "at least 1" in found.err
+
+
+def test_a_folder_of_hands_that_is_not_there_is_said(run, tmp_path):
+    found = run("tactile", "check", str(tmp_path / "nowhere"))
+    assert (found.status, "is no folder or hand file" in found.err) == (2, True)
+    found = run("tactile", "check", str(tmp_path))
+    assert (found.status, "holds no hand file (" in found.err) == (2, True)

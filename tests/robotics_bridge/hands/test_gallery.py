@@ -50,3 +50,10 @@ def test_a_file_that_cannot_be_read_is_one_sentence(tmp_path) -> None:
 def test_a_picture_of_each_hand_is_drawn(tmp_path) -> None:
     check_file(GALLERY["two-hands"].write(tmp_path, "two"), tmp_path)
     assert sorted(path.name for path in tmp_path.glob("*.png")) == ["two-left_palm.png", "two-right_palm.png"]
+
+
+def test_a_urdf_without_links_is_one_sentence(tmp_path):
+    path = tmp_path / "empty.urdf"
+    path.write_text('<robot name="x"/>')
+    (check,) = check_file(path, tmp_path)
+    assert check.errors == (f"{str(path)!r} holds no hand: it has no links.",)
