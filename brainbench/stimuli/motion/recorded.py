@@ -454,6 +454,8 @@ def load_angles(
     degrees = [[given.get(f"{name}.{axis}_deg", missing) for axis in _AXES] for name in names]
     turns = np.moveaxis(np.radians(degrees), 1, 2)[:, times >= 0]
     times = times[times >= 0]
+    if not len(times):
+        raise DataError(f"{brief(os.fspath(path))} has no time from 0 on, where a scene begins; shift its times.")
     filled = _filled(path, times, turns, options.longest_gap)
     return Tracked(names, _smooth(filled, 1 / step, options.lowpass), 1 / step, float(times[0]), rotations=rotations)
 
@@ -524,18 +526,30 @@ def _common(
 
 
 def _filled(path: str | os.PathLike[str], times: Array, values: Array, longest: float) -> Array:
-    """Return values [W, n, c] whose gaps are filled evenly; one that is longer than ``longest`` (s) is an error."""
+    """Return values [W, n, c] whose gaps are filled evenly; one that is longer than ``longest`` (s) is an error.
+
+    Angles (rad) that begin anew after a whole turn are counted through, and begin within half a turn of rest.
+    """
     filled, frames = values.copy(), 0
     for which, column in np.ndindex(len(values), values.shape[2]):
         series = filled[which, :, column]
         lost = ~np.isfinite(series)
-        if lost.all() or not lost.any():
-            continue
         places = np.flatnonzero(~lost)
+        if not len(places):
+            continue
+        series[places] = np.unwrap(series[places])
+        series -= 2 * math.pi * np.round(series[places[0]] / (2 * math.pi))
+        if not lost.any():
+            continue
+        if places[0] > 0 or places[-1] < len(times) - 1:
+            raise DataError(
+                f"{brief(os.fspath(path))} lacks a whisker at its {'beginning' if places[0] else 'end'}: cut it to"
+                f" {times[places[0]]:.4g} to {times[places[-1]]:.4g} s, in which all whiskers were seen."
+            )
         steps = np.diff(times[places])
         worst = int(np.argmax(steps))
         gap = float(steps[worst] - np.diff(times).min())
-        if gap > longest + 1e-9 or places[0] > 0 or places[-1] < len(times) - 1:
+        if gap > longest + 1e-9:
             raise DataError(
                 f"{brief(os.fspath(path))} has a gap of {1e3 * gap:.3g} ms from {times[places[worst]]:.4g} s on; gaps "
                 f"are filled up to {1e3 * longest:g} ms: track these frames again, or allow longer ones."

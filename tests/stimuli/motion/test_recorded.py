@@ -409,6 +409,36 @@ def test_a_scene_beyond_the_track_is_refused(tmp_path):
         tracked.angles(ARRAY["RC2"], np.array([0.1, 0.5]))
 
 
+def write_angles(path, times, degrees):
+    rows = [f"{time!r},{angle!r}" for time, angle in zip(times.tolist(), degrees.tolist(), strict=True)]
+    path.write_text("\n".join(["time_s,RC2.theta_deg", *rows]) + "\n")
+    return path
+
+
+def test_angles_that_begin_anew_after_a_whole_turn_are_counted_through(tmp_path):
+    times = np.arange(50) * 0.002
+    angles = 20 * np.sin(20 * np.pi * times) ** 2 - 1
+    plain = load_angles(write_angles(tmp_path / "plain.csv", times, angles), EXACT)
+    for name, shown in (("wrapped", angles % 360), ("turned", angles + 720), ("half", (angles + 180) % 360 - 180)):
+        again = load_angles(write_angles(tmp_path / f"{name}.csv", times, shown), EXACT)
+        np.testing.assert_allclose(again.turns, plain.turns, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("lost", "words"), [((0, 3), "beginning: cut it to 0.006 to 0.098"), ((46, 50), "end: cut it")]
+)
+def test_angles_that_are_missing_at_an_end_are_no_gap(tmp_path, lost, words):
+    times, angles = np.arange(50) * 0.002, np.linspace(0, 20, 50)
+    angles[slice(*lost)] = np.nan
+    with pytest.raises(DataError, match=f"lacks a whisker at its {words}"):
+        load_angles(write_angles(tmp_path / "angles.csv", times, angles), EXACT)
+
+
+def test_angles_before_a_scene_begins_are_one_sentence(tmp_path):
+    with pytest.raises(DataError, match=r"angles\.csv' has no time from 0 on"):
+        load_angles(write_angles(tmp_path / "angles.csv", np.arange(-50, 0) * 0.002, np.zeros(50)))
+
+
 def test_a_table_of_angles_tells_all_three(tmp_path):
     rows = [f"{t},{math.degrees(a)},{2.0 * k},-1" for k, (t, a) in enumerate(zip(TIMES, SWING, strict=True))]
     head = "time_s,RC2.theta_deg,RC2.phi_deg,RC2.zeta_deg"
