@@ -188,11 +188,7 @@ def differences(record: ResultRecord, again: ResultRecord, *, tolerance: float =
 
 
 def open_build(*sources: str | os.PathLike[str]) -> list[StoredRecord]:
-    """Read the records of folders, files, or built sites (which hold those they were made from), each record once.
-
-    Raises:
-        DataFileNotFoundError: there is nothing there.
-    """
+    """Read the records of folders, files, or built sites (which hold those they were made from), each record once."""
     folders = [(source, Path(source) / "records") for source in sources]
     return read_records([records if records.is_dir() else source for source, records in folders])
 

@@ -84,11 +84,7 @@ def record_text(record: ResultRecord) -> str:
 
 
 def read_record(path: str | os.PathLike[str]) -> ResultRecord:
-    """Read one record.
-
-    Raises:
-        DataFileNotFoundError: there is no such file.
-    """
+    """Read one record."""
     return _read(Path(path))[0]
 
 
@@ -161,9 +157,6 @@ def read_records(
     A file that cannot be used comes back with its problem in words instead of ending the whole
     reading. Files in two places with the same content count once. Sorted by path. ``light`` records
     are :func:`lightened`, for boards of thousands.
-
-    Raises:
-        DataFileNotFoundError: a path does not exist, or nothing was found at all.
     """
     sources = [Path(source)] if isinstance(source, (str, os.PathLike)) else [Path(item) for item in source]
     paths: list[Path] = []

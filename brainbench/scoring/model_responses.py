@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -34,15 +34,14 @@ _ELSEWHERE = "features computed elsewhere"
 
 
 @dataclass(frozen=True, eq=False)
-class _Features(Mapping[str, Any]):
-    """Features [K, F] by layer: all layers at once would take the memory of the activations once more."""
+class Reduced(Mapping[str, Any]):
+    """What is made of each layer when it is asked for: all at once would take the memory of the activations again."""
 
     activations: Mapping[str, NDArray[np.floating]]
-    rows: list[int]
-    time: str
+    reduce: Callable[[NDArray[np.floating]], NDArray[np.floating]]
 
     def __getitem__(self, layer: str) -> NDArray[np.floating]:
-        return reduce_time(self.activations[layer][self.rows], self.time)
+        return self.reduce(self.activations[layer])
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.activations)
@@ -85,7 +84,7 @@ class ModelResponses:
 
     def features(self, rows: list[int]) -> Mapping[str, NDArray[np.floating]]:
         """Return every layer's features [K, F] of the stimuli ``rows``, made when they are asked for."""
-        return _Features(self.activations, rows, self.time)
+        return Reduced(self.activations, lambda values: reduce_time(values[rows], self.time))
 
     def baseline_features(self, rows: list[int], seed: int) -> dict[str, dict[str, NDArray[np.floating]]]:
         """Return the raw input and random features of it; nothing without an input."""

@@ -8,15 +8,15 @@ the mean over the trials of all animals that are used.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from brainbench.core.contracts import BY_TRIAL
 from brainbench.core.errors import DataError, listing
-from brainbench.scoring.model_responses import reduce_time
+from brainbench.scoring.model_responses import Reduced, reduce_time
 from brainbench.scoring.neural_responses import NeuralResponses
 
 if TYPE_CHECKING:
@@ -30,24 +30,7 @@ MISSED = 0.05
 """Share of the trials from which trials without a stimulus, beside stimuli without a trial, put the names in doubt."""
 SHARED = 0.9
 """Share of the variance between labels that animals have in common below which their mean stands for none of them: at
-.9 a perfect model loses 3 to 7 % of its score, at .8 up to 13 % (8 to 40 labels, 2 to 10 animals)."""
-
-
-@dataclass(frozen=True, eq=False)
-class _Means(Mapping[str, Any]):
-    """Activations [label, T, F] by layer, means over the stimuli of each label, made when they are asked for."""
-
-    activations: Mapping[str, NDArray[np.floating]]
-    members: list[list[int]]
-
-    def __getitem__(self, layer: str) -> NDArray[np.floating]:
-        return mean_rows(self.activations[layer], self.members)
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self.activations)
-
-    def __len__(self) -> int:
-        return len(self.activations)
+.9 a perfect model loses 2 to 7 % of its score, at .8 up to 14 % (8 to 40 labels, 2 to 10 animals)."""
 
 
 def mean_rows(values: NDArray[np.floating], members: list[list[int]]) -> NDArray[np.floating]:
@@ -79,8 +62,8 @@ def shared_variance(values: NDArray[np.floating], animals: Sequence[str], labels
     common = means.mean(axis=0)
     between = float((common**2).sum()) / (len(kinds) - 1) * len(names)
     within = float(((means - common) ** 2).sum()) / ((len(kinds) - 1) * (len(names) - 1))
-    own, every = max(within - error, 0.0), max((between - within) / len(names), 0.0)
-    return every / (every + own) if every + own > 0 else math.nan
+    single, every = max(within - error, 0.0), max((between - within) / len(names), 0.0)
+    return every / (every + single) if every + single > 0 else math.nan
 
 
 def joined(
@@ -126,17 +109,17 @@ def joined(
     members = [rows[used & (kinds == label)].tolist() for label in labels]
     inputs = network.activations.values() if network.model_input is None else [network.model_input]
     of_trials = (reduce_time(values, network.time)[rows[used]] for values in inputs)
-    shares = [shared_variance(values, animals[used].tolist(), kinds[used].tolist()) for values in of_trials]
-    if not any(wrong) and max(shares, default=1.0) < SHARED:
+    shares = (shared_variance(values, animals[used].tolist(), kinds[used].tolist()) for values in of_trials)
+    if not any(wrong) and (largest := max(filter(math.isfinite, shares), default=1.0)) < SHARED:
         wrong.append(
-            f"animals met other stimuli under one label: {max(shares):.0%} of the variance between labels is common to"
+            f"animals met other stimuli under one label: {largest:.0%} of the variance between labels is common to"
             " them; score each by itself (--select subjects=NAME)"
         )
     stated = {"doubts": doubts, "label_doubt": "; ".join(filter(None, wrong))} | ({"ledger": ledger} if ledger else {})
     means = replace(
         network,
         labels=labels,
-        activations=_Means(network.activations, members),
+        activations=Reduced(network.activations, lambda values: mean_rows(values, members)),
         model_input=None if network.model_input is None else mean_rows(network.model_input, members),
         kinematics={name: mean_rows(values, members) for name, values in network.kinematics.items()},
     )

@@ -19,11 +19,7 @@ CUT = "It may be cut short: get it again."
 
 
 def read_tensors(path: str | os.PathLike[str], kind: str = "safetensors file") -> dict[str, torch.Tensor]:
-    """Read all tensors of a safetensors file; a weight that is not finite is refused.
-
-    Raises:
-        DataFileNotFoundError: there is no such file.
-    """
+    """Read all tensors of a safetensors file; a weight that is not finite is refused."""
     from safetensors.torch import load_file
 
     file = check_file(path, kind)
@@ -34,11 +30,7 @@ def read_tensors(path: str | os.PathLike[str], kind: str = "safetensors file") -
 
 
 def read_checkpoint(path: str | os.PathLike[str], kind: str = "PyTorch file") -> Mapping[str, Any]:
-    """Read the mapping that ``torch.save`` wrote; nothing in it is executed, and every weight is stored and finite.
-
-    Raises:
-        DataFileNotFoundError: there is no such file.
-    """
+    """Read the mapping that ``torch.save`` wrote; nothing in it is executed, and every weight is stored and finite."""
     import torch
 
     file, name = check_file(path, kind), brief(os.fspath(path))
