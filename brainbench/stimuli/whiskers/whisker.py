@@ -13,7 +13,6 @@ from itertools import pairwise
 from typing import Annotated, Any
 
 import numpy as np
-from numpy.polynomial import Polynomial
 from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.errors import UsageError, brief, check_each, check_kind
@@ -182,13 +181,8 @@ class Whisker:
     @property
     def mass(self) -> float:
         """Mass of the whole whisker [kg], the integral of ρ π r² (exact)."""
-        if self.radii:
-            s, weights = quadrature(0.0, self.arc_length, self.breaks)
-            return float(self.linear_density(s) @ weights)
-        (low, high), slope = self.densities, self.tip_radius - self.base_radius
-        # In powers of s/L.
-        area = Polynomial([np.pi * self.base_radius**2, 2 * np.pi * self.base_radius * slope, np.pi * slope**2])
-        return float((area * Polynomial([low, high - low])).integ()(1.0)) * self.arc_length
+        s, weights = quadrature(0.0, self.arc_length, self.breaks)
+        return float(self.linear_density(s) @ weights)
 
     def radius(self, s: ArrayLike) -> NDArray[np.float64]:
         """Return the radius [m] at arc length ``s`` [m]."""
