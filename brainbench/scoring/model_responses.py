@@ -34,7 +34,7 @@ _ELSEWHERE = "features computed elsewhere"
 
 
 @dataclass(frozen=True, eq=False)
-class Reduced(Mapping[str, Any]):
+class LayerFeatures(Mapping[str, Any]):
     """What is made of each layer when it is asked for: all at once would take the memory of the activations again."""
 
     activations: Mapping[str, NDArray[np.floating]]
@@ -84,7 +84,7 @@ class ModelResponses:
 
     def features(self, rows: list[int]) -> Mapping[str, NDArray[np.floating]]:
         """Return every layer's features [K, F] of the stimuli ``rows``, made when they are asked for."""
-        return Reduced(self.activations, lambda values: reduce_time(values[rows], self.time))
+        return LayerFeatures(self.activations, lambda values: reduce_time(values[rows], self.time))
 
     def baseline_features(self, rows: list[int], seed: int) -> dict[str, dict[str, NDArray[np.floating]]]:
         """Return the raw input and random features of it; nothing without an input."""

@@ -16,7 +16,7 @@ import numpy as np
 
 from brainbench.core.contracts import BY_TRIAL
 from brainbench.core.errors import DataError, listing
-from brainbench.scoring.model_responses import Reduced, reduce_time
+from brainbench.scoring.model_responses import LayerFeatures, reduce_time
 from brainbench.scoring.neural_responses import NeuralResponses
 
 if TYPE_CHECKING:
@@ -119,7 +119,7 @@ def joined(
     means = replace(
         network,
         labels=labels,
-        activations=Reduced(network.activations, lambda values: mean_rows(values, members)),
+        activations=LayerFeatures(network.activations, lambda values: mean_rows(values, members)),
         model_input=None if network.model_input is None else mean_rows(network.model_input, members),
         kinematics={name: mean_rows(values, members) for name, values in network.kinematics.items()},
     )
