@@ -66,6 +66,16 @@ def test_wrong_units_and_long_shapes_are_refused(factor, word):
         check_length(_with(SHAPES * factor), 0.0152)
 
 
+def test_traces_whose_points_lie_at_one_place_are_one_sentence():
+    shapes = SHAPES.copy()
+    shapes[:30] = shapes[:30, :1]
+    for points in (np.zeros_like(SHAPES), shapes):
+        with pytest.raises(DataError, match="lie at one place; trace them along the whisker"):
+            check_length(_with(points), 0.0152)
+    shapes[:30:2] = SHAPES[:30:2]
+    check_length(_with(shapes), 0.0155)
+
+
 def test_noise_does_not_make_a_shape_too_long():
     rng = np.random.default_rng(0)
     shapes = bent_shapes(frames=40, points=200)
