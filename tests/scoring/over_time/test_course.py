@@ -11,11 +11,15 @@ import pytest
 
 import brainbench
 from brainbench.cli import main
+from brainbench.core.contracts import Trials
 from brainbench.core.errors import DataError, UsageError
 from brainbench.datasets import open_recordings, write_recordings
 from brainbench.datasets.sessions import make_session
+from brainbench.metrics import compare, rdm
+from brainbench.metrics.reliability.subject_rdm import subject_rdm
 from brainbench.models.features import write_features
-from brainbench.scoring.over_time import animal_movie, score_over_time
+from brainbench.scoring.over_time import animal_movie, in_bins, layer_movie, score_over_time
+from brainbench.scoring.over_time.course import LaggedRDMs, best_lag, held_out_course, votes
 from brainbench.scoring.scores import score_record
 from leaderboards.site.score_page import write_report
 from tests.factories.moving_geometry import (
@@ -284,3 +288,131 @@ def test_unreliable_units_are_left_out_at_each_time_too(moving):
     assert every != some
     assert set(none) == {None}
     assert any("reliability of their tuning below" in reason for reason in courses[2]["reasons"])
+
+
+def test_an_activation_counts_in_a_bin_for_as_long_as_it_lasts_there():
+    values = np.array([0.0, 3.0, 6.0])[None, :, None]
+    np.testing.assert_allclose(in_bins(values, 0.1, 0.15).ravel(), [1.0, 5.0])
+    np.testing.assert_allclose(in_bins(values, 0.1, 0.05).ravel(), [0, 0, 3, 3, 6, 6])
+    # The last third of a bin is left out, two thirds of one are not.
+    assert in_bins(values, 0.1, 0.225).shape == (1, 1, 1)
+    assert in_bins(values, 0.1, 0.18).shape == (1, 2, 1)
+
+
+def test_a_layer_without_time_has_one_rdm():
+    patterns = np.random.default_rng(0).normal(size=(6, 1, 9))
+    movie = layer_movie(patterns, 1.0, 0.05)
+    np.testing.assert_allclose(movie, rdm(patterns[:, 0], method="sqeuclidean")[None])
+
+
+def test_each_bin_of_an_animal_is_prepared_as_a_score_without_time():
+    rng = np.random.default_rng(1)
+    session = make_moving_session(rng, make_path(rng, 6, 4))
+    how = {"method": "sqeuclidean", "comparison": "pearson", "splits": 30, "seed": 5}
+    movie = animal_movie("a", [session], 6, **how)
+    for bin in range(4):
+        alone = subject_rdm("a", [Trials(session.responses[:, bin], session.labels, session.keys)], 6, **how)
+        np.testing.assert_allclose(movie.rdms[bin], alone.rdm)
+        assert movie.reliability[bin] == alone.reliability
+
+
+def test_an_animal_is_reliable_only_where_it_responds():
+    rng = np.random.default_rng(2)
+    session = make_moving_session(rng, lagged(make_path(rng, 8, 6), 0, onset=3), noise=1.0)
+    movie = animal_movie("a", [session], 8, splits=30)
+    assert (movie.reliability[3:] > 0.6).all()
+    assert (movie.reliability[:3] < 0.5).all()
+
+
+def test_a_bin_without_an_rdm_says_why():
+    rng = np.random.default_rng(3)
+    session = make_moving_session(rng, make_path(rng, 6, 3))
+    responses = session.responses.copy()
+    responses[session.labels == 2, 1] = np.nan
+    movie = animal_movie("a", [Trials(responses, session.labels, session.keys)], 6, splits=5)
+    assert np.isnan(movie.rdms[1]).all()
+    assert np.isnan(movie.reliability[1])
+    assert [problem is None for problem in movie.problems] == [True, False, True]
+
+
+def test_an_animal_without_times_is_refused():
+    with pytest.raises(UsageError, match="'a'"):
+        animal_movie("a", [Trials(np.ones((6, 3)), np.arange(6))], 6)
+    with pytest.raises(UsageError, match=r"\(6, 4\)"):
+        in_bins(np.ones((6, 4)), 0.1, 0.1)
+    with pytest.raises(UsageError, match="bins of 0"):
+        in_bins(np.ones((6, 4, 2)), 0.1, 0.0)
+
+
+def _joined(rng, *, animals=3, lag=1, bins=6, comparison="whitened-cosine"):
+    path = make_path(rng, 6, bins)
+    movies = [make_layer(rng, make_path(rng, 6, bins)), make_layer(rng, path), make_layer(rng, path)[:1]]
+    brain = [make_movie(rng, lagged(path, lag), str(index)).rdms for index in range(animals)]
+    return movies, brain, LaggedRDMs.join(movies, brain, largest=2, comparison=comparison)
+
+
+def test_a_lag_compares_the_animals_bin_with_an_earlier_bin_of_the_model():
+    movies, brain, joined = _joined(np.random.default_rng(0))
+    (r,) = joined.compared()
+    assert r.shape == (3, 5, 6, 3)
+    for lag, place in ((-1, 1), (0, 2), (2, 4)):
+        expected = compare(movies[1][3 - lag], brain[2][3], method="whitened-cosine")
+        np.testing.assert_allclose(r[1, place, 3, 2], expected)
+    # The model has no time before its first bin, nor after its last.
+    assert np.isnan(r[1, 4, :2]).all()
+    assert np.isnan(r[1, 1, 5:]).all()
+    # A layer without time is compared at lag zero, with every bin.
+    assert np.isfinite(r[2, 2]).all()
+    assert np.isnan(np.delete(r[2], 2, axis=0)).all()
+
+
+def test_the_first_order_is_the_given_one_and_left_out_stimuli_leave_their_pairs():
+    _, _, joined = _joined(np.random.default_rng(1), comparison="pearson")
+    first = next(joined.permuted(20, 0))[0]
+    np.testing.assert_allclose(first, joined.compared()[0], equal_nan=True)
+    rows, cols = np.triu_indices(6, 1)
+    kept = (rows != 4) & (cols != 4)
+    expected = compare(joined.layers[3, kept], joined.animals[0, kept])
+    np.testing.assert_allclose(
+        np.ravel(joined.without_stimulus(4)[0, 0, 2, 3, 0]),
+        compare(joined.layers[3, kept], joined.animals.reshape(6, 3, -1)[3, 0, kept]),
+    )
+    assert np.isfinite(expected)
+
+
+def test_bins_without_an_rdm_are_left_out():
+    movies, brain, _ = _joined(np.random.default_rng(2))
+    brain[1] = brain[1].copy()
+    brain[1][3] = np.nan
+    (r,) = LaggedRDMs.join(movies, brain, largest=2, comparison="whitened-cosine").compared()
+    assert np.isnan(r[:, :, 3, 1]).all()
+    assert np.isfinite(r[1, 2, 3, 0])
+    assert np.isfinite(votes(r[None])[0, 1, 2, 1])
+
+
+def test_layer_and_lag_of_an_animal_are_chosen_on_the_others():
+    rng = np.random.default_rng(3)
+    r = rng.uniform(-0.1, 0.1, size=(1, 2, 3, 4, 3))
+    r[0, 1, 2, :, :2] = 0.9
+    r[0, 0, 0, :, 2] = 0.99
+    course, chosen = held_out_course(r)
+    # The third animal's own favourite is not what it is scored with.
+    assert chosen[0, 2] == 5
+    np.testing.assert_allclose(course[0, :, 2], r[0, 1, 2, :, 2])
+
+
+def test_bins_that_never_match_do_not_move_the_peak():
+    # True lag 1; the first three bins match nothing, and larger lags lose them.
+    bins, lags = 12, np.arange(-3, 4)
+    at = np.arange(bins) - lags[:, None]
+    height = np.exp(-0.5 * (lags - 1.0) ** 2)[:, None] * (np.arange(bins) >= 3)
+    excess = np.where((at >= 0) & (at < bins), height, np.nan)[None, :, :, None]
+    np.testing.assert_allclose(best_lag(excess) - 3, [1.0])
+    before, here, after = votes(excess[None])[0, 0, 3:6, 0]
+    assert 0.5 * (before - after) / (before - 2 * here + after) > 0.06
+
+
+def test_a_peak_at_an_end_or_without_a_neighbour_has_no_place():
+    heights = np.array([[3.0, 2.0, 1.0, 0.0], [np.nan, 2.0, 1.0, 0.0], [0.0, 1.0, 1.0, 0.0], [np.nan] * 4])
+    found = best_lag(np.repeat(heights[:, :, None, None], 5, axis=2))
+    np.testing.assert_allclose(found, [np.nan, np.nan, 1.5, np.nan])
