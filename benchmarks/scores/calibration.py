@@ -32,8 +32,7 @@ from brainbench.core.runs.jobs import run_jobs
 from brainbench.metrics import compare, get_metric, noise_ceiling, rdm
 from brainbench.metrics.inference.multiple import step_down
 from brainbench.metrics.inference.permutation import label_orders
-from brainbench.metrics.rdms.comparison import compare_all, features
-from brainbench.metrics.rdms.pairs import permuted_pairs
+from brainbench.metrics.rdms.comparison import compare_all, features, permuted_pairs
 from brainbench.metrics.reliability.subject_rdm import SubjectRDM, subject_rdm
 from brainbench.scoring.power.dimensions import signal_dimensions
 from brainbench.scoring.power.experiments import ExperimentDesign, power, simulate_experiments

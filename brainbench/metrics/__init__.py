@@ -12,9 +12,8 @@ from brainbench.metrics.inference.multiple import compare_models
 from brainbench.metrics.inference.permutation import permutation_test
 from brainbench.metrics.measures.metric import Metric, get_metric, list_metrics, register_metric
 from brainbench.metrics.measures.patterns import PatternMetric
-from brainbench.metrics.rdms.comparison import compare
+from brainbench.metrics.rdms.comparison import RDM, compare
 from brainbench.metrics.rdms.dissimilarity import noise_precision, rdm
-from brainbench.metrics.rdms.pairs import RDM
 from brainbench.metrics.reliability.noise_correction import noise_ceiling, noise_corrected
 
 __all__ = [

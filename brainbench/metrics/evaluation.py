@@ -41,7 +41,7 @@ from brainbench.metrics.inference.permutation import (
     most_exact,
     smallest_p,
 )
-from brainbench.metrics.rdms.pairs import Floats, Ints
+from brainbench.metrics.rdms.comparison import Floats, Ints
 from brainbench.metrics.reliability.noise_correction import RELIABILITY_GATE, Corrected, noise_ceiling
 from brainbench.metrics.reliability.subject_rdm import SubjectRDM, is_flat
 

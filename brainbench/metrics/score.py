@@ -43,7 +43,7 @@ from brainbench.metrics.inference.permutation import (
     layer_p,
     smallest_p,
 )
-from brainbench.metrics.rdms.pairs import Floats
+from brainbench.metrics.rdms.comparison import Floats
 from brainbench.metrics.reliability.noise_correction import RELIABILITY_GATE, Corrected
 from brainbench.metrics.reliability.subject_rdm import SubjectRDM
 

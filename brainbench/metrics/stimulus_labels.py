@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.errors import DataError, UsageError, listing
 from brainbench.metrics.arrays import Array, is_tensor, library, place, slices
-from brainbench.metrics.rdms.pairs import Floats, Ints
+from brainbench.metrics.rdms.comparison import Floats, Ints
 
 _SLICE_ELEMENTS = 1 << 20
 

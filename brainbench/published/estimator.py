@@ -42,9 +42,15 @@ from brainbench.core.records import LayerScore, Score, Status, SubjectScore
 from brainbench.metrics.evaluation import gather, held_out, recorded_rdm
 from brainbench.metrics.inference.permutation import EXACT_STIMULI, canonical_order, label_orders, make_test
 from brainbench.metrics.measures.rsa import RSA
-from brainbench.metrics.rdms.comparison import compare, permuted_comparisons
+from brainbench.metrics.rdms.comparison import (
+    Floats,
+    compare,
+    permuted_comparisons,
+    permuted_pairs,
+    rdm_stack,
+    stimulus_count,
+)
 from brainbench.metrics.rdms.dissimilarity import correlation_distances, rdm
-from brainbench.metrics.rdms.pairs import Floats, permuted_pairs, rdm_stack, stimulus_count
 from brainbench.metrics.reliability.noise_correction import (
     ANIMAL_GATE,
     RELIABILITY_GATE,

@@ -34,8 +34,8 @@ def demo_recordings(name: str = "demo", *, progress: Progress | None = None) -> 
     ``truth.json`` beside the files says what their neurons encode.
     """
     from brainbench.datasets.synthetic import PopulationDesign
+    from brainbench.datasets.synthetic.populations import ensure_recordings
     from brainbench.datasets.synthetic.rodgers_demo import ensure_rodgers_demo
-    from brainbench.datasets.synthetic.truth import ensure_recordings
     from brainbench.models.registry import locate_model
     from brainbench.stimuli import load_stimuli
 
@@ -49,7 +49,7 @@ def demo_recordings(name: str = "demo", *, progress: Progress | None = None) -> 
 
     def make(folder: Path) -> None:
         from brainbench.datasets.synthetic import ResponseGeometry, write_files
-        from brainbench.datasets.synthetic.truth import squared_euclidean_rdm
+        from brainbench.datasets.synthetic.populations import squared_euclidean_rdm
 
         write_files(
             folder,
@@ -88,7 +88,7 @@ def demo_identity(folder: Path, attributes: Mapping[str, Any]) -> str:
     Where stimuli are simulated anew, a processor's last digits are in the rates, and so may be in some spikes.
     ``attributes`` are those of the opened recordings.
     """
-    from brainbench.datasets.synthetic.truth import TRUTH
+    from brainbench.datasets.synthetic.populations import TRUTH
 
     read = [attributes.get(name) for name in ("conditions", "window", "bin", "selection")]
     return content_hash(read_json(folder / TRUTH)["config_hash"], *read)

@@ -18,9 +18,8 @@ from brainbench.core.contracts import Trials
 from brainbench.core.limits import Count, Limit, limited
 from brainbench.metrics.inference.permutation import label_orders
 from brainbench.metrics.measures.rsa import RSA
-from brainbench.metrics.rdms.comparison import compare
+from brainbench.metrics.rdms.comparison import Floats, compare, permuted_pairs
 from brainbench.metrics.rdms.dissimilarity import rdm
-from brainbench.metrics.rdms.pairs import Floats, permuted_pairs
 from brainbench.tradeoffs.study import Row, Study
 
 SPLITS = (10, 30, 100, 300, 1000, 3000)

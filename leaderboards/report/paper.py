@@ -20,12 +20,11 @@ from brainbench.core.files import content_hash, write_together
 from brainbench.core.records import ResultRecord
 from brainbench.core.version import __version__
 from leaderboards import text as words
-from leaderboards.boards import Board, conclusions, rank
+from leaderboards.boards import Board, conclusions, means_over, rank, table_of
 from leaderboards.entries import Entry
 from leaderboards.figures.charts import Figure, board_figures
 from leaderboards.figures.record import diagram, layers
 from leaderboards.figures.svg import STYLE, standalone
-from leaderboards.means import means_over, table_of
 from leaderboards.site.score_page import render, render_markdown
 from leaderboards.site.table import board_label
 from leaderboards.store import StoredRecord

@@ -39,9 +39,8 @@ from brainbench.core.reading.values import typed_values
 from brainbench.core.records import ResultRecord
 from leaderboards import text as words
 from leaderboards.audit import remarks
-from leaderboards.boards import Board, conclusions, rank
+from leaderboards.boards import Board, conclusions, means_over, rank, table_of
 from leaderboards.figures.charts import board_figures
-from leaderboards.means import means_over, table_of
 from leaderboards.site.score_page import model_page, render, script_json
 from leaderboards.site.table import COLUMNS, board_label, page_board, table_csv, table_rows
 from leaderboards.store import MAKE_ONE, SCHEMA_PATH, StoredRecord, record_text

@@ -10,8 +10,7 @@ from brainbench.core.contracts import CHANNELS
 from brainbench.datasets.ledger import Ledger
 from brainbench.datasets.sessions import Session, make_session
 from brainbench.datasets.synthetic import PopulationDesign
-from brainbench.datasets.synthetic.populations import draw_sessions
-from brainbench.datasets.synthetic.truth import spike_session, trial_times
+from brainbench.datasets.synthetic.populations import draw_sessions, spike_session, trial_times
 from brainbench.datasets.trials.counting import UNIT_COLUMNS, ReadingOptions, SessionCounts, missing_column
 from brainbench.datasets.trials.selection import EVERYTHING, Conditions, Window
 from brainbench.datasets.trials.session_trials import join_sessions

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from brainbench.core.contracts import Trials
 from brainbench.datasets.synthetic import PopulationDesign, ResponseGeometry
-from brainbench.datasets.synthetic.populations import draw_sessions
-from brainbench.datasets.synthetic.truth import correlation_rdm
+from brainbench.datasets.synthetic.populations import correlation_rdm, draw_sessions
 
 
 @dataclass(frozen=True)

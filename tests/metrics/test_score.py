@@ -18,8 +18,7 @@ from brainbench.core.statistics import t_interval, two_factor_error, two_factor_
 from brainbench.metrics import compare, noise_ceiling, noise_corrected, rdm
 from brainbench.metrics.measures.metric import get_metric
 from brainbench.metrics.measures.rsa import RSA, score_rdms
-from brainbench.metrics.rdms.comparison import compare_all
-from brainbench.metrics.rdms.pairs import permuted_pairs
+from brainbench.metrics.rdms.comparison import compare_all, permuted_pairs
 from brainbench.metrics.reliability.noise_correction import spearman_brown
 from brainbench.metrics.reliability.subject_rdm import subject_rdm
 from brainbench.metrics.score import held_to_scale, interval_reasons

@@ -11,7 +11,7 @@ from scipy.spatial.distance import pdist
 
 from brainbench.core.errors import DataError, UsageError
 from brainbench.metrics import rdm
-from brainbench.metrics.rdms.pairs import permuted_pairs, square
+from brainbench.metrics.rdms.comparison import permuted_pairs, square
 
 
 def _make_trials(seed=0, stimuli=6, units=23, repeats=10, offset=5.0):

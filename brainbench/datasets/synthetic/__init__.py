@@ -1,8 +1,8 @@
 """Synthetic recordings whose truth is known, as arrays, sessions of spike times, or files.
 
-A ``geometry`` (from a network's features) and a ``design`` give ``populations``: expected rates, trials and
-counts. ``truth`` relates a design to its noise ceiling, places spikes, and writes files with what the neurons encode
-beside them, once per machine. ``rodgers_demo`` puts the same neurons into the task and file layout of Rodgers 2022.
+A ``geometry`` (from a network's features) and a ``design`` give ``populations``: expected rates, trials and counts. They
+relate a design to its noise ceiling, place spikes, and write files with the truth beside them, once per machine.
+``rodgers_demo`` puts the same neurons into the task and file layout of Rodgers 2022.
 """
 
 from __future__ import annotations
@@ -12,9 +12,16 @@ from typing import TYPE_CHECKING
 from brainbench.core.lazy import lazy_exports
 
 if TYPE_CHECKING:
-    from brainbench.datasets.synthetic.populations import PopulationDesign, ResponseGeometry, draw_animals
+    from brainbench.datasets.synthetic.populations import (
+        PopulationDesign,
+        ResponseGeometry,
+        calibrate,
+        draw_animals,
+        measure_ceiling,
+        read_truth,
+        write_files,
+    )
     from brainbench.datasets.synthetic.rodgers_demo import ensure_rodgers_demo, make_rodgers_demo
-    from brainbench.datasets.synthetic.truth import calibrate, measure_ceiling, read_truth, write_files
 
 __all__ = [
     "PopulationDesign",

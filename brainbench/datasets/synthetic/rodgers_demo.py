@@ -25,11 +25,14 @@ from brainbench.core.reading.ranges import check_number
 from brainbench.datasets.layouts import published
 from brainbench.datasets.layouts.published import TRACKED
 from brainbench.datasets.sessions import Series, Session, make_session
-from brainbench.datasets.synthetic.populations import PopulationDesign, ResponseGeometry, draw_counts, expected_rates
-from brainbench.datasets.synthetic.truth import (
+from brainbench.datasets.synthetic.populations import (
     REST,
+    PopulationDesign,
+    ResponseGeometry,
     correlation_rdm,
+    draw_counts,
     ensure_recordings,
+    expected_rates,
     spike_trains,
     write_synthetic_nwb,
     write_with_truth,

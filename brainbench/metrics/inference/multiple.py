@@ -24,8 +24,7 @@ from brainbench.core.records import Score
 from brainbench.core.statistics import PairTest, compare_scores
 from brainbench.metrics.inference.permutation import tail_p
 from brainbench.metrics.measures.rsa import RSA, check_layers
-from brainbench.metrics.rdms.comparison import check_comparison
-from brainbench.metrics.rdms.pairs import Floats
+from brainbench.metrics.rdms.comparison import Floats, check_comparison
 from brainbench.metrics.reliability.subject_rdm import SubjectRDM
 from brainbench.metrics.score import score_layers
 

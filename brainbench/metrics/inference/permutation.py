@@ -19,8 +19,16 @@ from brainbench.core.errors import UsageError
 from brainbench.core.reading.ranges import check_number
 from brainbench.core.records import Status
 from brainbench.metrics.arrays import find_device
-from brainbench.metrics.rdms.comparison import check_comparison, permuted_comparisons
-from brainbench.metrics.rdms.pairs import Floats, Ints, permuted_pairs, rdm_stack, square, stimulus_count
+from brainbench.metrics.rdms.comparison import (
+    Floats,
+    Ints,
+    check_comparison,
+    permuted_comparisons,
+    permuted_pairs,
+    rdm_stack,
+    square,
+    stimulus_count,
+)
 
 EXACT_STIMULI = 8  # up to this many stimuli all orders are taken (8! = 40,320)
 

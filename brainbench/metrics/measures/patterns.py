@@ -23,8 +23,8 @@ from brainbench.metrics.hooks import Layers
 from brainbench.metrics.inference.permutation import SMALLEST_STIMULI, canonical_order, label_orders, tail_p
 from brainbench.metrics.measures.metric import Metric
 from brainbench.metrics.measures.rsa import lacking, parted
+from brainbench.metrics.rdms.comparison import Floats, Ints, permuted_pairs, rdm_stack, stimulus_count, upper
 from brainbench.metrics.rdms.dissimilarity import rdm
-from brainbench.metrics.rdms.pairs import Floats, Ints, permuted_pairs, rdm_stack, stimulus_count, upper
 from brainbench.metrics.reliability.noise_correction import Corrected, gated
 from brainbench.metrics.reliability.subject_rdm import SubjectRDM
 from brainbench.metrics.stimulus_labels import stimulus_codes, stimulus_means

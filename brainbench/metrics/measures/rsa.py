@@ -29,14 +29,19 @@ from brainbench.metrics.measures.metric import Metric
 from brainbench.metrics.rdms.comparison import (
     LINEAR,
     WITHOUT,
+    Floats,
+    Ints,
     check_comparison,
     permuted_comparisons,
+    permuted_pairs,
     products_without,
+    rdm_stack,
+    square,
     squares,
+    stimulus_count,
 )
 from brainbench.metrics.rdms.comparison import compare as compare_rdms
 from brainbench.metrics.rdms.dissimilarity import NOISE_METHODS, RDM_METHODS, rdm
-from brainbench.metrics.rdms.pairs import Floats, Ints, permuted_pairs, rdm_stack, square, stimulus_count
 from brainbench.metrics.reliability.noise_correction import (
     ESTIMATORS,
     Corrected,

@@ -29,7 +29,7 @@ from brainbench.metrics.arrays import (
     slices,
     solve_lower,
 )
-from brainbench.metrics.rdms.pairs import Floats, Ints, upper
+from brainbench.metrics.rdms.comparison import Floats, Ints, upper
 from brainbench.metrics.stimulus_labels import labelled_trials, response_matrix, stimulus_means, tensor_means
 
 _DUAL_RIDGE = 1e-3

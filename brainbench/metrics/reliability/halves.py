@@ -19,7 +19,7 @@ import numpy as np
 from brainbench.core.contracts import Trials
 from brainbench.core.errors import UsageError
 from brainbench.metrics.arrays import finite_mean
-from brainbench.metrics.rdms.comparison import features
+from brainbench.metrics.rdms.comparison import Floats, Ints, features, upper
 from brainbench.metrics.rdms.dissimilarity import (
     correlation_distances,
     correlation_from_gram,
@@ -27,7 +27,6 @@ from brainbench.metrics.rdms.dissimilarity import (
     product_distances,
     products_from_gram,
 )
-from brainbench.metrics.rdms.pairs import Floats, Ints, upper
 from brainbench.metrics.reliability.noise_correction import spearman_brown
 from brainbench.metrics.reliability.sessions import Hashes, SortedTrials, draws, trial_hashes
 from brainbench.metrics.stimulus_labels import labelled_trials

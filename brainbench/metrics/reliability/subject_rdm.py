@@ -27,9 +27,19 @@ from brainbench.core.errors import DataError, UsageError, check_name
 from brainbench.core.reading.ranges import check_number
 from brainbench.core.records import Interval
 from brainbench.metrics.arrays import finite_mean
-from brainbench.metrics.rdms.comparison import LINEAR, WITHOUT, check_comparison, compare, products, products_without
+from brainbench.metrics.rdms.comparison import (
+    LINEAR,
+    WITHOUT,
+    Floats,
+    Ints,
+    check_comparison,
+    compare,
+    permuted_pairs,
+    products,
+    products_without,
+    stimulus_count,
+)
 from brainbench.metrics.rdms.dissimilarity import NOISE_METHODS, RDM_METHODS
-from brainbench.metrics.rdms.pairs import Floats, Ints, permuted_pairs, stimulus_count
 from brainbench.metrics.reliability.halves import SplitRDMs, half_rdms, time_members
 from brainbench.metrics.reliability.noise_correction import RELIABILITY_GATE, spearman_brown
 from brainbench.metrics.reliability.sessions import SortedTrials, shifted_sessions, usable_sessions, whitened_sessions

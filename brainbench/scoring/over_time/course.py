@@ -33,9 +33,17 @@ from brainbench.metrics.arrays import finite_mean
 from brainbench.metrics.evaluation import choose_on_others, most_chosen
 from brainbench.metrics.inference.permutation import canonical_order, label_orders, tail_p
 from brainbench.metrics.measures.rsa import RSA
-from brainbench.metrics.rdms.comparison import check_comparison, compare_all, permuted_comparisons
+from brainbench.metrics.rdms.comparison import (
+    Floats,
+    Ints,
+    check_comparison,
+    compare_all,
+    permuted_comparisons,
+    permuted_pairs,
+    rdm_stack,
+    stimulus_count,
+)
 from brainbench.metrics.rdms.dissimilarity import rdm
-from brainbench.metrics.rdms.pairs import Floats, Ints, permuted_pairs, rdm_stack, stimulus_count
 from brainbench.metrics.reliability.noise_correction import RELIABILITY_GATE
 from brainbench.metrics.reliability.subject_rdm import is_flat, subject_rdm
 from brainbench.scoring.scores import ScoreInputs

@@ -30,8 +30,7 @@ from brainbench.core.statistics import wilson_interval
 from brainbench.metrics.evaluation import held_out
 from brainbench.metrics.inference.permutation import SMALLEST_STIMULI, label_orders, smallest_p, tail_p
 from brainbench.metrics.measures.rsa import RSA
-from brainbench.metrics.rdms.comparison import features
-from brainbench.metrics.rdms.pairs import Floats, Ints, upper
+from brainbench.metrics.rdms.comparison import Floats, Ints, features, upper
 
 SIMULATIONS = 1000
 STIMULUS_COUNTS = (4, 5, 6, 7, 8, 10, 12, 16, 20, 24, 32)

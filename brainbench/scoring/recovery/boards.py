@@ -1,4 +1,7 @@
-"""One board of a recovery: animals drawn from a candidate network, and the score of every candidate against them.
+"""Boards of a recovery: animals drawn from a candidate network, and the score of every candidate against them.
+
+Boards run on this machine or a cluster, and go on where an earlier run stopped. :func:`find_cheapest` repeats that with
+growing designs until the true candidate comes first often enough.
 
 Scores are those of the engine, :func:`brainbench.metrics.score.score_layers`, with few orders of the stimuli: the
 value, chance and what is attainable need no p. Letters: A animal, C candidate, F feature, K stimulus.
@@ -8,31 +11,185 @@ from __future__ import annotations
 
 import copy
 import math
+import os
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from functools import cached_property
-from itertools import combinations
+from functools import cached_property, partial
+from itertools import combinations, product
+from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.errors import UsageError, brief, repeats, unknown_name
-from brainbench.core.files import content_hash
+from brainbench.core.figures import INK, PALE, check_format, new_figure, save_figure
+from brainbench.core.files import content_hash, read_json, to_plain, write_json
 from brainbench.core.limits import Count, Limit, Seed, limited
 from brainbench.core.progress import Progress, track
 from brainbench.core.reading.ranges import check_number
-from brainbench.core.records import Score
-from brainbench.core.statistics import compare_scores
+from brainbench.core.reading.regular import readable
+from brainbench.core.records import Interval, Score
+from brainbench.core.runs.folder import begin_run
+from brainbench.core.runs.jobs import run_jobs
+from brainbench.core.statistics import FEWEST_ANIMALS, FEWEST_STIMULI, compare_scores, wilson_interval
 from brainbench.datasets.synthetic.populations import PopulationDesign, ResponseGeometry, principal_axes
 from brainbench.metrics.inference.multiple import adjust
 from brainbench.metrics.measures.metric import Metric, get_metric
-from brainbench.metrics.rdms.pairs import Ints
+from brainbench.metrics.rdms.comparison import Floats, Ints
 from brainbench.metrics.score import score_layers
 from brainbench.scoring.options import ScoreOptions
 
-FEWEST_STIMULI = 4  # fewest stimuli whose RDMs can be compared after one is left out
+WANTED = 0.8  # share of boards that the true candidate is to win
+
+
+@dataclass(frozen=True)
+class Recovery:
+    """Boards of every candidate, counted."""
+
+    names: tuple[str, ...]
+    """[C] candidates."""
+    design: RecoveryDesign
+    stimuli: int
+    """Stimuli of one board."""
+    boards: tuple[RecoveryBoard, ...]
+
+    @cached_property
+    def firsts(self) -> Ints:
+        """[C, C] boards in which the animals were drawn from one candidate (row) and another came first (column)."""
+        count = np.zeros((len(self.names),) * 2, dtype=np.int64)
+        for board in self.boards:
+            if board.first is not None:
+                count[board.true, board.first] += 1
+        return count
+
+    @cached_property
+    def counts(self) -> Ints:
+        """[C] boards of each candidate."""
+        return np.bincount([board.true for board in self.boards], minlength=len(self.names))
+
+    @cached_property
+    def won(self) -> Floats:
+        """[C, C] share of the boards of a candidate (row) in which it is told apart above another (column)."""
+        return self._share(1)
+
+    @cached_property
+    def lost(self) -> Floats:
+        """[C, C] share of the boards of a candidate (row) in which another (column) is told apart above it."""
+        return self._share(-1)
+
+    def _share(self, sign: int) -> Floats:
+        count = np.zeros((len(self.names),) * 2)
+        for board in self.boards:
+            count[board.true] += np.array(board.verdicts) == sign
+        return count / np.maximum(self.counts[:, None], 1)
+
+    def wins(self, candidate: int | None = None) -> Interval:
+        """Return Wilson's interval of the share of boards in which the true candidate comes first."""
+        firsts = np.diag(self.firsts)
+        if candidate is None:
+            return wilson_interval(int(firsts.sum()), int(self.counts.sum()), over="boards")
+        return wilson_interval(int(firsts[candidate]), int(self.counts[candidate]), over="boards")
+
+    @property
+    def win_rate(self) -> float:
+        """Share of all boards in which the true candidate comes first."""
+        return float(np.diag(self.firsts).sum() / len(self.boards))
+
+    @property
+    def outcomes(self) -> dict[str, float]:
+        """Shares of pairs (true candidate, another): win, tie and loss by the test of a board."""
+        rivals = ~np.eye(len(self.names), dtype=bool)
+        win, loss = float(self.won[rivals].mean()), float(self.lost[rivals].mean())
+        return {"win": win, "tie": 1 - win - loss, "loss": loss}
+
+    @property
+    def reliability(self) -> float:
+        """Mean split-half reliability of the animals."""
+        values = [board.reliability for board in self.boards if np.isfinite(board.reliability)]
+        return float(np.mean(values)) if values else float("nan")
+
+    def answer(self, wanted: float = WANTED) -> str:
+        """Say in one sentence whether the design can tell the candidates apart.
+
+        Yes or no where the interval of the win rate lies above or below ``wanted``. Yes also needs that as many$
+        of the pairs with the true network are told apart: a tied pair may stand in another order for other stimuli.
+        """
+        interval = self.wins()
+        said = f"the true network comes first in {self.win_rate:.0%} of {len(self.boards)} boards"
+        said += f" [{interval.low:.0%}, {interval.high:.0%}]; by chance it would in {1 / len(self.names):.0%}"
+        tie = self.outcomes["tie"]
+        if interval.low >= wanted and self.outcomes["win"] < wanted:
+            return f"Not beyond these stimuli: {said}, but {tie:.0%} of the pairs with it tie."
+        if interval.low >= wanted:
+            return f"Yes, this design finds the true network: {said}."
+        if interval.high < wanted:
+            return f"No, not in the {wanted:.0%} of boards that are wanted: {said}."
+        return f"Undecided beside the {wanted:.0%} that are wanted, more boards would tell: {said}."
+
+    def hardest(self, count: int = 3) -> list[tuple[str, str, float]]:
+        """Return the pairs (true, mistaken for, share of the true one's boards) that are confused most often."""
+        share = self.firsts / np.maximum(self.counts[:, None], 1)
+        np.fill_diagonal(share, 0)
+        order = np.argsort(-share, axis=None, kind="stable")[:count]
+        pairs = [np.unravel_index(place, share.shape) for place in order.tolist()]
+        return [(self.names[i], self.names[j], float(share[i, j])) for i, j in pairs if share[i, j] > 0]
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Remarks for a reader, beside the numbers."""
+        notes = []
+        if self.design.population.animals < FEWEST_ANIMALS or self.stimuli < FEWEST_STIMULI:
+            notes.append(f"All pairs tie: tests need {FEWEST_ANIMALS} animals and {FEWEST_STIMULI} stimuli.")
+        undefined = sum(board.first is None for board in self.boards)
+        if undefined:
+            notes.append(f"{undefined} boards have no score: their animals cannot be compared.")
+        return tuple(notes)
+
+
+FORMATS = (".png", ".svg", ".pdf")
+
+
+def plot_confusion(recovery: Recovery, path: str | os.PathLike[str]) -> Path:
+    """Draw, for every true candidate (row), the share of its boards in which each candidate (column) came first.
+
+    The suffix of the path is the format.
+    """
+    target = Path(path)
+    check_format(target, FORMATS)
+    count = len(recovery.names)
+    share = recovery.firsts / np.maximum(recovery.counts[:, None], 1)
+    size = 260 + 42 * count
+    figure = new_figure(size + 160, size)
+    figure.set_layout_engine("constrained")
+    axes = figure.subplots()
+    image = axes.imshow(share, cmap="BuGn", vmin=0, vmax=1)
+    figure.colorbar(image, ax=axes, label="share of the boards in which it came first", shrink=0.6)
+    for row, column in np.argwhere(share > 0).tolist():
+        value = share[row, column]
+        ink = "white" if value > 0.6 else INK
+        axes.text(column, row, f"{value:.0%}", ha="center", va="center", fontsize=7, color=ink)
+    axes.set_xticks(range(count), recovery.names, rotation=90, fontsize=8, color=INK)
+    axes.set_yticks(range(count), recovery.names, fontsize=8, color=INK)
+    axes.set_xlabel("network that came first", color=PALE)
+    axes.set_ylabel("network that made the data", color=PALE)
+    interval = recovery.wins()
+    population = recovery.design.population
+    axes.set_title(
+        f"true network first in {recovery.win_rate:.0%} of {len(recovery.boards)} boards "
+        f"[{interval.low:.0%}, {interval.high:.0%}]\n{recovery.stimuli} stimuli, {population.animals} animals of "
+        f"{population.units} units",
+        fontsize=9,
+        color=INK,
+    )
+    axes.tick_params(length=0)
+    for side in axes.spines.values():
+        side.set_visible(False)
+    return save_figure(figure, target, dpi=150)
+
+
+SMALLEST_RDM = 4  # fewest stimuli whose RDMs can be compared after one is left out
 
 
 @dataclass(frozen=True)
@@ -42,7 +199,7 @@ class RecoveryDesign:
 
     population: PopulationDesign = field(default_factory=PopulationDesign)
     """Animals, units, trials and noise."""
-    stimuli: Annotated[int, Limit(least=FEWEST_STIMULI)] | None = None
+    stimuli: Annotated[int, Limit(least=SMALLEST_RDM)] | None = None
     """Stimuli of one board, drawn anew for each from those that the candidates saw; all of them by default."""
     metric: str = "rsa"
     """Metric of the scores."""
@@ -270,3 +427,170 @@ def told_apart(scores: Sequence[Score]) -> Ints:
             result[first, second] = 1 if test.difference > 0 else -1
             result[second, first] = -result[first, second]
     return result
+
+
+BOARDS = 10
+_TOGETHER = 5  # boards that one job makes and one file keeps
+
+
+@dataclass(frozen=True)
+class _Job:
+    """Some boards of one true candidate."""
+
+    true: int
+    numbers: tuple[int, ...]
+
+    @property
+    def file(self) -> str:
+        """Name of the file of its boards in the folder of a study."""
+        return f"boards-{self.true:03d}-{self.numbers[0]:05d}.json"
+
+
+def recover(
+    candidates: Sequence[Candidate],
+    design: RecoveryDesign | None = None,
+    *,
+    boards: int = BOARDS,
+    first: int = 0,
+    folder: Path | None = None,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    progress: Progress | None = None,
+) -> Recovery:
+    """Draw boards from every candidate and count how often the true one wins.
+
+    Neither ``workers`` nor the scheduler changes a number. With a folder, a run that was killed goes on when it is
+    started again. ``first`` is the number of the first board: boards of other numbers have other animals. A folder
+    keeps finished boards; ``scheduler`` is the address of a Dask scheduler, whose workers make the boards instead of
+    processes here.
+    """
+    design = design or RecoveryDesign()
+    check_candidates(candidates, design, boards)
+    check_number("The number of the first board", first, least=0, whole=True)
+    jobs = [
+        _Job(true, tuple(range(start, min(start + _TOGETHER, first + boards))))
+        for start in range(first, first + boards, _TOGETHER)
+        for true in range(len(candidates))
+    ]
+    results: dict[_Job, list[RecoveryBoard]] = {}
+    if folder is not None:
+        folder.mkdir(parents=True, exist_ok=True)
+        config = {"candidates": [item.identity for item in candidates], "design": design}
+        begin_run(folder, config, "recovery", results="boards-*.json")
+        for job in jobs:
+            if (folder / job.file).is_file():
+                with readable(folder / job.file, "part of a recovery", "Delete it to make it again."):
+                    stored = [RecoveryBoard.of(item) for item in read_json(folder / job.file)]
+                if [item.number for item in stored] == list(job.numbers):
+                    results[job] = stored
+    missing = [job for job in jobs if job not in results]
+    total = done = sum(len(job.numbers) for job in jobs)
+    done -= sum(len(job.numbers) for job in missing)
+    work = partial(_make_boards, tuple(candidates), design)
+    for place, finished in run_jobs(work, missing, workers=workers, scheduler=scheduler):
+        job = missing[place]
+        results[job] = finished
+        done += len(finished)
+        if folder is not None:
+            write_json(folder / job.file, to_plain([board.stored for board in finished]))
+        if progress is not None:
+            progress(done, total, "scoring boards")
+    every = sorted((board for job in jobs for board in results[job]), key=lambda board: (board.true, board.number))
+    count = design.stimuli or len(candidates[0].stimuli)
+    return Recovery(tuple(item.name for item in candidates), design, count, tuple(every))
+
+
+def _make_boards(candidates: tuple[Candidate, ...], design: RecoveryDesign, job: _Job) -> list[RecoveryBoard]:
+    return [make_board(candidates, design, job.true, number) for number in job.numbers]
+
+
+def check_candidates(candidates: Sequence[Candidate], design: RecoveryDesign, boards: int) -> None:
+    """Raise UsageError for what cannot be run, before any work."""
+    check_number("number of candidates, which a recovery tells apart,", len(candidates), least=2)
+    check_number("The number of boards", boards, least=1, whole=True)
+    pool = len(candidates[0].stimuli)
+    if any(item.stimuli != candidates[0].stimuli for item in candidates):
+        raise UsageError("The candidates saw different stimuli; run all of them on the same ones in the same order.")
+    if design.stimuli is not None and design.stimuli > pool:
+        raise UsageError(f"A board of {design.stimuli} stimuli was asked for; the pool has {pool}.")
+    if get_metric(design.metric).of_model_alone:
+        raise UsageError(
+            f"The metric {design.metric!r} scores a model without looking at the animals, so it cannot tell who made "
+            "their data; choose another, such as 'rsa'."
+        )
+    if design.layer not in ("any", "last"):
+        for candidate in candidates:
+            candidate.choose(design.layer, np.random.default_rng(0))
+
+
+ANIMALS = (2, 4, 6, 10, 16)
+UNITS = (20, 60, 120)
+TRIALS = (5, 10, 20)
+STIMULI = (6, 10, 20, 40, 80)
+"""Numbers that are tried, as far as the pool allows."""
+
+
+@dataclass(frozen=True)
+class TriedDesign:
+    """One design of the search."""
+
+    animals: int
+    units: int
+    trials: int
+    """Trials of each stimulus."""
+    stimuli: int
+    win_rate: float
+    """Share of boards in which the true candidate came first."""
+    interval: Interval
+    """Wilson's interval of ``win_rate``."""
+
+
+def _cost(numbers: tuple[int, int, int, int]) -> tuple[int, int, int]:
+    """Return what a design costs: trials of all animals together, then units, then animals."""
+    animals, units, trials, stimuli = numbers
+    return animals * trials * stimuli, units, animals
+
+
+def find_cheapest(
+    candidates: Sequence[Candidate],
+    design: RecoveryDesign,
+    wanted: float,
+    *,
+    boards: int = 5,
+    progress: Progress | None = None,
+    **where: Any,
+) -> tuple[TriedDesign | None, tuple[TriedDesign, ...]]:
+    """Try designs from the cheapest on, and return the first that reaches a win rate, with all that were tried.
+
+    Cost is the number of trials of all animals, then the number of units. A design with no more of anything than one
+    that failed clearly (interval below ``wanted``) is not tried. The one returned reaches the rate on boards of other
+    numbers too. The design's numbers of animals, units, trials and stimuli are replaced; ``where`` are ``workers`` and
+    ``scheduler`` of :func:`recover`.
+    """
+    check_number("The wanted rate", wanted, above=0, below=1)
+    pool = len(candidates[0].stimuli)
+    sizes = [size for size in STIMULI if size < pool] + [pool]
+    grid = sorted(product(ANIMALS, UNITS, TRIALS, sizes), key=_cost)
+    tried: list[TriedDesign] = []
+    failed: list[tuple[int, ...]] = []
+
+    def measured(animals: int, units: int, trials: int, stimuli: int, **counted: int) -> TriedDesign:
+        population = replace(design.population, animals=animals, units=units, trials=trials)
+        changed = replace(design, population=population, stimuli=stimuli)
+        result = recover(candidates, changed, **counted, **where)
+        return TriedDesign(animals, units, trials, stimuli, result.win_rate, result.wins())
+
+    for numbers in track(grid, "trying designs", progress):
+        if any(all(mine <= other for mine, other in zip(numbers, one, strict=True)) for one in failed):
+            continue
+        attempt = measured(*numbers, boards=boards, first=0)
+        tried.append(attempt)
+        if attempt.interval.high < wanted:
+            failed.append(numbers)
+        elif attempt.win_rate >= wanted:
+            # The first to reach a rate by luck would be returned too often: it must do so again.
+            again = measured(*numbers, boards=2 * boards, first=boards)
+            tried[-1] = again
+            if again.win_rate >= wanted:
+                return again, tuple(tried)
+    return None, tuple(tried)

@@ -29,7 +29,7 @@ from brainbench.metrics.measures.metric import get_metric
 from brainbench.metrics.measures.patterns import LinearCKA
 from brainbench.scoring.model_responses import ResolvedModel, resolve_model, takes_si
 from brainbench.scoring.options import ScoreOptions
-from brainbench.scoring.recovery.boards import FEWEST_STIMULI, Candidate, RecoveryDesign
+from brainbench.scoring.recovery.boards import SMALLEST_RDM, Candidate, RecoveryDesign
 from brainbench.scoring.recovery.selection import Margins
 from brainbench.stimuli import Scene, load_stimuli, simulate
 from brainbench.stimuli.engines import get_engine
@@ -96,7 +96,7 @@ def design_for_networks(
     """
     search = _search()
     options, study = options or search.DesignOptions(), replace(study or RecoveryDesign(), stimuli=None)
-    check_number("number of scenes, half of which are held out,", len(scenes), least=2 * FEWEST_STIMULI)
+    check_number("number of scenes, half of which are held out,", len(scenes), least=2 * SMALLEST_RDM)
     if len(networks) != 2:
         raise UsageError(f"A design tells two networks apart; received {len(networks)}.")
     begin, limits = search.read_limits(scenes, variables, {})

@@ -19,10 +19,8 @@ from brainbench.core.progress import Progress
 from brainbench.core.reading.ranges import check_number
 from brainbench.metrics.evaluation import held_out
 from brainbench.metrics.measures.metric import Metric, get_metric
-from brainbench.metrics.rdms.comparison import compare_all
-from brainbench.metrics.rdms.pairs import Floats, Ints, permuted_pairs
-from brainbench.scoring.recovery.boards import FEWEST_STIMULI, Candidate, RecoveryDesign, draw_board
-from brainbench.scoring.recovery.study import check_candidates
+from brainbench.metrics.rdms.comparison import Floats, Ints, compare_all, permuted_pairs
+from brainbench.scoring.recovery.boards import SMALLEST_RDM, Candidate, RecoveryDesign, check_candidates, draw_board
 
 BOARDS = 4  # boards of each candidate on which stimuli are chosen
 FIRST_BOARD = 1_000_000  # number of the first of them, far from those on which rates are measured
@@ -57,7 +55,7 @@ def select_stimuli(
     design = replace(design or RecoveryDesign(), stimuli=None)
     check_candidates(candidates, design, boards)
     pool = len(candidates[0].stimuli)
-    check_number(f"Stimuli to keep of the {pool} of the pool", keep, least=FEWEST_STIMULI, most=pool, whole=True)
+    check_number(f"Stimuli to keep of the {pool} of the pool", keep, least=SMALLEST_RDM, most=pool, whole=True)
     check_number("The number of exchanges", exchanges, least=0, whole=True)
     metric = get_metric(design.metric)
     if not metric.of_rdms:

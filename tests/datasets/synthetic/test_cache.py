@@ -7,7 +7,7 @@ from brainbench.core.files import file_hash
 from brainbench.core.reading import hdf5
 from brainbench.datasets import open_recordings
 from brainbench.datasets.synthetic import PopulationDesign, ResponseGeometry, write_files
-from brainbench.datasets.synthetic.truth import TRUTH, ensure_recordings
+from brainbench.datasets.synthetic.populations import TRUTH, ensure_recordings
 
 GEOMETRY = ResponseGeometry.from_features([[1.0, 2, 0], [2, 0, 1], [0, 1, 3]], ["a", "b", "c"])
 

@@ -11,7 +11,7 @@ from scipy import stats
 from brainbench.core.errors import UsageError
 from brainbench.metrics import compare, permutation_test
 from brainbench.metrics.inference.permutation import label_orders, layer_p, make_test, tail_p
-from brainbench.metrics.rdms.pairs import permuted_pairs, square
+from brainbench.metrics.rdms.comparison import permuted_pairs, square
 from tests.factories.animals import make_rdm
 
 

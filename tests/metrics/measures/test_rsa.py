@@ -9,8 +9,7 @@ from brainbench.core.errors import UsageError
 from brainbench.metrics import rdm
 from brainbench.metrics.measures.metric import Metric
 from brainbench.metrics.measures.rsa import RSA, _products, non_negative, unique_part
-from brainbench.metrics.rdms.comparison import LINEAR
-from brainbench.metrics.rdms.pairs import permuted_pairs
+from brainbench.metrics.rdms.comparison import LINEAR, permuted_pairs
 from brainbench.metrics.reliability.subject_rdm import SubjectRDM
 from tests.factories.candidates import DESIGN, make_candidates
 

@@ -13,8 +13,8 @@ from scipy.spatial.distance import pdist
 
 from brainbench.core.errors import DataError, UsageError
 from brainbench.metrics import noise_precision, rdm
+from brainbench.metrics.rdms.comparison import permuted_pairs, square
 from brainbench.metrics.rdms.dissimilarity import RDM_METHODS
-from brainbench.metrics.rdms.pairs import permuted_pairs, square
 
 METHODS_WITHOUT_FOLDS = [method for method in RDM_METHODS if method != "crossnobis"]
 

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from brainbench.core.contracts import Trials
 from brainbench.core.errors import DataError, UsageError
 from brainbench.metrics import compare, rdm
-from brainbench.metrics.rdms.pairs import permuted_pairs
+from brainbench.metrics.rdms.comparison import permuted_pairs
 from brainbench.metrics.reliability.halves import SplitRDMs, members, reliable_units, unit_reliability
 from brainbench.metrics.reliability.noise_correction import spearman_brown
 from brainbench.metrics.reliability.sessions import draws, key_hashes

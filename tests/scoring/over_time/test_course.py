@@ -136,7 +136,7 @@ def test_the_order_of_stimuli_does_not_matter():
     layers, animals = _study(np.random.default_rng(6), stimuli=9)
     from dataclasses import replace
 
-    from brainbench.metrics.rdms.pairs import permuted_pairs
+    from brainbench.metrics.rdms.comparison import permuted_pairs
 
     pairs = permuted_pairs(np.random.default_rng(0).permutation(9)[None])[0]
     moved = [replace(item, rdms=item.rdms[:, pairs]) for item in animals]

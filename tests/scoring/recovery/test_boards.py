@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -9,7 +10,15 @@ from brainbench.core.errors import UsageError
 from brainbench.metrics import get_metric, rdm
 from brainbench.models.features import write_features
 from brainbench.scoring.options import ScoreOptions
-from brainbench.scoring.recovery import Candidate, open_candidates
+from brainbench.scoring.recovery import (
+    Candidate,
+    Recovery,
+    boards,
+    find_cheapest,
+    open_candidates,
+    plot_confusion,
+    recover,
+)
 from brainbench.scoring.recovery.boards import RecoveryBoard, draw_board, make_board, score_board
 from tests.factories.candidates import DESIGN, make_candidates
 
@@ -113,3 +122,157 @@ def test_some_of_the_stimuli_are_drawn_anew_for_each_board():
     assert score_board(candidates, *draw_board(candidates, design, 0, 0)[1:], design)[0].stimuli == tuple(
         f"s{row}" for row in shown[0]
     )
+
+
+def test_processes_change_nothing():
+    candidates = make_candidates(8)
+    here = recover(candidates, DESIGN, boards=2, workers=1)
+    assert recover(candidates, DESIGN, boards=2, workers=2) == here
+    assert [(one.true, one.number) for one in here.boards] == [(t, n) for t in range(3) for n in range(2)]
+
+
+def test_a_cluster_changes_nothing():
+    distributed = pytest.importorskip("distributed")
+    candidates = make_candidates(8)
+    with distributed.LocalCluster(
+        n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None, protocol="tcp", host="127.0.0.1"
+    ) as running:
+        found = recover(candidates, DESIGN, boards=1, scheduler=running.scheduler_address)
+    assert found == recover(candidates, DESIGN, boards=1, workers=1)
+
+
+def test_an_interrupted_recovery_goes_on(tmp_path, monkeypatch):
+    candidates = make_candidates(8)
+    whole = recover(candidates, DESIGN, boards=1, workers=1, folder=tmp_path)
+    (tmp_path / "boards-001-00000.json").unlink()
+    made = []
+
+    def counted(*arguments):
+        made.append(arguments[2:])
+        return original(*arguments)
+
+    original = boards.make_board
+    monkeypatch.setattr(boards, "make_board", counted)
+    told = []
+    again = recover(
+        candidates, DESIGN, boards=1, workers=1, folder=tmp_path, progress=lambda *state: told.append(state)
+    )
+    assert again == whole
+    assert made == [(1, 0)]
+    assert told == [(3, 3, "scoring boards")]
+
+
+def test_a_folder_of_another_recovery_is_refused(tmp_path):
+    candidates = make_candidates(8)
+    recover(candidates, DESIGN, boards=1, workers=1, folder=tmp_path)
+    with pytest.raises(UsageError, match=r"another recovery: design\.seed 0 \(now 1\)"):
+        recover(candidates, replace(DESIGN, seed=1), boards=1, workers=1, folder=tmp_path)
+    for made in tmp_path.glob("boards-*"):
+        made.unlink()
+    recover(candidates, replace(DESIGN, seed=1), boards=1, workers=1, folder=tmp_path)
+    (tmp_path / "config.json").unlink()
+    with pytest.raises(UsageError, match=r"holds no recovery \(it has 'boards-"):
+        recover(candidates, DESIGN, boards=1, workers=1, folder=tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("candidates", "changes", "boards", "culprit"),
+    [
+        (make_candidates(names=("a",)), {}, 1, "at least 2"),
+        (make_candidates(8), {"stimuli": 9}, 1, "9 stimuli .* the pool has 8"),
+        (make_candidates(8), {"metric": "rsaa"}, 1, "'rsa'"),
+        (make_candidates(8), {"layer": "layr1"}, 1, "'layer1'"),
+        (make_candidates(8), {"metric": "decoding"}, 1, "'decoding'"),
+        (make_candidates(8), {}, 0, "received 0"),
+        (make_candidates(8), {"splits": 1.5}, 1, "splits .* received 1.5"),
+        (make_candidates(8), {"seed": -1}, 1, "seed .* received -1"),
+        ((*make_candidates(8), *make_candidates(9, names=("d",))), {}, 1, "different stimuli"),
+    ],
+)
+def test_what_cannot_be_run_is_refused_before_it_starts(candidates, changes, boards, culprit):
+    with pytest.raises(UsageError, match=culprit):
+        recover(candidates, replace(DESIGN, **changes), boards=boards, workers=1)
+
+
+@pytest.fixture
+def small(monkeypatch):
+    """A grid of four designs."""
+    for name, values in (("ANIMALS", (4,)), ("UNITS", (40,)), ("TRIALS", (2, 8)), ("STIMULI", (6, 12))):
+        monkeypatch.setattr(boards, name, values)
+
+
+def test_the_cheapest_design_that_suffices_is_named(small):
+    candidates = make_candidates(14)
+    best, tried = find_cheapest(candidates, DESIGN, 0.7, boards=3, workers=1)
+    assert best is not None
+    assert best.win_rate >= 0.7
+    assert best == tried[-1]
+    costs = [one.animals * one.trials * one.stimuli for one in tried]
+    assert max(costs) == costs[-1]
+
+
+def test_none_is_named_where_none_suffices(small):
+    # Twins cannot be told apart, whatever is measured.
+    (one,) = make_candidates(14, names=("a",))
+    (twin,) = make_candidates(14, names=("b",))
+    best, tried = find_cheapest((one, twin), DESIGN, 0.9, boards=4, workers=1)
+    assert best is None
+    assert tried
+
+
+def test_a_rate_lies_between_0_and_1():
+    with pytest.raises(UsageError, match="received 1"):
+        find_cheapest(make_candidates(), DESIGN, 1.0)
+
+
+def _board(true, number, scaled, told=(0, 0)):
+    return RecoveryBoard(true, number, "layer1", scaled, told, 0.5)
+
+
+def test_boards_are_counted_by_who_made_them_and_who_came_first():
+    boards = (
+        _board(0, 0, (0.9, 0.2), (0, 1)),
+        _board(0, 1, (0.4, 0.6)),
+        _board(1, 0, (0.1, 0.8), (-1, 0)),
+        _board(1, 1, (0.1, 0.8), (1, 0)),
+    )
+    found = Recovery(("a", "b"), DESIGN, 12, boards)
+    assert found.firsts.tolist() == [[1, 1], [0, 2]]
+    assert found.win_rate == 0.75
+    assert found.outcomes == {"win": 0.5, "tie": 0.25, "loss": 0.25}
+    assert found.hardest() == [("a", "b", 0.5)]
+    assert found.wins(1).high == 1.0
+    assert found.wins().low < 0.75 < found.wins().high
+
+
+@pytest.mark.parametrize(("won", "word"), [(20, "Yes"), (2, "No"), (17, "Undecided")])
+def test_the_answer_follows_the_interval(won, word):
+    wins, losses = (((0.9, 0.1), (0, 1)), ((0.1, 0.9), (1, 0))), (((0.1, 0.9), (0, 0)), ((0.9, 0.1), (0, 0)))
+    boards = (_board(number % 2, number, *(wins if number < won else losses)[number % 2]) for number in range(20))
+    assert Recovery(("a", "b"), DESIGN, 12, tuple(boards)).answer(0.8).startswith(word)
+
+
+def test_ties_count_against_a_yes():
+    boards = tuple(_board(true, number, (0.9, 0.8)[:: 1 - 2 * true]) for true in (0, 1) for number in range(20))
+    answer = Recovery(("a", "b"), DESIGN, 12, boards).answer(0.8)
+    assert answer.startswith("Not beyond these stimuli: the true network comes first in 100%")
+    assert "100% of the pairs with it tie" in answer
+
+
+def test_boards_without_a_score_or_with_equal_ones_have_no_winner():
+    boards = (_board(0, 0, (math.nan, math.nan)), _board(1, 0, (0.5, 0.5)))
+    found = Recovery(("a", "b"), DESIGN, 8, boards)
+    assert not np.any(found.firsts)
+    assert len(found.notes) == 2
+
+
+def test_equal_recoveries_have_equal_pictures(tmp_path):
+    pytest.importorskip("matplotlib")
+    boards = (RecoveryBoard(0, 0, "x", (0.9, 0.2), (0, 1), 0.5), RecoveryBoard(1, 0, "x", (0.9, 0.2), (0, 0), 0.5))
+    found = Recovery(("a", "b"), DESIGN, 12, boards)
+    pictures = [plot_confusion(found, tmp_path / name).read_bytes() for name in ("a.png", "b.png")]
+    assert pictures[0] == pictures[1]
+    other = Recovery(("a", "b"), DESIGN, 12, boards[:1])
+    assert plot_confusion(other, tmp_path / "c.png").read_bytes() != pictures[0]
+    with pytest.raises(UsageError, match=r"\.png"):
+        plot_confusion(found, tmp_path / "a.gif")
