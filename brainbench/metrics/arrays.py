@@ -11,11 +11,14 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brainbench.core.devices import torch_device
 from brainbench.core.errors import UsageError
 
 Array = Any  # a numpy array or a torch tensor
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
 
 
 def is_tensor(values: Any) -> bool:

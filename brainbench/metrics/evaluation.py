@@ -30,18 +30,9 @@ import numpy as np
 from brainbench.core.errors import UsageError, check_name, repeats
 from brainbench.core.records import Ceiling, Interval
 from brainbench.core.statistics import t_interval
-from brainbench.metrics.arrays import finite_mean
+from brainbench.metrics.arrays import Floats, Ints, finite_mean
 from brainbench.metrics.hooks import MetricHooks
-from brainbench.metrics.inference.permutation import (
-    SMALLEST_STIMULI,
-    PermutationTest,
-    canonical_order,
-    label_orders,
-    make_test,
-    most_exact,
-    smallest_p,
-)
-from brainbench.metrics.rdms.comparison import Floats, Ints
+from brainbench.metrics.inference import permutation
 from brainbench.metrics.reliability.noise_correction import RELIABILITY_GATE, Corrected, noise_ceiling
 from brainbench.metrics.reliability.subject_rdm import SubjectRDM, is_flat
 
@@ -71,7 +62,7 @@ class Animals:
     @cached_property
     def order(self) -> Ints:
         """An order of the stimuli [K] that depends on the scored animals alone, not on how stimuli were listed."""
-        return canonical_order(self.rdms(self.scored))
+        return permutation.canonical_order(self.rdms(self.scored))
 
     @cached_property
     def sorted(self) -> tuple[SubjectRDM, ...]:
@@ -354,7 +345,7 @@ class LayerEvaluation:
     layer_r: Floats
     without: Floats
     """[K] the score without each stimulus."""
-    test: PermutationTest
+    test: permutation.PermutationTest
     layer_null: Floats
     """[N, L] mean of every layer under the orders of the stimuli; empty without a test."""
     competing: Ints
@@ -458,10 +449,14 @@ class _Votes:
     def null(self, seed: int) -> Callable[[], Iterable[Floats]]:
         """Return what gives the comparisons [N, L, A] under the orders of the stimuli, in chunks, as often as asked."""
         judged, draws = self.permuted, self.permuted.metric.orders
-        count, size, exact = judged.animals[0].count, len(judged.layers) * len(judged.animals), most_exact(draws)
+        count, size, exact = (
+            judged.animals[0].count,
+            len(judged.layers) * len(judged.animals),
+            permutation.most_exact(draws),
+        )
         # Of many stimuli no more than one order is held at a time.
         step = max(1, _CHUNK_ELEMENTS // max(len(judged.layers) * min(count, 64) ** 2, size))
-        orders = partial(label_orders, count, seed, exact=exact, draws=draws, step=step)
+        orders = partial(permutation.label_orders, count, seed, exact=exact, draws=draws, step=step)
         number = math.factorial(count) if count <= exact else draws + 1
         stored = list(judged.under(orders)) if number * size <= _KEPT_ELEMENTS else None
         return lambda: judged.under(orders) if stored is None else stored
@@ -469,13 +464,13 @@ class _Votes:
 
 def _test(
     null: Callable[[], Iterable[Floats]], judged: LayerComparisons, scale: CommonScale, rule: LayerRule, weights: Floats
-) -> tuple[PermutationTest, Floats]:
+) -> tuple[permutation.PermutationTest, Floats]:
     """Test the score by orders of the stimuli, the choice of layer repeated in each; also return layers' means."""
     metric, count = judged.metric, judged.animals[0].count
-    smallest = smallest_p(count, metric.orders)
-    if count < SMALLEST_STIMULI:
-        reason = f"{count} stimuli allow no p below {smallest:.3g}; at least {SMALLEST_STIMULI} are needed"
-        return PermutationTest(math.nan, smallest, True, 0, math.nan, np.empty(0), reason), np.empty((0, 0))
+    smallest = permutation.smallest_p(count, metric.orders)
+    if count < permutation.SMALLEST_STIMULI:
+        reason = f"{count} stimuli allow no p below {smallest:.3g}; at least {permutation.SMALLEST_STIMULI} are needed"
+        return permutation.PermutationTest(math.nan, smallest, True, 0, math.nan, np.empty(0), reason), np.empty((0, 0))
     scores, means = [], []
     for r in map(scale, null()):
         scores.append(rule.held(r) @ weights / len(weights))
@@ -483,7 +478,9 @@ def _test(
     every = np.concatenate(scores)
     # An order under which a comparison has no value says nothing.
     every = np.where(np.isfinite(every), every, -np.inf)
-    return make_test(every, exact=count <= most_exact(metric.orders), smallest=smallest), np.concatenate(means)
+    return permutation.make_test(
+        every, exact=count <= permutation.most_exact(metric.orders), smallest=smallest
+    ), np.concatenate(means)
 
 
 def without_scale(result: LayerEvaluation) -> str:

@@ -15,9 +15,8 @@ from numpy.typing import ArrayLike
 from brainbench.core.contracts import Trials
 from brainbench.core.errors import UsageError
 from brainbench.core.provenance import UniquePart
-from brainbench.metrics.arrays import fetch
+from brainbench.metrics.arrays import Floats, Ints, fetch
 from brainbench.metrics.inference.permutation import SMALLEST_STIMULI, canonical_order
-from brainbench.metrics.rdms.comparison import Floats, Ints
 from brainbench.metrics.reliability.noise_correction import Corrected, gated
 from brainbench.metrics.reliability.subject_rdm import SubjectRDM, simulated_animals, subject_rdm
 from brainbench.metrics.stimulus_labels import response_matrix

@@ -18,32 +18,10 @@ from brainbench.core.errors import UsageError, check_name, check_once
 from brainbench.core.provenance import Provenance, UniquePart
 from brainbench.core.records import LayerScore, Score, Status, SubjectScore
 from brainbench.core.statistics import FEWEST_ANIMALS, FEWEST_STIMULI, t_interval, two_factor_interval
-from brainbench.metrics.arrays import finite_mean
-from brainbench.metrics.evaluation import (
-    Animals,
-    LayerComparisons,
-    LayerEvaluation,
-    ceiling_of,
-    defined_layers,
-    evaluate,
-    first_best,
-    gather,
-    mean_rdm,
-    mean_reliability,
-    most_chosen,
-    recorded_rdm,
-    without_scale,
-)
+from brainbench.metrics import evaluation
+from brainbench.metrics.arrays import Floats, finite_mean
 from brainbench.metrics.hooks import MetricHooks
-from brainbench.metrics.inference.permutation import (
-    SMALLEST_STIMULI,
-    TIE,
-    PermutationTest,
-    label_orders,
-    layer_p,
-    smallest_p,
-)
-from brainbench.metrics.rdms.comparison import Floats
+from brainbench.metrics.inference import permutation
 from brainbench.metrics.reliability.noise_correction import RELIABILITY_GATE, Corrected
 from brainbench.metrics.reliability.subject_rdm import SubjectRDM
 
@@ -85,7 +63,7 @@ def score_layers(
     committed: str | None = None,
     each: bool = False,
     controls: Mapping[str, Floats] | None = None,
-) -> tuple[Score, PermutationTest | None]:
+) -> tuple[Score, permutation.PermutationTest | None]:
     """Score the layers of a model against animals; also return the permutation test with all statistics.
 
     ``layers`` are what :meth:`Metric.layer` made of each layer, in network order, ``subjects`` what
@@ -96,33 +74,33 @@ def score_layers(
     check_once("A score", map(str, stimuli))
     if committed is not None:
         check_name("layer", committed, layers)
-    animals = gather(metric, subjects, len(stimuli), estimator=estimator)
+    animals = evaluation.gather(metric, subjects, len(stimuli), estimator=estimator)
     if each:
         layers = {animals.subjects[i].subject: layers[animals.subjects[i].subject] for i in animals.scored}
     names, result, notes = list(layers), None, ()
-    usable = defined = defined_layers(metric, layers)
+    usable = defined = evaluation.defined_layers(metric, layers)
     if animals.scored and defined and len(stimuli) >= metric.fewest:
         ordered = [metric.take(layers[label], animals.order) for label in defined]
-        compared = LayerComparisons(metric, ordered, animals.sorted, device)
-        result, defined, notes = evaluate(compared, defined, animals, estimator, committed, seed, each=each)
+        compared = evaluation.LayerComparisons(metric, ordered, animals.sorted, device)
+        result, defined, notes = evaluation.evaluate(compared, defined, animals, estimator, committed, seed, each=each)
     lacking = {
         "constant or not finite": [name for name in names if name not in usable],
         "not comparable with every animal": [name for name in usable if name not in defined],
     }
     status, reasons = _verdict(metric, animals, lacking, defined, len(stimuli), estimator, result, committed)
-    reliability, reliability_interval = mean_reliability(animals)
+    reliability, reliability_interval = evaluation.mean_reliability(animals)
     about = {
         "name": name,
         "status": status,
         "reasons": (*reasons[:1], *notes, *reasons[1:]) if result is None else (*notes, *reasons),
         "reliability": reliability,
         "reliability_interval": reliability_interval,
-        "p_smallest": smallest_p(len(stimuli), metric.orders),
-        "ceiling": ceiling_of(animals, metric.comparison) if metric.of_rdms else None,
+        "p_smallest": permutation.smallest_p(len(stimuli), metric.orders),
+        "ceiling": evaluation.ceiling_of(animals, metric.comparison) if metric.of_rdms else None,
         "estimator": estimator,
         "metric": metric.describe(animals.subjects),
         "stimuli": tuple(map(str, stimuli)),
-        "brain_rdm": mean_rdm(animals) if metric.of_rdms else (),
+        "brain_rdm": evaluation.mean_rdm(animals) if metric.of_rdms else (),
     }
     beyond = controls if estimator == "default" else None
     splits = max(len(subject.split_half_r) for subject in animals.subjects)
@@ -135,10 +113,10 @@ def score_layers(
             stated["statistics"] = {"unique": part.stated}
         return Score(value=math.nan, layers=empty, subjects=parts, provenance=Provenance.of(stated), **about), None
     means = result.layer_values.mean(axis=1)
-    best = int(result.competing[first_best(means[result.competing, None]).item()])
-    chosen = most_chosen(result.chosen)
+    best = int(result.competing[evaluation.first_best(means[result.competing, None]).item()])
+    chosen = evaluation.most_chosen(result.chosen)
     layer, scored = layers[defined[chosen]], [animals.subjects[i] for i in animals.scored]
-    hopeless = without_scale(result)
+    hopeless = evaluation.without_scale(result)
     attainable = math.nan if hopeless else result.attainable
     if hopeless:
         earlier = about["reasons"]
@@ -151,7 +129,9 @@ def score_layers(
         **metric.statistics(metric.take(layer, animals.order), animals.sorted, seed),
     }
     if result.layer_null.size:
-        tests = zip(defined, *(p.tolist() for p in layer_p(result.layer_null, result.competing)), strict=True)
+        tests = zip(
+            defined, *(p.tolist() for p in permutation.layer_p(result.layer_null, result.competing)), strict=True
+        )
         statistics["layer_tests"] = [{"layer": name, "p": p, "p_corrected": corrected} for name, p, corrected in tests]
     if beyond:
         how = {"attainable": attainable, "committed": committed, "seed": seed}
@@ -172,7 +152,7 @@ def score_layers(
         best_layer_value=float(means[best]),
         layers=tuple(_layer_score(label, rows.get(label), result, status) for label in names),
         subjects=_subjects(metric, layers, animals, result, defined),
-        model_rdm=recorded_rdm(layer) if metric.of_rdms else (),
+        model_rdm=evaluation.recorded_rdm(layer) if metric.of_rdms else (),
         chance=float(finite_mean(result.test.null)),
         attainable=attainable,
         without_stimulus=tuple(result.without[np.argsort(animals.order)].tolist()),
@@ -184,12 +164,12 @@ def score_layers(
 
 def _verdict(
     metric: MetricHooks,
-    animals: Animals,
+    animals: evaluation.Animals,
     lacking: Mapping[str, Sequence[str]],
     defined: Sequence[str],
     stimuli: int,
     estimator: str,
-    result: LayerEvaluation | None,
+    result: evaluation.LayerEvaluation | None,
     committed: str | None,
 ) -> tuple[Status, tuple[str, ...]]:
     """Return the status of the score and its reasons, the gravest first; ``lacking`` are layers without a value."""
@@ -216,11 +196,11 @@ def _verdict(
     without_value = {why: ", ".join(found) for why, found in lacking.items() if found}
     reasons += [f"layers without a value ({why}), never chosen: {names}" for why, names in without_value.items()]
     reasons += [*metric.reasons, *interval_reasons(len(animals.scored), stimuli)]
-    unreliable = not animals.reliable or stimuli < SMALLEST_STIMULI
+    unreliable = not animals.reliable or stimuli < permutation.SMALLEST_STIMULI
     return "unreliable" if unreliable else "ok", tuple(reasons)
 
 
-def _layer_score(label: str, row: int | None, result: LayerEvaluation, status: Status) -> LayerScore:
+def _layer_score(label: str, row: int | None, result: evaluation.LayerEvaluation, status: Status) -> LayerScore:
     if row is None:
         return LayerScore(label, math.nan, math.nan, "undefined")
     values, r = result.layer_values[row], result.layer_r[row]
@@ -229,17 +209,21 @@ def _layer_score(label: str, row: int | None, result: LayerEvaluation, status: S
 
 
 def _subjects(
-    metric: MetricHooks, layers: Mapping[str, Any], animals: Animals, result: LayerEvaluation, names: Sequence[str]
+    metric: MetricHooks,
+    layers: Mapping[str, Any],
+    animals: evaluation.Animals,
+    result: evaluation.LayerEvaluation,
+    names: Sequence[str],
 ) -> tuple[SubjectScore, ...]:
     """Return every animal's part; one that did not vote meets the layer that the others chose."""
-    overall = names[most_chosen(result.chosen)]
+    overall = names[evaluation.most_chosen(result.chosen)]
     parts = []
     for index, subject in enumerate(animals.subjects):
         if index in animals.scored:
             row = animals.scored.index(index)
             part = float(result.values[row]), float(result.r[row]), names[int(result.chosen[row])]
         elif index in animals.usable:
-            r = LayerComparisons(metric, [layers[overall]], [subject]).given()
+            r = evaluation.LayerComparisons(metric, [layers[overall]], [subject]).given()
             value = float(result.scale(r, [names.index(overall)])[0, 0]) * animals.corrections[index].value
             part = value, float(r[0, 0]), overall
         else:
@@ -248,7 +232,7 @@ def _subjects(
     return tuple(parts)
 
 
-def _subject(animals: Animals, index: int, value: float, r: float, layer: str | None) -> SubjectScore:
+def _subject(animals: evaluation.Animals, index: int, value: float, r: float, layer: str | None) -> SubjectScore:
     subject, correction = animals.subjects[index], animals.corrections[index]
     status = "undefined" if math.isnan(value) else correction.status
     return SubjectScore(subject.subject, value, r, correction.reliability, status, subject.units, subject.trials, layer)
@@ -292,14 +276,16 @@ def score_agreement(
     if not subjects:
         raise UsageError("There are no animals to compare; give at least two SubjectRDM.")
     count = len(stimuli)
-    animals = gather(metric, subjects, count, estimator=estimator)
+    animals = evaluation.gather(metric, subjects, count, estimator=estimator)
     compared = animals.scored if count >= metric.fewest and len(animals.scored) > 1 else ()
     others = {i: [animals.subjects[j] for j in compared if j != i] for i in compared}
     factors = {i: metric.agreement(animals.subjects[i], others[i], estimator) for i in compared}
     pairs = []
     for i in compared:
         animal, partner = animals.subjects[i], metric.partner(animals.subjects[i], others[i])
-        pairs.append(LayerComparisons(metric, [metric.take(partner, animals.order)], [animal.take(animals.order)]))
+        pairs.append(
+            evaluation.LayerComparisons(metric, [metric.take(partner, animals.order)], [animal.take(animals.order)])
+        )
     raw = {i: float(pair.given()[0, 0]) for i, pair in zip(compared, pairs, strict=True)}
     values = {i: raw[i] * factors[i].value for i in compared}
     valid = [i for i in compared if math.isfinite(values[i])]
@@ -308,14 +294,14 @@ def score_agreement(
     if valid and len(valid) == len(compared):
         weights = np.array([factors[i].value for i in valid])
         without = np.stack([pair.without_each()[:, 0, 0] for pair in pairs], axis=1) @ weights / len(weights)
-        if count >= SMALLEST_STIMULI:
+        if count >= permutation.SMALLEST_STIMULI:
             null = _agreement_null(metric, animals, weights, seed)
             # The others' stimuli are permuted together, as those of a model are.
-            orders = list(label_orders(count, seed, exact=0, draws=metric.orders_between))[1:]
+            orders = list(permutation.label_orders(count, seed, exact=0, draws=metric.orders_between))[1:]
             chance = float(np.mean([np.mean(next(pair.under(lambda: orders))) for pair in pairs] * weights))
     smallest = smallest_p_of_animals(count, max(2, len(compared)), metric.orders_between)
     status, reasons = _agreement_verdict(metric, animals, factors, valid, count, smallest)
-    reliability, reliability_interval = mean_reliability(animals)
+    reliability, reliability_interval = evaluation.mean_reliability(animals)
     value = float(parts.mean()) if valid else math.nan
     scored = [animals.subjects[i] for i in valid]
     attainable = float(np.mean(metric.attainable(scored, seed) * animals.factors(valid))) if valid else math.nan
@@ -330,10 +316,10 @@ def score_agreement(
         reliability=reliability,
         reliability_interval=reliability_interval,
         interval=span and replace(span, method=f"{span.method}; approximate, since animals meet one another"),
-        p=float((null >= null[0] - TIE).mean()) if null.size else math.nan,
+        p=float((null >= null[0] - permutation.TIE).mean()) if null.size else math.nan,
         p_method=f"one-sided, every animal's labels permuted {metric.orders_between:,} times, (b+1)/(n+1)",
         p_smallest=smallest,
-        ceiling=ceiling_of(animals, metric.comparison) if metric.of_rdms else None,
+        ceiling=evaluation.ceiling_of(animals, metric.comparison) if metric.of_rdms else None,
         layer_rule="no layers: each animal against the others together",
         subjects=tuple(
             SubjectScore(
@@ -350,7 +336,7 @@ def score_agreement(
         estimator=estimator,
         metric=f"{metric.describe(animals.subjects)}; each animal against the others",
         stimuli=tuple(map(str, stimuli)),
-        brain_rdm=mean_rdm(animals) if metric.of_rdms else (),
+        brain_rdm=evaluation.mean_rdm(animals) if metric.of_rdms else (),
         chance=chance,
         attainable=attainable,
         without_stimulus=tuple(without[np.argsort(animals.order)].tolist()) if without.size else (),
@@ -359,7 +345,7 @@ def score_agreement(
     return held_to_scale(score)
 
 
-def _agreement_null(metric: MetricHooks, animals: Animals, factors: Floats, seed: int) -> Floats:
+def _agreement_null(metric: MetricHooks, animals: evaluation.Animals, factors: Floats, seed: int) -> Floats:
     """Return the mean agreement [N] under orders of every animal's stimuli, the given ones first."""
     # Each animal has its own order: one order for all would leave their agreement as it is.
     orders = np.tile(animals.order, (metric.orders_between + 1, len(animals.scored), 1))
@@ -369,7 +355,12 @@ def _agreement_null(metric: MetricHooks, animals: Animals, factors: Floats, seed
 
 
 def _agreement_verdict(
-    metric: MetricHooks, animals: Animals, factors: dict[int, Corrected], valid: list[int], count: int, smallest: float
+    metric: MetricHooks,
+    animals: evaluation.Animals,
+    factors: dict[int, Corrected],
+    valid: list[int],
+    count: int,
+    smallest: float,
 ) -> tuple[Status, tuple[str, ...]]:
     """Return the status of the agreement and its reasons, the gravest first."""
     reasons = tuple(f"{animals.subjects[i].subject}: {factors[i].reason}" for i in factors if factors[i].reason)
@@ -379,15 +370,20 @@ def _agreement_verdict(
         elif not factors:
             reasons = ("fewer than two animals can be used",)
         return "undefined", reasons + animals.reasons
-    if count < SMALLEST_STIMULI:
-        reasons = (f"{count} stimuli allow no p below {smallest:.3g}; at least {SMALLEST_STIMULI} are needed", *reasons)
+    if count < permutation.SMALLEST_STIMULI:
+        reasons = (
+            f"{count} stimuli allow no p below {smallest:.3g}; at least {permutation.SMALLEST_STIMULI} are needed",
+            *reasons,
+        )
     elif len(valid) < len(factors):
         reasons = ("no p: the agreement of some animals is undefined", *reasons)
     if len(valid) == 2:
         reasons += ("two animals make one comparison: no confidence interval",)
     else:
         reasons += interval_reasons(len(valid), count)
-    trusted = animals.reliable and count >= SMALLEST_STIMULI and all(factors[i].status == "ok" for i in factors)
+    trusted = (
+        animals.reliable and count >= permutation.SMALLEST_STIMULI and all(factors[i].status == "ok" for i in factors)
+    )
     return "ok" if trusted else "unreliable", reasons + animals.reasons + metric.reasons
 
 

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.errors import DataError, UsageError, listing
-from brainbench.metrics.arrays import Array, is_tensor, library, place, slices
-from brainbench.metrics.rdms.comparison import Floats, Ints
+from brainbench.metrics.arrays import Array, Floats, Ints, is_tensor, library, place, slices
 
 _SLICE_ELEMENTS = 1 << 20
 

@@ -102,10 +102,10 @@ def _check(what: str, refused: Mapping[str, Any], out: Path, becomes: str, fits:
 
 
 def _data_set(source: Path, out: Path) -> dict[str, Any]:
-    from brainbench.published.conversion import SweepTable, convert_sweeps, open_sweep_tree
+    from brainbench.published import conversion
 
-    tree = open_sweep_tree(source)
-    table = SweepTable(
+    tree = conversion.open_sweep_tree(source)
+    table = conversion.SweepTable(
         label=tree.listed.label,
         object=tree.listed.shape,
         split=tree.split,
@@ -118,7 +118,7 @@ def _data_set(source: Path, out: Path) -> dict[str, Any]:
         notes={"left_out": tree.left_out, "faults": tree.faults},
     )
     with progress_bar() as progress:
-        manifest = convert_sweeps(table, out, progress=progress)
+        manifest = conversion.convert_sweeps(table, out, progress=progress)
     about = ("sweeps", "splits", "left_out", "faults", "unstable", "content_hash", "config_hash")
     summary = {"rate_hz": tree.rate, "classes": len(tree.classes), **_frames(tree.times)}
     return {"kind": "data set", **summary, **{name: manifest[name] for name in about}}
@@ -129,32 +129,24 @@ def _sweep_set(paths: list[Path]) -> xr.Dataset:
     import numpy as np
 
     from brainbench.core.contracts import GRID_SHAPE
-    from brainbench.published.conversion import (
-        CELLS,
-        CONDITIONS,
-        FAULTS,
-        FRAME_TIMES,
-        FRAMES,
-        assemble_stimulus_set,
-        read_sweep,
-    )
+    from brainbench.published import conversion
     from brainbench.stimuli import Frames
 
-    sweeps = [read_sweep(path) for path in paths]
+    sweeps = [conversion.read_sweep(path) for path in paths]
     if len(rates := {sweep.rate for sweep in sweeps}) > 1:
         raise DataError(f"The sweeps have {listing(map(str, sorted(rates)))} Hz; convert those of each rate apart.")
-    first, interval = FRAME_TIMES[rates.pop()]
+    first, interval = conversion.FRAME_TIMES[rates.pop()]
     faults = [sweep.faulty() for sweep in sweeps]
-    return assemble_stimulus_set(
+    return conversion.assemble_stimulus_set(
         np.stack([sweep.wrench() for sweep in sweeps]),
-        [f"R{'ABCDE'[cell // GRID_SHAPE[1]]}{cell % GRID_SHAPE[1]}" for cell in CELLS.tolist()],
-        Frames(first=first, interval=interval, count=FRAMES),
+        [f"R{'ABCDE'[cell // GRID_SHAPE[1]]}{cell % GRID_SHAPE[1]}" for cell in conversion.CELLS.tolist()],
+        Frames(first=first, interval=interval, count=conversion.FRAMES),
         [
             {"label": path.stem, "shape": sweep.shape, "class": sweep.label}
-            | dict(zip(CONDITIONS, sweep.conditions, strict=True))
+            | dict(zip(conversion.CONDITIONS, sweep.conditions, strict=True))
             for path, sweep in zip(paths, sweeps, strict=True)
         ],
-        {name: np.stack([found[name] for found in faults]) for name in FAULTS},
+        {name: np.stack([found[name] for found in faults]) for name in conversion.FAULTS},
     )
 
 

@@ -39,17 +39,11 @@ from brainbench.core.progress import Progress
 from brainbench.core.provenance import Provenance
 from brainbench.core.reading.archives import read_npz
 from brainbench.core.records import LayerScore, Score, Status, SubjectScore
+from brainbench.metrics.arrays import Floats
 from brainbench.metrics.evaluation import gather, held_out, recorded_rdm
 from brainbench.metrics.inference.permutation import EXACT_STIMULI, canonical_order, label_orders, make_test
 from brainbench.metrics.measures.rsa import RSA
-from brainbench.metrics.rdms.comparison import (
-    Floats,
-    compare,
-    permuted_comparisons,
-    permuted_pairs,
-    rdm_stack,
-    stimulus_count,
-)
+from brainbench.metrics.rdms.comparison import compare, permuted_comparisons, permuted_pairs, rdm_stack, stimulus_count
 from brainbench.metrics.rdms.dissimilarity import correlation_distances, rdm
 from brainbench.metrics.reliability.noise_correction import (
     ANIMAL_GATE,

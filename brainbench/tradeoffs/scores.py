@@ -16,9 +16,10 @@ import numpy as np
 
 from brainbench.core.contracts import Trials
 from brainbench.core.limits import Count, Limit, limited
+from brainbench.metrics.arrays import Floats
 from brainbench.metrics.inference.permutation import label_orders
 from brainbench.metrics.measures.rsa import RSA
-from brainbench.metrics.rdms.comparison import Floats, compare, permuted_pairs
+from brainbench.metrics.rdms.comparison import compare, permuted_pairs
 from brainbench.metrics.rdms.dissimilarity import rdm
 from brainbench.tradeoffs.study import Row, Study
 

@@ -15,28 +15,9 @@ from brainbench.core.records import Interval
 from brainbench.core.statistics import is_finite
 from leaderboards.boards import Board
 from leaderboards.entries import Entry, twins
+from leaderboards.figures import svg
 from leaderboards.figures.rdms import rdm_lines, rdm_panel
 from leaderboards.figures.record import PARTS
-from leaderboards.figures.svg import (
-    SHOWN,
-    WIDTH,
-    ChartPoint,
-    ChartRow,
-    Drawing,
-    Figure,
-    Scale,
-    colours,
-    cut,
-    cut_name,
-    cut_words,
-    left_axis,
-    legend,
-    legend_words,
-    row_chart,
-    scale_of,
-    score_scale,
-    tick_text,
-)
 from leaderboards.ranking import DOUBTFUL
 from leaderboards.text import number, span
 
@@ -44,7 +25,7 @@ _LEAST_VARIANCE = 1e-100  # products of two smaller ones would be zero in floati
 _SHAPES = {"supervised": "square", "simclr": "cross", "simsiam": "up", "ae": "down", "untrained": "dot"}
 
 
-def accuracy_against_fit(entries: Sequence[Entry], *, supervised: bool = False) -> Figure:
+def accuracy_against_fit(entries: Sequence[Entry], *, supervised: bool = False) -> svg.Figure:
     """Draw the task accuracy against the neural fit, with its regression (figure 3.8 a; b: supervised ones alone)."""
     key, title, kind = "accuracy-fit", "Task accuracy against neural fit (as figure 3.8 a)", ""
     if supervised:
@@ -55,27 +36,27 @@ def accuracy_against_fit(entries: Sequence[Entry], *, supervised: bool = False) 
     points = [(value, e.scaled, e) for e in entries if (value := read(e)) is not None and _trusted(e)]
     if len(points) < 3:
         lacking = f"{len(points)} {kind}records state both a task accuracy and a trusted score; at least 3 are needed"
-        return Figure(key, title, lacking=lacking)
+        return svg.Figure(key, title, lacking=lacking)
     return scatter(key, title, points, label, fit=True)
 
 
-def parameters_against_fit(entries: Sequence[Entry]) -> Figure:
+def parameters_against_fit(entries: Sequence[Entry]) -> svg.Figure:
     """Draw the number of parameters against the neural fit (figure 3.3 b)."""
     key, title = "parameters", "Parameters against neural fit (as figure 3.3 b)"
     points = [(float(e.card.parameters), e.scaled, e) for e in entries if e.card.parameters and _trusted(e)]
     if len(points) < 2:
-        return Figure(key, title, lacking="fewer than 2 records state parameters and have a trusted score")
+        return svg.Figure(key, title, lacking="fewer than 2 records state parameters and have a trusted score")
     return scatter(key, title, points, "parameters", log=True)
 
 
-def parameters_against_accuracy(entries: Sequence[Entry]) -> Figure:
+def parameters_against_accuracy(entries: Sequence[Entry]) -> svg.Figure:
     """Draw the number of parameters against the task accuracy (figure 3.3 c)."""
     key, title = "parameters-accuracy", "Parameters against task accuracy (as figure 3.3 c)"
     label, read = _accuracy_of(entries)
     stated = [(e.card.parameters, read(e), e) for e in entries]
     points = [(float(count), value, e) for count, value, e in stated if count and value is not None]
     if len(points) < 2:
-        return Figure(key, title, lacking="fewer than 2 records state both parameters and a task accuracy")
+        return svg.Figure(key, title, lacking="fewer than 2 records state both parameters and a task accuracy")
     return scatter(key, title, points, "parameters", up_label=label, log=True)
 
 
@@ -112,32 +93,32 @@ def regression(x: Sequence[float], y: Sequence[float]) -> tuple[float, float, fl
 def scatter(
     key: str, title: str, points: Sequence[tuple[float, float, Entry]], label: str, up_label: str = "neural fit",
     *, log: bool = False, fit: bool = False,
-) -> Figure:  # fmt: skip
+) -> svg.Figure:  # fmt: skip
     """Return a scatter plot of entries, with a regression line where one is asked for."""
-    height, left, right, bottom = 400.0, 56.0, WIDTH - 190, 352.0
-    drawing = Drawing(WIDTH, height, f"{title}: {len(points)} models")
+    height, left, right, bottom = 400.0, 56.0, svg.WIDTH - 190, 352.0
+    drawing = svg.Drawing(svg.WIDTH, height, f"{title}: {len(points)} models")
     xs, ys = [x for x, *_ in points], [y for _, y, _ in points]
-    across = Scale(min(xs) / 1.4, max(xs) * 1.4, left, right, log=True) if log else scale_of(xs, left, right)
-    up = scale_of(ys, bottom, 16, floor=None)
-    left_axis(drawing, up, left, right)
+    across = svg.Scale(min(xs) / 1.4, max(xs) * 1.4, left, right, log=True) if log else svg.scale_of(xs, left, right)
+    up = svg.scale_of(ys, bottom, 16, floor=None)
+    svg.left_axis(drawing, up, left, right)
     for tick in across.ticks:
         drawing.line(across.at(tick), 16, across.at(tick), bottom, "grid")
-        drawing.text(across.at(tick), bottom + 18, tick_text(tick), "mid quiet")
+        drawing.text(across.at(tick), bottom + 18, svg.tick_text(tick), "mid quiet")
     drawing.text((left + right) / 2, height - 8, label, "mid")
     drawing.text(left - 44, 12, up_label, "")
     caption = fitted(drawing, across, up, xs, ys) if fit else ""
-    colour = colours(encoder_of(entry) for *_, entry in points)
+    colour = svg.colours(encoder_of(entry) for *_, entry in points)
     for x, y, entry in points:
         kind = colour[encoder_of(entry)]
         shape = _SHAPES.get(entry.card.objective or "", "diamond")
         drawing.mark(across.at(x), up.at(y), shape, kind, f"{entry.name}: {label} {x:g}, {up_label} {number(y)}", 4.5)
     objectives = dict.fromkeys(entry.card.objective or "not stated" for *_, entry in points)
-    legend(drawing, [(name, "dot", kind) for name, kind in colour.items()], WIDTH - 172)
+    svg.legend(drawing, [(name, "dot", kind) for name, kind in colour.items()], svg.WIDTH - 172)
     shapes = [(name, _SHAPES.get(name, "diamond"), "c0") for name in objectives]
-    legend(drawing, shapes, WIDTH - 172, 32.0 + 17 * len(colour))
+    svg.legend(drawing, shapes, svg.WIDTH - 172, 32.0 + 17 * len(colour))
     drawing.height = max(height, 36.0 + 17 * (len(colour) + len(shapes)))
     caption += "Colours are encoders, shapes are objectives; untrained models are means over their seeds."
-    return Figure(key, title, caption, drawing)
+    return svg.Figure(key, title, caption, drawing)
 
 
 def encoder_of(entry: Entry) -> str:
@@ -145,7 +126,7 @@ def encoder_of(entry: Entry) -> str:
     return (entry.card.encoder or "not stated").removesuffix("-ln")
 
 
-def fitted(drawing: Drawing, across: Scale, up: Scale, xs: Sequence[float], ys: Sequence[float]) -> str:
+def fitted(drawing: svg.Drawing, across: svg.Scale, up: svg.Scale, xs: Sequence[float], ys: Sequence[float]) -> str:
     """Draw the least-squares line of three points or more with the 95 % band of its mean; return the caption's part."""
     from scipy.special import stdtrit
 
@@ -178,7 +159,7 @@ _PANEL_NAME = 23
 """Characters of a name above a panel: bold letters of 10.5 pixels take about 6.7 each, the panel leaves 158."""
 
 
-def board_figures(board: Board) -> list[Figure]:
+def board_figures(board: Board) -> list[svg.Figure]:
     """Return all figures of a board, drawn or with what they lack."""
     entries, title = board.entries, "Augmentation ablation (as figure 3.8 c)"
     return [
@@ -196,7 +177,7 @@ def board_figures(board: Board) -> list[Figure]:
     ]
 
 
-def fit_per_model(board: Board) -> Figure:
+def fit_per_model(board: Board) -> svg.Figure:
     """Draw the neural fit of every model beside its untrained twin, with all baselines (figure 3.7 b)."""
     title = "Neural fit of every model"
     drawn = [entry for entry in board.entries if math.isfinite(entry.scaled)]
@@ -204,53 +185,61 @@ def fit_per_model(board: Board) -> Figure:
     partnered = {entry.architecture for entry in drawn if entry.trained}
     drawn = [entry for entry in drawn if entry.trained or entry.architecture not in partnered]
     if not drawn:
-        return Figure("fit", title, lacking="no record has a defined score that states its chance")
-    models, untrained = drawn[:SHOWN], twins(board.entries)
+        return svg.Figure("fit", title, lacking="no record has a defined score that states its chance")
+    models, untrained = drawn[: svg.SHOWN], twins(board.entries)
     base = [item for item in board.baselines if math.isfinite(item.score.scaled)]
-    colour = colours(map(_objective, models))
+    colour = svg.colours(map(_objective, models))
     rows = []
     for entry in models:
         kind = colour[_objective(entry)]
-        seeds = [ChartPoint(value, f"{kind} faint", size=2) for value in entry.sample.seeds]
+        seeds = [svg.ChartPoint(value, f"{kind} faint", size=2) for value in entry.sample.seeds]
         twin = _twin_points(entry, untrained, 3.5) if entry.trained else ()
         hollow = " open" if not entry.above_chance or entry.standing in DOUBTFUL else ""
-        mark = ChartPoint(entry.scaled, kind + hollow, f"{entry.name}: {number(entry.scaled)} {span(entry.interval)}")
+        mark = svg.ChartPoint(
+            entry.scaled, kind + hollow, f"{entry.name}: {number(entry.scaled)} {span(entry.interval)}"
+        )
         points = (*(seeds if entry.seeds > 1 else ()), *twin, mark)
         label_kind = "end" if not entry.unranked_because else "end quiet"
-        rows.append(ChartRow(cut_name(entry.name, 36), points, entry.interval, kind, label_kind))
+        rows.append(svg.ChartRow(svg.cut_name(entry.name, 36), points, entry.interval, kind, label_kind))
     for baseline in base:
         kind, shape = ("c7", "square") if baseline.kind == "animals" else ("c0", "diamond")
-        mark = ChartPoint(baseline.score.scaled, kind, f"{baseline.name}: {number(baseline.score.scaled)}", 4, shape)
-        rows.append(ChartRow(baseline.name, (mark,), baseline.score.scaled_interval, kind, "end quiet"))
+        mark = svg.ChartPoint(
+            baseline.score.scaled, kind, f"{baseline.name}: {number(baseline.score.scaled)}", 4, shape
+        )
+        rows.append(svg.ChartRow(baseline.name, (mark,), baseline.score.scaled_interval, kind, "end quiet"))
     values = [entry.scaled for entry in models] + [item.score.scaled for item in base]
-    scale = score_scale(values, [row.interval for row in rows], 250, WIDTH - 20)
+    scale = svg.score_scale(values, [row.interval for row in rows], 250, svg.WIDTH - 20)
     spans = (item.score.scaled_interval for item in base if item.kind == "animals")
     band = next(filter(is_finite, spans), None)
-    drawing = row_chart(f"{title}: {len(models)} models, best first", rows, scale, "scaled score", band=band)
+    drawing = svg.row_chart(f"{title}: {len(models)} models, best first", rows, scale, "scaled score", band=band)
     caption = "Score with its interval: 0 is chance, 1 all that is reliable. Hollow: not told apart from chance. "
     caption += "The band is the interval of animal-to-animal. " if band else ""
     caption += "Small dots are seeds. " if any(e.seeds > 1 for e in models) else ""
     caption += "Hollow grey points are untrained twins. " if any(e.trained for e in models) else ""
-    return Figure("fit", f"{title} (as figure 3.7 b)", caption + legend_words(colour) + cut_words(len(drawn)), drawing)
+    return svg.Figure(
+        "fit", f"{title} (as figure 3.7 b)", caption + svg.legend_words(colour) + svg.cut_words(len(drawn)), drawing
+    )
 
 
-def layer_fit(entries: Sequence[Entry]) -> Figure:
+def layer_fit(entries: Sequence[Entry]) -> svg.Figure:
     """Draw the neural fit of every layer, a small panel per model, coloured by part of the network (figure 3.4)."""
     key, title = "layers", "Neural fit by layer (as figure 3.4)"
     rows = [entry for entry in entries if any(math.isfinite(layer.value) for layer in entry.score.layers)]
     if not rows:
-        return Figure(key, title, lacking="no record holds scores of layers")
+        return svg.Figure(key, title, lacking="no record holds scores of layers")
     many, rows = len(rows), rows[:24]
-    columns, w, h = _PANELS, WIDTH / _PANELS, 112.0
-    drawing = Drawing(WIDTH, math.ceil(len(rows) / columns) * h + 6, f"Score of every layer of {len(rows)} models")
+    columns, w, h = _PANELS, svg.WIDTH / _PANELS, 112.0
+    drawing = svg.Drawing(
+        svg.WIDTH, math.ceil(len(rows) / columns) * h + 6, f"Score of every layer of {len(rows)} models"
+    )
     values = [layer.value for entry in rows for layer in entry.score.layers]
     for index, entry in enumerate(rows):
         x0, y0 = (index % columns) * w, (index // columns) * h
-        scale = scale_of(values, y0 + h - 14, y0 + 24, top=1.0)
-        drawing.text(x0 + 24, y0 + 14, cut_name(entry.name, _PANEL_NAME), "small title")
+        scale = svg.scale_of(values, y0 + h - 14, y0 + 24, top=1.0)
+        drawing.text(x0 + 24, y0 + 14, svg.cut_name(entry.name, _PANEL_NAME), "small title")
         for tick in (0.0, 0.5, 1.0):
             drawing.line(x0 + 24, scale.at(tick), x0 + w - 8, scale.at(tick), "one" if tick == 1 else "grid")
-            drawing.text(x0 + 20, scale.at(tick) + 3.5, tick_text(tick), "end quiet small")
+            drawing.text(x0 + 20, scale.at(tick) + 3.5, svg.tick_text(tick), "end quiet small")
         layers = entry.score.layers
         step = (w - 36) / len(layers)
         for i, layer in enumerate(layers):
@@ -263,44 +252,46 @@ def layer_fit(entries: Sequence[Entry]) -> Figure:
     caption = (
         "Mean noise-corrected score of each layer, in the network's order: encoder blue, attender orange, decoder "
         "green. A layer without a bar has no defined score. For reading only: picking the best layer here would "
-        f"flatter a model.{cut_words(many, 24)}"
+        f"flatter a model.{svg.cut_words(many, 24)}"
     )
-    return Figure(key, title, caption, drawing)
+    return svg.Figure(key, title, caption, drawing)
 
 
-def accuracy(entries: Sequence[Entry]) -> Figure:
+def accuracy(entries: Sequence[Entry]) -> svg.Figure:
     """Draw the task accuracy beside that of the untrained twin (figure 3.6)."""
     key, title = "accuracy", "Task accuracy (as figure 3.6)"
     stated = sorted((e for e in entries if e.card.top1 is not None), key=lambda e: -(e.card.top1 or 0))
     if not stated:
-        return Figure(key, title, lacking="no record states a task accuracy (top1 of its model card); trained ones do")
+        return svg.Figure(
+            key, title, lacking="no record states a task accuracy (top1 of its model card); trained ones do"
+        )
     # Untrained networks are drawn as twins; a board of such alone still shows them.
     stated = [e for e in stated if e.trained] or stated
-    models, untrained = stated[:SHOWN], twins(entries)
+    models, untrained = stated[: svg.SHOWN], twins(entries)
     twin_accuracies = [_twin_accuracy(entry, untrained) for entry in models]
-    colour = colours(map(_objective, models))
+    colour = svg.colours(map(_objective, models))
     rows = []
     for entry, twin in zip(models, twin_accuracies, strict=True):
         kind, card = colour[_objective(entry)], entry.card
         top1 = card.top1 or 0.0  # only models that state it are drawn
-        points = [ChartPoint(top1, kind, f"{entry.name}: top-1 {number(top1)}")]
+        points = [svg.ChartPoint(top1, kind, f"{entry.name}: top-1 {number(top1)}")]
         if card.top5 is not None:
-            points.insert(0, ChartPoint(card.top5, f"{kind} open", f"top-5 {number(card.top5)}", 3.5, "diamond"))
+            points.insert(0, svg.ChartPoint(card.top5, f"{kind} open", f"top-5 {number(card.top5)}", 3.5, "diamond"))
         if twin is not None:
-            points.insert(0, ChartPoint(twin, "c0 open", f"untrained twin {number(twin)}", 3.5))
-        rows.append(ChartRow(cut_name(entry.name, 36), points, card.accuracy_interval, kind))
+            points.insert(0, svg.ChartPoint(twin, "c0 open", f"untrained twin {number(twin)}", 3.5))
+        rows.append(svg.ChartRow(svg.cut_name(entry.name, 36), points, card.accuracy_interval, kind))
     reach = max(0.05, *(max(e.card.top1 or 0, e.card.top5 or 0, e.card.twin_top1 or 0) for e in models))
-    scale = Scale(0.0, min(1.0, reach * 1.05), 250, WIDTH - 20)
-    drawing = row_chart(f"{title}: {len(models)} models", rows, scale, "accuracy on held-out objects")
+    scale = svg.Scale(0.0, min(1.0, reach * 1.05), 250, svg.WIDTH - 20)
+    drawing = svg.row_chart(f"{title}: {len(models)} models", rows, scale, "accuracy on held-out objects")
     lack = " No record states the accuracy of an untrained twin." if set(twin_accuracies) == {None} else ""
     caption = (
         f"Top-1 accuracy with its Wilson interval, top-5 (diamond) and the untrained twin's top-1 (hollow grey).{lack} "
-        f"{legend_words(colour)}{cut_words(len(stated))}"
+        f"{svg.legend_words(colour)}{svg.cut_words(len(stated))}"
     )
-    return Figure(key, title, caption, drawing)
+    return svg.Figure(key, title, caption, drawing)
 
 
-def _ablation(key: str, title: str, entries: Sequence[Entry], level: _Told, held: _Told, what: str) -> Figure:
+def _ablation(key: str, title: str, entries: Sequence[Entry], level: _Told, held: _Told, what: str) -> svg.Figure:
     """Draw the fit of models trained at several levels of one thing, on the same data, the other (``held``) fixed."""
     groups: dict[tuple[str, ...], dict[str, Entry]] = {}
     for entry in entries:
@@ -309,23 +300,23 @@ def _ablation(key: str, title: str, entries: Sequence[Entry], level: _Told, held
             groups.setdefault(model, {}).setdefault(level(entry), entry)
     groups = {name: levels for name, levels in groups.items() if len(levels) > 1}
     if not groups:
-        return Figure(key, title, lacking=f"no model was trained with more than one {what}")
+        return svg.Figure(key, title, lacking=f"no model was trained with more than one {what}")
     untrained = twins(entries)
-    colour = colours(label for levels in groups.values() for label in sorted(levels))
+    colour = svg.colours(label for levels in groups.values() for label in sorted(levels))
     rows, values = [], []
     for model, levels in groups.items():
-        group = cut(", ".join(part for part in model[:-1] if part), 50)
+        group = svg.cut(", ".join(part for part in model[:-1] if part), 50)
         for label, entry in sorted(levels.items()):
             top1 = f", top-1 {number(entry.card.top1)}" if entry.card.top1 is not None else ""
-            mark = ChartPoint(entry.scaled, colour[label], f"{entry.name}, {label}: {number(entry.scaled)}{top1}")
+            mark = svg.ChartPoint(entry.scaled, colour[label], f"{entry.name}, {label}: {number(entry.scaled)}{top1}")
             points = (*_twin_points(entry, untrained, 3.2), mark)
-            rows.append(ChartRow(cut(label, 22), points, entry.interval, colour[label], group=group))
+            rows.append(svg.ChartRow(svg.cut(label, 22), points, entry.interval, colour[label], group=group))
             values.append(entry.scaled)
             group = ""
-    scale = score_scale(values, [row.interval for row in rows], 400, WIDTH - 20)
-    drawing = row_chart(f"{title}: {len(groups)} models", rows, scale, "scaled score", step=20)
+    scale = svg.score_scale(values, [row.interval for row in rows], 400, svg.WIDTH - 20)
+    drawing = svg.row_chart(f"{title}: {len(groups)} models", rows, scale, "scaled score", step=20)
     caption = f"Scaled score with its interval by {what}; hollow grey points are untrained twins."
-    return Figure(key, title, caption, drawing)
+    return svg.Figure(key, title, caption, drawing)
 
 
 def _objective(entry: Entry) -> str:
@@ -344,10 +335,12 @@ def _any_masking(entry: Entry) -> str:
     return _masking(entry) if entry.masking else ""
 
 
-def _twin_points(entry: Entry, untrained: Mapping[str, Entry], size: float) -> tuple[ChartPoint, ...]:
+def _twin_points(entry: Entry, untrained: Mapping[str, Entry], size: float) -> tuple[svg.ChartPoint, ...]:
     """Return the mark of a model's untrained twin, if its score is on the board."""
     twin = untrained.get(entry.architecture)
-    return () if twin is None else (ChartPoint(twin.scaled, "c0 open", f"untrained twin {number(twin.scaled)}", size),)
+    return (
+        () if twin is None else (svg.ChartPoint(twin.scaled, "c0 open", f"untrained twin {number(twin.scaled)}", size),)
+    )
 
 
 def _twin_accuracy(entry: Entry, untrained: Mapping[str, Entry]) -> float | None:

@@ -13,7 +13,7 @@ import numpy as np
 
 from brainbench.core.errors import visible_lines
 from leaderboards.boards import RAW_INPUT, Board
-from leaderboards.figures.svg import WIDTH, Drawing, Figure, Scale, cut, left_axis, legend, scale_of
+from leaderboards.figures import svg
 from leaderboards.ranking import DOUBTFUL
 from leaderboards.text import number
 
@@ -37,7 +37,7 @@ class RdmPicture:
     """The picture in words, for readers who do not see it."""
 
 
-def rdm_panel(board: Board) -> Figure:
+def rdm_panel(board: Board) -> svg.Figure:
     """Draw the RDMs of the raw input, of the best models of each kind and of the brain (figure 3.5 a to d)."""
     key, title = "rdms", "Representational dissimilarity (as figure 3.5)"
     picked = _picked(board)
@@ -45,13 +45,13 @@ def rdm_panel(board: Board) -> Figure:
     pictures = [(name, detail, rdm_picture(pairs, board.conditions)) for name, detail, pairs in picked]
     drawn = [(name, detail, picture) for name, detail, picture in pictures if picture is not None]
     if not drawn:
-        return Figure(key, title, lacking="no record holds RDMs")
-    side = min(WIDTH / len(drawn) - 16, 170.0)
-    drawing = Drawing(WIDTH, side + 72, f"{len(drawn)} dissimilarity matrices of {size} stimuli")
+        return svg.Figure(key, title, lacking="no record holds RDMs")
+    side = min(svg.WIDTH / len(drawn) - 16, 170.0)
+    drawing = svg.Drawing(svg.WIDTH, side + 72, f"{len(drawn)} dissimilarity matrices of {size} stimuli")
     for index, (name, detail, picture) in enumerate(drawn):
-        x0 = index * (WIDTH / len(drawn))
+        x0 = index * (svg.WIDTH / len(drawn))
         drawing.text(x0, 13, name, "title")
-        drawing.text(x0, 28, cut(detail, max(12, int(side / 6.3))), "quiet small")
+        drawing.text(x0, 28, svg.cut(detail, max(12, int(side / 6.3))), "quiet small")
         draw_rdm(drawing, x0, 38, side, picture)
         draw_range(drawing, x0, side + 46, side, picture)
     caption = (
@@ -59,10 +59,10 @@ def rdm_panel(board: Board) -> Figure:
         f"({', '.join(board.conditions[:8])}{', …' if size > 8 else ''}); dark is alike, bright is different, each "
         "matrix over its own range (the bar below it), as comparisons by correlation ignore scale."
     )
-    return Figure(key, title, caption, drawing)
+    return svg.Figure(key, title, caption, drawing)
 
 
-def rdm_lines(board: Board) -> Figure:
+def rdm_lines(board: Board) -> svg.Figure:
     """Draw the same RDMs as lines over the pairs of stimuli, each scaled to fit the brain's (figure 3.5 e).
 
     Pairs stand in the order of the brain's dissimilarity; many pairs are averaged in groups of equal size.
@@ -72,10 +72,10 @@ def rdm_lines(board: Board) -> Figure:
     truth = picked.pop("brain", np.empty(0))
     models = [(name, pairs) for name, pairs in picked.items() if pairs.shape == truth.shape]
     if not models:
-        return Figure(key, title, lacking="no record holds the RDMs of a model and of the brain")
+        return svg.Figure(key, title, lacking="no record holds the RDMs of a model and of the brain")
     finite = np.isfinite([truth, *(pairs for _, pairs in models)]).all(axis=0)
     if finite.sum() < 3:
-        return Figure(key, title, lacking="fewer than 3 pairs of stimuli are defined in all RDMs")
+        return svg.Figure(key, title, lacking="fewer than 3 pairs of stimuli are defined in all RDMs")
     order = np.argsort(truth[finite], kind="stable")
     groups = np.array_split(order, min(len(order), MOST_GROUPS))
     lines = [("brain", truth[finite])]
@@ -84,22 +84,22 @@ def rdm_lines(board: Board) -> Figure:
         flat = np.ptp(pairs[finite]) == 0
         slope, offset = (0.0, truth[finite].mean()) if flat else np.polyfit(pairs[finite], truth[finite], 1)
         lines.append((name, offset + slope * pairs[finite]))
-    drawing = Drawing(WIDTH, 300, f"{len(lines)} flattened dissimilarity matrices of {finite.sum()} pairs")
+    drawing = svg.Drawing(svg.WIDTH, 300, f"{len(lines)} flattened dissimilarity matrices of {finite.sum()} pairs")
     means = [np.array([values[group].mean() for group in groups]) for _, values in lines]
-    across = Scale(0, len(groups) - 1, 56, WIDTH - 170)
-    up = scale_of(np.concatenate(means).tolist(), 262, 16, floor=None)
-    left_axis(drawing, up, 56, WIDTH - 170)
-    drawing.text((56 + WIDTH - 170) / 2, 286, "pairs of stimuli, by the brain's dissimilarity", "mid")
+    across = svg.Scale(0, len(groups) - 1, 56, svg.WIDTH - 170)
+    up = svg.scale_of(np.concatenate(means).tolist(), 262, 16, floor=None)
+    svg.left_axis(drawing, up, 56, svg.WIDTH - 170)
+    drawing.text((56 + svg.WIDTH - 170) / 2, 286, "pairs of stimuli, by the brain's dissimilarity", "mid")
     for place, values in enumerate(means):
         points = "L".join(f"{across.at(i):.1f} {up.at(value):.1f}" for i, value in enumerate(values))
         drawing.path(f"M{points}", f"trace c{place}")
-    legend(drawing, [(name, "square", f"c{place}") for place, (name, _) in enumerate(lines)], WIDTH - 156)
+    svg.legend(drawing, [(name, "square", f"c{place}") for place, (name, _) in enumerate(lines)], svg.WIDTH - 156)
     few = f" in {len(groups)} groups" if len(groups) < finite.sum() else ""
     caption = (
         f"{finite.sum()} pairs of stimuli{few} in the order of the brain's dissimilarity; the other matrices are "
         "scaled to it by least squares. A line that rises with the brain's orders the pairs as the brain does."
     )
-    return Figure(key, title, caption, drawing)
+    return svg.Figure(key, title, caption, drawing)
 
 
 def _picked(board: Board) -> list[tuple[str, str, Sequence[float]]]:
@@ -155,7 +155,7 @@ def colour_stops() -> tuple[tuple[float, str], ...]:
     return tuple((100 * i / (len(_VIRIDIS) - 1), f"#{colour}") for i, colour in enumerate(_VIRIDIS))
 
 
-def draw_rdm(drawing: Drawing, x: float, y: float, side: float, picture: RdmPicture) -> None:
+def draw_rdm(drawing: svg.Drawing, x: float, y: float, side: float, picture: RdmPicture) -> None:
     """Put the picture of an RDM into a drawing, its pixels unblurred."""
     place = f'x="{x:.1f}" y="{y:.1f}" width="{side:.1f}" height="{side:.1f}"'
     drawing.rect(x, y, side, side, "box")
@@ -165,7 +165,7 @@ def draw_rdm(drawing: Drawing, x: float, y: float, side: float, picture: RdmPict
     )
 
 
-def draw_range(drawing: Drawing, x: float, y: float, width: float, picture: RdmPicture) -> None:
+def draw_range(drawing: svg.Drawing, x: float, y: float, width: float, picture: RdmPicture) -> None:
     """Draw the bar of an RDM's colours with the dissimilarities at its ends."""
     place = f'x="{x:.1f}" y="{y:.1f}" width="{width:.1f}" height="7"'
     bar = _png(np.arange(_LEVELS)[None])

@@ -9,19 +9,7 @@ from typing import Any
 
 from brainbench.core.errors import visible_name
 from brainbench.core.records import GraphNode, Interval, ModelGraph, ResultRecord, Score
-from leaderboards.figures.svg import (
-    ChartPoint,
-    ChartRow,
-    Drawing,
-    Scale,
-    cut,
-    cut_name,
-    row_chart,
-    scale_of,
-    score_scale,
-    shorten,
-    tick_text,
-)
+from leaderboards.figures import svg
 from leaderboards.text import number, span
 
 _BOX, _HEIGHT, _GAP, _LANE = 236.0, 34.0, 15.0, 13.0
@@ -34,7 +22,7 @@ class _Box:
     names: tuple[str, ...]  # the layers drawn as this box
 
 
-def diagram(graph: ModelGraph, title: str) -> Drawing:
+def diagram(graph: ModelGraph, title: str) -> svg.Drawing:
     """Draw a model's graph."""
     boxes = _folded(graph)
     place = {name: index for index, box in enumerate(boxes) for name in box.names}
@@ -48,7 +36,7 @@ def diagram(graph: ModelGraph, title: str) -> Drawing:
     height = len(boxes) * (_HEIGHT + _GAP) - _GAP + 12
     feedback = sum(edge.feedback for edge in graph.edges)
     words = f"Architecture of {title}: {len(graph.nodes)} parts, {feedback} feedback connections"
-    drawing = Drawing(width, height, words)
+    drawing = svg.Drawing(width, height, words)
     for index, box in enumerate(boxes):
         _draw_box(drawing, box, margin, _top(index))
     for source, target, feedback in sorted(edges):
@@ -105,7 +93,7 @@ def _top(index: int) -> float:
     return 6 + index * (_HEIGHT + _GAP)
 
 
-def _draw_box(drawing: Drawing, box: _Box, x: float, y: float) -> None:
+def _draw_box(drawing: svg.Drawing, box: _Box, x: float, y: float) -> None:
     node = box.node
     kind = _CLASSES.get(node.part, "c0")
     drawing.rect(x, y, _BOX, _HEIGHT, "box", rx=5)
@@ -113,13 +101,15 @@ def _draw_box(drawing: Drawing, box: _Box, x: float, y: float) -> None:
     short = node.name.partition(".")[2] or node.name
     if len(box.names) > 1:
         short = f"{len(box.names)} × {short.rstrip('0123456789')}"
-    drawing.text(x + 13, y + 14, shorten(short, 22), "title")
-    drawing.text(x + 13, y + 27, shorten(f"{node.kind}{' · ' + node.memory if node.memory else ''}", 40), "quiet small")
+    drawing.text(x + 13, y + 14, svg.shorten(short, 22), "title")
+    drawing.text(
+        x + 13, y + 27, svg.shorten(f"{node.kind}{' · ' + node.memory if node.memory else ''}", 40), "quiet small"
+    )
     if node.shape:
         drawing.text(x + _BOX - 8, y + 14, "×".join(map(str, node.shape)), "end quiet small")
 
 
-def _arc(drawing: Drawing, x: float, side: int, lane: int, source: float, target: float, kind: str) -> None:
+def _arc(drawing: svg.Drawing, x: float, side: int, lane: int, source: float, target: float, kind: str) -> None:
     out = x + side * (10 + _LANE * lane)
     down = target > source
     y1, y2 = source + _HEIGHT * 0.68, target + _HEIGHT * (0.32 if down else 0.5)
@@ -132,7 +122,7 @@ def _arc(drawing: Drawing, x: float, side: int, lane: int, source: float, target
     _head(drawing, x, y2, -side, 0, kind="c2" if "feedback" in kind else "c0")
 
 
-def _head(drawing: Drawing, x: float, y: float, dx: int, dy: int, kind: str = "c0") -> None:
+def _head(drawing: svg.Drawing, x: float, y: float, dx: int, dy: int, kind: str = "c0") -> None:
     """Draw an arrow head whose tip is at (x, y), pointing along (dx, dy)."""
     bx, by = x - 6 * dx, y - 6 * dy
     drawing.path(f"M{x} {y:.1f}L{bx + 3.2 * dy} {by + 3.2 * dx:.1f}L{bx - 3.2 * dy} {by - 3.2 * dx:.1f}z", kind)
@@ -144,17 +134,19 @@ _CURVE, _ROW = 190.0, 18.0
 _MOST_LAYERS = 60
 
 
-def draw_time_course(statistics: Mapping[str, Any]) -> Drawing | None:
+def draw_time_course(statistics: Mapping[str, Any]) -> svg.Drawing | None:
     """Draw the score at each time, and below it the latency of each layer; None without a usable score over time."""
     try:
         course = statistics["time_course"]
         points, layers = list(course["points"]), list(course["latencies"])[:_MOST_LAYERS]
         times = [_number(point["time"]) for point in points]
         half = _number(course["bin"]) / 2
-        across = Scale(min(times) - half, max(times) + half, _LEFT, _COURSE_WIDTH - _RIGHT)
+        across = svg.Scale(min(times) - half, max(times) + half, _LEFT, _COURSE_WIDTH - _RIGHT)
         rows = [layer for layer in layers if math.isfinite(_number(layer["latency"]))]
         height = _CURVE + 40 + (len(rows) * _ROW + 46 if rows else 0)
-        drawing = Drawing(_COURSE_WIDTH, height, f"Score at {len(points)} times, and the latency of {len(rows)} layers")
+        drawing = svg.Drawing(
+            _COURSE_WIDTH, height, f"Score at {len(points)} times, and the latency of {len(rows)} layers"
+        )
         _curve(drawing, points, across)
         if rows:
             _latencies(drawing, rows, _number(course["largest_lag"]))
@@ -164,7 +156,7 @@ def draw_time_course(statistics: Mapping[str, Any]) -> Drawing | None:
     return drawing
 
 
-def _curve(drawing: Drawing, points: Sequence[Mapping[str, Any]], across: Scale) -> None:
+def _curve(drawing: svg.Drawing, points: Sequence[Mapping[str, Any]], across: svg.Scale) -> None:
     defined = []
     for point in points:
         chance = _number(point["chance"])
@@ -172,11 +164,11 @@ def _curve(drawing: Drawing, points: Sequence[Mapping[str, Any]], across: Scale)
         if math.isfinite(value):
             defined.append((across.at(_number(point["time"])), value, ends, point))
     held = [min(max(end, -0.5), 1.5) for _, _, ends, _ in defined for end in ends]
-    up = scale_of([*(value for _, value, *_ in defined), *held], _CURVE, 22, top=1.0)
+    up = svg.scale_of([*(value for _, value, *_ in defined), *held], _CURVE, 22, top=1.0)
     drawing.text(_LEFT, 14, "score at each time: 0 chance, 1 all that is reliable", "title small")
     for tick in up.ticks:
         drawing.line(_LEFT, up.at(tick), _COURSE_WIDTH - _RIGHT, up.at(tick), "one" if tick in (0, 1) else "grid")
-        drawing.text(_LEFT - 6, up.at(tick) + 4, tick_text(tick), "end quiet small")
+        drawing.text(_LEFT - 6, up.at(tick) + 4, svg.tick_text(tick), "end quiet small")
     _ticks(drawing, across, _CURVE, "seconds after the window begins")
     if len(defined) > 1:
         drawing.path("M" + "L".join(f"{x:.1f} {up.at(value):.1f}" for x, value, *_ in defined), "line edge")
@@ -188,25 +180,25 @@ def _curve(drawing: Drawing, points: Sequence[Mapping[str, Any]], across: Scale)
         drawing.mark(x, up.at(value), "dot", "c1" if clear else "c1 open", tip, 3.5)
 
 
-def _latencies(drawing: Drawing, rows: Sequence[Mapping[str, Any]], largest: float) -> None:
-    across = Scale(-largest, largest, _LEFT, _COURSE_WIDTH - _RIGHT)
+def _latencies(drawing: svg.Drawing, rows: Sequence[Mapping[str, Any]], largest: float) -> None:
+    across = svg.Scale(-largest, largest, _LEFT, _COURSE_WIDTH - _RIGHT)
     top = _CURVE + 62
     bottom = top + len(rows) * _ROW - 6
     drawing.text(_LEFT, top - 14, "latency of the best match of each layer", "title small")
     drawing.line(across.at(0), top - 6, across.at(0), bottom, "one")
     for index, layer in enumerate(rows):
         y, latency, span = top + index * _ROW + 5, _number(layer["latency"]), _ends(layer["interval"])
-        drawing.text(_LEFT - 8, y + 4, cut(str(layer["layer"]), 22), "end small")
+        drawing.text(_LEFT - 8, y + 4, svg.cut(str(layer["layer"]), 22), "end small")
         if span:
             drawing.line(across.at(span[0]), y, across.at(span[1]), y, "span c1")
         drawing.mark(across.at(latency), y, "dot", "c1", f"{layer['layer']}: {1000 * latency:.0f} ms", 3.5)
     _ticks(drawing, across, bottom, "seconds by which neurons follow the model")
 
 
-def _ticks(drawing: Drawing, across: Scale, y: float, words: str) -> None:
+def _ticks(drawing: svg.Drawing, across: svg.Scale, y: float, words: str) -> None:
     drawing.line(across.start, y, across.end, y)
     for tick in across.ticks:
-        drawing.text(across.at(tick), y + 15, tick_text(tick), "mid quiet small")
+        drawing.text(across.at(tick), y + 15, svg.tick_text(tick), "mid quiet small")
     drawing.text(across.end, y + 28, words, "end quiet small")
 
 
@@ -223,7 +215,7 @@ def _ends(interval: Mapping[str, Any] | None) -> tuple[float, ...]:
 _MOST_STIMULI = 24  # stimuli that are drawn: those that add most to a score, and those that take most from it
 
 
-def stimulus_parts(score: Score) -> Drawing | None:
+def stimulus_parts(score: Score) -> svg.Drawing | None:
     """Draw by how much a score falls without each stimulus, most first; None where that is not stated."""
     pairs = zip(score.stimuli, score.without_stimulus, strict=False)
     falls = [(score.on_scale(score.value) - score.on_scale(without), name) for name, without in pairs]
@@ -234,41 +226,43 @@ def stimulus_parts(score: Score) -> Drawing | None:
     if left_out > 0:
         falls = [*falls[: _MOST_STIMULI // 2], *falls[-_MOST_STIMULI // 2 :]]
     rows = [
-        ChartRow(
-            cut_name(name, 20),
-            [ChartPoint(fall, "c1" if fall > 0 else "c2", f"{name}: {fall:+.4f}", 3.5)],
+        svg.ChartRow(
+            svg.cut_name(name, 20),
+            [svg.ChartPoint(fall, "c1" if fall > 0 else "c2", f"{name}: {fall:+.4f}", 3.5)],
             Interval(min(fall, 0.0), max(fall, 0.0)),
             "c1" if fall > 0 else "c2",
         )
         for fall, name in falls
     ]
     words = f"the score falls by, without each stimulus{f' ({left_out} in between not drawn)' if left_out > 0 else ''}"
-    scale = scale_of([fall for fall, _ in falls], _START, _WIDTH - 20)
-    return row_chart(f"{words}, {len(rows)} stimuli", rows, scale, words, step=15, width=_WIDTH)
+    scale = svg.scale_of([fall for fall, _ in falls], _START, _WIDTH - 20)
+    return svg.row_chart(f"{words}, {len(rows)} stimuli", rows, scale, words, step=15, width=_WIDTH)
 
 
-def unit_parts(statistics: Mapping[str, Any]) -> Drawing | None:
+def unit_parts(statistics: Mapping[str, Any]) -> svg.Drawing | None:
     """Draw how alike units and their matched features are, by animal and by group; None where no units are matched."""
     try:
         units, rows, values = statistics["units"], [], []
         for animal, parts in list(units["animals"].items())[:_MOST_LAYERS]:
             part = [_number(value) for value in parts]
             finite = [value for value in part if math.isfinite(value)]
-            points = [ChartPoint(value, "c1 faint", size=2) for value in finite]
+            points = [svg.ChartPoint(value, "c1 faint", size=2) for value in finite]
             mean = math.fsum(finite) / len(finite) if finite else math.nan
-            points.append(ChartPoint(mean, "c1", f"{animal}: {number(mean)}, {len(part)} units"))
-            rows.append(ChartRow(cut_name(animal, 20), points))
+            points.append(svg.ChartPoint(mean, "c1", f"{animal}: {number(mean)}, {len(part)} units"))
+            rows.append(svg.ChartRow(svg.cut_name(animal, 20), points))
             values += finite
         for column, groups in units.get("groups", {}).items():
             for name, group in list(groups.items())[:_MOST_LAYERS]:
                 low, high = map(_number, group["interval"] or (math.nan, math.nan))
                 interval = Interval(low, high) if math.isfinite(low + high) else None
                 tip = f"{name}: {number(_number(group['value']))}, {group['units']} units, {group['animals']} animals"
-                point = ChartPoint(_number(group["value"]), "c3", tip, shape="diamond")
+                point = svg.ChartPoint(_number(group["value"]), "c3", tip, shape="diamond")
                 label = f"{str(column).replace('_', ' ')} {name}"
-                rows.append(ChartRow(cut_name(label, 20), [point], interval, "c3"))
+                rows.append(svg.ChartRow(svg.cut_name(label, 20), [point], interval, "c3"))
         words = "correlation of each unit with its match"
-        return row_chart(f"{words}, {len(rows)} rows", rows, scale_of(values, _START, _WIDTH - 20), words, width=_WIDTH)
+        return svg.row_chart(
+            f"{words}, {len(rows)} rows", rows, svg.scale_of(values, _START, _WIDTH - 20), words, width=_WIDTH
+        )
     except (KeyError, TypeError, ValueError, AttributeError):
         # As above: anyone may have written it.
         return None
@@ -278,7 +272,7 @@ PARTS = {"encoder": "c1", "attender": "c2", "decoder": "c3"}  # colour class of 
 _WIDTH, _START = 490.0, 150.0
 
 
-def beside(record: ResultRecord) -> Drawing:
+def beside(record: ResultRecord) -> svg.Drawing:
     """Draw the score with those of animals and baselines, single animals as small points.
 
     On the common scale where the record states its chance, else in the metric's own unit.
@@ -293,7 +287,7 @@ def beside(record: ResultRecord) -> Drawing:
     return _chart(record, label, "value", rows, rows(animals)[1] if animals and animals.status == "ok" else None)
 
 
-def raw(record: ResultRecord) -> Drawing:
+def raw(record: ResultRecord) -> svg.Drawing:
     """Draw the raw comparisons, not corrected for noise, with the noise ceiling as a band."""
     ceiling = record.score.ceiling
     band = None if ceiling is None else Interval(ceiling.lower, ceiling.upper)
@@ -303,7 +297,7 @@ def raw(record: ResultRecord) -> Drawing:
 _Reading = Callable[[Score], tuple[Callable[[float], float], Interval | None]]
 
 
-def _chart(record: ResultRecord, label: str, name: str, reading: _Reading, band: Interval | None) -> Drawing:
+def _chart(record: ResultRecord, label: str, name: str, reading: _Reading, band: Interval | None) -> svg.Drawing:
     """Draw one row per score; ``name`` is the field of scores and animals that is drawn."""
     marks = [(visible_name(record.score.name), "c1", "dot", record.score)]
     marks += [("animal-to-animal", "c7", "square", record.animal_to_animal)] if record.animal_to_animal else []
@@ -314,15 +308,15 @@ def _chart(record: ResultRecord, label: str, name: str, reading: _Reading, band:
         value = place(getattr(score, name))
         singles = [place(getattr(item, name)) for item in score.subjects]
         hollow = "" if score.status == "ok" else " open"
-        points = [ChartPoint(one, f"{kind} faint", size=2) for one in singles]
-        points.append(ChartPoint(value, kind + hollow, f"{key}: {number(value)} {span(interval)}", 4, shape))
-        rows.append(ChartRow(cut_name(key, 20), points, interval, kind))
+        points = [svg.ChartPoint(one, f"{kind} faint", size=2) for one in singles]
+        points.append(svg.ChartPoint(value, kind + hollow, f"{key}: {number(value)} {span(interval)}", 4, shape))
+        rows.append(svg.ChartRow(svg.cut_name(key, 20), points, interval, kind))
         values += [value, *singles]
-    scale = score_scale(values, [row.interval for row in rows], _START, _WIDTH - 20)
-    return row_chart(f"{label}, {len(rows)} rows", rows, scale, label, width=_WIDTH, band=band)
+    scale = svg.score_scale(values, [row.interval for row in rows], _START, _WIDTH - 20)
+    return svg.row_chart(f"{label}, {len(rows)} rows", rows, scale, label, width=_WIDTH, band=band)
 
 
-def layers(records: Sequence[ResultRecord]) -> Drawing | None:
+def layers(records: Sequence[ResultRecord]) -> svg.Drawing | None:
     """Draw the layers of one model against their scores, all seeds; None without layers."""
     score = records[0].score
     seeds = [record.score.layers for record in records]
@@ -334,13 +328,13 @@ def layers(records: Sequence[ResultRecord]) -> Drawing | None:
         chosen = layer.layer == score.layer
         values = [one[index].value for one in seeds if len(one) == len(score.layers)]
         finite = [value for value in values if math.isfinite(value)]
-        points = [ChartPoint(value, f"{kind} faint", size=2.2) for value in finite if len(records) > 1]
+        points = [svg.ChartPoint(value, f"{kind} faint", size=2.2) for value in finite if len(records) > 1]
         interval = layer.interval if len(records) == 1 else None
         if finite:
             mean = math.fsum(finite) / len(finite)
             tip = f"{layer.layer}: {number(mean)} {span(interval)}"
-            points.append(ChartPoint(mean, kind if chosen else f"{kind} open", tip, 4))
-        rows.append(ChartRow(cut(layer.layer, 22), points, interval, kind, "end title" if chosen else "end"))
-    scale = score_scale([layer.value for one in seeds for layer in one], [row.interval for row in rows], 132, 470)
+            points.append(svg.ChartPoint(mean, kind if chosen else f"{kind} open", tip, 4))
+        rows.append(svg.ChartRow(svg.cut(layer.layer, 22), points, interval, kind, "end title" if chosen else "end"))
+    scale = svg.score_scale([layer.value for one in seeds for layer in one], [row.interval for row in rows], 132, 470)
     words = f"Score of {len(score.layers)} layers of {visible_name(score.name)}"
-    return row_chart(words, rows, scale, "score in the metric's own unit", step=20, width=_WIDTH)
+    return svg.row_chart(words, rows, scale, "score in the metric's own unit", step=20, width=_WIDTH)

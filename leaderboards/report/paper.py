@@ -22,9 +22,9 @@ from brainbench.core.version import __version__
 from leaderboards import text as words
 from leaderboards.boards import Board, conclusions, means_over, rank, table_of
 from leaderboards.entries import Entry
-from leaderboards.figures.charts import Figure, board_figures
+from leaderboards.figures.charts import board_figures
 from leaderboards.figures.record import diagram, layers
-from leaderboards.figures.svg import STYLE, standalone
+from leaderboards.figures.svg import STYLE, Figure, standalone
 from leaderboards.site.score_page import render, render_markdown
 from leaderboards.site.table import board_label
 from leaderboards.store import StoredRecord

@@ -21,19 +21,8 @@ from brainbench.core.devices import warp
 from brainbench.core.errors import check_name
 from brainbench.core.figures import COLORS, new_figure, panels, save_figure
 from brainbench.core.rotations import to_matrices
+from brainbench.stimuli.figures import surfaces
 from brainbench.stimuli.figures.pictures import Style, write_film
-from brainbench.stimuli.figures.surfaces import (
-    Camera,
-    Lens,
-    Triangles,
-    ball,
-    corner_normals,
-    draw,
-    lamp,
-    paint,
-    shade,
-    tube,
-)
 from robotics_bridge import hands, sensors
 from robotics_bridge.hands.scenes import closing, holding
 from robotics_bridge.physics import Geometry, HandState, MujocoEngine, MujocoWarpEngine, TouchScene
@@ -56,27 +45,29 @@ def link_rotation(pose: NDArray[np.float64]) -> NDArray[np.float64]:
     return to_matrices(np.roll(pose[3:], 1))
 
 
-def surface(geometry: Any, color: tuple[float, float, float]) -> Triangles:
+def surface(geometry: Any, color: tuple[float, float, float]) -> surfaces.Triangles:
     """Return the triangles of a geometry in the frame of its link; a plane has none."""
     if geometry.kind == "plane":
-        return Triangles.joined([])
+        return surfaces.Triangles.joined([])
     mesh, rotation = tessellate(geometry), to_matrices(geometry.quaternion)
     corners = mesh.vertices[mesh.faces] @ rotation.T + np.array(geometry.position)
-    return Triangles(corners, corner_normals(mesh) @ rotation.T, np.broadcast_to(np.array(color), (len(corners), 3)))
+    return surfaces.Triangles(
+        corners, surfaces.corner_normals(mesh) @ rotation.T, np.broadcast_to(np.array(color), (len(corners), 3))
+    )
 
 
-def placed(solid: Triangles, pose: NDArray[np.float64]) -> Triangles:
+def placed(solid: surfaces.Triangles, pose: NDArray[np.float64]) -> surfaces.Triangles:
     """Return triangles of a link in the world."""
     turn = link_rotation(pose)
     return replace(solid, corners=solid.corners @ turn.T + pose[:3], normals=solid.normals @ turn.T)
 
 
-def shaded(solids: Triangles, lens: Lens, gloss: float) -> tuple[NDArray[np.float64], Any, Any]:
+def shaded(solids: surfaces.Triangles, lens: surfaces.Lens, gloss: float) -> tuple[NDArray[np.float64], Any, Any]:
     """Draw triangles on white through a supersampled lens; return picture [H, W, 3], layer and light."""
-    light = lamp(lens, SAMPLES, solids.corners.reshape(-1, 3), solids)
+    light = surfaces.lamp(lens, SAMPLES, solids.corners.reshape(-1, 3), solids)
     image = np.ones((lens.size[1], lens.size[0], 3))
-    layer = draw(solids, lens)
-    paint(layer, shade(layer, lens, light, gloss=gloss, bias=8.0), image)
+    layer = surfaces.draw(solids, lens)
+    surfaces.paint(layer, surfaces.shade(layer, lens, light, gloss=gloss, bias=8.0), image)
     return image, layer, light
 
 
@@ -112,22 +103,26 @@ def draw_forces(
         for index in np.flatnonzero(link_probes.active):
             share = float(np.linalg.norm(force[index])) / peak
             color = np.array(palette(0.15 + 0.75 * share)[:3]) if share > 1e-3 else np.array([0.30, 0.42, 0.62])
-            marks.append(ball(world[index], 0.0007 + 0.0004 * (share > 1e-3), color))
+            marks.append(surfaces.ball(world[index], 0.0007 + 0.0004 * (share > 1e-3), color))
             if share > 0.02:
                 # The arrow shows the push on the skin from outside, so that it stays visible.
                 tip = world[index] - force[index] / peak * 0.022
                 start = world[index] + 0.0006 * normal[index]
                 line = np.linspace(tip, start, 12)
                 radii = np.r_[np.full(7, 0.00045), np.linspace(0.0011, 0.00015, 5)]
-                marks.append(tube(line, radii, np.broadcast_to(color, line.shape)))
-    solid, taxels, seen = Triangles.joined(hand), Triangles.joined(marks), Triangles.joined(held)
-    camera = Camera(view=(0.95, -0.55, 0.75))
+                marks.append(surfaces.tube(line, radii, np.broadcast_to(color, line.shape)))
+    solid, taxels, seen = (
+        surfaces.Triangles.joined(hand),
+        surfaces.Triangles.joined(marks),
+        surfaces.Triangles.joined(held),
+    )
+    camera = surfaces.Camera(view=(0.95, -0.55, 0.75))
     lens = camera.lens(np.concatenate([solid.corners.reshape(-1, 3), seen.corners.reshape(-1, 3)]), SIZE)
     fine = lens.supersampled(SAMPLES)
-    image, layer, light = shaded(Triangles.joined([solid, taxels]), fine, 0.08)
-    veil = draw(seen, fine)
+    image, layer, light = shaded(surfaces.Triangles.joined([solid, taxels]), fine, 0.08)
+    veil = surfaces.draw(seen, fine)
     front = veil.nearness.reshape(-1)[veil.pixels] > layer.nearness.reshape(-1)[veil.pixels]
-    colors = shade(veil, fine, light)
+    colors = surfaces.shade(veil, fine, light)
     flat = image.reshape(-1, 3)
     flat[veil.pixels[front]] = 0.24 * colors[front] + 0.76 * flat[veil.pixels[front]]
     image = _trimmed(averaged(image))
@@ -257,12 +252,12 @@ class Stage:
             self._parts.append((link, solid))
             focus.append(placed(solid, self._pose()[link]).corners.reshape(-1, 3))
         points = np.concatenate(focus)
-        self._lens = Camera(view=VIEWS.get(env.task.name, _VIEW)).lens(points, size).supersampled(SAMPLES)
+        self._lens = surfaces.Camera(view=VIEWS.get(env.task.name, _VIEW)).lens(points, size).supersampled(SAMPLES)
 
     def frame(self) -> NDArray[np.uint8]:
         """Return the picture [H, W, 3] of this moment."""
         pose = self._pose()
-        solids = Triangles.joined([placed(solid, pose[link]) for link, solid in self._parts])
+        solids = surfaces.Triangles.joined([placed(solid, pose[link]) for link, solid in self._parts])
         image, _, _ = shaded(solids, self._lens, 0.05)
         return (255 * averaged(image)).astype(np.uint8)
 

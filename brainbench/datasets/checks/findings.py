@@ -24,16 +24,8 @@ from brainbench.datasets.inspection import propose
 from brainbench.datasets.layouts.registry import RecordingLayout
 from brainbench.datasets.ledger import Ledger
 from brainbench.datasets.sessions import Session, SessionTable
+from brainbench.datasets.trials import selection
 from brainbench.datasets.trials.counting import SpikeTrains, recorded_span
-from brainbench.datasets.trials.selection import (
-    CONTACTS,
-    FIRST_CONTACT,
-    WHOLE,
-    Conditions,
-    Window,
-    joined_labels,
-    label_doubts,
-)
 
 Severity = Literal["error", "warning", "note"]
 SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")  # worst first
@@ -69,7 +61,9 @@ def some(names: list[str], limit: int = 5) -> str:
 _FEW = 2  # split halves need this many trials of every stimulus
 
 
-def check_labels(session: Session, layout: RecordingLayout | None, conditions: Conditions | None) -> Iterator[Finding]:
+def check_labels(
+    session: Session, layout: RecordingLayout | None, conditions: selection.Conditions | None
+) -> Iterator[Finding]:
     """Yield the findings about the condition labels of one session."""
     if conditions is None:
         proposals = [item.conditions for item in propose(session)]
@@ -83,14 +77,14 @@ def check_labels(session: Session, layout: RecordingLayout | None, conditions: C
     except BrainbenchError as error:
         yield Finding("error", "labels", str(error))
         return
-    counts = Counter(joined_labels(values))
+    counts = Counter(selection.joined_labels(values))
     missing = counts.pop("", 0)
     if missing:
         message = f"{share(missing, len(table))} trials have no value of {', '.join(conditions.columns)}"
         yield Finding("warning" if missing < len(table) else "error", "labels", message, "They are left out.")
     vocabulary = layout.vocabulary(conditions) if layout else None
     forms = conditions.forms(table) if all(name in table for name in conditions.columns) else {}
-    for doubt in label_doubts(forms, counts if vocabulary is None else ()):
+    for doubt in selection.label_doubts(forms, counts if vocabulary is None else ()):
         yield Finding("warning", "labels", doubt, "Make them one, or refuse them by --select.")
     if vocabulary is not None:
         yield from _strangers(counts, vocabulary, layout)
@@ -103,7 +97,7 @@ def check_labels(session: Session, layout: RecordingLayout | None, conditions: C
 
 def _order(table: SessionTable, values: NDArray[np.str_]) -> Iterator[Finding]:
     """Labels in blocks: slow changes over the session then pass for differences between stimuli."""
-    labels = np.array(joined_labels(values))
+    labels = np.array(selection.joined_labels(values))
     present = labels != ""
     with contextlib.suppress(BrainbenchError):
         order = presentation_order(table.times("start_time")[present], labels[present])
@@ -279,7 +273,7 @@ def _contacts(session: Session, trials: SessionTable) -> Iterator[Finding]:
     start, stop = np.sort(trials.times("start_time")), np.sort(trials.times("stop_time"))
     brief, every = 0, 0
     for name, table in session.tables.items():
-        if not CONTACTS.match(name) or not len(table):
+        if not selection.CONTACTS.match(name) or not len(table):
             continue
         begin, end = table.times("start_time"), table.times("stop_time")
         # The last trial that began before each contact; −1 for contacts before the first trial.
@@ -295,7 +289,10 @@ def _contacts(session: Session, trials: SessionTable) -> Iterator[Finding]:
 
 
 def check_coverage(
-    session: Session, spikes: list[NDArray[np.float64]], layout: RecordingLayout | None, conditions: Conditions | None
+    session: Session,
+    spikes: list[NDArray[np.float64]],
+    layout: RecordingLayout | None,
+    conditions: selection.Conditions | None,
 ) -> Iterator[Finding]:
     """Yield the findings about trials without recording, and breaks inside it.
 
@@ -309,7 +306,9 @@ def check_coverage(
         advice = "Name the end of the window: --window start..+SECONDS."
         yield Finding("warning", "coverage", f"{table.label} has no stop_time, and by default it ends windows", advice)
     # Without ends of trials only their beginnings can be held against the recorded span.
-    window = layout.window if layout else WHOLE if "stop_time" in table else Window("start", length=1e-3)
+    window = (
+        layout.window if layout else selection.WHOLE if "stop_time" in table else selection.Window("start", length=1e-3)
+    )
     try:
         edges = window.edges(session, table, [])
     except BrainbenchError:
@@ -447,12 +446,12 @@ def touches(session: Session, layout: RecordingLayout | None) -> tuple[NDArray[n
     First contacts of the trials if there are contact tables, else the event that the layout names.
     """
     trials = session.tables.get(layout.conditions.table if layout else "trials")
-    contacts = any(CONTACTS.match(name) for name in session.tables)
-    event = FIRST_CONTACT if contacts else layout.touch if layout else ""
-    if trials is None or not event or (event == FIRST_CONTACT and not contacts):
+    contacts = any(selection.CONTACTS.match(name) for name in session.tables)
+    event = selection.FIRST_CONTACT if contacts else layout.touch if layout else ""
+    if trials is None or not event or (event == selection.FIRST_CONTACT and not contacts):
         return None
     try:
-        edges = Window(event, length=1.0).edges(session, trials, [])
+        edges = selection.Window(event, length=1.0).edges(session, trials, [])
     except BrainbenchError:
         return None
     return np.sort(edges[np.isfinite(edges[:, 0]), 0]), event

@@ -1,7 +1,7 @@
 """Synthetic recordings whose truth is known, as arrays, sessions of spike times, or files.
 
-A ``geometry`` (from a network's features) and a ``design`` give ``populations``: expected rates, trials and counts. They
-relate a design to its noise ceiling, place spikes, and write files with the truth beside them, once per machine.
+A ``geometry`` (from a network's features) and a ``design`` give ``populations``: expected rates, trials and counts.
+They relate a design to its noise ceiling, place spikes, and write files with the truth beside them, once per machine.
 ``rodgers_demo`` puts the same neurons into the task and file layout of Rodgers 2022.
 """
 

@@ -25,18 +25,7 @@ from brainbench.core.reading.ranges import check_number
 from brainbench.datasets.layouts import published
 from brainbench.datasets.layouts.published import TRACKED
 from brainbench.datasets.sessions import Series, Session, make_session
-from brainbench.datasets.synthetic.populations import (
-    REST,
-    PopulationDesign,
-    ResponseGeometry,
-    correlation_rdm,
-    draw_counts,
-    ensure_recordings,
-    expected_rates,
-    spike_trains,
-    write_synthetic_nwb,
-    write_with_truth,
-)
+from brainbench.datasets.synthetic import populations
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -78,10 +67,12 @@ class SessionPlan:
     """Carries obs_intervals, and some units were lost before the end."""
 
     @property
-    def design(self) -> PopulationDesign:
+    def design(self) -> populations.PopulationDesign:
         """Units, rates and noise of this session."""
         # Fano factors of about 1.5: windows are longer than in the default design.
-        return PopulationDesign(1, units=self.units, modulation=self.modulation, dispersion=0.1, shared_gain=0.1)
+        return populations.PopulationDesign(
+            1, units=self.units, modulation=self.modulation, dispersion=0.1, shared_gain=0.1
+        )
 
 
 @dataclass(frozen=True)
@@ -102,7 +93,7 @@ class Behaviour:
 def draw_session(
     random: np.random.Generator,
     plan: SessionPlan,
-    geometry: ResponseGeometry,
+    geometry: populations.ResponseGeometry,
     expected: NDArray[np.float64],
     runs: Mapping[str, list[NDArray[np.float64]]],
 ) -> Session:
@@ -119,9 +110,9 @@ def draw_session(
     presented = behaviour.stimulus[answered]
     begin = behaviour.onset[answered] + first[presented]
     length = behaviour.lick[answered] - begin
-    counts = draw_counts(random, plan.design, expected[presented], length[:, None])
-    rest = REST * expected.mean(axis=0)
-    spikes = spike_trains(random, counts, begin, length, rest, behaviour.recorded)
+    counts = populations.draw_counts(random, plan.design, expected[presented], length[:, None])
+    rest = populations.REST * expected.mean(axis=0)
+    spikes = populations.spike_trains(random, counts, begin, length, rest, behaviour.recorded)
     contacts = draw_contacts(random, behaviour, runs)
     number = len(spikes)
     depth = np.round(np.sort(random.uniform(40, 1250, number)), 1)
@@ -284,7 +275,7 @@ def make_rodgers_demo(
     """
     check_number("The number of animals of the demo", animals, least=1, whole=True)
     stimuli = _in_vocabulary_order(check_stimulus_set(stimuli))
-    geometry = ResponseGeometry.from_activations(wrench_features(stimuli), published.LABELS)
+    geometry = populations.ResponseGeometry.from_activations(wrench_features(stimuli), published.LABELS)
     contact = stimuli["contact"].transpose("stimulus", "time", "whisker").values.astype(bool)
     names = tuple(str(name) for name in stimuli["whisker"].values)
     contacts = tracked_contacts(names, contact, float(np.median(np.diff(stimuli["time"].values))))
@@ -301,18 +292,18 @@ def make_rodgers_demo(
                 random = np.random.default_rng([seed, VERSION, index, number])
                 # Begun anew for every session: all sessions of an animal draw the same traits (expected_rates).
                 animal = np.random.default_rng([seed, VERSION, index])
-                expected = expected_rates(geometry, plan.design, animal, random)
+                expected = populations.expected_rates(geometry, plan.design, animal, random)
                 yield draw_session(random, plan, geometry, expected, contacts), expected
                 done += 1
                 if progress is not None:
                     progress(done, total, f"demo recordings {plan.subject}")
 
-    return write_with_truth(
+    return populations.write_with_truth(
         folder,
         draw(),
-        write=partial(write_synthetic_nwb, columns=COLUMNS),
+        write=partial(populations.write_synthetic_nwb, columns=COLUMNS),
         suffix="_behavior+ecephys.nwb",
-        distance=correlation_rdm,
+        distance=populations.correlation_rdm,
         version=VERSION,
         seed=seed,
         stimuli="rodgers",
@@ -329,7 +320,7 @@ def ensure_rodgers_demo(
     """Return the folder of the recordings, making them if this machine has none; see :func:`make_rodgers_demo`."""
     numbers = str(check_stimulus_set(stimuli).attrs["content_hash"])
     make = partial(make_rodgers_demo, stimuli=stimuli, seed=seed, animals=animals, progress=progress)
-    return ensure_recordings("demo-rodgers", numbers, _definition(stimuli, seed, animals), make=make)
+    return populations.ensure_recordings("demo-rodgers", numbers, _definition(stimuli, seed, animals), make=make)
 
 
 def _definition(stimuli: xr.Dataset, seed: int, animals: int) -> str:

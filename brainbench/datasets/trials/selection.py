@@ -13,15 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.contracts import (
-    MISSING_WORDS,
-    as_label,
-    as_labels,
-    as_number,
-    is_doubtful,
-    natural_key,
-    near_labels,
-)
+from brainbench.core import contracts
 from brainbench.core.errors import DataError, UsageError, brief, check_once, listing, nearest, repeats, unknown_name
 from brainbench.core.reading.ranges import check_number
 from brainbench.datasets.ledger import Ledger
@@ -57,14 +49,14 @@ class Conditions:
 
     def values(self, table: SessionTable) -> NDArray[np.str_]:
         """Return the condition values of every row as text [rows, columns]; "" where missing."""
-        return np.stack([as_labels(table.column(name)) for name in self.columns], axis=1)
+        return np.stack([contracts.as_labels(table.column(name)) for name in self.columns], axis=1)
 
     def forms(self, table: SessionTable) -> dict[tuple[str, str], set[str]]:
         """Return how the file writes each value: (column, its label) → the forms, of which most values have one."""
         forms: dict[tuple[str, str], set[str]] = {}
         for name in self.columns:
             values = np.unique(table.column(name))
-            for value, label in zip(values.tolist(), as_labels(values).tolist(), strict=True):
+            for value, label in zip(values.tolist(), contracts.as_labels(values).tolist(), strict=True):
                 written = ascii(value) if isinstance(value, str) else repr(value)
                 if isinstance(value, (int, float)) and abs(value) < 2**53:
                     written = repr(float(value))
@@ -83,10 +75,10 @@ def label_doubts(forms: Mapping[tuple[str, str], Collection[str]], vocabulary: I
     if merged:
         texts = (f"{label} of {name} ({', '.join(written[:3])})" for name, label, written in merged)
         yield f"values that are written differently count as one label: {listing(texts, limit=3, quoted=False)}"
-    if near := [listing(twins) for twins in near_labels(vocabulary)]:
+    if near := [listing(twins) for twins in contracts.near_labels(vocabulary)]:
         texts = "; ".join(near[:3]) + f" and {len(near) - 3} more" * (len(near) > 3)
         yield f"labels that differ only in case, blanks, signs or digits count as different stimuli: {texts}"
-    words = sorted({part for label in vocabulary for part in (label, *label.split("-")) if is_doubtful(part)})
+    words = sorted({part for label in vocabulary for part in (label, *label.split("-")) if contracts.is_doubtful(part)})
     if words:
         yield f"the label {listing(words)} may mean a missing value, and counts as a stimulus"
 
@@ -113,7 +105,7 @@ def joined_labels(values: NDArray[np.str_]) -> list[str]:
 def natural_vocabulary(values: Iterable[tuple[str, ...]]) -> tuple[str, ...]:
     """Order the labels of condition values: column by column, numbers numerically, text naturally."""
     # Sorted, not in order of appearance: that depends on the session that comes first, and RDMs would not share axes.
-    ordered = sorted(set(values), key=lambda row: [natural_key(item) for item in row])
+    ordered = sorted(set(values), key=lambda row: [contracts.natural_key(item) for item in row])
     labels = ["-".join(row) for row in ordered]
     if twice := repeats(labels):
         raise DataError(f"Two combinations of condition values both read {twice[0]!r}; choose fewer columns.")
@@ -170,7 +162,7 @@ class Rule:
         if self.refuse:
             parts.append(f"{self.column}!={'|'.join(self.refuse)}")
         if self.low is not None or self.high is not None:
-            low, high = ("" if bound is None else as_label(float(bound)) for bound in (self.low, self.high))
+            low, high = ("" if bound is None else contracts.as_label(float(bound)) for bound in (self.low, self.high))
             parts.append(f"{self.column}={low}..{high}")
         return " and ".join(parts)
 
@@ -185,7 +177,7 @@ class Rule:
                 table.require(self.column)
             return None
         values = table.column(self.column)
-        labels = as_labels(values)
+        labels = contracts.as_labels(values)
         if seen is not None and (self.allow or self.refuse):
             seen.setdefault(self, set()).update(labels.tolist())
         labels = np.char.lower(labels)
@@ -311,7 +303,7 @@ def check_values(ledgers: Iterable[Ledger]) -> list[str]:
     notes = []
     for rule, values in seen.seen.items():
         assert isinstance(rule, Rule)
-        present = sorted(values - {""}, key=natural_key)
+        present = sorted(values - {""}, key=contracts.natural_key)
         for value in (*rule.allow, *rule.refuse):
             if value in values:
                 continue
@@ -326,9 +318,9 @@ def _spellings(value: str, dtype: np.dtype[Any], present: Collection[str]) -> li
     """Return the texts, in lower case, that rows of a column may have for the value of a rule; NaN is a missing one."""
     spellings = [value.lower()]
     if dtype.kind == "U":
-        spellings += [] if value.lower() in present else [as_label(value).lower()]
-    elif math.isfinite(number := as_number(value)) or value.lower() in MISSING_WORDS:
-        spellings.append(as_label(number))
+        spellings += [] if value.lower() in present else [contracts.as_label(value).lower()]
+    elif math.isfinite(number := contracts.as_number(value)) or value.lower() in contracts.MISSING_WORDS:
+        spellings.append(contracts.as_label(number))
     return spellings + [one for pair in _TRUTH for one in pair if {*pair} & {*spellings}]
 
 
@@ -540,4 +532,4 @@ def _edge(text: str) -> tuple[str, str]:
 
 
 def _signed(seconds: float) -> str:
-    return f"{'+' * (seconds > 0)}{as_label(float(seconds))}" if seconds else ""
+    return f"{'+' * (seconds > 0)}{contracts.as_label(float(seconds))}" if seconds else ""

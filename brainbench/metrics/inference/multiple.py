@@ -22,9 +22,10 @@ from numpy.typing import ArrayLike
 from brainbench.core.errors import UsageError, check_name
 from brainbench.core.records import Score
 from brainbench.core.statistics import PairTest, compare_scores
+from brainbench.metrics.arrays import Floats
 from brainbench.metrics.inference.permutation import tail_p
 from brainbench.metrics.measures.rsa import RSA, check_layers
-from brainbench.metrics.rdms.comparison import Floats, check_comparison
+from brainbench.metrics.rdms.comparison import check_comparison
 from brainbench.metrics.reliability.subject_rdm import SubjectRDM
 from brainbench.metrics.score import score_layers
 

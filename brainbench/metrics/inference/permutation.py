@@ -18,17 +18,8 @@ from numpy.typing import ArrayLike
 from brainbench.core.errors import UsageError
 from brainbench.core.reading.ranges import check_number
 from brainbench.core.records import Status
-from brainbench.metrics.arrays import find_device
-from brainbench.metrics.rdms.comparison import (
-    Floats,
-    Ints,
-    check_comparison,
-    permuted_comparisons,
-    permuted_pairs,
-    rdm_stack,
-    square,
-    stimulus_count,
-)
+from brainbench.metrics.arrays import Floats, Ints, find_device
+from brainbench.metrics.rdms import comparison
 
 EXACT_STIMULI = 8  # up to this many stimuli all orders are taken (8! = 40,320)
 
@@ -123,15 +114,15 @@ def permutation_test(
     >>> test.count, round(test.p, 4), test.p == test.smallest
     (24, 0.0417, True)
     """
-    check_comparison(method)
-    model = rdm_stack(model_rdm, "model_rdm")
-    brain = np.atleast_2d(rdm_stack(brain_rdms, "brain_rdms"))
+    comparison.check_comparison(method)
+    model = comparison.rdm_stack(model_rdm, "model_rdm")
+    brain = np.atleast_2d(comparison.rdm_stack(brain_rdms, "brain_rdms"))
     if model.ndim != 1 or brain.ndim != 2 or model.shape[-1] != brain.shape[-1]:
         raise UsageError(
             f"A permutation test takes one model RDM [P] and brain RDMs [A, P] of the same stimuli; received shapes "
             f"{model.shape} and {brain.shape}."
         )
-    stimuli = stimulus_count(len(model))
+    stimuli = comparison.stimulus_count(len(model))
     exact, smallest = stimuli <= EXACT_STIMULI, smallest_p(stimuli)
     count = math.factorial(stimuli) if exact else RANDOM_PERMUTATIONS + 1
     null, reason = np.empty(0), ""
@@ -142,10 +133,10 @@ def permutation_test(
     else:
         # Sorted, random orders do not depend on how the stimuli were listed: entry n of two models is the same order.
         # The given one comes first, so the observed statistic went through the same arithmetic.
-        pairs = permuted_pairs(canonical_order(brain)[None])[0]
+        pairs = comparison.permuted_pairs(canonical_order(brain)[None])[0]
         chunks = label_orders(stimuli, seed, step=max(1, _CHUNK_ELEMENTS // len(model)))
         sides = model[None, pairs], brain[:, pairs]
-        comparisons = permuted_comparisons(*sides, chunks, method, device=find_device(device))
+        comparisons = comparison.permuted_comparisons(*sides, chunks, method, device=find_device(device))
         null = np.concatenate([r[:, 0].mean(axis=-1) for r in comparisons])
         if np.isfinite(null[0]):
             return make_test(null, exact=exact, smallest=smallest)
@@ -209,4 +200,4 @@ def label_orders(
 
 def canonical_order(brain: Floats) -> Ints:
     """Return an order of stimuli that depends on the RDMs [A, P] alone, not on how they were listed."""
-    return np.argsort(square(brain.mean(axis=0)).sum(axis=-1), kind="stable")
+    return np.argsort(comparison.square(brain.mean(axis=0)).sum(axis=-1), kind="stable")

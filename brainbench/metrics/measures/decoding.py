@@ -24,10 +24,10 @@ from numpy.typing import ArrayLike
 from brainbench.core.errors import UsageError
 from brainbench.core.reading.ranges import check_number
 from brainbench.core.records import Score
+from brainbench.metrics.arrays import Floats, Ints
 from brainbench.metrics.hooks import usable_features
 from brainbench.metrics.inference.permutation import label_orders, most_exact, tail_p
 from brainbench.metrics.measures.metric import Metric
-from brainbench.metrics.rdms.comparison import Floats, Ints
 from brainbench.metrics.reliability.subject_rdm import SubjectRDM, denoised
 from brainbench.metrics.stimulus_labels import response_matrix
 

@@ -18,12 +18,13 @@ from brainbench.core.contracts import Trials
 from brainbench.core.errors import DataError, UsageError
 from brainbench.core.provenance import UniquePart
 from brainbench.core.statistics import t_interval
+from brainbench.metrics.arrays import Floats, Ints
 from brainbench.metrics.evaluation import most_chosen
 from brainbench.metrics.hooks import Layers
 from brainbench.metrics.inference.permutation import SMALLEST_STIMULI, canonical_order, label_orders, tail_p
 from brainbench.metrics.measures.metric import Metric
 from brainbench.metrics.measures.rsa import lacking, parted
-from brainbench.metrics.rdms.comparison import Floats, Ints, permuted_pairs, rdm_stack, stimulus_count, upper
+from brainbench.metrics.rdms.comparison import permuted_pairs, rdm_stack, stimulus_count, upper
 from brainbench.metrics.rdms.dissimilarity import rdm
 from brainbench.metrics.reliability.noise_correction import Corrected, gated
 from brainbench.metrics.reliability.subject_rdm import SubjectRDM

@@ -22,6 +22,7 @@ from brainbench.core.limits import Count, limited
 from brainbench.core.provenance import UniquePart
 from brainbench.core.records import Score
 from brainbench.core.statistics import two_factor_interval
+from brainbench.metrics.arrays import Floats, Ints
 from brainbench.metrics.evaluation import first_best, most_chosen
 from brainbench.metrics.hooks import Layers, usable_features
 from brainbench.metrics.inference.permutation import canonical_order
@@ -29,8 +30,6 @@ from brainbench.metrics.measures.metric import Metric
 from brainbench.metrics.rdms.comparison import (
     LINEAR,
     WITHOUT,
-    Floats,
-    Ints,
     check_comparison,
     permuted_comparisons,
     permuted_pairs,

@@ -17,13 +17,11 @@ from html import escape
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from brainbench.core.errors import UsageError, check_each, check_name, check_once
-from brainbench.metrics.arrays import fetch, is_tensor, library, place
+from brainbench.metrics.arrays import Floats, Ints, fetch, is_tensor, library, place
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 LARGEST = 1e150  # largest dissimilarity, whose square is still a number
 
 

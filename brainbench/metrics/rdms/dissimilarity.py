@@ -20,6 +20,8 @@ from numpy.typing import ArrayLike
 from brainbench.core.errors import DataError, UsageError, check_name
 from brainbench.metrics.arrays import (
     Array,
+    Floats,
+    Ints,
     cholesky,
     fetch,
     find_device,
@@ -29,7 +31,7 @@ from brainbench.metrics.arrays import (
     slices,
     solve_lower,
 )
-from brainbench.metrics.rdms.comparison import Floats, Ints, upper
+from brainbench.metrics.rdms.comparison import upper
 from brainbench.metrics.stimulus_labels import labelled_trials, response_matrix, stimulus_means, tensor_means
 
 _DUAL_RIDGE = 1e-3

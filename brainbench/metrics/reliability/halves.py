@@ -18,15 +18,9 @@ import numpy as np
 
 from brainbench.core.contracts import Trials
 from brainbench.core.errors import UsageError
-from brainbench.metrics.arrays import finite_mean
-from brainbench.metrics.rdms.comparison import Floats, Ints, features, upper
-from brainbench.metrics.rdms.dissimilarity import (
-    correlation_distances,
-    correlation_from_gram,
-    poisson_rates,
-    product_distances,
-    products_from_gram,
-)
+from brainbench.metrics.arrays import Floats, Ints, finite_mean
+from brainbench.metrics.rdms import dissimilarity
+from brainbench.metrics.rdms.comparison import features, upper
 from brainbench.metrics.reliability.noise_correction import spearman_brown
 from brainbench.metrics.reliability.sessions import Hashes, SortedTrials, draws, trial_hashes
 from brainbench.metrics.stimulus_labels import labelled_trials
@@ -94,19 +88,19 @@ class SplitRDMs:
                 gram += products
                 total += part.units / number
         if self._method != "correlation":
-            return products_from_gram(gram, 1) / units
+            return dissimilarity.products_from_gram(gram, 1) / units
         # Correlation takes each pattern's mean over all units, which spans the sessions.
         centred = gram - total[:, :, None] * total[:, None, :] / units
         if (np.einsum("nii->ni", centred) <= _COMMON * np.einsum("nii->ni", gram)).any():
             return None
-        return correlation_from_gram(centred, np.zeros(gram.shape[:2]))
+        return dissimilarity.correlation_from_gram(centred, np.zeros(gram.shape[:2]))
 
     def _from_patterns(self, members: list[Floats]) -> Floats:
         """Return RDMs from mean patterns: any method, missing entries, large common offsets."""
         each = list(zip(self._sessions, members, strict=True))
         if self._method == "correlation":
             means = [mean_patterns(*item, self._count, variances=False)[0] for item in each]
-            return correlation_distances(np.concatenate(means, axis=-1), missing=True)
+            return dissimilarity.correlation_distances(np.concatenate(means, axis=-1), missing=True)
         # The other distances are means over the units that both patterns have, so slices of units add up.
         total = number = 0.0
         for session, member in each:
@@ -131,11 +125,11 @@ class SplitRDMs:
             seen = np.where(present, patterns, np.nan)
             with np.errstate(invalid="ignore", divide="ignore"):
                 noise = upper((summed + np.swapaxes(summed, -1, -2)) / shared)
-                return product_distances(seen, seen, missing=True) - noise, both
+                return dissimilarity.product_distances(seen, seen, missing=True) - noise, both
         if self._method == "poisson":
-            rates = poisson_rates(patterns)
-            return product_distances(rates, np.log(rates), missing=True), both
-        return product_distances(patterns, patterns, missing=True), both
+            rates = dissimilarity.poisson_rates(patterns)
+            return dissimilarity.product_distances(rates, np.log(rates), missing=True), both
+        return dissimilarity.product_distances(patterns, patterns, missing=True), both
 
 
 class _Sums:

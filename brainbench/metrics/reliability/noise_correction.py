@@ -20,8 +20,8 @@ from numpy.typing import ArrayLike
 
 from brainbench.core.errors import UsageError, check_name
 from brainbench.core.records import Status
-from brainbench.metrics.arrays import finite_mean
-from brainbench.metrics.rdms.comparison import Floats, check_comparison, compare, pooling, rdm_stack
+from brainbench.metrics.arrays import Floats, finite_mean
+from brainbench.metrics.rdms.comparison import check_comparison, compare, pooling, rdm_stack
 
 RELIABILITY_GATE = 0.5
 """Smallest mean reliability of a study's animals whose corrected score is trusted: from there on intervals hold the

@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 
 from brainbench.core.contracts import Trials
 from brainbench.core.errors import DataError, UsageError, check_name
-from brainbench.metrics.rdms.comparison import Floats, Ints
+from brainbench.metrics.arrays import Floats, Ints
 from brainbench.metrics.rdms.dissimilarity import NOISE_METHODS, NoiseModel, estimate_noise
 from brainbench.metrics.stimulus_labels import check_finite, labelled_trials, listed, stimulus_means
 

@@ -26,12 +26,10 @@ from brainbench.core.contracts import Trials, natural_key
 from brainbench.core.errors import DataError, UsageError, check_name
 from brainbench.core.reading.ranges import check_number
 from brainbench.core.records import Interval
-from brainbench.metrics.arrays import finite_mean
+from brainbench.metrics.arrays import Floats, Ints, finite_mean
 from brainbench.metrics.rdms.comparison import (
     LINEAR,
     WITHOUT,
-    Floats,
-    Ints,
     check_comparison,
     compare,
     permuted_pairs,

@@ -25,22 +25,7 @@ from brainbench.core.errors import DataError, UsageError
 from brainbench.core.files import read_mapping, write_json, write_tensors
 from brainbench.core.progress import Progress
 from brainbench.core.reading.regular import readable
-from brainbench.core.runs.folder import (
-    RESTART,
-    RUN,
-    STATE,
-    RunEnd,
-    Stop,
-    claim,
-    learner_state,
-    load_state,
-    mark,
-    occupied,
-    random_state,
-    restore_learner,
-    save_state,
-    set_random_state,
-)
+from brainbench.core.runs import folder
 from brainbench.core.runs.log import RunLog
 from brainbench.models.activations import evaluating
 from brainbench.models.ops.layers import seeded
@@ -71,7 +56,7 @@ _LOG_STEPS = 50
 
 
 @dataclass(frozen=True)
-class TrainingResult(RunEnd):
+class TrainingResult(folder.RunEnd):
     """End of a run; its folder is that of the model, for ``local-dir:``."""
 
     steps: int
@@ -115,8 +100,8 @@ def train(
         How it ended. A loss or gradient that is not finite ends it as ``diverged``: the last good state and model
         stay, and the batch is kept in ``failed-batch.safetensors``.
     """
-    stop = Stop(stop_after)
-    with processes(device) as where, occupied(Path(out), stop, lock=where.first), seeded(config.seed):
+    stop = folder.Stop(stop_after)
+    with processes(device) as where, folder.occupied(Path(out), stop, lock=where.first), seeded(config.seed):
         run = _Run(config, data, Path(out), where, progress, Path(controls or out) / CONTROLS_FILE)
         try:
             return run.run(stop)
@@ -177,7 +162,7 @@ class _Run:
         where.wait()
         self.twin = self._twin(start)
         self.at = _Position()
-        if (out / STATE).exists():  # what is no file is refused there
+        if (out / folder.STATE).exists():  # what is no file is refused there
             self._restore()
         self.log = RunLog(out, "step", self.at.step, active=where.first)
         for warning in config_warnings(config, self.model) if where.first else ():
@@ -186,20 +171,22 @@ class _Run:
     def _claim(self, *, write: bool) -> None:
         identity = {**self.config.identity, "classes": list(self.data.classes)}
         begin = {"run": identity, "status": "running"}
-        claim(self.out / RUN, identity, lambda: begin, stated=lambda document: document.get("run"), write=write)
+        folder.claim(
+            self.out / folder.RUN, identity, lambda: begin, stated=lambda document: document.get("run"), write=write
+        )
 
     def _twin(self, now: dict[str, Any]) -> dict[str, Any]:
         """Return what is told of the network that the run started from, which may have been drawn elsewhere."""
         if not self.where.first:
             return now
-        stored = read_mapping(self.out / RUN).get("twin")
+        stored = read_mapping(self.out / folder.RUN).get("twin")
         if stored is None:
-            mark(self.out / RUN, twin=now)
+            folder.mark(self.out / folder.RUN, twin=now)
         elif reason := difference(stored, now):
             _log.warning("The run goes on, but without its untrained twin: %s.", reason)
         return stored or now
 
-    def run(self, stop: Stop) -> TrainingResult:
+    def run(self, stop: folder.Stop) -> TrainingResult:
         """Train until all epochs are done or it is to stop; return how it ended."""
         self.stop = stop
         steps = len(self.batches)
@@ -317,7 +304,7 @@ class _Run:
     def _finish(self) -> TrainingResult:
         result, split = None, "test"
         if self.where.first:
-            document = read_mapping(self.out / RUN)
+            document = read_mapping(self.out / folder.RUN)
             self.controls = _evaluations(document.get("controls") or {})
             done = document.get("evaluation")
             if done is not None:
@@ -352,7 +339,12 @@ class _Run:
                 if result.collapsed:
                     _log.warning("%s has collapsed: %s.", self.config.model, result.reason)
             controls = {name: asdict(item) for name, item in self.controls.items()}
-            mark(self.out / RUN, evaluation=asdict(result) if result else None, controls=controls, status="finished")
+            folder.mark(
+                self.out / folder.RUN,
+                evaluation=asdict(result) if result else None,
+                controls=controls,
+                status="finished",
+            )
         self.where.wait()
         return self._result("finished", "", result)
 
@@ -405,19 +397,22 @@ class _Run:
             return
         progress = {"position": asdict(self.at), "batches": self.batches.state_dict()}
         # Dropout draws random numbers; augmentation does not, its numbers depend on seed, step and view alone.
-        random = random_state(self.where.device)
-        save_state(self.out / STATE, {**learner_state(self.learner, self.optimizer), **progress, "random": random})
+        random = folder.random_state(self.where.device)
+        folder.save_state(
+            self.out / folder.STATE,
+            {**folder.learner_state(self.learner, self.optimizer), **progress, "random": random},
+        )
 
     def _restore(self) -> None:
-        state = load_state(self.out / STATE)
-        with readable(self.out / STATE, "training state", RESTART):
-            restore_learner(state, self.learner, self.optimizer, self.out / STATE)
+        state = folder.load_state(self.out / folder.STATE)
+        with readable(self.out / folder.STATE, "training state", folder.RESTART):
+            folder.restore_learner(state, self.learner, self.optimizer, self.out / folder.STATE)
             batches = dict(state["batches"])
             if "part" in batches:  # every process reads its own part, and the first one's state was saved
                 batches["part"] = list(self.where.part)
             self.batches.load_state_dict(batches)
             self.at = msgspec.convert(state["position"], _Position)
-            set_random_state(state["random"], self.where.device)
+            folder.set_random_state(state["random"], self.where.device)
 
     def _keep_failure(self, views: tuple[torch.Tensor, ...], labels: torch.Tensor, loss: float, norm: float) -> str:
         reason = (
@@ -429,10 +424,12 @@ class _Run:
             tensors = {f"view{index}": view for index, view in enumerate(views)}
             write_tensors(self.out / FAILED, {**tensors, "labels": labels}, step=str(self.at.step))
             # Before the first validation there is no best model: the last saved state takes its place.
-            if not (self.out / BEST / WEIGHTS).is_file() and (self.out / STATE).is_file():
-                restore_learner(load_state(self.out / STATE), self.learner, self.optimizer, self.out / STATE)
+            if not (self.out / BEST / WEIGHTS).is_file() and (self.out / folder.STATE).is_file():
+                folder.restore_learner(
+                    folder.load_state(self.out / folder.STATE), self.learner, self.optimizer, self.out / folder.STATE
+                )
                 self._publish(None)
-            mark(self.out / RUN, status="diverged", reason=reason)
+            folder.mark(self.out / folder.RUN, status="diverged", reason=reason)
         return reason
 
     def _result(self, status: Any, reason: str, evaluation: Evaluation | None = None) -> TrainingResult:

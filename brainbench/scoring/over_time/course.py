@@ -29,13 +29,11 @@ from brainbench.core.progress import Progress, stages
 from brainbench.core.reading.ranges import check_number
 from brainbench.core.records import Interval
 from brainbench.core.statistics import FEWEST_ANIMALS, FEWEST_STIMULI, two_factor_interval
-from brainbench.metrics.arrays import finite_mean
+from brainbench.metrics.arrays import Floats, Ints, finite_mean
 from brainbench.metrics.evaluation import choose_on_others, most_chosen
 from brainbench.metrics.inference.permutation import canonical_order, label_orders, tail_p
 from brainbench.metrics.measures.rsa import RSA
 from brainbench.metrics.rdms.comparison import (
-    Floats,
-    Ints,
     check_comparison,
     compare_all,
     permuted_comparisons,

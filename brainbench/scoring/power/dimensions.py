@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 
 from brainbench.core.contracts import Trials
 from brainbench.core.errors import DataError, UsageError
-from brainbench.metrics.rdms.comparison import Floats
+from brainbench.metrics.arrays import Floats
 
 MOST = 100.0  # largest number of dimensions that is told apart from more
 _SPLITS = 20

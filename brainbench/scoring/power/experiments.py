@@ -27,10 +27,11 @@ from brainbench.core.limits import Count, Limit, Share, limited
 from brainbench.core.reading.ranges import check_number
 from brainbench.core.records import Interval
 from brainbench.core.statistics import wilson_interval
+from brainbench.metrics.arrays import Floats, Ints
 from brainbench.metrics.evaluation import held_out
 from brainbench.metrics.inference.permutation import SMALLEST_STIMULI, label_orders, smallest_p, tail_p
 from brainbench.metrics.measures.rsa import RSA
-from brainbench.metrics.rdms.comparison import Floats, Ints, features, upper
+from brainbench.metrics.rdms.comparison import features, upper
 
 SIMULATIONS = 1000
 STIMULUS_COUNTS = (4, 5, 6, 7, 8, 10, 12, 16, 20, 24, 32)

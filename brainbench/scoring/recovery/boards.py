@@ -35,9 +35,9 @@ from brainbench.core.runs.folder import begin_run
 from brainbench.core.runs.jobs import run_jobs
 from brainbench.core.statistics import FEWEST_ANIMALS, FEWEST_STIMULI, compare_scores, wilson_interval
 from brainbench.datasets.synthetic.populations import PopulationDesign, ResponseGeometry, principal_axes
+from brainbench.metrics.arrays import Floats, Ints
 from brainbench.metrics.inference.multiple import adjust
 from brainbench.metrics.measures.metric import Metric, get_metric
-from brainbench.metrics.rdms.comparison import Floats, Ints
 from brainbench.metrics.score import score_layers
 from brainbench.scoring.options import ScoreOptions
 

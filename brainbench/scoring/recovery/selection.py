@@ -17,9 +17,10 @@ import numpy as np
 from brainbench.core.errors import UsageError
 from brainbench.core.progress import Progress
 from brainbench.core.reading.ranges import check_number
+from brainbench.metrics.arrays import Floats, Ints
 from brainbench.metrics.evaluation import held_out
 from brainbench.metrics.measures.metric import Metric, get_metric
-from brainbench.metrics.rdms.comparison import Floats, Ints, compare_all, permuted_pairs
+from brainbench.metrics.rdms.comparison import compare_all, permuted_pairs
 from brainbench.scoring.recovery.boards import SMALLEST_RDM, Candidate, RecoveryDesign, check_candidates, draw_board
 
 BOARDS = 4  # boards of each candidate on which stimuli are chosen
