@@ -1,8 +1,10 @@
-"""Errors that tell the user what was received, what is allowed and what to do next."""
+"""Errors that tell the user what was received, what is allowed and what to do next; checks that raise them."""
 
 from __future__ import annotations
 
 import difflib
+import math
+import numbers
 import re
 import unicodedata
 from collections import Counter
@@ -221,6 +223,36 @@ def check_kind(name: str, value: object, kind: type | tuple[type, ...], wanted: 
     """Raise a :class:`UsageError` unless a value is of a kind, of which ``wanted`` is an example."""
     if not isinstance(value, kind):
         raise UsageError(f"The {name} must be {wanted}; received {brief(value)} ({type(value).__name__}).")
+
+
+def check_number(
+    name: str,
+    value: Any,
+    *,
+    least: float = -math.inf,
+    most: float = math.inf,
+    above: float = -math.inf,
+    below: float = math.inf,
+    whole: bool = False,
+) -> None:
+    """Raise a :class:`UsageError` unless ``value`` is a finite number within all bounds, and whole if asked for."""
+    kind = issubclass(type(value), numbers.Integral if whole else numbers.Real) and not isinstance(value, bool)
+    if kind and -math.inf < value < math.inf and least <= value <= most and above < value < below:
+        return
+    bounds = {"at least": least, "at most": most, "above": above, "below": below}
+    words = " and ".join(f"{word} {bound:,}" for word, bound in bounds.items() if math.isfinite(bound))
+    raise UsageError(
+        f"{name} must be a {'whole' if whole else 'finite'} number{words and ', '}{words}; received {brief(value)}."
+    )
+
+
+def check_numbers(name: str, value: Any, count: int, **bounds: Any) -> None:
+    """Raise a :class:`UsageError` unless ``value`` holds so many numbers that :func:`check_number` takes."""
+    values = list(value) if isinstance(value, Iterable) else []
+    if len(values) != count:
+        raise UsageError(f"{name} holds {count} numbers; received {brief(value)}.")
+    for number in values:
+        check_number(name, number, **bounds)
 
 
 def check_once(where: str, names: Iterable[str]) -> None:

@@ -29,8 +29,7 @@ from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
 import msgspec
 
-from brainbench.core.errors import UsageError, brief, check_name, check_once
-from brainbench.core.reading.ranges import check_number
+from brainbench.core.errors import UsageError, brief, check_name, check_number, check_once
 
 Check = Callable[[str, Any], None]
 T = TypeVar("T")

@@ -9,8 +9,7 @@ from typing import TypeGuard
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from brainbench.core.errors import DataError, UsageError
-from brainbench.core.reading.ranges import check_number
+from brainbench.core.errors import DataError, UsageError, check_number
 from brainbench.core.records import Interval, Score
 
 LEVEL = 0.95  # confidence level of all intervals

@@ -18,8 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from brainbench.core.errors import DataError, UsageError, brief, check_name, unknown_name
-from brainbench.core.reading.ranges import check_number
+from brainbench.core.errors import DataError, UsageError, brief, check_name, check_number, unknown_name
 from brainbench.core.reading.regular import MOST_PART, check_file, part_of, readable
 
 if TYPE_CHECKING:

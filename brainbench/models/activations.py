@@ -20,9 +20,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from brainbench.core.errors import BrainbenchError, UsageError, check_each, listing, unknown_name
+from brainbench.core.errors import BrainbenchError, UsageError, check_each, check_number, listing, unknown_name
 from brainbench.core.plugins import load_optional, optional_parts
-from brainbench.core.reading.ranges import check_number
 from brainbench.core.reading.regular import temporary_folder
 
 if TYPE_CHECKING:

@@ -15,8 +15,7 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from brainbench.core.errors import UsageError
-from brainbench.core.reading.ranges import check_number
+from brainbench.core.errors import UsageError, check_number
 from brainbench.models.ops import dispatch
 from brainbench.models.ops.layers import Linear
 from brainbench.models.ops.state_space import linear_scan

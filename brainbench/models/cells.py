@@ -19,8 +19,7 @@ from typing import Any, ClassVar, cast
 import torch
 from torch import nn
 
-from brainbench.core.errors import UsageError
-from brainbench.core.reading.ranges import check_number
+from brainbench.core.errors import UsageError, check_number
 from brainbench.models.ops import dispatch
 from brainbench.models.ops.dispatch import DeferredNormGrad
 from brainbench.models.ops.layers import ChannelNorm, Conv2d, load_named

@@ -16,7 +16,7 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from brainbench.core.reading.ranges import check_number
+from brainbench.core.errors import check_number
 from brainbench.models.graph.spec import Convolution, Dense, Edge, GraphSpec, Memory, Node
 from brainbench.models.ops.layers import RECTIFIER_GAIN, Conv2d, Linear
 from brainbench.models.ops.state_space import StateSpace, System

@@ -27,9 +27,8 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from brainbench.core.errors import DataError, UsageError, brief, check_name, needing
+from brainbench.core.errors import DataError, UsageError, brief, check_name, check_number, needing
 from brainbench.core.reading.apart import CRASHED, SECONDS, call_apart
-from brainbench.core.reading.ranges import check_number
 from brainbench.core.reading.regular import check_file, reason, temporary_folder
 from brainbench.core.reading.tensors import check_finite
 from brainbench.models.attenders import GPTAttender, MambaAttender, MambaMemory

@@ -14,8 +14,7 @@ import torch
 from torch import nn
 
 from brainbench.core.contracts import CHANNELS, SUB_STEP_SECONDS, SUB_STEPS
-from brainbench.core.errors import UsageError, check_each, check_name
-from brainbench.core.reading.ranges import check_number
+from brainbench.core.errors import UsageError, check_each, check_name, check_number
 from brainbench.models.graph.spec import UNROLLS, Unroll
 from brainbench.models.graph.temporal_graph import TemporalGraph
 from brainbench.models.parts import AllStepsDecoder, Attender, Encoder, make_decoder

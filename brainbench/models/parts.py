@@ -18,8 +18,7 @@ from torch import nn
 from torch.nn import functional
 
 from brainbench.core.contracts import GRID_SHAPE
-from brainbench.core.errors import UsageError, check_name
-from brainbench.core.reading.ranges import check_number
+from brainbench.core.errors import UsageError, check_name, check_number
 from brainbench.models.ops.layers import RECTIFIER_GAIN, Linear, perceptron
 
 

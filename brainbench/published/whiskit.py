@@ -27,9 +27,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.contracts import CHANNELS, GRID_SHAPE, check_stimulus_set
-from brainbench.core.errors import DataError, UsageError, check_name, choose_name, listing, unknown_name
+from brainbench.core.errors import DataError, UsageError, check_name, check_number, choose_name, listing, unknown_name
 from brainbench.core.files import write_text
-from brainbench.core.reading.ranges import check_number
 from brainbench.core.reading.tables import read_numbers
 from brainbench.core.reading.texts import read_text
 from brainbench.published.conversion import FRAME_STATUSES, LARGEST, SCALE, assemble_stimulus_set

@@ -8,11 +8,10 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from brainbench.core.errors import DataError, UsageError, brief, listing, unknown_name
+from brainbench.core.errors import DataError, UsageError, brief, check_number, listing, unknown_name
 from brainbench.core.files import to_plain
 from brainbench.core.identity import ScoreIdentity
 from brainbench.core.provenance import Provenance
-from brainbench.core.reading.ranges import check_number
 from brainbench.core.reading.texts import read_toml
 from brainbench.core.records import ESTIMATOR_VERSION, ResultRecord
 from brainbench.scoring.model_responses import follows_seed

@@ -19,8 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.errors import UsageError, check_each
-from brainbench.core.reading.ranges import check_number
+from brainbench.core.errors import UsageError, check_each, check_number
 from robotics_bridge.deploy.driver import Clock, Driver, HandReading, Source
 from robotics_bridge.deploy.safety import Command, SafeLink, SafetyLimits
 from robotics_bridge.envs import ActionMap

@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from brainbench.core.devices import CudaGraphStep, warp_recorder
-from brainbench.core.errors import UsageError, check_kind, needing
-from brainbench.core.reading.ranges import check_number
+from brainbench.core.errors import UsageError, check_kind, check_number, needing
 from robotics_bridge import hands
 from robotics_bridge.envs.simulation import EnvOptions
 from robotics_bridge.envs.state import EnvState

@@ -18,11 +18,10 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from brainbench.core.contracts import CHANNELS, GRID_SHAPE, SUB_STEP_SECONDS, SUB_STEPS, check_stimulus_set
-from brainbench.core.errors import DataError, UsageError, check_each, check_once, listing
+from brainbench.core.errors import DataError, UsageError, check_each, check_number, check_once, listing
 from brainbench.core.files import content_hash, to_json
 from brainbench.core.limits import Limit, limited
 from brainbench.core.progress import Progress, track
-from brainbench.core.reading.ranges import check_number
 from brainbench.core.rotations import from_matrices, from_rpy, to_matrices
 from brainbench.core.version import __version__
 from robotics_bridge import hands

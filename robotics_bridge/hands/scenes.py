@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.devices import mujoco_module
-from brainbench.core.errors import UsageError
-from brainbench.core.reading.ranges import check_number
+from brainbench.core.errors import UsageError, check_number
 from brainbench.core.rotations import from_matrices, from_z_axis, to_matrices
 from robotics_bridge.hands.hand import Hand
 from robotics_bridge.hands.spec import add_servo

@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.devices import mujoco_module
-from brainbench.core.errors import UsageError
-from brainbench.core.reading.ranges import check_number, check_numbers
+from brainbench.core.errors import UsageError, check_number, check_numbers
 from brainbench.core.rotations import to_matrices
 from robotics_bridge.sensors.probes.placement import Probes
 

@@ -18,8 +18,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.devices import mujoco_module, pick_device, record_launches, warp
-from brainbench.core.errors import UsageError, needing, unknown_name
-from brainbench.core.reading.ranges import check_number
+from brainbench.core.errors import UsageError, check_number, needing, unknown_name
 from robotics_bridge.physics.kernels.state import fill_contacts, fill_links
 from robotics_bridge.physics.scene import TouchScene, check_model_fields, differing_fields, model_fields
 from robotics_bridge.physics.state import MOST_ENVS, EnvIds, HandState, select_envs

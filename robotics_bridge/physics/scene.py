@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.devices import mujoco_module
-from brainbench.core.errors import UsageError, check_name, repeats, unknown_name
-from brainbench.core.reading.ranges import check_number, check_numbers
+from brainbench.core.errors import UsageError, check_name, check_number, check_numbers, repeats, unknown_name
 from brainbench.geometry import Mesh
 
 mujoco = mujoco_module()

@@ -16,8 +16,7 @@ import torch
 from numpy.typing import ArrayLike
 
 from brainbench.core.devices import pick_device, warp
-from brainbench.core.errors import UsageError, check_each
-from brainbench.core.reading.ranges import check_number
+from brainbench.core.errors import UsageError, check_each, check_number
 from robotics_bridge.physics.kernels.state import StateArrays
 
 _CONTACT = {"distance": 0.0, "force": float("nan"), "position": 0.0, "normal": 0.0, "friction": 0.0}

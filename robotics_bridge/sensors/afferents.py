@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.signal import butter, sosfilt_zi
 
-from brainbench.core.errors import UsageError, brief, check_each
-from brainbench.core.reading.ranges import check_number
+from brainbench.core.errors import UsageError, brief, check_each, check_number
 
 if TYPE_CHECKING:
     import torch

@@ -11,9 +11,8 @@ import numpy as np
 import torch
 
 from brainbench.core.devices import pick_device, record_launches, warp
-from brainbench.core.errors import UsageError, check_kind, listing, unknown_name
+from brainbench.core.errors import UsageError, check_kind, check_number, listing, unknown_name
 from brainbench.core.plugins import load_object
-from brainbench.core.reading.ranges import check_number
 from brainbench.core.rotations import to_matrices
 from robotics_bridge.physics.scene import TouchScene
 from robotics_bridge.physics.state import MOST_ENVS, EnvIds, HandState, select_envs

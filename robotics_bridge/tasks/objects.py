@@ -13,9 +13,8 @@ from numbers import Real
 from typing import Any
 
 from brainbench.core.devices import mujoco_module
-from brainbench.core.errors import UsageError, brief
+from brainbench.core.errors import UsageError, brief, check_numbers
 from brainbench.core.limits import Positive, limited
-from brainbench.core.reading.ranges import check_numbers
 from robotics_bridge.tasks.settings import unit_vector
 
 GRAIN = 1e-4  # half size of the stand-in for a solid that a shape lacks [m]

@@ -11,9 +11,8 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
-from brainbench.core.errors import UsageError, brief, check_each
+from brainbench.core.errors import UsageError, brief, check_each, check_numbers
 from brainbench.core.limits import Count, Limit, NotNegative, Positive, Share, limited
-from brainbench.core.reading.ranges import check_numbers
 
 Range = Annotated[tuple[float, float], Limit(rising=True)]  # lower and upper bound of a uniform distribution
 Factors = Annotated[tuple[NotNegative, NotNegative], Limit(rising=True)]  # the same of numbers that are not negative

@@ -8,9 +8,8 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 
-from brainbench.core.errors import UsageError, brief, check_each, check_name
+from brainbench.core.errors import UsageError, brief, check_each, check_name, check_number, check_numbers
 from brainbench.core.limits import Count, Limit, NotNegative, Positive, limited
-from brainbench.core.reading.ranges import check_number, check_numbers
 from brainbench.core.rotations import TURN
 from robotics_bridge.tasks import terms
 from robotics_bridge.tasks.goals import Goal

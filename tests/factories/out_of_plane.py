@@ -9,8 +9,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.errors import UsageError
-from brainbench.core.reading.ranges import check_number
+from brainbench.core.errors import UsageError, check_number
 from brainbench.stimuli.engines.fidelity import DEFAULT_ENGINE, Fidelity
 from brainbench.stimuli.motion.jobs import Load
 from brainbench.stimuli.motion.trajectories import smooth_step

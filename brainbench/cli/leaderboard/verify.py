@@ -19,9 +19,8 @@ import typer
 
 from brainbench.cli.options import SCORE, SCORE_FLAGS, option_fields, out_folder, out_folder_option, with_options
 from brainbench.cli.output import Output, progress_bar, table_of, tracked
-from brainbench.core.errors import BrainbenchError, DataError, UsageError, brief, look_alike, visible
+from brainbench.core.errors import BrainbenchError, DataError, UsageError, brief, check_number, look_alike, visible
 from brainbench.core.files import content_hash, private_folder, write_json
-from brainbench.core.reading.ranges import check_number
 from brainbench.core.reading.regular import temporary_folder
 
 if TYPE_CHECKING:

@@ -63,8 +63,8 @@ def play(
     width: Annotated[int, typer.Option(help="Of a frame [pixels].")] = 480,
 ) -> Output:
     """Run an agent in one environment of a task and show what happens, as numbers and as a film."""
+    from brainbench.core.errors import check_number
     from brainbench.core.figures import check_format
-    from brainbench.core.reading.ranges import check_number
     from robotics_bridge.tasks.settings import contacts_name
 
     for flag, number, bound in (("--seconds", seconds, 0), ("--rate", rate, 0), ("--width (pixels)", width, 63)):
@@ -140,7 +140,7 @@ def evaluate(
     touched the object (rad/s), the mean duration (s) and the share of episodes that a drop (or another ending of the
     task) ended.
     """
-    from brainbench.core.reading.ranges import check_number
+    from brainbench.core.errors import check_number
     from robotics_bridge.policies.evaluate import evaluate as run
     from robotics_bridge.tasks.settings import contacts_name
 

@@ -97,7 +97,7 @@ def bench(
     The benchmark against peers and rooflines is benchmarks/tactile/throughput.py in the repository.
     """
     from brainbench.cli.tactile import scenes
-    from brainbench.core.reading.ranges import check_number
+    from brainbench.core.errors import check_number
 
     check_number("--repeats", repeats, least=1)
     envs, device = batch["num_envs"], batch["device"]

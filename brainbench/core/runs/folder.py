@@ -16,9 +16,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from brainbench.core.errors import DataError, UsageError, brief
+from brainbench.core.errors import DataError, UsageError, brief, check_number
 from brainbench.core.files import is_temporary, lock_folder, read_mapping, to_plain, write_json, write_tensors
-from brainbench.core.reading.ranges import check_number
 from brainbench.core.reading.regular import check_file, readable, reason
 from brainbench.core.reading.tensors import check_finite
 

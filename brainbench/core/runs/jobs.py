@@ -12,8 +12,7 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from typing import Any
 
-from brainbench.core.errors import DataError, UsageError, needing
-from brainbench.core.reading.ranges import check_number
+from brainbench.core.errors import DataError, UsageError, check_number, needing
 
 TIMEOUT = 30  # seconds that the scheduler of a cluster may take to answer
 STOPPING = threading.Event()

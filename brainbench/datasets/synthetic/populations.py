@@ -27,12 +27,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.contracts import Trials
-from brainbench.core.errors import DataError, UsageError, check_name
+from brainbench.core.errors import DataError, UsageError, check_name, check_number
 from brainbench.core.files import cache_dir, check_folder, content_hash, file_hash, read_json, write_json
 from brainbench.core.limits import Count, Limit, NotNegative, Positive, Share, limited
 from brainbench.core.progress import Progress
 from brainbench.core.reading.hdf5 import trust_hdf5
-from brainbench.core.reading.ranges import check_number
 from brainbench.core.reading.sealed import is_sealed, keeping, seal_file
 from brainbench.datasets.hdf5 import write_recordings
 from brainbench.datasets.nwb import write_nwb

@@ -18,10 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.contracts import check_stimulus_set
-from brainbench.core.errors import DataError, listing
+from brainbench.core.errors import DataError, check_number, listing
 from brainbench.core.files import content_hash
 from brainbench.core.progress import Progress
-from brainbench.core.reading.ranges import check_number
 from brainbench.datasets.layouts import published
 from brainbench.datasets.layouts.published import TRACKED
 from brainbench.datasets.sessions import Series, Session, make_session

@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.contracts import as_labels, as_number, natural_key
-from brainbench.core.errors import DataError, UsageError, listing
-from brainbench.core.reading.ranges import check_number
+from brainbench.core.errors import DataError, UsageError, check_number, listing
 from brainbench.datasets.ledger import Ledger
 from brainbench.datasets.sessions import OBSERVED, SPIKES, Session, SessionTable
 from brainbench.datasets.trials.selection import CONTACTS, Conditions, Selection, Window, joined_labels, select_rows

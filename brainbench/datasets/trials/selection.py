@@ -14,8 +14,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core import contracts
-from brainbench.core.errors import DataError, UsageError, brief, check_once, listing, nearest, repeats, unknown_name
-from brainbench.core.reading.ranges import check_number
+from brainbench.core.errors import (
+    DataError,
+    UsageError,
+    brief,
+    check_number,
+    check_once,
+    listing,
+    nearest,
+    repeats,
+    unknown_name,
+)
 from brainbench.datasets.ledger import Ledger
 from brainbench.datasets.sessions import Session, SessionTable
 

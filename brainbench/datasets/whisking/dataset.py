@@ -21,12 +21,19 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 import numpy as np
 
 from brainbench.core.contracts import CHANNELS, GRID_SHAPE, SUB_STEP_SECONDS, SUB_STEPS, SWEEPS_FORMAT, SWEEPS_SCHEMA
-from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, brief, check_name, listing
+from brainbench.core.errors import (
+    DataError,
+    DataFileNotFoundError,
+    UsageError,
+    brief,
+    check_name,
+    check_number,
+    listing,
+)
 from brainbench.core.files import cache_dir, content_hash, hash_arrays, read_json
 from brainbench.core.plugins import load_optional
 from brainbench.core.progress import Progress, track
 from brainbench.core.reading.hdf5 import open_hdf5
-from brainbench.core.reading.ranges import check_number
 from brainbench.core.reading.regular import readable
 from brainbench.core.reading.sealed import is_sealed, keep_entry, read_sealed, write_sealed
 

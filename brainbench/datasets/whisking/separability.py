@@ -14,9 +14,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from brainbench.core.errors import DataError, UsageError, check_each, check_once, needing
+from brainbench.core.errors import DataError, UsageError, check_each, check_number, check_once, needing
 from brainbench.core.progress import Progress
-from brainbench.core.reading.ranges import check_number
 from brainbench.core.records import Interval, Status
 
 if TYPE_CHECKING:

@@ -15,8 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from brainbench.core.errors import UsageError
-from brainbench.core.reading.ranges import check_number
+from brainbench.core.errors import UsageError, check_number
 from brainbench.core.records import Status
 from brainbench.metrics.arrays import Floats, Ints, find_device
 from brainbench.metrics.rdms import comparison

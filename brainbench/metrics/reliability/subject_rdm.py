@@ -23,8 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.contracts import Trials, natural_key
-from brainbench.core.errors import DataError, UsageError, check_name
-from brainbench.core.reading.ranges import check_number
+from brainbench.core.errors import DataError, UsageError, check_name, check_number
 from brainbench.core.records import Interval
 from brainbench.metrics.arrays import Floats, Ints, finite_mean
 from brainbench.metrics.rdms.comparison import (

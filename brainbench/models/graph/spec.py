@@ -12,8 +12,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Literal
 
-from brainbench.core.errors import UsageError, brief, check_name, listing
-from brainbench.core.reading.ranges import check_number
+from brainbench.core.errors import UsageError, brief, check_name, check_number, listing
 
 Shape = tuple[int, ...]
 Unroll = Literal["biological", "full"]

@@ -10,8 +10,7 @@ from collections.abc import Mapping
 from graphlib import CycleError, TopologicalSorter
 from typing import Any
 
-from brainbench.core.errors import DataError, brief, check_name, listing, unknown_name
-from brainbench.core.reading.ranges import check_number
+from brainbench.core.errors import DataError, brief, check_name, check_number, listing, unknown_name
 from brainbench.core.reading.regular import readable
 from brainbench.core.reading.texts import read_json, read_mapping
 from brainbench.models.graph.spec import Convolution, Dense, Edge, GraphSpec, Memory, Node, Operation, Pool

@@ -19,9 +19,8 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from brainbench.core.errors import DataError, UsageError, check_name, listing, nearest, unknown_name
+from brainbench.core.errors import DataError, UsageError, check_name, check_number, listing, nearest, unknown_name
 from brainbench.core.files import content_hash
-from brainbench.core.reading.ranges import check_number
 
 
 @contextmanager

@@ -29,8 +29,7 @@ from torch.nn import functional
 
 from brainbench.core.contracts import CHANNELS, GRID_SHAPE
 from brainbench.core.devices import torch_device
-from brainbench.core.errors import UsageError, check_name
-from brainbench.core.reading.ranges import check_number
+from brainbench.core.errors import UsageError, check_name, check_number
 from brainbench.models.network import Normaliser
 
 LAST_COLUMNS = (4, 4, 6, 6, 5)

@@ -21,8 +21,7 @@ from torch.nn import functional
 from torch.optim import Optimizer
 
 from brainbench.core.devices import record_step
-from brainbench.core.errors import UsageError, check_name
-from brainbench.core.reading.ranges import check_number
+from brainbench.core.errors import UsageError, check_name, check_number
 from brainbench.models.attenders import GPTBlock, MambaBlock
 from brainbench.models.cells import Cell, GatedCell
 from brainbench.models.encoders import BasicBlock, S4Block

@@ -23,10 +23,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.contracts import Trials
-from brainbench.core.errors import DataError, UsageError, listing
+from brainbench.core.errors import DataError, UsageError, check_number, listing
 from brainbench.core.files import to_plain
 from brainbench.core.progress import Progress, stages
-from brainbench.core.reading.ranges import check_number
 from brainbench.core.records import Interval
 from brainbench.core.statistics import FEWEST_ANIMALS, FEWEST_STIMULI, two_factor_interval
 from brainbench.metrics.arrays import Floats, Ints, finite_mean

@@ -22,9 +22,8 @@ from typing import Annotated
 
 import numpy as np
 
-from brainbench.core.errors import UsageError, check_name
+from brainbench.core.errors import UsageError, check_name, check_number
 from brainbench.core.limits import Count, Limit, Share, limited
-from brainbench.core.reading.ranges import check_number
 from brainbench.core.records import Interval
 from brainbench.core.statistics import wilson_interval
 from brainbench.metrics.arrays import Floats, Ints

@@ -23,12 +23,11 @@ from typing import Annotated, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from brainbench.core.errors import UsageError, brief, repeats, unknown_name
+from brainbench.core.errors import UsageError, brief, check_number, repeats, unknown_name
 from brainbench.core.figures import INK, PALE, check_format, new_figure, save_figure
 from brainbench.core.files import content_hash, read_json, to_plain, write_json
 from brainbench.core.limits import Count, Limit, Seed, limited
 from brainbench.core.progress import Progress, track
-from brainbench.core.reading.ranges import check_number
 from brainbench.core.reading.regular import readable
 from brainbench.core.records import Interval, Score
 from brainbench.core.runs.folder import begin_run

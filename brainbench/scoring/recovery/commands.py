@@ -15,10 +15,9 @@ import typer
 from brainbench.cli.options import SCORE, SchedulerOption, WorkersOption, option, out_folder_option, with_options
 from brainbench.cli.output import Output, progress_bar, table_of
 from brainbench.cli.requirements import Requirement, needs
-from brainbench.core.errors import UsageError
+from brainbench.core.errors import UsageError, check_number
 from brainbench.core.files import provenance, to_plain, write_json
 from brainbench.core.identity import SealedPlan
-from brainbench.core.reading.ranges import check_number
 
 if TYPE_CHECKING:
     from brainbench.scoring.recovery import Candidate, Recovery, RecoveryDesign

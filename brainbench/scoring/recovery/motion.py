@@ -20,9 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.contracts import GRID_SHAPE
-from brainbench.core.errors import DataError, UsageError
+from brainbench.core.errors import DataError, UsageError, check_number
 from brainbench.core.plugins import OptionalPart
-from brainbench.core.reading.ranges import check_number
 from brainbench.core.records import Interval, Status
 from brainbench.core.statistics import t_interval
 from brainbench.metrics.measures.metric import get_metric

@@ -14,9 +14,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from brainbench.core.errors import UsageError
+from brainbench.core.errors import UsageError, check_number
 from brainbench.core.progress import Progress
-from brainbench.core.reading.ranges import check_number
 from brainbench.metrics.arrays import Floats, Ints
 from brainbench.metrics.evaluation import held_out
 from brainbench.metrics.measures.metric import Metric, get_metric

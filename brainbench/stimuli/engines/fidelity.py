@@ -14,9 +14,8 @@ from functools import cache
 from importlib import resources
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from brainbench.core.errors import UsageError, brief, check_name
+from brainbench.core.errors import UsageError, brief, check_name, check_number
 from brainbench.core.limits import Limit, Positive, limited, read_pairs, read_value, with_changes
-from brainbench.core.reading.ranges import check_number
 from brainbench.core.tradeoffs import TradeoffPoint, cheapest
 from brainbench.stimuli.whiskers.whisker import Chain, Whisker, build_chain
 

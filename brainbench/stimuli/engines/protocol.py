@@ -16,9 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.devices import usable_processors
-from brainbench.core.errors import UsageError, listing
+from brainbench.core.errors import UsageError, check_number, listing
 from brainbench.core.progress import Progress as NamedProgress
-from brainbench.core.reading.ranges import check_number
 from brainbench.stimuli.engines.air import check_air
 from brainbench.stimuli.engines.error_estimates import with_errors
 from brainbench.stimuli.engines.fidelity import Fidelity

@@ -17,9 +17,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from brainbench.core.errors import DataError, UsageError
+from brainbench.core.errors import DataError, UsageError, check_number
 from brainbench.core.limits import Count, Limit, limited
-from brainbench.core.reading.ranges import check_number
 from brainbench.stimuli.tracks.contract import check_length, check_track, traced_lengths
 from brainbench.stimuli.whiskers.whisker import Whisker
 

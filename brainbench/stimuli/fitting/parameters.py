@@ -19,9 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core import rotations
-from brainbench.core.errors import UsageError, check_each, unknown_name
+from brainbench.core.errors import UsageError, check_each, check_number, unknown_name
 from brainbench.core.limits import Count, Limit, Positive, limited
-from brainbench.core.reading.ranges import check_number
 from brainbench.core.statistics import check_level
 from brainbench.stimuli.engines.fidelity import MOST_LINKS
 from brainbench.stimuli.motion.jobs import Follicle, Job

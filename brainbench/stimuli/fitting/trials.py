@@ -17,10 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.contracts import CHANNELS
-from brainbench.core.errors import DataError, UsageError, brief, check_name, choose_name, listing
+from brainbench.core.errors import DataError, UsageError, brief, check_name, check_number, choose_name, listing
 from brainbench.core.limits import Limit, limited
 from brainbench.core.reading.hdf5 import open_hdf5
-from brainbench.core.reading.ranges import check_number
 from brainbench.core.reading.tables import read_columns
 from brainbench.core.rotations import Vector
 from brainbench.stimuli.fitting.contacts import normal_offsets

@@ -13,9 +13,8 @@ from typing import Annotated, ClassVar, Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.errors import UsageError
+from brainbench.core.errors import UsageError, check_number
 from brainbench.core.limits import Limit, limited
-from brainbench.core.reading.ranges import check_number
 from brainbench.core.rotations import Length, Point
 from brainbench.stimuli.objects.obstacle import Obstacle
 from brainbench.stimuli.whiskers.whisker import Whisker

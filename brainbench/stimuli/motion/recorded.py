@@ -36,9 +36,8 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.errors import DataError, UsageError, brief, check_name, listing
+from brainbench.core.errors import DataError, UsageError, brief, check_name, check_numbers, listing
 from brainbench.core.limits import Limit, NotNegative, Positive, limited
-from brainbench.core.reading.ranges import check_numbers
 from brainbench.core.reading.tables import read_columns, read_numbers
 from brainbench.core.rotations import TURN, Angle, Vector, base_rotation
 from brainbench.stimuli.motion.trajectories import ROTATIONS, Rotations, follow_angles, low_pass

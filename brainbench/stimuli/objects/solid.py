@@ -12,10 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from brainbench.core.errors import UsageError, check_name
+from brainbench.core.errors import UsageError, check_name, check_number
 from brainbench.core.files import content_hash, portable
 from brainbench.core.limits import NotNegative, limited
-from brainbench.core.reading.ranges import check_number
 from brainbench.core.rotations import Angles, Point, Vector, euler_matrix, from_matrices
 from brainbench.geometry import DecompositionSettings, Mesh, decompose, deviation, load_mesh, repair
 from brainbench.stimuli.motion.trajectories import Path, Spin, Still, Translation

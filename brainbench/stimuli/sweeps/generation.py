@@ -25,11 +25,10 @@ from numpy.typing import NDArray
 
 from brainbench.core.contracts import SWEEPS_FORMAT, SWEEPS_SCHEMA
 from brainbench.core.devices import gpus, pick_device, usable_processors
-from brainbench.core.errors import BrainbenchError, DataError, UsageError
+from brainbench.core.errors import BrainbenchError, DataError, UsageError, check_number
 from brainbench.core.files import content_hash, is_temporary, lock_folder, provenance, write_json
 from brainbench.core.progress import Progress
 from brainbench.core.reading.hdf5 import open_hdf5
-from brainbench.core.reading.ranges import check_number
 from brainbench.core.runs.folder import begin_run
 from brainbench.core.runs.jobs import (
     STOPPING,

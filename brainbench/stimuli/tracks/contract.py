@@ -21,8 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.contracts import CHANNELS
-from brainbench.core.errors import DataError, brief, check_each, check_once
-from brainbench.core.reading.ranges import check_number
+from brainbench.core.errors import DataError, brief, check_each, check_number, check_once
 
 if TYPE_CHECKING:
     import xarray as xr

@@ -17,8 +17,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.errors import DataError, UsageError
-from brainbench.core.reading.ranges import check_number
+from brainbench.core.errors import DataError, UsageError, check_number
 from brainbench.core.rotations import base_rotation, euler_matrix
 from brainbench.stimuli.engines import get_engine
 from brainbench.stimuli.engines.fidelity import DEFAULT_ENGINE, Fidelity

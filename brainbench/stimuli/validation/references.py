@@ -15,8 +15,7 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.errors import UsageError
-from brainbench.core.reading.ranges import check_number
+from brainbench.core.errors import UsageError, check_number
 from brainbench.stimuli.whiskers.whisker import Whisker
 
 # Runge-Kutta steps along the rod, and finite elements of the frequencies.

@@ -15,9 +15,8 @@ from typing import Annotated, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from brainbench.core.errors import UsageError, brief, check_each, check_kind
+from brainbench.core.errors import UsageError, brief, check_each, check_kind, check_number
 from brainbench.core.limits import Limit, NotNegative, limited
-from brainbench.core.reading.ranges import check_number
 from brainbench.core.rotations import Length
 
 SOFTEST = 1e3

@@ -16,9 +16,8 @@ from typing import Annotated, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.errors import DataError, UsageError
+from brainbench.core.errors import DataError, UsageError, check_number
 from brainbench.core.limits import Limit, Seed, Share, limited, read_pairs, with_changes
-from brainbench.core.reading.ranges import check_number
 from robotics_bridge import hands
 from robotics_bridge.deploy.driver import DriverRequest, HandReading
 from robotics_bridge.deploy.links.udp import LOOPBACK, HandEnd, HandLink, UdpDriver, new_key

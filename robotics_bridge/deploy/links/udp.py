@@ -27,8 +27,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, check_once
-from brainbench.core.reading.ranges import check_number
+from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, check_number, check_once
 from robotics_bridge import hands
 from robotics_bridge.deploy.driver import DriverRequest, HandReading, LinkCounters
 from robotics_bridge.deploy.safety import ClockOffset

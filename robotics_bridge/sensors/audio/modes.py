@@ -14,9 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.sparse.linalg import eigsh
 from scipy.spatial import KDTree
 
-from brainbench.core.errors import UsageError, brief, needing
+from brainbench.core.errors import UsageError, brief, check_number, check_numbers, needing
 from brainbench.core.files import cache_dir, content_hash, to_plain
-from brainbench.core.reading.ranges import check_number, check_numbers
 from brainbench.core.reading.sealed import read_sealed, write_sealed
 from brainbench.geometry import Mesh, winding_number
 from robotics_bridge.physics.scene import Geometry

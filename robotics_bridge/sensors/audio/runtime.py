@@ -12,9 +12,8 @@ import numpy as np
 import torch
 
 from brainbench.core.devices import warp
-from brainbench.core.errors import UsageError, check_kind
+from brainbench.core.errors import UsageError, check_kind, check_number
 from brainbench.core.limits import NotNegative, Positive, limited
-from brainbench.core.reading.ranges import check_number
 from robotics_bridge.physics.state import HandState
 from robotics_bridge.sensors.audio.sensors import ActuationAudio, AudioSensor, ContactAudio
 from robotics_bridge.sensors.context import fill

@@ -11,9 +11,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, ClassVar
 
-from brainbench.core.errors import UsageError, unknown_name
+from brainbench.core.errors import UsageError, check_number, unknown_name
 from brainbench.core.limits import Count, Limit, NotNegative, Positive, limited
-from brainbench.core.reading.ranges import check_number
 from robotics_bridge.sensors.sensor import Sensor
 
 

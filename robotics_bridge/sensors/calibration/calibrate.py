@@ -22,8 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import beta
 
-from brainbench.core.errors import DataError, UsageError, listing
-from brainbench.core.reading.ranges import check_number
+from brainbench.core.errors import DataError, UsageError, check_number, listing
 from brainbench.core.reading.tables import read_columns
 from robotics_bridge.sensors.calibration.likelihood import (
     Z95,

@@ -10,8 +10,7 @@ import typer
 
 from brainbench.cli.options import out_file_option
 from brainbench.cli.output import Output, table_of
-from brainbench.core.errors import UsageError, listing
-from brainbench.core.reading.ranges import check_number
+from brainbench.core.errors import UsageError, check_number, listing
 
 if TYPE_CHECKING:
     from robotics_bridge.sensors.calibration.calibrate import Log

@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.devices import pick_device, warp
-from brainbench.core.errors import UsageError
-from brainbench.core.reading.ranges import check_number
+from brainbench.core.errors import UsageError, check_number
 from robotics_bridge.sensors.context import LaunchContext, ReadoutSlice, fill
 from robotics_bridge.sensors.kernels.noise import NoiseParams, crosstalk, delay_line, measure
 from robotics_bridge.sensors.noise.model import Noise, stream_key

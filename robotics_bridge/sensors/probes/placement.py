@@ -8,8 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from brainbench.core.errors import UsageError, brief
-from brainbench.core.reading.ranges import check_number, check_numbers
+from brainbench.core.errors import UsageError, brief, check_number, check_numbers
 from brainbench.geometry import Mesh
 
 FARTHEST = 10.0  # distance [m] from its link beyond which no probe is, and largest radius

@@ -10,8 +10,8 @@ from typing import Annotated, Any, ClassVar
 import numpy as np
 
 from brainbench.core.devices import warp
+from brainbench.core.errors import check_number
 from brainbench.core.limits import Limit, NotNegative, limited
-from brainbench.core.reading.ranges import check_number
 from robotics_bridge.physics.state import HandState
 from robotics_bridge.sensors.kernels.probe import depth_kernel, distance_kernel
 from robotics_bridge.sensors.noise.model import PROBE_KNOBS, TAXEL_KNOBS

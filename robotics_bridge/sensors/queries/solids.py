@@ -14,9 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.devices import to_struct, warp
-from brainbench.core.errors import UsageError
+from brainbench.core.errors import UsageError, check_number
 from brainbench.core.files import cache_dir
-from brainbench.core.reading.ranges import check_number
 from brainbench.core.reading.sealed import read_sealed, write_sealed
 from brainbench.geometry import Mesh
 from brainbench.geometry.mesh import repair, sample_surface

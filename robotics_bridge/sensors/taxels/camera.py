@@ -16,10 +16,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
-from brainbench.core.errors import DataError, UsageError
+from brainbench.core.errors import DataError, UsageError, check_number
 from brainbench.core.files import atomic_path
 from brainbench.core.reading.archives import read_npz
-from brainbench.core.reading.ranges import check_number
 
 SPAN = 1.5  # largest slope along an axis that the table holds
 _BINS = 61

@@ -13,8 +13,7 @@ import numpy as np
 import torch
 
 from brainbench.core.devices import warp
-from brainbench.core.errors import UsageError
-from brainbench.core.reading.ranges import check_number
+from brainbench.core.errors import UsageError, check_number
 from robotics_bridge.physics.state import HandState
 from robotics_bridge.sensors.context import ReadoutSlice, fill
 from robotics_bridge.sensors.kernels.dilation import (

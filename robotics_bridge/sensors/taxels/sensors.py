@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, cast
 
-from brainbench.core.errors import UsageError
+from brainbench.core.errors import UsageError, check_number
 from brainbench.core.limits import Count, Limit, NotNegative, Positive, limited
-from brainbench.core.reading.ranges import check_number
 from robotics_bridge.sensors.noise.model import GRID_KNOBS, TAXEL_KNOBS
 from robotics_bridge.sensors.sensor import Convention, ProbeSensor, QuerySensor, Sensor
 

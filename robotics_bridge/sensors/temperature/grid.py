@@ -16,9 +16,8 @@ from typing import Annotated, Any, ClassVar, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.errors import UsageError, check_kind
+from brainbench.core.errors import UsageError, check_kind, check_number
 from brainbench.core.limits import Count, Limit, NotNegative, Positive, limited
-from brainbench.core.reading.ranges import check_number
 from brainbench.core.rotations import to_matrices
 from robotics_bridge.physics.scene import Geometry, TouchScene
 from robotics_bridge.sensors.sensor import Sensor

@@ -18,8 +18,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.errors import check_name
-from brainbench.core.reading.ranges import check_number
+from brainbench.core.errors import check_name, check_number
 from brainbench.geometry import Mesh, convex_hull
 from brainbench.stimuli.objects.procedural import builders
 from brainbench.stimuli.objects.procedural.bodies import Body, ShapeSampler
