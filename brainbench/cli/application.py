@@ -38,9 +38,6 @@ def build(words: Sequence[str] | None = None) -> typer.Typer:
     """Return the command line: the command that ``words`` begin with alone; without words all, complete.
 
     Before any command is named in the words, all stand there with their help alone.
-
-    Raises:
-        MissingDependencyError: the words name an optional command whose folder was taken off.
     """
     first = None if words is None else next((word for word in words if not word.startswith("-")), "")
     second = words[1] if words and len(words) > 1 else ""

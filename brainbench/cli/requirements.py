@@ -118,12 +118,7 @@ def needs_of(name: str, command: Callable[..., Any] | None) -> Needs:
 
 
 def check_requirements(needs: Needs, values: Mapping[str, Any]) -> None:
-    """Check what a command needs for the values of its parameters.
-
-    Raises:
-        FileWriteError: the cache cannot be made.
-        UsageError: it cannot be written, or a number is none.
-    """
+    """Check what a command needs for the values of its parameters."""
     for name, value in values.items():
         for number in value if isinstance(value, (list, tuple)) else [value]:
             if isinstance(number, float) and not math.isfinite(number):

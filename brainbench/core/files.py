@@ -206,9 +206,6 @@ def atomic_path(target: str | os.PathLike[str], *, sync: bool = True) -> Iterato
 
     The temporary name keeps the target's suffix, so libraries that choose a format by suffix work. Without ``sync`` the
     caller sees to it that the content is on disk: of many files at once.
-
-    Raises:
-        FileWriteError: the folder cannot be made or written, or the disk is full.
     """
     target = Path(target)
     temporary = target
@@ -472,11 +469,7 @@ class _Disk(io.FileIO):
 
 @contextlib.contextmanager
 def create_hdf5(path: str | os.PathLike[str], **options: Any) -> Iterator[h5py.File]:
-    """Yield a new HDF5 file that replaces ``path`` when the block ends; ``options`` are those of ``h5py.File``.
-
-    Raises:
-        FileWriteError: the folder cannot be written, or the disk is full.
-    """
+    """Yield a new HDF5 file that replaces ``path`` when the block ends; ``options`` are those of ``h5py.File``."""
     import h5py
 
     with atomic_path(path) as temporary, _Disk(temporary, "r+") as disk:
@@ -494,11 +487,7 @@ def create_hdf5(path: str | os.PathLike[str], **options: Any) -> Iterator[h5py.F
 
 
 def write_tensors(path: str | os.PathLike[str], tensors: Mapping[str, torch.Tensor], **metadata: str) -> None:
-    """Write tensors of any device to one safetensors file, replaced as a whole.
-
-    Raises:
-        FileWriteError: the folder cannot be made or written, or the disk is full.
-    """
+    """Write tensors of any device to one safetensors file, replaced as a whole."""
     from safetensors.torch import save
 
     stored = {name: value.detach().cpu().contiguous().clone() for name, value in tensors.items()}

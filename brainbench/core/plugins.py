@@ -132,11 +132,7 @@ class OptionalPart:
         return ""
 
     def load(self, kind: str) -> Any:
-        """Import and return the object; ``kind`` is what it is, for messages: ``command``, ``metric``, ``engine``.
-
-        Raises:
-            MissingDependencyError: its folder was taken off, or its module cannot be imported.
-        """
+        """Import and return the object; ``kind`` is what it is, for messages: ``command``, ``metric``, ``engine``."""
         module, _, attribute = self.target.partition(":")
         words = self.name.replace(".", " ")
         if self.taken_off:
@@ -171,21 +167,13 @@ def optional_parts(group: str) -> dict[str, OptionalPart]:
 
 
 def load_optional(group: str, name: str, kind: str) -> Any | None:
-    """Return the object of one name of a group, or None where no entry has the name.
-
-    Raises:
-        MissingDependencyError: the folder that holds it was taken off.
-    """
+    """Return the object of one name of a group, or None where no entry has the name."""
     part = optional_parts(group).get(name)
     return None if part is None else part.load(kind)
 
 
 def require_optional(group: str, name: str, kind: str) -> Any:
-    """Return the object of one name of a group that ships with this package.
-
-    Raises:
-        MissingDependencyError: the folder that holds it was taken off, or the installation does not know it.
-    """
+    """Return the object of one name of a group that ships with this package."""
     part = load_optional(group, name, kind)
     if part is None:
         raise MissingDependencyError(

@@ -50,11 +50,7 @@ def write_features(path: str | Path, labels: Sequence[str], activations: Mapping
 
 
 def read_features(path: str | Path) -> Features:
-    """Read a file in the layout above.
-
-    Raises:
-        DataFileNotFoundError: there is no such file.
-    """
+    """Read a file in the layout above."""
     import h5py
 
     path = Path(path)

@@ -62,11 +62,7 @@ class UserModel:
         return Path(place) if place.endswith(".py") else None
 
     def build(self, **options: Any) -> nn.Module:
-        """Build the model from its code as it is today; a change since it was added is told in a warning.
-
-        Raises:
-            DataFileNotFoundError: the file is gone.
-        """
+        """Build the model from its code as it is today; a change since it was added is told in a warning."""
         if self.path is not None and not self.path.is_file():
             raise DataFileNotFoundError(
                 f"The model {self.name!r} was added from {str(self.path)!r}, which is gone; put the file back, or "

@@ -59,11 +59,7 @@ class Settings:
 
 
 def read_weights(path: str | os.PathLike[str]) -> ForeignWeights:
-    """Read a file of weights; nothing in it is executed.
-
-    Raises:
-        DataFileNotFoundError: there is no such file.
-    """
+    """Read a file of weights; nothing in it is executed."""
     path, kind = Path(path), "file of weights"
     read = read_tensors if path.suffix == ".safetensors" else read_checkpoint
     content: Mapping[str, Any] = read(path, kind)
@@ -80,11 +76,7 @@ def read_weights(path: str | os.PathLike[str]) -> ForeignWeights:
 
 
 def read_settings(path: str | os.PathLike[str]) -> Settings:
-    """Read a run's settings (``config.yaml``, JSON or TOML), or PyTorchTNN's configuration of its graph (JSON).
-
-    Raises:
-        DataFileNotFoundError: there is no such file.
-    """
+    """Read a run's settings (``config.yaml``, JSON or TOML), or PyTorchTNN's configuration of its graph (JSON)."""
     values = read_mapping(path, "file of settings")
     if "nodes" in values:
         memory = next((node.memory for node in read_graph(values).nodes if node.memory is not None), None)

@@ -446,11 +446,7 @@ def add_walk(inputs: Any, *, progress: Progress | None = None) -> dict[str, Any]
 
 
 def explain_file(path: str | Path) -> tuple[WalkStep, ...]:
-    """Walk through the split halves in an ``.npz`` file: arrays ``r_xy``, ``r_yy`` and maybe ``r_xx``.
-
-    Raises:
-        DataFileNotFoundError: there is no such file.
-    """
+    """Walk through the split halves in an ``.npz`` file: arrays ``r_xy``, ``r_yy`` and maybe ``r_xx``."""
     arrays = read_npz(path, ".npz file of plain arrays")
     if missing := {"r_xy", "r_yy"} - arrays.keys():
         raise DataError(f"{path} lacks the array {sorted(missing)[0]!r}; it has {sorted(arrays)}.")

@@ -18,11 +18,7 @@ if TYPE_CHECKING:
 
 
 def read_npz(path: str | os.PathLike[str], kind: str = ".npz file") -> dict[str, NDArray[np.generic]]:
-    """Read all arrays of a NumPy archive.
-
-    Raises:
-        DataFileNotFoundError: there is no such file.
-    """
+    """Read all arrays of a NumPy archive."""
     import numpy as np
 
     file = check_file(path, kind)

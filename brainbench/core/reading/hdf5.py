@@ -43,9 +43,6 @@ def open_hdf5(path: str | os.PathLike[str], kind: str = "HDF5 file", hint: str =
         path: the file.
         kind: what it shall be, in words.
         hint: what to do when it is damaged; the end of the message.
-
-    Raises:
-        DataFileNotFoundError: there is no such file.
     """
     import h5py
 

@@ -41,9 +41,6 @@ def check_file(path: str | os.PathLike[str], kind: str = "file", *, most: int | 
         path: what the user named.
         kind: what it shall be, in words.
         most: largest size in bytes.
-
-    Raises:
-        DataFileNotFoundError: there is nothing of this name.
     """
     name, file = brief(os.fspath(path)), user_path(path)
     try:
@@ -72,9 +69,6 @@ def part_of(folder: Path, name: str, kind: str = "file") -> Path:
     """Return where a file is that one in ``folder`` names: a regular one of bounded size, in that folder.
 
     The folder above counts too where the name begins with ``../``: packages of robots keep meshes beside descriptions.
-
-    Raises:
-        DataFileNotFoundError: there is nothing of this name.
     """
     place, above = folder / name, Path(name).parts[:1] == ("..",)
     root = folder.resolve().parent if above else folder.resolve()

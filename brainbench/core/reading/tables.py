@@ -25,9 +25,6 @@ def read_columns(
     """Return the names in the first line of a comma-separated file, and the numbers [line, column] below.
 
     With ``gaps`` cells may be empty, ``na`` or ``nan``, which are NaN; lines without any are left out.
-
-    Raises:
-        DataFileNotFoundError: there is no such file.
     """
     header, *rows = (read_rows(path, kind) if gaps else _trimmed(path, kind)) or [[]]
     if twice := repeats(filter(None, header)):

@@ -82,9 +82,6 @@ def get_metric(name: str | Metric) -> Metric:
     """Return a registered metric, or the one that ``FILE.py:NAME`` or ``package.module:NAME`` names.
 
     NAME is a metric, or a class or function that makes one without arguments. A metric itself is checked and returned.
-
-    Raises:
-        DataFileNotFoundError: there is no such file or module.
     """
     if not isinstance(name, str):
         check_metric(name)

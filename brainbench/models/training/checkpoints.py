@@ -75,11 +75,7 @@ def save_checkpoint(
 
 
 def read_config(folder: str | os.PathLike[str]) -> dict[str, Any]:
-    """Read the configuration of a model's folder.
-
-    Raises:
-        DataFileNotFoundError: there is no such folder, or no configuration in it.
-    """
+    """Read the configuration of a model's folder."""
     from brainbench.core.files import read_mapping
 
     path = Path(folder) / CONFIG
@@ -105,11 +101,7 @@ def read_config(folder: str | os.PathLike[str]) -> dict[str, Any]:
 
 
 def load_weights(model: nn.Module, path: str | os.PathLike[str], *, what: str) -> None:
-    """Load a safetensors file into a model of the same parameters and buffers; all or nothing.
-
-    Raises:
-        DataFileNotFoundError: there is no such file.
-    """
+    """Load a safetensors file into a model of the same parameters and buffers; all or nothing."""
     from brainbench.core.reading.tensors import read_tensors
     from brainbench.models.ops.layers import load_named
 
@@ -122,9 +114,6 @@ def find_folder(source: str) -> Path:
 
     The hub is asked only for a name with its prefix; what it sends is kept in its own cache. A folder with one foreign
     checkpoint (:data:`FOREIGN`) instead of ours is imported into our cache.
-
-    Raises:
-        DataFileNotFoundError: there is no such folder or repository.
     """
     if source.startswith(LOCAL):
         folder = user_path(source.removeprefix(LOCAL))
