@@ -34,8 +34,7 @@ from brainbench.metrics.inference.multiple import step_down
 from brainbench.metrics.inference.permutation import label_orders
 from brainbench.metrics.rdms.comparison import compare_all, features, permuted_pairs
 from brainbench.metrics.reliability.subject_rdm import SubjectRDM, subject_rdm
-from brainbench.scoring.power.dimensions import signal_dimensions
-from brainbench.scoring.power.experiments import ExperimentDesign, power, simulate_experiments
+from brainbench.scoring.power.experiments import ExperimentDesign, power, signal_dimensions, simulate_experiments
 
 DOCS = Path(__file__).parents[2] / "docs"
 IMAGES = DOCS / "images"

@@ -36,8 +36,8 @@ from brainbench.core.limits import Count, Limit, limited
 from brainbench.core.plugins import load_entry_points
 from brainbench.core.progress import Progress
 from brainbench.core.provenance import Provenance
-from brainbench.core.reading.archives import check_archive
 from brainbench.core.reading.regular import check_file, readable, user_path
+from brainbench.core.reading.tensors import check_archive
 from brainbench.core.reading.texts import parse_toml, read_text, read_toml
 from brainbench.core.reading.values import typed_values
 from brainbench.core.records import ResultRecord

@@ -30,8 +30,8 @@ from brainbench.core.devices import usable_processors
 from brainbench.core.errors import DataError, listing, repeats
 from brainbench.core.files import cache_dir, content_hash, file_hash, read_json, to_json
 from brainbench.core.progress import Progress
-from brainbench.core.reading.archives import read_npz
 from brainbench.core.reading.sealed import read_sealed, write_sealed
+from brainbench.core.reading.tensors import read_npz
 from brainbench.core.reading.texts import check_values
 from brainbench.core.version import __version__
 from brainbench.datasets.whisking.dataset import FOLDERS, Shard

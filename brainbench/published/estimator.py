@@ -37,7 +37,7 @@ from brainbench.core.errors import DataError, UsageError, brief, check_each
 from brainbench.core.files import to_plain
 from brainbench.core.progress import Progress
 from brainbench.core.provenance import Provenance
-from brainbench.core.reading.archives import read_npz
+from brainbench.core.reading.tensors import read_npz
 from brainbench.core.records import LayerScore, Score, Status, SubjectScore
 from brainbench.metrics.arrays import Floats
 from brainbench.metrics.evaluation import gather, held_out, recorded_rdm

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.errors import DataError, UsageError, listing
-from brainbench.core.reading.archives import read_npz
+from brainbench.core.reading.tensors import read_npz
 from brainbench.datasets.checks.findings import Finding, share
 from brainbench.datasets.layouts.registry import RecordingLayout
 from brainbench.datasets.ledger import Ledger

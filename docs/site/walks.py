@@ -152,7 +152,7 @@ WAYS = (
             "leaderboards.store:_read",
             "leaderboards.boards:rank",
             "leaderboards.ranking:told_apart",
-            "leaderboards.site.table:page_board",
+            "leaderboards.site.build:page_board",
         ),
         _page,
     ),

@@ -13,8 +13,7 @@ from brainbench.core.records import ResultRecord
 from brainbench.core.statistics import two_factor_error
 from leaderboards.boards import NO_SCALE, _combined, conclusions, means_over, rank, table_of
 from leaderboards.report.paper import references, write_paper
-from leaderboards.site.build import build_leaderboard
-from leaderboards.site.table import table_rows
+from leaderboards.site.build import build_leaderboard, table_rows
 from tests.factories.records import draw_board, make_record
 
 TRUTHS = {"best": 0.95, "good": 0.6, "fair": 0.3, "nothing": 0.0}

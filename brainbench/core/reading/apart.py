@@ -22,8 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.errors import BrainbenchError, DataError, brief
-from brainbench.core.reading.archives import read_npz
 from brainbench.core.reading.regular import check_file, readable, temporary_folder
+from brainbench.core.reading.tensors import read_npz
 
 SECONDS = 60.0
 """Processor time for a file, by default."""

@@ -25,8 +25,8 @@ from numpy.typing import NDArray
 
 from brainbench.core.errors import DataError
 from brainbench.core.files import atomic_path, content_hash, file_hash, library_versions, settings_dir, write_private
-from brainbench.core.reading.archives import read_npz
 from brainbench.core.reading.hdf5 import trust_hdf5
+from brainbench.core.reading.tensors import read_npz
 
 T = TypeVar("T")
 KEY_VARIABLE = "BRAINBENCH_CACHE_KEY"

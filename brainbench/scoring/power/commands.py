@@ -149,7 +149,7 @@ def _dimensions(
 def _of_recordings(recordings: str, conditions: str | None) -> tuple[int, str, NeuralResponses]:
     from brainbench.datasets.trials.session_trials import trials_by_subject
     from brainbench.scoring.neural_responses import open_neural_responses
-    from brainbench.scoring.power.dimensions import signal_dimensions
+    from brainbench.scoring.power.experiments import signal_dimensions
 
     with progress_bar() as progress:
         brain = open_neural_responses(recordings, progress=progress, conditions=conditions)
@@ -162,7 +162,7 @@ def _of_model(model: str) -> tuple[int, str]:
 
     from brainbench.scoring.model_responses import resolve_model
     from brainbench.scoring.options import ScoreOptions
-    from brainbench.scoring.power.dimensions import pattern_dimensions
+    from brainbench.scoring.power.experiments import pattern_dimensions
 
     with progress_bar() as progress:
         responses = resolve_model(model).respond(ScoreOptions(), progress=progress)

@@ -18,7 +18,7 @@ from scipy import ndimage
 
 from brainbench.core.errors import DataError, UsageError, check_number
 from brainbench.core.files import atomic_path
-from brainbench.core.reading.archives import read_npz
+from brainbench.core.reading.tensors import read_npz
 
 SPAN = 1.5  # largest slope along an axis that the table holds
 _BINS = 61

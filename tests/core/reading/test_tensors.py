@@ -1,9 +1,12 @@
+import zipfile
+
+import numpy as np
 import pytest
 import torch
 from safetensors.torch import save_file
 
 from brainbench.core.errors import DataError, DataFileNotFoundError
-from brainbench.core.reading.tensors import check_stored, read_checkpoint, read_tensors
+from brainbench.core.reading.tensors import check_stored, read_checkpoint, read_npz, read_tensors
 from tests.factories.damage import Unknown
 
 
@@ -44,3 +47,29 @@ def test_only_plain_tensors_with_all_their_numbers_pass(tensor):
     check_stored({"good": torch.ones(2, 3)}, "file")
     with pytest.raises(DataError, match=r"'bad'.*file"):
         check_stored({"good": torch.ones(2), "bad": tensor}, "file")
+
+
+def test_arrays_come_back(tmp_path):
+    np.savez(tmp_path / "a.npz", one=np.arange(3), two=np.eye(2))
+    found = read_npz(tmp_path / "a.npz")
+    np.testing.assert_array_equal(found["two"], np.eye(2))
+    assert list(found) == ["one", "two"]
+
+
+def test_pickles_encryption_and_false_headers_are_refused(tmp_path):
+    path = tmp_path / "a.npz"
+    np.savez(path, evil=np.array([{}], dtype=object))
+    with pytest.raises(DataError, match="evil"):
+        read_npz(path)
+    np.savez(path, one=np.arange(3))
+    data = bytearray(path.read_bytes())
+    # Bit 0 of the flags says encrypted, in the local header and in the directory.
+    data[6] |= 1
+    data[data.index(b"PK\x01\x02") + 8] |= 1
+    path.write_bytes(data)
+    with pytest.raises(DataError, match="encrypted"):
+        read_npz(path)
+    with zipfile.ZipFile(path, "w") as archive, archive.open("one.npy", "w") as stream:
+        np.lib.format.write_array_header_1_0(stream, {"descr": "<f8", "fortran_order": False, "shape": (2**40,)})
+    with pytest.raises(DataError, match="one"):
+        read_npz(path)
