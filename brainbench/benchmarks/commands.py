@@ -12,6 +12,7 @@ from brainbench.cli.options import SCORE, SCORE_FLAGS, out_file_option, with_opt
 from brainbench.cli.output import Output, facts, progress_bar, table_of
 from brainbench.cli.requirements import needs
 
+OPENING = "brainbench.benchmarks.opening"
 app = typer.Typer(no_args_is_help=True, help="Make, check and pack benchmarks: one file that others score on.")
 NamedBenchmark = Annotated[str, typer.Argument(help="A benchmark: FILE.toml, FILE.zip, or a name of the list.")]
 
@@ -19,16 +20,14 @@ NamedBenchmark = Annotated[str, typer.Argument(help="A benchmark: FILE.toml, FIL
 @app.command("make")
 @needs(cache=True)
 @with_options(SCORE, ("recordings", "match", *OPTIONS), flags=SCORE_FLAGS)
+@with_options(f"{OPENING}:Benchmark", ("citation", "contact"), parameter="about", build=False)
+@with_options(f"{OPENING}:Recordings", ("source", "doi", "version", "licence"), parameter="origin", build=False)
 def make(
     out: Annotated[Path, out_file_option("File to write, FILE.toml, in a folder that holds the recordings.")],
     options: Any = None,
     name: Annotated[str | None, typer.Option(help="Name of the benchmark; by default that of the file.")] = None,
-    citation: Annotated[str, typer.Option(help="Work to cite, with its DOI.")] = "",
-    contact: Annotated[str, typer.Option(help="Whom to ask.")] = "",
-    source: Annotated[str, typer.Option(help="Archive or address where the recordings are published.")] = "",
-    doi: Annotated[str, typer.Option(help="DOI of the recordings.")] = "",
-    version: Annotated[str, typer.Option(help="Version of the recordings at their source.")] = "",
-    licence: Annotated[str, typer.Option(help="Licence of the recordings.")] = "",
+    about: Any = None,
+    origin: Any = None,
     held_out: Annotated[
         Path | None, typer.Option("--held-out", help="Commitment of leaderboard hold-out to what is kept back.")
     ] = None,
@@ -40,10 +39,9 @@ def make(
 
     if out.suffix != ".toml":
         raise UsageError(f"--out is a file that ends in .toml; received {out.name!r}. To make a .zip of it: pack.")
-    origin = {"source": source, "doi": doi, "version": version, "licence": licence}
-    about = {"citation": citation, "contact": contact, **origin}
     with progress_bar() as progress:
-        benchmark = make_benchmark(options, out, name=name or out.stem, held_out=held_out, progress=progress, **about)
+        about |= {"name": name or out.stem, "held_out": held_out, "progress": progress}
+        benchmark = make_benchmark(options, out, **about, **origin)
     write_text(out, benchmark.to_toml())
     text = f"{_text(benchmark)}\n\nfile       {out}\nnext       brainbench benchmark pack {out} --out {out.stem}.zip"
     return Output({"benchmark": benchmark.plain, "path": out}, text)

@@ -79,11 +79,13 @@ class Recordings:
     content_hash: Annotated[str, Limit(shortest=8, longest=64)]
     """Hash of what is read of them."""
     source: Words = ""
-    """Archive or address where they are published."""
+    """Archive or address where the recordings are published."""
     doi: Words = ""
+    """DOI of the recordings."""
     version: Words = ""
-    """Version of the data set at its source."""
+    """Version of the recordings at their source."""
     licence: Words = ""
+    """Licence of the recordings."""
 
 
 @dataclass(frozen=True)
@@ -120,7 +122,9 @@ class Benchmark:
     held_out: Commitment | None = None
     """Published hash of what is held back."""
     citation: Words = ""
+    """Work to cite, with its DOI."""
     contact: Words = ""
+    """Whom to ask."""
     schema: Literal[1] = SCHEMA
 
     def __post_init__(self) -> None:

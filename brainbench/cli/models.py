@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from brainbench.cli.options import out_file_option
+from brainbench.cli.options import SeedOption, out_file_option
 from brainbench.cli.output import Output, facts, list_without_command, progress_bar, table, table_of, tracked
 from brainbench.core.files import to_plain
 
@@ -201,7 +201,7 @@ def export(
     model: Annotated[str, typer.Argument(help="A registry name, or local-dir:FOLDER of a trained model.")],
     format: Annotated[str, typer.Option(help="onnx, or torch (an exported program).")] = "onnx",
     out: Annotated[Path | None, out_file_option("File to write.")] = None,
-    seed: Annotated[int, typer.Option(help="Seed of untrained weights.")] = 0,
+    seed: SeedOption = 0,
 ) -> Output:
     """Export one step, obs and h_in to features and h_out, with its contract, and check the written file."""
     from brainbench.models.export import SUFFIXES, export_model

@@ -33,6 +33,7 @@ from brainbench.core.files import check_folder
 from brainbench.core.limits import bounds_of, check_value
 
 WorkersOption = Annotated[int | None, typer.Option(min=1, help="Processes. [default: as many as there are processors]")]
+SeedOption = Annotated[int, typer.Option(help="Seed of untrained weights.")]
 SchedulerOption = Annotated[str | None, typer.Option(help="Let workers of a Dask scheduler (tcp://host:8786) do it.")]
 
 SCORE = "brainbench.scoring.options:ScoreOptions"

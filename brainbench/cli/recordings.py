@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from brainbench.cli.options import SCORE, beside, option, out_file_option, out_folder_option, with_options
+from brainbench.cli.options import SCORE, SeedOption, beside, option, out_file_option, out_folder_option, with_options
 from brainbench.cli.output import Output, facts, progress_bar, table, table_of
 from brainbench.cli.requirements import needs
 from brainbench.cli.score import left_out
@@ -117,7 +117,7 @@ def compare(
     model: Annotated[str, typer.Argument(help="A model as brainbench score takes it, or another file of RDMs.")],
     options: Any = None,
     metric: Metric = "rsa-correlation",
-    seed: Annotated[int, typer.Option(help="Seed of untrained weights.")] = 0,
+    seed: SeedOption = 0,
 ) -> Output:
     """Compare RDMs of a file with those of a model's layers, or of another file, as they are.
 

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
-from brainbench.cli.options import items, numbers, out_file, out_file_option, picture_file, with_options
+from brainbench.cli.options import SeedOption, items, numbers, out_file, out_file_option, picture_file, with_options
 from brainbench.cli.output import Output, progress_bar, table_of
 from brainbench.cli.requirements import PICTURES_IF_PLOT, needs
 from brainbench.stimuli.engines.fidelity import DEFAULT_ENGINE
@@ -112,7 +112,7 @@ def model(
     steps: Annotated[str, typer.Option(help="Last steps of the sweeps that are shown, comma-separated.")] = "22",
     score: Annotated[bool, typer.Option(help="Also score every setting on the demo recordings.")] = False,
     data: Annotated[Path | None, typer.Option(help="Folder of sweeps: also measure test accuracy.")] = None,
-    seed: Annotated[int, typer.Option(help="Seed of untrained weights.")] = 0,
+    seed: SeedOption = 0,
 ) -> Output:
     """Measure error, latency, score and accuracy of a network over precision, unrolling and number of steps."""
     from brainbench.stimuli import load_stimuli
