@@ -1,6 +1,6 @@
 """``brainbench stimuli``: list, show, simulate, draw and plot stimuli.
 
-:mod:`~brainbench.cli.stimuli.scenes` says what a SOURCE names; the other modules hold the commands.
+:mod:`~brainbench.cli.stimuli.scenes` shows and draws what a SOURCE names, ``simulate`` computes forces.
 """
 
 from __future__ import annotations
@@ -8,7 +8,7 @@ from __future__ import annotations
 import typer
 
 from brainbench.cli.output import list_without_command
-from brainbench.cli.stimuli import draw, scenes, simulate
+from brainbench.cli.stimuli import scenes, simulate
 
 app = typer.Typer(help="Simulate whiskers on objects; look at scenes and forces.")
 app.command("list")(scenes.list_)
@@ -18,8 +18,8 @@ for _command in (
     simulate.simulate,
     simulate.sweep,
     simulate.separability,
-    draw.render,
-    draw.plot,
+    scenes.render,
+    scenes.plot,
     scenes.objects,
 ):
     app.command(_command.__name__)(_command)

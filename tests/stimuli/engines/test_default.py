@@ -4,7 +4,7 @@ import inspect
 
 import pytest
 
-from brainbench.cli.stimuli import draw, simulate
+from brainbench.cli.stimuli import scenes, simulate
 from brainbench.cli.stimuli import simulate as simulate_command
 from brainbench.stimuli import load_stimuli, simulation
 from brainbench.stimuli.engines import fidelity, get_engine, list_engines
@@ -19,7 +19,7 @@ ASKED = (
     simulation.simulate, simulation.prepare, load_stimuli, simulation.record, pictures.render, simulate_sweeps,
     bench_tests.peg, bench_tests.point_load, bench_tests.ringdown, bench_tests.slip_off, out_of_plane.load_aside,
     out_of_plane.push_aside, fidelity.measured,
-    fidelity.Fidelity.auto, GenerationSettings, draw.render, draw.plot,
+    fidelity.Fidelity.auto, GenerationSettings, scenes.render, scenes.plot,
     simulate_command.simulate, simulate.sweep,
 )  # fmt: skip
 
