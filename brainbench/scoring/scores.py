@@ -8,10 +8,13 @@ both → a noise-corrected comparison with honest statistics.
 from __future__ import annotations
 
 import time as clock
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.contracts import BY_TRIAL
 from brainbench.core.errors import UsageError, check_name, listing
@@ -21,7 +24,6 @@ from brainbench.core.plugins import require_optional
 from brainbench.core.progress import Progress, stages, track
 from brainbench.core.provenance import Provenance
 from brainbench.core.records import ESTIMATOR_VERSION, ResultRecord, Score
-from brainbench.scoring.influence import influence_of
 from brainbench.scoring.options import ScoreOptions
 from brainbench.scoring.own_stimuli import joined
 from brainbench.scoring.presentation import presentation_of
@@ -30,6 +32,7 @@ if TYPE_CHECKING:
     from brainbench.metrics import Metric
     from brainbench.scoring.model_responses import ModelResponses, ResolvedModel
     from brainbench.scoring.neural_responses import NeuralResponses
+
 
 PARTS = "brainbench.scoring"
 """Entry points of what stands in optional folders: additions to a record's statistics by the name of their option,
@@ -323,3 +326,54 @@ def metric_of(options: ScoreOptions) -> Metric:
         if getattr(options, name):
             _optional(name)
     return metric
+
+
+DECIDES = 0.5  # share from which a unit or an animal decides alone
+_CHANCE_LEVEL = 0.05
+
+
+def effective_number(shares: ArrayLike) -> float:
+    """Return (Σw)²/Σw² of shares w, as many as would be of equal size; negative ones count as none, NaN without any.
+
+    >>> effective_number([1, 1, 1, 1]), round(effective_number([9, 1, 0, 0]), 2)
+    (4.0, 1.22)
+    """
+    parts = np.maximum(np.asarray(shares, dtype=np.float64), 0.0)
+    return float(parts.sum() ** 2 / (parts**2).sum()) if parts.any() else float("nan")
+
+
+def unit_shares(animal: Any, *, by_noise: bool = False) -> NDArray[np.float64]:
+    """Return the variance over stimuli [U] of each unit's mean responses, without that of noise, ``by_noise`` over it.
+
+    Squared distances are sums over units, so these are what each adds to an animal's RDM.
+    """
+    noise = animal.noise.mean(axis=0)
+    tuned = np.maximum(animal.patterns.var(axis=0, ddof=1) - noise, 0.0)
+    return np.divide(tuned, noise, out=np.zeros_like(tuned), where=noise > 0) if by_noise else tuned
+
+
+def influence_of(score: Score, metric: Any, animals: Sequence[Any]) -> tuple[dict[str, Any], tuple[str, ...]]:
+    """Return the effective numbers of units (median over animals) and of animals, and a remark where one decides."""
+    numbers, loud, remarks = [], [], []
+    for animal in animals:
+        # In bins a unit is several features, which nobody tells apart here.
+        if animal.problem is not None or animal.patterns.shape[1] != animal.units or animal.units < 2:
+            continue
+        shares = unit_shares(animal, by_noise=getattr(metric, "noise", "none") != "none")
+        if shares.any():
+            numbers.append(effective_number(shares))
+            if (largest := float(shares.max() / shares.sum())) > DECIDES:
+                loud.append((largest, f"{animal.subject}: one of {animal.units} units has {largest:.0%} of the tuning"))
+    stated: dict[str, Any] = {"units": float(np.median(numbers)), "units_least": min(numbers)} if numbers else {}
+    if loud:
+        remarks.append(f"one unit decides in {len(loud)} of {len(animals)} animals ({max(loud)[1]})")
+    every = [part for part in score.subjects if part.status != "undefined"]
+    scored = [part for part in every if part.status == "ok"] or every
+    heights = np.maximum([score.on_scale(part.value) for part in scored], 0.0)
+    if np.isfinite(heights).all() and heights.any():
+        stated |= {"animals": effective_number(heights), "of_animals": len(scored)}
+        first = int(np.argmax(heights))
+        if len(scored) > 2 and heights[first] > DECIDES * heights.sum() and score.p <= _CHANCE_LEVEL:
+            share = heights[first] / heights.sum()
+            remarks.append(f"one animal decides: {scored[first].subject} has {share:.0%} of the score")
+    return {"effective": stated} if stated else {}, tuple(remarks)
