@@ -503,7 +503,9 @@ def spread_kernel(kinds: frozenset[int], raycast: bool, noisy: bool, sticky: boo
                         rounds = int(0)
                         lean = wp.vec3f()
                         first = wp.vec3f()
-                        second = wp.mat33f()
+                        ways = wp.vec3f()
+                        places = wp.vec3f()
+                        turns = wp.vec3f()
                         while node >= 0:
                             push = ContactPush()
                             push.point = wp.vec3f(sphere[0], sphere[1], sphere[2])
@@ -512,12 +514,14 @@ def spread_kernel(kinds: frozenset[int], raycast: bool, noisy: bool, sticky: boo
                                 if source == wp.static(NEAR):
                                     push = push_of(plan, state, friction, env, link, node)
                             push.lean = lean
-                            # Sums over taxels: y, y m · n and whether any is near; rows y q, y a, y a × q; of y a aᵀ
-                            # the diagonal and the rest, and the longest a, which leads from the point. Once they are
-                            # solved, the same registers hold s; rows b, θ and the middle; Σ f.
+                            # Sums over taxels: y, y m · n and whether any is near; y q, y a, y a × q; of y a aᵀ the
+                            # diagonal and the rest, and the longest a, which leads from the point. Once they are
+                            # solved, the same registers hold s; b, the middle, θ; Σ f.
                             if not solved:
                                 first = wp.vec3f()
-                                second = wp.mat33f()
+                                ways = wp.vec3f()
+                                places = wp.vec3f()
+                                turns = wp.vec3f()
                             squares = wp.vec3f()
                             products = wp.vec3f()
                             most = float(0.0)
@@ -537,11 +541,13 @@ def spread_kernel(kinds: frozenset[int], raycast: bool, noisy: bool, sticky: boo
                                         a = x - push.point
                                         most = wp.max(most, wp.length(a))
                                         first += c.weight * wp.vec3f(1.0, c.facing, 0.0)
-                                        second += c.weight * wp.matrix_from_rows(c.way, a, wp.cross(a, c.way))
+                                        ways += c.weight * c.way
+                                        places += c.weight * a
+                                        turns += c.weight * wp.cross(a, c.way)
                                         squares += c.weight * wp.cw_mul(a, a)
                                         products += c.weight * wp.vec3f(a[1] * a[2], a[2] * a[0], a[0] * a[1])
                                 elif c.weight + c.noisy > 0.0:
-                                    unit = first[0] * c.way + second[0] + wp.cross(second[1], x - second[2])
+                                    unit = first[0] * c.way + ways + wp.cross(turns, x - places)
                                     squares += c.weight * unit
                                     reading = wrench_at(x, c.weight * unit)
                                     if not fresh:
@@ -557,12 +563,12 @@ def spread_kernel(kinds: frozenset[int], raycast: bool, noisy: bool, sticky: boo
                                     clear(faces, io, env, n, wp.static(noisy))
                                 n += threads
                             if wp.static(cuda):
-                                sums = block_sum(first, second, squares, products, most)
+                                sums = block_sum(first, ways, places, turns, squares, products, most)
                                 for axis in range(3):
                                     first[axis] = sums[axis]
-                                    second[0, axis] = sums[3 + axis]
-                                    second[1, axis] = sums[6 + axis]
-                                    second[2, axis] = sums[9 + axis]
+                                    ways[axis] = sums[3 + axis]
+                                    places[axis] = sums[6 + axis]
+                                    turns[axis] = sums[9 + axis]
                                     squares[axis] = sums[12 + axis]
                                     products[axis] = sums[15 + axis]
                                 most = sums[18]
@@ -580,9 +586,9 @@ def spread_kernel(kinds: frozenset[int], raycast: bool, noisy: bool, sticky: boo
                                     # measure; b then carries what is missing.
                                     scale = push.load / wp.max(first[1], 0.5 * whole)
                                     mean = push.load / whole
-                                    center = second[1] / whole
-                                    even = (push.force - scale * second[0]) / whole
-                                    moment -= scale * second[2] + whole * wp.cross(center, even)
+                                    center = places / whole
+                                    even = (push.force - scale * ways) / whole
+                                    moment -= scale * turns + whole * wp.cross(center, even)
                                     # Shares of the weights and of their extent, lest squares of small numbers vanish.
                                     moment /= whole
                                     extents = wp.mat33f(
@@ -611,7 +617,9 @@ def spread_kernel(kinds: frozenset[int], raycast: bool, noisy: bool, sticky: boo
                                             lean += (steepest - 0.5) / mean * wp.cross(push.normal, tilt)
                                             lean *= wp.min(wp.static(STEEPEST) / (far * wp.length(lean)), 1.0)
                                     first = wp.vec3f(scale, 0.0, 0.0)
-                                    second = wp.matrix_from_rows(even, tilt, center + push.point)
+                                    ways = even
+                                    turns = tilt
+                                    places = center + push.point
                                 elif source == wp.static(NEAR):
                                     rest += wp.length(push.force)
                                     node = faces.follower[node]

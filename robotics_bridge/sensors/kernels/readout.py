@@ -56,8 +56,7 @@ def store_planes(planes: wp.array3d(dtype=wp.float32), row: int, n: int, count: 
 
 
 Sums = wp.types.vector(length=19, dtype=wp.float32)
-_SUMMED = [f"{name}[{k}]" for name in ("first", "second.data[0]", "second.data[1]", "second.data[2]") for k in range(3)]
-_SUMMED += [f"{name}[{k}]" for name in ("squares", "products") for k in range(3)]
+_SUMMED = ("first", "ways", "places", "turns", "squares", "products")
 _HALVES = ((16, 18, 9), (8, 9, 5), (4, 5, 3), (2, 3, 2), (1, 2, 1))
 """Distance of lanes that exchange, numbers that a lane holds, and those that it keeps."""
 
@@ -80,7 +79,7 @@ def _exchange(half: int, held: int, rest: int) -> str:
     const int lane = threadIdx.x % 32;
     int place = 0, mine = 18;
     bool upper;
-    {" ".join(f"float v{k} = {name};" for k, name in enumerate(_SUMMED))}
+    {" ".join(f"float v{k} = {name};" for k, name in enumerate(f"{rows}[{n}]" for rows in _SUMMED for n in range(3)))}
     {" ".join(_exchange(*numbers) for numbers in _HALVES)}
     __syncthreads();
     if (mine > 0) parts[threadIdx.x / 32][place] = v0;
@@ -96,7 +95,15 @@ def _exchange(half: int, held: int, rest: int) -> str:
     return values;
 """
 )
-def block_sum(first: wp.vec3f, second: wp.mat33f, squares: wp.vec3f, products: wp.vec3f, most: float) -> Sums:
+def block_sum(
+    first: wp.vec3f,
+    ways: wp.vec3f,
+    places: wp.vec3f,
+    turns: wp.vec3f,
+    squares: wp.vec3f,
+    products: wp.vec3f,
+    most: float,
+) -> Sums:
     """Return the sums over the threads of a block, and of the last the largest."""
     ...
 
