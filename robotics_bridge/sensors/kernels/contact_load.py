@@ -26,7 +26,7 @@ from brainbench.core.devices import warp
 from robotics_bridge.physics.kernels.state import StateArrays
 from robotics_bridge.sensors.kernels.distance import FAR, SIDED, SolidArrays, shape_functions
 from robotics_bridge.sensors.kernels.noise import episode_draw
-from robotics_bridge.sensors.kernels.pairs import PairArrays, SlotArrays
+from robotics_bridge.sensors.kernels.pairs import PairArrays, SlotArrays, push_side
 from robotics_bridge.sensors.kernels.readout import (
     FUSED,
     ProbeArrays,
@@ -387,13 +387,15 @@ def spread_kernel(kinds: frozenset[int], raycast: bool, noisy: bool, sticky: boo
             if solids.link[geometry] == body:
                 rotation = pairs.rotation[env, place]
                 facing = wp.vec3f()
+                side = float(0.0)
                 limit = float(0.0)
                 if wp.static(bool(kinds & SIDED)):
                     facing = rotation @ (radius * probes.normal[n])
+                    side = push_side(pairs, env, place, probes.normal[n])
                 if wp.static(raycast or bool(kinds & SIDED)):
                     limit = 2.0 * solids.bound[row, geometry][3] + radius
                 x = rotation @ probes.position[n] + pairs.offset[env, place]
-                touch = distance(solids, row, geometry, x, facing, limit)
+                touch = distance(solids, row, geometry, x, facing, side, limit)
                 if touch[3] < nearest[3]:
                     m = wp.transpose(rotation) @ wp.vec3f(touch[0], touch[1], touch[2])
                     nearest = wp.vec4f(m[0], m[1], m[2], touch[3])

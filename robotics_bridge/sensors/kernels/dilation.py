@@ -450,7 +450,7 @@ def anchor_kernel(kinds: frozenset[int], raycast: bool, side_by_side: bool) -> A
         for o in range(gel.own_first, gel.own_last):
             local = wp.transform_point(wp.transform_inverse(solids.frame[row, own[o]]), z)
             limit = 2.0 * solids.bound[row, own[o]][3]
-            phi = wp.min(phi, distance(solids, row, own[o], local, wp.vec3f(), limit)[3])
+            phi = wp.min(phi, distance(solids, row, own[o], local, wp.vec3f(), 0.0, limit)[3])
         return phi
 
     @wp.kernel(module="unique")
@@ -531,7 +531,7 @@ def anchor_kernel(kinds: frozenset[int], raycast: bool, side_by_side: bool) -> A
                 phi = float(0.0)
                 if alone:
                     if wp.static(not side_by_side):
-                        phi = distance_to(solids.values, shape, turn @ p + shift, wp.vec3f(), limit)[3]
+                        phi = distance_to(solids.values, shape, turn @ p + shift, wp.vec3f(), 0.0, limit)[3]
                 else:
                     phi = height_over(solids, pads.own, gel, solid_row, z)
                 # Two heights as in a Schmitt trigger: an anchor set at −enter is lost only above +leave, so that a

@@ -245,19 +245,19 @@ def outer(found: wp.vec4f, facing: wp.vec3f) -> wp.vec4f:
 
 
 @wp.func
-def wall(shape: SolidShape, x: wp.vec3f, facing: wp.vec3f, reach: float) -> wp.vec4f:
+def wall(shape: SolidShape, x: wp.vec3f, facing: wp.vec3f, side: float, reach: float) -> wp.vec4f:
     """Ask a thin wall from the side of the sensor: past its middle, and through it, the side touched stays the same."""
     found = triangles(shape.mesh, x, reach, shape.size[0])
     radius = wp.length(facing)
     slope = wp.dot(wp.vec3f(found[0], found[1], found[2]), facing)
     if slope <= 0.2 * radius:
         return outer(found, facing)
-    # A surface farther behind the sensor than its radius was not passed; nor was one that thins out to its rim, as a
-    # lens does, farther behind than it is thick.
+    # Where no contact tells the side, a surface farther behind the sensor than its radius was not passed; nor was one
+    # that thins out to its rim, as a lens does, farther behind than it is thick.
     limit = radius
     if shape.size[2] > 1.5 * shape.size[1]:
         limit = wp.min(radius, shape.size[2])
-    if found[3] >= limit:
+    if side < 0.0 or (side == 0.0 and found[3] >= limit):
         return found
     # The nearest side faces away from the sensor, so the point lies past the middle. Going back along the sensor's
     # normal, the first face that is left, and not entered, is the one that the sensor came through.
@@ -312,9 +312,10 @@ def shape_functions(kinds: frozenset[int], raycast: bool) -> SimpleNamespace:
     """Return the functions that find distances for the kinds a scene has.
 
     ``shape_of(solids, row, geometry)`` reads what is known of a geometry, once for many points;
-    ``distance_to(solids.values, shape, x, facing, reach) -> (normal, distance)`` asks it, where ``facing`` is the
-    outward normal of the sensor times its radius, or 0 for a distance that knows no side;
-    ``distance(solids, row, geometry, x, facing, reach)`` does both.
+    ``distance_to(solids.values, shape, x, facing, side, reach) -> (normal, distance)`` asks it, where ``facing`` is the
+    outward normal of the sensor times its radius, or 0 for a distance that knows no side, and ``side`` is 1 where
+    contacts push on the sensor's side, −1 on the other one, 0 where none tells;
+    ``distance(solids, row, geometry, x, facing, side, reach)`` does both.
 
     Args:
         kinds: only their code is compiled.
@@ -372,16 +373,18 @@ def shape_functions(kinds: frozenset[int], raycast: bool) -> SimpleNamespace:
 
     @wp.func
     def beyond(
-        values: wp.array(dtype=wp.float32), shape: SolidShape, x: wp.vec3f, facing: wp.vec3f, found: wp.vec4f
-    ) -> wp.vec4f:
+        values: wp.array(dtype=wp.float32), shape: SolidShape, x: wp.vec3f, facing: wp.vec3f, side: float,
+        found: wp.vec4f,
+    ) -> wp.vec4f:  # fmt: skip
         # As for walls: past the middle of a thin solid the side touched stays the same. Steps of the distance itself
         # lead from the point back along the sensor's normal to the side that it came through.
         radius = wp.length(facing)
         slope = wp.dot(wp.vec3f(found[0], found[1], found[2]), facing)
         if slope <= 0.2 * radius:
             return outer(found, facing)
-        # A surface farther behind the sensor than the solid is thick was not passed: it lies on a thin link.
-        if found[3] >= wp.min(radius, shape.thickness):
+        # Where no contact tells the side, a surface farther behind the sensor than the solid is thick was not passed:
+        # it lies on a thin link.
+        if side < 0.0 or (side == 0.0 and found[3] >= wp.min(radius, shape.thickness)):
             return found
         back = -facing / radius
         most = (wp.max(found[3], 0.0) + 2.0 * shape.thickness) * radius / slope
@@ -404,19 +407,21 @@ def shape_functions(kinds: frozenset[int], raycast: bool) -> SimpleNamespace:
 
     @wp.func
     def distance_to(
-        values: wp.array(dtype=wp.float32), shape: SolidShape, x: wp.vec3f, facing: wp.vec3f, reach: float
+        values: wp.array(dtype=wp.float32), shape: SolidShape, x: wp.vec3f, facing: wp.vec3f, side: float, reach: float
     ) -> wp.vec4f:
         if wp.static(WALL in kinds):
             if shape.kind == wp.static(WALL):
-                return wall(shape, x, facing, reach)
+                return wall(shape, x, facing, side, reach)
         found = nearest(values, shape, x, reach)
         if wp.static(thin):
             if shape.thickness > 0.0:
-                return beyond(values, shape, x, facing, found)
+                return beyond(values, shape, x, facing, side, found)
         return found
 
     @wp.func
-    def distance(solids: SolidArrays, row: int, geometry: int, x: wp.vec3f, facing: wp.vec3f, reach: float) -> wp.vec4f:
-        return distance_to(solids.values, shape_of(solids, row, geometry), x, facing, reach)
+    def distance(
+        solids: SolidArrays, row: int, geometry: int, x: wp.vec3f, facing: wp.vec3f, side: float, reach: float
+    ) -> wp.vec4f:
+        return distance_to(solids.values, shape_of(solids, row, geometry), x, facing, side, reach)
 
     return SimpleNamespace(shape_of=shape_of, distance_to=distance_to, distance=distance)

@@ -16,7 +16,7 @@ from robotics_bridge.sensors.kernels.contact_load import ContactFaces, PressArra
 from robotics_bridge.sensors.kernels.distance import FAR, SIDED, SolidArrays, SolidShape, shape_functions
 from robotics_bridge.sensors.kernels.noise import NoiseParams, episode_draw, radius_noise
 from robotics_bridge.sensors.kernels.noise import power as series_power
-from robotics_bridge.sensors.kernels.pairs import PairArrays
+from robotics_bridge.sensors.kernels.pairs import PairArrays, push_side
 from robotics_bridge.sensors.kernels.readout import (
     CLEAN,
     FUSED,
@@ -267,9 +267,11 @@ def kinematic_kernel(
                         if wp.static(raycast or bool(kinds & SIDED)):
                             limit = 2.0 * solids.bound[variant, geometry][3]
                     facing = wp.vec3f()
+                    side = float(0.0)
                     if wp.static(bool(kinds & SIDED)):
                         facing = rotation @ (radius * probes.normal[n])
-                    found = distance_to(solids.values, shape, rotation @ x + offset, facing, limit + radius)
+                        side = push_side(pairs, env, held, probes.normal[n])
+                    found = distance_to(solids.values, shape, rotation @ x + offset, facing, side, limit + radius)
                     if found[3] < best:
                         best = found[3]
                         normal = wp.transpose(rotation) @ wp.vec3f(found[0], found[1], found[2])

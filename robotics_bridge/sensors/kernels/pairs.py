@@ -17,6 +17,9 @@ from robotics_bridge.sensors.kernels.distance import PLANE, SolidArrays
 wp = warp()
 
 
+UNIT = 1.0e4  # whole number that a component of a normal of 1 is added as
+
+
 @wp.struct
 class SlotArrays:
     """Plan of who may meet whom."""
@@ -63,6 +66,9 @@ class PairArrays:
     """[B, P] of the geometry at the link's origin, relative to the link, link frame (m/s)."""
     spin: wp.array2d(dtype=wp.vec3f)
     """[B, P] relative angular velocity, link frame (rad/s)."""
+    push: wp.array2d(dtype=wp.vec3f)
+    """[B, P] mean normal of the contacts, the way they push the link, link frame; 0 without any, empty where no solid
+    is asked from the side of the sensor."""
 
 
 @wp.kernel(module="unique")
@@ -97,8 +103,18 @@ def clear_readings(mask: wp.array(dtype=wp.bool), planes: wp.array3d(dtype=wp.fl
 
 
 @wp.func
-def mark(slots: SlotArrays, env: int, link: int, other: int, words: int, bits: wp.array2d(dtype=wp.int32)):
-    """Note in the bits of every slot of a link that it touches a geometry."""
+def push_side(pairs: PairArrays, env: int, place: int, normal: wp.vec3f) -> float:
+    """Return 1 where contacts push a sensor against its outward normal, −1 where along it, 0 where neither."""
+    push = wp.dot(pairs.push[env, place], normal)
+    return wp.where(push < -0.5, 1.0, wp.where(push > 0.5, -1.0, 0.0))
+
+
+@wp.func
+def mark(
+    slots: SlotArrays, env: int, link: int, other: int, words: int, bits: wp.array2d(dtype=wp.int32), push: wp.vec3f,
+    pushes: wp.array3d(dtype=wp.int32),
+):  # fmt: skip
+    """Note in the bits of every slot of a link that it touches a geometry, and which way it is pushed."""
     for slot in range(slots.link.shape[0]):
         if slots.felt[slot] == link:
             place = slots.place[slot, other]
@@ -110,6 +126,12 @@ def mark(slots: SlotArrays, env: int, link: int, other: int, words: int, bits: w
                 # Many contacts of one pair set the same bit; reading first spares most of the atomic operations.
                 if (bits[env, word] & bit) == 0:
                     wp.atomic_or(bits, env, word, bit)
+                if pushes.shape[2] == 4:
+                    # Sums of whole numbers do not depend on the order of threads.
+                    member = slots.member_first[slot] + place
+                    for axis in range(3):
+                        wp.atomic_add(pushes, env, member, axis, int(wp.rint(wp.static(UNIT) * push[axis])))
+                    wp.atomic_add(pushes, env, member, 3, 1)
 
 
 @cache
@@ -130,6 +152,7 @@ def start_kernel(contacts: bool, apart: bool) -> Any:
         state: StateArrays,
         words: int,
         bits: wp.array2d(dtype=wp.int32),
+        pushes: wp.array3d(dtype=wp.int32),
         age: wp.array(dtype=wp.int32),
         status: wp.array(dtype=wp.int32),
         stride: int,
@@ -155,7 +178,8 @@ def start_kernel(contacts: bool, apart: bool) -> Any:
                     for side in range(2):
                         link = slots.watched[pair[side]]
                         if link >= 0:
-                            mark(slots, state.contact_env[c], link, pair[1 - side], words, bits)
+                            push = wp.where(side == 0, -1.0, 1.0) * state.contact_normal[c]
+                            mark(slots, state.contact_env[c], link, pair[1 - side], words, bits, push, pushes)
                 c += stride
 
     return start
@@ -175,6 +199,7 @@ def pair_kernel(apart: bool) -> Any:
         state: StateArrays,
         words: int,
         bits: wp.array2d(dtype=wp.int32),
+        pushes: wp.array3d(dtype=wp.int32),
         out: PairArrays,
         crowded: wp.array(dtype=wp.int32),
         status: wp.array(dtype=wp.int32),
@@ -211,6 +236,13 @@ def pair_kernel(apart: bool) -> Any:
                     if word != 0:
                         bits[env, slot * words + place // 32] = 0
                 wanted = (word >> wp.int32(place % 32)) & 1
+            push = wp.vec3f()
+            if pushes.shape[2] == 4:
+                count = float(pushes[env, members + place, 3])
+                for axis in range(3):
+                    push[axis] = float(pushes[env, members + place, axis]) / wp.max(wp.static(UNIT) * count, 1.0)
+                for axis in range(4):
+                    pushes[env, members + place, axis] = 0
             if wanted == 1:
                 geometry = slots.members[members + place]
                 there = state.pose[env, solids.link[geometry]]
@@ -237,6 +269,8 @@ def pair_kernel(apart: bool) -> Any:
                         out.offset[env, at] = wp.transform_get_translation(relative)
                         out.velocity[env, at] = wp.quat_rotate_inv(turn, speed)
                         out.spin[env, at] = wp.quat_rotate_inv(turn, spin - own_spin)
+                        if pushes.shape[2] == 4:
+                            out.push[env, at] = wp.quat_rotate_inv(turn, push)
                     found += 1
         if found > room:
             wp.atomic_max(crowded, env, found)

@@ -12,7 +12,7 @@ from typing import Any
 from brainbench.core.devices import warp
 from robotics_bridge.sensors.kernels.distance import FAR, SIDED, SolidArrays, shape_functions
 from robotics_bridge.sensors.kernels.noise import episode_draw, radius_noise
-from robotics_bridge.sensors.kernels.pairs import PairArrays
+from robotics_bridge.sensors.kernels.pairs import PairArrays, push_side
 from robotics_bridge.sensors.kernels.readout import CLEAN, ProbeArrays, ReadoutArrays, readout_functions, silenced
 
 wp = warp()
@@ -42,16 +42,18 @@ def deepest_function(kinds: frozenset[int], raycast: bool) -> Any:
             rotation = pairs.rotation[env, at]
             limit = reach
             facing = wp.vec3f()
+            side = float(0.0)
             if wp.static(bool(kinds & SIDED)):
                 # A probe without a limit asks for the distance, whichever side is the nearest.
                 if reach <= 0.0:
                     facing = rotation @ (probes.radius[n] * probes.normal[n])
+                    side = push_side(pairs, env, at, probes.normal[n])
             if wp.static(raycast or bool(kinds & SIDED)):
                 # A query of triangles searches within a limit: from inside, the surface is at most a bounding diameter
                 # away.
                 if reach <= 0.0:
                     limit = 2.0 * solids.bound[row, geometry][3] + probes.radius[n]
-            found = distance(solids, row, geometry, rotation @ x + pairs.offset[env, at], facing, limit)
+            found = distance(solids, row, geometry, rotation @ x + pairs.offset[env, at], facing, side, limit)
             # The largest penetration of 4.2 is the least signed distance. A strict comparison keeps the first of equals
             # in the order of geometry numbers, so that ties do not depend on the order of contacts.
             if found[3] < best:

@@ -96,14 +96,9 @@ def _exchange(half: int, held: int, rest: int) -> str:
 """
 )
 def block_sum(
-    first: wp.vec3f,
-    ways: wp.vec3f,
-    places: wp.vec3f,
-    turns: wp.vec3f,
-    squares: wp.vec3f,
-    products: wp.vec3f,
+    first: wp.vec3f, ways: wp.vec3f, places: wp.vec3f, turns: wp.vec3f, squares: wp.vec3f, products: wp.vec3f,
     most: float,
-) -> Sums:
+) -> Sums:  # fmt: skip
     """Return the sums over the threads of a block, and of the last the largest."""
     ...
 

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from brainbench.core.devices import to_struct, warp
 from robotics_bridge.physics.state import HandState
-from robotics_bridge.sensors.context import LaunchContext
+from robotics_bridge.sensors.context import LaunchContext, memory_of
 from robotics_bridge.sensors.kernels.pairs import PairArrays, SlotArrays, pair_kernel, start_kernel
 from robotics_bridge.sensors.queries.solids import Solids
 
@@ -87,7 +87,8 @@ class PairTable:
     @property
     def state_bytes(self) -> int:
         """Memory per environment [bytes]."""
-        return _PLACE_BYTES * sum(self._rooms) + 4 * len(self._slots) * (1 + self._words) + 4
+        sided = memory_of([self.struct.push, self._pushes], self._context.num_envs)
+        return _PLACE_BYTES * sum(self._rooms) + 4 * len(self._slots) * (1 + self._words) + 4 + sided
 
     def freeze(self) -> None:
         """Make the arrays."""
@@ -130,15 +131,18 @@ class PairTable:
             setattr(lists, name, c.zeros(listed, warp().vec3f))
         self.struct = lists
         self._bits = c.zeros((envs, count * self._words), int)
+        sided = self._solids.sided and bool(plan["members"])
+        lists.push = c.zeros(listed if sided else (0, 0), warp().vec3f)
+        self._pushes = c.zeros((envs, len(plan["members"]), 4) if sided else (0, 0, 0), int)
         self.crowded = c.zeros(envs, int)
 
     def update(self, state: HandState) -> None:
         """Count an update, refresh the state's status, mark contacts, and list what every slot meets now."""
         c, envs, room = self._context, self._context.num_envs, state.contact_env.shape[0]
         dim = max(envs, room) if self._apart else envs
-        inputs = [self.plan, state.arrays, self._words, self._bits, c.age, self.status, dim]
+        inputs = [self.plan, state.arrays, self._words, self._bits, self._pushes, c.age, self.status, dim]
         c.launch(start_kernel(self._contacts, self._apart), dim, *inputs)
         if self._slots:
-            inputs = [self.plan, self._solids.struct, state.arrays, self._words, self._bits, self.struct]
+            inputs = [self.plan, self._solids.struct, state.arrays, self._words, self._bits, self._pushes, self.struct]
             dim = envs * (len(self._slots) + self._apart * state.num_links)
             c.launch(pair_kernel(self._apart), dim, *inputs, self.crowded, self.status)

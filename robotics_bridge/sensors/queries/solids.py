@@ -248,6 +248,11 @@ class Solids:
         self.struct: Any = to_struct(SolidArrays, {k: np.asarray(v) for k, v in arrays.items()}, device)
         """The Warp structure that kernels take."""
 
+    @property
+    def sided(self) -> bool:
+        """True if any solid is asked from the side of the sensor."""
+        return bool((self.kinds == WALL).any() or (self._thickness > 0).any())
+
     def kinds_of(self, geometries: Iterable[int], *, others: bool = False) -> frozenset[int]:
         """Return the kinds (numbers) that some geometries take in any environment, and the mark of thin ones.
 

@@ -85,6 +85,47 @@ def test_the_back_of_a_thin_link_does_not_read_what_lies_on_its_front_as_passed(
     np.testing.assert_allclose(suite.read("d").numpy(), 0.001, atol=1e-6)
 
 
+def _told(shape: dict, pad: float, under: float, back: bool) -> tuple[float, float]:
+    """Return depth and force of taxels on a plate, where a contact tells that the object pushes it from above."""
+    link = Geometry(name="p", link="p", kind="box", size=(0.04, 0.04, pad))
+    scene = TouchScene(("p", "o"), (link, Geometry(name="o", link="o", **shape)))
+    side = -1 if back else 1
+    probes = Probes.grid(3, 3, size=(0.004, 0.004), center=(0, 0, side * pad), normal=(0, 0, side), radius=0.004)
+    sensors = {"d": ContactDepthProbe(link="p", probes=probes), "f": KinematicTaxel(link="p", probes=probes)}
+    suite = SensorSuite(scene, sensors, num_envs=1)
+    state = state_of(scene, poses_at(2, {1: (0, 0, pad + under)}))
+    where = {"position": [[0, 0, pad]], "normal": [[0, 0, 1]], "force": [1.0], "friction": [[0, 0, 0]]}
+    state.set_contacts([0], [(0, 1)], distance=[-0.001], **where)
+    suite.update(state)
+    return suite.read("d").max().item(), suite.read("f")[..., 2].sum().item()
+
+
+@pytest.mark.parametrize("pressed", [0.5, 6.0])
+@pytest.mark.parametrize("kind", ["box", "cylinder", "plate", "lens"])
+def test_the_side_of_the_reported_contact_is_felt_however_deep(kind: str, pressed: float) -> None:
+    """Six times as deep as a sheet is thick: what lies wholly below the surface still pushes it from above."""
+    half = 0.2e-3
+    plate = trimesh.creation.box((0.04, 0.04, 2 * half))
+    shape = {
+        "box": {"kind": "box", "size": (0.02, 0.02, half)}, "cylinder": {"kind": "cylinder", "size": (0.02, half)},
+        "plate": {"kind": "mesh", "mesh": Mesh(plate.vertices, plate.faces)},
+        "lens": {"kind": "mesh", "mesh": _ball(0.02, 0.02, half)},
+    }[kind]  # fmt: skip
+    depth, force = _told(shape, 0.01, half - 2 * half * pressed, back=False)
+    assert depth == pytest.approx(0.004 + 2 * half * pressed, rel=0.01)
+    assert force < -0.5
+
+
+@pytest.mark.parametrize("mesh", [False, True])
+def test_the_back_of_a_link_thinner_than_the_solid_is_not_pressed_through(mesh: bool) -> None:
+    """A plate of 2 mm on a shell of .8 mm: probes on the back lie .8 mm from it."""
+    plate = trimesh.creation.box((0.04, 0.04, 0.002))
+    shape = {"kind": "box", "size": (0.02, 0.02, 0.001)}
+    if mesh:
+        shape = {"kind": "mesh", "mesh": Mesh(plate.vertices, plate.faces)}
+    assert _told(shape, 0.0004, 0.001, back=True)[0] == pytest.approx(0.0032, abs=1e-6)
+
+
 def test_a_solid_is_thin_by_its_least_width() -> None:
     assert least_width(Geometry(name="a", link="a", kind="cylinder", size=(0.02, 0.001))) == 0.002 < THINNEST
     assert least_width(Geometry(name="a", link="a", kind="capsule", size=(0.002, 0.0001))) == 0.004
