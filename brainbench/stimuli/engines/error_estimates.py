@@ -93,7 +93,7 @@ def calm_error(job: Job, trace: Trace, fidelity: Fidelity) -> float:
     if fidelity.solver == "quasistatic":
         return math.nan
     chain = fidelity.chain(job.whisker)
-    period = 2 * math.pi / float(chain.frequencies()[0])
+    period = 2 * math.pi / chain.first_frequency
     slow = (getattr(job.follicle, "finest", None) or 0.0) >= SLOW * period
     return CALM / chain.links**2 if slow else math.nan
 

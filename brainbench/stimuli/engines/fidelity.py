@@ -117,7 +117,7 @@ class Fidelity:
 
     def step_of(self, chain: Chain) -> float:
         """Return the time step [s] of a chain."""
-        return self.step(float(chain.frequencies()[0]) / (2 * math.pi), chain.whisker.damping_ratio)
+        return self.step(chain.first_frequency / (2 * math.pi), chain.whisker.damping_ratio)
 
     def step(self, frequency: float, damping_ratio: float = math.inf) -> float:
         """Return the time step [s] of a whisker whose first mode has this frequency [Hz] and is to ring with a ratio.

@@ -73,7 +73,7 @@ class Pluck:
         straight = replace(whisker, curvature=0.0, bends=())
         force = condition["deflection"] / references.point_load_deflection(straight, 1.0, arc)
         whole = force * np.asarray(self.direction, dtype=float) / math.hypot(*self.direction)
-        ratio, omega = min(whisker.damping_ratio, 0.9), float(build_chain(whisker, 16).frequencies()[0])
+        ratio, omega = min(whisker.damping_ratio, 0.9), build_chain(whisker, 16).first_frequency
         damped = math.sqrt(1 - ratio**2)
         decay = math.exp(-math.pi * ratio / damped)
         part = -whole * decay / (1 + decay)

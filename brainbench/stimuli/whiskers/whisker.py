@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, fields
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from itertools import pairwise
 from typing import Annotated, Any
 
@@ -334,6 +334,11 @@ class Chain:
         link = min(max(int(np.searchsorted(self.nodes, arc)) - 1, 0), self.links - 1)
         return link, (arc - self.nodes[link]) / (self.nodes[link + 1] - self.nodes[link])
 
+    @cached_property
+    def first_frequency(self) -> float:
+        """Lowest angular frequency (rad/s); see :meth:`frequencies`."""
+        return float(self.frequencies()[0])
+
     def frequencies(self, count: int = 1) -> NDArray[np.float64]:
         """Return the lowest angular frequencies [count] (rad/s) of small planar motion, undamped, base fixed."""
         from scipy.linalg import eigh
@@ -358,12 +363,12 @@ class Chain:
         step: stiffness-proportional damping β k behaves as (β + dt) k. So β = max(2 ζ/ω₁ − dt, 0).
         """
         # Damping β k gives a mode ω the ratio β ω/2.
-        beta = 2 * self.whisker.damping_ratio / self.frequencies()[0] - time_step
+        beta = 2 * self.whisker.damping_ratio / self.first_frequency - time_step
         return max(beta, 0.0) * self.stiffness
 
     def achieved_damping_ratio(self, time_step: float) -> float:
         """Return the damping ratio of the first mode with this step; too long a step raises it above the whisker's."""
-        return max(self.whisker.damping_ratio, float(self.frequencies()[0]) * time_step / 2)
+        return max(self.whisker.damping_ratio, self.first_frequency * time_step / 2)
 
     def _planar_mass(self) -> NDArray[np.float64]:
         """Return the joint-space inertia [N, N] of the straightened chain for small rotations about z."""

@@ -10,6 +10,7 @@ import time
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -342,7 +343,8 @@ def _simulate(
         # Compiling is done once; it is no cost of a whisker.
         paused = time.thread_time()
         twists, flows = given[0].kind[:2]
-        solver = WhiskerSolver(packed.chains, fidelity, device, packed.shapes.needs, twists=twists, flows=flows)
+        make = _solver_of if device.is_cpu else _solver_of.__wrapped__
+        solver = make(tuple(packed.chains), fidelity, str(device), packed.shapes.needs, twists, flows)
         started += time.thread_time() - paused
         result = packed.launch(solver, record_shape=record_shape)
         np.add.at(seconds, rows, (time.thread_time() - started) / len(rows))
@@ -351,6 +353,14 @@ def _simulate(
     result = run_with_retries(launch, retry, ahead=lambda: tries_ahead(device))
     traces = (trace_of(result, row, task.job, fidelity, seconds[row]) for row, task in enumerate(given))
     return dict(zip(tasks, traces, strict=True))
+
+
+@lru_cache(maxsize=256)
+def _solver_of(
+    chains: tuple[Chain, ...], fidelity: Fidelity, device: str, needs: int, twists: bool, flows: bool
+) -> WhiskerSolver:
+    """Return a solver; on a processor, where setting up costs as much as simulating 20 ms, callers share it."""
+    return WhiskerSolver(chains, fidelity, pick_device(device), needs, twists=twists, flows=flows)
 
 
 def trace_of(result: LaunchResult, row: int, job: Job, fidelity: Fidelity, seconds: float) -> Trace:

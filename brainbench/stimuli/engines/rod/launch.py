@@ -296,7 +296,7 @@ class WhiskerSolver:
         if self.yields:
             packed["follicle"] = pack_follicles(self.chains, self.quasistatic)
         with lock_of(device):
-            self.chain_arrays = to_struct(self.kernels.structs.ChainArrays, packed, device)
+            self.chain_arrays = to_struct(self.kernels.structs.ChainArrays, packed, device, copy=False)
         self.block = {} if block is None else {"block_dim": block}
         self.steps = np.array([fidelity.step_of(chain) * MILLI for chain in self.chains])
         """[whisker] longest time step (ms)."""
@@ -400,7 +400,7 @@ class WhiskerSolver:
             scene = structs.SceneArrays()
             scene.chains, scene.options = self.chain_arrays, options
             for name, (kind, values) in parts.items():
-                setattr(scene, name, to_struct(kind, values, device))
+                setattr(scene, name, to_struct(kind, values, device, copy=False))
             problems = make_problems(self.kernels, self.capacity, count, device, self.iterations)
         return scene, problems, results, shapes_of
 

@@ -248,7 +248,7 @@ def pack_chains(
         taper["start_radius"][:n, w], taper["end_radius"][:n, w] = radii[:-1], radii[1:]
         taper["arc"][:n, w], taper["arc_length"][:n, w] = chain.nodes[:-1] * MILLI, np.diff(chain.nodes) * MILLI
     # Damping ratio ζ of the first mode ω₁ as stiffness-proportional damping, β = 2 ζ / ω₁.
-    beta = [0 if quasistatic else 2 * c.whisker.damping_ratio / c.frequencies()[0] * MILLI for c in chains]
+    beta = [0 if quasistatic else 2 * c.whisker.damping_ratio / c.first_frequency * MILLI for c in chains]
     return {
         "links": np.array([c.links for c in chains], dtype=np.int32),
         "beta": np.array(beta),
