@@ -136,28 +136,21 @@ def to_struct(kind: Any, values: Mapping[str, np.ndarray], device: Any, *, copy:
     Arrays of records are structured, with the fields of the record in order. Without ``copy`` the structure may
     share memory with other structures and, on a processor, with ``values``: for kernels that only read it.
     """
-    wp = warp()
-    struct = kind()
+    wp, struct = warp(), kind()
+    unused = _unused.__wrapped__ if copy else _unused
     for name, value in values.items():
         dtype = kind.vars[name].type.dtype
         array = np.ascontiguousarray(value)
-        record = _record_of(dtype)
-        if record is not None and array.dtype.names != record.names:
-            raise TypeError(f"{name} holds records of {record.names}; received {array.dtype.names}")
-        if array.size == 0:
-            make = _unused.__wrapped__ if copy else _unused
-            setattr(struct, name, make(array.shape[1:], record or array.dtype, dtype, str(device)))
-            continue
-        if record is not None:
+        if hasattr(dtype, "numpy_dtype"):
+            record = np.dtype(dtype.numpy_dtype())
+            if array.dtype.names != record.names:
+                raise TypeError(f"{name} holds records of {record.names}; received {array.dtype.names}")
             array = array.astype(record)
-        setattr(struct, name, wp.array(array, dtype=dtype, device=device, copy=copy))
+        if array.size == 0:
+            setattr(struct, name, unused(array.shape[1:], array.dtype, dtype, str(device)))
+        else:
+            setattr(struct, name, wp.array(array, dtype=dtype, device=device, copy=copy))
     return struct
-
-
-@cache
-def _record_of(dtype: Any) -> np.dtype | None:
-    """Return the numpy type of a Warp structure; None for other types."""
-    return np.dtype(dtype.numpy_dtype()) if hasattr(dtype, "numpy_dtype") else None
 
 
 @cache

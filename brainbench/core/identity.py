@@ -78,6 +78,7 @@ class ScoreIdentity:
     ) -> ScoreIdentity:
         """Return the identity that a provenance states; ``fallback`` are settings where it states none."""
         version = origin.settings.get("estimator_version")
+        stated = {**SETTINGS, **(fallback or {}), **origin.settings}
         return cls(
             model=model,
             weights=weights,
@@ -86,14 +87,9 @@ class ScoreIdentity:
             stimuli=origin.stimuli_hash,
             labels=labels,
             pairing=origin.pairing,
-            settings=to_json(full_settings({**(fallback or {}), **origin.settings})),
+            settings=to_json(to_plain({name: stated[name] for name in SETTINGS})),
             estimator_version=version if isinstance(version, int) else None,
         )
-
-
-def full_settings(stated: Mapping[str, Any]) -> dict[str, Any]:
-    """Return all of :data:`SETTINGS`, those that are not stated with their defaults."""
-    return to_plain({name: stated.get(name, default) for name, default in SETTINGS.items()})
 
 
 def unusual_settings(stated: Mapping[str, Any]) -> dict[str, Any]:

@@ -150,7 +150,9 @@ class _Document:
         """Rebuild it from :meth:`to_json` or from the mapping inside it."""
         data = parse_json(source, "This text") if isinstance(source, str) else source
         cls._check_version(data)
-        document = _convert(cls, data)
+        choices = {"status": get_args(Status), "schema": (RECORD_SCHEMA,)}
+        document = typed_values(cls, data, "the record", choices=choices)
+        _check_rest(data, document, "")
         for score in document.scores:
             if contradiction := _contradiction(score):
                 raise DataError(f"The score {brief(score.name)} contradicts itself: {contradiction}.")
@@ -474,13 +476,6 @@ def _steady(score: Mapping[str, Any] | None) -> dict[str, Any] | None:
     volatile = ("time", "machine", "python", "packages", "seconds", "command")
     provenance = {name: value for name, value in (score.get("provenance") or {}).items() if name not in volatile}
     return {**score, "provenance": provenance}
-
-
-def _convert(kind: type, data: Any) -> Any:
-    """Make a dataclass from parsed JSON."""
-    built = typed_values(kind, data, "the record", choices={"status": get_args(Status), "schema": (RECORD_SCHEMA,)})
-    _check_rest(data, built, "")
-    return built
 
 
 @cache

@@ -59,7 +59,8 @@ class KirchhoffRod:
                 CubicSpline(s, 2 * whisker.curvature * np.cos(whisker.tangent_angle(s)) ** 3),
                 np.zeros_like,
             )
-        laws = (curvature, whisker.bending_stiffness, whisker.torsional_stiffness, twist, whisker.radius)
+        bending = whisker.bending_stiffness
+        laws = (curvature, bending, lambda s: whisker.torsion_ratio * bending(s), twist, whisker.radius)
         return cls(whisker.arc_length, *(lambda s, law=law: float(law(s)) for law in laws))
 
 

@@ -41,20 +41,15 @@ def run_groups(
     """
     traces: dict[int, Trace] = {}
     total = sum(map(len, groups))
-
-    def keep(some: Mapping[int, Trace]) -> None:
-        for index, trace in some.items():
-            traces[index] = trace
-            if progress is not None:
-                progress(len(traces), total)
-
-    if len(groups) == 1:  # starting a thread costs as much as simulating 10 ms
-        keep(run(groups[0]))
-        return [traces[index] for index in range(total)]
     with ThreadPoolExecutor(max_workers=threads) as pool:
         try:
-            for future in as_completed([pool.submit(run, group) for group in groups]):
-                keep(future.result())
+            # Starting a thread costs as much as simulating 10 ms.
+            futures = [pool.submit(run, group) for group in groups] if len(groups) > 1 else []
+            parts = (future.result() for future in as_completed(futures)) if futures else map(run, groups)
+            for index, trace in (pair for part in parts for pair in part.items()):
+                traces[index] = trace
+                if progress is not None:
+                    progress(len(traces), total)
         except BaseException:
             # Without this an interrupt or a failed job would wait for every job that is still queued.
             pool.shutdown(wait=False, cancel_futures=True)

@@ -199,10 +199,6 @@ class Whisker:
         """Torsional over flexural rigidity, G J/(E I) = 1/(1 + ν): J = π r⁴/2 is twice the second moment I."""
         return 1 / (1 + self.poisson_ratio)
 
-    def torsional_stiffness(self, s: ArrayLike) -> NDArray[np.float64]:
-        """Return the torsional rigidity G J [N·m²] at arc length ``s`` [m]."""
-        return self.torsion_ratio * self.bending_stiffness(s)
-
     def linear_density(self, s: ArrayLike) -> NDArray[np.float64]:
         """Return the mass per length ρ π r² [kg/m] at arc length ``s`` [m]."""
         base, tip = self.densities

@@ -342,9 +342,8 @@ def _simulate(
         packed = PackedTasks.of([given[row] for row in rows], finer)
         # Compiling is done once; it is no cost of a whisker.
         paused = time.thread_time()
-        twists, flows = given[0].kind[:2]
         make = _solver_of if device.is_cpu else _solver_of.__wrapped__
-        solver = make(tuple(packed.chains), fidelity, str(device), packed.shapes.needs, twists, flows)
+        solver = make(tuple(packed.chains), fidelity, str(device), packed.shapes.needs, *given[0].kind[:2])
         started += time.thread_time() - paused
         result = packed.launch(solver, record_shape=record_shape)
         np.add.at(seconds, rows, (time.thread_time() - started) / len(rows))
@@ -356,11 +355,9 @@ def _simulate(
 
 
 @lru_cache(maxsize=256)
-def _solver_of(
-    chains: tuple[Chain, ...], fidelity: Fidelity, device: str, needs: int, twists: bool, flows: bool
-) -> WhiskerSolver:
+def _solver_of(chains: tuple[Chain, ...], fidelity: Fidelity, device: str, needs: int, *kind: bool) -> WhiskerSolver:
     """Return a solver; on a processor, where setting up costs as much as simulating 20 ms, callers share it."""
-    return WhiskerSolver(chains, fidelity, pick_device(device), needs, twists=twists, flows=flows)
+    return WhiskerSolver(chains, fidelity, pick_device(device), needs, twists=kind[0], flows=kind[1])
 
 
 def trace_of(result: LaunchResult, row: int, job: Job, fidelity: Fidelity, seconds: float) -> Trace:

@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
 from dataclasses import replace
-from functools import cache, cached_property, partial
+from functools import cached_property, partial
 from itertools import groupby
 from typing import Any
 
@@ -278,7 +278,7 @@ class SweepLauncher:
         """
         grid, head = self.grid, self._head
         rotations = sorted({sweep.rotation for sweep in sweeps})
-        about_z = np.array([_about_z(rotation) for rotation in rotations])
+        about_z = np.array([euler_matrix((0.0, 0.0, rotation)) for rotation in rotations])
         # Turned about z: how far it then reaches along x and y.
         x, y = surface.outline.T
         # The lowest corner of the outline's convex hull is that of the whole surface.
@@ -312,9 +312,3 @@ def pack_object(solid: Solid) -> tuple[float, PackedSurface]:
     if solid.surface is None:
         raise UsageError(f"The object {solid.name!r} has no exact surface to sweep over; use the backend 'mujoco'.")
     return solid.diagonal, PackedSurface.of(solid.surface.vertices * MILLI, solid.surface.faces)
-
-
-@cache
-def _about_z(rotation: float) -> NDArray[np.float64]:
-    """Return the matrix of a rotation about z (rad); grids have few."""
-    return euler_matrix((0.0, 0.0, rotation))
