@@ -30,6 +30,8 @@ from typing import Any
 
 import torch
 
+from tests.factories.forks import fork, sentences
+from tests.factories.reading_trials import LONGEST, not_finite
 from tests.factories.structures import restructure
 
 FAILURES = ("traceback", "hang", "crash", "silent", "leaked", "half-written", "wordy")
@@ -39,8 +41,6 @@ PATIENCE = 300.0
 """Time of a case by the clock, which a busy machine stretches."""
 MEMORY = 16 << 30
 """Address space [bytes] of a case; libraries reserve much more than they use."""
-LONGEST = 400
-"""Characters of one sentence to a user."""
 SECRET = "PRIVATE-7f3a91"
 """Stands in files that no case was given: ``../../etc/passwd`` from its folder, and the user's settings beside it."""
 LARGEST = 1e200
@@ -104,12 +104,10 @@ def cases(door: Door, folder: Path, seeds: range) -> Iterator[Verdict]:
 
 
 def _judge(door: Door, path: Path, place: Path, what: str) -> Verdict:
-    before, streams = _files(place), (place.parent / "out", place.parent / "err")
-    child = os.fork()
-    if not child:
-        _run(door, path, place, streams)
+    before, out, err = _files(place), place.with_name("out"), place.with_name("err")
+    child = fork(partial(_run, door, path, place), out, err)
     status = _wait(child)
-    out, err = (stream.read_text(errors="replace") for stream in streams)
+    out, err = (stream.read_text(errors="replace") for stream in (out, err))
     error = re.sub(r"\s+", " ", err).strip().removeprefix("brainbench: ")
     written = _files(place) - before
     verdict = partial(Verdict, what=what, detail=error[-600:])
@@ -136,56 +134,37 @@ def _judge(door: Door, path: Path, place: Path, what: str) -> Verdict:
 ABSENT = 97
 
 
-def _run(door: Door, path: Path, place: Path, streams: tuple[Path, Path]) -> None:
-    """Do the work of a case in this process, and end it."""
-    status = 1
+def _run(door: Door, path: Path, place: Path) -> None:
+    """Do the work of a case within its bounds."""
     try:
-        for number, stream in enumerate(streams, 1):
-            os.dup2(os.open(stream, os.O_CREAT | os.O_WRONLY | os.O_TRUNC), number)
-        sys.stdout, sys.stderr = open(1, "w", closefd=False), open(2, "w", closefd=False)  # noqa: SIM115
         os.chdir(place)
         os.environ["BRAINBENCH_CONFIG"] = str(place)
         os.setpgid(0, 0)
         resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
         resource.setrlimit(resource.RLIMIT_CPU, (SECONDS, SECONDS + 5))
         faulthandler.enable(sys.stderr)
-        status = _call(door, path, place)
-    except SystemExit as end:
-        status = end.code if isinstance(end.code, int) else int(end.code is not None)
-    except BaseException:  # noqa: BLE001 - whatever ends a case is told
-        import traceback
-
-        traceback.print_exc()
+        _call(door, path, place)
     finally:
         with suppress(BaseException):
-            sys.stdout.flush()
-            sys.stderr.flush()
             (place.parent / "modules").write_text("\n".join(sys.modules))
-        os._exit(status)
 
 
-def _call(door: Door, path: Path, place: Path) -> int:
+def _call(door: Door, path: Path, place: Path) -> None:
     if door.read is None:
         from brainbench.cli import main
 
         values = {"file": path, "folder": place, "stem": path.with_suffix("")}
         sys.argv = ["brainbench", *(word.format(**values) for word in shlex.split(door.words))]
-        main()
-        return 0
-    from brainbench.core.errors import BrainbenchError
-    from tests.factories.reading_trials import not_finite
-
+        return main()
     try:
-        result = door.read(path)
+        with sentences():
+            result = door.read(path)
     except ModuleNotFoundError as error:
         if (error.name or "").startswith(("brainbench", "robotics_bridge", "leaderboards")):
-            return ABSENT
+            sys.exit(ABSENT)
         raise
-    except BrainbenchError as error:
-        sys.stderr.write(f"{error}\n")
-        return error.exit_code
     sys.stdout.write(json.dumps({"odd": math.nan if not_finite(result) else 0.0, "text": str(result)[:2000]}))
-    return 0
+    return None
 
 
 def _text(path: Path) -> str:

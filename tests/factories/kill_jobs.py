@@ -10,19 +10,22 @@ import argparse
 import json
 import os
 import random
+import shlex
 import shutil
 import signal
 import sys
 import time
-import traceback
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from brainbench.core.errors import BrainbenchError
+import torch
+
+from tests.factories.forks import fork, sentences
 from tests.factories.sweep_batches import files_of
 
 PAUSE = 0.2
@@ -50,6 +53,11 @@ class KillJob:
     """Pattern of the first finished part, where it comes late: every second kill falls after it."""
     apart: tuple[str, ...] = ()
     """Names of files that hold times, which are only there or not."""
+
+    def do(self, inputs: Path, out: Path) -> None:
+        """Do the work; an error is a sentence."""
+        with sentences():
+            self.run(inputs, out)
 
 
 @dataclass
@@ -82,7 +90,8 @@ def content(folder: Path, job: KillJob) -> dict[str, Any]:
             # TensorBoard names its files by time and process, and begins a new one in every run.
             continue
         if name.endswith((".json", ".jsonl")):
-            found[name] = [_without_times(json.loads(line, parse_constant=str)) for line in _documents(name, data)]
+            lines = data.splitlines() if name.endswith(".jsonl") else [data]
+            found[name] = [_without_times(json.loads(line, parse_constant=str)) for line in lines]
         else:
             found[name] = b"" if any(part in name for part in job.apart) else data
     return found
@@ -97,11 +106,11 @@ def measure(job: KillJob, folder: Path, kills: int, signals: Sequence[str] = ("K
         import_module(module)
     inputs, whole = folder / "inputs", folder / "whole"
     inputs.mkdir(parents=True)
-    _finish(_fork(lambda: job.prepare(inputs), folder / "prepare.log"), folder / "prepare.log")
+    _finish(fork(lambda: job.prepare(inputs), folder / "prepare.log"), folder / "prepare.log")
     # The first run may compile what later ones find in the machine's own caches.
-    _finish(_fork(lambda: job.run(inputs, folder / "first"), folder / "first.log"), folder / "first.log")
+    _finish(fork(partial(job.do, inputs, folder / "first"), folder / "first.log"), folder / "first.log")
     begin = time.monotonic()
-    child = _fork(lambda: job.run(inputs, whole), folder / "whole.log")
+    child = fork(partial(job.do, inputs, whole), folder / "whole.log")
     _wait_for_part(whole, job.part)
     first = _work(child)
     work = _finish(child, folder / "whole.log")
@@ -113,7 +122,7 @@ def measure(job: KillJob, folder: Path, kills: int, signals: Sequence[str] = ("K
         if outcome.kills == kills:
             break
         out, log = folder / str(place), folder / f"{place}.log"
-        child = _fork(lambda out=out: job.run(inputs, out), log)
+        child = fork(partial(job.do, inputs, out), log)
         late = bool(job.part) and place % 2 == 1
         if late:
             _wait_for_part(out, job.part)
@@ -131,7 +140,7 @@ def measure(job: KillJob, folder: Path, kills: int, signals: Sequence[str] = ("K
         there = out.is_dir() and any(not Path(name).name.startswith(".") for name in files_of(out))
         outcome.resumed += met and there and job.resumes
         outcome.repeated += met and not (there and job.resumes)
-        status = os.waitpid(_fork(lambda out=out: job.run(inputs, out), log), 0)[1]
+        status = os.waitpid(fork(partial(job.do, inputs, out), log), 0)[1]
         now = content(out, job) if out.is_dir() else {}
         # What was finished before the kill may refuse to be written once more.
         if status and now != expected:
@@ -165,7 +174,7 @@ def _let_work(child: int, seconds: float) -> None:
 def _run_together(job: KillJob, inputs: Path, folder: Path, expected: dict[str, Any], outcome: Outcome) -> None:
     """Run a command twice at once into one folder: both finish, or one is refused in a sentence."""
     out, logs = folder / "together", [folder / f"together-{place}.log" for place in range(2)]
-    children = [_fork(lambda: job.run(inputs, out), log) for log in logs]
+    children = [fork(partial(job.do, inputs, out), log) for log in logs]
     failed = [log.read_text() for child, log in zip(children, logs, strict=True) if os.waitpid(child, 0)[1]]
     if len(failed) > 1:
         outcome.together.append("none finished")
@@ -173,30 +182,6 @@ def _run_together(job: KillJob, inputs: Path, folder: Path, expected: dict[str, 
     outcome.together += _differ(content(out, job), expected)
     outcome.pairs += 1
     shutil.rmtree(out)
-
-
-def _fork(run: Callable[[], None], log: Path) -> int:
-    child = os.fork()
-    if child:
-        return child
-    status = 1
-    try:
-        handle = os.open(log, os.O_CREAT | os.O_WRONLY | os.O_TRUNC)
-        os.dup2(handle, 1)
-        os.dup2(handle, 2)
-        sys.stdout, sys.stderr = open(1, "w", closefd=False), open(2, "w", closefd=False)  # noqa: SIM115
-        run()
-        status = 0
-    except SystemExit as end:
-        status = int(end.code or 0)
-    except BrainbenchError as error:
-        sys.stderr.write(f"{error}\n")
-    except BaseException:  # noqa: BLE001 - whatever ends a run is told
-        traceback.print_exc()
-    finally:
-        sys.stdout.flush()
-        sys.stderr.flush()
-        os._exit(status)
 
 
 def _finish(child: int, log: Path) -> float:
@@ -212,21 +197,29 @@ def _differ(one: dict[str, Any], other: dict[str, Any]) -> list[str]:
     return sorted(name for name in one.keys() | other.keys() if one.get(name) != other.get(name))
 
 
-def _documents(name: str, data: bytes) -> list[bytes]:
-    return data.splitlines() if name.endswith(".jsonl") else [data]
-
-
 def _without_times(value: Any) -> Any:
     if isinstance(value, dict):
         return {key: _without_times(item) for key, item in value.items() if key not in TIMES}
     return [_without_times(item) for item in value] if isinstance(value, list) else value
 
 
-def _command(*words: object) -> None:
-    from brainbench.cli import main
+def _command(words: str, cache: str = "") -> Callable[[Path, Path], None]:
+    """Return what runs a command; ``{inputs}`` and ``{out}`` stand for its folders, also in that of its cache."""
 
-    sys.argv = ["brainbench", *map(str, words)]
-    main()
+    def run(inputs: Path, out: Path) -> None:
+        from brainbench.cli import main
+
+        if cache:
+            os.environ["BRAINBENCH_CACHE"] = cache.format(out=out)
+        sys.argv = ["brainbench", *(word.format(inputs=inputs, out=out) for word in shlex.split(words))]
+        main()
+
+    return run
+
+
+def _factory(module: str, name: str) -> Callable[[Path], None]:
+    """Return a function of the factories, which is imported where it is called."""
+    return lambda inputs: getattr(import_module(f"tests.factories.{module}"), name)(inputs)  # noqa: PLW0108 - later
 
 
 def _generate(inputs: Path, out: Path) -> None:
@@ -237,26 +230,20 @@ def _generate(inputs: Path, out: Path) -> None:
 
 
 def _train(inputs: Path, out: Path) -> None:
-    import torch
-
     from brainbench.models.training.config import TrainingConfig
     from brainbench.models.training.trainer import train
     from tests.factories.training_sweeps import tiny
 
-    torch.set_num_threads(1)
     options: dict[str, Any] = {"epochs": 3, "batch_size": 8, "optimizer": "adamw", "learning_rate": 1e-3}
     options |= {"checkpoint_seconds": 0.0, "augmentation": "physical", "precision": "float32"}
     train(TrainingConfig.published("zhuang-small", "supervised", **options), tiny(), out=out, device="cpu")
 
 
 def _train_policy(inputs: Path, out: Path) -> None:
-    import torch
-
     from robotics_bridge import tasks
     from robotics_bridge.policies.training.teacher import TeacherRun, train
     from robotics_bridge.tasks.settings import TeacherSettings
 
-    torch.set_num_threads(1)
     small = TeacherSettings(num_envs=2, steps_per_env=4, iterations=12, epochs=1, minibatches=1, hidden=(8,))
     env = tasks.make(tasks.load("in_palm_rotate"), num_envs=2, threads=1, seed=0)
     train(env, out, TeacherRun(iterations=12, save_every=1), settings=small)
@@ -268,15 +255,6 @@ def _write_records(inputs: Path) -> None:
 
     for index in range(24):
         write_record(make_record(f"net-{index}", 0.3 + 0.02 * index), inputs / "records")
-
-
-def _score(inputs: Path, out: Path) -> None:
-    import torch
-
-    torch.set_num_threads(1)
-    os.environ["BRAINBENCH_CACHE"] = str(out / "cache")
-    words = ("--conditions", "trials:stimulus", "--stimuli", "rodgers", "--whiskers", "C2", "--fidelity", "fast")
-    _command("score", "zhuang-small", "-r", inputs / "rec.h5", *words, "--out", out / "records", "--json")
 
 
 def _write_recordings(inputs: Path) -> None:
@@ -294,20 +272,11 @@ def _write_recordings(inputs: Path) -> None:
 
 
 def _write_checkpoint(inputs: Path) -> None:
-    import torch
-
     from brainbench.models.registry import load_model
     from tests.factories.published_files import lightning_state
 
     state = lightning_state(load_model("s4-small", seed=5, classes=9))
     torch.save({"state_dict": state, "epoch": 6, "global_step": 50}, inputs / "x.ckpt")
-
-
-def _write_set(inputs: Path) -> None:
-    from tests.factories.published_sweeps import write_tree
-
-    write_tree(inputs / "tree", sizes=(40, 20, 20))
-    _command("stimuli", "convert", inputs / "tree" / "train", inputs / "set.h5", "--json")
 
 
 def _write_tree(inputs: Path) -> None:
@@ -316,33 +285,9 @@ def _write_tree(inputs: Path) -> None:
     write_tree(inputs / "tree", sizes=(40, 20, 20))
 
 
-def _import(inputs: Path, out: Path) -> None:
-    _command("models", "import", inputs / "x.ckpt", "--architecture", "s4-small", "--out", out, "--json")
-
-
-def _convert(inputs: Path, out: Path) -> None:
-    os.environ["BRAINBENCH_CACHE"] = str(out.with_name(f"cache-{out.name}"))
-    _command("stimuli", "convert", inputs / "tree", out, "--json")
-
-
-def _export(inputs: Path, out: Path) -> None:
-    _command("export", "zhuang-small", "--format", "torch", "--out", out / "step.pt2", "--json")
-
-
-def _convert_set(inputs: Path, out: Path) -> None:
-    _command("stimuli", "convert", inputs / "set.h5", out / "run", "-s", "00000000", "--json")
-
-
-def _write_study(inputs: Path) -> None:
-    from tests.factories.scored_files import write_study
-
-    write_study(inputs)
-
-
-def _write_benchmark(inputs: Path) -> None:
-    from tests.factories.foreign_goods import benchmark
-
-    benchmark(inputs)
+def _write_set(inputs: Path) -> None:
+    _write_tree(inputs)
+    _command("stimuli convert {inputs}/tree/train {inputs}/set.h5 --json")(inputs, inputs)
 
 
 def _make_benchmark(inputs: Path, out: Path) -> None:
@@ -351,16 +296,12 @@ def _make_benchmark(inputs: Path, out: Path) -> None:
         place.parent.mkdir(parents=True, exist_ok=True)
         with suppress(FileExistsError):
             place.hardlink_to(path)
-    os.environ["BRAINBENCH_CACHE"] = str(out.with_name(f"cache-{out.name}"))
-    words = ("-r", out / "data", "--conditions", "trials:texture", "--stimuli", out / "eight.h5", "--citation", "Doe")
-    _command("benchmark", "make", *words, "--out", out / "lab.toml", "--json")
+    words = "--conditions trials:texture --stimuli {out}/eight.h5 --citation Doe --out {out}/lab.toml --json"
+    _command(f"benchmark make -r {{out}}/data {words}", _BESIDE)(inputs, out)
 
 
-def _pack_benchmark(inputs: Path, out: Path) -> None:
-    _command("benchmark", "pack", inputs / "lab.toml", "--out", out / "lab.zip", "--json")
-
-
-_CLI = ("torch", "brainbench.cli")
+_BESIDE = "{out.parent}/cache-{out.name}"
+_CLI = ("brainbench.cli",)
 _TRAINER = ("brainbench.models.training.trainer", "tests.factories.training_sweeps")
 _SCORE = ("brainbench.scoring.scores", "brainbench.stimuli", "brainbench.models.zoo", "brainbench.datasets", "warp")
 _BENCHMARK = ("brainbench.benchmarks.commands", "brainbench.scoring.scores", "brainbench.datasets", "h5py")
@@ -373,22 +314,42 @@ JOBS = (
     KillJob("train", 12, _train, modules=_TRAINER, resumes=True),
     KillJob("policy train", 10, _train_policy, modules=_TEACHER, resumes=True, part="state.safetensors"),
     KillJob(
-        "leaderboard add", 16, lambda inputs, out: _command("leaderboard", "add", inputs / "records", "--to", out),
+        "leaderboard add", 16, _command("leaderboard add {inputs}/records --to {out}"),
         _write_records, (*_CLI, "leaderboards"), resumes=True,
     ),
     KillJob(
-        "leaderboard build", 16, lambda inputs, out: _command("leaderboard", "build", inputs / "records", "--out", out),
+        "leaderboard build", 16, _command("leaderboard build {inputs}/records --out {out}"),
         _write_records, (*_CLI, "leaderboards.site"),
     ),
     KillJob(
-        "score, empty cache", 12, _score, _write_recordings, (*_CLI, *_SCORE), resumes=True, apart=(".html",)
+        "score, empty cache", 12,
+        _command(
+            "score zhuang-small -r {inputs}/rec.h5 --conditions trials:stimulus --stimuli rodgers --whiskers C2 "
+            "--fidelity fast --out {out}/records --json", "{out}/cache",
+        ),
+        _write_recordings, (*_CLI, *_SCORE), resumes=True, apart=(".html",),
     ),
-    KillJob("models export", 8, _export, modules=(*_CLI, "torch.export", "brainbench.models.export")),
-    KillJob("stimuli convert, sweeps", 12, _convert, _write_tree, (*_CLI, "h5py", "brainbench.stimuli"), resumes=True),
-    KillJob("stimuli convert, a run", 8, _convert_set, _write_set, (*_CLI, "h5netcdf", "brainbench.stimuli")),
-    KillJob("benchmark make", 8, _make_benchmark, _write_study, (*_CLI, *_BENCHMARK)),
-    KillJob("benchmark pack", 8, _pack_benchmark, _write_benchmark, (*_CLI, *_BENCHMARK)),
-    KillJob("models import", 12, _import, _write_checkpoint, (*_CLI, "brainbench.published.checkpoint_import")),
+    KillJob(
+        "models export", 8, _command("export zhuang-small --format torch --out {out}/step.pt2 --json"),
+        modules=(*_CLI, "torch.export", "brainbench.models.export"),
+    ),
+    KillJob(
+        "stimuli convert, sweeps", 12, _command("stimuli convert {inputs}/tree {out} --json", _BESIDE),
+        _write_tree, (*_CLI, "h5py", "brainbench.stimuli"), resumes=True,
+    ),
+    KillJob(
+        "stimuli convert, a run", 8, _command("stimuli convert {inputs}/set.h5 {out}/run -s 00000000 --json"),
+        _write_set, (*_CLI, "h5netcdf", "brainbench.stimuli"),
+    ),
+    KillJob("benchmark make", 8, _make_benchmark, _factory("scored_files", "write_study"), (*_CLI, *_BENCHMARK)),
+    KillJob(
+        "benchmark pack", 8, _command("benchmark pack {inputs}/lab.toml --out {out}/lab.zip --json"),
+        _factory("foreign_goods", "benchmark"), (*_CLI, *_BENCHMARK),
+    ),
+    KillJob(
+        "models import", 12, _command("models import {inputs}/x.ckpt --architecture s4-small --out {out} --json"),
+        _write_checkpoint, (*_CLI, "brainbench.published.checkpoint_import"),
+    ),
 )  # fmt: skip
 
 
@@ -400,6 +361,7 @@ def main() -> None:
     parser.add_argument("--signals", default="KILL", help="sent in turn: KILL,TERM,HUP,STOP")
     parser.add_argument("--pairs", type=int, default=1)
     chosen = parser.parse_args()
+    torch.set_num_threads(1)
     for job in JOBS:
         if job.name in chosen.names:
             kills = job.kills if chosen.kills is None else chosen.kills
