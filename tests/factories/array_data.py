@@ -6,29 +6,14 @@ from typing import Any
 
 import torch
 
-from brainbench.core.errors import UsageError
 from brainbench.models.training.batches import BatchOptions
 
 
 class ArrayBatches:
-    """Batches of sweeps in memory [N, T, S·C, H, W] in SI with integer labels [N], in an order drawn in every epoch.
-
-    Raises:
-        UsageError: sizes do not fit.
-    """
+    """Batches of sweeps in memory [N, T, S·C, H, W] in SI with integer labels [N], in an order drawn in every epoch."""
 
     def __init__(self, sweeps: Any, labels: Any, options: BatchOptions) -> None:
         self.sweeps, self.labels, self.options = torch.as_tensor(sweeps), torch.as_tensor(labels).long(), options
-        if self.sweeps.ndim != 5 or self.labels.shape != self.sweeps.shape[:1] or not len(self.labels):
-            raise UsageError(
-                "Training needs sweeps [sweep, time, channel, row, column] and one label each; received "
-                f"{list(self.sweeps.shape)} and {list(self.labels.shape)}."
-            )
-        size, (rank, parts) = options.batch_size, options.part
-        if size < 1 or size % parts or not 0 <= rank < parts:
-            raise UsageError(
-                f"A batch must divide evenly among the processes; received batch_size {size} and part {(rank, parts)}."
-            )
         self.epoch = self._batch = 0
 
     def __len__(self) -> int:
@@ -60,17 +45,8 @@ class ArrayBatches:
         return {"seed": seed, "batch_size": size, "epoch": self.epoch, "batch": self._batch}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on where another iteration over the same sweeps stood.
-
-        Raises:
-            UsageError: it had another seed or batch size.
-        """
-        seed, size = self.options.seed, self.options.batch_size
-        if (state["seed"], state["batch_size"]) != (seed, size):
-            raise UsageError(
-                f"The saved state has seed {state['seed']} and batch size {state['batch_size']}; here they are {seed} "
-                f"and {size}."
-            )
+        """Go on where another iteration over the same sweeps stood."""
+        assert (state["seed"], state["batch_size"]) == (self.options.seed, self.options.batch_size)
         self.epoch, self._batch = int(state["epoch"]), int(state["batch"])
 
 

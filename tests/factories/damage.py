@@ -8,6 +8,8 @@ import random
 import re
 import shutil
 import zipfile
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,63 +27,36 @@ SPECIAL = 6
 _VALUE = re.compile(rb'"[^"\n]*"|-?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?|true|false|null')
 _NUMBER = re.compile(rb"-?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?")
 _XML = (".xml", ".urdf")
+TEXTS = (".json", ".toml", ".csv", ".txt", ".obj", ".off", ".xml", ".urdf", ".yaml", ".key")
 _NUMBERS = (np.nan, np.inf, -np.inf, -1.0, 1e300, 0.0, 3.5)
 
 
 def damage(path: Path, seed: int) -> str:
     """Damage a file in place and say how; equal seeds do the same."""
     chance = random.Random(seed)
-    special = (_folder, _pipe, _endless, _dangling, _loop, _empty)
     # The first seeds try each thing that is no file once; the others draw.
     if seed < SPECIAL:
-        return special[seed](path)
-    kinds = [_bytes]
-    if path.suffix in (".h5", ".nwb"):
-        kinds += [_hdf5] * 4
-    elif path.suffix == ".safetensors":
-        kinds += [_tensors] * 3
-    elif path.suffix in (".json", ".toml", ".csv", ".txt", ".obj", ".off", ".xml", ".urdf", ".yaml", ".key"):
-        kinds += [_text] * 4
-    elif path.suffix == ".npz":
-        kinds += [_npz] * 4
-    elif path.suffix == ".ckpt":
-        kinds += [_checkpoint] * 4
-    return chance.choice(kinds)(path, chance)
+        return _replace(path, seed)
+    kinds = {".h5": [_hdf5] * 4, ".nwb": [_hdf5] * 4, ".safetensors": [_tensors] * 3, ".npz": [_npz] * 4}
+    kinds |= dict.fromkeys(TEXTS, [_text] * 4) | {".ckpt": [_checkpoint] * 4}
+    return chance.choice([_bytes, *kinds.get(path.suffix, ())])(path, chance)
 
 
-def _folder(path: Path) -> str:
-    path.unlink()
-    path.mkdir()
-    return "a folder"
-
-
-def _pipe(path: Path) -> str:
-    path.unlink()
-    os.mkfifo(path)
-    return "a FIFO"
-
-
-def _endless(path: Path) -> str:
-    path.unlink()
-    path.symlink_to("/dev/zero")
-    return "a device without end"
-
-
-def _dangling(path: Path) -> str:
-    path.unlink()
-    path.symlink_to(path.with_name("gone"))
-    return "a link to nothing"
-
-
-def _loop(path: Path) -> str:
-    path.unlink()
-    path.symlink_to(path)
-    return "a link to itself"
-
-
-def _empty(path: Path) -> str:
-    path.write_bytes(b"")
-    return "empty"
+def _replace(path: Path, seed: int) -> str:
+    """Put what is no file in the place of one, or empty it."""
+    things: dict[str, Callable[[], Any]] = {
+        "a folder": path.mkdir,
+        "a FIFO": partial(os.mkfifo, path),
+        "a device without end": partial(path.symlink_to, "/dev/zero"),
+        "a link to nothing": partial(path.symlink_to, path.with_name("gone")),
+        "a link to itself": partial(path.symlink_to, path),
+        "empty": partial(path.write_bytes, b""),
+    }
+    name, put = list(things.items())[seed]
+    if name != "empty":
+        path.unlink()
+    put()
+    return name
 
 
 def _bytes(path: Path, chance: random.Random) -> str:

@@ -1,10 +1,7 @@
-"""Hands of paper for the control loop, by clocks of their own, and the table of stalls.
+"""Hands of paper for the control loop, by clocks of their own, and sessions in which time is lost.
 
-    python -m tests.factories.paper_hands
-
-Loses time in the policy, in a source of observations, in reading, in the recorder and in garbage collection, at the
-first command and at a later one, by clocks that jitter, and by SIGSTOP; prints for each how many commands were sent
-that came from a report older than the limits allow.
+Time is lost in the policy, in a source of observations, in reading, in the recorder and in garbage collection, at the
+first command and at a later one, by clocks that jitter, and by SIGSTOP.
 """
 
 from __future__ import annotations
@@ -12,8 +9,6 @@ from __future__ import annotations
 import gc
 import itertools
 import json
-import logging
-import os
 import signal
 import subprocess
 import sys
@@ -239,29 +234,3 @@ def suspended(length: float) -> Stall:
     process.send_signal(signal.SIGCONT)
     ages, *rest = json.loads(process.communicate(timeout=60)[0])
     return Stall(length, 0.1 + SIGNAL_DELAY, tuple(ages), *rest)
-
-
-def table() -> Iterator[str]:
-    """Yield the lines of the table of stalls."""
-    rows = {f"{place}, call {call}": stalls(place, call) for place in PLACES for call in (1, 30)}
-    rows["jittering clocks"] = jitter(range(250))
-    if os.name == "posix":
-        rows["SIGSTOP"] = map(suspended, STALLS)
-    yield "| time lost in | cases | longest [s] | commands | sessions stopped | stale commands |"
-    yield "|---|---|---|---|---|---|"
-    total = Counter()
-    for what, sessions in rows.items():
-        cases = list(sessions)
-        longest = max(case.length for case in cases) or STALLS[-1]
-        commands, stale = sum(len(case.ages) for case in cases), sum(case.stale for case in cases)
-        stopped = sum(case.status == "stopped" for case in cases)
-        total.update(cases=len(cases), commands=commands, stale=stale)
-        yield f"| {what} | {len(cases)} | {longest:g} | {commands:,} | {stopped} | {stale} |"
-    yield f"{total['cases']} cases, {total['commands']:,} commands: {total['stale']} stale"
-
-
-if __name__ == "__main__":
-    logging.disable()  # each safe stop is logged
-    for line in table():
-        sys.stdout.write(f"{line}\n")
-        sys.stdout.flush()

@@ -18,13 +18,13 @@ from safetensors.torch import save_file
 from brainbench.cli.options import numbers as option_numbers
 from brainbench.core.contracts import read_match
 from brainbench.core.errors import DataError
-from brainbench.core.files import read_mapping, write_json
+from brainbench.core.files import read_mapping
 from brainbench.core.records import ResultRecord, record_identity
 from brainbench.core.runs.folder import STATE
 from brainbench.datasets import export, open_recordings, write_recordings
 from brainbench.datasets.trials.selection import Selection, Window
 from brainbench.datasets.whisking.dataset import WhiskingDataset
-from brainbench.geometry.mesh import load_mesh, save_mesh
+from brainbench.geometry.mesh import convex_hull, load_mesh, save_mesh
 from brainbench.models.features import read_features, write_features
 from brainbench.models.graph.tnn_import import read_graph
 from brainbench.models.training.batches import Processes
@@ -38,7 +38,6 @@ from brainbench.stimuli import WhiskerArray, load_stimuli
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.motion.recorded import load_initial_angles, load_trajectory
 from brainbench.stimuli.objects.collections import read_categories, read_ids, resolve_objects
-from brainbench.stimuli.objects.solid import sphere
 from brainbench.stimuli.scenes.scene_files import load_scene
 from brainbench.stimuli.stimulus_set import hash_stimulus_set, write_stimulus_set
 from brainbench.stimuli.sweeps.generation import generate
@@ -82,8 +81,6 @@ checkpoint_seconds = 60.0
 optimizer = "sgd"
 augmentation = "none"
 """
-
-
 CLASSES = "name,label\n02691156,plane\n03001627/bb,seat\n"
 
 
@@ -103,10 +100,6 @@ GRAPH = {
 }  # fmt: skip
 
 
-def _nwb(folder: Path) -> Path:
-    return write_nwb(folder / "sub-m1_ses-s1.nwb")
-
-
 def _spikes(folder: Path) -> Path:
     return write_recordings(folder / "spikes.h5", make_simple_session())
 
@@ -115,11 +108,6 @@ def _counts(folder: Path) -> Path:
     return write_recordings(
         folder / "counts.h5", open_recordings(_spikes(folder), conditions="trials:stimulus", bin=0.25)
     )
-
-
-def _copy_recordings(path: Path) -> Path:
-    (written,) = export([path], path.with_name("copy.h5"))
-    return written
 
 
 def _stimulus_set(folder: Path) -> Path:
@@ -139,22 +127,12 @@ def _activations(folder: Path) -> Path:
     return write_features(folder / "features.h5", list("abcd"), layers)
 
 
-def _infinite(layers: Any) -> bool:
-    return any(np.isinf(layer).any() for layer in layers.values())
-
-
 def _mesh(suffix: str) -> Callable[[Path], Path]:
     def make(folder: Path) -> Path:
-        solid = sphere(0.01).surface or _tetrahedron()
-        return save_mesh(folder / f"mesh{suffix}", solid, unit="mm")
+        tetrahedron = convex_hull(np.array([[0.0, 0, 0], [0.01, 0, 0], [0, 0.01, 0], [0, 0, 0.01]]))
+        return save_mesh(folder / f"mesh{suffix}", tetrahedron, unit="mm")
 
     return make
-
-
-def _tetrahedron() -> Any:
-    from brainbench.geometry.mesh import convex_hull
-
-    return convex_hull(np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]) * 0.01)
 
 
 def _run(name: str) -> Callable[[Path], Path]:
@@ -303,42 +281,25 @@ def _bad_batch(jobs: Any) -> bool:
     )
 
 
-def _site(folder: Path) -> Path:
-    return build_leaderboard([make_record()], folder / "site").with_name(MANIFEST)
-
-
-def _commitment(folder: Path) -> Path:
-    return write_json(folder / "held-out.json", Commitment("animals", 3, 8, "9f3c2a7be1d04455", "0f" * 32).plain)
-
-
-def _whiskers(text: str) -> Any:
-    return WhiskerArray.mouse(whiskers=text)
-
-
-def _objects(text: str) -> Any:
-    return resolve_objects([text])
-
-
 SURFACES = (
-    Surface("recordings, NWB", _nwb, lambda path: open_recordings(path, conditions="trials:texture"), bad_counts),
+    Surface(
+        "recordings, NWB", lambda folder: write_nwb(folder / "sub-m1_ses-s1.nwb"),
+        lambda path: open_recordings(path, conditions="trials:texture"), bad_counts,
+    ),
     Surface("recordings, HDF5", _spikes, lambda path: open_recordings(path, conditions="trials:stimulus"), bad_counts),
     Surface("recordings, counts", _counts, open_recordings, bad_counts),
-    Surface("recordings, copied", _spikes, _copy_recordings, lambda written: not written.is_file()),
+    Surface(
+        "recordings, copied", _spikes, lambda path: export([path], path.with_name("copy.h5")),
+        lambda copies: not copies[0].is_file(),
+    ),
     Surface("stimulus set", _stimulus_set, lambda path: load_stimuli(path).input, not_finite),
     Surface("stimulus arrays", _arrays, lambda path: load_stimuli(path).input, not_finite),
     # NaN in activations is a missing value, and the score of such a layer has a status.
     Surface(
-        "activations",
-        _activations,
-        read_features,
-        lambda found: any(np.isinf(x).any() for x in found.activations.values()),
+        "activations", _activations, read_features,
+        lambda features: any(np.isinf(layer).any() for layer in features.activations.values()),
     ),
-    Surface(
-        "scene",
-        written("scene.toml", SCENE),
-        load_scene,
-        _bad_scene,
-    ),
+    Surface("scene", written("scene.toml", SCENE), load_scene, _bad_scene),
     *(
         Surface(f"mesh, {suffix[1:].upper()}", _mesh(suffix), lambda path: load_mesh(path, unit="mm"), not_finite)
         for suffix in (".obj", ".stl", ".ply", ".off", ".glb")
@@ -350,18 +311,11 @@ SURFACES = (
     Surface("network, JSON", written_json("graph.json", GRAPH), read_graph, _bad_graph),
     Surface("weights", _weights, _load, not_finite),
     Surface(
-        "model configuration",
-        written_json(
-            "config.json", {"brainbench_model": 1, "architecture": "zhuang", "options": {"seed": 1}, "version": 1}
-        ),
-        lambda path: read_config(path.parent),
-        not_finite,
+        "model configuration", written_json("config.json", MODEL), lambda path: read_config(path.parent), not_finite
     ),
     Surface(
-        "training options",
-        written("train.toml", CONFIG),
-        lambda path: TrainingConfig.published("zhuang-small", **read_mapping(path)),
-        _bad_config,
+        "training options", written("train.toml", CONFIG),
+        lambda path: TrainingConfig.published("zhuang-small", **read_mapping(path)), _bad_config,
     ),
     Surface("training state", _training, _go_on, _bad_training),
     Surface("batch file", written("batch.toml", BATCH), read_batch, _bad_batch),
@@ -375,36 +329,40 @@ SURFACES = (
     Surface("manifest", _sweeps("manifest.json"), _read_sweeps, not_finite),
     Surface("shard", _sweeps("train-00000.h5"), _read_sweeps, not_finite),
     Surface(
-        "result record",
-        written_json("record.json", json.loads(make_record().to_json())),
-        _read_record,
-        _bad_record,
+        "result record", written_json("record.json", json.loads(make_record().to_json())), _read_record, _bad_record
     ),
-    Surface("site manifest", _site, lambda path: check_site(path.parent), lambda found: not found[1]),
-    Surface("commitment", _commitment, Commitment.read, lambda found: min(found.held, found.public) < 1),
     Surface(
-        "fidelity text",
-        written("fidelity.txt", "fast,links=12,links_per_mm=0.3,time_step=1e-4,solver=quasistatic"),
-        typed(Fidelity.parse),
-        not_finite,
+        "site manifest", lambda folder: build_leaderboard([make_record()], folder / "site").with_name(MANIFEST),
+        lambda path: check_site(path.parent), lambda checked: not checked[1],
+    ),
+    Surface(
+        "commitment", written_json("held-out.json", Commitment("animals", 3, 8, "9f3c2a7be1d04455", "0f" * 32).plain),
+        Commitment.read, lambda stated: min(stated.held, stated.public) < 1,
+    ),
+    Surface(
+        "fidelity text", written("fidelity.txt", "fast,links=12,links_per_mm=0.3,time_step=1e-4,solver=quasistatic"),
+        typed(Fidelity.parse), not_finite,
     ),
     Surface(
         "selection text",
         written("selection.txt", "outcome=correct|error; units.layer=4; depth=1.5..20; min_spikes=50"),
-        typed(Selection.parse),
-        lambda value: value.min_spikes < 0,
+        typed(Selection.parse), lambda selection: selection.min_spikes < 0,
     ),
     Surface("seeds text", written("seeds.txt", "0-4,7,9"), typed(parse_seeds), lambda seeds: min(seeds) < 0),
     Surface("window text", written("window.txt", "first-contact-0.1..choice+0.25"), typed(Window.parse), not_finite),
-    Surface("trials text", written("trials.txt", "16-20"), typed(parse_trials), lambda found: min(numbers(found)) < 1),
-    Surface("whiskers text", written("whiskers.txt", "C1-C3,D*,*2"), typed(_whiskers), lambda array: not len(array)),
-    Surface("objects text", written("objects.txt", "torus:20"), typed(_objects), lambda found: not found),
+    Surface("trials text", written("trials.txt", "16-20"), typed(parse_trials), lambda rows: min(numbers(rows)) < 1),
     Surface(
-        "numbers text",
-        written("numbers.txt", "0.5,1e-3,20"),
-        typed(lambda text: option_numbers(text, "--steps", float)),
-        not_finite,
+        "whiskers text", written("whiskers.txt", "C1-C3,D*,*2"),
+        typed(lambda text: WhiskerArray.mouse(whiskers=text)), lambda array: not len(array),
+    ),
+    Surface(
+        "objects text", written("objects.txt", "torus:20"), typed(lambda text: resolve_objects([text])),
+        lambda objects: not objects,
+    ),
+    Surface(
+        "numbers text", written("numbers.txt", "0.5,1e-3,20"),
+        typed(lambda text: option_numbers(text, "--steps", float)), not_finite,
     ),
     *PUBLISHED,
     *ROBOTS,
-)
+)  # fmt: skip

@@ -19,64 +19,21 @@ from typing import Any
 from tests.factories.damage import SPECIAL, damage
 
 ODD: tuple[Any, ...] = (
-    math.nan,
-    math.inf,
-    -math.inf,
-    1e308,
-    -1e308,
-    1e-320,
-    2**31,
-    -(2**31),
-    2**63,
-    -1,
-    0,
-    0.5,
-    True,
-    None,
-    "",
-    " ",
-    "nan",
-    "x" * 5000,
-    [],
-    {},
-    [[]],
-    {"a": {}},
-    [None],
-    [math.nan] * 3,
-    "../../etc/passwd",
-    "os:system",
-    "\x00",
-    "\u202e",
-    "\ud800",
-    "1",
-    10**400,
-    [[0] * 3] * 1000,
-)
+    math.nan, math.inf, -math.inf, 1e308, -1e308, 1e-320, 2**31, -(2**31), 2**63, -1, 0, 0.5, True, None, "", " ",
+    "nan", "x" * 5000, [], {}, [[]], {"a": {}}, [None], [math.nan] * 3, "../../etc/passwd", "os:system", "\x00",
+    "\u202e", "\ud800", "1", 10**400, [[0] * 3] * 1000,
+)  # fmt: skip
 """What takes the place of a value."""
 CELLS = (
-    "nan",
-    "inf",
-    "-inf",
-    "1e308",
-    "-1",
-    "0",
-    "",
-    "x",
-    "1,5",
-    "1e400",
-    "0x10",
-    "١٢",
-    "9" * 400,
-    "1_000",
-    "\u200b1",
-    "true",
-    "-1e-320",
-    "1e18",
-    "a\x00b",
-    "''",
-    "2147483648.0",
-)
+    "nan", "inf", "-inf", "1e308", "-1", "0", "", "x", "1,5", "1e400", "0x10", "١٢", "9" * 400, "1_000", "\u200b1",
+    "true", "-1e-320", "1e18", "a\x00b", "''", "2147483648.0",
+)  # fmt: skip
 """What takes the place of a cell of a table."""
+TABLE_CHANGES = (
+    *["cell"] * 4, "column", "scale", "drop row", "drop column", "double row", "double column", "name", "twin", "short",
+    "long", "shuffle", "constant", "semicolons", "mark", "empty", "many", "reverse",
+)  # fmt: skip
+"""Kinds of changes to a table; the first is drawn four times as often."""
 TWINS = str.maketrans({"a": "а", "e": "е", "o": "о", "i": "і", "x": "х", "p": "р", "c": "с"})
 """Latin letters and the Cyrillic ones that look like them."""
 STATEMENTS = (
@@ -198,34 +155,7 @@ def _document(path: Path, chance: random.Random) -> str:
 def _table(path: Path, chance: random.Random) -> str:
     rows = list(csv.reader(io.StringIO(path.read_bytes().decode(errors="replace").replace("\0", ""))))
     rows = [row for row in rows if row] or [[""]]
-    place, kind = (
-        chance.randrange(len(rows)),
-        chance.choice(
-            (
-                "cell",
-                "cell",
-                "cell",
-                "cell",
-                "column",
-                "scale",
-                "drop row",
-                "drop column",
-                "double row",
-                "double column",
-                "name",
-                "twin",
-                "short",
-                "long",
-                "shuffle",
-                "constant",
-                "semicolons",
-                "mark",
-                "empty",
-                "many",
-                "reverse",
-            )
-        ),
-    )
+    place, kind = chance.randrange(len(rows)), chance.choice(TABLE_CHANGES)
     row = rows[place]
     column = chance.randrange(len(row))
     everywhere = [other for other in rows[1:] if len(other) > column]
@@ -280,10 +210,8 @@ def _table(path: Path, chance: random.Random) -> str:
 
 def _code(path: Path, chance: random.Random) -> str:
     lines = path.read_text(errors="replace").splitlines() or [""]
-    place, kind = (
-        chance.randrange(len(lines)),
-        chance.choice(("insert", "insert", "replace", "drop", "twin", "name", "bytes")),
-    )
+    place = chance.randrange(len(lines))
+    kind = chance.choice(("insert", "insert", "replace", "drop", "twin", "name", "bytes"))
     statement = chance.choice(STATEMENTS)
     indent = lines[place][: len(lines[place]) - len(lines[place].lstrip())]
     if kind == "insert":
@@ -309,33 +237,9 @@ def _words(path: Path, chance: random.Random) -> str:
     place = chance.randrange(len(text) + 1)
     end = min(len(text), place + chance.randint(0, 8))
     pieces = (
-        "",
-        "/",
-        "//",
-        "..",
-        "../..",
-        "@",
-        ":",
-        "\x00",
-        "\x1b[31m",
-        "\u202e",
-        "%2e%2e",
-        " ",
-        "~",
-        "~nobody/x",
-        "а",
-        "-",
-        "\n",
-        "x" * 5000,
-        "C:\\",
-        "hf-hub:",
-        "local-dir:",
-        "file:///",
-        "https://",
-        "*",
-        "\U0001f600",
-        text,
-    )
+        "", "/", "//", "..", "../..", "@", ":", "\x00", "\x1b[31m", "\u202e", "%2e%2e", " ", "~", "~nobody/x", "а",
+        "-", "\n", "x" * 5000, "C:\\", "hf-hub:", "local-dir:", "file:///", "https://", "*", "\U0001f600", text,
+    )  # fmt: skip
     piece = chance.choice(pieces)
     path.write_text(text[:place] + piece + text[end:], errors="replace")
     return f"{piece[:10]!r} at {place}"
