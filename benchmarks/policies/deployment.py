@@ -31,9 +31,9 @@ from robotics_bridge.deploy.driver import Clock, HandReading, LinkCounters
 from robotics_bridge.deploy.session import REAL_TYPES, DeployedPolicy, PressureCalibration, read_deployed
 from robotics_bridge.envs.env import Env
 from robotics_bridge.envs.step import VELOCITY
+from robotics_bridge.policies.contract import with_contacts_of
 from robotics_bridge.policies.evaluate import Policy, evaluate, mean_of_episodes
 from robotics_bridge.policies.export import export_policy
-from robotics_bridge.policies.fit import with_contacts_of
 from robotics_bridge.policies.training.distill import load_student
 from robotics_bridge.tasks.task import Task
 

@@ -313,11 +313,12 @@ class GraspSampling:
     """Candidates per shape before giving up."""
 
 
+_SEED = 0  # of the candidates
 _VERSION = 1  # raised whenever the same settings would sample other grasps
 SETTINGS = {"xhand1": GraspSampling(), "sharpa": GraspSampling(near=0.01)}  # by hand; others take those of xhand1
 
 
-def grasps_for(task: Task, hand: Hand, model: TaskModel, *, seed: int = 0) -> dict[str, NDArray[np.float64]]:
+def grasps_for(task: Task, hand: Hand, model: TaskModel) -> dict[str, NDArray[np.float64]]:
     """Return grasps for every shape of a task, sampled once and kept in the cache.
 
     Returns:
@@ -330,12 +331,12 @@ def grasps_for(task: Task, hand: Hand, model: TaskModel, *, seed: int = 0) -> di
     # By these a grasp holds too. Usual values are left out, since keys of earlier versions do not have them.
     defaults = ((task.friction, 1.0), (asdict(task.solver), asdict(Solver())), (hand.physics, None))
     numbers += [model.rest.tolist(), *(own for own, other in defaults if own != other)]
-    key = content_hash(_VERSION, asdict(settings), asdict(task.contacts), task.name, seed, *numbers)
+    key = content_hash(_VERSION, asdict(settings), asdict(task.contacts), task.name, _SEED, *numbers)
     path = cache_dir("grasps") / f"{hand.name}-{key}.npz"
     if (cached := read_sealed(path, "grasps")) is not None:
         return cached
     each = max(settings.count // len(model.models), 1)
-    parts = [sample(task, hand, model, index, each, settings, seed) for index in range(len(model.models))]
+    parts = [sample(task, hand, model, index, each, settings) for index in range(len(model.models))]
     grasps = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     grasps["rows"] = np.arange(each * len(parts), dtype=float).reshape(len(parts), each)
     write_sealed(path, "grasps", grasps)
@@ -343,11 +344,11 @@ def grasps_for(task: Task, hand: Hand, model: TaskModel, *, seed: int = 0) -> di
 
 
 def sample(
-    task: Task, hand: Hand, model: TaskModel, shape: int, count: int, settings: GraspSampling, seed: int
+    task: Task, hand: Hand, model: TaskModel, shape: int, count: int, settings: GraspSampling
 ) -> dict[str, NDArray[np.float64]]:
     """Return grasps ``joints``, ``target`` [n, J] and ``object`` [n, 7] of one shape."""
     trial = _Trial(task, model, shape, settings)
-    rng = np.random.default_rng((seed, shape))
+    rng = np.random.default_rng((_SEED, shape))
     grasps: dict[str, list[NDArray[np.float64]]] = {"joints": [], "target": [], "object": []}
     for _ in range(settings.tries):
         if len(grasps["joints"]) == count:

@@ -331,14 +331,11 @@ class Tree:
 
     def _outranks(self, fork: int, body: int, count: dict[int, int]) -> bool:
         """Return whether of two forks, one below the other, the first is the palm."""
-        if body in lineage(self._model, fork)[1:]:
-            return count[fork] >= max(count[body], 3) or self._away(fork, body) > _LONGEST
-        if fork in lineage(self._model, body)[1:]:
-            return not (count[body] >= max(count[fork], 3) or self._away(fork, body) > _LONGEST)
+        way = np.linalg.norm(self._data.xpos[fork] - self._data.xpos[body])
+        for lower, upper in ((fork, body), (body, fork)):
+            if upper in lineage(self._model, lower)[1:]:
+                return (count[lower] >= max(count[upper], 3) or way > _LONGEST) == (lower == fork)
         return False
-
-    def _away(self, first: int, second: int) -> float:
-        return float(np.linalg.norm(self._data.xpos[first] - self._data.xpos[second]))
 
     def _branches(self, body: int) -> list[int]:
         return [child for child in self._children[body] if self._joints[child]]

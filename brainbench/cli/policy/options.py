@@ -57,7 +57,7 @@ class World:
         ``published``, which defines them.
         """
         from robotics_bridge import tasks
-        from robotics_bridge.policies.fit import with_contacts_of
+        from robotics_bridge.policies.contract import with_contacts_of
         from robotics_bridge.tasks.registry import apply_overrides
 
         read_task_file(self.task_file)
@@ -89,7 +89,7 @@ def agent_of(name: str, env: Env, *, seed: int = 0) -> Any:
     if name in evaluate.AGENTS:
         return evaluate.agent(name, env, seed=seed)
     if stored(name).get("brainbench_student"):
-        from robotics_bridge.policies.fit import check_fit
+        from robotics_bridge.policies.contract import check_fit
         from robotics_bridge.policies.training.distill import load_student
 
         student, described = load_student(name, device=str(env.device))

@@ -31,7 +31,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from itertools import pairwise
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 import torch
@@ -427,7 +427,6 @@ class HandCalibration:
 
 
 Time = Literal["native", "resampled"]
-TIMES = ("native", "resampled")
 CONTROL_SUB_STEP = 0.005  # seconds between readings of the tactile sensors (200 Hz physics)
 
 
@@ -475,7 +474,6 @@ class Resampler(nn.Module):
 
 
 Learning = Literal["frozen", "finetuned"]
-LEARNING = ("frozen", "finetuned")
 
 
 class FrontEnd(nn.Module):
@@ -505,8 +503,8 @@ class FrontEnd(nn.Module):
         options: Mapping[str, Any] | None = None,
     ) -> None:
         super().__init__()
-        check_name("time of an encoder", time, TIMES)
-        check_name("way of learning of an encoder", learning, LEARNING)
+        check_name("time of an encoder", time, get_args(Time))
+        check_name("way of learning of an encoder", learning, get_args(Learning))
         network, name = model, type(model).__name__
         if isinstance(model, str):
             network, name = load_model(model, seed=seed, pretrained=pretrained, **(options or {})), model

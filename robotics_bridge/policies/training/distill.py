@@ -48,10 +48,9 @@ from brainbench.core.runs.folder import (
 )
 from brainbench.core.runs.log import RunLog
 from robotics_bridge.hands.layouts import check_probes, is_probe_file
-from robotics_bridge.policies.contract import JOINTS, Groups, from_json, shapes_of
+from robotics_bridge.policies.contract import JOINTS, Groups, check_hand, check_version, from_json, shapes_of
 from robotics_bridge.policies.encoders.arms import EncoderConfig, elu_perceptron
 from robotics_bridge.policies.evaluate import Policy
-from robotics_bridge.policies.fit import check_hand, check_version
 from robotics_bridge.policies.shipped import policy_path, student_folder
 from robotics_bridge.policies.student import TACTILE, TactilePolicy
 from robotics_bridge.policies.training.distill_config import DistillConfig

@@ -14,10 +14,10 @@ from brainbench.core.errors import DataError, UsageError
 from brainbench.core.files import read_json, read_mapping, write_json
 from brainbench.core.progress import Progress, track
 from robotics_bridge import tasks
+from robotics_bridge.policies.contract import check_version, with_contacts_of
 from robotics_bridge.policies.encoders.arms import ARMS, EncoderConfig
 from robotics_bridge.policies.encoders.taxel_grid import CONTROL_SUB_STEP, HandCalibration
 from robotics_bridge.policies.evaluate import Policy, evaluate
-from robotics_bridge.policies.fit import check_version, with_contacts_of
 from robotics_bridge.policies.shipped import list_policies
 from robotics_bridge.policies.training.distill import CONFIG, DistillResult, distill, load_student
 from robotics_bridge.policies.training.distill_config import DistillConfig

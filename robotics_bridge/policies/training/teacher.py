@@ -40,9 +40,8 @@ from brainbench.core.runs.folder import (
 )
 from brainbench.core.runs.log import RunLog, check_sinks
 from robotics_bridge.envs.env import Env, RslRlEnv
-from robotics_bridge.policies.contract import from_json
+from robotics_bridge.policies.contract import check_fit, check_version, from_json
 from robotics_bridge.policies.evaluate import Policy
-from robotics_bridge.policies.fit import check_fit, check_version
 from robotics_bridge.policies.shipped import SENSING, policy_path
 from robotics_bridge.policies.student import TACTILE, ActingModel
 from robotics_bridge.policies.training.distill import CONFIG, MODEL, describe_run

@@ -11,9 +11,9 @@ from brainbench.cli.policy.options import agent_of, touch_of
 from brainbench.core.errors import UsageError
 from brainbench.core.files import read_json
 from robotics_bridge import tasks
+from robotics_bridge.policies.contract import with_contacts_of
 from robotics_bridge.policies.evaluate import Policy, evaluate
 from robotics_bridge.policies.export import export_policy
-from robotics_bridge.policies.fit import with_contacts_of
 from robotics_bridge.policies.shipped import FOLDER, list_policies, policy_path
 from robotics_bridge.policies.training.distill import load_student
 from robotics_bridge.policies.training.teacher import Trainer, load_teacher
