@@ -9,6 +9,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from robotics_bridge.physics import Geometry, HandState, TouchScene
+from robotics_bridge.sensors import Probes, SensorSuite, TemperatureGrid
+from robotics_bridge.sensors.temperature.materials import ThermalMaterial
 
 PYRAMID = """<mujoco><option timestep="0.01" tolerance="1e-5"/><worldbody><geom name="floor" type="plane" size="0 0 1"/>
 {boxes}</worldbody></mujoco>"""
@@ -83,3 +85,50 @@ def move_all(poses: np.ndarray, velocities: np.ndarray, motion: np.ndarray) -> t
     v = velocities.reshape(-1, 6)
     spun = np.concatenate([turn.apply(v[:, :3]), turn.apply(v[:, 3:])], 1)
     return moved.reshape(*shape, 7), spun.reshape(*shape, 6)
+
+
+BALL = Geometry(name="ball", link="object", kind="sphere", size=(0.01,))
+GRID = Probes.grid(4, 5, size=(0.02, 0.03), center=(0, 0, 0.005), radius=0.003)
+
+
+def suite_of(sensors: dict, envs: int = 1, scene: TouchScene | None = None, **options: object) -> SensorSuite:
+    """Return a suite of sensors, by default on a pad beside a ball."""
+    return SensorSuite(scene or pad_scene(BALL), sensors, num_envs=envs, **options)  # type: ignore[arg-type]
+
+
+def touching(envs: int = 1, height: float = 0.0145) -> np.ndarray:
+    """Return poses in which the ball lies on the pad."""
+    return poses_at(3, {2: (0.001, -0.002, height)}, envs)
+
+
+FREE_BALL = Geometry(name="ball", link="ball", kind="sphere", size=(0.01,))
+
+
+def free_suite(*, num_envs: int = 1, **sensors) -> SensorSuite:
+    """Return a suite of sensors on a pad beside a ball that is its own link."""
+    return SensorSuite(pad_scene(FREE_BALL), sensors, num_envs=num_envs)
+
+
+def ball_state(*heights: float) -> HandState:
+    """Return a state in which that ball touches the pad, at a height in each environment (m)."""
+    poses = np.stack([poses_at(3, {2: (0, 0, height)}).reshape(3, 7) for height in heights])
+    scene = pad_scene(FREE_BALL)
+    state = state_of(scene, poses)
+    pair = [scene.geometries_of("hand")[0], scene.geometries_of("ball")[0]]
+    state.set_contacts(range(len(heights)), [pair] * len(heights))
+    return state
+
+
+PLAIN = ThermalMaterial(2.0, 1000.0, 1000.0, 0.8)
+
+
+def make_grid(envs: int = 1, half: tuple[float, float, float] = (0.01, 0.02, 0.03), contacts: int = 0, **knobs):
+    """Return a suite with one grid on a box, and a state; links are world, pad and object."""
+    geometries = (
+        Geometry(name="pad", link="pad", kind="box", size=half),
+        Geometry(name="object", link="object", kind="sphere", size=(0.04,)),
+    )
+    scene = TouchScene(("world", "pad", "object"), geometries)
+    defaults = {"convection": 0.0, "radiates": False, "material": PLAIN}
+    suite = SensorSuite(scene, {"grid": TemperatureGrid(link="pad", **{**defaults, **knobs})}, num_envs=envs)
+    return suite, HandState.empty(envs, 3, contacts)

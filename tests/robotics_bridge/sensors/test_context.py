@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from brainbench.geometry import Mesh
-from robotics_bridge.physics import Geometry, TouchScene
+from robotics_bridge.physics import Geometry
 from robotics_bridge.sensors import (
     ContactDepthProbe,
     ContactProbe,
@@ -21,16 +21,7 @@ from robotics_bridge.sensors import (
 )
 from robotics_bridge.sensors.kernels import dilation, kinematic, proximity
 from robotics_bridge.sensors.kernels import probe as _probe_kernels
-from tests.factories.touch_scenes import pad_scene, poses_at, state_of
-
-BALL = Geometry(name="ball", link="object", kind="sphere", size=(0.01,))
-
-
-GRID = Probes.grid(4, 5, size=(0.02, 0.03), center=(0, 0, 0.005), radius=0.003)
-
-
-def _suite(sensors: dict, envs: int = 1, scene: TouchScene | None = None, **options: object) -> SensorSuite:
-    return SensorSuite(scene or pad_scene(BALL), sensors, num_envs=envs, **options)  # type: ignore[arg-type]
+from tests.factories.touch_scenes import BALL, GRID, pad_scene, poses_at, state_of, suite_of
 
 
 def test_sensors_of_one_class_share_a_launch_and_nothing_else_is_compiled() -> None:
@@ -41,7 +32,7 @@ def test_sensors_of_one_class_share_a_launch_and_nothing_else_is_compiled() -> N
     aside = Geometry(name="aside", link="aside", kind="mesh", mesh=mesh)
     scene = pad_scene(BALL, aside)
     sensors = {f"tip{i}": ContactProbe(link="hand", probes=GRID, track=("object",)) for i in range(5)}
-    suite = _suite(sensors, scene=scene)
+    suite = suite_of(sensors, scene=scene)
     suite.update(state_of(scene, poses_at(4, {2: (0, 0, 0.0145), 3: (1, 0, 0)})))
     assert len(suite.runtimes) == 1
     assert _fields_and_trees(suite) == (0, 0)
@@ -78,6 +69,6 @@ def test_a_noisy_taxel_keeps_at_most_130_bytes(name: str) -> None:
         noise=noise,
         **options,
     )
-    held = _suite({"taxel": sensor}).state_bytes
+    held = suite_of({"taxel": sensor}).state_bytes
     assert (held["sensors"] + held["shared"]) / 100 <= 130
     assert held["rings"] == 0

@@ -10,7 +10,7 @@ import torch
 
 from brainbench.core.errors import UsageError
 from brainbench.geometry import Mesh
-from robotics_bridge.physics import Geometry, HandState, TouchScene
+from robotics_bridge.physics import Geometry, HandState
 from robotics_bridge.sensors import (
     ContactAudio,
     ContactDepthProbe,
@@ -23,18 +23,17 @@ from robotics_bridge.sensors import (
     TemperatureGrid,
 )
 from robotics_bridge.sensors.audio.sensors import Modes
-from tests.factories.touch_scenes import move_all, pad_scene, poses_at, random_pose, state_of
-
-BALL = Geometry(name="ball", link="object", kind="sphere", size=(0.01,))
-GRID = Probes.grid(4, 5, size=(0.02, 0.03), center=(0, 0, 0.005), radius=0.003)
-
-
-def _suite(sensors: dict, envs: int = 1, scene: TouchScene | None = None, **options: object) -> SensorSuite:
-    return SensorSuite(scene or pad_scene(BALL), sensors, num_envs=envs, **options)  # type: ignore[arg-type]
-
-
-def _touching(envs: int = 1, height: float = 0.0145) -> np.ndarray:
-    return poses_at(3, {2: (0.001, -0.002, height)}, envs)
+from tests.factories.touch_scenes import (
+    BALL,
+    GRID,
+    move_all,
+    pad_scene,
+    poses_at,
+    random_pose,
+    state_of,
+    suite_of,
+    touching,
+)
 
 
 def _press(state: HandState, envs: int = 1) -> None:
@@ -45,7 +44,7 @@ def _press(state: HandState, envs: int = 1) -> None:
 
 def test_readings_have_the_shapes_of_their_layouts_and_share_memory() -> None:
     line = Probes([[0, 0, 0.005]] * 7, [[0, 0, 1.0]] * 7, 0.003)
-    suite = _suite(
+    suite = suite_of(
         {
             "grid": ContactDepthProbe(link="hand", probes=GRID),
             "line": ContactDepthProbe(link="hand", probes=line),
@@ -53,14 +52,14 @@ def test_readings_have_the_shapes_of_their_layouts_and_share_memory() -> None:
         },
         envs=3,
     )
-    suite.update(state_of(suite.scene, _touching(3)))
+    suite.update(state_of(suite.scene, touching(3)))
     assert suite.read("grid").shape == (3, 4, 5)
     assert suite.read("line").shape == (3, 7)
     assert suite.read("taxel").shape == (3, 4, 5, 6)
     assert suite.read("grid").data_ptr() == suite.read("grid").data_ptr()
     view = suite.read("grid")
     before = view.clone()
-    suite.update(state_of(suite.scene, _touching(3, height=0.014)))
+    suite.update(state_of(suite.scene, touching(3, height=0.014)))
     assert not torch.equal(view, before)
 
 
@@ -87,8 +86,8 @@ def test_fillers_read_zero_whatever_the_noise() -> None:
     radius[[3, 7]] = 0
     probes = Probes(GRID.position, GRID.normal, radius, (4, 5))
     noise = Noise(white=1e-3, bias=0.1, dead_probability=0.5, dead_range=(1.0, 2.0))
-    suite = _suite({"depth": ContactDepthProbe(link="hand", probes=probes, noise=noise)})
-    suite.update(state_of(suite.scene, _touching()))
+    suite = suite_of({"depth": ContactDepthProbe(link="hand", probes=probes, noise=noise)})
+    suite.update(state_of(suite.scene, touching()))
     read = suite.read("depth").flatten()
     assert (read[[3, 7]] == 0).all()
     assert (np.delete(read.numpy(), [3, 7]) != 0).all()
@@ -96,7 +95,7 @@ def test_fillers_read_zero_whatever_the_noise() -> None:
 
 def test_reset_starts_single_environments_anew() -> None:
     sensor = ContactProbe(link="hand", probes=Probes([[0, 0, 0.005]], [[0, 0, 1.0]], 1e-6), release=1e-4)
-    suite = _suite({"bit": sensor}, envs=2)
+    suite = suite_of({"bit": sensor}, envs=2)
     for depth in (6e-4, 3e-4):
         suite.update(state_of(suite.scene, poses_at(3, {2: (0, 0, 0.015 + 1e-6 - depth)}, 2)))
     assert suite.read("bit").flatten().tolist() == [1, 1]
@@ -107,25 +106,25 @@ def test_reset_starts_single_environments_anew() -> None:
 
 def test_a_diverged_environment_reads_nan_and_harms_no_other() -> None:
     sensors = {"depth": ContactDepthProbe(link="hand", probes=GRID), "taxel": KinematicTaxel(link="hand", probes=GRID)}
-    suite, alone = _suite(sensors, envs=3), _suite(sensors)
-    poses = _touching(3)
+    suite, alone = suite_of(sensors, envs=3), suite_of(sensors)
+    poses = touching(3)
     poses[1, 2, 0] = np.nan
     suite.update(state_of(suite.scene, poses))
-    alone.update(state_of(alone.scene, _touching()))
+    alone.update(state_of(alone.scene, touching()))
     assert suite.diverged.tolist() == [False, True, False]
     for name in sensors:
         assert suite.read(name)[1].isnan().all()
         assert torch.equal(suite.read(name)[2], alone.read(name)[0])
     suite.reset([1])
-    suite.update(state_of(suite.scene, _touching(3)))
+    suite.update(state_of(suite.scene, touching(3)))
     assert torch.equal(suite.read("depth")[1], alone.read("depth")[0])
 
 
 def test_flags_belong_to_the_suite_that_raised_them() -> None:
     scene, far = pad_scene(BALL), replace(GRID, position=np.add(GRID.position, (0.1, 0, 0)))
-    lost = _suite({"f": KinematicTaxel(link="hand", probes=far, total="engine")}, scene=scene)
-    other = _suite({"c": ContactProbe(link="hand", probes=GRID)}, scene=scene)
-    state = state_of(scene, _touching())
+    lost = suite_of({"f": KinematicTaxel(link="hand", probes=far, total="engine")}, scene=scene)
+    other = suite_of({"c": ContactProbe(link="hand", probes=GRID)}, scene=scene)
+    state = state_of(scene, touching())
     _press(state)
     lost.update(state)
     other.update(state)
@@ -148,8 +147,8 @@ def test_after_a_reset_nothing_of_the_old_episode_can_be_read(delay: float) -> N
         "load": KinematicTaxel(link="hand", probes=GRID, total="engine"),
         "warm": TemperatureGrid(link="hand", tau=0.1),
     }
-    suite = _suite(sensors, envs=3)
-    state = state_of(suite.scene, _touching(3))
+    suite = suite_of(sensors, envs=3)
+    state = state_of(suite.scene, touching(3))
     _press(state, 3)
     for _ in range(5):
         suite.update(state)
@@ -173,7 +172,7 @@ def test_after_a_reset_nothing_of_the_old_episode_can_be_read(delay: float) -> N
     ("settings", "advised"), [({}, True), ({"total": "engine"}, False), ({"convention": "thesis"}, False)]
 )
 def test_a_law_of_depths_says_once_that_it_does_not_follow_the_load(settings, advised, caplog) -> None:
-    suite = _suite({"f": KinematicTaxel(link="hand", probes=GRID, **settings)})
+    suite = suite_of({"f": KinematicTaxel(link="hand", probes=GRID, **settings)})
     state = state_of(suite.scene, poses_at(3, {2: (0.001, -0.002, 0.1)}))
     state.contact_count.zero_()
     suite.update(state)
@@ -187,14 +186,14 @@ def test_a_law_of_depths_says_once_that_it_does_not_follow_the_load(settings, ad
 
 
 def test_history_holds_the_last_readings_oldest_first_and_is_cleared_by_reset() -> None:
-    suite = _suite({"depth": ContactDepthProbe(link="hand", probes=GRID, history=3)}, envs=2)
+    suite = suite_of({"depth": ContactDepthProbe(link="hand", probes=GRID, history=3)}, envs=2)
     read = []
     for height in (0.0145, 0.0143, 0.0141, 0.0139):
-        suite.update(state_of(suite.scene, _touching(2, height)))
+        suite.update(state_of(suite.scene, touching(2, height)))
         read.append(suite.read("depth").clone())
     assert torch.equal(suite.read_history("depth"), torch.stack(read[1:], dim=1))
     suite.reset([0])
-    suite.update(state_of(suite.scene, _touching(2)))
+    suite.update(state_of(suite.scene, touching(2)))
     kept = suite.read_history("depth")
     assert (kept[0, :2] == 0).all()
     assert torch.equal(kept[1, 1], read[3][1])
@@ -203,7 +202,7 @@ def test_history_holds_the_last_readings_oldest_first_and_is_cleared_by_reset() 
 def test_readings_do_not_depend_on_batch_pose_or_order_of_probes() -> None:
     rng = np.random.default_rng(3)
     scene = pad_scene(BALL)
-    poses = np.concatenate([_touching(), _touching(1, 0.0142), _touching(1, 0.0148)])
+    poses = np.concatenate([touching(), touching(1, 0.0142), touching(1, 0.0148)])
     velocities = rng.normal(0, 0.1, (3, 3, 6))
     order = rng.permutation(20)
     shuffled = Probes(GRID.position[order], GRID.normal[order], GRID.radius[order])
@@ -229,10 +228,10 @@ def test_readings_do_not_depend_on_batch_pose_or_order_of_probes() -> None:
 def test_seeds_and_offsets_decide_the_noise_and_nothing_else() -> None:
     noise = Noise(white=1e-3)
     sensors = {"a": ContactDepthProbe(link="hand", probes=GRID, noise=noise)}
-    whole, shard = _suite(sensors, envs=4, seed=5), _suite(sensors, envs=2, seed=5, env_offset=2)
-    other = _suite(sensors, envs=4, seed=6)
+    whole, shard = suite_of(sensors, envs=4, seed=5), suite_of(sensors, envs=2, seed=5, env_offset=2)
+    other = suite_of(sensors, envs=4, seed=6)
     for suite in (whole, shard, other):
-        suite.update(state_of(suite.scene, _touching(suite.num_envs)))
+        suite.update(state_of(suite.scene, touching(suite.num_envs)))
     assert torch.equal(whole.read("a")[2:], shard.read("a"))
     assert not torch.equal(whole.read("a"), other.read("a"))
     assert torch.equal(whole.read_ground_truth("a"), other.read_ground_truth("a"))
@@ -241,9 +240,9 @@ def test_seeds_and_offsets_decide_the_noise_and_nothing_else() -> None:
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: _suite({"a": ContactProbe(link="hnad", probes=GRID)}), "did you mean 'hand'"),
-        (lambda: _suite({"a": GRID}), "must be a sensor"),
-        (lambda: _suite({}, envs=0), "at most 1,000,000; received"),
+        (lambda: suite_of({"a": ContactProbe(link="hnad", probes=GRID)}), "did you mean 'hand'"),
+        (lambda: suite_of({"a": GRID}), "must be a sensor"),
+        (lambda: suite_of({}, envs=0), "at most 1,000,000; received"),
         (
             lambda: ContactProbe(link="hand", probes=GRID, threshold=1e-4, release=2e-4),
             "release .*most 0.0001",
@@ -259,11 +258,11 @@ def test_mistakes_are_named(make: object, message: str) -> None:
 
 
 def test_states_and_names_that_do_not_fit_are_refused() -> None:
-    suite = _suite({"depth": ContactDepthProbe(link="hand", probes=GRID)}, envs=2)
+    suite = suite_of({"depth": ContactDepthProbe(link="hand", probes=GRID)}, envs=2)
     with pytest.raises(UsageError, match=r"2 environments .* has 1"):
-        suite.update(state_of(suite.scene, _touching(1)))
+        suite.update(state_of(suite.scene, touching(1)))
     with pytest.raises(UsageError, match=r"dt .*received 0"):
-        suite.update(state_of(suite.scene, _touching(2)), dt=0.0)
+        suite.update(state_of(suite.scene, touching(2)), dt=0.0)
     with pytest.raises(UsageError, match="did you mean 'depth'"):
         suite.read("dept")
     with pytest.raises(UsageError, match=r"'depth' .*history="):

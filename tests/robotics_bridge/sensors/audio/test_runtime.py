@@ -8,73 +8,33 @@ import numpy as np
 import pytest
 
 from brainbench.core.errors import UsageError
-from robotics_bridge.physics.scene import Geometry, TouchScene
 from robotics_bridge.physics.state import HandState
 from robotics_bridge.sensors.audio.runtime import Microphone, joint_drive
 from robotics_bridge.sensors.audio.sensors import ActuationAudio, ContactAudio, Modes
 from robotics_bridge.sensors.noise.model import Noise
 from robotics_bridge.sensors.suite import SensorSuite
-from tests.factories.touch_scenes import pad_scene, poses_at, state_of
-
-MODES = Modes((500.0, 1730.0, 4100.0), (8.0, 15.0, 40.0), (1.0, -0.7, 0.4))
-
-
-DT, K = 0.005, 160
-
-
-RATE = K / DT
-
-
-def _scene() -> TouchScene:
-    shapes = (
-        Geometry(name="box", link="box", kind="box", size=(0.1, 0.1, 0.01)),
-        Geometry(name="ball", link="ball", kind="sphere", size=(0.02,)),
-    )
-    return TouchScene(("world", "box", "ball"), shapes)
-
-
-def _make(envs: int = 1, **knobs):
-    sensor = ContactAudio(link="box", modes=MODES, samples=K, **knobs)
-    return SensorSuite(_scene(), {"sound": sensor}, num_envs=envs), HandState.empty(envs, 3, 4 * envs)
-
-
-def _touch(state: HandState, force, envs=(0,)) -> None:
-    count = len(envs)
-    state.set_contacts(
-        list(envs), np.tile([[0, 1]], (count, 1)), force=np.full(count, force),
-        position=np.zeros((count, 3)), normal=np.tile([0.0, 0, 1], (count, 1)),
-    )  # fmt: skip
-
-
-def _strike(suite: SensorSuite, state: HandState, blocks: int, force: float = 10.0, name: str = "sound") -> np.ndarray:
-    suite.update(state, DT)
-    _touch(state, force)
-    heard = []
-    for _ in range(blocks):
-        suite.update(state, DT)
-        heard.append(suite.read_ground_truth(name)[0, 0].numpy().copy())
-        state.contact_count.fill_(0)
-    return np.concatenate(heard)
+from tests.factories.struck_box import DT, MODES, RATE, K, box_scene, make_box, strike, touch_box
+from tests.factories.touch_scenes import ball_state, free_suite
 
 
 def test_what_is_held_at_a_reset_makes_no_sound_and_what_strikes_afterwards_does():
-    suite, state = _make()
-    _touch(state, 30.0)
+    suite, state = make_box()
+    touch_box(state, 30.0)
     for _ in range(2):
         suite.reset()
         for _ in range(3):
             suite.update(state, DT)
             assert np.all(suite.read("sound").numpy() == 0)
-    _touch(state, 40.0)
+    touch_box(state, 40.0)
     suite.update(state, DT)
     assert suite.read("sound").abs().max() > 0
 
 
 def test_environments_ring_reset_and_break_alone_and_alike_in_any_batch():
-    alone = _strike(*_make(), 3)
-    suite, state = _make(envs=3)
+    alone = strike(*make_box(), 3)
+    suite, state = make_box(envs=3)
     suite.update(state, DT)
-    _touch(state, 10.0, envs=(0, 2))
+    touch_box(state, 10.0, envs=(0, 2))
     suite.update(state, DT)
     read = suite.read("sound").numpy()
     assert np.array_equal(read[0, 0], alone[:K])
@@ -92,7 +52,7 @@ def test_environments_ring_reset_and_break_alone_and_alike_in_any_batch():
 
 def test_drives_whine_at_their_speed_and_grow_louder_with_load():
     sensor = ActuationAudio(link="box", joints=2, samples=K, friction=0.0, pitch=80.0, hum=0.0)
-    suite, state = SensorSuite(_scene(), {"drives": sensor}, num_envs=1), HandState.empty(1, 3)
+    suite, state = SensorSuite(box_scene(), {"drives": sensor}, num_envs=1), HandState.empty(1, 3)
     effort, speed = joint_drive(suite, "drives")
     effort[0] = effort.new_tensor([1.0, 3.0])
     speed[0] = speed.new_tensor([10.0, -5.0])
@@ -112,7 +72,7 @@ def test_drives_whine_at_their_speed_and_grow_louder_with_load():
 
 def test_idle_drives_hum_and_moving_ones_rasp():
     sensor = ActuationAudio(link="box", joints=1, samples=K, hum=0.01, hum_frequency=120.0, friction=1e-2)
-    suite, state = SensorSuite(_scene(), {"drives": sensor}, num_envs=1), HandState.empty(1, 3)
+    suite, state = SensorSuite(box_scene(), {"drives": sensor}, num_envs=1), HandState.empty(1, 3)
     suite.update(state, DT)
     t = np.arange(1, K + 1) / RATE
     assert suite.read("drives")[0, 0].numpy() == pytest.approx(0.01 * np.sin(2 * np.pi * 120 * t), abs=1e-5)
@@ -128,7 +88,7 @@ def test_idle_drives_hum_and_moving_ones_rasp():
 def test_samples_of_a_block_of_any_length_have_noise_of_their_own(samples):
     noisy = Noise(white=1.0)
     sensor = ContactAudio(link="box", modes=MODES, samples=samples, noise=noisy)
-    suite, state, heard = SensorSuite(_scene(), {"sound": sensor}, num_envs=1), HandState.empty(1, 3), []
+    suite, state, heard = SensorSuite(box_scene(), {"sound": sensor}, num_envs=1), HandState.empty(1, 3), []
     for _ in range(3):
         suite.reset()
         suite.update(state, DT)
@@ -138,11 +98,11 @@ def test_samples_of_a_block_of_any_length_have_noise_of_their_own(samples):
 
 @pytest.mark.parametrize("distance", [0.343, 1.0, 2.5])
 def test_a_microphone_hears_late_by_r_over_c_and_weaker_by_one_over_r(distance):
-    suite, state = _make()
+    suite, state = make_box()
     listener = Microphone(position=(distance, 0.0, 0.0)).build(suite)
     suite.update(state, DT)
     listener.update(state, DT)
-    _touch(state, 10.0)
+    touch_box(state, 10.0)
     source, heard = [], []
     for _ in range(6):
         suite.update(state, DT)
@@ -160,7 +120,7 @@ def test_a_microphone_hears_late_by_r_over_c_and_weaker_by_one_over_r(distance):
 
 def test_a_microphone_set_up_during_an_episode_is_no_louder_at_first():
     sensor = ActuationAudio(link="box", joints=1, samples=K, hum=1.0, hum_frequency=400.0)
-    suite, state = SensorSuite(_scene(), {"drives": sensor}, num_envs=1), HandState.empty(1, 3)
+    suite, state = SensorSuite(box_scene(), {"drives": sensor}, num_envs=1), HandState.empty(1, 3)
     pose = np.tile([1.0, 0, 0, 1, 0, 0, 0], (3, 1))
     pose[0, 0] = 0.0
     state.set_pose(pose)
@@ -175,7 +135,7 @@ def test_a_microphone_set_up_during_an_episode_is_no_louder_at_first():
 
 def test_sources_add_up_and_the_power_of_distance_is_chosen():
     sensors = {name: ContactAudio(link=name, modes=MODES, samples=K) for name in ("box", "ball")}
-    suite, state = SensorSuite(_scene(), sensors, num_envs=1), HandState.empty(1, 3, 4)
+    suite, state = SensorSuite(box_scene(), sensors, num_envs=1), HandState.empty(1, 3, 4)
     pose = np.zeros((3, 7))
     pose[:, 3] = 1
     pose[1, 0], pose[2, 0] = 1.0, -1.0
@@ -184,7 +144,7 @@ def test_sources_add_up_and_the_power_of_distance_is_chosen():
     one = Microphone(power=2.0, sources=("box",)).build(suite)
     for block in range(3):
         if block == 1:
-            _touch(state, 10.0)
+            touch_box(state, 10.0)
         suite.update(state, DT)
         both.update(state, DT)
         one.update(state, DT)
@@ -196,7 +156,7 @@ def test_sources_add_up_and_the_power_of_distance_is_chosen():
 
 def test_a_microphone_without_sources_and_wrong_settings_are_explained():
     with pytest.raises(UsageError, match="no source of sound"):
-        Microphone().build(SensorSuite(_scene(), {}, num_envs=1))
+        Microphone().build(SensorSuite(box_scene(), {}, num_envs=1))
     with pytest.raises(UsageError, match=r"samples .*received 0"):
         ContactAudio(link="box", modes=MODES, samples=0)
     with pytest.raises(UsageError, match=r"threshold .*received -1"):
@@ -220,7 +180,7 @@ def test_a_microphone_stands_somewhere(place, value):
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 def test_sound_that_is_not_finite_is_heard_as_nan_until_the_reset_and_not_as_silence(value):
-    suite = SensorSuite(_scene(), {"drive": ActuationAudio(link="box", joints=2, samples=K, hum=1.0)}, num_envs=2)
+    suite = SensorSuite(box_scene(), {"drive": ActuationAudio(link="box", joints=2, samples=K, hum=1.0)}, num_envs=2)
     state = HandState.empty(2, 3, 4)
     listener = Microphone(position=(1.0, 0.0, 0.0)).build(suite)
     torque, _speed = joint_drive(suite, "drive")
@@ -247,7 +207,7 @@ def test_sound_that_is_not_finite_is_heard_as_nan_until_the_reset_and_not_as_sil
 
 
 def test_a_state_that_diverged_is_heard_as_nan():
-    suite, state = _make(2)
+    suite, state = make_box(2)
     listener = Microphone(position=(1.0, 0.0, 0.0)).build(suite)
     state.pose_torch[1, 1, 0] = np.nan
     suite.update(state, DT)
@@ -256,27 +216,11 @@ def test_a_state_that_diverged_is_heard_as_nan():
     assert listener.read().isnan().all(dim=1).tolist() == [False, True]
 
 
-BALL = Geometry(name="ball", link="ball", kind="sphere", size=(0.01,))
-
-
-def _suite(*, num_envs: int = 1, **sensors) -> SensorSuite:
-    return SensorSuite(pad_scene(BALL), sensors, num_envs=num_envs)
-
-
-def _state(*heights: float):
-    poses = np.stack([poses_at(3, {2: (0, 0, height)}).reshape(3, 7) for height in heights])
-    scene = pad_scene(BALL)
-    state = state_of(scene, poses)
-    pair = [scene.geometries_of("hand")[0], scene.geometries_of("ball")[0]]
-    state.set_contacts(range(len(heights)), [pair] * len(heights))
-    return state
-
-
 @pytest.mark.parametrize("dt", [0, -0.01, np.nan, np.inf])
 def test_a_microphone_hears_blocks_of_some_length(dt) -> None:
-    suite = _suite(a=ContactAudio(link="hand", modes=Modes((500.0,), (0.0,), (1.0,))))
-    suite.update(_state(0.014))
+    suite = free_suite(a=ContactAudio(link="hand", modes=Modes((500.0,), (0.0,), (1.0,))))
+    suite.update(ball_state(0.014))
     with pytest.raises(UsageError, match="dt"):
-        Microphone().build(suite).update(_state(0.014), dt)
+        Microphone().build(suite).update(ball_state(0.014), dt)
     with pytest.raises(UsageError, match="sources"):
         Microphone(sources="a")

@@ -8,54 +8,18 @@ import pytest
 
 from brainbench.core.errors import UsageError
 from robotics_bridge.physics.engines import MujocoEngine
-from robotics_bridge.physics.scene import Geometry, TouchScene
 from robotics_bridge.physics.state import HandState
 from robotics_bridge.sensors.audio.modes import find_modes
 from robotics_bridge.sensors.audio.runtime import Microphone, joint_drive
 from robotics_bridge.sensors.audio.sensors import ActuationAudio, ContactAudio, Modes
 from robotics_bridge.sensors.suite import SensorSuite
 from tests.factories.sensor_episode import require_processor
-
-MODES = Modes((500.0, 1730.0, 4100.0), (8.0, 15.0, 40.0), (1.0, -0.7, 0.4))
-DT, K = 0.005, 160
-RATE = K / DT
-
-
-def _scene() -> TouchScene:
-    shapes = (
-        Geometry(name="box", link="box", kind="box", size=(0.1, 0.1, 0.01)),
-        Geometry(name="ball", link="ball", kind="sphere", size=(0.02,)),
-    )
-    return TouchScene(("world", "box", "ball"), shapes)
-
-
-def _make(envs: int = 1, **knobs):
-    sensor = ContactAudio(link="box", modes=MODES, samples=K, **knobs)
-    return SensorSuite(_scene(), {"sound": sensor}, num_envs=envs), HandState.empty(envs, 3, 4 * envs)
-
-
-def _touch(state: HandState, force, envs=(0,)) -> None:
-    count = len(envs)
-    state.set_contacts(
-        list(envs), np.tile([[0, 1]], (count, 1)), force=np.full(count, force),
-        position=np.zeros((count, 3)), normal=np.tile([0.0, 0, 1], (count, 1)),
-    )  # fmt: skip
-
-
-def _strike(suite: SensorSuite, state: HandState, blocks: int, force: float = 10.0, name: str = "sound") -> np.ndarray:
-    suite.update(state, DT)
-    _touch(state, force)
-    heard = []
-    for _ in range(blocks):
-        suite.update(state, DT)
-        heard.append(suite.read_ground_truth(name)[0, 0].numpy().copy())
-        state.contact_count.fill_(0)
-    return np.concatenate(heard)
+from tests.factories.struck_box import DT, MODES, RATE, K, box_scene, make_box, strike, touch_box
 
 
 def test_an_impact_rings_as_the_sum_of_damped_modes():
-    suite, state = _make()
-    heard = _strike(suite, state, 20)
+    suite, state = make_box()
+    heard = strike(suite, state, 20)
     t = np.arange(1, len(heard) + 1) / RATE
     impulse = 10 * DT
     expected = sum(
@@ -66,8 +30,8 @@ def test_an_impact_rings_as_the_sum_of_damped_modes():
 
 
 def test_the_spectrum_peaks_at_the_modal_frequencies():
-    suite, state = _make()
-    heard = _strike(suite, state, 60)
+    suite, state = make_box()
+    heard = strike(suite, state, 60)
     spectrum = np.abs(np.fft.rfft(heard * np.hanning(len(heard))))
     frequency = np.fft.rfftfreq(len(heard), 1 / RATE)
     for mode in MODES.frequency:
@@ -77,20 +41,20 @@ def test_the_spectrum_peaks_at_the_modal_frequencies():
 
 
 def test_loudness_grows_with_the_impulse_and_a_steady_load_is_silent():
-    suite, state = _make()
-    soft, hard = _strike(*_make(), 4, force=5.0), _strike(*_make(), 4, force=50.0)
+    suite, state = make_box()
+    soft, hard = strike(*make_box(), 4, force=5.0), strike(*make_box(), 4, force=50.0)
     assert hard == pytest.approx(10 * soft, abs=float(1e-4 * np.abs(hard).max()))
-    _touch(state, 30.0)
+    touch_box(state, 30.0)
     for _ in range(400):
         suite.update(state, DT)
     assert np.abs(suite.read("sound").numpy()).max() < 1e-4 * np.abs(hard).max()
-    quiet = _strike(*_make(threshold=20.0), 3, force=15.0)
+    quiet = strike(*make_box(threshold=20.0), 3, force=15.0)
     assert np.all(quiet == 0)
 
 
 def test_a_longer_contact_excites_high_modes_less():
     def share(contact_time: float) -> float:
-        heard = _strike(*_make(contact_time=contact_time), 40)
+        heard = strike(*make_box(contact_time=contact_time), 40)
         spectrum = np.abs(np.fft.rfft(heard)) ** 2
         frequency = np.fft.rfftfreq(len(heard), 1 / RATE)
         return spectrum[frequency > 3000].sum() / spectrum.sum()
@@ -100,8 +64,8 @@ def test_a_longer_contact_excites_high_modes_less():
 
 def test_sliding_colours_the_same_resonances_and_grows_with_speed_and_force():
     def rub(speed: float, force: float = 2.0) -> np.ndarray:
-        suite, state = _make(threshold=1e9)
-        _touch(state, force)
+        suite, state = make_box(threshold=1e9)
+        touch_box(state, force)
         velocity = np.zeros((1, 3, 6))
         velocity[0, 2, 0] = speed
         state.set_velocity(velocity)
@@ -123,8 +87,8 @@ def test_sliding_colours_the_same_resonances_and_grows_with_speed_and_force():
 
 def test_modes_beyond_half_the_sample_rate_are_left_out():
     sensor = ContactAudio(link="box", modes=Modes((500.0, 20_000.0), (5.0, 5.0), (1.0, 100.0)), samples=K)
-    suite, state = SensorSuite(_scene(), {"sound": sensor}, num_envs=1), HandState.empty(1, 3, 4)
-    assert np.abs(_strike(suite, state, 3)).max() < 2 * 10 * DT
+    suite, state = SensorSuite(box_scene(), {"sound": sensor}, num_envs=1), HandState.empty(1, 3, 4)
+    assert np.abs(strike(suite, state, 3)).max() < 2 * 10 * DT
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -1.0, True])
@@ -190,7 +154,7 @@ def test_cpu_and_cuda_agree():
             "contact": ContactAudio(link="box", modes=MODES, samples=K),
             "drives": ActuationAudio(link="box", joints=3, samples=K, hum=0.01),
         }
-        suite, state = SensorSuite(_scene(), sensors, num_envs=4, device=device), HandState.empty(4, 3, 16, device)
+        suite, state = SensorSuite(box_scene(), sensors, num_envs=4, device=device), HandState.empty(4, 3, 16, device)
         listener = Microphone(position=(0.5, 0.0, 0.2)).build(suite)
         velocity = np.zeros((4, 3, 6))
         velocity[:, 2, 0] = 0.1
@@ -199,7 +163,7 @@ def test_cpu_and_cuda_agree():
         blocks = []
         for block in range(6):
             if block == 1:
-                _touch(state, 10.0, envs=(0, 2))
+                touch_box(state, 10.0, envs=(0, 2))
             suite.update(state, DT)
             listener.update(state, DT)
             blocks.append(np.concatenate([listener.read().cpu().numpy(), suite.read("contact")[:, 0].cpu().numpy()]))

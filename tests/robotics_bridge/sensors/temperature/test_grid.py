@@ -19,26 +19,13 @@ from robotics_bridge.sensors.suite import SensorSuite
 from robotics_bridge.sensors.temperature.grid import TemperatureGrid
 from robotics_bridge.sensors.temperature.materials import MATERIALS, ThermalBody, ThermalMaterial, material
 from robotics_bridge.sensors.temperature.runtime import link_temperature
-
-PLAIN = ThermalMaterial(2.0, 1000.0, 1000.0, 0.8)
+from tests.factories.touch_scenes import PLAIN, make_grid
 
 LIMITS = {"contact_conductance", "warm_range", "cold_range"}
 """Numbers of a grid of which infinity means none."""
 NUMBERS = LIMITS | {
     "base_temperature", "ambient_temperature", "convection", "source", "contact_radius", "depth_weight", "tau",
 }  # fmt: skip
-
-
-def _make(envs: int = 1, half: tuple[float, float, float] = (0.01, 0.02, 0.03), contacts: int = 0, **knobs):
-    """Return a suite with one grid on a box, and a state; links are world, pad and object."""
-    geometries = (
-        Geometry(name="pad", link="pad", kind="box", size=half),
-        Geometry(name="object", link="object", kind="sphere", size=(0.04,)),
-    )
-    scene = TouchScene(("world", "pad", "object"), geometries)
-    defaults = {"convection": 0.0, "radiates": False, "material": PLAIN}
-    suite = SensorSuite(scene, {"grid": TemperatureGrid(link="pad", **{**defaults, **knobs})}, num_envs=envs)
-    return suite, HandState.empty(envs, 3, contacts)
 
 
 def _field(suite: SensorSuite, values: np.ndarray) -> None:
@@ -60,7 +47,7 @@ def _face(state: HandState, half: float, envs=(0,), depth: float = 0.0, height: 
 @pytest.mark.parametrize("dt", [1e-3, 0.1])
 def test_an_eigenmode_of_a_slab_decays_as_the_heat_equation_says(mode, dt):
     cells, length = 48, 0.06
-    suite, state = _make(cells=(1, 1, cells), base_temperature=20.0)
+    suite, state = make_grid(cells=(1, 1, cells), base_temperature=20.0)
     suite.update(state, dt)
     z = (np.arange(cells) + 0.5) / cells
     shape = np.cos(mode * math.pi * z)
@@ -76,7 +63,7 @@ def test_an_eigenmode_of_a_slab_decays_as_the_heat_equation_says(mode, dt):
 def test_many_tiny_steps_add_up_to_what_long_ones_do():
     read = {}
     for dt, steps in ((1e-5, 2000), (1e-2, 2)):
-        suite, state = _make(cells=(1, 1, 2), source=2e4, base_temperature=30.0)
+        suite, state = make_grid(cells=(1, 1, 2), source=2e4, base_temperature=30.0)
         for _ in range(steps):
             suite.update(state, dt)
         read[dt] = float(suite.read_ground_truth("grid").double().mean()) - 30
@@ -86,7 +73,7 @@ def test_many_tiny_steps_add_up_to_what_long_ones_do():
 
 @pytest.mark.parametrize("dt", [1e-5, 1e-3, 1e-1])
 def test_an_insulated_grid_keeps_its_heat_and_a_level_one_its_temperature(dt):
-    suite, state = _make(cells=(3, 4, 5), base_temperature=31.0)
+    suite, state = make_grid(cells=(3, 4, 5), base_temperature=31.0)
     for _ in range(20):
         suite.update(state, dt)
     assert np.all(suite.read_ground_truth("grid").numpy() == 31.0)
@@ -102,7 +89,7 @@ def test_an_insulated_grid_keeps_its_heat_and_a_level_one_its_temperature(dt):
 
 @pytest.mark.parametrize("dt", [1e-4, 1e-2, 0.1])
 def test_a_lump_cools_by_newtons_law_at_any_step(dt):
-    suite, state = _make(cells=(1, 1, 1), convection=200.0, ambient_temperature=20.0, base_temperature=60.0)
+    suite, state = make_grid(cells=(1, 1, 1), convection=200.0, ambient_temperature=20.0, base_temperature=60.0)
     steps = max(1, min(round(20 / dt), 300))
     for _ in range(steps):
         suite.update(state, dt)
@@ -113,7 +100,7 @@ def test_a_lump_cools_by_newtons_law_at_any_step(dt):
 
 
 def test_radiation_follows_stefan_and_boltzmann():
-    suite, state = _make(cells=(1, 1, 1), radiates=True, ambient_temperature=20.0, base_temperature=300.0)
+    suite, state = make_grid(cells=(1, 1, 1), radiates=True, ambient_temperature=20.0, base_temperature=300.0)
     dt, steps = 0.1, 600
     for _ in range(steps):
         suite.update(state, dt)
@@ -126,7 +113,7 @@ def test_radiation_follows_stefan_and_boltzmann():
 def test_a_source_warms_by_its_power_and_nothing_else():
     source = np.zeros((2, 2, 2))
     source[1, 0, 1] = 5e5
-    suite, state = _make(cells=(2, 2, 2), source=source)
+    suite, state = make_grid(cells=(2, 2, 2), source=source)
     for _ in range(100):
         suite.update(state, 0.01)
     gain = suite.read_ground_truth("grid").double().mean() - 22
@@ -138,7 +125,7 @@ def test_a_source_warms_by_its_power_and_nothing_else():
 def test_touching_a_half_space_gives_the_temperatures_of_two_half_spaces(name, dt):
     """Carslaw & Jaeger: the interface is at (e₁T₁ + e₂T₂) / (e₁ + e₂), the grid follows the error function."""
     # A face of 2 m so that heat flows straight through; 24 mm deep.
-    suite, state = _make(
+    suite, state = make_grid(
         half=(1.0, 1.0, 0.012), contacts=4, cells=(1, 1, 240), base_temperature=33.0,
         bodies={"object": ThermalBody(name, 13.0)},
     )  # fmt: skip
@@ -162,7 +149,7 @@ def test_short_touches_take_up_the_heat_of_two_half_spaces(own, other):
     half, found = (0.2, 0.2, 0.01), []
     e1, e2 = material(own).effusivity, material(other).effusivity
     for dt in (0.002, 0.01):
-        suite, state = _make(
+        suite, state = make_grid(
             half=half, contacts=4, material=own, base_temperature=33.0, bodies={"object": ThermalBody(other, 13.0)}
         )
         _face(state, 0.2, height=0.01)
@@ -178,7 +165,7 @@ def test_short_touches_take_up_the_heat_of_two_half_spaces(own, other):
 
 def test_a_patch_warms_every_cell_that_it_covers_and_no_other():
     pad = {"cells": (6, 6, 1), "half": (0.03, 0.03, 0.005), "bodies": {"object": ThermalBody("steel", 60.0)}}
-    suite, state = _make(contacts=4, **pad)
+    suite, state = make_grid(contacts=4, **pad)
     _face(state, 0.02, height=0.005)
     suite.update(state, 1e-3)
     warmed = suite.read_ground_truth("grid")[0, :, :, 0].numpy() - 22
@@ -186,7 +173,7 @@ def test_a_patch_warms_every_cell_that_it_covers_and_no_other():
     assert inner.min() == pytest.approx(inner.max(), rel=0.2)
     assert inner.min() > 100 * max(warmed[0].max(), warmed[:, -1].max())
     # A single point is a disc: as large as several cells, it reaches all of them.
-    suite, state = _make(contacts=1, contact_radius=1.0, **pad)
+    suite, state = make_grid(contacts=1, contact_radius=1.0, **pad)
     state.set_contacts([0], [[0, 1]], distance=[-2e-4], position=[[0, 0, 0.005]], normal=[[0, 0, 1.0]])
     suite.update(state, 1e-3)
     warmed = suite.read_ground_truth("grid")[0, :, :, 0].numpy() - 22
@@ -196,7 +183,7 @@ def test_a_patch_warms_every_cell_that_it_covers_and_no_other():
 def test_metal_feels_colder_than_wood_at_the_same_temperature():
     felt = {}
     for name in ("aluminium", "glass", "wood"):
-        suite, state = _make(
+        suite, state = make_grid(
             contacts=1,
             half=(0.006, 0.006, 0.003),
             cells=(5, 5, 5),
@@ -215,7 +202,7 @@ def test_metal_feels_colder_than_wood_at_the_same_temperature():
 
 
 def test_the_published_conduction_is_available_with_its_length_and_area():
-    suite, state = _make(
+    suite, state = make_grid(
         contacts=4,
         cells=(1, 1, 1),
         conduction="thesis",
@@ -234,7 +221,7 @@ def test_the_published_conduction_is_available_with_its_length_and_area():
 
 def test_a_contact_of_depth_has_the_area_of_a_cut_ball_and_none_gives_no_heat():
     def gain(depth: float, conductance: float = 1.0) -> float:
-        suite, state = _make(
+        suite, state = make_grid(
             contacts=1, cells=(1, 1, 1), base_temperature=0.0, contact_conductance=conductance, contact_radius=0.004,
             bodies={"object": ThermalBody("copper", 100.0)}, material=ThermalMaterial(400, 1000, 100, 0),
         )  # fmt: skip
@@ -252,7 +239,7 @@ def test_a_contact_of_depth_has_the_area_of_a_cut_ball_and_none_gives_no_heat():
 
 @pytest.mark.parametrize("dt", [1e-5, 1e-3, 0.1])
 def test_no_step_is_too_long_even_for_a_thin_hot_copper_pad(dt):
-    suite, state = _make(
+    suite, state = make_grid(
         half=(0.01, 0.01, 1e-4), contacts=4, cells=(4, 4, 2), material="copper", convection=500.0, radiates=True,
         bodies={"object": ThermalBody("copper", 400.0)}, ambient_temperature=-20.0,
     )  # fmt: skip
@@ -265,7 +252,7 @@ def test_no_step_is_too_long_even_for_a_thin_hot_copper_pad(dt):
 
 def test_the_element_lags_exactly_and_reads_less_upward_than_downward():
     for step in (0.01, 1.0):
-        suite, state = _make(cells=(1, 1, 1), tau=0.4, base_temperature=20.0)
+        suite, state = make_grid(cells=(1, 1, 1), tau=0.4, base_temperature=20.0)
         suite.update(state, step)
         _field(suite, np.array([30.0]))
         for count in range(1, 4):
@@ -274,11 +261,11 @@ def test_the_element_lags_exactly_and_reads_less_upward_than_downward():
         assert float(suite.read_ground_truth("grid")) == pytest.approx(30, abs=1e-4)
     # A source warms evenly at 3 K/s; the element follows by τ, whatever the step.
     for step in (1e-3, 0.1, 0.6):
-        suite, state = _make(cells=(1, 1, 1), tau=0.4, base_temperature=22.0, source=3e6)
+        suite, state = make_grid(cells=(1, 1, 1), tau=0.4, base_temperature=22.0, source=3e6)
         for _ in range(round(1.2 / step)):
             suite.update(state, step)
         assert float(suite.read("grid")) == pytest.approx(22 + 3 * (1.2 - 0.4 * (1 - math.exp(-3))), abs=1e-3)
-    suite, state = _make(cells=(1, 1, 2), warm_range=5.0, cold_range=15.0, base_temperature=30.0)
+    suite, state = make_grid(cells=(1, 1, 2), warm_range=5.0, cold_range=15.0, base_temperature=30.0)
     suite.update(state, 1e-3)
     _field(suite, np.array([80.0, -40.0]))
     suite.update(state, 1e-5)
@@ -352,7 +339,7 @@ def test_a_grid_needs_finite_geometry_or_corners():
     with pytest.raises(UsageError, match=r"conductivity .*received -1"):
         ThermalMaterial(-1, 1, 1)
     assert MATERIALS["steel"].effusivity == pytest.approx(math.sqrt(15 * 7900 * 480))
-    suite, _state = _make()
+    suite, _state = make_grid()
     with pytest.raises(UsageError, match=r"'gird'; .* 'grid'"):
         link_temperature(suite, "gird")
 
@@ -368,7 +355,7 @@ def test_an_empty_scene_is_read_at_the_shortest_and_the_longest_step():
 
 @pytest.mark.slow
 def test_a_hundred_thousand_cells_keep_their_heat():
-    suite, state = _make(cells=(100, 100, 10), source=1e5)
+    suite, state = make_grid(cells=(100, 100, 10), source=1e5)
     for _ in range(5):
         suite.update(state, 0.01)
     assert suite.read_ground_truth("grid").double().mean() - 22 == pytest.approx(1e5 * 0.05 / 1e6, rel=1e-3)

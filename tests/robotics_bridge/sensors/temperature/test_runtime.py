@@ -14,23 +14,10 @@ from robotics_bridge.physics.state import HandState
 from robotics_bridge.sensors.noise.model import Noise
 from robotics_bridge.sensors.suite import SensorSuite
 from robotics_bridge.sensors.temperature.grid import TemperatureGrid
-from robotics_bridge.sensors.temperature.materials import ThermalBody, ThermalMaterial
+from robotics_bridge.sensors.temperature.materials import ThermalBody
 from robotics_bridge.sensors.temperature.runtime import diffusion, link_temperature, lost_contacts
 from tests.factories.sensor_episode import require_processor
-
-PLAIN = ThermalMaterial(2.0, 1000.0, 1000.0, 0.8)
-
-
-def _make(envs: int = 1, half: tuple[float, float, float] = (0.01, 0.02, 0.03), contacts: int = 0, **knobs):
-    """Return a suite with one grid on a box, and a state; links are world, pad and object."""
-    geometries = (
-        Geometry(name="pad", link="pad", kind="box", size=half),
-        Geometry(name="object", link="object", kind="sphere", size=(0.04,)),
-    )
-    scene = TouchScene(("world", "pad", "object"), geometries)
-    defaults = {"convection": 0.0, "radiates": False, "material": PLAIN}
-    suite = SensorSuite(scene, {"grid": TemperatureGrid(link="pad", **{**defaults, **knobs})}, num_envs=envs)
-    return suite, HandState.empty(envs, 3, contacts)
+from tests.factories.touch_scenes import make_grid
 
 
 def _face(state: HandState, half: float, envs=(0,), depth: float = 0.0, height: float = 0.03) -> None:
@@ -71,7 +58,7 @@ def test_a_grid_that_touches_another_feels_its_material_and_temperature(bodies):
 
 
 def test_environments_are_reset_and_break_alone():
-    suite, state = _make(envs=3, contacts=12, cells=(2, 2, 2), bodies={"object": ThermalBody("steel", 60.0)})
+    suite, state = make_grid(envs=3, contacts=12, cells=(2, 2, 2), bodies={"object": ThermalBody("steel", 60.0)})
     _face(state, 0.008, envs=(0, 1, 2), depth=1e-3)
     warm = link_temperature(suite, "grid")
     warm[2] = 22.0
@@ -98,7 +85,7 @@ def test_environments_are_reset_and_break_alone():
 
 
 def test_noise_touches_the_measured_branch_alone():
-    suite, state = _make(envs=200, cells=(2, 2, 2), noise=Noise(white=0.1, quantum=0.05))
+    suite, state = make_grid(envs=200, cells=(2, 2, 2), noise=Noise(white=0.1, quantum=0.05))
     suite.update(state, 0.01)
     assert np.all(suite.read_ground_truth("grid").numpy() == 22)
     error = suite.read("grid").numpy() - 22
@@ -107,7 +94,7 @@ def test_noise_touches_the_measured_branch_alone():
 
 
 def test_contacts_without_room_are_counted_and_warned_of_once():
-    suite, state = _make(contacts=60, bodies={"object": ThermalBody("steel", 60.0)})
+    suite, state = make_grid(contacts=60, bodies={"object": ThermalBody("steel", 60.0)})
     state.set_contacts(
         np.zeros(60), np.tile([[0, 1]], (60, 1)), distance=np.full(60, -1e-4),
         position=np.random.default_rng(0).normal(size=(60, 3)) * 0.01, normal=np.tile([0.0, 0, 1], (60, 1)),
