@@ -222,6 +222,7 @@ class Controller:
         return None
 
     def _tick(self) -> str | None:
+        """Do a control step; return why the session must stop, or None."""
         begun, busy = self.clock(), time.thread_time()
         reading = self.link.read()
         if reading is None:
@@ -263,6 +264,7 @@ class Controller:
         return {name: groups.get(name, proprio) for name in self.contract.inputs}
 
     def _limit(self, targets: Mapping[str, float], reading: HandReading) -> NDArray[np.float64]:
+        """Return the targets [J] within the limits of speed and position; joints without one stay."""
         wanted = np.array([targets.get(name, reading.position[i]) for i, name in enumerate(self.driver.joints)])
         # The speed limit runs from target to target: measured from the joints, a load that holds them would slow the
         # targets.

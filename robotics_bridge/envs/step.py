@@ -41,6 +41,7 @@ def observe(state: EnvState) -> dict[str, torch.Tensor]:
 
 
 def _joints(state: EnvState, *, noisy: bool) -> torch.Tensor:
+    """Return positions, scaled velocities and the last action [B, 2J + A]."""
     simulation, noise = state.simulation, state.task.noise
     position = simulation.qpos[:, state.actuators.qpos_columns]
     velocity = VELOCITY * simulation.qvel[:, state.actuators.qvel_columns]

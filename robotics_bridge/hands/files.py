@@ -59,6 +59,7 @@ def checked_xml(path: Path, route: tuple[Path, ...] = ()) -> ElementTree.Element
 
 
 def _included(path: Path, folder: Path, route: tuple[Path, ...]) -> ElementTree.Element:
+    """Return the root element of a file with included ones in place; numbers that no hand has are refused."""
     if path.resolve() in route or len(route) > _DEEPEST:
         raise DataError(f"{brief(str(path))} includes itself, or files more than {_DEEPEST} deep.")
     text = read_text(path, KIND)

@@ -158,6 +158,7 @@ class Hand:
         return replace(self, custom=layout)
 
     def _cast(self, resolution: str, links: tuple[str, ...]) -> Layout:
+        """Cast a grid on the inner side of each link; links that get none are named in a warning."""
         layout: Layout = {}
         reasons: list[str] = []
         facing = palmar_directions(self.model, self.palm, self.fingers)

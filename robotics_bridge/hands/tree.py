@@ -6,7 +6,7 @@ it as a bundle of parallel rays.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -341,11 +341,14 @@ class Tree:
         return [child for child in self._children[body] if self._joints[child]]
 
     def _hand(self, palm: int) -> Branches:
+        """Return the fingers that part from a palm; chains that a closed loop joins are one."""
         chains = [chain for start in self._branches(palm) for chain in self._chains(start, ())]
         loops = looped_bodies(self._model)
         groups: list[list[tuple[int, ...]]] = []
         for chain in chains:
-            joined = [group for group in groups if any(_meet(chain, each, loops) for each in group)]
+            joined = [
+                group for group in groups if any(loop & {*chain} and loop & {*each} for each in group for loop in loops)
+            ]
             groups = [group for group in groups if group not in joined]
             groups.append([each for group in joined for each in group] + [chain])
         groups.sort(key=lambda group: min(chain[0] for chain in group))
@@ -407,10 +410,6 @@ class Tree:
                 first = next(iter(joints), None)
             follow |= {joint for joint in joints if joint != first and joint not in leading}
         return frozenset(follow)
-
-
-def _meet(first: Iterable[int], second: Iterable[int], loops: list[frozenset[int]]) -> bool:
-    return any(loop & {*first} and loop & {*second} for loop in loops)
 
 
 def coupled(model: Any) -> list[tuple[int, int, NDArray[np.float64]]]:

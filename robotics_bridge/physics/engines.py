@@ -162,6 +162,7 @@ class MujocoEngine:
         self.forward()
 
     def _each(self, work: Any) -> None:
+        """Do some work in every environment, by all threads, and refresh the state."""
         gather = self._gatherer.gather
 
         def run(chunk: NDArray[np.int64]) -> None:
@@ -287,9 +288,11 @@ class MujocoWarpEngine:
         assignment: Sequence[int] = (),
         contacts: int | None = None,
     ) -> None:
-        self._engine = _mujoco_warp()
-        check_number("environments of an engine", num_envs, least=1, most=MOST_ENVS, whole=True)
         wp = warp()
+        with needing("mujoco-warp", extra="gpu", purpose="Simulation on a GPU"):
+            import mujoco_warp
+        self._engine: Any = mujoco_warp
+        check_number("environments of an engine", num_envs, least=1, most=MOST_ENVS, whole=True)
         self._device = pick_device(device)
         models = list(model) if isinstance(model, (list, tuple)) else [model]
         self.model: Any = models[0]
@@ -420,14 +423,8 @@ class MujocoWarpEngine:
         wp.launch(fill_contacts, dim=c.worldid.shape[0], inputs=inputs, device=self._device)
 
 
-def _mujoco_warp() -> Any:
-    warp()
-    with needing("mujoco-warp", extra="gpu", purpose="Simulation on a GPU"):
-        import mujoco_warp
-    return mujoco_warp
-
-
 def _put_model(engine: Any, model: Any, varied: Mapping[str, np.ndarray], num_envs: int) -> Any:
+    """Return the model on the device, with fields [B, …] that differ between environments."""
     wp = warp()
     fields = engine.Model.__dataclass_fields__
     shapes = {name: getattr(field.type, "shape", ()) for name, field in fields.items()}

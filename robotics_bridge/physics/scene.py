@@ -198,7 +198,10 @@ class TouchScene:
         }
         pairs = zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True)
         always = frozenset((min(pair), max(pair)) for pair in pairs)
-        return cls(links, geometries, _never(model), always, variants, _flexes(model), reports_forces=True)
+        collides = (model.flex_contype | model.flex_conaffinity) != 0
+        kind = mujoco.mjtObj.mjOBJ_FLEX
+        flexes = tuple(mujoco.mj_id2name(model, kind, i) or f"flex{i}" for i in np.flatnonzero(collides).tolist())
+        return cls(links, geometries, _never(model), always, variants, flexes, reports_forces=True)
 
 
 def _name(model: Any, what: int, index: int) -> str:
@@ -206,6 +209,7 @@ def _name(model: Any, what: int, index: int) -> str:
 
 
 def _geometries(model: Any, links: tuple[str, ...]) -> tuple[Geometry, ...]:
+    """Return the geometries of a model in its order; those of one mesh share it."""
     geometries = []
     meshes: dict[int, Mesh] = {}
     for index in range(model.ngeom):
@@ -224,13 +228,6 @@ def _geometries(model: Any, links: tuple[str, ...]) -> tuple[Geometry, ...]:
             )
         )  # fmt: skip
     return tuple(geometries)
-
-
-def _flexes(model: Any) -> tuple[str, ...]:
-    collides = (model.flex_contype | model.flex_conaffinity) != 0
-    kind = mujoco.mjtObj.mjOBJ_FLEX
-    names = (mujoco.mj_id2name(model, kind, index) or f"flex{index}" for index in np.flatnonzero(collides).tolist())
-    return tuple(names)
 
 
 def _mesh(model: Any, index: int) -> Mesh:

@@ -56,6 +56,8 @@ def read_policy(
 
 
 class _OnnxRunner:
+    """An ONNX file as a function of one step, with the memory between steps."""
+
     def __init__(self, path: str | Path, shapes: Mapping[str, tuple[int, ...]], threads: int | None) -> None:
         self.session = onnx_session(path, threads)
         inputs = {item.name: item.shape for item in self.session.get_inputs()}
@@ -135,6 +137,7 @@ def export_policy(
 
 
 def _write(policy: TactilePolicy, path: Path) -> None:
+    """Write one step of a policy as ONNX, for any number of rows."""
     require_onnx()
     step: Any = policy.as_onnx()
     batch = torch.export.Dim("batch", min=1, max=8192)

@@ -30,6 +30,7 @@ def apply_overrides(task: Task, words: Iterable[str]) -> Task:
 
 
 def _changed(task: Task, path: list[str], text: str) -> Task:
+    """Return a task with one other number, by the dotted name of where it stands."""
     first, *rest = path
     for part in ("rewards", "endings"):
         terms: Mapping[str, Reward | Ending] = getattr(task, part)

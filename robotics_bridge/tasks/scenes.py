@@ -262,6 +262,7 @@ def _moved(task: Task, hand: Hand, joints: Sequence[str]) -> tuple[str, ...]:
 
 
 def _tips(hand: Hand) -> dict[str, Any]:
+    """Return finger tip → point of distances: as released, else the middle of its taxels."""
     layout = hand.layout("low", "tips")
     points = {}
     for tip in hand.tips:

@@ -171,7 +171,13 @@ def write_lerobot(folder: Path, frames: Mapping[str, NDArray[np.floating]], sess
     shapes: dict[str, tuple[int, ...]] = dict(zip(PARTS, sizes, strict=True))
     table, length = _columns(frames, fps, shapes), len(frames[PARTS[0]])
     _write_frames(folder / _DATA.format(chunk_index=0, file_index=0), table, shapes)
-    stats = {name: _stats(values) for name, values in table.items()}
+    stats: dict[str, dict[str, list[Any]]] = {}
+    for name, values in table.items():
+        flat = values.astype(np.float64)
+        moments = {part: getattr(np, part)(flat, axis=0) for part in ("min", "max", "mean", "std")}
+        stats[name] = {part: np.atleast_1d(value).tolist() for part, value in moments.items()} | {
+            "count": [len(values)]
+        }
     episode = {
         "episode_index": 0, "tasks": [task], "length": length, "dataset_from_index": 0, "dataset_to_index": length,
         "data/chunk_index": 0, "data/file_index": 0, "meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0,
@@ -236,13 +242,8 @@ def _columns(
     return {**columns, "timestamp": (frame / fps).astype(np.float32), **counters}
 
 
-def _stats(values: NDArray) -> dict[str, list[Any]]:
-    flat = values.astype(np.float64)
-    stats = {name: np.atleast_1d(getattr(np, name)(flat, axis=0)).tolist() for name in ("min", "max", "mean", "std")}
-    return {**stats, "count": [len(values)]}
-
-
 def _write_frames(path: Path, table: Mapping[str, NDArray], shapes: Mapping[str, tuple[int, ...]]) -> None:
+    """Write a table with the arrays of each cell as nested lists, of fixed sizes where they have one axis."""
     import pyarrow as pa
     from pyarrow import parquet
 
@@ -396,6 +397,7 @@ def _placed(links: Sequence[str], numbers: Sequence[int], layout: Layout, name: 
 
 
 def _read_table(path: Path, hand: Hand, layout: Layout) -> TouchLog:
+    """Read a log as a table of joints and taxels."""
     header, table = read_columns(path, "log of joints and taxels")
     if "time" not in header:
         raise DataError(f"{path.name} needs a column 'time' (s), joints (rad) and taxels LINK:NUMBER (N).")
@@ -415,6 +417,7 @@ def _read_table(path: Path, hand: Hand, layout: Layout) -> TouchLog:
 
 
 def _read_episode(folder: Path, hand: Hand, layout: Layout, episode: int) -> TouchLog:
+    """Read an episode of a LeRobot data set; taxels that it does not place are those of the hand's layout."""
     name = folder.name
     info = read_json(folder / "meta" / "info.json", "LeRobot description")
     version = str(info.get("codebase_version", "")) if isinstance(info, dict) else ""

@@ -229,6 +229,7 @@ def serve(hand: SimulatedHand, link: HandLink, faults: Faults, seconds: float = 
 def _spoil(
     values: NDArray[np.float64], faults: Faults, random: np.random.Generator, joints: int, link: HandLink, stamp: float
 ) -> Iterator[bytes]:
+    """Yield the report as faults leave it; nothing where it is lost."""
     drop, damage, absurd, nan = random.random(4)
     values = values.copy()
     if absurd < faults.absurd:

@@ -182,6 +182,7 @@ def _along(
 
 
 def _lay_sites(axes: FingerAxes, reference: Layout) -> None:
+    """Fill edges and centres of the sites: quantiles of a layout's taxels along each axis."""
     columns = GRID_SHAPE[1]
     parts = []
     for link, probes in reference.items():

@@ -303,6 +303,8 @@ class _Learner(nn.Module):
 
 
 class _Run:
+    """The state of a distillation and its iterations."""
+
     def __init__(self, config: DistillConfig, out: Path, env: Any, teacher: Policy, *, graphs: bool = True) -> None:
         self.config, self.out, self.env, self.teacher = config, out, env, teacher
         self.device = torch.device(env.device)
@@ -367,6 +369,7 @@ class _Run:
 
     @torch.no_grad()
     def _act(self, share: float) -> Rollout:
+        """Step the environments; the teacher takes a share of the actions and labels all."""
         recorder = Recorder(self.config.steps_per_env, self.memory)
         targets = [head.target for head in self.decoders]
         recorded = [name for name in (*self.groups, *targets) if self.front is None or name != TACTILE]
@@ -475,6 +478,7 @@ class _Run:
             check_probes(self.config.resolution, earlier.get("deployment", {}).get("probes"))
 
     def _save(self) -> None:
+        """Write the state, the rollouts that are learned from again, and the student."""
         # The memory of noisy sensors is in no file, so such a run starts new episodes at every state it saves.
         if self.config.noisy:
             self.observations = self.env.reset()
@@ -501,6 +505,7 @@ class _Run:
             self._go_on(state)
 
     def _go_on(self, state: Mapping[str, Any]) -> None:
+        """Take up what :meth:`_save` wrote."""
         restore_learner(state, self.learner, self.optimizer, self.out / STATE)
         self.iteration, self.loss = int(state["iteration"]), float(state["loss"])
         cuda = self.device.type == "cuda"

@@ -303,6 +303,7 @@ def read_sweep(path: str | Path = PUBLISHED) -> StudentSweep:
 
 
 def _sweep(path: Path, document: Mapping[str, Any]) -> StudentSweep:
+    """Return the sweep of a file's values, every student of which is made once."""
     check_each("key of a sweep", document, _KEYS)
     listed = tuple(document.get("students", ()))
     if listed and (

@@ -147,6 +147,7 @@ def calibrated(config: DistillConfig, env: Any, teacher: Any, out: Path) -> Dist
 
 
 def _measure(tactile: EncoderConfig, env: Any, teacher: Any) -> HandCalibration:
+    """Return the unit of force and moment of two seconds in which the teacher acts."""
     grid = tactile.grid().to(env.device)
     observations, felt = env.reset(), []
     for _ in range(_CALIBRATION_STEPS):

@@ -353,6 +353,7 @@ def _train(
 
 
 def _resume(trainer: Trainer, run: Path, facts: dict[str, Any]) -> None:
+    """Claim the folder of a run, and go on from its last state where there is one."""
     document = run / "config.json"
 
     def stated(document_of_run: dict[str, Any]) -> object:
