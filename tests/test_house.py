@@ -20,8 +20,8 @@ MOST_MODULES = 16
 MOST_LINES = 700
 """Lines of a module, which is cut by idea; 150 to 450 are usual."""
 BUDGETS = {
-    "brainbench/stimuli": 26_770,  # the error of every whisker, follicles that give way, air, shapes in space, species,
-    # rest shapes that links cannot follow
+    "brainbench/stimuli": 27_140,  # the error of every whisker, follicles that give way, air, shapes in space, species,
+    # rest shapes that links cannot follow, contacts on the bent rod
     "robotics_bridge": 25_260,  # newtons that no taxel has, trees of any hand, replays, gel pictures, devices fitted,
     # a status for each fitted device, the side of a thin solid that contact reports
     "brainbench/models": 8_410,  # the proof that a layer is a response, its probes in files, ONNX files tried apart
@@ -40,10 +40,10 @@ BUDGETS = {
 }
 """Folder → lines of Python that it may have: as the rooms stand, with two per cent to move in. Who adds a capability
 pays in the same folder, or raises the number in the commit that needs it, with the reason."""
-MOST_PRODUCT_LINES, MOST_PRODUCT_MODULES = 98_300, 412
+MOST_PRODUCT_LINES, MOST_PRODUCT_MODULES = 98_680, 412
 """Lines grew last by responses of any kind, errors of sweeps, boards of 10,000 records, ONNX files tried apart, drift
 over time, files of torch_brain and rsatoolbox both ways, real tactile devices fitted jointly to presses, air flow,
-rest shapes in space, species files and stimuli of single trials."""
+rest shapes in space, species files, stimuli of single trials and contacts on the bent rod."""
 VAGUE = frozenset(
     re.findall(r"\w+", "found told own kept known asked one other item shown made named taken usual"),
 )

@@ -54,6 +54,11 @@ class Fidelity:
     twist: bool | None = field(default=None, metadata={"later": True, "before": False})
     """True lets whiskers twist about their axis; one that stays in one plane is computed without in any case. None: as
     the scenes say (:attr:`brainbench.stimuli.scenes.scene.Scene.twist`), where the backend can."""
+    contact_line: Literal["links", "rod"] = field(default="links", metadata={"later": True})
+    """What contacts touch: the straight links, whose direction jumps at each joint, or the centre line of the bent rod,
+    as beam theory tells it between the joints: with the same links many times nearer where a whisker is held between
+    contacts or slides past one. The backend ``rod`` alone knows it, for objects of spheres, capsules, cylinders and
+    boxes; gradients and fits take the links."""
     contact_tolerance: Annotated[float, Limit(least=1e-12, most=1e-3)] | None = field(
         default=None, metadata={"later": True}
     )

@@ -176,6 +176,8 @@ class WhiskerEngine:
     """True when whiskers feel moving air (:mod:`brainbench.stimuli.engines.air`)."""
     coils: ClassVar[bool] = False
     """True when rest shapes may have ``bends`` (:class:`brainbench.stimuli.whiskers.whisker.Whisker`)."""
+    smooth: ClassVar[bool] = False
+    """True when contacts may touch the centre line of the rod (:attr:`Fidelity.contact_line`)."""
     surfaces: ClassVar[bool] = False
     """True when it collides the exact surface of obstacles that have one; others collide convex parts."""
     batches: ClassVar[bool] = False
@@ -220,6 +222,7 @@ class WhiskerEngine:
         for able, used, words in (
             (self.yields, any(job.whisker.follicle for job in jobs), "have rigid follicles; leave follicle out"),
             (self.coils, any(job.whisker.bends for job in jobs), "rest as parabolas; leave bends out"),
+            (self.smooth, fidelity.contact_line == "rod", "touch with straight links; leave contact_line out"),
             (self.flows, any(job.air_flow is not None for job in jobs), "feel no air; leave air_flow out"),
         ):
             if used and not able:

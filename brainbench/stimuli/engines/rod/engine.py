@@ -232,6 +232,7 @@ class RodEngine(WhiskerEngine):
     twists = True
     yields = True
     flows = True
+    smooth = True
     coils = True
     surfaces = True
     batches = True

@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.devices import to_struct, warp
+from brainbench.core.errors import UsageError
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.rod.limits import (
     CONTACT_BOUNDS,
@@ -33,6 +34,7 @@ from brainbench.stimuli.engines.rod.limits import (
     LIGHT,
     LONGEST_SPAN,
     MESHES,
+    NOTHING,
     TO_ROUNDING,
     WIDEST,
     contact_iterations,
@@ -287,12 +289,18 @@ class WhiskerSolver:
             options["sliced"] = sliced
         self.yields = any(chain.whisker.follicle is not None for chain in self.chains)
         rolls = any(chain.rest_rolls.any() for chain in self.chains)
-        uses = {"yields": self.yields, "rolls": rolls, "flows": flows}
+        smooth = fidelity.contact_line == "rod" and needs > NOTHING
+        if smooth and (needs == MESHES or options.get("recorder")):
+            raise UsageError(
+                "contact_line=rod knows spheres, capsules, cylinders and boxes, but no meshes, gradients or fits; leave"
+                " it out, or build the objects of these."
+            )
+        uses = {"yields": self.yields, "rolls": rolls, "flows": flows, "smooth": smooth}
         features = tuple(name for name, used in uses.items() if used)
         self.kernels = load_kernels(
             device, self.real, self.capacity, needs, hinges=hinges, features=features, **options
         )
-        packed = pack_chains(self.capacity, self.chains, self.quasistatic, hinges, rolls=rolls)
+        packed = pack_chains(self.capacity, self.chains, self.quasistatic, hinges, rolls=rolls, smooth=smooth)
         if self.yields:
             packed["follicle"] = pack_follicles(self.chains, self.quasistatic)
         with lock_of(device):

@@ -20,6 +20,14 @@ SPARE = 4
 """Places of possible contact that are watched within a step beyond those; the nearest are kept when there are more."""
 CONTACT_ROUNDS = 4
 """Times that contacts are added to a step because the others press the whisker onto them."""
+STEADY = 1.0
+"""Time (ms) over which the forces are averaged by which contacts bend the centre line between the joints. Those of one
+step would answer to the very bends that they make, and swing."""
+STEEP = 2.0, 4.0
+"""Times that a joint is softer than the one before, up to which beam theory is followed between them in full, and from
+which on not at all."""
+LARGE_BEND = 0.4
+"""Bend (rad) of a joint at which it is followed by half."""
 CLOSED = 1e-3
 """Overlap (mm) at the end of a step from which a place counts as pressed upon."""
 LARGEST_FORCE = 1e6

@@ -8,6 +8,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -22,7 +24,7 @@ from brainbench.stimuli.engines.rod import limits
 from brainbench.stimuli.engines.rod.limits import LIGHT, WIDE
 from brainbench.stimuli.motion.jobs import MICRO, MILLI, Follicle, Load
 from brainbench.stimuli.objects.obstacle import Box, Capsule, ConvexPart, Cylinder, Obstacle, Sphere
-from brainbench.stimuli.whiskers.whisker import Chain
+from brainbench.stimuli.whiskers.whisker import Chain, quadrature
 
 CAPACITIES = (12, 24, 48, 100)
 """Links for which kernels are compiled; a chain takes the smallest that holds it."""
@@ -220,7 +222,7 @@ def rotation_vectors(before: NDArray, after: NDArray) -> NDArray[np.float64]:
 
 
 def pack_chains(
-    capacity: int, chains: Sequence[Chain], quasistatic: bool, hinges: int, *, rolls: bool = False
+    capacity: int, chains: Sequence[Chain], quasistatic: bool, hinges: int, *, rolls: bool = False, smooth: bool = False
 ) -> dict[str, NDArray]:
     """Return what the kernel's ``ChainArrays`` hold: whiskers as chains, [link, whisker] of ``capacity`` links."""
     count = len(chains)
@@ -257,7 +259,44 @@ def pack_chains(
         "build": build,
         "inertia": inertia,
         "taper": taper,
+        **({"beam": _pack_beams(capacity, chains)} if smooth else {}),
     }
+
+
+def _pack_beams(capacity: int, chains: Sequence[Chain]) -> NDArray[np.void]:
+    names = "moment_slope", "force_slope", "force_deflection"
+    beams = np.zeros((capacity, len(chains)), dtype=[*((name, "f8", 4) for name in names), ("trust", "f8")])
+    places = np.arange(4) / 3
+    for w, chain in enumerate(chains):
+        # Joints that are far softer than the one before fold before beam theory says anything.
+        steep = np.append(1.0, chain.stiffness[:-1] / chain.stiffness[1:])
+        steep[1] = 1.0
+        trust = np.interp(steep, limits.STEEP, (1.0, 0.0))
+        beams["trust"][: chain.links, w] = trust
+        along = trust[:, None] * (1 - places) + np.append(trust[1:], trust[-1])[:, None] * places
+        for order, name in enumerate(names):
+            # 1/(N·m) to 1/(µN·m), m to mm.
+            beams[name][: chain.links, w] = along * beam_errors(chain)[order] * (MILLI**order / MICRO)
+    return beams
+
+
+@lru_cache(256)
+def beam_errors(chain: Chain) -> NDArray[np.float64]:
+    """Return [3, link, 4] what the joints before a place lack of the rod: ∫ (s − x)ᵏ/(E I) dx − Σ c (s − x)ᵏ, SI.
+
+    Orders k = 0, 1 and 2; places s at 0, 1/3, 2/3 and 1 along each link; x are arc lengths, in the sum those of joints
+    of compliance c. Under a moment M and a force V across at s the joints miss (Euler-Bernoulli) the slope there by
+    order 0 · M + order 1 · V, the deflection by order 1 · M + order 2 · V.
+    """
+    whisker, nodes, orders = chain.whisker, chain.nodes, np.arange(3)[:, None]
+    compliance, errors = 1 / chain.stiffness, np.zeros((3, chain.links, 4))
+    for link, k in np.ndindex(chain.links, 4):
+        s = nodes[link] + (nodes[link + 1] - nodes[link]) * k / 3
+        parts = [quadrature(low, high, whisker.breaks) for low, high in pairwise([*nodes[: link + 1], s])]
+        x, weights = (np.concatenate(values) for values in zip(*parts, strict=True))
+        rod = (s - x) ** orders @ (weights / whisker.bending_stiffness(x))
+        errors[:, link, k] = rod - (s - nodes[: link + 1]) ** orders @ compliance[: link + 1]
+    return errors
 
 
 def pack_follicles(chains: Sequence[Chain], quasistatic: bool) -> NDArray[np.void]:

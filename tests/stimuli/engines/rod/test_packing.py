@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -15,6 +17,7 @@ from brainbench.stimuli.engines.rod.packing import (
     KNOT,
     PackedMotions,
     PackedSurface,
+    beam_errors,
     capacity_for,
     follicle_track,
     knots_alike,
@@ -102,3 +105,17 @@ def test_hulls_with_such_triangles_have_no_whisker_inside_before_they_arrive(lab
         [type(job)(job.whisker, job.follicle, job.obstacles, times) for job in jobs], Fidelity(links=10, time_step=1e-3)
     )
     assert [trace.reason for trace in traces if trace.reason] == []
+
+
+@pytest.mark.parametrize("links", [5, 11])
+def test_joints_and_what_they_lack_are_the_beam(links):
+    """Deflection and slope of a uniform cantilever under a force and a moment at its end s: s³/3EI, s²/2EI, s/EI."""
+    whisker = replace(C2, curvature=0.0, tip_radius=C2.base_radius)
+    chain = build_chain(whisker, links)
+    errors, stiffness = beam_errors(chain), float(whisker.bending_stiffness(0.0))
+    for link, k in np.ndindex(links, 4):
+        s = whisker.arc_length * (link + k / 3) / links
+        levers = s - chain.nodes[: link + 1]
+        joints = [np.sum(levers**order / chain.stiffness[: link + 1]) for order in range(3)]
+        beam = [s ** (order + 1) / (order + 1) / stiffness for order in range(3)]
+        np.testing.assert_allclose(joints + errors[:, link, k], beam, rtol=1e-9, atol=1e-12 * beam[0])

@@ -12,6 +12,7 @@ vec4: Any = wp.types.vector(4, real)
 vec5: Any = wp.types.vector(5, real)
 vec6: Any = wp.types.vector(6, real)
 mat33: Any = wp.types.matrix((3, 3), real)
+mat34: Any = wp.types.matrix((3, 4), real)
 JointVector: Any = wp.types.vector(hinges, real)
 """One number for each hinge of a joint: bending about y, bending about z, twist about x."""
 JointInverse: Any = wp.types.vector(hinges + 1, real)

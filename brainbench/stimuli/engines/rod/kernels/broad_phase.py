@@ -36,16 +36,18 @@ from brainbench.stimuli.motion.jobs import MILLI
 
 from .algebra import JointVector, Spatial, first_axis, rotate, vec3
 from .articulated_body import ChainState, ProximityState, hinge_direction
+from .centre_line import bent_link
 from .distances import segments
 from .motion import BodyMotion, elapsed, instant, pose_at, pose_from
 from .narrow_phase import link_shape_distance
-from .parameters import against, hinges, real, recorded, sliced, yields
+from .parameters import against, hinges, real, recorded, sliced, smooth, yields
 from .state import (
     WAIT_DISTANCES,
     WAIT_FORCES,
     WAIT_REST,
     WAIT_SLICE,
     ContactCandidates,
+    ContactProblems,
     LinkDistance,
     PausedWhiskers,
     PerListed1,
@@ -55,6 +57,7 @@ from .state import (
     WhiskerJob,
     WhiskerState,
     cone,
+    line_place,
     most_candidates,
     row,
 )
@@ -299,6 +302,7 @@ def judge_overlap(state: wp.ref[WhiskerState], deepest: real, crossing: int, bas
 @wp.func(inline=True)
 def find_candidates(
     scene: SceneArrays,
+    problems: ContactProblems,
     paused: PausedWhiskers,
     job: WhiskerJob,
     chain: wp.ref[ChainState],
@@ -321,6 +325,7 @@ def find_candidates(
     crossing = int(0)
     base_gap = zero
     query = state.first_query
+    base = rotate(pose.quaternion, vec3(real(1.0), zero, zero))
     angular = pose.spin
     linear = pose.velocity
     looked_at = job.end_shape - job.first_shape
@@ -351,6 +356,9 @@ def find_candidates(
         linear = linear + wp.cross(joint, spun)
         taper = scene.chains.taper[i, job.whisker]
         if row(proximity.clearance, i) <= margin + taper.start_radius:
+            link_here = cone(joint, joint + link, taper)
+            if wp.static(smooth):
+                link_here = bent_link(scene.chains, problems, job, chain, base, state.contacts, i)
             # One shape after the other, each at two places: between the ends, and at the far end.
             closest = others
             for place in range(looked_at):
@@ -371,7 +379,6 @@ def find_candidates(
                 else:
                     bound = row(proximity.clearance, i)
                     leaf = row(proximity.leaf, i)
-                    link_here = cone(joint, joint + link, taper)
                     found = link_shape_distance(scene.shapes, s, body, link_here, margin, bound, leaf, 0, 1)
                 proximity.leaf[i] = found.leaf
                 closest = wp.min(closest, found.clearance)
@@ -397,6 +404,8 @@ def find_candidates(
                         radius = taper.start_radius + (taper.end_radius - taper.start_radius) * share
                         # The force acts on the skin of the whisker: its radius is the lever of friction.
                         point = joint + link * share - normal * radius
+                        if wp.static(smooth):
+                            point = line_place(link_here, share) - normal * radius
                         # The object's velocity in the middle of the step.
                         middle = instant(now.tick, now.part + real(0.5) * h)
                         half = pose_from(scene.motions, scene.shapes.track[s], middle, pose)
@@ -607,6 +616,9 @@ def check_rest(
                     # A little is kept off here and less than that given back below, so that rounding never raises the
                     # bound.
                     slack = slack - taper.start_radius - real(0.05)
+                    if wp.static(smooth):
+                        # So far the rest shape bows out of a link.
+                        slack = slack - real(0.25) * link.length * wp.abs(link.bend_sine)
                     proximity.safe_until[i] = real(1e30)
                     if slack <= zero:
                         proximity.safe_until[i] = before

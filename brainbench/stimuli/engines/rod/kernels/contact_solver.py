@@ -13,7 +13,7 @@ the source is the same. Forces in mN, compliance in mm/ms per mN.
 
 import warp as wp
 
-from brainbench.stimuli.engines.rod.limits import CONTACT_BOUNDS, CONTACT_ROUNDS, GROUPS, LARGEST_FORCE, WARP
+from brainbench.stimuli.engines.rod.limits import CONTACT_BOUNDS, CONTACT_ROUNDS, GROUPS, LARGEST_FORCE, STEADY, WARP
 
 from .algebra import spatial, vec3, vec4, vec6
 from .articulated_body import ChainState, ProximityState, joint_record
@@ -33,7 +33,7 @@ from .delassus import (
     select_contacts,
     stride,
 )
-from .parameters import capacity, cuda, group_size, max_contacts, module_options, queue, real, recorded, yields
+from .parameters import capacity, cuda, group_size, max_contacts, module_options, queue, real, recorded, smooth, yields
 from .state import (
     ContactCandidates,
     ContactProblems,
@@ -508,6 +508,10 @@ def store_forces(problems: ContactProblems, solver: wp.ref[SolverState], own: wp
             arc = row(own.arc, k)
             problems.held[solver.job, solver.thread + k].arc = arc
             problems.held[solver.job, solver.thread + k].force = force_k
+            if wp.static(smooth):
+                steady = row(own.steady, k)
+                weight = solver.step / (solver.step + real(wp.static(STEADY)))
+                problems.held[solver.job, solver.thread + k].steady = steady + (force_k - steady) * weight
             if wp.static(recorded):
                 problems.held[solver.job, solver.thread + k].slot = row(own.slot, k)
             force = force + force_k

@@ -15,7 +15,7 @@ from brainbench.stimuli.engines.rod.limits import CLOSED, CREVICE
 from .algebra import JointVector, Spatial, inertia_times, minus, plus, reader, spatial, vec3, vec6
 from .articulated_body import acceleration_over_joint, force_over_joint, inverse_times
 from .distances import NUMBERS
-from .parameters import capacity, group_size, hinges, max_contacts, real, recorded, yields
+from .parameters import capacity, group_size, hinges, max_contacts, real, recorded, smooth, yields
 from .state import ContactProblems, JointRecord, PerLinkJoint, most_candidates
 from .thread_groups import broadcast, group_or, group_sum, warp_max
 
@@ -58,6 +58,8 @@ class ThreadContacts:
     """Compliance to the contact's own forces."""
     if recorded:
         slot: PerContactInt
+    if smooth:
+        steady: PerContact3
 
 
 @wp.struct
@@ -140,10 +142,14 @@ def add_contact(problems: ContactProblems, solver: wp.ref[SolverState], own: wp.
     # The forces of the last step are a good first guess.
     # They are kept in world axes, because the tangents turn from step to step.
     guess = vec3(zero, zero, zero)
+    if wp.static(smooth):
+        own.steady[k] = guess
     for e in range(solver.previous_contacts):
         held = problems.held[index, e]
         if wp.abs(held.arc - candidate.arc) < real(0.3) * candidate.link_arc:
             guess = held.force
+            if wp.static(smooth):
+                own.steady[k] = held.steady
     for a in range(3):
         own.free_rate[3 * k + a] = wp.dot(row(own.axis, 3 * k + a), candidate.free_velocity)
         own.force[3 * k + a] = wp.dot(guess, row(own.axis, 3 * k + a))

@@ -15,7 +15,7 @@ from brainbench.stimuli.engines.rod.limits import CAPSULE, CYLINDER, SPHERE
 
 from .algebra import vec2, vec3, vec4, vec5
 from .parameters import real
-from .state import Cone
+from .state import Cone, line_place, line_tangent
 
 # As fine as the numbers: 2⁻²⁰ is about 1e-6, 2⁻⁴⁴ about 6e-14 of a link.
 halvings = 20 if real is wp.float32 else 44
@@ -80,17 +80,16 @@ def primitive(kind: int, size: vec3, x: vec3) -> vec4:
 def segment_primitive(kind: int, size: vec3, link: Cone) -> vec5:
     """Return the place along a link (0 to 1) of the least gap, that gap (negative inside) and the normal.
 
-    The gap is convex along the segment: its slope is halved to zero.
+    The gap is convex along a segment, and hardly less along its centre line: its slope is halved to zero.
     """
     low = real(0.0)
     high = real(1.0)
-    a = link.a
     ra = link.start_radius
     rb = link.end_radius
-    along = link.b - a
     for _ in range(wp.static(halvings)):
         middle = real(0.5) * (low + high)
-        here = primitive(kind, size, a + along * middle)
+        here = primitive(kind, size, line_place(link, middle))
+        along = line_tangent(link, middle)
         # Derivative of the gap along a–b: of the distance, less that of the radius.
         slope = here[0] * along[0] + here[1] * along[1] + here[2] * along[2] - (rb - ra)
         if slope > real(0.0):
@@ -103,7 +102,7 @@ def segment_primitive(kind: int, size: vec3, link: Cone) -> vec5:
         share = real(0.0)
     if high == real(1.0):
         share = real(1.0)
-    found = primitive(kind, size, a + along * share)
+    found = primitive(kind, size, line_place(link, share))
     return vec5(share, found[3] - (ra + (rb - ra) * share), found[0], found[1], found[2])
 
 

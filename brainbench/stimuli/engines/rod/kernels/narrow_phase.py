@@ -29,7 +29,7 @@ from brainbench.stimuli.engines.rod.limits import (
 from .algebra import maximum, minimum, unrotate, vec2, vec3, vec4
 from .distances import NUMBERS, TRIANGLES, primitive, segment_primitive
 from .motion import BodyMotion, pose_from
-from .parameters import against, cuda, group_size, module_options, real
+from .parameters import against, cuda, group_size, module_options, real, smooth
 from .state import (
     ChainArrays,
     Cone,
@@ -41,6 +41,7 @@ from .state import (
     PausedWhiskers,
     ShapeArrays,
     cone,
+    line_place,
 )
 from .thread_groups import broadcast, group_min, group_min_int, warp_max
 
@@ -575,6 +576,15 @@ def link_shape_distance(
     link = Cone()
     link.a = a
     link.b = b
+    if wp.static(smooth):
+        for k in range(4):
+            offset = vec3(world.line.offset[0, k], world.line.offset[1, k], world.line.offset[2, k])
+            turn = vec3(world.line.turn[0, k], world.line.turn[1, k], world.line.turn[2, k])
+            offset = unrotate(local_quaternion, unrotate(body.quaternion, offset)) / scale
+            turn = unrotate(local_quaternion, unrotate(body.quaternion, turn)) / scale
+            for d in range(3):
+                link.line.offset[d, k] = offset[d]
+                link.line.turn[d, k] = turn[d]
     link.start_radius = ra
     link.end_radius = rb
     found = LinkDistance()
@@ -617,6 +627,9 @@ def link_shape_distance(
         found.between = 0
         if nearest[0] > real(1e-3) and nearest[0] < real(1.0 - 1e-3):
             found.between = 1
+        if wp.static(smooth):
+            a = line_place(link, real(0.0))
+            b = line_place(link, real(1.0))
         tip = primitive(shapes.kind[s], shapes.size[s] / scale, b)
         found.end = 1
         found.end_gap = tip[3] - rb

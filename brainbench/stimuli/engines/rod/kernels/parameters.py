@@ -15,6 +15,8 @@ yields = False
 """True: follicles give way, see ``FollicleConstants``."""
 rolls = False
 """True: rest shapes leave their plane."""
+smooth = False
+"""True: contacts touch the centre line of the bent rod (``centre_line``); False: the straight links."""
 flows = False
 """True: air flows, whose drag whiskers feel."""
 against = MESHES

@@ -13,9 +13,9 @@ import warp as wp
 
 from brainbench.stimuli.engines.rod.limits import LISTED, SPARE, WIDE, contacts_for
 
-from .algebra import JointInverse, JointVector, Spatial, SpatialInertia, mat33, reader, vec3, vec4
+from .algebra import JointInverse, JointVector, Spatial, SpatialInertia, mat33, mat34, reader, vec3, vec4
 from .motion import BodyMotion, Instant, JobArrays, MotionArrays, ReadingArrays, instant, pose_at
-from .parameters import capacity, flows, hinges, real, recorded, rolls, yields
+from .parameters import capacity, flows, hinges, real, recorded, rolls, smooth, yields
 
 if recorded:
     from .recorder.records import StepRecords
@@ -85,6 +85,22 @@ class LinkTaper:
 
 
 @wp.struct
+class BeamErrors:
+    """What the joints before a place of a link lack of the rod (:func:`.packing.beam_errors`).
+
+    Places 0, 1/3, 2/3 and 1 along the link."""
+
+    moment_slope: vec4
+    """Slope (1/µN·m) under a moment."""
+    force_slope: vec4
+    """Slope (1/mN) under a force across, and deflection (mm/µN·m) under a moment."""
+    force_deflection: vec4
+    """Deflection (mm/mN) under a force across."""
+    trust: real
+    """How far beam theory is followed at the joint of the link (0 to 1); the errors contain it."""
+
+
+@wp.struct
 class FollicleConstants:
     """Springs and dampers of a follicle along and about its own axes; axes without stiffness are rigid."""
 
@@ -111,6 +127,8 @@ class ChainArrays:
     inertia: wp.array2d(dtype=LinkInertia)
     """[link, whisker]"""
     taper: wp.array2d(dtype=LinkTaper)
+    if smooth:
+        beam: wp.array2d(dtype=BeamErrors)
     """[link, whisker]"""
     if yields:
         follicle: wp.array(dtype=FollicleConstants)
@@ -450,6 +468,9 @@ class HeldContact:
     force: vec3
     if recorded:
         slot: wp.int32  # its candidate
+    if smooth:
+        steady: vec3
+        """Mean of the force over :data:`.limits.STEADY`."""
 
 
 @wp.struct
@@ -513,6 +534,16 @@ class PausedLink:
 
 
 @wp.struct
+class CentreLine:
+    """Centre line of the rod beside a straight link, at the places 0, 1/3, 2/3 and 1 along it; a cubic between them."""
+
+    offset: mat34
+    """How far it lies from the link."""
+    turn: mat34
+    """By what its tangent, times the length of the link, differs from the link."""
+
+
+@wp.struct
 class DistanceQuery:
     """A link whose distance is asked for."""
 
@@ -532,6 +563,8 @@ class Cone:
     b: vec3
     start_radius: real
     end_radius: real
+    if smooth:
+        line: CentreLine
 
 
 @wp.func
@@ -543,6 +576,34 @@ def cone(a: vec3, b: vec3, taper: LinkTaper) -> Cone:
     link.start_radius = taper.start_radius
     link.end_radius = taper.end_radius
     return link
+
+
+@wp.func
+def cubic_weights(place: real) -> vec4:
+    """Return the weights of values at 0, 1/3, 2/3 and 1 in the cubic through them."""
+    x = real(3.0) * place
+    rest = real(1.0) - place
+    ends = (real(1.0) - x) * (real(2.0) - x) * real(0.5)
+    middle = real(1.5) * x * rest
+    return vec4(ends * rest, middle * (real(2.0) - x), middle * (x - real(1.0)), ends * place)
+
+
+@wp.func
+def line_place(link: Cone, share: real) -> vec3:
+    """Return the point of a link's centre line at a place along it, 0 to 1."""
+    place = link.a + (link.b - link.a) * share
+    if wp.static(smooth):
+        place = place + link.line.offset * cubic_weights(share)
+    return place
+
+
+@wp.func
+def line_tangent(link: Cone, share: real) -> vec3:
+    """Return the direction of a link's centre line at a place along it, as long as the link."""
+    along = link.b - link.a
+    if wp.static(smooth):
+        along = along + link.line.turn * cubic_weights(share)
+    return along
 
 
 @wp.struct

@@ -291,7 +291,9 @@ def run(
                     state.closing_speed = zero
                     if near_count > 0:
                         step.margin = reach.margin
-                        count = find_candidates(scene, paused, job, chain, proximity, near, candidates, state, step)
+                        count = find_candidates(
+                            scene, problems, paused, job, chain, proximity, near, candidates, state, step
+                        )
                 if wp.static(sliced or recorded):
                     state.waiting_for = 0
                     state.time_left = zero
