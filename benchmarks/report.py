@@ -39,10 +39,12 @@ QUESTIONS = (
 )  # fmt: skip
 """Question of a reader, subjects and words of the titles that answer it; a section stands under the first that fits."""
 HEADLINES = (
-    ("whiskers below 10 % error with the setting measured for 90 % of them", "Settings chosen for an error",
-     r"\| 10% \|[^|]*\| ([^|]*) \|", ""),
-    ("median error at that setting", "Settings chosen for an error", r"\| 10% \|[^|]*\|[^|]*\| ([^|]*) \|", ""),
-    ("processor time of a simulated second of one whisker, there", "Settings chosen for an error",
+    ("true error of whiskers with an object on one side at `balanced`, median",
+     "Errors of whiskers and their estimates", r"\| balanced \| one-side \|[^|]*\| ([^|]*) \|", " %"),
+    ("whiskers between objects, slipping off or let go whose estimated error is no smaller than the true one",
+     "Errors of whiskers and their estimates",
+     r"\| balanced \| hard \|[^|]*\|[^|]*\|[^|]*\|[^|]*\| ([^|]*) \|", ""),
+    ("processor time of a simulated second of one whisker at `balanced`", "Settings chosen for an error",
      r"\| 10% \|[^|]*\|[^|]*\|[^|]*\| ([^|]*) \|", " s"),
     ("error of Young's modulus fitted to base forces with 1 % noise, median",
      "Fitted whiskers: truth, coverage and wrong models", r"\| young_modulus \| ([^|]*) \|", " %"),
