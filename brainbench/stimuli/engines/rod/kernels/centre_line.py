@@ -13,10 +13,11 @@ import warp as wp
 
 from brainbench.stimuli.engines.rod.limits import LARGE_BEND
 
-from .algebra import first_axis, vec3
+from .algebra import Spatial, first_axis, spatial, vec3
 from .articulated_body import ChainState, hinge_direction
 from .parameters import real
 from .state import (
+    BeamErrors,
     CentreLine,
     ChainArrays,
     Cone,
@@ -50,8 +51,7 @@ def linearity(bend: vec3) -> real:
 
 @wp.struct
 class LinkLoads:
-    """Moments of the joints around a link, from the one before its own on, as one contact on the link would make them;
-    and what contacts on other links do along it."""
+    """Moments of joints around a link, as one contact on it would make them, and what other contacts do along it."""
 
     before: vec3
     here: vec3
@@ -75,21 +75,24 @@ def steady_push(problems: ContactProblems, job: WhiskerJob, c: int, along: vec3)
 
 
 @wp.func
-def link_loads(
+def inner_error(beam: BeamErrors, place: real, push: vec3, ahead: real) -> Spatial:
+    """Return the slope and the deflection that joints miss of a force further in, ``ahead`` (mm, negative) of here."""
+    weights = cubic_weights(place)
+    slope = push * wp.dot(weights, beam.force_slope)
+    return spatial(slope, push * wp.dot(weights, beam.force_deflection) - slope * ahead)
+
+
+@wp.func
+def take_off_contacts(
     chains: ChainArrays,
     problems: ContactProblems,
     job: WhiskerJob,
-    chain: wp.ref[ChainState],
     contacts: int,
     i: int,
     along: vec3,
-) -> LinkLoads:
-    """Return what loads a link, of direction ``along``; ``contacts`` of the last step."""
-    loads = LinkLoads()
-    loads.before = joint_moment(chains, job, chain, i - 1)
-    loads.here = joint_moment(chains, job, chain, i)
-    loads.after = joint_moment(chains, job, chain, i + 1)
-    loads.beyond = joint_moment(chains, job, chain, i + 2)
+    loads: wp.ref[LinkLoads],
+):
+    """Take what contacts of the last step on other links do off the moments around a link of direction ``along``."""
     taper = chains.taper[i, job.whisker]
     span = taper.arc_length
     for c in range(contacts):
@@ -107,12 +110,10 @@ def link_loads(
         elif reach < real(0.0):
             loads.before = loads.before - push * wp.max(reach + span, real(0.0))
             inner = wp.max(i + int(wp.floor(reach / span)), 0)
-            weights = cubic_weights((reach + span * real(i - inner)) / span)
-            beam = chains.beam[inner, job.whisker]
-            slope = push * wp.dot(weights, beam.force_slope)
-            loads.inner_slope = loads.inner_slope + slope
-            loads.inner_offset = loads.inner_offset + push * wp.dot(weights, beam.force_deflection) - slope * reach
-    return loads
+            place = (reach + span * real(i - inner)) / span
+            error = inner_error(chains.beam[inner, job.whisker], place, push, reach)
+            loads.inner_slope = loads.inner_slope + error.w
+            loads.inner_offset = loads.inner_offset + error.v
 
 
 @wp.func
@@ -132,10 +133,14 @@ def bent_link(
     link = row(chain.node, i + 1) - at
     length = wp.length(link)
     along = link / length
-    loads = link_loads(chains, problems, job, chain, contacts, i, along)
+    loads = LinkLoads()
+    loads.before = joint_moment(chains, job, chain, i - 1)
+    loads.here = joint_moment(chains, job, chain, i)
+    loads.after = joint_moment(chains, job, chain, i + 1)
+    loads.beyond = joint_moment(chains, job, chain, i + 2)
     # Bends of the joints at both ends, and what of their turns is rest shape.
     beam = chains.beam[i, job.whisker]
-    bend = joint_moment(chains, job, chain, i) / chains.inertia[i, job.whisker].stiffness
+    bend = loads.here / chains.inertia[i, job.whisker].stiffness
     most = wp.length(bend)
     first = linearity(bend)
     last = real(1.0)
@@ -145,15 +150,16 @@ def bent_link(
         start = (along - base - bend * (beam.trust * first)) * real(2.0)
     else:
         start = along - wp.normalize(at - row(chain.node, i - 1)) - bend * (beam.trust * first)
-        bend = joint_moment(chains, job, chain, i - 1) / chains.inertia[i - 1, job.whisker].stiffness
+        bend = loads.before / chains.inertia[i - 1, job.whisker].stiffness
         most = most + wp.length(bend)
     end = start
     if i < job.links - 1:
-        bend = joint_moment(chains, job, chain, i + 1) / chains.inertia[i + 1, job.whisker].stiffness
+        bend = loads.after / chains.inertia[i + 1, job.whisker].stiffness
         last = linearity(bend)
         end = wp.normalize(row(chain.node, i + 2) - row(chain.node, i + 1)) - along
         end = end - bend * (chains.beam[i + 1, job.whisker].trust * last)
         most = most + wp.length(bend)
+    take_off_contacts(chains, problems, job, contacts, i, along, loads)
     taper = chains.taper[i, job.whisker]
     line = CentreLine()
     places = int(4)
@@ -185,15 +191,13 @@ def bent_link(
                         force = force + push
                         moment = moment + push * ahead
                     else:
-                        weights = cubic_weights(reach / taper.arc_length)
-                        slope = push * wp.dot(weights, beam.force_slope)
-                        inner_slope = inner_slope + slope
-                        inner_offset = inner_offset + push * wp.dot(weights, beam.force_deflection) - slope * ahead
+                        error = inner_error(beam, reach / taper.arc_length, push, ahead)
+                        inner_slope = inner_slope + error.w
+                        inner_offset = inner_offset + error.v
         moment = moment + loads.outer_moment - loads.outer_force * (length * place)
         force = force + loads.outer_force
         slope = moment * beam.moment_slope[k] + force * beam.force_slope[k] + inner_slope
-        offset = moment * beam.force_slope[k] + force * beam.force_deflection[k]
-        offset = offset + inner_offset
+        offset = moment * beam.force_slope[k] + force * beam.force_deflection[k] + inner_offset
         # Beams bend little: what they say of a soft tip that is folded over is no more than part of the bends around.
         held = wp.min(first * left + last * place, half * most / wp.max(wp.length(slope), real(1e-12)))
         slope = slope * held - start * (half * left * left) + end * (half * place * place)
