@@ -277,7 +277,7 @@ class TouchLog:
     position: NDArray[np.float64]
     """[T, J] measured (rad, m)."""
     target: NDArray[np.float64]
-    """[T, J] of the drives; the positions where the log has none."""
+    """[T, J] of the drives on the way to each frame; the positions where the log has none."""
     points: TactilePoints
     force: NDArray[np.float64]
     """[T, N] along inward normals, in ``unit``."""
@@ -306,9 +306,10 @@ class TouchLog:
             raise DataError(f"{self.name} needs joints and taxels; it has {counts}.")
         if (most := float(np.abs(self.force).max(initial=0.0))) > _STRONGEST:
             raise DataError(f"{self.name}: a taxel reads {most:g}, more than any hand feels ({_STRONGEST:g}).")
-        taxel, times = Counter(self.taxels).most_common(1)[0]
-        if times > 1:
-            raise DataError(f"{self.name}: the taxel {taxel} stands in it {times} times.")
+        for kind, names in {"taxel": self.taxels, "joint": self.joints}.items():
+            name, times = Counter(names).most_common(1)[0]
+            if times > 1:
+                raise DataError(f"{self.name}: the {kind} {name} stands in it {times} times.")
         far = float(np.abs(self.points.position).max())
         if not far <= _LARGEST:
             raise DataError(f"{self.name}: a taxel lies {far:g} m from its link; scale millimetres by 1e-3.")
@@ -367,7 +368,7 @@ def read_touch_log(path: str | os.PathLike[str], hand: Hand, layout: Layout, epi
             raise
         except (KeyError, IndexError, TypeError, AttributeError, ValueError) as error:
             raise DataError(f"{path.name}/meta is not as LeRobot writes it ({brief(repr(error))}).") from None
-    for name, positions in zip(log.joints, log.position.T, strict=True):
+    for name, positions in zip(log.joints, np.concatenate([log.position, log.target]).T, strict=True):
         joint = hand.model.joint(name)
         unit, wrong = ("rad", "degrees") if joint.type[0] == 3 else ("m", "millimetres")
         low, high = joint.range if hand.model.jnt_limited[joint.id] else (-np.pi, np.pi)
@@ -436,7 +437,9 @@ def _read_episode(folder: Path, hand: Hand, layout: Layout, episode: int) -> Tou
         raise DataError(f"{name}: observation.state has {position.shape[1:]} numbers and {len(joints)} joint names.")
     target, driven = position, _joint_names(features.get("action", {}).get("names"))
     if sorted(driven) == sorted(joints):
-        target = _stacked(frames, "action", name)[:, [driven.index(joint) for joint in joints]]
+        # An action is what follows its frame's state.
+        actions = _stacked(frames, "action", name)[:, [driven.index(joint) for joint in joints]]
+        target = np.concatenate([position[:1], actions[:-1]])
     unit, described = "N", folder / "meta" / "tactile.json"
     if described.is_file():
         places = read_json(described, "places of tactile points")
@@ -509,8 +512,7 @@ def replay(log: TouchLog, hand: str) -> Replay:
 
     What lay in the real hand is not known: touch of anything else differs from the ball's.
     """
-    steps = np.diff(log.time)
-    step = float(np.median(steps))
+    step = float(np.median(np.diff(log.time)))
     substeps = int(np.ceil(_RATE * step))
     body = SimulatedHand(hand, substeps / step)
     sensors = {}
@@ -525,13 +527,14 @@ def replay(log: TouchLog, hand: str) -> Replay:
     body.engine.set(qpos=start)
     target = body.position
     simulated, position = np.zeros(log.force.shape), np.zeros(log.position.shape)
-    for frame in range(len(log.time)):
+    # A gap in the log is waited for, and what is rounded away at a frame is made up for at the next.
+    reports = np.diff(np.round(substeps * (log.time - log.time[0]) / step).astype(int), prepend=0)
+    for frame, passed in enumerate(np.diff(log.time, prepend=log.time[0] - step)):
         target[columns] = log.target[frame]
         body.drive(target)
-        # A gap in the log is waited for.
-        for _ in range(round(substeps * (steps[frame - 1] / step if frame else 1.0))):
+        for _ in range(reports[frame]):
             body.step()
-        suite.update(body.engine.state, step)
+        suite.update(body.engine.state, passed)
         position[frame] = body.position[columns]
         for link, rows in rows_of.items():
             force = suite.read(link)[0, :, :3].numpy()

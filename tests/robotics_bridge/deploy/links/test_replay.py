@@ -28,6 +28,7 @@ from robotics_bridge.deploy.links.replay import (
     total_wrench,
     write_lerobot,
 )
+from robotics_bridge.deploy.links.simulated_hand import SimulatedHand
 from robotics_bridge.deploy.session import PressureCalibration
 from robotics_bridge.hands.observations import observe
 from robotics_bridge.policies.contract import PolicyContract
@@ -210,6 +211,36 @@ def test_what_the_simulated_hand_recorded_is_replayed_to_the_last_newton(recorde
     felt = max(rows, key=lambda row: row["simulated_peak"])
     assert felt["error"] == pytest.approx(np.sqrt(np.mean(recorded.simulated**2, axis=0)).max(), rel=0.5)
     assert felt["correlation"] == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("missing", [(), (5, 6, 7)])
+def test_an_action_moves_the_hand_after_the_state_of_its_frame(recorded, jaws, tmp_path, missing) -> None:
+    """A hand that is driven here, reported before each command as LeRobot does, goes the same way in the replay."""
+    log = recorded.log
+    body = SimulatedHand(str(jaws), 200.0)
+    steps, states = np.linspace(0.03, 0.0, FRAMES // 4).repeat(4), []
+    start = body.engine.data[0].qpos.copy()
+    start[[int(body.engine.model.joint(joint).qposadr[0]) for joint in log.joints]] = 0.03
+    body.engine.set(qpos=start)
+    for target in steps:
+        states.append(body.position)
+        body.drive(np.full(len(log.joints), target))
+        for _ in range(4):
+            body.step()
+    actions = steps[:, None].repeat(len(log.joints), axis=1)
+    folder = _episode(tmp_path / "v3", replace(log, position=np.array(states), target=actions))
+    if missing:
+        file = folder / "data" / "chunk-000" / "file-000.parquet"
+        pd.read_parquet(file).drop(index=[*missing]).to_parquet(file)
+    hand = hands.load(jaws)
+    result = replay(read_touch_log(folder, hand, hand.layout("low", "tips")), str(jaws))
+    assert np.ptp(result.position) > 0.01
+    assert result.tracking < 1e-6
+
+
+def test_a_joint_that_stands_in_a_log_twice_is_refused(recorded) -> None:
+    with pytest.raises(DataError, match="the joint l stands in it 2 times"):
+        replace(recorded.log, joints=("l", "l"))
 
 
 def test_episodes_of_both_layouts_and_tables_are_read_alike(recorded, jaws, tmp_path) -> None:
