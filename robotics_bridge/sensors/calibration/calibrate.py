@@ -42,6 +42,8 @@ SHORTEST = 10
 """Readings of the shortest episode that is used."""
 LARGEST = 1e12
 """Magnitude of times and readings beyond which a log is taken to be damaged."""
+SLOWEST = 0.2
+"""Longest time (s) between readings of a device; beyond it times look like milliseconds."""
 FARTHEST = 2.0
 """Distance (m) of the ball from its link above which numbers look like millimetres."""
 _PLACE = ("x", "y", "z")
@@ -77,8 +79,11 @@ class Log:
             raise UsageError(f"Readings are [T, N] with T = {len(self.time)}; received {self.readings.shape}.")
         if self.probes and len(self.probes) != self.readings.shape[1]:
             raise UsageError(f"{self.readings.shape[1]} probes have as many names; received {len(self.probes)}.")
-        if len(self.time) > 1 and not self.step > 0:
-            raise UsageError(f"Times of a log (s) rise; received steps of {self.step:g} s.")
+        if len(self.time) > 1 and not 0 < self.step <= SLOWEST:
+            raise UsageError(
+                f"Times of a log (s) rise by at most {SLOWEST:g} s; received steps of {self.step:g} s. Scale "
+                "milliseconds by 1e-3."
+            )
         if self.ball is not None and self.ball.shape[1:] != (3,):
             raise UsageError(f"ball is [T, 3] (m); received {self.ball.shape}.")
         if self.ball is not None and (far := float(np.abs(self.ball).max())) > FARTHEST:
