@@ -8,6 +8,7 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from brainbench.core.contracts import BY_TRIAL
 from brainbench.core.errors import DataError, UsageError, brief, check_number, listing, unknown_name
 from brainbench.core.files import to_plain
 from brainbench.core.identity import ScoreIdentity
@@ -123,7 +124,9 @@ def _identity_of(job: ScoringJob, brain: NeuralResponses, stimuli: Stimuli) -> S
     from brainbench.scoring.scores import metric_of
 
     model = resolve_model(job.model, seed=job.options.model_seed)
-    pairs = brain.pairs(model.labels or stimuli.labels, job.options.match)
+    labels = model.labels or stimuli.labels
+    pairs = brain.pairs(labels, job.options.match)
+    brain = brain.with_stimuli(labels) if job.options.match == BY_TRIAL else brain
     # Features with labels of their own were made of stimuli that nobody here knows.
     hashes = {} if model.labels else {"config_hash": stimuli.config_hash, "content_hash": stimuli.content_hash}
     options = replace(job.options, metric=metric_of(job.options))

@@ -119,6 +119,14 @@ class NeuralResponses:
         return (*map(str, self.dataset.attrs.get("doubts", ())), *notes)
 
     @property
+    def of_units(self) -> NDArray[np.bool_]:
+        """[trial] True in sessions with units; others are no part of a score."""
+        pairs = ("unit_subject", "unit_session"), ("subject", "session")
+        units, trials = (zip(*(self.dataset[name].values.astype(str) for name in pair), strict=True) for pair in pairs)
+        present = {*units}
+        return np.array([trial in present for trial in trials], dtype=bool)
+
+    @property
     def published(self) -> bool:
         """True for a published file of rates, whose zeros the published estimators count."""
         return self.dataset.attrs.get("layout") == PUBLISHED_LAYOUT
@@ -154,7 +162,8 @@ class NeuralResponses:
         Labels that are joined by trial are those of their trials.
         """
         if match == BY_TRIAL:
-            names = self.dataset["stimulus"].values.astype(str)[self.stimulus_rows(stimuli) >= 0]
+            brain = self.with_stimuli(stimuli)
+            names = brain.dataset["stimulus"].values.astype(str)[brain.of_units]
             return {label: label for label in self.vocabulary if label in names}
         if self.label_doubt and match is None:
             if len(stimuli) != len(self.vocabulary):
@@ -165,6 +174,10 @@ class NeuralResponses:
                 )
             match = dict(zip(self.vocabulary, stimuli, strict=True))
         return join_labels(self.vocabulary, stimuli, match)
+
+    def with_stimuli(self, stimuli: tuple[str, ...]) -> NeuralResponses:
+        """Return the part of the trials that have a stimulus of their own."""
+        return replace(self, dataset=self.dataset.isel(trial=self.stimulus_rows(stimuli) >= 0))
 
     def stimulus_rows(self, labels: tuple[str, ...], *, step: int = 0) -> NDArray[np.int64]:
         """Return the row of each trial's own stimulus [trial]; −1 where it has none.

@@ -102,10 +102,9 @@ def joined(
         trials = ledger["trials"]
         entry = {"reason": WITHOUT, "number": lost, "lost": True}
         ledger["trials"] = {**trials, "read": trials["read"] - lost, "left_out": [*trials["left_out"], entry]}
-    # Trials of a session without units are no part of a score.
-    units = {*zip(*(data[name].values.astype(str).tolist() for name in ("unit_subject", "unit_session")), strict=True)}
-    used = keep & [pair in units for pair in zip(animals.tolist(), sessions.tolist(), strict=True)]
-    labels = tuple(label for label in brain.vocabulary if label in kinds[used])
+    used = keep & brain.of_units
+    pairs = brain.pairs(network.labels, BY_TRIAL)
+    labels = tuple(pairs)
     members = [rows[used & (kinds == label)].tolist() for label in labels]
     inputs = network.activations.values() if network.model_input is None else [network.model_input]
     of_trials = (reduce_time(values, network.time)[rows[used]] for values in inputs)
@@ -124,4 +123,4 @@ def joined(
         kinematics={name: mean_rows(values, members) for name, values in network.kinematics.items()},
     )
     chosen = replace(brain, dataset=data.isel(trial=keep).assign_attrs(stated))
-    return chosen, means, dict(zip(labels, labels, strict=True))
+    return chosen, means, pairs

@@ -153,6 +153,18 @@ def test_what_does_not_join_is_said(study, tmp_path):
     assert differences(record, again) == []
 
 
+@pytest.mark.parametrize("lost", [0, 3])
+def test_a_score_by_trial_is_not_computed_again(felt, run, tmp_path, lost):
+    folder, values = felt
+    names = ["_".join(map(str, trial)) for trial in values]
+    path = write_features(tmp_path / "own.h5", names[lost:], {"layer": np.stack([*values.values()])[lost:]})
+    options = f'recordings = "{folder}"\nconditions = "trials:stimulus"\nmatch = "trial"\n'
+    (tmp_path / "batch.toml").write_text(f'[options]\n{options}[[entries]]\nmodels = ["{path}"]\n')
+    add = ("leaderboard", "add", "--batch", str(tmp_path / "batch.toml"), "--to", str(tmp_path / "board"), "--json")
+    states = [entry["state"] for _ in range(2) for entry in json.loads(run(*add).out)["results"]]
+    assert states == ["scored", "known"]
+
+
 def test_a_label_without_any_trial_is_dropped(study, tmp_path):
     data = open_recordings(study[0] / "recordings", conditions="trials:stimulus")
     names = zip(data["subject"].values, data["trial_id"].values, data["stimulus"].values, strict=True)
