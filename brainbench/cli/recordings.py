@@ -177,12 +177,11 @@ def _of_rdms(metric: str) -> RSA:
 
 
 def _stored(source: str) -> StoredRDMs | None:
-    """Return the RDMs that a file of rsatoolbox holds; None of whatever is no such file."""
-    import h5py
-
+    """Return the RDMs that a file of rsatoolbox (.h5, .hdf5) holds; None of whatever is no such file."""
     from brainbench.datasets.rdm_files import read_rdms
 
-    return read_rdms(source) if Path(source).is_file() and h5py.is_hdf5(source) else None
+    path = Path(source)
+    return read_rdms(path) if path.suffix.lower() in (".h5", ".hdf5") and path.is_file() else None
 
 
 def _described(stored: StoredRDMs) -> str:

@@ -129,5 +129,11 @@ def test_a_number_that_is_none_is_refused(run, command, option, value):
     assert f"takes a finite number; received {float(value)}" in " ".join(outcome.err.split())
 
 
+def test_a_tolerance_below_nothing_is_refused(run):
+    outcome = run("leaderboard", "verify", *WORDS["leaderboard verify"], "--tolerance", "-1")
+    assert outcome.status == 2
+    assert "tolerance" in outcome.err
+
+
 def test_every_command_is_guarded():
     assert all(getattr(command, "guarded", False) for _, command in commands(app))

@@ -21,6 +21,7 @@ from brainbench.cli.options import SCORE, SCORE_FLAGS, option_fields, out_folder
 from brainbench.cli.output import Output, progress_bar, table_of, tracked
 from brainbench.core.errors import BrainbenchError, DataError, UsageError, brief, check_number, look_alike, visible
 from brainbench.core.files import content_hash, private_folder, write_json
+from brainbench.core.limits import NotNegative, limited
 from brainbench.core.reading.regular import temporary_folder
 
 if TYPE_CHECKING:
@@ -130,6 +131,7 @@ def _two_digits(score: Score) -> dict[str, Any]:
 
 
 @dataclass(frozen=True)
+@limited
 class Repetition:
     """How records are scored again."""
 
@@ -141,7 +143,7 @@ class Repetition:
     """Benchmark (.zip, .toml or name) that the records are of, in place of recordings and stimuli."""
     score: bool = True
     """Score the model again and compare; else only read the files."""
-    tolerance: float = 1e-3
+    tolerance: NotNegative = 1e-3
     """Numbers that differ by no more are equal, distances by no more than this share of the largest."""
     trust_code: bool = False
     """Also run code and weights that do not come with this package."""
