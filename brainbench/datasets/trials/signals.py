@@ -119,9 +119,10 @@ class Samples:
         return keep
 
     def covered(self, edges: Floats, ledger: Ledger) -> NDArray[np.bool_]:
-        """Return which windows [rows, 2] (s) lie between the first and the last frame: [rows, U]."""
-        begin, end = (edges if self.starts is None else edges - self.starts[:, None]).T
-        inside = (begin >= self.times[0] - self.step) & (end <= self.times[-1] + self.step)
+        """Return which windows [rows, 2] (s) lie between the first and the last frame, and in no gap: [rows, U]."""
+        spans = edges if self.starts is None else edges - self.starts[:, None]
+        inside = (spans[:, 0] >= self.times[0] - self.step) & (spans[:, 1] <= self.times[-1] + self.step)
+        inside &= time_lost(self.times, spans) <= LOST * np.diff(spans, axis=1)[:, 0]
         return np.repeat((inside | math.isnan(self.step))[:, None], len(self.units), axis=1)
 
     def respond(self, rows: NDArray[np.int64], units: NDArray[np.int64], bounds: Floats) -> NDArray[np.float32]:
@@ -188,6 +189,26 @@ class Samples:
         imaged = self.band is None and self.series.unit != "spikes"
         if doubt := fading(rates, BLEACHING if imaged else "as where electrodes or arousal change"):
             to.doubts.append(f"{self.name}: {doubt}")
+
+
+LOST = 0.1
+"""Share of a window without frames up to which its mean stands for all of it."""
+
+
+def time_lost(times: Floats, spans: Floats) -> Floats:
+    """Return the time (s) without frames in each span [n, 2], from the times [F] of frames.
+
+    A frame stands for the time to the next, but for no more than most frames do (the 90th percentile): the rest of an
+    interval that is half as long again is lost.
+    """
+    steps = np.diff(times)
+    most = float(np.quantile(steps, 0.9)) if len(steps) else 0.0
+    gaps = np.flatnonzero(steps > 1.5 * most)
+    if not len(gaps):
+        return np.zeros(len(spans))
+    ends = np.stack([times[gaps] + most, times[gaps + 1]], axis=1).ravel()
+    lost = np.repeat([0.0, *np.cumsum(steps[gaps] - most)], 2)[1:-1]
+    return np.diff(np.interp(spans, ends, lost), axis=1)[:, 0]
 
 
 BLEACHING = "as where an indicator bleaches; take ΔF/F of a running baseline"

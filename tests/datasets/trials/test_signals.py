@@ -5,7 +5,7 @@ import pytest
 from brainbench.core.errors import DataError, UsageError
 from brainbench.datasets import check, inspect, open_recordings, write_recordings
 from brainbench.datasets.sessions import make_session
-from brainbench.datasets.trials.signals import fading
+from brainbench.datasets.trials.signals import fading, time_lost
 from tests.factories.recording_files import write_nwb
 from tests.factories.recordings import make_simple_session
 
@@ -50,6 +50,34 @@ def test_bins_timestamps_and_chosen_cells(tmp_path):
     _, values = means(path, window="start..+0.4", bin=0.2, select="units.id=1")
     assert values.shape == (6, 2, 1)
     np.testing.assert_allclose(values[2, :, 0], [data[20:22, 1].mean(), data[22:24, 1].mean()], rtol=1e-5)
+
+
+@pytest.mark.parametrize("rates", [(20, 20), (20, 60)])
+def test_windows_without_a_tenth_of_their_frames_are_left_out(tmp_path, rates):
+    """Trials of .5 s each second; frames are missing from 2.06 to 4.02 s, and one of ten in the first trial."""
+    stamps = np.concatenate([np.arange(0, 3, 1 / rates[0]), 3 + np.arange(0, 4, 1 / rates[1])])
+    stamps = stamps[(np.abs(stamps - 0.25) > 1e-9) & ~((stamps > 2.06) & (stamps < 4.02))]
+    data = np.random.default_rng(0).normal(size=(len(stamps), 3))
+    opened, values = means(imaged(tmp_path / "a.nwb", data, stamps=stamps))
+    assert opened["trial_id"].values.tolist() == ["0", "2", "8", "10"]
+    trials = opened.attrs["ledger"]["trials"]
+    assert {"reason": "outside the recorded span", "number": 2, "lost": False} in trials["left_out"]
+    np.testing.assert_allclose(values[0, 0], data[stamps < 0.5].mean(axis=0), rtol=1e-5)
+
+
+def test_the_time_that_frames_do_not_cover_is_that_of_a_fine_grid():
+    random = np.random.default_rng(1)
+    for _ in range(50):
+        steps = np.where(random.random(200) < 0.03, random.uniform(1, 9, 200), random.uniform(0.9, 1.1, 200))
+        times, most = np.cumsum(steps), np.quantile(steps[1:], 0.9)
+        begin, end = np.sort(random.uniform(times[0], times[-1], 2))
+        grid = np.linspace(begin, end, 20001)
+        place = np.searchsorted(times, grid, side="right") - 1
+        gap = np.append(steps[1:], 0)[place] > 1.5 * most
+        share = np.mean(gap & (grid - times[place] > most))
+        assert time_lost(times, np.array([[begin, end]]))[0] == pytest.approx(
+            (end - begin) * share, abs=1e-3 * (end - begin)
+        )
 
 
 def test_frames_that_are_nan_are_left_out(tmp_path):
