@@ -32,6 +32,9 @@ SHARED = 0.9
 """Share of the variance between labels that animals have in common below which their mean stands for none of them: at
 .9 a perfect model loses 2 to 7 % of its score, at .8 up to 14 % (8 to 40 labels, 2 to 10 animals)."""
 
+LEVEL = 0.01
+"""Level at which labels differ within animals."""
+
 
 def mean_rows(values: NDArray[np.floating], members: list[list[int]]) -> NDArray[np.floating]:
     """Return the mean [K, …] of the rows of values [S, …] that belong together."""
@@ -40,12 +43,15 @@ def mean_rows(values: NDArray[np.floating], members: list[list[int]]) -> NDArray
 
 
 def shared_variance(values: NDArray[np.floating], animals: Sequence[str], labels: Sequence[str]) -> float:
-    """Return the share of the variance between labels in values [S, F] that animals have in common; NaN if unknown.
+    """Return the share of the variance between labels in values [S, F] that animals have in common.
 
     Sums of squares of the mean of each label in each animal, with labels that all animals have, estimate the variance
     of labels and that of labels within animals (analysis of variance of two factors, trials being the error). What is
-    an animal's under all labels changes no distance.
+    an animal's under all labels changes no distance. 1 where labels differ within animals no more than trials make them
+    (F test), NaN where that is unknown.
     """
+    from scipy.stats import f
+
     cells: dict[tuple[str, str], list[int]] = {}
     for row in np.flatnonzero(np.isfinite(values).all(axis=1)).tolist():
         cells.setdefault((animals[row], labels[row]), []).append(row)
@@ -63,7 +69,8 @@ def shared_variance(values: NDArray[np.floating], animals: Sequence[str], labels
     between = float((common**2).sum()) / (len(kinds) - 1) * len(names)
     within = float(((means - common) ** 2).sum()) / ((len(kinds) - 1) * (len(names) - 1))
     single, every = max(within - error, 0.0), max((between - within) / len(names), 0.0)
-    return every / (every + single) if every + single > 0 else math.nan
+    differ = f.sf(within / error, (len(kinds) - 1) * (len(names) - 1), free) < LEVEL if error > 0 else within > 0
+    return every / (every + single) if differ else 1.0
 
 
 def joined(
@@ -106,12 +113,13 @@ def joined(
     pairs = brain.pairs(network.labels, BY_TRIAL)
     labels = tuple(pairs)
     members = [rows[used & (kinds == label)].tolist() for label in labels]
-    inputs = network.activations.values() if network.model_input is None else [network.model_input]
+    inputs = [values for values in (network.model_input, *network.activations.values()) if values is not None]
     of_trials = (reduce_time(values, network.time)[rows[used]] for values in inputs)
     shares = (shared_variance(values, animals[used].tolist(), kinds[used].tolist()) for values in of_trials)
-    if not any(wrong) and (largest := max(filter(math.isfinite, shares), default=1.0)) < SHARED:
+    # A layer whose mean stands for no animal would leave the score to others, which may know less.
+    if not any(wrong) and (smallest := min(filter(math.isfinite, shares), default=1.0)) < SHARED:
         wrong.append(
-            f"animals met other stimuli under one label: {largest:.0%} of the variance between labels is common to"
+            f"animals met other stimuli under one label: {smallest:.0%} of the variance between labels is common to"
             " them; score each by itself (--select subjects=NAME)"
         )
     stated = {"doubts": doubts, "label_doubt": "; ".join(filter(None, wrong))} | ({"ledger": ledger} if ledger else {})

@@ -292,6 +292,18 @@ def test_animals_that_met_other_stimuli_under_one_label_are_scored_apart(tmp_pat
     together = score_features(tmp_path / "recordings", names, [*values.values()])
     assert together.status == "unreliable"
     assert "animals met other stimuli under one label: 0% of the variance" in together.reasons[0]
+    # A layer that animals have in common takes no doubt from the others.
+    data = open_recordings(tmp_path / "recordings", conditions="trials:stimulus")
+    ids = zip(*(data[name].values.tolist() for name in ("subject", "session", "trial_id")), strict=True)
+    kinds = dict(zip(map("_".join, ids), data["stimulus"].values.tolist(), strict=True))
+    noise = np.random.default_rng(0).normal(size=(len(names), 8))
+    common = np.array([np.eye(8)[int(kinds[name][1:])] for name in names]) + 1e-3 * noise
+    for layer in (common, noise):
+        path = write_features(tmp_path / "two.h5", names, {"own": np.stack([*values.values()]), "other": layer})
+        how = {"recordings": data, "match": "trial", "baselines": False}
+        assert score_record(str(path), **how).score.status == "unreliable"
+    path = write_features(tmp_path / "two.h5", names, {"common": common, "noise": noise})
+    assert "animals met" not in " ".join(score_record(str(path), **how).score.reasons)
     alone = score_features(tmp_path / "recordings", names, [*values.values()], select="subjects=m1")
     assert alone.status == "ok"
     assert alone.value > together.value + 0.05
