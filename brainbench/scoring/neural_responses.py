@@ -110,11 +110,8 @@ class NeuralResponses:
     @cached_property
     def doubts(self) -> tuple[str, ...]:
         """Notes on the recordings that every result must state."""
-        trials, units = (
-            dict.fromkeys(zip(*(self.dataset[name].values.astype(str).tolist() for name in pair), strict=True))
-            for pair in (("session", "subject"), ("unit_session", "unit_subject"))
-        )
-        lost = [f"session {session} of {subject}" for session, subject in trials if (session, subject) not in units]
+        sides = (self.dataset[name].values[~self.of_units].tolist() for name in ("session", "subject"))
+        lost = [f"session {session} of {subject}" for session, subject in dict.fromkeys(zip(*sides, strict=True))]
         notes = [f"{', '.join(lost)}: no unit is left, so the trials are left out"] if lost else []
         return (*map(str, self.dataset.attrs.get("doubts", ())), *notes)
 

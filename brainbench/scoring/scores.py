@@ -56,6 +56,8 @@ class ScoreInputs:
     animals: tuple[Any, ...]
     """What the metric made of each animal."""
     options: ScoreOptions
+    doubts: tuple[str, ...] = ()
+    """Reasons why no score of these recordings is to be trusted, whatever its units or times."""
 
     @cached_property
     def features(self) -> Mapping[str, Any]:
@@ -142,7 +144,8 @@ def score_record(
     inputs = ScoreInputs(brain, network, metric, labels, rows, animals, options)
     stage_done()
 
-    scores, between = _compare(inputs, baselines=baselines, progress=progress)
+    scores, between, doubts = _compare(inputs, baselines=baselines, progress=progress)
+    inputs = replace(inputs, doubts=doubts)
     stage_done()
     by_trial = {"match": BY_TRIAL} if options.match == BY_TRIAL else {}
     settings = {"estimator_version": ESTIMATOR_VERSION, "model": model if isinstance(model, str) else None, **by_trial}
@@ -237,8 +240,10 @@ def _check_inputs(resolved: ResolvedModel, brain: NeuralResponses, options: Scor
         ) from error
 
 
-def _compare(inputs: ScoreInputs, *, baselines: bool, progress: Progress | None) -> tuple[list[Score], Score | None]:
-    """Score the features of the model (the first) and, if asked, of baselines and the animals against one another.
+def _compare(
+    inputs: ScoreInputs, *, baselines: bool, progress: Progress | None
+) -> tuple[list[Score], Score | None, tuple[str, ...]]:
+    """Score the features of the model (the first) and, if asked, of baselines and the animals; also return doubts.
 
     The published estimators take a published file as its authors' code does: zeros kept, the maximum over all layers.
     """
@@ -263,15 +268,16 @@ def _compare(inputs: ScoreInputs, *, baselines: bool, progress: Progress | None)
     presentation = presentation_of(inputs.metric, inputs.animals, inputs.labels, control=baselines, seed=options.seed)
     spikes = "many trials share spikes with another one of their stimulus, which makes noise look reliable"
     recorded = brain.label_doubt, spikes if brain.dependent else ""
-    scores = [_doubted(score, *presentation.doubts, *recorded) for score in scores]
+    wrong = *presentation.doubts, *filter(None, recorded)
+    scores = [doubted(score, *wrong) for score in scores]
     stated = scores[0].provenance
     effective, remarks = influence_of(scores[0], inputs.metric, inputs.animals)
     statistics = {**stated.statistics, **presentation.statistics, **effective}
     scores[0] = held_parts(replace(scores[0], provenance=replace(stated, statistics=statistics)))
-    between = between and _doubted(between, *presentation.doubts, *recorded)
+    between = between and doubted(between, *wrong)
     if baselines and presentation.control is not None:
         # That the times alone explain something is no doubt about the times.
-        scores.append(_doubted(presentation.control, *recorded))
+        scores.append(doubted(presentation.control, *recorded))
     doubts = (*network.doubts, *brain.doubts)
     unfelt = [label for row, label in enumerate(network.labels) if row not in inputs.rows]
     if unfelt and options.match is None:
@@ -279,7 +285,7 @@ def _compare(inputs: ScoreInputs, *, baselines: bool, progress: Progress | None)
         doubts += (f"{len(unfelt)} of {len(network.labels)} stimuli have no recordings and are left out: {names}",)
     scores = [replace(score, reasons=(*score.reasons, *doubts)) for score in scores]
     scores[0] = replace(scores[0], reasons=(*scores[0].reasons, *remarks, *presentation.remarks))
-    return scores, between and replace(between, reasons=(*between.reasons, *doubts))
+    return scores, between and replace(between, reasons=(*between.reasons, *doubts)), wrong
 
 
 def _optional(name: str) -> Any:
@@ -287,7 +293,7 @@ def _optional(name: str) -> Any:
     return require_optional(PARTS, name, "part of a score")
 
 
-def _doubted(score: Score, *doubts: str) -> Score:
+def doubted(score: Score, *doubts: str) -> Score:
     """Return a score that is never ``ok`` with a doubt, empty ones aside; why it has no value at all goes first."""
     reasons = tuple(filter(None, doubts))
     if not reasons:

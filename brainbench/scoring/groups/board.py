@@ -12,7 +12,7 @@ import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from brainbench.core.errors import listing
 from brainbench.core.files import to_plain
@@ -20,9 +20,7 @@ from brainbench.core.progress import Progress, track
 from brainbench.core.records import Interval, Score
 from brainbench.core.statistics import PairTest, compare_scores
 from brainbench.metrics.inference.multiple import adjust
-
-if TYPE_CHECKING:
-    from brainbench.scoring.scores import ScoreInputs
+from brainbench.scoring.scores import ScoreInputs, doubted
 
 LEVEL = 0.05  # largest corrected p of a group that is named, against chance and against each other group
 
@@ -67,15 +65,16 @@ def score_groups(
     *,
     by: str,
     stimuli: Sequence[str],
+    doubts: Sequence[str] = (),
     **options: Any,
 ) -> GroupBoard:
     """Score the layers of a model against each group of units, and rank the groups.
 
     ``features`` are [K, F] by layer, ``animals`` what :meth:`Metric.animal` made of each group's units, by group;
-    options are those of :meth:`Metric.score`.
+    options are those of :meth:`Metric.score`. With ``doubts`` of the recordings no group can be judged.
     """
     scores = {
-        name: metric.score(features, members, name=name, stimuli=stimuli, **options)
+        name: doubted(metric.score(features, members, name=name, stimuli=stimuli, **options), *doubts)
         for name, members in animals.items()
     }
     order = sorted(scores, key=lambda name: -scores[name].scaled if math.isfinite(scores[name].scaled) else math.inf)
@@ -132,7 +131,9 @@ def add_groups(inputs: ScoreInputs, *, progress: Progress | None = None) -> dict
     animals = {}
     for name in track(list(parts), "groups of units", progress):
         animals[name] = parts[name].animals(inputs.labels, inputs.metric, options)
-    how = {"estimator": options.estimator, "seed": options.seed, "layer": inputs.network.card.layer}
+    how: dict[str, Any] = {"estimator": options.estimator, "seed": options.seed, "layer": inputs.network.card.layer}
     by = str(options.by).partition("=")[0]
-    board = score_groups(inputs.metric, inputs.features, animals, by=by, stimuli=inputs.labels, **how)
+    board = score_groups(
+        inputs.metric, inputs.features, animals, by=by, stimuli=inputs.labels, doubts=inputs.doubts, **how
+    )
     return {"groups": to_plain(board)}

@@ -543,4 +543,5 @@ def time_course(inputs: ScoreInputs, *, progress: Progress | None = None) -> Tim
     for name, values in network.activations.items():
         layers[name] = layer_movie(values[inputs.rows], seconds / values.shape[1], width, method=metric.model_method)
         stage_done()
-    return score_over_time(layers, animals, width=width, comparison=metric.comparison, seed=options.seed)
+    course = score_over_time(layers, animals, width=width, comparison=metric.comparison, seed=options.seed)
+    return replace(course, reasons=(*inputs.doubts, *course.reasons))

@@ -109,6 +109,19 @@ def test_a_record_holds_the_groups_and_text_and_report_show_them(recordings, tmp
     assert without.score.value == record.score.value
 
 
+def test_no_group_can_be_judged_where_the_recordings_are_in_doubt(recordings):
+    data, model = recordings
+    data = data.assign_attrs(label_doubt="labels were guessed")
+    record = score_record(
+        model, recordings=data, by="area", baselines=False, metric=Quick(), match={name: name for name in LABELS[:12]}
+    )
+    board = record.score.provenance.statistics["groups"]
+    assert board["best"] == ""
+    assert {(group["status"], group["reasons"][0]) for group in board["groups"]} == {
+        ("unreliable", "labels were guessed")
+    }
+
+
 @pytest.mark.parametrize(
     ("by", "words"),
     [
