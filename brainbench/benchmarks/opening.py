@@ -240,11 +240,7 @@ def list_benchmarks() -> dict[str, Path]:
 
 
 def open_benchmark(source: str | os.PathLike[str]) -> tuple[Benchmark, Path]:
-    """Return a benchmark, by its file or its name, and the folder of its files, all of which are as it states.
-
-    Raises:
-        DataFileNotFoundError: it, or one of its files, is not there.
-    """
+    """Return a benchmark, by its file or its name, and the folder of its files, all of which are as it states."""
     path = Path(source)
     if path.suffix.lower() not in ENDINGS:
         names = list_benchmarks()

@@ -62,10 +62,6 @@ class Decomposition:
 
 
 def decompose(mesh: Mesh, settings: DecompositionSettings | None = None) -> Decomposition:
-    """Cut a mesh into convex pieces; holes of the surface are closed by CoACD's remeshing.
-
-    Raises:
-        MissingDependencyError: the folder that cuts them was taken off.
-    """
+    """Cut a mesh into convex pieces; holes of the surface are closed by CoACD's remeshing."""
     cut = require_optional("brainbench.geometry", "decomposition", "collision")
     return cut(mesh, settings or DecompositionSettings())

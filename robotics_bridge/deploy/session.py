@@ -186,11 +186,7 @@ class DeployedPolicy:
 
 
 def read_deployed(path: str | Path) -> DeployedPolicy:
-    """Read an exported policy's contract, which lies beside the file as ``FILE.json``.
-
-    Raises:
-        DataFileNotFoundError: the file or its contract is missing.
-    """
+    """Read an exported policy's contract, which lies beside the file as ``FILE.json``."""
     path = Path(path)
     contract = path.with_name(f"{path.name}.json")
     for file in (path, contract):

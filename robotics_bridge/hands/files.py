@@ -141,9 +141,6 @@ def read_mjspec(path: Path) -> Any:
     Meshes for display only are dropped (their files are often absent), degenerate and unbalanced inertias are
     corrected, mesh paths given from the file's own folder are found too, bodies and joints without a name are numbered,
     a hand that floats is fixed, and the file's defaults hold for its own elements alone.
-
-    Raises:
-        DataFileNotFoundError: the file is missing.
     """
     mujoco = mujoco_module()
     folder, root = path.parent, checked_xml(path)

@@ -130,11 +130,7 @@ def check_key(key: bytes) -> None:
 
 
 def read_key(path: str | os.PathLike[str]) -> bytes:
-    """Read a key from a file of 64 hexadecimal digits that nobody but its owner can read.
-
-    Raises:
-        DataFileNotFoundError: there is no such file.
-    """
+    """Read a key from a file of 64 hexadecimal digits that nobody but its owner can read."""
     path = Path(path)
     hint = f"Make one with: (umask 077; openssl rand -hex {KEY} > hand.key), and copy it to the hand's computer."
     if not path.is_file():

@@ -288,11 +288,7 @@ class StudentSweep:
 
 
 def read_sweep(path: str | Path = PUBLISHED) -> StudentSweep:
-    """Read a sweep: a file, or one that ships, by its name without ending.
-
-    Raises:
-        DataFileNotFoundError: there is no such file.
-    """
+    """Read a sweep: a file, or one that ships, by its name without ending."""
     shipped = PUBLISHED.parent / f"{path}.toml"
     path = shipped if not Path(path).exists() and shipped.is_file() else path
     document = read_toml(

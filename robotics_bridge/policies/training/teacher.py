@@ -391,11 +391,7 @@ def _save(trainer: Trainer, run: Path) -> None:
 
 
 def newest(run: Path) -> Path:
-    """Return the last ``model_<iteration>.safetensors`` of a run.
-
-    Raises:
-        DataFileNotFoundError: the folder holds no model.
-    """
+    """Return the last ``model_<iteration>.safetensors`` of a run."""
     numbers = [path.stem.removeprefix("model_") for path in run.glob("model_*.safetensors")]
     if not (iterations := [int(number) for number in numbers if number.isdecimal()]):
         raise DataFileNotFoundError(f"{str(run)!r} holds no trained policy (model_<iteration>.safetensors).")

@@ -98,9 +98,6 @@ class Log:
 def read_log(path: str | os.PathLike[str]) -> Log:
     """Read a CSV file with a header: ``time`` (s), optionally ``reference``, ``episode``, ``x``, ``y`` and ``z`` (the
     centre of a ball, m), else probes.
-
-    Raises:
-        DataFileNotFoundError: the file is missing.
     """
     name = Path(path).name
     header, table = read_columns(path, "log")
