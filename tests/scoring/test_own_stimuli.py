@@ -165,6 +165,21 @@ def test_a_score_by_trial_is_not_computed_again(felt, run, tmp_path, lost):
     assert states == ["scored", "known"]
 
 
+def test_a_score_by_trial_is_computed_on_held_out_stimuli_too(felt, run, tmp_path):
+    folder, values = felt
+    path = write_features(tmp_path / "own.h5", ["_".join(map(str, trial)) for trial in values],
+                          {"layer": np.stack([*values.values()])})  # fmt: skip
+    board, secret = str(tmp_path / "board"), ("--secret", str(tmp_path / "secret"))
+    hold = ("leaderboard", "hold-out", str(folder), "--stimuli", "4", "--conditions", "trials:stimulus")
+    assert run(*hold, "--out", board, *secret).status == 0
+    score = ("score", str(path), "--recordings", f"{board}/public.h5", "--match", "trial", "--out", str(tmp_path))
+    assert run(*score).status == 0
+    (record,) = tmp_path.glob("own--*.json")
+    verify = ("leaderboard", "verify", str(record), "--held-out", f"{board}/held-out.json", "--no-score", *secret)
+    result = run(*verify, "--trust-code", "--json")
+    assert json.loads(result.out)[0]["on_held_out"]["score"] > 0.5
+
+
 def test_a_label_without_any_trial_is_dropped(study, tmp_path):
     data = open_recordings(study[0] / "recordings", conditions="trials:stimulus")
     names = zip(data["subject"].values, data["trial_id"].values, data["stimulus"].values, strict=True)

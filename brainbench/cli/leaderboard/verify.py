@@ -109,8 +109,8 @@ def score_held_out(record: ResultRecord, commitment: Commitment, secret: Path) -
 
     held = open_recordings(commitment.open(secret))
     pairs = record.score.provenance.pairs
-    match = {label: pairs.get(label, label) for label in held.attrs["vocabulary"]}
     settings = {**record.score.provenance.settings, "conditions": None, "select": None, "window": None, "bin": None}
+    match = settings.get("match") or {label: pairs.get(label, label) for label in held.attrs["vocabulary"]}
     options = ScoreOptions.stated_in(settings, recordings=held, match=match)
     held_score = score_record(str(settings["model"]), options).score
     return {
