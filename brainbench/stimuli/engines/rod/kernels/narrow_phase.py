@@ -531,7 +531,9 @@ def mesh_distance(shapes: ShapeArrays, s: int, link: Cone, within: real, got: Ne
 def mesh_overlap(shapes: ShapeArrays, s: int, link: Cone, leaf: int, part: int, live: int) -> vec2:
     """Return the deepest overlap of a link with a surface, and that of its start; measured at places along it."""
     overlap = vec2(real(-1e20), real(0.0))
-    for k in range(wp.static(PARTS + 1)):
+    # A count that the compiler does not know, or it would write out a search for each place.
+    places = wp.static(PARTS + 1) + wp.min(0, part)
+    for k in range(places):
         share = real(k) / real(wp.static(PARTS))
         x = link.a + (link.b - link.a) * share
         got = nearest_triangles(shapes, s, x, x, real(wp.static(ANYWHERE)), real(0.0), leaf, part, live)
