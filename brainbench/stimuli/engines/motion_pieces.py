@@ -95,14 +95,17 @@ def carried_pose(motion: RigidMotion | None, anchor: NDArray[np.float64]) -> Pos
 
     def pose(times: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         place, quaternions = _poses(motion(times), times, 4, "an object")
+        # Most bodies never turn.
+        quaternions = quaternions[: 1 if (quaternions == quaternions[:1]).all() else None]
         zero = ~quaternions.any(axis=1)
         if zero.any():
+            first = times[: len(quaternions)][zero].min()
             raise UsageError(
-                f"The motion of an object gives a quaternion of zero length at {times[zero].min():.6g} s; give unit "
+                f"The motion of an object gives a quaternion of zero length at {first:.6g} s; give unit "
                 "quaternions (w, x, y, z), (1, 0, 0, 0) for no rotation."
             )
         turn = to_matrices(quaternions)
-        return place + turn @ anchor, turn
+        return place + turn @ anchor, np.broadcast_to(turn, (len(times), 3, 3))
 
     return pose
 
@@ -133,7 +136,12 @@ class Cutting:
 
         def path(times: NDArray[np.float64]) -> NDArray[np.float64]:
             place, turn = pose(times)
-            return np.concatenate([place, turn.reshape(-1, 9) * size], axis=1) * MILLI
+            values = np.empty((len(times), 12))
+            values[:, :3] = place * MILLI
+            # The first alone where all share its memory.
+            turn = turn[: None if turn.strides[0] else 1]
+            values[:, 3:] = turn.reshape(-1, 9) * size * MILLI
+            return values
 
         return self.cut(path, getattr(obstacle.motion, "finest", None), "an object")
 
@@ -198,16 +206,19 @@ class _Sampled:
             slope[early] = 2 * slope[early] - (self.at(knots[early] + 2 * side) - self.at(knots[early])) / (2 * side)
         x = self.at(begin + KNOT * np.arange(looks + 1) / looks)
         each = looks // pieces
-        x = x[:, np.arange(pieces)[:, None] * each + np.arange(each + 1)]
+        # Coordinates that stand still, as those of a body that does not turn, are followed whatever the pieces.
+        moves = (x != x[:1, :1]).any(axis=(0, 1)) | (slope != 0).any(axis=(0, 1))
+        slope = slope[..., moves]
+        x = x[..., moves][:, np.arange(pieces)[:, None] * each + np.arange(each + 1)]
         u, width = (np.arange(each + 1) / each)[:, None], KNOT / pieces
         a, b = x[:, :, :1], x[:, :, -1:]
         # Cubic Hermite piece through both ends.
         fit = a + (b - a) * u * u * (3 - 2 * u)
         fit += width * u * (1 - u) * (slope[:, :-1, None] * (1 - u) - slope[:, 1:, None] * u)
         miss = x - fit
-        rate = np.abs(np.diff(miss, axis=2)).max(axis=(2, 3)) / (width / each) * 1e-3
+        rate = np.abs(np.diff(miss, axis=2)).max(axis=(2, 3), initial=0.0) / (width / each) * 1e-3
         speed = float(np.abs(np.diff(x, axis=2)).max(initial=0.0)) / (width / each) * 1e-3
-        return np.abs(miss).max(axis=(2, 3)), rate, speed
+        return np.abs(miss).max(axis=(2, 3), initial=0.0), rate, speed
 
 
 def _refine(
