@@ -46,7 +46,7 @@ from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.rod.launch import WhiskerSolver
 from brainbench.stimuli.engines.rod.limits import contacts_for
 from brainbench.stimuli.engines.rod.packing import PackedJobs
-from brainbench.stimuli.engines.rod.slices import allocate, lock_of, parts_of
+from brainbench.stimuli.engines.rod.slices import SceneParts, allocate, lock_of
 from brainbench.stimuli.motion.jobs import MICRO, MILLI
 from brainbench.stimuli.whiskers.whisker import Chain
 
@@ -70,7 +70,7 @@ class RecordingSolver(WhiskerSolver):
         self.checkpoints: list[tuple[Any, Any, Any]] = []
         """States of whiskers, their links and their contacts at the beginning of each segment."""
 
-    def _take_steps(self, scene: Any, problems: Any, results: Any, jobs: PackedJobs) -> None:
+    def _take_steps(self, scene: SceneParts, problems: Any, results: Any, jobs: PackedJobs) -> None:
         wp, device, structs, count = warp(), self.device, self.kernels.structs, len(jobs)
         time = scene.readings.time.numpy()
         spans = np.diff(time["tick"] + time["part"], prepend=0.0)
@@ -99,7 +99,7 @@ class RecordingSolver(WhiskerSolver):
 
     def _run(self) -> None:
         self.paused.records.count.zero_()
-        arguments = [*parts_of(self.scene), self.problems, self.paused, self.results]
+        arguments = [*self.scene, self.problems, self.paused, self.results]
         warp().launch(self.kernels.run, self.count, arguments, device=self.device)
 
     def _segments(self) -> Iterator[Any]:
@@ -171,8 +171,11 @@ class RecordingSolver(WhiskerSolver):
                 **dict.fromkeys(("wrench", "contact"), (some, frames, 2, count)),
                 contacts=count,
             )
+            scene = self.kernels.structs.SceneArrays()
+            for name, part in self.scene._asdict().items():
+                setattr(scene, name, part)
             for records in self._segments():
-                arguments = [self.scene, records, system, tangents, outputs]
+                arguments = [scene, records, system, tangents, outputs]
                 wp.launch(kernels.tangent_segment, count, arguments, device=device)
             wrench, points, contact = (
                 np.moveaxis(values.numpy(), 3, 1) for values in (outputs.wrench, outputs.points, outputs.contact)

@@ -47,7 +47,7 @@ from brainbench.stimuli.engines.rod.packing import (
     pack_chains,
     pack_follicles,
 )
-from brainbench.stimuli.engines.rod.slices import Slices, allocate, download, lock_of, make_problems, parts_of
+from brainbench.stimuli.engines.rod.slices import SceneParts, Slices, allocate, download, lock_of, make_problems
 from brainbench.stimuli.engines.trust import (
     BLOW_STRIDE,
     FEWEST_READINGS,
@@ -371,7 +371,7 @@ class WhiskerSolver:
             result.contact_wrench = np.moveaxis(forces, 2, 0).reshape(len(jobs), len(given.readings), 6)
         return result
 
-    def _upload(self, given: Launch) -> tuple[Any, Any, Any, dict[str, Any]]:
+    def _upload(self, given: Launch) -> tuple[SceneParts, Any, Any, dict[str, Any]]:
         """Return scene, contact problems and results on the device, and the shapes of the results."""
         wp, structs, device, jobs = warp(), self.kernels.structs, self.device, given.jobs
         size, count, frames = given.size, len(jobs), len(given.readings)
@@ -388,12 +388,12 @@ class WhiskerSolver:
         steps = self.steps[jobs.whisker]
         between = float(np.median(np.diff(given.readings, prepend=given.start))) * MILLI
         steps = np.where(jobs.finer > 1, np.minimum(steps, max(between, 1e-4)), steps)
-        parts = {
-            "motions": (structs.MotionArrays, given.motions.arrays()),
-            "shapes": (structs.ShapeArrays, given.shapes.arrays()),
-            "jobs": (structs.JobArrays, jobs.arrays(self.chains, steps, given.start)),
-            "readings": (structs.ReadingArrays, _readings(given.readings - given.start)),
-        }
+        parts = (
+            (structs.MotionArrays, given.motions.arrays()),
+            (structs.ShapeArrays, given.shapes.arrays()),
+            (structs.JobArrays, jobs.arrays(self.chains, steps, given.start)),
+            (structs.ReadingArrays, _readings(given.readings - given.start)),
+        )
         shapes_of = {
             "state": count,
             "wrench": (size[0], frames, size[1], 6),
@@ -405,14 +405,12 @@ class WhiskerSolver:
         with lock_of(device):
             results = allocate(structs.ResultArrays, device, **shapes_of)
             results.contact = wp.full((size[0], frames, size[1]), -1.0, dtype=self.real, device=device)
-            scene = structs.SceneArrays()
-            scene.chains, scene.options = self.chain_arrays, options
-            for name, (kind, values) in parts.items():
-                setattr(scene, name, to_struct(kind, values, device, copy=False))
+            arrays = (to_struct(kind, values, device, copy=False) for kind, values in parts)
+            scene = SceneParts._make((self.chain_arrays, *arrays, options))
             problems = make_problems(self.kernels, self.capacity, count, device, self.iterations)
         return scene, problems, results, shapes_of
 
-    def _take_steps(self, scene: Any, problems: Any, results: Any, jobs: PackedJobs) -> Any:
+    def _take_steps(self, scene: SceneParts, problems: Any, results: Any, jobs: PackedJobs) -> Any:
         """Take all whiskers to their last reading; return the stream in which that is done, None of a processor."""
         wp, device, count = warp(), self.device, len(jobs)
         if self.sliced:
@@ -423,7 +421,7 @@ class WhiskerSolver:
             self.slices = slices.run(scene, problems, results, self.block["block_dim"])
             return slices.stream
         with lock_of(device):
-            inputs = [*parts_of(scene), problems, self.kernels.structs.PausedWhiskers(), results]
+            inputs = [*scene, problems, self.kernels.structs.PausedWhiskers(), results]
             wp.launch(self.kernels.run, count, inputs, device=device, **self.block)
             wp.synchronize_device(device)
         return None

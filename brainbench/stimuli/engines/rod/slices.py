@@ -17,7 +17,7 @@ import threading
 import time
 from collections.abc import Mapping
 from contextlib import AbstractContextManager, nullcontext
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -166,7 +166,7 @@ class Slices:
         size[AFTER_OTHERS] = lanes
         on.queue, on.queue_size = (wp.array(values, device=device) for values in (queue, size))
 
-    def run(self, scene: Any, problems: Any, results: Any, block: int) -> int:
+    def run(self, scene: SceneParts, problems: Any, results: Any, block: int) -> int:
         """Take all whiskers to their end with ``block`` threads of a block; return the number of slices."""
         wp, waits, slices, left = warp(), 0, 0, self.lanes
         inputs = scene, problems, results
@@ -219,7 +219,7 @@ class Slices:
         scene, problems, results = inputs
         on.budget = self.budget or (1 if left < FEW else BUDGET)
         for _ in range(SLICES_PER_CHECK):
-            arguments = [*parts_of(scene), problems, on, results]
+            arguments = [*scene, problems, on, results]
             wp.launch(kernels.run, left + 3 * WARP, arguments, device=device, stream=self.stream, block_dim=block)
             # After an even number of slices both arrays are back in place, so a recorded graph can be repeated.
             on.queue, on.next_queue = on.next_queue, on.queue
@@ -242,7 +242,7 @@ class Slices:
             wp.launch(
                 kernels.measure_distances,
                 many,
-                [*parts_of(scene)[:4], on, many],
+                [*scene[:4], on, many],
                 device=device,
                 stream=self.stream,
                 block_dim=limits.DISTANCE_BOUNDS[0],
@@ -252,9 +252,15 @@ class Slices:
                     self.stream.wait_stream(stream)
 
 
-def parts_of(scene: Any) -> list[Any]:
-    """Return a scene as kernels take it, part by part."""
-    return [scene.chains, scene.motions, scene.shapes, scene.jobs, scene.readings, scene.options]
+class SceneParts(NamedTuple):
+    """A scene as kernels take it, part by part."""
+
+    chains: Any
+    motions: Any
+    shapes: Any
+    jobs: Any
+    readings: Any
+    options: Any
 
 
 def allocate(kind: Any, device: Any, **shapes: int | tuple[int, ...]) -> Any:
