@@ -1,19 +1,20 @@
 """Robot hands: two of our own made of primitives, any URDF or MJCF file, and where their probes sit.
 
-``spec`` describes a hand as data (``sharpa.toml``, ``xhand1.toml``), ``files`` reads any other,
-``hand`` makes either ready for use, ``layouts`` and ``tree`` place probes on its links, ``observations`` turns
-their readings into what a policy gets, and ``scenes`` lays an object on the palm.
+``files`` reads the file of a hand, ``hand`` makes it ready for use, ``layouts`` and ``tree`` place probes on its links,
+``observations`` turns their readings into what a policy gets, and ``scenes`` lays an object on the palm. Our own hands
+are MJCF files (``sharpa.xml``, ``xhand1.xml``), each with its palm, fingers, pads and speeds beside it (``.toml``).
 """
 
 from __future__ import annotations
 
 import os
+import tomllib
 from pathlib import Path
 
 from brainbench.core.errors import unknown_name
 from brainbench.core.lazy import lazy_exports
 from robotics_bridge.hands.hand import Hand, all_from_file, from_file
-from robotics_bridge.hands.spec import read_spec
+from robotics_bridge.hands.layouts import Pad
 
 __all__ = ["Hand", "list_hands", "load", "load_all"]
 
@@ -32,8 +33,10 @@ def load(name_or_path: str | os.PathLike[str], *, palm: str | None = None) -> Ha
     """
     name = os.fspath(name_or_path)
     if name in _OWN:
-        spec = read_spec(_OWN[name])
-        return Hand(spec.name, spec.palm, spec.fingers, spec=spec)
+        data = tomllib.loads(_OWN[name].read_text(encoding="utf-8"))
+        fingers = {finger: tuple(chain) for finger, chain in data["fingers"].items()}
+        pads = {link: Pad(**pad) for link, pad in data["pads"].items()}
+        return Hand(name, data["palm"], fingers, _OWN[name].with_suffix(".xml"), pads, data["speeds"])
     return from_file(_hand_file(name), palm)
 
 

@@ -214,9 +214,9 @@ def _balance_inertias(spec: Any, path: Path) -> None:
         )  # fmt: skip
 
 
-def stated_speeds(path: Path | None) -> dict[str, float]:
+def stated_speeds(path: Path) -> dict[str, float]:
     """Return joint → largest speed (rad/s or m/s) of a URDF file, which MuJoCo does not keep; 0 states none."""
-    if path is None or path.suffix.lower() != ".urdf":
+    if path.suffix.lower() != ".urdf":
         return {}
     with readable(path, "URDF or MJCF file"):
         root = ElementTree.fromstring(read_text(path, KIND))

@@ -7,7 +7,7 @@ import logging
 import math
 import os
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -20,8 +20,7 @@ from brainbench.core.errors import DataError, UsageError, brief, check_each, che
 from brainbench.core.files import content_hash
 from brainbench.core.reading.regular import readable
 from robotics_bridge.hands.files import read_mjspec, stated_speeds
-from robotics_bridge.hands.layouts import Layout, check_names, is_probe_file, pad_probes, read_probes, select
-from robotics_bridge.hands.spec import HandSpec, build
+from robotics_bridge.hands.layouts import Layout, Pad, check_names, is_probe_file, pad_probes, read_probes, select
 from robotics_bridge.hands.tree import Tree, cast_grid, geoms_of, palmar_directions
 from robotics_bridge.sensors.probes.placement import Probes
 
@@ -53,10 +52,12 @@ class Hand:
     """Name of the link that carries the fingers."""
     fingers: Mapping[str, tuple[str, ...]]
     """Finger → its links from palm to tip."""
-    spec: HandSpec | None = None
-    """The data of one of our own hands."""
-    path: Path | None = None
-    """The file of any other."""
+    path: Path
+    """Its URDF or MJCF file."""
+    pads: Mapping[str, Pad] = field(default_factory=dict)
+    """Link → sensing surface of one of our own hands; empty for any other."""
+    speeds: Mapping[str, float] = field(default_factory=dict)
+    """Joint → its rated speed [rad/s], where the file cannot state it."""
     custom: Layout | None = None
     """Probes of :meth:`with_probes`, the resolution ``custom``."""
     couplers: frozenset[str] = frozenset()
@@ -64,11 +65,12 @@ class Hand:
 
     def mjspec(self) -> Any:
         """Return a new ``mujoco.MjSpec`` of the hand, for scenes to attach; the palm is fixed to the world."""
-        if self.spec is not None:
-            return build(self.spec)
-        if self.path is None:
-            raise UsageError(f"Hand {self.name!r} has neither data nor a file.")
         return read_mjspec(self.path)
+
+    @property
+    def source(self) -> str:
+        """What :func:`robotics_bridge.hands.load` takes to make it again: a name of ours, or a path."""
+        return self.name if self.pads else str(self.path)
 
     @cached_property
     def model(self) -> Any:
@@ -78,7 +80,7 @@ class Hand:
     @cached_property
     def physics(self) -> str | None:
         """Hash of the masses, drives, frictions and places of a hand of a file; None for our own hands."""
-        if self.path is None:
+        if self.pads:
             return None
         # Six digits: what compilers of other machines make of the rest is no other hand.
         return content_hash(*([f"{x:.6g}" for x in getattr(self.model, name).ravel()] for name in _PHYSICS))
@@ -105,7 +107,7 @@ class Hand:
         :data:`LEVER` times that.
         """
         names = list(joints)
-        speeds = stated_speeds(self.path) if self.spec is None else {one.name: one.velocity for one in self.spec.joints}
+        speeds = stated_speeds(self.path) | dict(self.speeds)
         if assumed := [name for name in names if name not in speeds]:
             slow = f"slides: {UNKNOWN_SPEED * LEVER:g} m/s"
             assumption = f"{UNKNOWN_SPEED:g} rad/s ({slow}) counts as the largest of {listing(assumed)}"
@@ -138,12 +140,10 @@ class Hand:
         if resolution == "custom" and self.custom is not None:
             return select(self.custom, links)
         check_names(resolution, placement)
-        if self.spec is not None:
-            return {
-                link.name: pad_probes(link, link.grids[resolution])
-                for link in self.spec.links
-                if link.name in links and resolution in link.grids
-            }
+        if self.pads:
+            spec = self.mjspec()
+            solids = {link: spec.body(link).first_geom() for link in self.pads if link in links}
+            return {link: pad_probes(solid, self.pads[link], resolution) for link, solid in solids.items()}
         return self._cast(resolution, links)
 
     def with_probes(self, source: str | os.PathLike[str] | Layout) -> Hand:

@@ -5,15 +5,17 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.errors import DataError, UsageError, brief, check_name
+from brainbench.core.devices import mujoco_module
+from brainbench.core.errors import DataError, brief, check_name
 from brainbench.core.files import file_hash, read_json, write_json
 from brainbench.core.reading.regular import reason
-from robotics_bridge.hands.spec import BoxGeometry, CapsuleGeometry, Grid, Link, Pad
 from robotics_bridge.sensors.probes.placement import Probes
 
 RESOLUTIONS = ("low", "med", "high")
@@ -22,21 +24,35 @@ Layout = dict[str, Probes]
 """Link → its probes, in the link's frame."""
 
 
-def pad_probes(link: Link, grid: Grid) -> Probes:
-    """Lay a grid on the pad of a link; raise UsageError if it has none."""
-    if link.pad is None or not link.solids:
-        raise UsageError(f"Link {link.name!r} has no sensing pad.")
-    solid = link.solids[0]
-    if isinstance(solid, CapsuleGeometry):
-        position, normal = _on_capsule(solid, link.pad, grid)
-    elif isinstance(solid, BoxGeometry):
-        position, normal = _on_box(solid, link.pad, grid)
-    else:
-        raise UsageError(f"The pad of link {link.name!r} lies on a sphere; use a capsule or a box.")
-    keep = np.ones(grid.rows * grid.columns, dtype=bool)
-    if grid.active is not None:
-        keep[fillers(grid.rows, grid.columns, grid.rows * grid.columns - grid.active)] = False
-    return Probes(position, normal, np.where(keep, grid.radius, 0.0), (grid.rows, grid.columns))
+@dataclass(frozen=True)
+class Pad:
+    """The sensing surface of a link, on its first solid.
+
+    On a capsule, columns run along the axis and on over the round end, rows around it. On a box, they fill one face.
+    """
+
+    facing: tuple[float, float, float]
+    """Out of the middle of the surface: along an axis of a box, across the axis of a capsule."""
+    along: tuple[float, float]
+    """Capsule: from, to on the meridian, counted from the start of the axis [m]. Box: half extent of rows and
+    columns [m]."""
+    grids: Mapping[str, tuple[int, int, float] | tuple[int, int, float, int]]
+    """Resolution → rows, columns, sensing radius [m] and, where the far corners are fillers, the probes that sense."""
+    over_end: float = 0.0
+    """Capsule: share of the meridian of the round end by which columns run on beyond ``along``."""
+    around: float = 0.9
+    """Capsule: half angle that the rows cover [rad]."""
+
+
+def pad_probes(solid: Any, pad: Pad, resolution: str) -> Probes:
+    """Lay a grid of a pad on its solid, a box or capsule of a ``mujoco.MjSpec``."""
+    rows, columns, radius, *active = pad.grids[resolution]
+    on_box = solid.type == mujoco_module().mjtGeom.mjGEOM_BOX
+    position, normal = (_on_box if on_box else _on_capsule)(solid, pad, rows, columns)
+    keep = np.ones(rows * columns, dtype=bool)
+    if active:
+        keep[fillers(rows, columns, rows * columns - int(active[0]))] = False
+    return Probes(position, normal, np.where(keep, radius, 0.0), (rows, columns))
 
 
 def fillers(rows: int, columns: int, count: int) -> NDArray[np.int64]:
@@ -55,36 +71,36 @@ def _centred(count: int, half: float) -> NDArray[np.float64]:
     return np.linspace(-half, half, count) if count > 1 else np.zeros(1)
 
 
-def _on_capsule(solid: CapsuleGeometry, pad: Pad, grid: Grid) -> tuple[NDArray, NDArray]:
+def _on_capsule(solid: Any, pad: Pad, rows: int, columns: int) -> tuple[NDArray, NDArray]:
     """Return positions and normals [N, 3] of a grid on a capsule."""
-    start, end = np.array(solid.start), np.array(solid.end)
+    start, end, radius = solid.fromto[:3], solid.fromto[3:], float(solid.size[0])
     length = np.linalg.norm(end - start)
     axis = (end - start) / length
     # Frame of the pad: along the axis, across it towards the facing side, and sideways.
     up = np.array(pad.facing, dtype=float) - axis * np.dot(pad.facing, axis)
     up /= np.linalg.norm(up)
     side = np.cross(axis, up)
-    last = pad.along[1] + pad.over_end * (solid.radius * (math.pi / 2))
-    arcs = np.linspace(pad.along[0], last, grid.columns)
-    angle, arc = (item.ravel() for item in np.meshgrid(_centred(grid.rows, pad.around), arcs, indexing="ij"))
+    last = pad.along[1] + pad.over_end * (radius * (math.pi / 2))
+    arcs = np.linspace(pad.along[0], last, columns)
+    angle, arc = (item.ravel() for item in np.meshgrid(_centred(rows, pad.around), arcs, indexing="ij"))
     # Beyond the end of the axis the meridian runs over the round end.
-    tilt = np.maximum(arc - length, 0) / solid.radius
+    tilt = np.maximum(arc - length, 0) / radius
     across = np.cos(angle)[:, None] * up + np.sin(angle)[:, None] * side
     normal = np.cos(tilt)[:, None] * across + np.sin(tilt)[:, None] * axis
-    return start + np.minimum(arc, length)[:, None] * axis + solid.radius * normal, normal
+    return start + np.minimum(arc, length)[:, None] * axis + radius * normal, normal
 
 
-def _on_box(solid: BoxGeometry, pad: Pad, grid: Grid) -> tuple[NDArray, NDArray]:
+def _on_box(solid: Any, pad: Pad, rows: int, columns: int) -> tuple[NDArray, NDArray]:
     """Return positions and normals [N, 3] of a grid on a face of a box."""
     normal = np.array(pad.facing, dtype=float)
     face = int(np.argmax(np.abs(normal)))
     # Columns run along z where the face has one, rows across.
     rows_axis, columns_axis = {0: (1, 2), 1: (0, 2), 2: (0, 1)}[face]
-    sides = (_centred(grid.rows, pad.along[0]), _centred(grid.columns, pad.along[1]))
+    sides = (_centred(rows, pad.along[0]), _centred(columns, pad.along[1]))
     y, x = (item.ravel() for item in np.meshgrid(*sides, indexing="ij"))
-    position = np.tile(np.array(solid.center), (len(y), 1))
+    position = np.tile(np.array(solid.pos), (len(y), 1))
     # From the middle of the box to the face that looks along the normal.
-    position[:, face] += normal[face] * solid.half[face]
+    position[:, face] += normal[face] * solid.size[face]
     position[:, rows_axis] += y
     position[:, columns_axis] += x
     return position, np.tile(normal, (len(y), 1))

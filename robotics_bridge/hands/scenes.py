@@ -13,7 +13,6 @@ from brainbench.core.devices import mujoco_module
 from brainbench.core.errors import UsageError, check_number
 from brainbench.core.rotations import from_matrices, from_z_axis, to_matrices
 from robotics_bridge.hands.hand import Hand
-from robotics_bridge.hands.spec import add_servo
 from robotics_bridge.hands.tree import Tree, coupled, half_open, link_middle, opens, palmar_directions, slide_of
 
 mujoco = mujoco_module()
@@ -62,6 +61,15 @@ def holding_spec(
         friction=(1.0, 0.01, 1e-4),
     )  # fmt: skip
     return spec
+
+
+def add_servo(spec: Any, joint: str, stiffness: float, damping: float) -> None:
+    """Add the position servo of a joint, of the joint's name, to a ``mujoco.MjSpec``."""
+    spec.add_actuator(
+        name=joint, target=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT, gaintype=mujoco.mjtGain.mjGAIN_FIXED,
+        biastype=mujoco.mjtBias.mjBIAS_AFFINE, gainprm=[stiffness] + [0.0] * 9,
+        biasprm=[0.0, -stiffness, -damping] + [0.0] * 7,
+    )  # fmt: skip
 
 
 def place_palm(hand: Hand, spec: Any, place: ArrayLike, turn: ArrayLike) -> Any:

@@ -312,7 +312,7 @@ def check_fit(described: Mapping[str, Any], env: Env, name: str) -> None:
     check_version(described, name)
     student = described.get("distill")
     hand = str(described.get("hand") or (student.get("hand", "") if isinstance(student, dict) else ""))
-    if hand and hand != env.hand.name and Path(hand).stem != Path(str(env.hand.path or env.hand.name)).stem:
+    if hand and hand != env.hand.name and Path(hand).stem != Path(env.hand.source).stem:
         raise UsageError(
             f"The policy {name!r} was trained for the hand {hand[:80]!r}; received {env.hand.name!r}: make the "
             "environment with that hand."

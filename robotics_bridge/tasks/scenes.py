@@ -267,7 +267,7 @@ def _tips(hand: Hand) -> dict[str, Any]:
     points = {}
     for tip in hand.tips:
         points[tip] = (0.0, 0.0, 0.0)
-        if tip in _TIPS and hand.spec is not None:
+        if tip in _TIPS and hand.pads:
             points[tip] = _TIPS[tip]
         elif tip in layout and layout[tip].active.any():
             points[tip] = tuple(layout[tip].position[layout[tip].active].mean(axis=0).tolist())

@@ -81,7 +81,7 @@ def sensing_policy(
             "encoder": encoder
         }
     return DistillConfig(
-        task=env.task.name, hand=str(env.hand.path or env.hand.name), embedder="lstm", hidden=settings.hidden,
+        task=env.task.name, hand=env.hand.source, embedder="lstm", hidden=settings.hidden,
         num_envs=env.num_envs, seed=seed, contacts=cast(Any, contacts if contacts in CONTACTS else None), **senses,
     )  # fmt: skip
 
@@ -325,8 +325,8 @@ def _train(
         trainer.begin_from(start, std=options.start_std)
         origin = {"file": str(start), "hash": file_hash(start)}
     facts = {
-        "kind": "teacher", "task": env.task.name, "hand": env.hand.name, "hand_path": str(env.hand.path or ""),
-        "hand_physics": env.hand.physics,
+        "kind": "teacher", "task": env.task.name, "hand": env.hand.name,
+        "hand_path": "" if env.hand.pads else str(env.hand.path), "hand_physics": env.hand.physics,
         "num_envs": env.num_envs, "seed": options.seed, "settings": asdict(settings), "rsl_rl": trainer.config,
         "observation_shapes": {name: list(shape) for name, shape in env.observation_shapes.items()},
         "action_names": list(env.action_names), "action_map": env.action_map.plain(), "start": origin,

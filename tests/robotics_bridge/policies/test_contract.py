@@ -146,7 +146,7 @@ def test_many_damaged_contracts_are_refused_or_sound(tmp_path) -> None:
 
 
 def _env(contacts: str = "published") -> Any:
-    hand = SimpleNamespace(name="xhand1", path=None)
+    hand = SimpleNamespace(name="xhand1", source="xhand1")
     return SimpleNamespace(hand=hand, task=SimpleNamespace(contacts=CONTACTS[contacts]))
 
 
