@@ -68,16 +68,6 @@ def style_axes(axes: Any) -> None:
     axes.spines[["left", "bottom"]].set(color=PALE)
 
 
-def plain_log_ticks(axes: Any) -> None:
-    """Label logarithmic axes with 1, 2 and 5 of each decade, or its 1 alone over many decades, as plain numbers."""
-    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
-
-    for axis, (low, high) in ((axes.xaxis, axes.get_xlim()), (axes.yaxis, axes.get_ylim())):
-        axis.set_major_locator(LogLocator(subs=(1, 2, 5) if high < 300 * low else (1,)))
-        axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-        axis.set_minor_formatter(NullFormatter())
-
-
 def check_format(path: Path, allowed: Iterable[str]) -> str:
     """Return the lower-case suffix of ``path``; one that is not ``allowed`` is a :class:`UsageError`."""
     choices = list(allowed)

@@ -2,28 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import asdict
-from itertools import product
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from brainbench.cli.options import SeedOption, items, numbers, out_file, out_file_option, picture_file, with_options
+from brainbench.cli.options import items, numbers, out_file_option, with_options
 from brainbench.cli.output import Output, progress_bar, table_of
-from brainbench.cli.requirements import PICTURES_IF_PLOT, needs
+from brainbench.cli.requirements import needs
 from brainbench.stimuli.engines.fidelity import DEFAULT_ENGINE
-
-PlotOption = Annotated[
-    Path | None, typer.Option(callback=picture_file, help="Also draw error against cost (.png, .svg, .pdf).")
-]
 
 app = typer.Typer(no_args_is_help=True, help="Measure accuracy against cost.")
 
 
 @app.command("whisker")
-@needs(PICTURES_IF_PLOT)
 def whisker(
     out: Annotated[Path, out_file_option("Table (.json); points in it are kept.")] = Path("whisker-tradeoff.json"),
     links: Annotated[str, typer.Option(help="Links per whisker, comma-separated; the default grid if empty.")] = "",
@@ -35,8 +27,6 @@ def whisker(
     solvers: Annotated[
         str, typer.Option(help="dynamic, quasistatic (of the backend rod), or both, comma-separated.")
     ] = "dynamic",
-    csv: Annotated[Path | None, typer.Option(callback=out_file, help="Also write the table as CSV.")] = None,
-    plot: PlotOption = None,
 ) -> Output:
     """Measure error and cost of whisker simulations over links, time step, solver, backend and collision geometry.
 
@@ -55,10 +45,6 @@ def whisker(
     )
     with progress_bar() as progress:
         rows = study.run_study(whiskers.study(chosen), out, progress=progress)
-    if csv is not None:
-        study.write_csv(rows, csv)
-    if plot is not None:
-        study.draw_study(whiskers.charts(rows), plot)
     best = whiskers.best(rows)
     setting = {
         ">links": "{0[links]}",
@@ -103,60 +89,9 @@ def score(options: Any) -> Output:
     return Output({"points": rows}, table_of(title, rows, columns))
 
 
-@app.command("model")
-@needs(cache=True)
-def model(
-    name: Annotated[str, typer.Argument(help="A registry name, or local-dir:FOLDER of a trained model.")],
-    precisions: Annotated[str, typer.Option(help="float32, bf16, int8, comma-separated.")] = "float32,bf16,int8",
-    unrolls: Annotated[str, typer.Option(help="biological, full, comma-separated.")] = "biological",
-    steps: Annotated[str, typer.Option(help="Last steps of the sweeps that are shown, comma-separated.")] = "22",
-    score: Annotated[bool, typer.Option(help="Also score every setting on the demo recordings.")] = False,
-    data: Annotated[Path | None, typer.Option(help="Folder of sweeps: also measure test accuracy.")] = None,
-    seed: SeedOption = 0,
-) -> Output:
-    """Measure error, latency, score and accuracy of a network over precision, unrolling and number of steps."""
-    from brainbench.stimuli import load_stimuli
-    from brainbench.tradeoffs import networks, study
-
-    axes: Any = (items(precisions), items(unrolls), numbers(steps, "--steps"))
-    chosen = [networks.ModelSetting(*values) for values in product(*axes)]
-
-    def more(network: networks.Reduced) -> Mapping[str, Any]:
-        values: dict[str, Any] = {}
-        if score:
-            import brainbench
-
-            values["score"] = brainbench.score(network).value
-        if data is not None:
-            from brainbench.datasets import WhiskingDataset
-            from brainbench.models.training.evaluation import evaluate
-
-            accuracy = asdict(evaluate(network, WhiskingDataset(data, split="test", shuffle=False)))
-            values |= {"top1": accuracy["top1"], "top5": accuracy["top5"]}
-        return values
-
-    with progress_bar() as progress:
-        sweeps = load_stimuli("rodgers", whiskers="all", fidelity=None, progress=progress).input
-        rows = study.run_study(networks.study(name, chosen, sweeps, seed=seed, more=more), progress=progress)
-    columns = {
-        "precision": "{0[precision]}",
-        "unrolling": "{0[unroll]}",
-        ">steps": "{0[steps]}",
-        ">error": "{0[error]:.2%}",
-        ">ms / sweep": "{0[ms]:.2f}",
-        ">p99 ms": "{0[p99_ms]:.2f}",
-        ">MB": lambda row: f"{row['stored_bytes'] / 1e6:.2f}",
-        ">score": lambda row: _number(row.get("score"), ".3f"),
-        ">top-1": lambda row: _number(row.get("top1"), ".3f"),
-    }
-    return Output(rows, table_of(f"{name}, batch 1:", rows, columns))
-
-
 @app.command("tactile")
-@needs(PICTURES_IF_PLOT)
 def tactile(
     out: Annotated[Path, out_file_option("Table (.json); points in it are kept.")] = Path("tactile-tradeoff.json"),
-    plot: PlotOption = None,
 ) -> Output:
     """Measure error and cost of tactile queries over backend, resolution, surface points and taxels.
 
@@ -166,8 +101,6 @@ def tactile(
 
     with progress_bar() as progress:
         rows = study.run_study(sensors.study(), out, progress=progress)
-    if plot is not None:
-        study.draw_study(sensors.charts(rows), plot)
     columns = {
         "part": "{0[part]}",
         ">setting": lambda row: row.get("points") or row.get("taxels") or row["query"],

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import cache
 from typing import Any, cast
 
@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from trimesh.triangles import closest_point
 
 from brainbench.geometry import Mesh, winding_number
-from brainbench.tradeoffs.study import Panel, Row, Study
+from brainbench.tradeoffs.study import Row, Study
 from robotics_bridge.physics import Geometry, HandState, TouchScene
 from robotics_bridge.sensors.probes.placement import Probes
 from robotics_bridge.sensors.queries.solids import surface_points
@@ -59,26 +59,6 @@ def study() -> Study:
             "cost": "microseconds per environment and update",
         },
     )
-
-
-def charts(rows: Sequence[Row]) -> list[Panel]:
-    """Return the chart of each part of a table."""
-    titles = {
-        "mesh": "distance to 4,608 triangles,\nby cells of the distance field",
-        "points": "proximity taxels,\nby number of surface points",
-        "taxels": "pad of taxels,\nby number of taxels",
-    }
-    words = "time per environment and update (µs)", "relative error of the force (RMS)", "error"
-
-    def label(row: Row) -> str:
-        if row["part"] == "mesh":
-            return f"{row['resolution']}³" if row["resolution"] else "no field: each triangle"
-        return f"{row.get('points') or row['taxels']:,}"
-
-    return [
-        Panel(title, *words, [row for row in rows if row["part"] == part], label=label)
-        for part, title in titles.items()
-    ]
 
 
 def triangle_distance(mesh: Mesh, points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

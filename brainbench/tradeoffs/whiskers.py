@@ -45,7 +45,7 @@ from brainbench.stimuli.objects.solid import Solid, rodgers_solid, touchable
 from brainbench.stimuli.validation import bench_tests
 from brainbench.stimuli.validation.bench_tests import peg, ringdown
 from brainbench.stimuli.whiskers.array import WhiskerArray
-from brainbench.tradeoffs.study import Panel, Row, Study, front
+from brainbench.tradeoffs.study import Row, Study, front
 
 PROTOCOL = 6  # counts up when the experiments change, so that points of different experiments never share a table
 PEGS = ((0.3, 0.05), (0.5, 0.1), (0.5, 0.2), (0.7, 0.2), (0.8, 0.02))
@@ -153,25 +153,6 @@ def best(rows: Sequence[Row]) -> list[TradeoffPoint]:
     """
     moving = [row for row in rows if not row.get("collision") and _moves(row)]
     return front(moving, ERROR, (*RESOLUTION, "backend", *TAILS.values()))
-
-
-def charts(rows: Sequence[Row]) -> list[Panel]:
-    """Return the charts of a table: by engine, and by collision geometry where the table has any."""
-    words = "processor time per second of one whisker (s/s)", "relative error that 90 % stay below", ERROR
-    presets = {tuple(vars(Fidelity.preset(name))[item] for item in RESOLUTION): name for name in list_presets()}
-    bench, hollow = ([row for row in rows if bool(row.get("collision")) is concave] for concave in (False, True))
-    in_contact = Panel(
-        "an object on one side", *words, bench,
-        series=lambda row: row["backend"] + ("" if _moves(row) else ", without inertia"),
-        label=lambda row: presets.get(tuple(row.get(item) for item in RESOLUTION), ""),
-    )  # fmt: skip
-    by_surface = Panel(
-        "hollow objects, by collision surface", *words, hollow,
-        series=lambda row: f"{row['collision']}, {row['backend']}",
-    )  # fmt: skip
-    hard = [row for row in bench if row.get("hard_90")]
-    both = replace(in_contact, title="both sides, slips and releases", error="hard_90", rows=hard)
-    return [in_contact, *([both] if hard else []), *([by_surface] if hollow else [])]
 
 
 def _fields(setting: SimulationSetting) -> Row:

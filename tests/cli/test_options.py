@@ -119,8 +119,8 @@ def test_other_commands_refuse_such_an_out_too(run, tmp_path, command):
 @pytest.mark.parametrize(
     ("command", "option"),
     [
-        (("tradeoff", "whisker"), "--csv"),
-        (("tradeoff", "tactile"), "--plot"),
+        (("tradeoff", "whisker"), "--out"),
+        (("stimuli", "fit", "none"), "--picture"),
         (("policy", "play", "in_palm_rotate"), "--video"),
         (("policy", "sweep"), "--out"),
         (("policy", "export", "none"), "--out"),
@@ -142,7 +142,7 @@ def test_destinations_without_an_option_are_checked_first(run, tmp_path, command
     assert (outcome.status, str(tmp_path / "file") in outcome.err) == (2, True)
 
 
-@pytest.mark.parametrize("command", [("tradeoff", "tactile", "--plot")])
+@pytest.mark.parametrize("command", [("stimuli", "fit", "none", "--picture")])
 def test_a_picture_of_an_unknown_format_is_refused_first(run, tmp_path, command):
     outcome = run(*command, str(tmp_path / "x.txt2"))
     assert (outcome.status, "txt2" in outcome.err) == (2, True)

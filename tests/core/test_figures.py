@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from brainbench.core.errors import UsageError
-from brainbench.core.figures import INK, check_format, new_figure, panels, plain_log_ticks, save_figure
+from brainbench.core.figures import INK, check_format, new_figure, panels, save_figure
 
 
 @pytest.mark.parametrize("suffix", ["png", "svg", "pdf"])
@@ -36,16 +36,6 @@ def test_panels_have_the_size_that_was_asked_for_and_the_common_style():
     assert figure.get_size_inches().tolist() == [6, 4]
     assert {panel.title.get_color() for panel in axes.flat} == {INK}
     assert not any(panel.spines["top"].get_visible() for panel in axes.flat)
-
-
-@pytest.mark.parametrize(("high", "words"), [(20, ["1", "2", "5", "10", "20"]), (1e4, ["1", "10", "100", "1000"])])
-def test_logarithmic_axes_are_labelled_with_plain_numbers(high, words):
-    _, axes = panels(1, 1, (3, 2))
-    panel = axes[0, 0]
-    panel.set(xscale="log", yscale="log", xlim=(1, high), ylim=(1, high))
-    plain_log_ticks(panel)
-    shown = [label.get_text() for label in panel.get_xticklabels()]
-    assert [word for word in shown if 1 <= float(word) <= high][: len(words)] == words
 
 
 def test_a_format_is_told_by_the_ending_of_the_name():

@@ -16,7 +16,7 @@ def test_the_cost_of_tactile_queries_is_measured_against_their_error(
     for name, values in {"RESOLUTIONS": (16, 32), "POINTS": (50, 500), "TAXELS": (4, 20)}.items():
         monkeypatch.setattr(sensors, name, values)
     out = tmp_path / "table.json"
-    found = run("tradeoff", "tactile", "--out", str(out), "--plot", str(tmp_path / "plot.png"), "--json")
+    found = run("tradeoff", "tactile", "--out", str(out), "--json")
     assert found.status == 0, found.err
     points = json.loads(found.out)["points"]
     assert points == read_json(out)["points"]
@@ -27,7 +27,6 @@ def test_the_cost_of_tactile_queries_is_measured_against_their_error(
     assert errors["points"][0] > errors["points"][1]
     assert errors["taxels"][0] > errors["taxels"][1]
     assert errors["primitive"][0] < 1e-5
-    assert (tmp_path / "plot.png").stat().st_size > 5000
 
 
 @pytest.mark.slow

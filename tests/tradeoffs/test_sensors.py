@@ -5,14 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from brainbench.geometry import Mesh, winding_number
-from brainbench.tradeoffs.sensors import charts, study, triangle_distance
+from brainbench.tradeoffs.sensors import study, triangle_distance
 
 
-def test_every_part_is_measured_and_three_are_drawn() -> None:
-    rows = [{**row, "error": 0.1, "cost": 1.0} for row in study().settings]
-    assert {row["part"] for row in rows} == {"mesh", "primitive", "points", "taxels"}
-    assert [len(chart.rows) for chart in charts(rows)] == [5, 6, 5]
-    assert charts(rows)[0].label(rows[0]) == "16³"
+def test_every_part_is_measured() -> None:
+    assert {row["part"] for row in study().settings} == {"mesh", "primitive", "points", "taxels"}
 
 
 def test_distances_to_triangles_in_double_precision_are_exact_for_a_cube() -> None:

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import importlib.util
-
 import pytest
 
-from brainbench.core.errors import DataError, MissingDependencyError
+from brainbench.core.errors import DataError
 from brainbench.core.files import read_json
-from brainbench.tradeoffs.study import Panel, Study, draw_study, front, run_study
+from brainbench.tradeoffs.study import Study, front, run_study
 
 
 def _make_study(calls, numbers, **fixed):
@@ -40,13 +38,3 @@ def test_the_front_leaves_out_failed_and_beaten_settings():
     rows = [{"links": n, "error": error, "cost": cost} for n, error, cost in [(6, 0.1, 1), (8, 0.2, 2), (10, 0.05, 3)]]
     rows.append({"links": 4, "error": None, "cost": None})
     assert [point.settings["links"] for point in front(rows, "error", ["links"])] == [6, 10]
-
-
-def test_a_picture_has_a_chart_for_each_panel(tmp_path):
-    rows = run_study(_make_study([], [2, 4, 8]))
-    chart = Panel("links", "cost", "error", "error", rows, label=lambda row: str(row["links"]))
-    if importlib.util.find_spec("matplotlib"):
-        assert draw_study([chart, chart], tmp_path / "plot.png").stat().st_size > 1000
-    else:
-        with pytest.raises(MissingDependencyError, match=r"\[report\]"):
-            draw_study([chart], tmp_path / "plot.png")
