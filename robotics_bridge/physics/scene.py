@@ -32,9 +32,9 @@ LONGEST_STEP = 0.1  # longest time step of an engine (s); contacts of hands need
 class Geometry:
     """A solid that is fixed to a link."""
 
-    name: str
-    link: str
-    """The link that carries it."""
+    name: str = ""
+    link: str = ""
+    """The link that carries it; empty while it belongs to none."""
     kind: str
     """One of :data:`KINDS`. Planes are half-spaces below z = 0, capsules and cylinders lie along z."""
     size: tuple[float, ...] = ()
@@ -51,7 +51,7 @@ class Geometry:
 
     def __post_init__(self) -> None:
         check_name("kind of geometry", self.kind, KINDS)
-        of = f"of {self.name!r}"
+        of = f"of {self.name!r}" if self.name else f"of a {self.kind}"
         check_numbers(f"size {of}", self.size, _SIZES[self.kind], above=0)
         check_number(f"contype {of}", self.contype, whole=True)
         check_number(f"affinity {of}", self.affinity, whole=True)
@@ -61,7 +61,7 @@ class Geometry:
             verb = "has" if self.mesh is not None else "names no"
             raise UsageError(f"The {self.kind} {self.name!r} {verb} mesh; kind='mesh' goes with mesh=Mesh(...).")
         norm = float(np.linalg.norm(self.quaternion))
-        check_number(f"length of the quaternion of {self.name!r}", norm, above=1e-6)
+        check_number(f"length of the quaternion {of}", norm, above=1e-6)
         object.__setattr__(self, "quaternion", tuple(float(q) / norm for q in self.quaternion))
         object.__setattr__(self, "size", tuple(float(s) for s in self.size))
 

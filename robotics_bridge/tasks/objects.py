@@ -9,12 +9,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from numbers import Real
 from typing import Any
 
 from brainbench.core.devices import mujoco_module
-from brainbench.core.errors import UsageError, brief, check_numbers
+from brainbench.core.errors import UsageError, check_name, check_number
 from brainbench.core.limits import Positive, limited
+from robotics_bridge.physics import Geometry
 from robotics_bridge.tasks.settings import unit_vector
 
 GRAIN = 1e-4  # half size of the stand-in for a solid that a shape lacks [m]
@@ -23,37 +23,13 @@ _SIZES = {"box": 3, "cylinder": 2, "capsule": 2, "sphere": 1}
 
 
 @dataclass(frozen=True)
-class ObjectPrimitive:
-    """A primitive in the body's frame."""
-
-    kind: str
-    """``box``, ``cylinder``, ``capsule`` or ``sphere``."""
-    size: tuple[float, ...]
-    """Half edges; radius and half length; radius [m]."""
-    position: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    quaternion: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
-    """Orientation (w, x, y, z); made unit length."""
-
-    def __post_init__(self) -> None:
-        if self.kind not in _SIZES:
-            raise UsageError(f"A solid is one of {', '.join(_SIZES)}; received {self.kind!r}.")
-        sizes = self.size if isinstance(self.size, Sequence) else ()
-        if len(sizes) != _SIZES[self.kind] or not all(isinstance(s, Real) and 0 < s <= LARGEST for s in sizes):
-            raise UsageError(
-                f"A {self.kind} has {_SIZES[self.kind]} positive size(s) in metres, at most {LARGEST:g}; received "
-                f"{brief(self.size)}."
-            )
-        check_numbers(f"The position of a {self.kind}", self.position, 3)
-        object.__setattr__(self, "quaternion", unit_vector(f"The quaternion of a {self.kind}", self.quaternion, 4))
-
-
-@dataclass(frozen=True)
 @limited(of="{} of an object")
 class ObjectShape:
     """One object: its solids and its outer measures."""
 
     name: str
-    solids: tuple[ObjectPrimitive, ...]
+    solids: tuple[Geometry, ...]
+    """Boxes, cylinders, capsules and spheres in the body's frame."""
     extent: tuple[Positive, Positive, Positive]
     """Edges of the box around it, along the body's axes [m]."""
     bottom: float
@@ -64,6 +40,9 @@ class ObjectShape:
     def __post_init__(self) -> None:
         if not self.solids:
             raise UsageError(f"The object {self.name!r} needs at least one solid.")
+        for solid in self.solids:
+            check_name(f"kind of a solid of {self.name!r}", solid.kind, _SIZES)
+            check_number(f"size of the {solid.kind} of {self.name!r} in metres", max(solid.size), most=LARGEST)
         if self.round_about is not None:
             axis = unit_vector(f"round_about of the object {self.name!r}", self.round_about, 3)
             object.__setattr__(self, "round_about", axis)
@@ -82,12 +61,12 @@ class ObjectShape:
 
 def box(x: float, y: float, z: float) -> ObjectShape:
     """Return a block with these edges [m]."""
-    return ObjectShape(f"box {x:g} {y:g} {z:g}", (ObjectPrimitive("box", (x / 2, y / 2, z / 2)),), (x, y, z), z / 2)
+    return ObjectShape(f"box {x:g} {y:g} {z:g}", (Geometry(kind="box", size=(x / 2, y / 2, z / 2)),), (x, y, z), z / 2)
 
 
 def cylinder(radius: float, height: float) -> ObjectShape:
     """Return an upright cylinder [m]."""
-    solid = ObjectPrimitive("cylinder", (radius, height / 2))
+    solid = Geometry(kind="cylinder", size=(radius, height / 2))
     extent = (2 * radius, 2 * radius, height)
     return ObjectShape(f"cylinder {radius:g} {height:g}", (solid,), extent, height / 2, round_about=(0.0, 0.0, 1.0))
 
@@ -95,7 +74,7 @@ def cylinder(radius: float, height: float) -> ObjectShape:
 def ball(radius: float) -> ObjectShape:
     """Return a ball [m]."""
     return ObjectShape(
-        f"ball {radius:g}", (ObjectPrimitive("sphere", (radius,)),), (2 * radius, 2 * radius, 2 * radius), radius
+        f"ball {radius:g}", (Geometry(kind="sphere", size=(radius,)),), (2 * radius, 2 * radius, 2 * radius), radius
     )
 
 
@@ -109,15 +88,17 @@ def screwdriver(length: float, handle_length: float, handle_radius: float, shaft
     """
     if not 0 < handle_length < length:
         raise UsageError(f"The handle is shorter than the tool; received {handle_length} m of {length} m.")
-    handle = ObjectPrimitive(
-        "cylinder", (handle_radius, handle_length / 2), (0.0, length - handle_length / 2, 0.0), _UPRIGHT_Y
-    )
+    handle = Geometry(
+        kind="cylinder", size=(handle_radius, handle_length / 2), position=(0.0, length - handle_length / 2, 0.0),
+        quaternion=_UPRIGHT_Y,
+    )  # fmt: skip
     # A capsule's half length leaves out its round ends, so that the lower one ends at the tip and the upper in the
     # handle.
     free = length - handle_length
-    shaft = ObjectPrimitive(
-        "capsule", (shaft_radius, (free - shaft_radius) / 2), (0.0, (free + shaft_radius) / 2, 0.0), _UPRIGHT_Y
-    )
+    shaft = Geometry(
+        kind="capsule", size=(shaft_radius, (free - shaft_radius) / 2), position=(0.0, (free + shaft_radius) / 2, 0.0),
+        quaternion=_UPRIGHT_Y,
+    )  # fmt: skip
     wide = 2 * max(handle_radius, shaft_radius)
     return ObjectShape(f"screwdriver {handle_radius:g}", (handle, shaft), (wide, length, wide), 0.0)
 
@@ -162,7 +143,7 @@ def add_object(
         solid = next((s for s in waiting if s.kind == kind), None)
         if solid is not None:
             waiting.remove(solid)
-        used = solid or ObjectPrimitive(kind, (GRAIN,) * _SIZES[kind], middle.position)
+        used = solid or Geometry(kind=kind, size=(GRAIN,) * _SIZES[kind], position=middle.position)
         # What the shape takes part in decides: friction of the object alone, whatever the hand is made of.
         body.add_geom(
             name=f"{name}_{index}", type=getattr(mujoco.mjtGeom, f"mjGEOM_{kind.upper()}"),

@@ -9,8 +9,8 @@ import pytest
 
 from brainbench.core.errors import UsageError
 from robotics_bridge import hands, tasks
+from robotics_bridge.physics import Geometry
 from robotics_bridge.tasks.objects import (
-    ObjectPrimitive,
     ObjectShape,
     ball,
     box,
@@ -52,12 +52,14 @@ def test_blocks_weigh_what_their_density_says() -> None:
         assert each.body_mass[body] == pytest.approx(task.density * volume, rel=1e-6)
 
 
-@pytest.mark.parametrize("size", [20.0, 0.0, np.nan, np.inf, "a"])
+@pytest.mark.parametrize("size", [0.0, np.nan, np.inf, "a"])
 def test_objects_have_sizes_in_metres(size) -> None:
-    with pytest.raises(UsageError, match="metres"):
-        ObjectPrimitive("sphere", (size,))
+    with pytest.raises(UsageError, match="size of a sphere"):
+        Geometry(kind="sphere", size=(size,))
+    with pytest.raises(UsageError, match=r"metres must .*at most 3\.0; received 20"):
+        ball(20.0)
     with pytest.raises(UsageError, match="sphere"):
-        ObjectPrimitive("sphere", 0.01)  # type: ignore[arg-type]
+        Geometry(kind="sphere", size=0.01)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(

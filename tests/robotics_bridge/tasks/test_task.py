@@ -10,9 +10,9 @@ import pytest
 
 from brainbench.core.errors import UsageError
 from robotics_bridge import tasks
+from robotics_bridge.physics import Geometry
 from robotics_bridge.tasks import terms
 from robotics_bridge.tasks.goals import SteppingRotation, TimedRotation
-from robotics_bridge.tasks.objects import ObjectPrimitive
 from robotics_bridge.tasks.settings import TeacherSettings
 from robotics_bridge.tasks.task import ActuatorRandomisation, Ending, ObjectRandomisation, Placement, Push, Success
 
@@ -92,7 +92,7 @@ def test_ranges_are_two_numbers_in_order(kind, name) -> None:
 def test_orientations_have_a_length(value) -> None:
     makers = (
         lambda: Placement(quaternion=value),
-        lambda: ObjectPrimitive("sphere", (0.01,), quaternion=value),
+        lambda: Geometry(kind="sphere", size=(0.01,), quaternion=value),
         lambda: _changed(hand_poses={"xhand1": ((0, 0, 0.5), value)}),
     )
     for make in makers:
