@@ -241,7 +241,7 @@ class Controller:
             return f"the policy gave actions of shape {action.shape} instead of {self._action.shape}"
         if not np.isfinite(action).all():
             return "the policy gave values that are no numbers"
-        if (limit := self.contract.more.get("action_limit")) is not None:
+        if (limit := self.contract.action_limit) is not None:
             # What counts and is observed as the last action, as in training (``Task.action_limit``).
             action = np.clip(action, -limit, limit)
         self._action = action.astype(np.float32)

@@ -130,7 +130,7 @@ class DeployedPolicy:
         contract = self.contract
         check_measured(contract.inputs, "A policy on a hand")
         # What is told to the hand is no measurement; a contract that states it needs no word of the user.
-        answered = ("proprio", "tactile", *(("command",) if "command" in contract.more else ()))
+        answered = ("proprio", "tactile", *(("command",) if contract.command is not None else ()))
         unmeasured = {
             name: f"{list(shape)}, {_MEANINGS.get(name, 'known to the simulation alone')}"
             for name, shape in contract.inputs.items()
@@ -176,8 +176,8 @@ class DeployedPolicy:
             raise UsageError("Touch is measured; give what stands in where it is not as fallback, not among sources.")
         if "tactile" not in inputs and (calibration is not None or fallback is not None):
             raise UsageError("The policy reads no touch, so a calibration or fallback of it reaches nothing.")
-        if "command" in inputs and "command" in contract.more:
-            sources.setdefault("command", constant("command", contract.more["command"], inputs["command"]))
+        if "command" in inputs and contract.command is not None:
+            sources.setdefault("command", constant("command", contract.command, inputs["command"]))
         if "tactile" in inputs:
             sources["tactile"] = RealTouch(contract, driver.fingers, calibration=calibration, fallback=fallback)
         safe = SafetyLimits.of_hand(body, driver.joints, **dict(limits or {}))

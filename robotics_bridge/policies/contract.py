@@ -11,7 +11,7 @@ import json
 import logging
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, is_dataclass, replace
+from dataclasses import dataclass, is_dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
@@ -117,9 +117,6 @@ class _Deployment(msgspec.Struct):
     action_limit: Annotated[float, Meta(ge=1e-6, le=1e6)] | None = None
 
 
-_MORE = ("task", "placement", "resolution", "probes", "sub_steps", "action_limit")
-
-
 class _Written(msgspec.Struct):
     format: Literal["onnx"]
     inputs: Groups
@@ -151,10 +148,19 @@ class PolicyContract:
     """Tactile observation type."""
     sha256: str = ""
     """Hash of the file of the network; empty in contracts of earlier versions."""
-    more: Mapping[str, Any] = field(default_factory=dict)
-    """``task``, ``placement``, ``resolution``, ``probes`` (hash of a probe file), ``sub_steps``, ``command`` (what it
-    is told by default) and ``action_limit``, where they stand in the contract, and ``twist``, the torsional
-    friction of force taxels (N·m·s; None: they hold), and ``contacts``, the contact model in which it was trained."""
+    contacts: ContactModel = CONTACTS["published"]
+    """Contact model in which it was trained."""
+    twist: float | None = None
+    """Torsional friction of force taxels [N·m·s]; None: they hold. The rest is None where nothing is stated."""
+    task: str | None = None
+    placement: str | None = None
+    resolution: str | None = None
+    probes: str | None = None
+    """Hash of a probe file."""
+    sub_steps: int | None = None
+    command: tuple[float, ...] | None = None
+    """What it is told by default."""
+    action_limit: float | None = None
 
     @classmethod
     def read(cls, path: Path) -> PolicyContract:
@@ -190,16 +196,13 @@ class PolicyContract:
         links, observe = (given.links, given.observe) if "tactile" in inputs else ((), "none")
         if "tactile" in inputs:
             _check_touch(given, inputs["tactile"], where)
-        more = {name: getattr(given, name) for name in _MORE}
-        if "command" in inputs and given.command is not None:
-            if len(given.command) != (count := math.prod(inputs["command"])):
-                raise wrong(where, "deployment.command", given.command, f"the policy reads {count} numbers")
-            more["command"] = given.command
-        more = {name: value for name, value in more.items() if value is not None}
-        more |= {"twist": given.twist, "contacts": trained_contacts(deployment, where)}
+        command = given.command if "command" in inputs else None
+        if command is not None and len(command) != (count := math.prod(inputs["command"])):
+            raise wrong(where, "deployment.command", command, f"the policy reads {count} numbers")
         return cls(
             inputs, given.rate, given.hand, joints, moved, given.action_map.rows(), given.frozen, links, observe,
-            written.sha256, more,
+            written.sha256, trained_contacts(deployment, where), given.twist, given.task, given.placement,
+            given.resolution, given.probes, given.sub_steps, command, given.action_limit,
         )  # fmt: skip
 
 

@@ -92,7 +92,7 @@ def deploy(
         "udp" if ":" in driver else driver,
         DriverRequest(contract=contract, address=driver, key=key, faults=tuple(fault or ()), seconds=seconds + 60),
     )
-    beside = f"simulated beside the hand, {contacts_name(contract.more['contacts'])} contacts"
+    beside = f"simulated beside the hand, {contacts_name(contract.contacts)} contacts"
     unmeasured = {
         name: f"{what}: {beside if shadow and name == 'tactile' else 'constant'}"
         for name, what in deployed.require({*given, *(("tactile",) if shadow else ())}).items()

@@ -121,7 +121,7 @@ class SessionRecorder:
             return None
         frames = {name: np.array([frame[part] for frame in self.frames]) for part, name in enumerate(PARTS)}
         session = SessionFacts(
-            task=self.contract.more.get("task", "deployed policy"), fps=self.contract.rate, joints=self.joints,
+            task=self.contract.task or "deployed policy", fps=self.contract.rate, joints=self.joints,
             points=self.points, robot=self.hand.name, unit="unit of the hand's pressure",
         )  # fmt: skip
         return write_lerobot(self.folder, frames, session)

@@ -167,14 +167,14 @@ class ShadowTouch:
     """
 
     def __init__(self, contract: PolicyContract, joints: tuple[str, ...]) -> None:
-        more = contract.more
         if "tactile" not in contract.inputs:
             raise UsageError("The policy reads no touch, so none can be simulated beside the hand (--shadow).")
-        if missing := [name for name in ("placement", "resolution", "sub_steps") if name not in more]:
+        stated = {name: getattr(contract, name) for name in ("placement", "resolution", "sub_steps")}
+        if missing := [name for name, value in stated.items() if value is None]:
             raise UsageError(f"The contract does not say {missing[0]!r}, so no touch can be simulated beside the hand.")
-        check_probes(more["resolution"], more.get("probes"))
-        self.sub_steps: int = more["sub_steps"]
-        senses = {name: more[name] for name in ("placement", "resolution", "twist", "contacts")}
+        check_probes(stated["resolution"], contract.probes)
+        self.sub_steps: int = stated.pop("sub_steps")
+        senses = {**stated, "twist": contract.twist, "contacts": contract.contacts}
         self.hand = SimulatedHand(contract.hand, contract.rate * self.sub_steps, observe=contract.observe, **senses)
         # A hand need not report a joint that mimics another; the coupling moves it here too.
         reported = [(own, joints.index(name)) for own, name in enumerate(self.hand.joints) if name in joints]
@@ -259,7 +259,7 @@ def open_simulated(request: DriverRequest) -> contextlib.AbstractContextManager[
 @contextlib.contextmanager
 def _simulated(request: DriverRequest, faults: Faults) -> Iterator[UdpDriver]:
     contract = request.contract
-    end = simulated_hand(contract.hand, contacts=contract.more["contacts"], faults=faults, seconds=request.seconds)
+    end = simulated_hand(contract.hand, contacts=contract.contacts, faults=faults, seconds=request.seconds)
     with end as there, UdpDriver(*there) as driver:
         yield driver
 

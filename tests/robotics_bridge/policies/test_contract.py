@@ -52,9 +52,9 @@ def test_a_contract_is_read_as_it_was_written(tmp_path) -> None:
     assert (found.rate, found.joints, found.moved, found.frozen) == (40.0, ("a", "b", "c"), ("a", "c"), {"b": 0.3})
     assert found.inputs == {"proprio": (8,), "command": (1,), "tactile": (5, 2, 3)}
     assert found.action_map["scale"] == (0.5, -0.5)
-    assert found.more["contacts"] == CONTACTS["published"]
+    assert found.contacts == CONTACTS["published"]
     firm = _set(contract_of(), "deployment.contacts", asdict(CONTACTS["firm"]))
-    assert _read(tmp_path, firm).more["contacts"] == CONTACTS["firm"]
+    assert _read(tmp_path, firm).contacts == CONTACTS["firm"]
 
 
 @pytest.mark.parametrize(

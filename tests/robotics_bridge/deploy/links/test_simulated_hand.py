@@ -29,7 +29,7 @@ def _contract(observe: str, joints: tuple[str, ...] = HAND.joints) -> PolicyCont
     links = tuple(HAND.layout("low", "hand"))
     more = {"placement": "hand", "resolution": "low", "sub_steps": 5, "twist": None, "contacts": CONTACTS["firm"]}
     inputs = {"tactile": (5, len(links), 3)}
-    return PolicyContract(inputs, 40.0, "xhand1", joints, joints, {}, {}, links, observe, "", more)
+    return PolicyContract(inputs, 40.0, "xhand1", joints, joints, {}, {}, links, observe, "", **more)
 
 
 def test_it_follows_the_reported_joints_whatever_their_order_and_feels_the_ball() -> None:
