@@ -1,7 +1,7 @@
 """Pictures of camera-based sensors such as GelSight and DIGIT: a gel's surface to colours, by a table of its slopes.
 
 Coloured lamps around the gel give every slope of its surface a colour of its own. The table is read from one picture of
-a ball that is pressed in, whose slopes are known: its own inside the contact, Hertz's beside it. Colours are those of
+a ball that is pressed in, whose slopes are known: its own inside the contact, Sneddon's beside it. Colours are those of
 the rested gel plus the table's (Yuan, Dong & Adelson 2017). Letters: B environment, H, W pixel, R, C marker.
 """
 
@@ -25,6 +25,7 @@ _BINS = 61
 _BLUR = 1.0  # width (bins) over which neighbouring slopes share their colour, so that gaps of the table are filled
 _MARKER = 0.12  # how much darker than its surroundings a marker is (of full scale)
 _WIDEST = (25, 25)  # pixels in which a marker fits
+_NODES = 32  # of the quadrature of slopes under a ball
 _FITTED = 3  # order of the polynomial that stands for the picture of the rested gel, where there is none
 
 
@@ -144,10 +145,13 @@ def _ball_slopes(
     """Return slopes along x and y [H, W] of a gel under a ball, and distances from its centre, all in pixels."""
     y, x = np.mgrid[: shape[0], : shape[1]] - np.reshape(center[::-1], (2, 1, 1))
     distance = np.hypot(x, y)
-    share = np.minimum(contact / np.maximum(distance, 1e-9), 1.0)
-    # The derivative of ((2 a² − r²) asin(a/r) + a √(r² − a²)) / (π R) (Johnson 1985, eq. 3.42a).
-    beside = 2 * (contact * np.sqrt(1 - share**2) - distance * np.arcsin(share)) / (np.pi * radius)
-    slope = np.where(distance < contact, -distance / radius, beside)
+    # The slope of a half-space under a rigid ball (Sneddon 1965): 2/π ∫ g(r sin φ) sin φ dφ up to asin(a/r), with
+    # g(t) = atanh(t/R) + tR/(R² − t²). Inside the contact it is the ball's; Hertz's paraboloid is flatter.
+    nodes, weights = np.polynomial.legendre.leggauss(_NODES)
+    end = np.arcsin(np.minimum(contact / np.maximum(distance, 1e-9), 1.0))[..., None]
+    sines = np.sin(end * (nodes + 1) / 2)
+    t = distance[..., None] * sines / radius
+    slope = -((np.arctanh(t) + t / (1 - t**2)) * sines * end) @ weights / np.pi
     return slope * x / np.maximum(distance, 1e-9), slope * y / np.maximum(distance, 1e-9), distance
 
 

@@ -5,8 +5,10 @@ The pressure under a pad follows from its indentation.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Mapping
+from functools import partial
 from typing import Any, cast
 
 import numpy as np
@@ -229,8 +231,9 @@ def contact_pressure(
 
     Environments that diverged, or whose pressure was not found, are NaN.
 
-    Under a ball of radius r that is pressed in by δ it is Hertz's, with the total 4/3 E √r δ^1.5 / (1 − ν²), as long as
-    the contact is at least five markers across and small beside the thickness of the pad.
+    Under a ball of radius r that is pressed in by δ it is Sneddon's (1965), and Hertz's for a small δ, with the total
+    4/3 E √r δ^1.5 / (1 − ν²), as long as the contact is at least five markers across and small beside the thickness of
+    the pad.
 
     Args:
         suite: that read the sensor.
@@ -271,7 +274,30 @@ def _pressed(suite: SensorSuite, name: str) -> tuple[ElastomerTaxel, tuple[float
     place = runtime.slices[name]
     height = warp().to_torch(runtime.pads.height)[0, :, place.span].unflatten(1, place.layout).double()
     kernel = torch.as_tensor(_love(place.layout, pitch), device=height.device)
-    return sensor, pitch, kernel, _solve(height, kernel)
+    return sensor, pitch, kernel, _solve(_depth(height, pitch), kernel)
+
+
+def _depth(height: torch.Tensor, pitch: tuple[float, float]) -> torch.Tensor:
+    """Return how deep bodies reach below each marker [B, R, C], from the distances to their surfaces at the markers.
+
+    A ball about a marker up to the nearest surface lies inside its body, whose own surface is the envelope of all.
+    """
+    square = height.clamp_min(0) ** 2
+    most = float(height.nan_to_num(0.0, 0.0).max())
+    rows, columns = (min(int(most / step) + 1, count - 1) for step, count in zip(pitch, height.shape[1:], strict=True))
+    # Half of the slope of the square is how far from a ball's centre its deepest point lies, between markers too.
+    slopes = torch.gradient(square, spacing=pitch, dim=(1, 2))
+    pad = partial(torch.nn.functional.pad, pad=(columns, columns, rows, rows))
+    padded, deepest = [pad(square), *(pad(slope / 2) for slope in slopes)], square
+    for row, column in itertools.product(range(2 * rows + 1), range(2 * columns + 1)):
+        part = slice(row, row + square.shape[1]), slice(column, column + square.shape[2])
+        away = (row - rows) * pitch[0], (column - columns) * pitch[1]
+        reach, *lean = (values[:, *part] for values in padded)
+        for slope, offset, step in zip(lean, away, pitch, strict=True):
+            nearer = (slope - offset).clamp(-step / 2, step / 2)
+            reach = reach - offset**2 + nearer * (2 * (slope - offset) - nearer)
+        deepest = torch.maximum(deepest, reach)
+    return deepest.sqrt()
 
 
 def _love(layout: tuple[int, ...], pitch: tuple[float, float]) -> np.ndarray:

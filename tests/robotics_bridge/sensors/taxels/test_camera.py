@@ -23,12 +23,12 @@ def _picture(surface: np.ndarray) -> np.ndarray:
 
 
 def _pressed(center: tuple[float, float], contact: float, shape=(120, 160), pixel: float = PIXEL) -> np.ndarray:
-    """Return Hertz's surface (m) under a ball of 3 mm; the contact in pixels."""
+    """Return Sneddon's surface (m) under a ball of 3 mm; the contact in pixels."""
     y, x = np.mgrid[: shape[0], : shape[1]]
     r, a = np.hypot(x - center[0], y - center[1]).clip(1e-6) * pixel, contact * pixel
-    q = np.minimum(a / r, 1)
-    beside = ((2 * a**2 - r**2) * np.arcsin(q) + a * np.sqrt((r**2 - a**2).clip(0))) / (np.pi * BALL)
-    return np.where(r < a, a**2 / BALL - r**2 / (2 * BALL), beside)
+    angles = np.linspace(0, 1, 201)[:, None, None] * np.arcsin(np.minimum(a / r, 1))
+    t = r * np.sin(angles)
+    return 2 / np.pi * np.trapezoid(a * np.arctanh(a / BALL) - t * np.arctanh(t / BALL), angles, axis=0)
 
 
 @pytest.fixture(scope="module")
@@ -52,6 +52,17 @@ def test_another_shape_is_shown_as_the_lamps_show_it(camera) -> None:
     assert _off(shown[1], _picture(flat)) < 0.01
     # Turned lamps are not mistaken for these.
     assert _off(shown[0][..., ::-1], _picture(ridge)) > scale
+
+
+def test_the_press_that_calibrates_is_shown_as_it_was_seen(camera) -> None:
+    surface = _pressed((80, 60), 40)
+    scale = _off(_picture(surface), _picture(0 * surface))
+    assert _off(camera.render(surface[None])[0], _picture(surface)) < 0.1 * scale
+    # Inside the contact the surface is the ball's.
+    y, x = np.mgrid[:120, :160] - np.array([60, 80]).reshape(2, 1, 1)
+    inside = np.hypot(x, y) < 39
+    ball = np.sqrt((BALL**2 - PIXEL**2 * (x**2 + y**2)).clip(0))
+    np.testing.assert_allclose((surface - ball)[inside], (surface - ball)[60, 80], atol=1e-7)
 
 
 def test_markers_apart_stand_for_the_pixels_between(camera) -> None:

@@ -43,6 +43,28 @@ def test_pressure_under_a_ball_is_that_of_hertz(depth: float) -> None:
     assert not surface[1].any()
 
 
+@pytest.mark.parametrize("share", [0.3, 0.6, 0.8])
+def test_surface_and_load_under_a_ball_are_those_of_sneddon_however_deep(share: float) -> None:
+    """A rigid ball on an elastic half-space (Sneddon 1965), to contacts of four fifths of its radius."""
+    ball, pitch = 3e-3, 1e-4
+    grid = Probes.grid(101, 101, size=(1e-2, 1e-2), center=(0, 0, 0.005), radius=1e-3)
+    scene = pad_scene(Geometry(name="ball", link="ball", kind="sphere", size=(ball,)))
+    suite = SensorSuite(scene, {"gel": ElastomerTaxel(link="hand", probes=grid, points=0)}, num_envs=1)
+    a = share * ball
+    depth = a * np.arctanh(share)
+    suite.update(state_of(scene, poses_at(3, {2: (0, 0, 0.005 + ball - depth)}, 1)))
+    r = np.arange(1, 50) * pitch
+    angles = np.linspace(0, 1, 2001)[:, None] * np.arcsin(np.minimum(a / r, 1))
+    t = r * np.sin(angles)
+    sneddon = 2 / np.pi * np.trapezoid(depth - t * np.arctanh(t / ball), angles, axis=0)
+    surface = gel_surface(suite, "gel")[0, 50, 51:100].double().numpy()
+    np.testing.assert_allclose(surface, sneddon, atol=0.01 * depth)
+    np.testing.assert_allclose(np.diff(surface), np.diff(sneddon), atol=0.05 * np.abs(np.diff(sneddon)).max())
+    load = ((a**2 + ball**2) * np.log((ball + a) / (ball - a)) - 2 * a * ball) * MODULUS / (2 * (1 - POISSON**2))
+    pressure = contact_pressure(suite, "gel", modulus=MODULUS, poisson=POISSON)
+    assert float(pressure.sum()) * pitch**2 == pytest.approx(load, rel=0.03)
+
+
 def test_pressures_add_up_to_the_contact_forces_of_the_engine() -> None:
     model = mujoco.MjModel.from_xml_string(
         """<mujoco><option timestep="0.002"/><worldbody>
