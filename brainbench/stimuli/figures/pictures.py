@@ -6,6 +6,7 @@ Force and moment traces stand on the 5 × 7 layout of the whiskers, one small pa
 
 from __future__ import annotations
 
+import itertools
 import logging
 import math
 import os
@@ -20,7 +21,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from brainbench.core.contracts import CHANNELS, GRID_SHAPE, check_stimulus_set
+from brainbench.core.contracts import CHANNELS, check_stimulus_set
 from brainbench.core.errors import DataError, UsageError, check_name, choose_name, listing, needing
 from brainbench.core.figures import DOTS_PER_INCH, INK, PALE, check_format, new_figure, save_figure
 from brainbench.core.files import atomic_path
@@ -577,14 +578,13 @@ def _figure(
     stimulus: xr.Dataset, label: str, channel: str, limits: tuple[float, float], size: tuple[int, int]
 ) -> Figure:
     figure = new_figure(*size)
-    rows, cols = GRID_SHAPE
-    unit = size[0] / 1600
-    points = 0.72 * unit
-    room = {"left": 0.055, "right": 0.99, "top": 0.885, "bottom": 0.075, "wspace": 0.08, "hspace": 0.16}
-    panels: Any = figure.subplots(rows, cols, sharex=True, sharey=True, gridspec_kw=room)
     cells = list(zip(stimulus["row"].values.tolist(), stimulus["col"].values.tolist(), strict=True))
+    rows, cols = (range(min(side), max(side) + 1) for side in zip(*cells, strict=True))
+    points = 0.72 * size[0] / 1600
+    room = {"left": 0.055, "right": 0.99, "top": 0.885, "bottom": 0.075, "wspace": 0.08, "hspace": 0.16}
+    panels: Any = figure.subplots(len(rows), len(cols), sharex=True, sharey=True, squeeze=False, gridspec_kw=room)
     values = _values(stimulus, channel)
-    for (row, col), panel in np.ndenumerate(panels):
+    for (row, col), panel in zip(itertools.product(rows, cols), panels.flat, strict=True):
         if (row, col) not in cells:
             panel.axis("off")
             continue

@@ -298,6 +298,15 @@ def test_several_stimuli_make_a_file_each_with_equal_bytes_every_time(few, tmp_p
     assert [path.read_bytes() for path in plot(few, tmp_path / f"traces.{suffix}", size=(400, 240))] == before
 
 
+def test_panels_fill_the_picture_whichever_whiskers_there_are(few):
+    row = _simulate(array=WhiskerArray.mouse(whiskers="C1,C2"))
+    figure = module._figure(row.isel(stimulus=0), "one", "F", (0.0, 1.0), (800, 480))
+    boxes = [panel.get_position() for panel in figure.axes]
+    assert len(boxes) == 2
+    assert min(box.height for box in boxes) > 0.7
+    assert sum(box.width for box in boxes) > 0.8
+
+
 def test_one_stimulus_and_a_part_of_the_time_can_be_chosen(few, tmp_path):
     (path,) = plot(few, tmp_path / "one.png", stimulus="one", window=(0.02, 0.05), size=(400, 240))
     assert path == tmp_path / "one.png"
