@@ -114,13 +114,11 @@ def trials_by_subject(dataset: xr.Dataset, *, averaged: bool = False) -> dict[st
         if not keep.any():
             continue
         rows = rows[keep]
-        part_counts = (
-            part_counts
-            if keep.all() and units.all()
-            else part_counts[np.ix_(keep, np.arange(part_counts.shape[1]), units)]
-        )
+        if not (keep.all() and units.all()):
+            part_counts = part_counts[np.ix_(keep, np.arange(part_counts.shape[1]), units)]
         # Bins past a window's end have NaN counts and duration 0; NaN seconds avoid the division by zero.
         seconds = np.where(duration[rows] > 0, duration[rows], np.nan)
+        rates = part_counts / seconds[:, :, None]
         keys = [f"{subject}/{session}/{ids[row]}" for row in rows]
         for earlier, names in before.setdefault(subject, []):
             # Probes of one session in files of their own share the noise of their trials, so the same trials must go
@@ -132,9 +130,7 @@ def trials_by_subject(dataset: xr.Dataset, *, averaged: bool = False) -> dict[st
         before[subject].append((rows, unique))
         by_subject.setdefault(subject, []).append(
             Trials(
-                responses=_average(part_counts / seconds[:, :, None], seconds)
-                if averaged
-                else part_counts / seconds[:, :, None],
+                responses=_average(rates, seconds) if averaged else rates,
                 labels=labels[rows],
                 keys=unique,
                 covariates={name: dataset[name].values[rows].astype(np.float64) for name in covariates},
