@@ -5,10 +5,8 @@ The pressure under a pad follows from its indentation.
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Mapping
-from functools import partial
 from typing import Any, cast
 
 import numpy as np
@@ -282,22 +280,21 @@ def _depth(height: torch.Tensor, pitch: tuple[float, float]) -> torch.Tensor:
 
     A ball about a marker up to the nearest surface lies inside its body, whose own surface is the envelope of all.
     """
-    square = height.clamp_min(0) ** 2
-    most = float(height.nan_to_num(0.0, 0.0).max())
-    rows, columns = (min(int(most / step) + 1, count - 1) for step, count in zip(pitch, height.shape[1:], strict=True))
-    # Half of the slope of the square is how far from a ball's centre its deepest point lies, between markers too.
-    slopes = torch.gradient(square, spacing=pitch, dim=(1, 2))
-    pad = partial(torch.nn.functional.pad, pad=(columns, columns, rows, rows))
-    padded, deepest = [pad(square), *(pad(slope / 2) for slope in slopes)], square
-    for row, column in itertools.product(range(2 * rows + 1), range(2 * columns + 1)):
-        part = slice(row, row + square.shape[1]), slice(column, column + square.shape[2])
-        away = (row - rows) * pitch[0], (column - columns) * pitch[1]
-        reach, *lean = (values[:, *part] for values in padded)
-        for slope, offset, step in zip(lean, away, pitch, strict=True):
-            nearer = (slope - offset).clamp(-step / 2, step / 2)
-            reach = reach - offset**2 + nearer * (2 * (slope - offset) - nearer)
-        deepest = torch.maximum(deepest, reach)
-    return deepest.sqrt()
+    square, most = height.clamp_min(0) ** 2, float(height.nan_to_num(0.0, 0.0).max())
+    # Squares of depths are h² less the squares of both offsets, so one axis follows the other.
+    for axis, step in enumerate(pitch, start=1):
+        # Half of the slope of the square is how far from a ball's centre its deepest point lies, between markers too.
+        (slope,), deepest = torch.gradient(square, spacing=step, dim=axis), square.clone()
+        reach = min(int(most / step) + 1, square.shape[axis] - 1)
+        for place in range(-reach, reach + 1):
+            part = axis, max(0, place), square.shape[axis] - abs(place)
+            lean = slope.narrow(*part) / 2 - place * step
+            nearer = lean.clamp(-step / 2, step / 2)
+            depth = square.narrow(*part) - (place * step) ** 2 + nearer * (2 * lean - nearer)
+            target = deepest.narrow(axis, max(0, -place), part[2])
+            target.copy_(torch.maximum(target, depth))
+        square = deepest
+    return square.sqrt()
 
 
 def _love(layout: tuple[int, ...], pitch: tuple[float, float]) -> np.ndarray:
