@@ -14,8 +14,7 @@ from brainbench.core.lazy import lazy_exports
 
 if TYPE_CHECKING:
     from leaderboards.boards import rank
-    from leaderboards.site.build import build_leaderboard
-    from leaderboards.site.score_page import write_report
+    from leaderboards.site.build import build_leaderboard, write_report
     from leaderboards.store import read_records, write_record
 
 __all__ = ["build_leaderboard", "rank", "read_records", "write_record", "write_report"]

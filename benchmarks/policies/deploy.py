@@ -16,10 +16,9 @@ from tensordict import TensorDict
 
 from benchmarks.report import publish, script_parser, table
 from robotics_bridge import hands
-from robotics_bridge.deploy.controller import realtime
+from robotics_bridge.deploy.controller import read_deployed, realtime
 from robotics_bridge.deploy.links.simulated_hand import Faults, simulated_hand
 from robotics_bridge.deploy.links.udp import UdpDriver
-from robotics_bridge.deploy.session import read_deployed
 from robotics_bridge.policies.export import export_policy
 from robotics_bridge.policies.student import TactilePolicy
 

@@ -26,9 +26,8 @@ from numpy.typing import NDArray
 from benchmarks.report import publish, script_parser, table
 from brainbench.core.statistics import wilson_interval
 from robotics_bridge import tasks
-from robotics_bridge.deploy.controller import Report
+from robotics_bridge.deploy.controller import REAL_TYPES, DeployedPolicy, PressureCalibration, Report, read_deployed
 from robotics_bridge.deploy.driver import Clock, HandReading, LinkCounters
-from robotics_bridge.deploy.session import REAL_TYPES, DeployedPolicy, PressureCalibration, read_deployed
 from robotics_bridge.envs.env import Env
 from robotics_bridge.envs.step import VELOCITY
 from robotics_bridge.policies.contract import with_contacts_of

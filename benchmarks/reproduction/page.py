@@ -26,7 +26,7 @@ from brainbench.core.files import write_text
 from brainbench.core.statistics import is_finite, wilson_interval
 from leaderboards.figures.charts import board_figures
 from leaderboards.figures.svg import Drawing, standalone
-from leaderboards.site.score_page import escape_markdown
+from leaderboards.site.build import escape_markdown
 from leaderboards.text import SYNTHETIC, number, plural, span
 
 PAGE = "what-reproduces.md"

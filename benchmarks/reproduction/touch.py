@@ -24,7 +24,7 @@ from brainbench.core.files import read_json, write_text
 from brainbench.core.records import Interval
 from brainbench.core.statistics import LEVEL, is_finite
 from leaderboards.figures.svg import Drawing, Scale, standalone, tick_text
-from leaderboards.site.score_page import escape_markdown
+from leaderboards.site.build import escape_markdown
 from leaderboards.text import number, span
 
 RECORDS = Path(__file__).parents[1] / "policies" / "records"

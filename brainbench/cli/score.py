@@ -284,7 +284,7 @@ def score(
     """Score a model against neural recordings and write a result record and an HTML report."""
     from brainbench.core.files import to_plain
     from brainbench.scoring.kept_records import keep, read_kept, record_path
-    from leaderboards.site.score_page import write_report
+    from leaderboards.site.build import write_report
     from leaderboards.store import write_record
 
     if options.explain and Path(model).suffix == ".npz":

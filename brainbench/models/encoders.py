@@ -1,26 +1,32 @@
-"""Encoders, which turn a stimulus [B, T, C, H, W] into features [B, T, F].
+"""Encoders, from a stimulus [B, T, C, H, W] to features [B, T, F], and attenders, from these to features [B, T, W].
 
 The recurrent convolutional network of Zhuang et al. (2017), with any cell; a ResNet18 of every time step on its own,
 which is the feedforward control without any memory (He et al. 2016); and a structured state-space encoder (S4: Gu, Goel
 & Ré 2022, with the stable form A = Λ − P P* of Goel et al. 2022).
+
+Attenders look back over the whole sweep: a causal transformer answers at an action token after every step; selective
+state spaces (Mamba: Gu & Dao 2023) solve a sweep by a parallel scan, on CUDA by the kernel of ``mamba_ssm`` where that
+package is installed, with equal results.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Collection
+from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
+from typing import Any, NamedTuple, cast
 
 import torch
 from torch import nn
 from torch.nn import functional
 
-from brainbench.core.errors import check_number
+from brainbench.core.errors import UsageError, check_number
 from brainbench.models.graph.spec import Convolution, Dense, Edge, GraphSpec, Memory, Node
+from brainbench.models.ops import dispatch
 from brainbench.models.ops.layers import RECTIFIER_GAIN, Conv2d, Linear
-from brainbench.models.ops.state_space import StateSpace, System
-from brainbench.models.parts import check_sweep, run_layers
+from brainbench.models.ops.state_space import StateSpace, System, linear_scan
+from brainbench.models.parts import check_sweep, run_layers, wanted
 
 INPUT_SHAPE = (30, 5, 7)  # five sub-steps of six channels (sub-step-major) on the whisker grid
 
@@ -228,3 +234,295 @@ class S4Encoder(nn.Module):
             y, memory = block.step(y, memory, system)
             after.append((memory, system))
         return self.fc(y), tuple(after)
+
+
+# GPT-2 draws weights with standard deviation 0.02 at any width; gain/√fan_in is its width-aware form
+# (0.02 ≈ gain 0.45 at 512), and residual branches shrink with depth so that the sum keeps its scale.
+_TOKEN_STD = 0.02
+
+
+@dataclass(frozen=True)
+class GPTState:
+    """Keys and values of the tokens so far, one pair [B, heads, tokens, width/heads] per block."""
+
+    keys: tuple[torch.Tensor, ...]
+    values: tuple[torch.Tensor, ...]
+
+    @property
+    def tokens(self) -> int:
+        """Number of tokens seen."""
+        return self.keys[0].shape[2]
+
+
+class GPTBlock(nn.Module):
+    """Pre-norm attention and a four times wider MLP, each added to the stream [B, tokens, width].
+
+    ``dropout`` is the share of the attention weights and of the added values that is dropped while training; what each
+    of ``depth`` blocks adds is scaled by 1/√(2 depth).
+    """
+
+    def __init__(self, width: int, heads: int, dropout: float, depth: int) -> None:
+        super().__init__()
+        self.heads = heads
+        self.dropout = dropout
+        # Two branches of each block add to the stream: 2 · depth of them in all (GPT-2, Radford et al. 2019).
+        residual = 1.0 / math.sqrt(2.0 * depth)
+        self.norm_attention = nn.LayerNorm(width)
+        self.query_key_value = Linear(width, 3 * width)
+        self.project = Linear(width, width, gain=residual)
+        self.norm_mlp = nn.LayerNorm(width)
+        # The tanh form of GELU, as published.
+        self.mlp = nn.Sequential(
+            Linear(width, 4 * width), nn.GELU("tanh"), Linear(4 * width, width, gain=residual), nn.Dropout(dropout)
+        )
+        self.residual_dropout = nn.Dropout(dropout)
+
+    def forward(
+        self, x: torch.Tensor, past: tuple[torch.Tensor, torch.Tensor] | None = None
+    ) -> tuple[torch.Tensor, tuple[torch.Tensor, torch.Tensor]]:
+        """Return the stream and the keys and values of all tokens so far."""
+        batch, tokens, width = x.shape
+        fused = self.query_key_value(self.norm_attention(x)).view(batch, tokens, 3, self.heads, width // self.heads)
+        query, key, value = fused.permute(2, 0, 3, 1, 4)
+        mask = None
+        if past is not None:
+            seen = past[0].shape[2]
+            key, value = torch.cat((past[0], key), 2), torch.cat((past[1], value), 2)
+            # New tokens attend to all that came before and to themselves: a triangle moved by the tokens seen.
+            mask = torch.ones(tokens, seen + tokens, dtype=torch.bool, device=x.device).tril(seen)
+        dropped = self.dropout if self.training else 0.0
+        attended = functional.scaled_dot_product_attention(query, key, value, mask, dropped, is_causal=mask is None)
+        # Pre-norm: the stream itself is never normalised inside the blocks, so gradients pass through them unchanged.
+        x = x + self.residual_dropout(self.project(attended.transpose(1, 2).reshape(batch, tokens, width)))
+        return x + self.mlp(self.norm_mlp(x)), (key, value)
+
+
+class GPTAttender(nn.Module):
+    """Map features [B, T, F] to [B, T, width], causally, for at most ``context // 2`` steps.
+
+    Tokens: x0, a, x1, a, … with one learned action token a; 22 steps make 44 tokens of a context of 65. Pre-norm blocks
+    as in GPT-2 (Radford et al. 2019), learned positions, a head w → w without bias ("LM head").
+
+    ``context`` counts tokens, two per step and one over; ``dropout`` is the share dropped while training. 25,778,688
+    parameters for 512 → 512; 6,532,608 for 512 → 256.
+    """
+
+    def __init__(
+        self, features: int, width: int, *, blocks: int = 8, heads: int = 4, context: int = 65, dropout: float = 0.1
+    ) -> None:
+        super().__init__()
+        check_number("The share dropped by a GPT attender", dropout, least=0, most=1)
+        if width < 1 or width % heads:
+            raise UsageError(f"The width of a GPT attender must be a multiple of its {heads} heads; received {width}.")
+        self.features = width
+        self.context = context
+        self.action = nn.Parameter(torch.empty(features))
+        self.embed = Linear(features, width)
+        self.positions = nn.Parameter(torch.empty(context, width))
+        self.dropout = nn.Dropout(dropout)
+        self.blocks: Any = nn.ModuleList(GPTBlock(width, heads, dropout, blocks) for _ in range(blocks))
+        self.norm = nn.LayerNorm(width)
+        self.lm_head = Linear(width, width, use_bias=False)
+        for tokens in (self.action, self.positions):
+            if not tokens.is_meta:
+                nn.init.normal_(tokens, std=_TOKEN_STD)
+        self.layers = (*(f"block{index}" for index in range(1, blocks + 1)), "lm_head")
+
+    @property
+    def max_steps(self) -> int:
+        """Longest sweep that fits the context."""
+        return self.context // 2
+
+    def multiply_adds(self) -> int:
+        """Return the multiply-adds of the first step: two tokens through the blocks, one through the head.
+
+        Every earlier token adds 4 × width per block to the attention of a later step.
+        """
+        linear = sum(module.weight.numel() for module in self.modules() if isinstance(module, Linear))
+        attention = len(self.blocks) * 2 * 2 * 2 * self.features
+        return 2 * linear - self.lm_head.weight.numel() + attention
+
+    def init_state(self, batch: int) -> GPTState:
+        """Return the state before the first step: no tokens."""
+        heads = self.blocks[0].heads
+        empty = (self.positions.new_zeros(batch, heads, 0, self.features // heads),) * len(self.blocks)
+        return GPTState(empty, empty)
+
+    def step(self, x: torch.Tensor, state: GPTState) -> tuple[torch.Tensor, GPTState]:
+        """Advance by one step of features [B, F]; return the answer [B, width] and the next state."""
+        stream = self.tokens(x[:, None], state.tokens)
+        keys, values = [], []
+        for block, *past in zip(self.blocks, state.keys, state.values, strict=True):
+            stream, (key, value) = block(stream, past)
+            keys.append(key)
+            values.append(value)
+        return self.lm_head(self.norm(stream[:, 1])), GPTState(tuple(keys), tuple(values))
+
+    def forward(self, x: torch.Tensor, *, return_activations: bool | Collection[str] = False) -> Any:
+        """Return the answers [B, T, width], with activations also those at the action tokens of named layers."""
+        stream = self.tokens(x, 0)
+        names = wanted(self.layers, return_activations)
+        activations = {}
+        for name, block in zip(self.layers, self.blocks, strict=False):
+            stream, _ = block(stream)
+            if name in names:
+                activations[name] = stream[:, 1::2]
+        y = self.lm_head(self.norm(stream[:, 1::2]))
+        if "lm_head" in names:
+            activations["lm_head"] = y
+        return y if return_activations is False else (y, activations)
+
+    def tokens(self, x: torch.Tensor, start: int) -> torch.Tensor:
+        """Return what the blocks see of features [B, T, F]: two tokens per step [B, 2 T, width], from ``start`` on."""
+        batch, steps, features = x.shape
+        if start + 2 * steps > self.context:
+            raise UsageError(
+                f"The GPT attender remembers at most {self.max_steps} steps (context {self.context} tokens, two per "
+                f"step); received step {start // 2 + steps}. Shorten the sweep or start again from init_state."
+            )
+        # x₀, a, x₁, a, …: answers are read at the odd places, where the token itself carries no stimulus.
+        pairs = torch.stack((x, self.action.to(x.dtype).expand(batch, steps, features)), 2)
+        return self.dropout(self.embed(pairs.flatten(1, 2)) + self.positions[start : start + 2 * steps])
+
+
+_STEP_RANGE = (1e-3, 1e-1)
+
+
+class MambaMemory(NamedTuple):
+    """Memory of a block between two steps."""
+
+    recent: torch.Tensor
+    """[B, inner, convolution − 1] the inputs of the short convolution, oldest first."""
+    state: torch.Tensor
+    """[B, inner, states] of the state space."""
+
+
+MambaState = tuple[MambaMemory, ...]  # one memory per block
+
+
+class MambaBlock(nn.Module):
+    """x + selective state space(LayerNorm(x)), [B, T, width].
+
+    Per inner channel and state: h_t = exp(Δ_t A) h_{t−1} + Δ_t B_t u_t, y_t = C_t · h_t + D u_t, where the step
+    Δ_t and the vectors B_t, C_t are functions of the input; y is gated by SiLU of a second branch.
+
+    Sizes are those of :class:`MambaAttender`; what each of ``depth`` blocks adds is scaled by 1/√depth.
+    """
+
+    def __init__(self, width: int, *, expansion: int, states: int, convolution: int, depth: int) -> None:
+        super().__init__()
+        inner, self.rank, self.states = expansion * width, math.ceil(width / 16), states
+        self.norm = nn.LayerNorm(width)
+        self.expand = Linear(width, 2 * inner, use_bias=False)
+        self.convolution = nn.Conv1d(inner, inner, convolution, groups=inner)
+        self.select = Linear(inner, self.rank + 2 * states, use_bias=False)
+        self.step_size = Linear(self.rank, inner, gain=1.0 / math.sqrt(3.0))
+        self.log_decay = nn.Parameter(torch.arange(1.0, states + 1).log().repeat(inner, 1))
+        self.skip = nn.Parameter(torch.ones(inner))
+        self.project = Linear(inner, width, use_bias=False, gain=1.0 / math.sqrt(depth))
+        if not self.skip.is_meta:
+            with torch.no_grad():
+                low, high = map(math.log, _STEP_RANGE)
+                # Δ is drawn log-uniformly; its inverse softplus is Δ + log(1 − e^−Δ).
+                size = torch.empty(inner).uniform_(low, high).exp()
+                # The softplus of this bias is the step size.
+                self.step_size.bias.copy_(size + torch.log(-torch.expm1(-size)))
+
+    def init_memory(self, batch: int) -> MambaMemory:
+        """Return the memory before the first step, all zeros."""
+        inner, _, size = self.convolution.weight.shape
+        return MambaMemory(self.skip.new_zeros(batch, inner, size - 1), self.skip.new_zeros(batch, inner, self.states))
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        """Process a sweep [B, T, width]."""
+        u, gate = self.expand(self.norm(x)).chunk(2, -1)
+        # Zeros before the first step alone make the short convolution causal.
+        padded = functional.pad(u.transpose(1, 2), (self.convolution.kernel_size[0] - 1, 0))
+        u = functional.silu(self.convolution(padded).transpose(1, 2))
+        if (scan := dispatch.selective_scan(u)) is not None:
+            return self._scanned(scan, x, u, gate)
+        decay, drive, readout = self._selected(u)
+        return self._out(x, linear_scan(decay, drive), readout, u, gate)
+
+    def step(self, x: torch.Tensor, memory: MambaMemory) -> tuple[torch.Tensor, MambaMemory]:
+        """Advance by one step [B, width]; return the answer and the next memory."""
+        u, gate = self.expand(self.norm(x)).chunk(2, -1)
+        # The stream keeps the last inputs, so its short convolution sees what the sweep's does.
+        window = torch.cat((memory.recent.to(u.dtype), u[..., None]), -1)
+        weight, bias = self.convolution.weight[:, 0], cast(torch.Tensor, self.convolution.bias)
+        u = functional.silu((window * weight).sum(-1) + bias)
+        decay, drive, readout = self._selected(u)
+        h = decay * memory.state + drive
+        return self._out(x, h, readout, u, gate), MambaMemory(window[..., 1:], h)
+
+    def _selected(self, u: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Return exp(Δ A) and Δ B u [..., inner, states], and C [..., states], in single precision or better."""
+        size, drive, readout = self.select(u).split((self.rank, self.states, self.states), -1)
+        # Products of many decays need more digits than half floats have.
+        exact = torch.promote_types(u.dtype, torch.float32)
+        size = functional.softplus(self.step_size(size)).to(exact)
+        # exp(Δ A) with A = −exp(log_decay) < 0, so no state can grow; the input enters by Δ B (Gu & Dao 2023).
+        decay = torch.exp(size[..., None] * -torch.exp(self.log_decay.to(exact)))
+        return decay, (size * u.to(exact))[..., None] * drive.to(exact)[..., None, :], readout.to(exact)
+
+    def _scanned(self, scan: Any, x: torch.Tensor, u: torch.Tensor, gate: torch.Tensor) -> torch.Tensor:
+        """Answer by a kernel that scans, reads out and gates in one pass; it takes [B, channel, T]."""
+        size, drive, readout = self.select(u).split((self.rank, self.states, self.states), -1)
+        size = size @ self.step_size.weight.to(size.dtype).T
+        u, size, drive, readout, gate = (part.transpose(1, 2).contiguous() for part in (u, size, drive, readout, gate))
+        decay, bias = -torch.exp(self.log_decay.float()), self.step_size.bias.float()
+        y = scan(u, size, decay, drive, readout, self.skip.float(), z=gate, delta_bias=bias, delta_softplus=True)
+        return x + self.project(y.transpose(1, 2)).to(x.dtype)
+
+    def _out(self, x: torch.Tensor, h: torch.Tensor, readout: torch.Tensor, u: torch.Tensor, gate: torch.Tensor) -> Any:
+        """Read the states h [..., inner, states] out, gate them and add them to the stream."""
+        y = (h * readout[..., None, :]).sum(-1).to(u.dtype) + self.skip * u
+        return x + self.project(y * functional.silu(gate)).to(x.dtype)
+
+
+class MambaAttender(nn.Module):
+    """Map features [B, T, F] to [B, T, F], causally and for any number of steps; a stream is the recurrence.
+
+    Pre-norm residual blocks and a final norm; 6,784,000 parameters at width 512.
+
+    The inner width of a block is ``expansion`` times F, with ``states`` per inner channel; the short convolution sees
+    ``convolution`` steps.
+    """
+
+    max_steps: int | None = None
+
+    def __init__(
+        self, features: int, *, blocks: int = 4, expansion: int = 2, states: int = 16, convolution: int = 4
+    ) -> None:
+        super().__init__()
+        sizes = {"expansion": expansion, "states": states, "convolution": convolution}
+        given = {"features": features, "blocks": blocks, **sizes}
+        if min(given.values()) < 1:
+            received = ", ".join(f"{name} {value}" for name, value in given.items())
+            raise UsageError(f"A Mamba attender needs positive sizes; received {received}.")
+        self.features = features
+        self.blocks: Any = nn.ModuleList(MambaBlock(features, depth=blocks, **sizes) for _ in range(blocks))
+        self.norm = nn.LayerNorm(features)
+        self.layers: tuple[str, ...] = (*(f"block{index}" for index in range(1, blocks + 1)), "norm")
+
+    def multiply_adds(self) -> int:
+        """Return the multiply-adds of products and convolutions in one step (the recurrences add about 3 %)."""
+        return sum(m.weight.numel() for m in self.modules() if isinstance(m, (Linear, nn.Conv1d)))
+
+    def forward(self, x: torch.Tensor, *, return_activations: bool | Collection[str] = False) -> Any:
+        """Return the answers [B, T, F], with activations also ``{layer: [B, T, F]}``."""
+        layers = zip(self.layers, (*self.blocks, self.norm), strict=True)
+        y, activations = run_layers(x, layers, return_activations)
+        return y if return_activations is False else (y, activations)
+
+    def init_state(self, batch: int) -> MambaState:
+        """Return the state before the first step, all zeros."""
+        return tuple(block.init_memory(batch) for block in self.blocks)
+
+    def step(self, x: torch.Tensor, state: MambaState) -> tuple[torch.Tensor, MambaState]:
+        """Advance by one step of features [B, F]; return the answer [B, F] and the next state."""
+        after = []
+        for block, memory in zip(self.blocks, state, strict=True):
+            x, memory = block.step(x, memory)
+            after.append(memory)
+        return self.norm(x), tuple(after)

@@ -31,8 +31,7 @@ from brainbench.core.errors import DataError, UsageError, brief, check_name, che
 from brainbench.core.reading.apart import CRASHED, SECONDS, call_apart
 from brainbench.core.reading.regular import check_file, reason, temporary_folder
 from brainbench.core.reading.tensors import check_finite
-from brainbench.models.attenders import GPTAttender, MambaAttender, MambaMemory
-from brainbench.models.encoders import S4Encoder
+from brainbench.models.encoders import GPTAttender, MambaAttender, MambaMemory, S4Encoder
 from brainbench.models.graph.temporal_graph import GraphState, TemporalGraph
 from brainbench.models.network import EncoderAttenderDecoder
 from brainbench.models.ops.state_space import System

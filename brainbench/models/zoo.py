@@ -109,12 +109,12 @@ def _encoder(architecture: Architecture) -> Encoder:
 
 def _attender(architecture: Architecture, features: int) -> Attender | None:
     if architecture.attender == "gpt":
-        from brainbench.models.attenders import GPTAttender
+        from brainbench.models.encoders import GPTAttender
 
         # As published, the ResNet's transformer is half as wide as its features.
         return GPTAttender(features, features // 2 if architecture.encoder == "resnet18" else features)
     if architecture.attender == "mamba":
-        from brainbench.models.attenders import MambaAttender
+        from brainbench.models.encoders import MambaAttender
 
         return MambaAttender(features)
     return None

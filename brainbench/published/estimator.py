@@ -54,8 +54,7 @@ from brainbench.metrics.reliability.noise_correction import (
     spearman_brown,
 )
 from brainbench.metrics.reliability.subject_rdm import SubjectRDM, is_flat
-from brainbench.models.attenders import GPTAttender, MambaAttender
-from brainbench.models.encoders import ResNet18Encoder, S4Encoder
+from brainbench.models.encoders import GPTAttender, MambaAttender, ResNet18Encoder, S4Encoder
 from brainbench.models.graph.temporal_graph import TemporalGraph
 from brainbench.models.network import EncoderAttenderDecoder
 from brainbench.models.parts import AllStepsDecoder, Attender

@@ -25,8 +25,7 @@ from leaderboards.entries import Entry
 from leaderboards.figures.charts import board_figures
 from leaderboards.figures.record import diagram, layers
 from leaderboards.figures.svg import STYLE, Figure, standalone
-from leaderboards.site.build import board_label
-from leaderboards.site.score_page import render, render_markdown
+from leaderboards.site.build import board_label, render, render_markdown
 from leaderboards.store import StoredRecord
 
 

@@ -9,7 +9,7 @@ import typer
 
 from brainbench.cli.options import out_file_option, with_options
 from brainbench.cli.output import Output, progress_bar, table_of
-from brainbench.cli.policy.options import ENV, HandOption
+from brainbench.cli.policy.train import ENV, HandOption
 from brainbench.cli.requirements import needs
 
 if TYPE_CHECKING:

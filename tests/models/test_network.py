@@ -7,8 +7,7 @@ import torch
 
 from brainbench.core.contracts import CHANNELS, GRID_SHAPE
 from brainbench.core.errors import UsageError
-from brainbench.models.attenders import GPTAttender
-from brainbench.models.encoders import zhuang_graph
+from brainbench.models.encoders import GPTAttender, zhuang_graph
 from brainbench.models.graph.temporal_graph import TemporalGraph
 from brainbench.models.network import EncoderAttenderDecoder, Normaliser
 from brainbench.models.parts import make_decoder

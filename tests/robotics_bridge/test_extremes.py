@@ -10,11 +10,10 @@ import torch
 
 from brainbench.core.errors import UsageError
 from robotics_bridge import hands, tasks
-from robotics_bridge.deploy.controller import Controller
+from robotics_bridge.deploy.controller import Controller, PressureCalibration, constant
 from robotics_bridge.deploy.driver import Clock, HandReading, LinkCounters
 from robotics_bridge.deploy.links.udp import UdpDriver, new_key
 from robotics_bridge.deploy.safety import SafetyLimits
-from robotics_bridge.deploy.session import PressureCalibration, constant
 from robotics_bridge.hands.scenes import holding
 from robotics_bridge.physics import Geometry, HandState, MujocoEngine
 from robotics_bridge.policies.contract import PolicyContract

@@ -12,7 +12,7 @@ from brainbench.cli.options import out_file, with_options
 from brainbench.cli.output import Output, progress_bar
 
 if TYPE_CHECKING:
-    from robotics_bridge.deploy.session import DeployedPolicy
+    from robotics_bridge.deploy.controller import DeployedPolicy
 
 
 LINKS = "robotics_bridge.links"
@@ -76,12 +76,11 @@ def deploy(
     Exit status 1: it was stopped for safety.
     """
     from brainbench.core.plugins import require_optional
-    from robotics_bridge.deploy import session
-    from robotics_bridge.deploy.controller import check_duration, realtime
+    from robotics_bridge.deploy.controller import check_duration, read_deployed, realtime
     from robotics_bridge.deploy.driver import DriverRequest, open_driver
     from robotics_bridge.tasks.settings import contacts_name
 
-    deployed = session.read_deployed(policy)
+    deployed = read_deployed(policy)
     contract = deployed.contract
     check_duration(seconds)
     recorder = None if record is None else require_optional(LINKS, "lerobot", "recorder")(contract, record)
@@ -127,7 +126,7 @@ def _inputs(deployed: DeployedPolicy, words: list[str]) -> dict[str, Any]:
     """Return group → its constant, as --input gives them."""
     from brainbench.core.errors import check_each
     from brainbench.core.limits import read_pairs, read_value
-    from robotics_bridge.deploy.session import constant
+    from robotics_bridge.deploy.controller import constant
 
     wanted = [name for name in deployed.contract.inputs if name != "proprio"]
     pairs = read_pairs(words, "--input", "command=1,0,0")

@@ -10,7 +10,7 @@ import typer
 
 from brainbench.cli.options import out_file, out_file_option, with_options
 from brainbench.cli.output import Output, facts, progress_bar, table_of
-from brainbench.cli.policy.options import ENV, ENVS_FLAG, TOUCH, World, agent_of, in_world, touch_of
+from brainbench.cli.policy.train import ENV, ENVS_FLAG, TOUCH, World, agent_of, in_world, touch_of
 
 
 def list_tasks() -> Output:

@@ -9,7 +9,7 @@ import typer
 
 from brainbench.cli.options import out_folder_option, with_options
 from brainbench.cli.output import Output, table, table_of, tracked
-from brainbench.cli.policy.options import ENV, ENVS_FLAG, DeviceOption, HandOption
+from brainbench.cli.policy.train import ENV, ENVS_FLAG, DeviceOption, HandOption
 from brainbench.core.errors import UsageError, brief
 
 _HAND_FILES = (".urdf", ".xml", ".mjcf")

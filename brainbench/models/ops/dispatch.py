@@ -7,7 +7,7 @@ deferred gradients        a pass with gradients that :func:`deferring` wraps  he
 fused kernels             bfloat16 on CUDA with Triton, no gradients          here
 packed weights            one stimulus on the CPU, after :func:`.layers.packed`  :class:`.layers.PackedMatrix`
 one matrix product        one stimulus on the CPU, many weights, no gradients  :class:`.layers.Conv2d`
-scan of ``mamba_ssm``     CUDA, where the package is installed                :mod:`brainbench.models.attenders`
+scan of ``mamba_ssm``     CUDA, where the package is installed                :mod:`brainbench.models.encoders`
 PyTorch                   everything else                                     :class:`.layers.Conv2d`
 ========================  ==================================================  ==========================================
 

@@ -22,9 +22,8 @@ from torch.optim import Optimizer
 
 from brainbench.core.devices import record_step
 from brainbench.core.errors import UsageError, check_name, check_number
-from brainbench.models.attenders import GPTBlock, MambaBlock
 from brainbench.models.cells import Cell, GatedCell
-from brainbench.models.encoders import BasicBlock, S4Block
+from brainbench.models.encoders import BasicBlock, GPTBlock, MambaBlock, S4Block
 from brainbench.models.ops.layers import copy_named
 from brainbench.models.parts import AutoencoderHead, SimCLRHead, SimSiamHead
 from brainbench.models.recipes import OPTIMIZERS, SCHEDULES

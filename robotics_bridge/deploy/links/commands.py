@@ -9,7 +9,7 @@ import typer
 
 from brainbench.cli.options import out_file_option
 from brainbench.cli.output import Output, table_of
-from brainbench.cli.policy.options import HandOption
+from brainbench.cli.policy.train import HandOption
 
 
 def replay(

@@ -39,9 +39,9 @@ from brainbench.core.files import atomic_path, write_json
 from brainbench.core.reading.tables import read_columns
 from brainbench.core.reading.texts import read_json
 from robotics_bridge import hands
+from robotics_bridge.deploy.controller import PressureCalibration
 from robotics_bridge.deploy.driver import HandReading
 from robotics_bridge.deploy.links.simulated_hand import SimulatedHand
-from robotics_bridge.deploy.session import PressureCalibration
 from robotics_bridge.hands import Hand
 from robotics_bridge.hands.layouts import Layout
 from robotics_bridge.policies.contract import PolicyContract

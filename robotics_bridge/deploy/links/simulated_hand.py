@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 from brainbench.core.errors import DataError, UsageError, check_number
 from brainbench.core.limits import Limit, Seed, Share, limited, read_pairs, with_changes
 from robotics_bridge import hands
+from robotics_bridge.deploy.controller import PressureCalibration
 from robotics_bridge.deploy.driver import DriverRequest, HandReading
 from robotics_bridge.deploy.links.udp import LOOPBACK, HandEnd, HandLink, UdpDriver, new_key
-from robotics_bridge.deploy.session import PressureCalibration
 from robotics_bridge.hands.layouts import check_probes
 from robotics_bridge.hands.observations import observation_type, observe, sensors_for
 from robotics_bridge.hands.scenes import ARMATURE, OBJECT, holding

@@ -76,7 +76,7 @@ def test_deploy_asks_for_what_is_missing_before_a_hand_is_started(tmp_path, monk
 
 @pytest.mark.slow
 def test_a_student_plays_with_its_own_touch_and_is_exported(tmp_path: Path) -> None:
-    from robotics_bridge.deploy.session import read_deployed
+    from robotics_bridge.deploy.controller import read_deployed
     from robotics_bridge.tasks.settings import CONTACTS
 
     name, file = "in_palm_rotate.student", tmp_path / "policy.onnx"

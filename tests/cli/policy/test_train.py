@@ -7,10 +7,11 @@ import pytest
 from typer.testing import CliRunner
 
 from brainbench.cli import app
-from brainbench.core.errors import UsageError
+from brainbench.core.errors import DataError, UsageError
 from brainbench.core.files import lock_folder, read_json
 from robotics_bridge import hands
 from robotics_bridge.hands.layouts import write_probes
+from tests.factories.policies import teacher_in
 from tests.factories.policy_commands import run_policy
 
 
@@ -133,3 +134,33 @@ def test_a_student_of_any_touch_and_encoder_runs_to_the_recorded_episode(
         "deploy", "run/policy.onnx", "--shadow", "--seconds", 1, "--timeout", 1, "--record", "ep", "--json"
     )
     assert json.loads(deployed)["status"] == "finished"
+
+
+@pytest.mark.slow
+def test_a_policy_plays_in_the_contacts_that_it_was_trained_in_unless_told_otherwise(tmp_path: Path) -> None:
+    other = str(teacher_in("published", tmp_path / "other"))
+
+    def contacts(agent: str, *more: str) -> str:
+        words = ("--agent", agent, "--seconds", "0.05", *more)
+        return json.loads(run_policy("play", "in_palm_rotate", *words, "--json"))["contacts"]
+
+    firm = ("--change", "contacts=firm")
+    assert contacts("random") == contacts("in_palm_rotate.teacher") == contacts(other, *firm) == "firm"
+    assert contacts(other) == contacts("in_palm_rotate.teacher", "--change", "contacts=published") == "published"
+    with pytest.raises(UsageError, match="counted from"):
+        contacts("in_palm_rotate.teacher", "--config", "published")
+    with pytest.raises(UsageError, match="different contacts"):
+        run_policy("evaluate", "in_palm_rotate", other, "in_palm_rotate.teacher")
+
+
+def test_wrong_requests_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="did you mean 'random'"):
+        run_policy("play", "in_palm_rotate", "--agent", "randm", "--seconds", "0.1")
+    with pytest.raises(UsageError, match="--seconds must be"):
+        run_policy("play", "in_palm_rotate", "--seconds", "0")
+    with pytest.raises(DataError, match=r"none\.py"):
+        run_policy("play", "in_palm_rotate", "--task-file", str(tmp_path / "none.py"))
+    broken = tmp_path / "broken.py"
+    broken.write_text("1 / 0")
+    with pytest.raises(DataError, match="ZeroDivisionError"):
+        run_policy("play", "in_palm_rotate", "--task-file", str(broken))

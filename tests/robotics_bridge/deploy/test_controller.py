@@ -5,15 +5,38 @@ from __future__ import annotations
 import gc
 import os
 import re
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
+import torch
 
 from brainbench.core.errors import UsageError
-from robotics_bridge import hands
-from robotics_bridge.deploy.controller import PRIORITY, Controller, realtime
+from robotics_bridge import hands, tasks
+from robotics_bridge.deploy.controller import (
+    PRIORITY,
+    Controller,
+    DeployedPolicy,
+    LatencyHistogram,
+    PressureCalibration,
+    RateMonitor,
+    RealTouch,
+    read_deployed,
+    realtime,
+)
+from robotics_bridge.deploy.driver import Clock, Driver, HandReading, LinkCounters
 from robotics_bridge.deploy.safety import SafetyLimits
+from robotics_bridge.policies.contract import PolicyContract
+from robotics_bridge.policies.evaluate import Policy
+from robotics_bridge.policies.export import export_policy
+from robotics_bridge.policies.training.distill import build_student, describe_run
+from robotics_bridge.policies.training.distill_config import DistillConfig
+from robotics_bridge.tasks.task import ObservationNoise
 from tests.factories.paper_hands import OwnClock, PaperHand, make_contract, make_limits, run_session
+from tests.factories.policies import contract_of
 
 linux = pytest.mark.skipif(not hasattr(os, "SCHED_FIFO"), reason="SCHED_FIFO is Linux's")
 
@@ -162,3 +185,147 @@ def test_what_does_not_fit_is_refused_before_anything_moves() -> None:
         SafetyLimits.of_hand(hand, ("knee",))
     report, _, _ = run_session(groups=("proprio", "command"), sources={"command": lambda r: np.array([np.nan])})
     assert report.reason == "the observation 'command' holds values that are no numbers"
+
+
+def test_histogram_and_rate() -> None:
+    histogram = LatencyHistogram()
+    for value in np.linspace(0.001, 0.1, 1000):
+        histogram.append(float(value))
+    assert sum(int(line.split()[3]) for line in histogram.text().splitlines()) == 1000
+    assert histogram.summary()["p50"] == pytest.approx(50.5, rel=1e-3)
+    assert histogram.summary()["max"] == pytest.approx(100.0)
+    assert histogram.text().count("\n") == 20  # two decades
+    monitor = RateMonitor(40, 1.0)
+    rates = [monitor.tick(0.05 * step) for step in range(60)]
+    assert rates[5] == 40  # too early to tell
+    assert rates[-1] == pytest.approx(20)
+
+
+def test_a_source_that_the_policy_does_not_read_is_refused() -> None:
+    with pytest.raises(UsageError, match=r"'comand'.*did you mean 'command'"):
+        run_session(groups=("proprio", "command"), sources={"comand": None, "command": lambda reading: np.zeros(1)})
+
+
+def _deployed(group: str, size: int = 1, **deployment: Any) -> DeployedPolicy:
+    contract = contract_of()
+    contract["inputs"][1] = [group, [size]]
+    contract["deployment"] |= {"hand": "xhand1", **deployment}
+    return DeployedPolicy(Path("policy.onnx"), PolicyContract.of(contract, "policy.onnx.json"))
+
+
+@pytest.mark.parametrize("group", ["goal", "priv_obj_state", "priv_proprio", "aux_goal_dist", "aux_obj_size"])
+def test_no_constant_stands_for_what_only_the_simulation_knows(group: str) -> None:
+    with pytest.raises(UsageError, match=f"'{group}', which only the simulation knows"):
+        _deployed(group).require({group, "tactile"})
+
+
+def test_a_command_that_the_contract_states_needs_no_word_of_the_user() -> None:
+    assert "command" not in _deployed("command", command=[1.0]).require({"tactile"})
+    with pytest.raises(UsageError, match=r"command \(\[4\], what the hand is told"):
+        _deployed("command", 4).require({"tactile"})
+
+
+def test_touch_of_a_policy_without_touch_reaches_nothing_and_is_refused() -> None:
+    deployed, hand = _deployed("command", command=[0.5]), SimpleNamespace(joints=(), fingers=())
+    inputs = {name: shape for name, shape in deployed.contract.inputs.items() if name != "tactile"}
+    deployed = replace(deployed, contract=replace(deployed.contract, inputs=inputs, links=()))
+    for options in ({"fallback": lambda reading: None}, {"calibration": PressureCalibration()}):
+        with pytest.raises(UsageError, match="reads no touch"):
+            deployed.controller(cast("Driver", hand), **options)
+    with pytest.raises(UsageError, match="fallback, not among sources"):
+        deployed.controller(cast("Driver", hand), sources={"tactile": lambda reading: None})
+
+
+class _OwnClock(Clock):
+    def __init__(self) -> None:
+        self.now = 0.0
+
+    def __call__(self) -> float:
+        return self.now
+
+    def sleep(self, seconds: float) -> None:
+        self.now += seconds
+
+
+class _TaskHand:
+    """A hand that is the task itself: each command is held against what evaluation does in the same state."""
+
+    def __init__(self, env: Any, policy: Policy, clock: Clock) -> None:
+        self.env, self.policy, self.clock, self.counters = env, policy, clock, LinkCounters()
+        self.joints, self.fingers = env.joint_names, tuple(env.hand.fingers)
+        self.number = 0
+        self.pairs: list[tuple[np.ndarray, np.ndarray]] = []
+        self.largest = 0.0
+
+    def read(self) -> HandReading:
+        self.number += 1
+        columns, state = self.env.state.actuators, self.env.simulation
+        position, velocity = state.qpos[0, columns.qpos_columns], state.qvel[0, columns.qvel_columns]
+        pressure = np.zeros((len(self.fingers), 3))
+        now = self.clock()
+        return HandReading(self.number, now, now, position.double().numpy(), velocity.double().numpy(), pressure)
+
+    def send(self, targets: np.ndarray) -> None:
+        self.env.step(self.policy(self.env.observations))
+        self.largest = max(self.largest, float(self.env.state.episode.action.abs().max()))
+        self.pairs.append((np.array(targets), self.env.state.actuators.target[0].numpy().copy()))
+
+    def stop(self) -> None: ...
+
+    def close(self) -> None: ...
+
+
+def test_a_deployed_policy_sees_and_does_what_evaluation_does(tmp_path: Path) -> None:
+    task = replace(tasks.load("in_palm_rotate"), noise=ObservationNoise(position=0.0, velocity=0.0))
+    env = tasks.make(task, num_envs=1, threads=1, seed=2)
+    config = DistillConfig(task="in_palm_rotate", observe="none", embedder="lstm", hidden=(16,), num_envs=1)
+    with torch.random.fork_rng():
+        torch.manual_seed(3)
+        student = build_student(config, env.observation_shapes, ["proprio", "command"], env.num_actions).eval()
+        # Actions beyond the limit: deployed, they must be bounded and remembered as in the task.
+        student.mlp[-1].weight.data *= 200.0  # type: ignore[index]
+    described = describe_run(config, student, env)
+    found = export_policy(student, tmp_path / "policy", deployment=described["deployment"])
+    clock = _OwnClock()
+    hand = _TaskHand(env, Policy(student), clock)
+    limits = {"margin": 1.0, "pressure": 1000.0}
+    controller = read_deployed(found.path).controller(hand, limits=limits, clock=clock)
+    report = controller.run(0.5)
+    assert (report.status, report.ticks) == ("finished", 20)
+    sent, wanted = (np.array(part) for part in zip(*hand.pairs, strict=True))
+    assert np.ptp(wanted, axis=0).max() > 0.1
+    assert hand.largest == pytest.approx(task.action_limit)
+    np.testing.assert_allclose(sent, wanted, atol=2e-4)
+
+
+JOINTS = ("a", "b", "c")
+
+
+def _touching(observe: str, shape: tuple[int, ...]) -> PolicyContract:
+    body = hands.load("xhand1")
+    links = (body.palm, body.fingers["index"][-1], body.fingers["thumb"][-1])
+    return PolicyContract({"tactile": shape}, 40.0, "xhand1", JOINTS, JOINTS, {}, {}, links, observe)
+
+
+def test_real_values_fill_all_slots_and_simulated_ones_the_rest() -> None:
+    pressure = np.array([[0.0, 0.0, 0.03], [0.02, 0.0, 0.1]])
+    reading = HandReading(0, 0.0, 0.0, np.zeros(3), np.zeros(3), pressure)
+    fallback = lambda r: np.full((5, 3, 1), 7.0)  # noqa: E731
+    touch = RealTouch(_touching("agg_bool", (5, 3, 1)), ("thumb", "index"), fallback=fallback)
+    assert touch(reading)[:, :, 0].tolist() == [[7.0, 1.0, 0.0]] * 5  # 4.31: |f| > 0.05
+    force = RealTouch(_touching("agg_force", (5, 3, 3)), ("thumb", "index"))
+    assert force(reading)[2].tolist() == [[0, 0, 0], [-20.0, 0.0, 100.0], [0.0, 0.0, 30.0]]
+    calibration = PressureCalibration(per_finger={"index": 500.0})
+    again = calibration.pressure(("thumb", "index"), calibration.force(("thumb", "index"), pressure))
+    np.testing.assert_allclose(again, pressure)
+    simulated = RealTouch(_touching("force", (5, 9, 3)), (), fallback=lambda r: np.ones((5, 9, 3)))
+    assert simulated(reading).all()
+    with pytest.raises(UsageError, match=r"'force', .*'agg_force'"):
+        RealTouch(_touching("force", (5, 9, 3)), ())
+
+
+@pytest.mark.parametrize("observe", ["agg_force", "agg_bool"])
+def test_a_calibration_of_a_finger_that_the_hand_lacks_is_refused(observe) -> None:
+    calibration = PressureCalibration(per_finger={"indx": 5.0})
+    with pytest.raises(UsageError, match="'indx'; did you mean 'index'"):
+        RealTouch(_touching(observe, (5, 3, 3)), ("thumb", "index"), calibration=calibration)

@@ -15,7 +15,7 @@ from tensordict import TensorDict
 
 from brainbench.core.errors import BrainbenchError, DataError
 from brainbench.core.files import write_json
-from robotics_bridge.deploy.session import read_deployed
+from robotics_bridge.deploy.controller import read_deployed
 from robotics_bridge.policies.export import compare, export_policy, read_policy
 from robotics_bridge.policies.student import StepPolicy, TactilePolicy
 from tests.factories.mutations import mutate_text

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from brainbench.cli.policy.options import agent_of, touch_of
+from brainbench.cli.policy.train import agent_of, touch_of
 from brainbench.core.errors import UsageError
 from brainbench.core.files import read_json
 from robotics_bridge import tasks

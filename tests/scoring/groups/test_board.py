@@ -23,7 +23,7 @@ from brainbench.metrics.measures.rsa import RSA
 from brainbench.models.features import write_features
 from brainbench.scoring.groups import score_groups
 from brainbench.scoring.scores import score_record
-from leaderboards.site.score_page import write_report
+from leaderboards.site.build import write_report
 from leaderboards.text import group_rows
 from tests.factories.recordings import as_recordings, make_simple_session, quiet_design
 

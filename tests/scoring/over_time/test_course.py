@@ -21,7 +21,7 @@ from brainbench.models.features import write_features
 from brainbench.scoring.over_time import animal_movie, in_bins, layer_movie, score_over_time
 from brainbench.scoring.over_time.course import LaggedRDMs, best_lag, held_out_course, votes
 from brainbench.scoring.scores import score_record
-from leaderboards.site.score_page import write_report
+from leaderboards.site.build import write_report
 from tests.factories.moving_geometry import (
     BIN,
     DIMENSIONS,

@@ -14,6 +14,7 @@ from pyarrow import parquet
 
 from brainbench.core.errors import DataError, UsageError
 from robotics_bridge import hands
+from robotics_bridge.deploy.controller import PressureCalibration
 from robotics_bridge.deploy.driver import HandReading
 from robotics_bridge.deploy.links.replay import (
     PARTS,
@@ -29,7 +30,6 @@ from robotics_bridge.deploy.links.replay import (
     write_lerobot,
 )
 from robotics_bridge.deploy.links.simulated_hand import SimulatedHand
-from robotics_bridge.deploy.session import PressureCalibration
 from robotics_bridge.hands.observations import observe
 from robotics_bridge.policies.contract import PolicyContract
 from robotics_bridge.policies.encoders.taxel_grid import TaxelGrid, finger_axes_of

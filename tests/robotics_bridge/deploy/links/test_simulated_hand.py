@@ -9,9 +9,9 @@ import pytest
 
 from brainbench.core.errors import UsageError
 from robotics_bridge import hands
+from robotics_bridge.deploy.controller import RealTouch
 from robotics_bridge.deploy.driver import HandReading
 from robotics_bridge.deploy.links.simulated_hand import ShadowTouch, SimulatedHand, simulated_hand
-from robotics_bridge.deploy.session import RealTouch
 from robotics_bridge.hands.scenes import closing
 from robotics_bridge.policies.contract import PolicyContract
 from robotics_bridge.tasks.settings import CONTACTS

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from robotics_bridge import tasks
-from robotics_bridge.deploy.session import read_deployed
+from robotics_bridge.deploy.controller import read_deployed
 from robotics_bridge.policies.evaluate import Policy
 from robotics_bridge.policies.export import export_policy
 from robotics_bridge.policies.training.distill import distill, load_student
