@@ -8,9 +8,8 @@ from typing import Annotated, Any
 import typer
 
 from brainbench.benchmarks.opening import OPTIONS
-from brainbench.cli.options import SCORE, SCORE_FLAGS, out_file_option, with_options
+from brainbench.cli.options import SCORE, SCORE_FLAGS, needs, out_file_option, with_options
 from brainbench.cli.output import Output, facts, progress_bar, table_of
-from brainbench.cli.requirements import needs
 
 OPENING = "brainbench.benchmarks.opening"
 app = typer.Typer(no_args_is_help=True, help="Make, check and pack benchmarks: one file that others score on.")

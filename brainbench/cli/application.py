@@ -72,7 +72,7 @@ def build(words: Sequence[str] | None = None) -> typer.Typer:
         elif first is not None and not single and part.present:
             app.command(name, help=part.summary, rich_help_panel=OPTIONAL_PANEL)(_named_only)
     if first is None or single:
-        from brainbench.cli.requirements import guard
+        from brainbench.cli.options import guard
 
         guard(app)
     return app

@@ -8,9 +8,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from brainbench.cli.options import SCORE, SeedOption, beside, option, out_file_option, out_folder_option, with_options
+from brainbench.cli.options import (
+    SCORE,
+    SeedOption,
+    beside,
+    needs,
+    option,
+    out_file_option,
+    out_folder_option,
+    with_options,
+)
 from brainbench.cli.output import Output, facts, progress_bar, table, table_of
-from brainbench.cli.requirements import needs
 from brainbench.cli.score import left_out
 
 if TYPE_CHECKING:

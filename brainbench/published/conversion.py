@@ -40,11 +40,13 @@ from brainbench.stimuli.objects.solid import Solid
 from brainbench.stimuli.scenes.scene import Frames
 from brainbench.stimuli.stimulus_set import hash_stimulus_set, new_stimulus_set
 from brainbench.stimuli.sweeps.generation import write_data_set
-from brainbench.stimuli.sweeps.plan import SPLITS, USUAL_SHARD, PlannedShard
-from brainbench.stimuli.sweeps.shards import (
+from brainbench.stimuli.sweeps.plan import (
     COUNTS,
     OK,
+    SPLITS,
     UNSTABLE,
+    USUAL_SHARD,
+    PlannedShard,
     ShardContent,
     encode_texts,
     shard_attributes,

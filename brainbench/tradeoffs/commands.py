@@ -7,9 +7,8 @@ from typing import Annotated, Any
 
 import typer
 
-from brainbench.cli.options import items, numbers, out_file_option, with_options
+from brainbench.cli.options import items, needs, numbers, out_file_option, with_options
 from brainbench.cli.output import Output, progress_bar, table_of
-from brainbench.cli.requirements import needs
 from brainbench.stimuli.engines.fidelity import DEFAULT_ENGINE
 
 app = typer.Typer(no_args_is_help=True, help="Measure accuracy against cost.")

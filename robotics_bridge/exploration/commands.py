@@ -7,10 +7,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from brainbench.cli.options import out_file_option, with_options
+from brainbench.cli.options import needs, out_file_option, with_options
 from brainbench.cli.output import Output, progress_bar, table_of
 from brainbench.cli.policy.train import ENV, HandOption
-from brainbench.cli.requirements import needs
 
 if TYPE_CHECKING:
     from robotics_bridge.exploration.record import Explored

@@ -10,9 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from brainbench.cli.options import option_fields, with_options
+from brainbench.cli.options import needs, option_fields, with_options
 from brainbench.cli.output import Output, progress_bar, table_of, tracked
-from brainbench.cli.requirements import needs
 from brainbench.core.errors import UsageError
 from brainbench.core.files import to_plain
 from brainbench.core.identity import SealedPlan

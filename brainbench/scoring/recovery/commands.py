@@ -12,9 +12,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from brainbench.cli.options import SCORE, SchedulerOption, WorkersOption, option, out_folder_option, with_options
+from brainbench.cli.options import (
+    SCORE,
+    Requirement,
+    SchedulerOption,
+    WorkersOption,
+    needs,
+    option,
+    out_folder_option,
+    with_options,
+)
 from brainbench.cli.output import Output, progress_bar, table_of
-from brainbench.cli.requirements import Requirement, needs
 from brainbench.core.errors import UsageError, check_number
 from brainbench.core.files import provenance, to_plain, write_json
 from brainbench.core.identity import SealedPlan

@@ -41,12 +41,16 @@ from brainbench.core.runs.jobs import (
 )
 from brainbench.stimuli.engines import get_engine
 from brainbench.stimuli.engines.error_estimates import LARGEST_ERROR
-from brainbench.stimuli.sweeps.plan import SPLITS, GenerationPlan, Plan, PlannedShard, ShardTask
-from brainbench.stimuli.sweeps.shards import (
+from brainbench.stimuli.sweeps.plan import (
     COUNTS,
     OK,
+    SPLITS,
     UNUSABLE,
     BuiltObject,
+    GenerationPlan,
+    Plan,
+    PlannedShard,
+    ShardTask,
     build_object,
     make_shard,
     simulate_shard,

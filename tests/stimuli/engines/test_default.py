@@ -10,8 +10,7 @@ from brainbench.stimuli import load_stimuli, simulation
 from brainbench.stimuli.engines import fidelity, get_engine, list_engines
 from brainbench.stimuli.engines.fidelity import DEFAULT_ENGINE
 from brainbench.stimuli.figures import pictures
-from brainbench.stimuli.sweeps.plan import GenerationSettings
-from brainbench.stimuli.sweeps.shards import simulate_sweeps
+from brainbench.stimuli.sweeps.plan import GenerationSettings, simulate_sweeps
 from brainbench.stimuli.validation import bench_tests
 from tests.factories import out_of_plane
 

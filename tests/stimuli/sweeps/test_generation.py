@@ -19,8 +19,7 @@ from brainbench.stimuli.engines.fidelity import Fidelity, list_presets
 from brainbench.stimuli.objects.collections import resolve_objects
 from brainbench.stimuli.sweeps import generation
 from brainbench.stimuli.sweeps.generation import generate
-from brainbench.stimuli.sweeps.plan import GenerationPlan, GenerationSettings
-from brainbench.stimuli.sweeps.shards import BuiltObject
+from brainbench.stimuli.sweeps.plan import BuiltObject, GenerationPlan, GenerationSettings
 from brainbench.stimuli.sweeps.sweep_scenes import SweepGrid
 from tests.factories.sweep_batches import GRID, files_of, small_plan
 

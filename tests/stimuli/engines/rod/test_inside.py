@@ -15,7 +15,7 @@ from brainbench.stimuli.motion.jobs import Job, StillFollicle
 from brainbench.stimuli.objects.obstacle import Box, Capsule, ConvexPart, Cylinder, Obstacle, Sphere
 from brainbench.stimuli.objects.procedural import make
 from brainbench.stimuli.objects.solid import shape_solid
-from brainbench.stimuli.sweeps.shards import simulate_sweeps
+from brainbench.stimuli.sweeps.plan import simulate_sweeps
 from brainbench.stimuli.sweeps.sweep_scenes import SweepGrid, SweepScenes
 from tests.factories.whiskers import C2
 

@@ -16,7 +16,7 @@ COARSE = Fidelity(links=10, time_step=1e-3)
 
 def test_sweeps_through_the_fast_path_equal_their_scenes():
     from brainbench.stimuli import simulate
-    from brainbench.stimuli.sweeps.shards import simulate_sweeps
+    from brainbench.stimuli.sweeps.plan import simulate_sweeps
 
     objects = resolve_objects(["ellipsoid-1"], surfaces=True)
     grid = SweepGrid(speed=(0.05,), rotation=(0.0, 0.7), distance=(0.005,), size=(0.03,))
@@ -34,7 +34,7 @@ def test_sweeps_through_the_fast_path_equal_their_scenes():
 
 
 def test_sweeps_do_not_depend_on_which_share_a_launch():
-    from brainbench.stimuli.sweeps.shards import simulate_sweeps
+    from brainbench.stimuli.sweeps.plan import simulate_sweeps
 
     objects = resolve_objects(["ellipsoid-1", "brick-2"], surfaces=True)
     grid = SweepGrid(speed=(0.05,), rotation=(0.0, 0.7), distance=(0.005,), size=(0.03,))
@@ -46,7 +46,7 @@ def test_sweeps_do_not_depend_on_which_share_a_launch():
 
 @pytest.mark.slow
 def test_whiskers_that_cannot_be_trusted_are_simulated_again_and_no_other_changes():
-    from brainbench.stimuli.sweeps.shards import simulate_sweeps
+    from brainbench.stimuli.sweeps.plan import simulate_sweeps
 
     objects = resolve_objects(["chair-0"], surfaces=True)
     scenes = SweepScenes(GRIDS["thesis-high"], {name: item.load for name, item in objects.items()})
@@ -114,7 +114,7 @@ def _few_sweeps(**grid):
 @pytest.mark.parametrize("path", ["sweeps", "scenes"])
 def test_an_object_too_fast_to_be_followed_is_told_of_in_sweeps_as_in_scenes(path, speed, step, way):
     from brainbench.stimuli import simulate
-    from brainbench.stimuli.sweeps.shards import simulate_sweeps
+    from brainbench.stimuli.sweeps.plan import simulate_sweeps
 
     scenes, fidelity = _few_sweeps(speed=(0.05, speed)), Fidelity(links=10, time_step=step)
     if path == "sweeps":
@@ -164,7 +164,7 @@ def test_whiskers_that_pause_for_every_look_at_a_mesh_feel_the_same(budget):
 
 
 def test_sweeps_through_the_fast_path_may_leave_inertia_out():
-    from brainbench.stimuli.sweeps.shards import simulate_sweeps
+    from brainbench.stimuli.sweeps.plan import simulate_sweeps
 
     objects = resolve_objects(["ellipsoid-1"], surfaces=True)
     grid = SweepGrid(speed=(0.03,), rotation=(0.0,), distance=(0.005,), size=(0.03,))
