@@ -284,19 +284,24 @@ class SensorSuite:
         It counts contacts with what they track. NaN where nobody knows: in environments that diverged, and in all where
         the engine had no room for every contact.
         """
-        self._flagged(0)
+        return self._lack(1)
+
+    @property
+    def missing_moment(self) -> torch.Tensor:
+        """Most moment [B, L] (N·m) that the taxels of a link may lack, like :attr:`missing`: contacts push beyond what
+        the taxels in touch span. Over the load it is how far off the centre of pressure lies."""
+        return self._lack(2)
+
+    def _lack(self, plane: int) -> torch.Tensor:
+        lost = self._flagged(DIVERGED | OVERFULL)[:, None]
         if self.pairs.loads is None:
             return torch.zeros(self.num_envs, len(self.scene.links), device=wp.device_to_torch(self.device))
-        lost = self._flagged(DIVERGED | OVERFULL)[:, None]
-        return wp.to_torch(self.pairs.loads)[1].masked_fill(lost, torch.nan)
+        return wp.to_torch(self.pairs.loads)[plane].masked_fill(lost, torch.nan)
 
     @property
     def unfelt(self) -> torch.Tensor:
         """Mask [B] of environments in which more than a hundredth of the load of a link was :attr:`missing`."""
-        missing = self.missing
-        if self.pairs.loads is None:
-            return missing.isnan().any(dim=1)
-        return ~(missing <= 0.01 * wp.to_torch(self.pairs.loads)[0]).all(dim=1)
+        return ~(self.missing <= 0.01 * self._lack(0)).all(dim=1)
 
     def _flagged(self, bit: int) -> torch.Tensor:
         if self._pose is None:

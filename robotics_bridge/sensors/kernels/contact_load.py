@@ -3,11 +3,12 @@
 Contacts by which one body pushes a link from one side, within 60°, are a face, with force F, load P along its normal n
 and moment M about the middle c of the taxels that carry it. A taxel of weight y = d^α, at r from c, carries::
 
-    f = y (s q + b + θ × r),    s = P / Σ y (m · n),    b = (F − s Σ y q) / Σ y,    J θ = M − s Σ r × y q
+    f = y s q + z (b + θ × r),    s = P / Σ z,    b = (F − s Σ y q) / Σ z,    J θ = M − s Σ r × y q
 
-with the outward normal m of what is touched, q = m (and m + σ for taxels that hold what they touch, ``stick``) and
-J = Σ y (r² − r rᵀ), so that Σ f = F and Σ r × f = M whatever the weights are. Where θ would pull a taxel, weights lean
-over first, y e^(λ · r), until it does not, as far as some taxels bear the moment.
+with the outward normal m of what is touched, z = y (m · n), q = m (and m + σ for taxels that hold what they touch,
+``stick``) and J = Σ z (r² − r rᵀ), Σ z r = 0, so that Σ f = F and Σ r × f = M whatever the weights are. Where θ would
+pull a taxel along n, weights lean over first, y e^(λ · r), until it does not, as far as some taxels bear the moment:
+a load beyond the outermost of them has the rest as its missing moment, since taxels push and never pull.
 
 The carriers of a face are, by source: :data:`TOUCH`, taxels that the body
 gives their depth, from that side; else :data:`BEHIND`, those that overlap it behind what is nearer (a block on a card);
@@ -25,17 +26,13 @@ from typing import Any
 from brainbench.core.devices import warp
 from robotics_bridge.physics.kernels.state import StateArrays
 from robotics_bridge.sensors.kernels.distance import FAR, SIDED, SolidArrays, shape_functions
-from robotics_bridge.sensors.kernels.noise import episode_draw
 from robotics_bridge.sensors.kernels.pairs import PairArrays, SlotArrays, push_side
 from robotics_bridge.sensors.kernels.readout import (
-    FUSED,
     ProbeArrays,
     ReadoutArrays,
-    block_sum,
+    group_functions,
     load_four,
     load_planes,
-    readout_functions,
-    silenced,
     store_planes,
 )
 
@@ -67,7 +64,7 @@ class SpreadPlan:
     links: wp.array(dtype=wp.int32)
     """[M] links that carry these sensors."""
     loads: wp.array3d(dtype=wp.float32)
-    """[2, B, L] sum of the forces that push a link, and what its taxels lack of them (N)."""
+    """[3, B, L] sum of the forces that push a link, and what its taxels lack of them (N) and of their moment (N·m)."""
     fresh: wp.array(dtype=wp.int32)
     """[M] 1 in the first group with sensors on a link, which overwrites its loads of the update before."""
     told: wp.array(dtype=wp.int32)
@@ -185,51 +182,6 @@ def push_of(
     return push
 
 
-@wp.func
-def join_face(
-    plan: SpreadPlan, link_of: wp.array(dtype=wp.int32), state: StateArrays, friction: wp.array(dtype=wp.vec3f),
-    faces: ContactFaces, env: int, link: int, node: int,
-):  # fmt: skip
-    """Add a node to the face of its body and side, or begin one."""
-    push = push_of(plan, state, friction, env, link, node)
-    geometry = state.contact_geom[node // 2][1 - node % 2]
-    other = int(-1)
-    if geometry >= 0:
-        other = link_of[geometry]
-    before = int(-1)
-    at = faces.head[env, link]
-    while at >= 0 and not (faces.face[at].other == other and wp.dot(faces.face[at].normal, push.normal) > 0.5):
-        before = at
-        at = faces.face[at].next
-    face = Face()
-    if at < 0:
-        at = node
-        if before < 0:
-            faces.head[env, link] = node
-        else:
-            faces.face[before].next = node
-        face.next = -1
-        face.last = node
-        face.other = other
-        face.normal = push.normal
-        face.origin = push.point
-        face.low = push.point
-        face.high = push.point
-    else:
-        face = faces.face[at]
-        faces.watched[at] = faces.watched[at] | faces.watched[node]
-    faces.follower[face.last] = node
-    faces.follower[node] = -1
-    face.last = node
-    face.low = wp.min(face.low, push.point)
-    face.high = wp.max(face.high, push.point)
-    face.overlap = wp.max(face.overlap, push.overlap)
-    face.load = face.load + push.load
-    face.force = face.force + push.force
-    face.moment = face.moment + wp.cross(push.point - face.origin, push.force)
-    faces.face[at] = face
-
-
 @wp.kernel(enable_backward=False)
 def list_contacts(
     plan: SpreadPlan, slots: SlotArrays, link_of: wp.array(dtype=wp.int32), state: StateArrays, stride: int,
@@ -278,8 +230,17 @@ def join_faces(
     start = faces.listed[env, link]
     faces.listed[env, link] = -1
     faces.head[env, link] = -1
+    if plan.fresh[number] == 1:
+        for row in range(3):
+            plan.loads[row, env, link] = 0.0
+    if start < 0:
+        return
+    head = int(-1)
     latest = int(-1)
-    more = start >= 0
+    more = bool(True)
+    # The face of the latest node, which is written once another follows.
+    at = int(-1)
+    face = Face()
     while more:
         # The least numbers beyond the latest; what is sorted stays in registers.
         least = Nodes(wp.static(BEYOND))
@@ -294,23 +255,60 @@ def join_faces(
         more = least[wp.static(SORTED - 1)] != wp.static(BEYOND)
         while least[0] != wp.static(BEYOND):
             latest = least[0]
-            join_face(plan, link_of, state, friction, faces, env, link, latest)
+            push = push_of(plan, state, friction, env, link, latest)
+            geometry = state.contact_geom[latest // 2][1 - latest % 2]
+            other = int(-1)
+            if geometry >= 0:
+                other = link_of[geometry]
+            before = int(-1)
+            place = head
+            # The first face of this body and side, or a new one.
+            apart = bool(True)
+            while place >= 0 and apart:
+                there = face
+                if place != at:
+                    there = faces.face[place]
+                apart = not (there.other == other and wp.dot(there.normal, push.normal) > 0.5)
+                if apart:
+                    before = place
+                    place = there.next
+            if place < 0 or place != at:
+                if at >= 0:
+                    faces.face[at] = face
+                at = place
+                if at >= 0:
+                    face = faces.face[at]
+                else:
+                    at = latest
+                    if before < 0:
+                        head = at
+                    else:
+                        faces.face[before].next = at
+                    face = Face()
+                    face.next = -1
+                    face.last = at
+                    face.other = other
+                    face.normal = push.normal
+                    face.origin = push.point
+                    face.low = push.point
+                    face.high = push.point
+            faces.watched[at] = faces.watched[at] | faces.watched[latest]
+            faces.follower[face.last] = latest
+            faces.follower[latest] = -1
+            face.last = latest
+            face.low = wp.min(face.low, push.point)
+            face.high = wp.max(face.high, push.point)
+            face.overlap = wp.max(face.overlap, push.overlap)
+            face.load = face.load + push.load
+            face.force = face.force + push.force
+            face.moment = face.moment + wp.cross(push.point - face.origin, push.force)
             for k in range(wp.static(SORTED - 1)):
                 least[k] = least[k + 1]
             least[wp.static(SORTED - 1)] = wp.static(BEYOND)
-    if plan.fresh[number] == 1:
-        plan.loads[0, env, link] = 0.0
-        plan.loads[1, env, link] = 0.0
-    if start >= 0 and (io.status[env] & 1) == 0:
-        item = wp.vec2i(env * plan.links.shape[0] + number, faces.head[env, link])
-        faces.items[0, wp.atomic_add(faces.count, 0, 1)] = item
-
-
-@wp.func
-def wrench_at(x: wp.vec3f, f: wp.vec3f) -> wp.spatial_vectorf:
-    """Return a force at x with its torque about the origin."""
-    turn = wp.cross(x, f)
-    return wp.spatial_vectorf(f[0], f[1], f[2], turn[0], turn[1], turn[2])
+    faces.face[at] = face
+    faces.head[env, link] = head
+    if (io.status[env] & 1) == 0:
+        faces.items[0, wp.atomic_add(faces.count, 0, 1)] = wp.vec2i(env * plan.links.shape[0] + number, head)
 
 
 @wp.func
@@ -356,10 +354,10 @@ def clear(faces: ContactFaces, io: ReadoutArrays, env: int, n: int, noisy: bool)
 
 
 @cache
-def spread_kernel(kinds: frozenset[int], raycast: bool, noisy: bool, sticky: bool, cuda: bool, deep: bool) -> Any:
-    """Return the kernel ``spread`` that writes readings and loads. Block: link of an environment, ``stride`` apart.
+def spread_kernel(kinds: frozenset[int], raycast: bool, noisy: bool, sticky: bool, lanes: int, deep: bool) -> Any:
+    """Return the kernel ``spread`` that writes readings and loads. Group of threads: link of an environment.
 
-    The threads of a block share its taxels, and add up what each has found, so that a contact costs no more than the
+    The threads of a group share its taxels, and add up what each has found, so that a contact costs no more than the
     taxels of its link divided by them. A processor takes them in one thread.
 
     Args:
@@ -367,11 +365,13 @@ def spread_kernel(kinds: frozenset[int], raycast: bool, noisy: bool, sticky: boo
         raycast: ask triangles.
         noisy: whether measured readings are another array.
         sticky: taxels hold what they touch.
-        cuda: a GPU runs it.
+        lanes: threads of a group; a processor has one.
         deep: all sources of carriers; a GPU first takes the links where :data:`TOUCH` is enough, which needs fewer
             registers.
     """
     distance = shape_functions(kinds, raycast).distance
+    cuda, group = lanes > 1, group_functions(lanes)
+    total_of, largest_of = group.total, group.largest
 
     @wp.func
     def behind(
@@ -411,20 +411,20 @@ def spread_kernel(kinds: frozenset[int], raycast: bool, noisy: bool, sticky: boo
         if source == wp.static(TOUCH):
             # All is asked for at once; most links touch one body from one side. Fillers never touch.
             touch = load_four(press.touch[env], n)
-            mine = press.body[env, n] == body
             extra = float(0.0)
             if wp.static(noisy):
                 extra = press.noisy[env, n]
-            m = wp.vec3f(touch[0], touch[1], touch[2])
-            facing = wp.dot(m, side)
-            if mine and touch[3] + extra > 0.0 and facing > 0.0:
-                if alone or belongs(faces, head, face, x, m, plan.reach[n]):
-                    carrier.weight = touch[3]
-                    carrier.noisy = extra
-                    carrier.facing = facing
-                    carrier.way = m
-                    if wp.static(sticky):
-                        carrier.way = m + press.sigma[env, n]
+            if touch[3] + extra > 0.0:
+                m = wp.vec3f(touch[0], touch[1], touch[2])
+                facing = wp.dot(m, side)
+                if press.body[env, n] == body and facing > 0.0:
+                    if alone or belongs(faces, head, face, x, m, plan.reach[n]):
+                        carrier.weight = touch[3]
+                        carrier.noisy = extra
+                        carrier.facing = facing
+                        carrier.way = m
+                        if wp.static(sticky):
+                            carrier.way = m + press.sigma[env, n]
         elif wp.static(deep):
             if radius > 0.0 and source == wp.static(BEHIND):
                 back = behind(solids, pairs, probes, env, n, slot, body)
@@ -440,18 +440,19 @@ def spread_kernel(kinds: frozenset[int], raycast: bool, noisy: bool, sticky: boo
                 carrier.facing = 1.0
                 carrier.way = push.normal
             carrier.noisy = carrier.weight
-        steep = wp.dot(push.lean, x - push.point)
-        if steep != 0.0 and carrier.weight + carrier.noisy > 0.0:
-            steep = wp.exp(steep)
-            carrier.weight *= steep
-            carrier.noisy *= steep
+        if carrier.weight + carrier.noisy > 0.0:
+            steep = wp.dot(push.lean, x - push.point)
+            if steep != 0.0:
+                steep = wp.exp(steep)
+                carrier.weight *= steep
+                carrier.noisy *= steep
         return carrier
 
     @wp.kernel(
         module="unique",
         enable_backward=False,
         grid_stride=False,
-        launch_bounds=(128, 2 if deep else 4),
+        launch_bounds=(32, 8 if deep else 16),
         module_options={"fast_math": cuda and not raycast},
     )
     def spread(
@@ -467,9 +468,8 @@ def spread_kernel(kinds: frozenset[int], raycast: bool, noisy: bool, sticky: boo
         stride: int,
         io: ReadoutArrays,
     ):
-        threads = wp.block_dim()
-        item = int(wp.uint32(wp.tid()) // wp.uint32(threads))
-        lane = int(wp.uint32(wp.tid()) % wp.uint32(threads))
+        item = int(wp.uint32(wp.tid()) // wp.uint32(wp.static(lanes)))
+        lane = int(wp.uint32(wp.tid()) % wp.uint32(wp.static(lanes)))
         many = plan.links.shape[0]
         count = faces.count[wp.static(int(cuda and deep))]
         while item < count:
@@ -480,7 +480,7 @@ def spread_kernel(kinds: frozenset[int], raycast: bool, noisy: bool, sticky: boo
             link = plan.links[entry[0] % many]
             written = int(0)
             pushed = float(0.0)
-            lost = float(0.0)
+            lost = wp.vec2f()
             left = bool(False)
             here = head
             while here >= 0:
@@ -489,25 +489,18 @@ def spread_kernel(kinds: frozenset[int], raycast: bool, noisy: bool, sticky: boo
                 normal = faces.face[here].normal
                 body = faces.face[here].other
                 size = wp.length(faces.face[here].force)
-                lack = size
+                lack = wp.vec2f(size, 0.0)
                 watched = faces.watched[here]
                 for k in range(plan.sensors.shape[1]):
                     if ((watched >> k) & 1) == 1 and not left:
                         sensor = plan.sensors[link, k]
                         span = plan.spans[sensor]
-                        # What this sensor does not carry of the face.
-                        rest = float(0.0)
+                        # What this sensor does not carry of the face: force and moment.
+                        rest = wp.vec2f()
                         fresh = ((written >> k) & 1) == 0
                         near = bool(False)
                         source = int(wp.static(TOUCH))
-                        solved = bool(False)
                         node = here
-                        rounds = int(0)
-                        lean = wp.vec3f()
-                        first = wp.vec3f()
-                        ways = wp.vec3f()
-                        places = wp.vec3f()
-                        turns = wp.vec3f()
                         while node >= 0:
                             push = ContactPush()
                             push.point = wp.vec3f(sphere[0], sphere[1], sphere[2])
@@ -515,69 +508,70 @@ def spread_kernel(kinds: frozenset[int], raycast: bool, noisy: bool, sticky: boo
                             if wp.static(deep):
                                 if source == wp.static(NEAR):
                                     push = push_of(plan, state, friction, env, link, node)
-                            push.lean = lean
-                            # Sums over taxels: y, y m · n and whether any is near; y q, y a, y a × q; of y a aᵀ the
-                            # diagonal and the rest, and the longest a, which leads from the point. Once they are
-                            # solved, the same registers hold s; b, the middle, θ; Σ f.
-                            if not solved:
+                            rounds = int(0)
+                            carried = bool(False)
+                            more = bool(True)
+                            scale = float(0.0)
+                            even = wp.vec3f()
+                            tilt = wp.vec3f()
+                            center = wp.vec3f()
+                            while more:
+                                # Sums over taxels: y, y m · n and whether any is near; y q, y a, y a × q; of y a aᵀ
+                                # the diagonal and the rest, and the longest a, which leads from the point.
                                 first = wp.vec3f()
                                 ways = wp.vec3f()
                                 places = wp.vec3f()
                                 turns = wp.vec3f()
-                            squares = wp.vec3f()
-                            products = wp.vec3f()
-                            most = float(0.0)
-                            n = span[0] + lane
-                            while n < span[1]:
-                                packed = load_four(probes.packed, n)
-                                x = wp.vec3f(packed[0], packed[1], packed[2])
-                                # Called at one place alone, so that a processor's compiler copies no structures.
-                                c = carrier_of(
-                                    plan, probes, solids, pairs, faces, press, push, x, packed[3], env, n,
-                                    span[2], head, alone, here, body, normal, source,
-                                )  # fmt: skip
-                                if not solved:
-                                    if not near and first[2] == 0.0 and gap_to(sphere, x) <= plan.reach[n]:
-                                        first[2] = 1.0
+                                squares = wp.vec3f()
+                                products = wp.vec3f()
+                                most = float(0.0)
+                                n = span[0] + lane
+                                while n < span[1]:
+                                    packed = load_four(probes.packed, n)
+                                    x = wp.vec3f(packed[0], packed[1], packed[2])
+                                    c = carrier_of(
+                                        plan, probes, solids, pairs, faces, press, push, x, packed[3], env, n,
+                                        span[2], head, alone, here, body, normal, source,
+                                    )  # fmt: skip
                                     if c.weight > 0.0:
+                                        if not near and first[2] == 0.0 and gap_to(sphere, x) <= plan.reach[n]:
+                                            first[2] = 1.0
                                         a = x - push.point
                                         most = wp.max(most, wp.length(a))
-                                        first += c.weight * wp.vec3f(1.0, c.facing, 0.0)
+                                        along = c.weight * c.facing
+                                        first += wp.vec3f(c.weight, along, 0.0)
                                         ways += c.weight * c.way
-                                        places += c.weight * a
+                                        places += along * a
                                         turns += c.weight * wp.cross(a, c.way)
-                                        squares += c.weight * wp.cw_mul(a, a)
-                                        products += c.weight * wp.vec3f(a[1] * a[2], a[2] * a[0], a[0] * a[1])
-                                elif c.weight + c.noisy > 0.0:
-                                    unit = first[0] * c.way + ways + wp.cross(turns, x - places)
-                                    squares += c.weight * unit
-                                    reading = wrench_at(x, c.weight * unit)
-                                    if not fresh:
-                                        reading += load_planes(io.truth, env, n, 6)
-                                    store_planes(io.truth, env, n, 6, reading)
-                                    if wp.static(noisy):
-                                        reading = wrench_at(x, c.noisy * unit)
-                                        if not fresh:
-                                            reading += load_planes(io.measured, env, n, 6)
-                                        store_planes(io.measured, env, n, 6, reading)
-                                    faces.filled[env, n] = wp.uint8(1)
-                                elif fresh:
-                                    clear(faces, io, env, n, wp.static(noisy))
-                                n += threads
-                            if wp.static(cuda):
-                                sums = block_sum(first, ways, places, turns, squares, products, most)
-                                for axis in range(3):
-                                    first[axis] = sums[axis]
-                                    ways[axis] = sums[3 + axis]
-                                    places[axis] = sums[6 + axis]
-                                    turns[axis] = sums[9 + axis]
-                                    squares[axis] = sums[12 + axis]
-                                    products[axis] = sums[15 + axis]
-                                most = sums[18]
-                            if not solved:
-                                whole = first[0]
+                                        squares += along * wp.cw_mul(a, a)
+                                        products += along * wp.vec3f(a[1] * a[2], a[2] * a[0], a[0] * a[1])
+                                    n += wp.static(lanes)
+                                if wp.static(cuda):
+                                    first = total_of(first)
+                                    ways = total_of(ways)
+                                    places = total_of(places)
+                                    turns = total_of(turns)
+                                    squares = total_of(squares)
+                                    products = total_of(products)
+                                    most = largest_of(most)
+                                whole = first[1]
                                 near = near or first[2] > 0.0
+                                if not near and source == wp.static(TOUCH):
+                                    # Seldom is a taxel near that carries nothing.
+                                    close = wp.vec3f()
+                                    n = span[0] + lane
+                                    while n < span[1]:
+                                        packed = load_four(probes.packed, n)
+                                        x = wp.vec3f(packed[0], packed[1], packed[2])
+                                        if gap_to(sphere, x) <= plan.reach[n]:
+                                            close[0] = 1.0
+                                        n += wp.static(lanes)
+                                    if wp.static(cuda):
+                                        close = total_of(close)
+                                    near = close[0] > 0.0
+                                more = False
                                 if whole > 0.0 and (near or source == wp.static(NEAR)):
+                                    carried = True
                                     moment = wp.vec3f()
                                     if source != wp.static(NEAR):
                                         face = faces.face[here]
@@ -586,7 +580,7 @@ def spread_kernel(kinds: frozenset[int], raycast: bool, noisy: bool, sticky: boo
                                         moment = face.moment + wp.cross(face.origin - push.point, push.force)
                                     # Taxels that face away by more than 60° on average would be stretched beyond all
                                     # measure; b then carries what is missing.
-                                    scale = push.load / wp.max(first[1], 0.5 * whole)
+                                    scale = push.load / wp.max(whole, 0.5 * first[0])
                                     mean = push.load / whole
                                     center = places / whole
                                     even = (push.force - scale * ways) / whole
@@ -603,48 +597,76 @@ def spread_kernel(kinds: frozenset[int], raycast: bool, noisy: bool, sticky: boo
                                     # A little more on its diagonal lets a row of taxels, which bears no moment along
                                     # it, be solved; what rounding leaves of taxels at one place is none.
                                     tilt = wp.vec3f()
+                                    inertia = wp.mat33f()
                                     if trace > 1.0e-4 * extent:
-                                        inertia = 1.0001 * wp.identity(n=3, dtype=wp.float32) - extents / trace
-                                        tilt = wp.inverse(inertia) @ moment / trace
+                                        inertia = (1.0001 * trace) * wp.identity(n=3, dtype=wp.float32) - extents
+                                        tilt = wp.inverse(inertia / trace) @ moment / trace
                                     # No taxel is pulled, however far it lies: what is beyond half of that moves into
-                                    # the weights, y e^(λ · r) for y (1 + λ · r).
-                                    solved = True
+                                    # the weights, y e^(λ · r) for y (1 + λ · r). What turns about the normal pulls
+                                    # none, and drags no more than the load pushes.
                                     far = most + wp.length(center)
+                                    spin = wp.dot(tilt, push.normal)
+                                    tilt -= spin * push.normal
+                                    spin = wp.clamp(spin, -mean / far, mean / far)
                                     steepest = wp.length(tilt) * far / mean
                                     if steepest > 1.0:
                                         tilt /= steepest
                                         rounds += 1
-                                        solved = rounds == wp.static(ROUNDS)
-                                        if not solved:
-                                            lean += (steepest - 0.5) / mean * wp.cross(push.normal, tilt)
-                                            lean *= wp.min(wp.static(STEEPEST) / (far * wp.length(lean)), 1.0)
-                                    first = wp.vec3f(scale, 0.0, 0.0)
-                                    ways = even
-                                    turns = tilt
-                                    places = center + push.point
-                                elif source == wp.static(NEAR):
-                                    rest += wp.length(push.force)
-                                    node = faces.follower[node]
-                                elif wp.static(deep):
-                                    source = wp.where(near, source + 1, wp.static(NEAR))
-                                else:
-                                    left = True
-                                    node = -1
-                            else:
+                                        more = rounds < wp.static(ROUNDS)
+                                        if more:
+                                            lean = push.lean + (steepest - 0.5) / mean * wp.cross(push.normal, tilt)
+                                            push.lean = lean * wp.min(
+                                                wp.static(STEEPEST) / (far * wp.length(lean)), 1.0
+                                            )
+                                    tilt += spin * push.normal
+                                    if not more:
+                                        rest[1] += whole * wp.length(moment - inertia @ tilt)
+                            if carried:
+                                center += push.point
+                                total = wp.vec3f()
+                                n = span[0] + lane
+                                while n < span[1]:
+                                    packed = load_four(probes.packed, n)
+                                    x = wp.vec3f(packed[0], packed[1], packed[2])
+                                    c = carrier_of(
+                                        plan, probes, solids, pairs, faces, press, push, x, packed[3], env, n,
+                                        span[2], head, alone, here, body, normal, source,
+                                    )  # fmt: skip
+                                    if c.weight + c.noisy > 0.0:
+                                        unit = scale * c.way + c.facing * (even + wp.cross(tilt, x - center))
+                                        total += c.weight * unit
+                                        reading = wp.spatial_vector(c.weight * unit, wp.cross(x, c.weight * unit))
+                                        if not fresh:
+                                            reading += load_planes(io.truth, env, n, 6)
+                                        store_planes(io.truth, env, n, 6, reading)
+                                        if wp.static(noisy):
+                                            reading = wp.spatial_vector(c.noisy * unit, wp.cross(x, c.noisy * unit))
+                                            if not fresh:
+                                                reading += load_planes(io.measured, env, n, 6)
+                                            store_planes(io.measured, env, n, 6, reading)
+                                        faces.filled[env, n] = wp.uint8(1)
+                                    elif fresh:
+                                        clear(faces, io, env, n, wp.static(noisy))
+                                    n += wp.static(lanes)
+                                if wp.static(cuda):
+                                    total = total_of(total)
                                 written = written | (1 << k)
                                 fresh = False
-                                if source != wp.static(NEAR):
-                                    push.force = faces.face[here].force
-                                gap = wp.length(push.force - squares)
+                                gap = wp.length(push.force - total)
                                 # Rounding of the sums is no loss.
                                 if not (gap <= 1.0e-4 * wp.length(push.force)):
-                                    rest += gap
-                                solved = False
-                                rounds = 0
-                                lean = wp.vec3f()
+                                    rest[0] += gap
                                 node = wp.where(source == wp.static(NEAR), faces.follower[node], -1)
+                            elif source == wp.static(NEAR):
+                                rest[0] += wp.length(push.force)
+                                node = faces.follower[node]
+                            elif wp.static(deep):
+                                source = wp.where(near, source + 1, wp.static(NEAR))
+                            else:
+                                left = True
+                                node = -1
                         # Sensors of a link need not all feel it.
-                        if not (rest >= lack):
+                        if not (rest[0] >= lack[0]):
                             lack = rest
                 pushed += size
                 lost += lack
@@ -661,40 +683,14 @@ def spread_kernel(kinds: frozenset[int], raycast: bool, noisy: bool, sticky: boo
                     n = span[0] + lane
                     while n < span[1]:
                         clear(faces, io, env, n, wp.static(noisy))
-                        n += threads
+                        n += wp.static(lanes)
             if lane == 0:
                 # Sensors of several groups may sit on a link: the most that one of them lacks counts.
                 plan.loads[0, env, link] = wp.max(plan.loads[0, env, link], pushed)
-                plan.loads[1, env, link] = wp.where(wp.isnan(lost), lost, wp.max(plan.loads[1, env, link], lost))
-                if not (lost <= 0.01 * pushed):
+                for row in range(2):
+                    most = wp.max(plan.loads[1 + row, env, link], lost[row])
+                    plan.loads[1 + row, env, link] = wp.where(wp.isnan(lost[row]), lost[row], most)
+                if not (lost[0] <= 0.01 * pushed):
                     plan.told[0] = 1
 
     return spread
-
-
-@cache
-def measure_kernel(hysteresis: bool, walk: bool) -> Any:
-    """Return the kernel ``measure`` that applies the noise to what was spread. Dim [B N]."""
-    readout = readout_functions(FUSED, hysteresis, walk, exact=False)
-    recall_six, emit_six = readout.recall_six, readout.emit_six
-
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, launch_bounds=(256, 4))
-    def measure(plan: SpreadPlan, probes: ProbeArrays, faces: ContactFaces, io: ReadoutArrays):
-        tid = wp.uint32(wp.tid())
-        count = wp.uint32(probes.radius.shape[0])
-        env = int(tid // count)
-        n = int(tid % count)
-        if silenced(io, 6, env, n, probes.radius[n]):
-            return
-        age = io.age[env]
-        lag, drift = recall_six(io, env, n, age)
-        part = probes.part[n]
-        # What nothing touches was not written.
-        signal = wp.spatial_vectorf()
-        if faces.head[env, plan.link[part]] >= 0:
-            signal = load_planes(io.measured, env, n, 6)
-        probe = probes.probe[n]
-        fixed = episode_draw(io.knobs[part], env + io.env_offset, probe, io.episode[env])
-        emit_six(io, io.knobs[part], env, n, probe, age, io.episode[env], fixed, lag, drift, signal, signal)
-
-    return measure

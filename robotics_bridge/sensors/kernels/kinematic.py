@@ -24,6 +24,7 @@ from robotics_bridge.sensors.kernels.readout import (
     ProbeArrays,
     ReadoutArrays,
     load_four,
+    load_planes,
     readout_functions,
     silenced,
     store_planes,
@@ -335,3 +336,31 @@ def kinematic_kernel(
                 n = span[1]
 
     return kinematic
+
+
+@cache
+def measure_kernel(hysteresis: bool, walk: bool) -> Any:
+    """Return the kernel ``measure`` that applies the noise to what was spread. Dim [B N]."""
+    readout = readout_functions(FUSED, hysteresis, walk, exact=False)
+    recall_six, emit_six = readout.recall_six, readout.emit_six
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, launch_bounds=(256, 4))
+    def measure(plan: SpreadPlan, probes: ProbeArrays, faces: ContactFaces, io: ReadoutArrays):
+        tid = wp.uint32(wp.tid())
+        count = wp.uint32(probes.radius.shape[0])
+        env = int(tid // count)
+        n = int(tid % count)
+        if silenced(io, 6, env, n, probes.radius[n]):
+            return
+        age = io.age[env]
+        lag, drift = recall_six(io, env, n, age)
+        part = probes.part[n]
+        # What nothing touches was not written.
+        signal = wp.spatial_vectorf()
+        if faces.head[env, plan.link[part]] >= 0:
+            signal = load_planes(io.measured, env, n, 6)
+        probe = probes.probe[n]
+        fixed = episode_draw(io.knobs[part], env + io.env_offset, probe, io.episode[env])
+        emit_six(io, io.knobs[part], env, n, probe, age, io.episode[env], fixed, lag, drift, signal, signal)
+
+    return measure

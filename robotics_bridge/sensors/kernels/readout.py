@@ -55,52 +55,24 @@ def store_planes(planes: wp.array3d(dtype=wp.float32), row: int, n: int, count: 
     ...
 
 
-Sums = wp.types.vector(length=19, dtype=wp.float32)
-_SUMMED = ("first", "ways", "places", "turns", "squares", "products")
-_HALVES = ((16, 18, 9), (8, 9, 5), (4, 5, 3), (2, 3, 2), (1, 2, 1))
-"""Distance of lanes that exchange, numbers that a lane holds, and those that it keeps."""
-
-
-def _exchange(half: int, held: int, rest: int) -> str:
-    lines = [f"upper = lane & {half};", f"most = max(most, __shfl_xor_sync(~0u, most, {half}));"]
-    for k in range(rest):
-        far = f"v{k + rest}" if k + rest < held else "0.0f"
-        lines.append(f"v{k} = (upper ? {far} : v{k}) + __shfl_xor_sync(~0u, upper ? v{k} : {far}, {half});")
-    return " ".join([*lines, f"place += upper ? {rest} : 0; mine = upper ? mine - {rest} : min(mine, {rest});"])
-
-
-@wp.func_native(
-    f"""
-    wp::vec_t<19, float> values;
+@cache
+def group_functions(lanes: int) -> SimpleNamespace:
+    """Return ``total(vector)`` and ``largest(number)`` of so many threads of a GPU, a power of 2 up to 32."""
+    head = f"""
 #if defined(__CUDA_ARCH__)
-    // Halves of the lanes take halves of the sums, five times: fewer shuffles than whole sums in every lane.
-    constexpr int warps = WP_TILE_BLOCK_DIM / 32;
-    __shared__ float parts[warps][19];
-    const int lane = threadIdx.x % 32;
-    int place = 0, mine = 18;
-    bool upper;
-    {" ".join(f"float v{k} = {name};" for k, name in enumerate(f"{rows}[{n}]" for rows in _SUMMED for n in range(3)))}
-    {" ".join(_exchange(*numbers) for numbers in _HALVES)}
-    __syncthreads();
-    if (mine > 0) parts[threadIdx.x / 32][place] = v0;
-    if (lane == 0) parts[threadIdx.x / 32][18] = most;
-    __syncthreads();
+    const unsigned group = {2**lanes - 1}u << (threadIdx.x % 32 / {lanes} * {lanes});
     #pragma unroll
-    for (int k = 0; k < 19; ++k) {{
-        values[k] = parts[0][k];
-        for (int warp = 1; warp < warps; ++warp)
-            values[k] = k < 18 ? values[k] + parts[warp][k] : max(values[k], parts[warp][k]);
-    }}
-#endif
-    return values;
-"""
-)
-def block_sum(
-    first: wp.vec3f, ways: wp.vec3f, places: wp.vec3f, turns: wp.vec3f, squares: wp.vec3f, products: wp.vec3f,
-    most: float,
-) -> Sums:  # fmt: skip
-    """Return the sums over the threads of a block, and of the last the largest."""
-    ...
+    for (int half = {lanes // 2}; half; half /= 2)"""
+    sums = " ".join(f"value[{axis}] += __shfl_xor_sync(group, value[{axis}], half);" for axis in range(3))
+    tail = "\n#endif\n    return value;\n"
+
+    @wp.func_native(f"{head} {{ {sums} }}{tail}")
+    def total(value: wp.vec3f) -> wp.vec3f: ...
+
+    @wp.func_native(f"{head} value = max(value, __shfl_xor_sync(group, value, half));{tail}")
+    def largest(value: float) -> float: ...
+
+    return SimpleNamespace(total=total, largest=largest)
 
 
 CLEAN, FUSED, STAGED = range(3)

@@ -46,8 +46,8 @@ class PairTable:
         """Warp array [B] of :data:`DIVERGED` and :data:`OVERFULL`, as of the last update."""
         self._loaded: set[int] = set()
         self.loads: Any = None
-        """Warp array [2, B, L] of links with taxels of ``total="engine"``: sum of the engine's forces, and what their
-        taxels lack of them (N); None where there are none (:meth:`count_loads`)."""
+        """Warp array [3, B, L] of links with taxels of ``total="engine"``: sum of the engine's forces, what taxels lack
+        of them (N) and of their moment (N·m); None where there are none (:meth:`count_loads`)."""
         self.told: Any = context.zeros(1, int)
         """Warp array [1]: 1 once more than a hundredth of a load was missing."""
 
@@ -79,7 +79,7 @@ class PairTable:
     def count_loads(self, links: Sequence[int]) -> tuple[Any, list[bool]]:
         """Return :attr:`loads`, made by the first call, and which of these links no call before has named."""
         if self.loads is None:
-            self.loads = self._context.zeros((2, self._context.num_envs, len(self._solids.scene.links)))
+            self.loads = self._context.zeros((3, self._context.num_envs, len(self._solids.scene.links)))
         fresh = [link not in self._loaded for link in links]
         self._loaded.update(links)
         return self.loads, fresh

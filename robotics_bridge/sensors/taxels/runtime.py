@@ -18,10 +18,9 @@ from robotics_bridge.sensors.kernels.contact_load import (
     SpreadPlan,
     join_faces,
     list_contacts,
-    measure_kernel,
     spread_kernel,
 )
-from robotics_bridge.sensors.kernels.kinematic import KinematicParams, StickArrays, kinematic_kernel
+from robotics_bridge.sensors.kernels.kinematic import KinematicParams, StickArrays, kinematic_kernel, measure_kernel
 from robotics_bridge.sensors.kernels.proximity import ProximityArrays, ProximityParams, proximity_kernel
 from robotics_bridge.sensors.kernels.readout import FUSED
 from robotics_bridge.sensors.probes.placement import Probes
@@ -119,14 +118,14 @@ class ContactLoadRuntime(KinematicRuntime):
         plan.fresh, plan.told = context.array(fresh, int), context.pairs.told
         plan.slip = 1.0 if configs[0].convention == "physical" else -1.0
         sticky = configs[0].sticky
-        # A few threads for the taxels of a link; as many blocks as the GPU holds take the links in turn.
+        # A few threads for the taxels of a link; as many groups of them as the GPU holds take the links in turn.
         most, items = max(part.count for part in self.slices.values()), envs * plan.links.shape[0]
-        self._threads = 1 if not cuda else 32 if most <= 256 else 64
-        options = self.kinds, configs[0].query == "raycast", self.noisy, sticky, cuda
-        blocks = 2048 // self._threads * context.device.sm_count if cuda else 8
-        self._spread = [(spread_kernel(*options, True), min(items, blocks // 8))]
+        self._lanes = 1 if not cuda else 8 if most <= 64 else 16 if most <= 256 else 32
+        options = self.kinds, configs[0].query == "raycast", self.noisy, sticky, self._lanes
+        groups = 2048 // self._lanes * context.device.sm_count if cuda else 8
+        self._spread = [(spread_kernel(*options, True), min(items, groups // 8))]
         if cuda:
-            self._spread.insert(0, (spread_kernel(*options, False), min(items, blocks)))
+            self._spread.insert(0, (spread_kernel(*options, False), min(items, groups)))
         shape, press = (envs, self.count), self.press
         press.touch, press.body = context.zeros(shape, wp.vec4f), context.zeros(shape, int)
         press.noisy = context.zeros(shape if self.noisy else (1, 1))
@@ -155,9 +154,9 @@ class ContactLoadRuntime(KinematicRuntime):
         c.launch(list_contacts, threads, plan, c.pairs.plan, link_of, state.arrays, threads, faces)
         c.launch(join_faces, (c.num_envs, plan.links.shape[0]), plan, *scene, faces, self.io, block=32)
         super().run_kernels(state, dt)
-        for kernel, blocks in self._spread:
-            inputs = [plan, self.probes, *scene, c.solids.struct, c.pairs.struct, faces, self.press, blocks, self.io]
-            c.launch(kernel, blocks * self._threads, *inputs, block=self._threads)
+        for kernel, groups in self._spread:
+            inputs = [plan, self.probes, *scene, c.solids.struct, c.pairs.struct, faces, self.press, groups, self.io]
+            c.launch(kernel, groups * self._lanes, *inputs, block=32)
         if self.mode == FUSED:
             c.launch(measure_kernel(*self.stores), c.num_envs * self.count, plan, self.probes, faces, self.io)
 
