@@ -323,6 +323,9 @@ def cache_path(
     ratios = [mount.whisker.damping_ratio for scene in scenes for mount in scene.mounts]
     if max(map(steps_to_ring, ratios)) > (fidelity.steps_per_period or math.inf):
         more = (*more, "ringing")
+    # Estimates that fall by no more than theory allows came later, too.
+    if fidelity.error is not None:
+        more = (*more, "theory")
     key = content_hash(config_hash(scenes, fidelity, engine.name), library, PHYSICS_VERSION, *more, length=24)
     return cache_dir(folder) / f"{key}.h5"
 

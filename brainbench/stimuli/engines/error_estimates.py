@@ -8,7 +8,7 @@ forces between opposed contacts at random, and no change of the step shows it.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -42,10 +42,21 @@ def with_errors(run: Run, jobs: Sequence[Job], fidelity: Fidelity) -> list[Trace
     """Return the traces of jobs with their estimated errors.
 
     Where the fidelity promises an ``error``, whiskers beyond it are simulated again with what errs most made finer, one
-    by one.
+    by one. An estimate falls by no more than theory allows: to take the first that happens to be small would favour
+    those that are too small.
     """
     traces = list(run(jobs, fidelity))
-    settings = [fidelity] * len(traces)
+    settings, errors = [fidelity] * len(traces), np.zeros((len(traces), 2))
+    seconds = [trace.seconds for trace in traces]
+    runs: dict[tuple[int, Fidelity], Trace] = {}
+
+    def simulate(chosen: Mapping[int, Fidelity]) -> None:
+        for setting in dict.fromkeys(chosen.values()):
+            missing = [index for index in chosen if chosen[index] == setting and (index, setting) not in runs]
+            for index, trace in zip(missing, run([jobs[i] for i in missing], setting) if missing else (), strict=True):
+                runs[index, setting] = trace
+                seconds[index] += trace.seconds
+
     pending: dict[int, Fidelity] = {}
     for index, (job, trace) in enumerate(zip(jobs, traces, strict=True)):
         if trace.status == "ok" and not trace.steps:
@@ -56,30 +67,38 @@ def with_errors(run: Run, jobs: Sequence[Job], fidelity: Fidelity) -> list[Trace
                 error = math.nan
             traces[index] = replace(trace, error=error)
             if math.isnan(error):
-                pending[index] = fidelity
+                pending[index], runs[index, fidelity] = fidelity, trace
     for place in range(ROUNDS if fidelity.error is not None else 1):
+        simulate(pending)
+        pending = {index: chosen for index, chosen in pending.items() if runs[index, chosen].status == "ok"}
+        changed = [
+            {i: halved_step(chosen, jobs[i].whisker, jobs[i].spacing) for i, chosen in pending.items()},
+            {i: more_links(chosen, jobs[i].whisker) for i, chosen in pending.items()},
+        ]
+        for some in changed:
+            simulate(some)
         finer: dict[int, Fidelity] = {}
-        for chosen in dict.fromkeys(pending.values()):
-            which = [index for index in pending if pending[index] == chosen]
-            if place:
-                for index, trace in zip(which, run([jobs[index] for index in which], chosen), strict=True):
-                    before = traces[index]
-                    if trace.status == "ok":
-                        steps, seconds = before.steps + trace.steps, before.seconds + trace.seconds
-                        traces[index], settings[index] = replace(trace, steps=steps, seconds=seconds), chosen
-            which = [index for index in which if settings[index] == chosen]
-            for index, (by_step, by_links, seconds) in _estimates(run, jobs, traces, which, chosen).items():
-                trace, error = traces[index], math.hypot(by_step, by_links)
-                traces[index] = replace(trace, error=error, seconds=trace.seconds + seconds)
-                if fidelity.error is not None and error > fidelity.error:
-                    finer[index] = _finer(chosen, jobs[index], by_step, by_links)
+        for index, chosen in pending.items():
+            job, trace = jobs[index], runs[index, chosen]
+            changes_by = [_change(job, trace, runs[index, some[index]]) for some in changed]
+            # Shares of the errors that the finer setting leaves by theory.
+            shorter, more = chosen.time_step < settings[index].time_step, chosen.links > settings[index].links
+            least = np.where(np.isfinite(errors[index]), errors[index], 0.0) / (1 + shorter, MORE if more else 1.0)
+            errors[index] = np.maximum(np.multiply((HALF_STEP, MORE_LINKS), changes_by), least)
+            steps = trace.steps + (traces[index].steps if place else 0)
+            settings[index], error = chosen, math.hypot(*errors[index])
+            traces[index] = replace(trace, error=error, steps=steps)
+            following = _finer(chosen, job, *errors[index])
+            if error > (fidelity.error or math.inf) and following != chosen:
+                finer[index] = following
+        runs = {(index, setting): trace for (index, setting), trace in runs.items() if finer.get(index) == setting}
         pending = finer
-    ratios = [settings[index].damping_of(job) for index, job in enumerate(jobs)]
     promise = fidelity.error or LARGEST_ERROR
     remarks = [remark_on(trace.error, promise) if trace.status == "ok" else "" for trace in traces]
+    ratios = [setting.damping_of(job) for setting, job in zip(settings, jobs, strict=True)]
     return [
-        replace(trace, damping=ratio, remark=remark)
-        for trace, ratio, remark in zip(traces, ratios, remarks, strict=True)
+        replace(trace, damping=ratio, remark=remark, seconds=spent)
+        for trace, ratio, remark, spent in zip(traces, ratios, remarks, seconds, strict=True)
     ]
 
 
@@ -88,13 +107,11 @@ def calm_error(job: Job, trace: Trace, fidelity: Fidelity) -> float:
 
     Its forces are those of carrying its mass along, which only the number of links changes.
     """
-    if trace.contact.any() or job.loads or any(job.gravity) or job.air_flow is not None or job.whisker.bends:
-        return math.nan
-    if fidelity.solver == "quasistatic":
+    driven = job.loads or any(job.gravity) or job.air_flow is not None or job.whisker.bends
+    if trace.contact.any() or driven or fidelity.solver == "quasistatic":
         return math.nan
     chain = fidelity.chain(job.whisker)
-    period = 2 * math.pi / chain.first_frequency
-    slow = (getattr(job.follicle, "finest", None) or 0.0) >= SLOW * period
+    slow = (getattr(job.follicle, "finest", None) or 0.0) >= SLOW * 2 * math.pi / chain.first_frequency
     return CALM / chain.links**2 if slow else math.nan
 
 
@@ -151,27 +168,12 @@ def more_links(fidelity: Fidelity, whisker: Whisker) -> Fidelity:
     return replace(fidelity, links=changed if changed <= MOST else round(count / MORE), links_per_mm=None)
 
 
-def _estimates(
-    run: Run, jobs: Sequence[Job], traces: Sequence[Trace], which: Sequence[int], fidelity: Fidelity
-) -> dict[int, tuple[float, float, float]]:
-    """Return what the step and what the links err by, and the seconds spent, by index of the job."""
-    errors = {index: [0.0, 0.0] for index in which}
-    spent = dict.fromkeys(which, 0.0)
-    for place, factor in enumerate((HALF_STEP, MORE_LINKS)):
-        settings = {index: _changed(fidelity, jobs[index], place) for index in which}
-        for setting in dict.fromkeys(settings.values()):
-            some = [index for index in which if settings[index] == setting]
-            for index, finer in zip(some, run([jobs[index] for index in some], setting), strict=True):
-                spent[index] += finer.seconds
-                trace, length = traces[index], np.array([jobs[index].whisker.arc_length])
-                contact = (trace.contact | finer.contact)[None]
-                change = float(changes(trace.wrench[None], finer.wrench[None], contact, length)[0])
-                errors[index][place] = factor * change if finer.status == "ok" else math.inf
-    return {index: (errors[index][0], errors[index][1], spent[index]) for index in which}
-
-
-def _changed(fidelity: Fidelity, job: Job, place: int) -> Fidelity:
-    return more_links(fidelity, job.whisker) if place else halved_step(fidelity, job.whisker, job.spacing)
+def _change(job: Job, trace: Trace, finer: Trace) -> float:
+    """Return the share by which a finer run changes a trace; infinite where it cannot be trusted."""
+    if finer.status != "ok":
+        return math.inf
+    contact, length = (trace.contact | finer.contact)[None], np.array([job.whisker.arc_length])
+    return float(changes(trace.wrench[None], finer.wrench[None], contact, length)[0])
 
 
 def _finer(fidelity: Fidelity, job: Job, by_step: float, by_links: float) -> Fidelity:

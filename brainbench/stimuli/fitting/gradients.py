@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import cached_property
 from typing import Any, Literal, TypeVar
 
 import numpy as np
@@ -42,7 +42,7 @@ from brainbench.stimuli.fitting.parameters import JobParameters
 from brainbench.stimuli.fitting.recorded_run import RecordingSolver
 from brainbench.stimuli.motion.jobs import MILLI, Job, Trace
 from brainbench.stimuli.objects.obstacle import ConvexPart, Obstacle
-from brainbench.stimuli.whiskers.whisker import Chain, Whisker, build_chain
+from brainbench.stimuli.whiskers.whisker import build_chain
 
 __all__ = ["ContactEvents", "Gradient", "GradientRun", "JobParameters", "Tangents"]
 
@@ -120,13 +120,8 @@ def packed_change(task: JobTask, low: Job, high: Job, width: float, quasistatic:
     return changes
 
 
-@lru_cache(maxsize=8)
-def _chain(whisker: Whisker, links: int) -> Chain:
-    return build_chain(whisker, links)
-
-
 def _whisker(task: JobTask, job: Job, quasistatic: bool) -> Numbers:
-    chain = _chain(job.whisker, task.chain.links)
+    chain = build_chain(job.whisker, task.chain.links)
     packed = pack_chains(chain.links, [chain], quasistatic, 2 + task.twists)
     build, inertia, taper = (packed[name][:, 0] for name in ("build", "inertia", "taper"))
     torsion = inertia["torsion"] if task.twists else np.zeros(chain.links)
@@ -156,7 +151,7 @@ def _loads(task: JobTask, job: Job) -> Numbers:
     _require("loads", len(job.loads), len(task.job.loads))
     if not job.loads:
         return {}
-    nodes = _chain(job.whisker, task.chain.links).nodes
+    nodes = build_chain(job.whisker, task.chain.links).nodes
     shares = []
     for before, load in zip(task.job.loads, job.loads, strict=True):
         link, _ = task.chain.locate(before.arc)

@@ -9,7 +9,6 @@ import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -330,7 +329,9 @@ def _judge(problem: _Problem, solutions: Sequence[_Solution], began: float) -> F
     status: Status = "undefined" if not best.converged or "undefined" in worst else "unreliable" if reasons else "ok"
     whisker = free.condition(u).whisker
     predicted = tuple(
-        trace.link_positions if trial.of_shapes and trace.link_positions is not None else _wrench(trial, trace)
+        trace.link_positions
+        if trial.of_shapes and trace.link_positions is not None
+        else trial.residuals(trace, trial.job.whisker) + trial.measured["wrench"].values
         for trial, trace in zip(model.trials, traces, strict=True)
     )
     return FitResult(
@@ -427,10 +428,6 @@ def _unlikely(free: FreeParameters, index: int, value: float, interval: Interval
         f"{name} is {value:.3g} {parameter.unit}, and {expected}: a unit, the frame rate or a property that was "
         "taken as known is wrong. If it is right, start near it."
     )
-
-
-def _wrench(trial: Trial, trace: Any) -> Array:
-    return trial.residuals(trace, trial.job.whisker) + trial.measured["wrench"].values
 
 
 def _inverse(information: Array) -> Array:

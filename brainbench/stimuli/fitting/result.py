@@ -279,16 +279,13 @@ def _words(deviation: float, members: Sequence[str], components: Array) -> str:
     ]
     together = ", ".join(changes[:-1]) + f" together with {changes[-1]}"
     if not identified:
-        return f"The data cannot tell {_listed(members)} apart: {together} leaves them as they are."
+        listed = ", ".join(members[:-1])
+        return f"The data cannot tell {listed} and {members[-1]} apart: {together} leaves them as they are."
     return f"The combination {together} is known to {_size(members[0], deviation * abs(components[0]))}."
 
 
 def _size(name: str, deviation: float) -> str:
     return f"{100 * deviation:.2g} %" if PARAMETERS[name].kind == "log" else f"{deviation:.2g} of its scale"
-
-
-def _listed(names: Sequence[str]) -> str:
-    return ", ".join(names[:-1]) + f" and {names[-1]}"
 
 
 def unknown_parameters(combinations: Sequence[Direction]) -> dict[str, Direction]:

@@ -132,6 +132,25 @@ def test_a_promise_makes_only_those_finer_that_need_it():
     assert max(links for rat, links in counts if rat) > 30
 
 
+def test_an_estimate_that_happens_to_be_small_is_not_believed():
+    runs = []
+
+    def run(jobs, setting):
+        runs.append(setting)
+        # More than twelve links err alike, as whiskers do that stick in another place than the true one.
+        return [_trace(0.1 if setting.links < 12 else 0.0) for _ in jobs]
+
+    (trace,) = with_errors(run, [Job(C2, StillFollicle(), (), TIMES)], Fidelity(links=10, error=0.05))
+    first = 3 * 0.1
+    assert trace.error == pytest.approx(first / 1.5**4)
+    assert "above 5%" in trace.remark
+    (trace,) = with_errors(run, [Job(C2, StillFollicle(), (), TIMES)], Fidelity(links=10, error=0.15))
+    assert trace.error == pytest.approx(first / 1.5**2)
+    assert not trace.remark
+    # The finer run of an estimate is the next to be judged; none is made twice.
+    assert [setting.links for setting in runs[-7:]] == [10, 10, 15, 15, 23, 23, 35]
+
+
 def test_differences_are_relative_above_a_nanonewton_and_of_force_or_moment():
     wrench = np.zeros((4, 6))
     wrench[:, 0], wrench[:, 5] = 1e-3, 1e-6
