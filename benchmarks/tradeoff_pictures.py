@@ -41,11 +41,14 @@ class Panel:
 def draw_study(charts: Sequence[Panel], path: Path) -> Path:
     """Draw charts side by side, into a file whose suffix is the format."""
     figure, (axes,) = panels(1, len(charts), (4.6 * len(charts) + 1, 4.6))
+    # A series has one colour in all charts.
+    series = sorted({chart.series(row) for chart in charts for row in chart.rows})
     for chart, axis in zip(charts, axes, strict=True):
         usable = [row for row in chart.rows if row[chart.error] is not None and row["cost"] is not None]
         names = sorted({chart.series(row) for row in usable})
-        for number, name in enumerate(names):
-            rows, colour = [row for row in usable if chart.series(row) == name], COLORS[number % len(COLORS)]
+        for name in names:
+            rows = [row for row in usable if chart.series(row) == name]
+            colour = COLORS[series.index(name) % len(COLORS)]
             best = front(rows, chart.error, ())
             axis.scatter(
                 [row["cost"] for row in rows], [row[chart.error] for row in rows], s=18, color=colour, alpha=0.6
