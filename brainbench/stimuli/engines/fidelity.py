@@ -181,7 +181,7 @@ RESOLUTION = ("links", "links_per_mm", "time_step", "steps_per_period", "contact
 
 _PRESETS = {
     "fast": {"links": 8, "links_per_mm": 0.25, "time_step": 2e-4, "steps_per_period": 10},
-    "balanced": {"links": 11, "links_per_mm": 0.4, "time_step": 1e-4, "steps_per_period": 25},
+    "balanced": {"links": 11, "links_per_mm": 0.4, "time_step": 1e-4, "steps_per_period": 34},
     "accurate": {"links": 20, "time_step": 5e-5, "steps_per_period": 120},
 }
 

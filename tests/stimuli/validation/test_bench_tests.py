@@ -195,17 +195,18 @@ def test_a_result_prints_its_figures_and_not_the_trace():
 @pytest.mark.parametrize("name", GATE_WHISKERS)
 def test_every_preset_rings_as_the_rod_and_is_damped_as_asked(name):
     whisker = GATE_WHISKERS[name]
-    for preset, promise in (("fast", 0.15), ("balanced", 0.05), ("accurate", 0.01)):
+    for preset, promise in (("fast", 0.15), ("balanced", 0.03), ("accurate", 0.01)):
         result = ringdown(whisker, fidelity=preset)
         np.testing.assert_allclose(result.frequencies, result.reference_frequencies, rtol=promise)
-        np.testing.assert_allclose(result.damping_ratios[0], whisker.damping_ratio, rtol=max(promise, 0.05))
+        np.testing.assert_allclose(result.damping_ratios[0], whisker.damping_ratio, rtol=max(promise, 0.03))
 
 
 def test_a_short_whisker_rings_as_it_should_at_preset_balanced():
     whisker = GATE_WHISKERS["E5"]
     ring = ringdown(whisker, modes=2, fidelity="balanced")
     np.testing.assert_allclose(ring.frequency_errors, 0, atol=0.05)
-    assert ring.damping_ratio == pytest.approx(whisker.damping_ratio, rel=0.05)
+    assert ring.frequency_errors[0] == pytest.approx(0, abs=0.03)
+    assert ring.damping_ratio == pytest.approx(whisker.damping_ratio, rel=0.03)
 
 
 def test_modes_are_rung_one_by_one():
