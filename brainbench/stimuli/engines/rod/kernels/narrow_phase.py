@@ -26,7 +26,7 @@ from brainbench.stimuli.engines.rod.limits import (
     WIDE,
 )
 
-from .algebra import maximum, minimum, unrotate, vec2, vec3, vec4
+from .algebra import maximum, minimum, unrotate, vec3, vec4
 from .distances import NUMBERS, TRIANGLES, primitive, segment_primitive
 from .motion import BodyMotion, pose_from
 from .parameters import against, cuda, group_size, module_options, real, smooth
@@ -528,25 +528,13 @@ def mesh_distance(shapes: ShapeArrays, s: int, link: Cone, within: real, got: Ne
 
 
 @wp.func
-def mesh_overlap(shapes: ShapeArrays, s: int, link: Cone, leaf: int, part: int, live: int) -> vec2:
-    """Return the deepest overlap of a link with a surface, and that of its start; measured at places along it."""
-    overlap = vec2(real(-1e20), real(0.0))
-    # A count that the compiler does not know, or it would write out a search for each place.
-    places = wp.static(PARTS + 1) + wp.min(0, part)
-    for k in range(places):
-        share = real(k) / real(wp.static(PARTS))
-        x = link.a + (link.b - link.a) * share
-        got = nearest_triangles(shapes, s, x, x, real(wp.static(ANYWHERE)), real(0.0), leaf, part, live)
-        if got.end_face >= 0:
-            face = shapes.face[s] + got.end_face
-            away = x - surface_point(shapes, face, got.end_v, got.end_w)
-            radius = link.start_radius + (link.end_radius - link.start_radius) * share
-            out = pseudo_normal(shapes, face, got.end_v, got.end_w)
-            depth = radius - signed_direction(away, wp.sqrt(got.end), out, radius)[3]
-            overlap[0] = wp.max(overlap[0], depth)
-            if k == 0:
-                overlap[1] = depth
-    return overlap
+def overlap_at(shapes: ShapeArrays, s: int, link: Cone, share: real, got: NearestTriangles) -> real:
+    """Return how deep a place of a link lies in a surface, given the triangle nearest to it."""
+    face = shapes.face[s] + got.end_face
+    away = link.a + (link.b - link.a) * share - surface_point(shapes, face, got.end_v, got.end_w)
+    radius = link.start_radius + (link.end_radius - link.start_radius) * share
+    out = pseudo_normal(shapes, face, got.end_v, got.end_w)
+    return radius - signed_direction(away, wp.sqrt(got.end), out, radius)[3]
 
 
 @wp.func
@@ -606,18 +594,33 @@ def link_shape_distance(
         # Without a bound, nothing found within a radius means outside or deep inside: the nearest of all tells.
         if bound <= real(0.0):
             farthest = real(wp.static(ANYWHERE)) / scale
-        got = nearest_triangles(shapes, s, a, b, farthest, within, leaf - 1, part, searching)
-        found = mesh_distance(shapes, s, link, within, got)
-        found.clearance = wp.min(found.clearance, radius)
-        deep = int(0)
-        if searching == 1 and found.crossing == 1 and margin >= real(0.0):
-            deep = 1
-        if warp_max(deep) == 1:
-            overlap = mesh_overlap(shapes, s, link, found.leaf - 1, part, deep)
-            if deep == 1:
-                found.depth = overlap[0]
-                found.start = 1
-                found.start_gap = -overlap[1]
+        first_leaf = leaf
+        # The link, and where it lies inside then places along it: one search, which would be written out for each.
+        place = int(-1)
+        places = int(0)
+        while place < places:
+            share = real(place) / real(wp.static(PARTS))
+            if place >= 0:
+                a = link.a + (link.b - link.a) * share
+                b = a
+                farthest = real(wp.static(ANYWHERE))
+            got = nearest_triangles(shapes, s, a, b, farthest, within, first_leaf - 1, part, searching)
+            if place < 0:
+                found = mesh_distance(shapes, s, link, within, got)
+                found.clearance = wp.min(found.clearance, radius)
+                if found.crossing == 0 or margin < real(0.0):
+                    searching = int(0)
+                places = wp.static(PARTS + 1) * warp_max(searching)
+                if searching == 1:
+                    found.start = 1
+                first_leaf = found.leaf
+                within = real(0.0)
+            elif searching == 1 and got.end_face >= 0:
+                depth = overlap_at(shapes, s, link, share, got)
+                found.depth = wp.max(found.depth, depth)
+                if place == 0:
+                    found.start_gap = -depth
+            place = place + 1
     # Primitives: what lies between the ends, and the far end on its own.
     if meshed == 0:
         nearest = segment_primitive(shapes.kind[s], shapes.size[s] / scale, link)
