@@ -94,7 +94,7 @@ def load_kernels(
         else:
             kernels = build_kernels(real, capacity, sliced=options.get("sliced", False), **kind)
     if device.is_cuda and options.get("sliced"):
-        blocks = {kernels.run: options["bounds"][0], kernels.swap_queues: None}
+        blocks = {**dict.fromkeys((kernels.run, kernels.go_on), options["bounds"][0]), kernels.swap_queues: None}
         blocks[kernels.measure_distances] = DISTANCE_BOUNDS[0]
         blocks |= {kernel: CONTACT_BOUNDS[0] for kernel, _ in kernels.solve_contacts}
         # Those that this machine does not have yet compile side by side.

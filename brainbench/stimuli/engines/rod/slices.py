@@ -1,8 +1,8 @@
 """Whiskers in slices: on a GPU a whisker pauses where it needs distances from a mesh, which are found for all at once.
 
-Every whisker takes steps until it needs to know what is near, or what its contacts do; further kernels answer these
-questions (``kernels.broad_phase`` says why); then the whiskers go on, those with like answers side by side. Results do
-not depend on the slicing.
+In a slice every whisker takes a step, by one kernel for each part of it: up to the links that may be near something,
+their distances, up to the contact problem, its solution (``kernels.broad_phase`` says why). Results do not depend on
+the slicing.
 
 Threads simulate on one GPU side by side, each with streams of its own: a launch of few whiskers, whose slices follow
 one another however idle the GPU is, then costs the others next to nothing. Warp's streams, recordings and memory know
@@ -102,15 +102,11 @@ def download(arrays: Mapping[str, Any], stream: Any) -> dict[str, NDArray[Any]]:
     return {name: array.numpy() for name, array in host.items()}
 
 
-BUDGET = 4  # steps that a whisker begins in one slice
-FEW = 2**14
-"""Whiskers below which one step begins in a slice: a kernel then takes as long as its slowest thread, and whiskers in
-contact, which need two slices a step, would wait for others' four."""
 SMALL = 2**10
 """Whiskers below which a recorded graph is kept as it is: threads without a whisker cost it nothing then."""
-SLICES_PER_CHECK = 8  # slices (an even number) after which the host counts the whiskers that are left
+SLICES_PER_CHECK = 4  # slices after which the host counts the whiskers that are left
 MOST_THREADS = 2**19  # most threads that find distances at once: a few times as many as a GPU runs side by side
-REPEATS, RARELY = (4, 64), 256
+REPEATS, RARELY = (4, 64), 128
 """Least and most times that a recorded graph is launched for each count, and slices so far for one time more: the host
 has many launches to look after."""
 
@@ -124,7 +120,6 @@ class Slices:
         capacity: int,
         lanes: int,
         device: Any,
-        budget: int | None = None,
         recorded: bool | None = None,
         urgent: bool = False,
     ) -> None:
@@ -132,15 +127,13 @@ class Slices:
 
         Args:
             kernels, capacity, lanes, device: as of the launch.
-            budget: steps that a whisker begins in one slice; by the number of whiskers that are left when None.
             recorded: False when a GPU is given kernel after kernel instead of CUDA graphs.
             urgent: True when these go first among all that the GPU could do.
         """
         wp = warp()
         self.kernels, self.device, self.lanes, self.capacity = kernels, device, lanes, capacity
-        self.budget = budget
         self.recorded = device.is_cuda if recorded is None else recorded
-        # Distances and contact forces of a slice need not wait for each other.
+        # Contact forces of few and of many candidates need not wait for each other.
         self.stream: Any = None
         self.streams, self.counts = [None] * len(kernels.solve_contacts), []
         if self.recorded or device.is_cuda:
@@ -214,39 +207,29 @@ class Slices:
         return slices
 
     def _several(self, inputs: tuple[Any, Any, Any], left: int, block: int) -> None:
-        """Launch some slices for at most ``left`` whiskers."""
+        """Launch some slices for at most ``left`` whiskers: each takes a step in a slice."""
         wp, on, device, kernels = warp(), self.struct, self.device, self.kernels
         scene, problems, results = inputs
-        on.budget = self.budget or (1 if left < FEW else BUDGET)
+
+        def launch(kernel: Any, threads: int, arguments: list[Any], block: int, stream: Any = self.stream) -> None:
+            # Whole warps: the threads of a group speak with each other.
+            threads = -(-threads // WARP) * WARP
+            wp.launch(kernel, threads, arguments, device=device, stream=stream, block_dim=block)
+
         for _ in range(SLICES_PER_CHECK):
-            arguments = [*scene, problems, on, results]
-            wp.launch(kernels.run, left + 3 * WARP, arguments, device=device, stream=self.stream, block_dim=block)
-            # After an even number of slices both arrays are back in place, so a recorded graph can be repeated.
-            on.queue, on.next_queue = on.next_queue, on.queue
-            wp.launch(kernels.swap_queues, 1, [on], device=device, stream=self.stream)
+            for kernel in (kernels.run, kernels.go_on):
+                launch(kernel, left + 3 * WARP, [*scene, problems, on, results], block)
+                # Twice a slice: both arrays are then back in place, so a recorded graph can be repeated.
+                on.queue, on.next_queue = on.next_queue, on.queue
+                wp.launch(kernels.swap_queues, 1, [on], device=device, stream=self.stream)
+                if kernel is kernels.run:
+                    many = min(self.queries, self.capacity * left) * kernels.distance_group
+                    many = min(-(-many // WARP) * WARP, MOST_THREADS)
+                    launch(kernels.measure_distances, many, [*scene[:4], on, many], limits.DISTANCE_BOUNDS[0])
             for (kernel, threads), stream in zip(kernels.solve_contacts, self.streams, strict=True):
-                # Whole warps: the threads of a group speak with each other.
-                many = -(-left * threads // WARP) * WARP
                 if stream is not None:
                     stream.wait_stream(self.stream)
-                wp.launch(
-                    kernel,
-                    many,
-                    [problems, on],
-                    device=device,
-                    stream=stream or self.stream,
-                    block_dim=limits.CONTACT_BOUNDS[0],
-                )
-            many = min(self.queries, self.capacity * left) * kernels.distance_group
-            many = min(-(-many // WARP) * WARP, MOST_THREADS)
-            wp.launch(
-                kernels.measure_distances,
-                many,
-                [*scene[:4], on, many],
-                device=device,
-                stream=self.stream,
-                block_dim=limits.DISTANCE_BOUNDS[0],
-            )
+                launch(kernel, left * threads, [problems, on], limits.CONTACT_BOUNDS[0], stream or self.stream)
             for stream in self.streams:
                 if stream is not None:
                     self.stream.wait_stream(stream)

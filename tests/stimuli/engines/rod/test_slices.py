@@ -83,7 +83,7 @@ def test_threads_that_take_turns_on_a_gpu_get_what_one_alone_gets(as_a_gpu):
         together = dict(
             zip(
                 scenes.objects,
-                pool.map(lambda name: _launch(scenes, name, recorded=True, budget=1), scenes.objects),
+                pool.map(lambda name: _launch(scenes, name, recorded=True), scenes.objects),
                 strict=True,
             )
         )

@@ -33,8 +33,9 @@ class Kernels:
     """Takes every whisker to its last reading, or to where it pauses."""
     structs: ModuleType
     """Module of the structures (``kernels.state``) for these kernels."""
+    go_on: Any = None
+    """This and the next three only of kernels that pause: takes whiskers from their distances to contact forces."""
     swap_queues: Any = None
-    """This and the next two only of kernels that pause."""
     measure_distances: Any = None
     distance_group: int = 1
     """Threads that answer one distance query."""
@@ -101,7 +102,7 @@ def build_kernels(
     whole = {"max_contacts": most, "bounds": bounds, **common}
     if recorder:
         whole |= {"recorded": True, "recorder": recorder}
-    run, structs = specialize("step", **whole).run, specialize("state", **whole)
+    run, structs = specialize("step", stage=int(sliced), **whole).run, specialize("state", **whole)
     if not sliced:
         return Kernels(run, structs, parameters=whole)
     # Threads of a group: for few contacts, for some and for many. A processor takes them one by one.
@@ -110,6 +111,7 @@ def build_kernels(
     return Kernels(
         run,
         structs,
+        specialize("step", stage=2, **whole).run,
         specialize("broad_phase", **whole).swap_queues,
         specialize("narrow_phase", group_size=group, **common).measure_distances,
         group,

@@ -31,6 +31,9 @@ bounds: tuple[int, int] | None = None
 """CUDA launch bounds of the kernel that takes steps."""
 max_contacts = contacts_for(capacity)
 """Contacts that fit: they are solved together."""
+stage = 0
+"""Part of a step that a kernel takes of whiskers that pause: 1 up to the distances that it asks for, 2 from these to
+the contact forces; 0 the whole."""
 group_size = 1
 """Threads that work together on one whisker's contacts, or on one link's distance."""
 queue = 0

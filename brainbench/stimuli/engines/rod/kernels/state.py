@@ -619,8 +619,6 @@ class QueryFrame:
 class PausedWhiskers:
     """Whiskers between two slices, the queues they stand in, and the distances they wait for."""
 
-    budget: wp.int32
-    """Steps that a whisker begins in one slice."""
     queue: wp.array2d(dtype=wp.int32)
     """[3, job] whiskers to go on with: after distances, after contact forces, all others."""
     next_queue: wp.array2d(dtype=wp.int32)
@@ -647,6 +645,7 @@ class PausedWhiskers:
     answer: wp.array(dtype=LinkDistance)
     """[query]"""
     if recorded:
+        budget: wp.int32  # steps after which a whisker pauses
         ended: wp.array(dtype=wp.int32)  # [job] 1: it came to its end
         keep: wp.int32  # 1: the steps of this slice are written down
         records: StepRecords

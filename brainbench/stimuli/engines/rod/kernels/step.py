@@ -36,7 +36,7 @@ from .broad_phase import (
 )
 from .contact_solver import any_gap_closes, queue_problem, read_solution, solve_contacts, write_problem
 from .motion import cell_at, elapsed, instant
-from .parameters import against, bounds, flows, module_options, real, recorded, sliced, yields
+from .parameters import against, bounds, flows, module_options, real, recorded, sliced, stage, yields
 from .state import (
     ENDED,
     WAIT_DISTANCES,
@@ -196,6 +196,10 @@ def run(
         if wp.static(recorded):
             if state.waiting_for == ENDED:
                 return
+        if wp.static(stage == 2):
+            if state.waiting_for != WAIT_DISTANCES:
+                stand_in_queue(paused, index, state)
+                return
         resume(paused, index, job.links, chain, proximity)
     first_step = state.steps
     if state.waiting_for == 0:
@@ -207,6 +211,12 @@ def run(
     first_reading = state.reading
     count_readings = scene.readings.time.shape[0]
     for reading in range(first_reading, count_readings + 1):
+        if wp.static(stage == 2):
+            # The step is taken.
+            if state.waiting_for == 0:
+                wait = WAIT_SLICE
+                state.reading = reading
+                break
         until = instant(state.reading_time.tick, state.reading_time.part + job.longest_step)
         result = int(-1)
         if reading < count_readings:
@@ -217,14 +227,15 @@ def run(
             # A reading at the very start.
             state.pending_reading = result
             continue
-        if state.at_rest == 1 and elapsed(until) > state.safe_until and state.time_left == zero:
+        resting = state.at_rest == 1 and state.time_left == zero
+        if wp.static(stage != 2) and resting and elapsed(until) > state.safe_until:
             end = elapsed(scene.readings.time[count_readings - 1])
             wait = check_rest(scene, paused, job, chain, proximity, state, elapsed(until), end)
             if wp.static(sliced):
                 if wait != 0:
                     state.reading = reading
                     break
-        if state.at_rest == 1 and elapsed(until) <= state.safe_until and state.time_left == zero:
+        if resting and elapsed(until) <= state.safe_until:
             # At rest, and nothing can have come near: the wrench stays zero.
             state.reading_time = until
             state.pending_reading = int(-1)
@@ -239,10 +250,14 @@ def run(
                 state.time_left = left
                 # A step for which distances or forces were found meanwhile began in an earlier slice.
                 if state.waiting_for != WAIT_DISTANCES and state.waiting_for != WAIT_FORCES:
-                    if used >= paused.budget:
+                    if wp.static(recorded):
+                        if used >= paused.budget:
+                            wait = WAIT_SLICE
+                            break
+                        used = used + 1
+                    if wp.static(stage == 2):
                         wait = WAIT_SLICE
                         break
-                    used = used + 1
             now = instant(until.tick, until.part - left)
             # Equal steps up to the next reading.
             # The thousandth keeps rounding from adding a step.
@@ -259,7 +274,7 @@ def run(
             solved = int(0)
             base_wrench = Spatial()
             tip_acceleration = none
-            if wp.static(sliced) and state.waiting_for == WAIT_FORCES:
+            if wp.static(stage == 1) and state.waiting_for == WAIT_FORCES:
                 # The forces of this step have been found meanwhile.
                 state.waiting_for = 0
                 state.time_left = zero
@@ -280,11 +295,12 @@ def run(
                 if wp.static(against > NOTHING):
                     reach = search_range(scene, job, state, h)
                     near_count = count_near_links(scene, job, proximity, reach)
-                    if wp.static(sliced):
-                        if near_count > 0 and state.waiting_for != WAIT_DISTANCES:
+                    if wp.static(stage == 1):
+                        wait = WAIT_DISTANCES
+                        if near_count > 0:
                             wait = query_distances(scene, paused, job, chain, proximity, state, reach, step, near_count)
-                            state.top_speed = previous_speed
-                            break
+                        state.top_speed = previous_speed
+                        break
                     lower_clearance(job, proximity, near, reach)
                     state.last_step = h
                     state.closes = 0
@@ -345,7 +361,7 @@ def run(
                         record_contacts(scene, paused, problems, job, chain, candidates, step, place, solved)
             state.contacts = int(0)
             touched = int(0)
-            if wp.static(against > NOTHING) and solved == 1:
+            if wp.static(against > NOTHING and stage != 2) and solved == 1:
                 read_solution(problems, job, chain, state)
                 base_wrench = problems.solution[index].base
                 tip_acceleration = problems.solution[index].tip_acceleration
