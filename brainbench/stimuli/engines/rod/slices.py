@@ -115,13 +115,7 @@ class Slices:
     """Whiskers of one launch that take turns with the kernels that work for them."""
 
     def __init__(
-        self,
-        kernels: Any,
-        capacity: int,
-        lanes: int,
-        device: Any,
-        recorded: bool | None = None,
-        urgent: bool = False,
+        self, kernels: Any, capacity: int, lanes: int, device: Any, recorded: bool | None = None, urgent: bool = False
     ) -> None:
         """Make room for ``lanes`` whiskers on the device.
 
@@ -164,7 +158,7 @@ class Slices:
         wp, waits, slices, left = warp(), 0, 0, self.lanes
         inputs = scene, problems, results
         graphs: list[Any] = []
-        capture, fits = None, 0
+        fits = 0
         while left:
             if STOPPING.is_set():
                 raise KeyboardInterrupt
