@@ -79,3 +79,19 @@ def test_a_shipped_record_is_confirmed_by_scoring_it_again(stored):
     record = next(item.record for item in stored if item.record and item.record.score.name == "s4-small")
     # The demo recordings are made anew on this machine; their last digits may differ, their statistics may not.
     assert differences(record, score_again(record, Repetition())) == []
+
+
+def test_the_table_of_trained_networks_states_the_scores_of_their_records(stored):
+    scores = {
+        (item.record.score.name, item.record.card.seed): item.record.score for item in stored if item.record is not None
+    }
+    page = RESULTS.parents[1] / "docs" / "networks.md"
+    rows = [line.strip("| \n").split(" | ") for line in page.read_text(encoding="utf-8").splitlines()]
+    rows = [row for row in rows if len(row) == 6 and row[1].lower() in ("supervised", "simclr")]
+    assert len(rows) == 8
+    for name, objective, *_, trained, twin in rows:
+        name = name.strip("`")
+        for key, text in (((f"{name}.{objective.lower()}", 0), trained), ((name, 0), twin)):
+            interval = scores[key].scaled_interval
+            assert interval is not None
+            assert text == f"{scores[key].scaled:.2f} [{interval.low:.2f}, {interval.high:.2f}]", key
