@@ -8,14 +8,20 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import cycle
 from pathlib import Path
 from typing import Any
+
+from matplotlib.patheffects import withStroke
 
 from brainbench.core.figures import COLORS, panels, save_figure
 from brainbench.core.files import read_json
 from brainbench.stimuli.engines.fidelity import RESOLUTION, Fidelity, list_presets
 from brainbench.tradeoffs.study import Row, front
 
+SIDES = (6, 5, "left"), (-6, -3, "right"), (6, -11, "left"), (-6, -11, "right")
+"""Places of labels beside their points (points of the page), and how they are aligned."""
+HALO = withStroke(linewidth=2.5, foreground="white")
 TABLES = {
     "whisker": Path("brainbench/stimuli/fidelity_table.json"),
     "tactile": Path("robotics_bridge/sensors/fidelity_table.json"),
@@ -57,10 +63,10 @@ def draw_study(charts: Sequence[Panel], path: Path) -> Path:
                 [point.cost for point in best], [point.error for point in best], color=colour, where="post", lw=1.2
             )
             axis.plot([], [], "o-", color=colour, label=name)
-            for side, row in enumerate(row for row in rows if chart.label(row)):
-                # On alternate sides, because neighbours are close.
-                shift = {"xytext": (6, 5 if side % 2 else -11), "textcoords": "offset points"}
-                axis.annotate(chart.label(row), (row["cost"], row[chart.error]), color=colour, fontsize=8.5, **shift)
+            # On four sides in turn, because neighbours are close.
+            for row, side in zip((row for row in rows if chart.label(row)), cycle(SIDES)):
+                place = {"xytext": side[:2], "textcoords": "offset points", "ha": side[2], "path_effects": [HALO]}
+                axis.annotate(chart.label(row), (row["cost"], row[chart.error]), color=colour, fontsize=8.5, **place)
         axis.set(xscale="log", yscale="log", title=chart.title, xlabel=chart.xlabel, ylabel=chart.ylabel)
         plain_log_ticks(axis)
         axis.margins(0.15)
