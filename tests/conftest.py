@@ -45,6 +45,13 @@ def _private_cache(tmp_path_factory: pytest.TempPathFactory) -> None:
     os.environ["BRAINBENCH_CONFIG"] = str(tmp_path_factory.mktemp("settings"))
 
 
+@pytest.fixture(autouse=True)
+def _same_random_numbers() -> None:
+    """Draw the same random numbers of torch in every run of a test."""
+    if (torch := sys.modules.get("torch")) is not None:
+        torch.manual_seed(20170607)
+
+
 @dataclass(frozen=True)
 class Outcome:
     """Exit status and streams of a command."""

@@ -123,7 +123,7 @@ def test_recorded_forces_are_those_of_pressed_skin(tmp_path, fingers) -> None:
     inward = {link: -10.0 * each[layout[link].active].sum(0) for link, each in weighed.items()}
     assert {*recorder.points.links} == {TIPS[row] for row in rows}
     for link, point in zip(recorder.points.links, recorder.frames[0][3], strict=True):
-        np.testing.assert_allclose(point[:3], inward[link], rtol=1e-4)
+        np.testing.assert_allclose(point[:3], inward[link], atol=1e-5 * np.linalg.norm(inward[link]))
 
 
 def test_the_wrench_is_the_sum_of_the_points() -> None:
