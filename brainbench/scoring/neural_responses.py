@@ -115,7 +115,7 @@ class NeuralResponses:
         notes = [f"{', '.join(lost)}: no unit is left, so the trials are left out"] if lost else []
         return (*map(str, self.dataset.attrs.get("doubts", ())), *notes)
 
-    @property
+    @cached_property
     def of_units(self) -> NDArray[np.bool_]:
         """[trial] True in sessions with units; others are no part of a score."""
         pairs = ("unit_subject", "unit_session"), ("subject", "session")

@@ -28,7 +28,7 @@ from brainbench.core.reading import sealed
 from brainbench.core.reading.sealed import keep_entry, read_sealed, write_sealed
 from brainbench.core.rotations import base_rotation
 from brainbench.stimuli.engines import PHYSICS_VERSION, get_engine
-from brainbench.stimuli.engines.fidelity import DEFAULT_ENGINE, Fidelity, steps_to_ring
+from brainbench.stimuli.engines.fidelity import DEFAULT_ENGINE, Fidelity
 from brainbench.stimuli.engines.protocol import WhiskerEngine
 from brainbench.stimuli.explain import ATTRIBUTE, SECONDS, explain, plan
 from brainbench.stimuli.motion.jobs import Job, Trace
@@ -319,13 +319,6 @@ def cache_path(
     from importlib import metadata
 
     library = metadata.version(engine.package) + engine.revision if engine.package else ""
-    # Steps that are shortened to ring as asked came later than entries that exist.
-    ratios = [mount.whisker.damping_ratio for scene in scenes for mount in scene.mounts]
-    if max(map(steps_to_ring, ratios)) > (fidelity.steps_per_period or math.inf):
-        more = (*more, "ringing")
-    # Estimates that fall by no more than theory allows came later, too.
-    if fidelity.error is not None:
-        more = (*more, "theory")
     key = content_hash(config_hash(scenes, fidelity, engine.name), library, PHYSICS_VERSION, *more, length=24)
     return cache_dir(folder) / f"{key}.h5"
 

@@ -8,11 +8,11 @@ are MJCF files (``sharpa.xml``, ``xhand1.xml``), each with its palm, fingers, pa
 from __future__ import annotations
 
 import os
-import tomllib
 from pathlib import Path
 
 from brainbench.core.errors import unknown_name
 from brainbench.core.lazy import lazy_exports
+from brainbench.core.reading.texts import read_toml
 from robotics_bridge.hands.hand import Hand, all_from_file, from_file
 from robotics_bridge.hands.layouts import Pad
 
@@ -33,7 +33,7 @@ def load(name_or_path: str | os.PathLike[str], *, palm: str | None = None) -> Ha
     """
     name = os.fspath(name_or_path)
     if name in _OWN:
-        data = tomllib.loads(_OWN[name].read_text(encoding="utf-8"))
+        data = read_toml(_OWN[name])
         fingers = {finger: tuple(chain) for finger, chain in data["fingers"].items()}
         pads = {link: Pad(**pad) for link, pad in data["pads"].items()}
         return Hand(name, data["palm"], fingers, _OWN[name].with_suffix(".xml"), pads, data["speeds"])
