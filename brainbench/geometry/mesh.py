@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.errors import DataError, UsageError, brief, check_name, check_number, unknown_name
+from brainbench.core.files import atomic_path, content_hash, without_last_digits
 from brainbench.core.reading.regular import MOST_PART, check_file, part_of, readable
 
 if TYPE_CHECKING:
@@ -299,8 +300,6 @@ class Mesh:
     @cached_property
     def content_hash(self) -> str:
         """Hash of vertices and faces; the name does not count."""
-        from brainbench.core.files import content_hash, without_last_digits
-
         return content_hash(without_last_digits(self.vertices), self.faces)
 
     def scaled(self, factor: float) -> Mesh:
@@ -363,12 +362,13 @@ def hull_faces(points: NDArray[np.float64]) -> NDArray[np.int32]:
 
 
 def face_owners(mesh: Mesh) -> NDArray[np.int64]:
-    """Return the number [F] of the connected piece that each face belongs to."""
+    """Return the number [F] of the piece that each face belongs to: all that are joined by whole edges."""
     from trimesh.graph import connected_component_labels
 
-    # Two edges of a triangle join its three vertices; pieces are the components of that graph.
-    edges = mesh.faces[:, [0, 1, 1, 2]].reshape(-1, 2)
-    return connected_component_labels(edges, node_count=len(mesh.vertices))[mesh.faces[:, 0]]
+    # Bodies that meet in one corner are two, each with an inside of its own. Edges are joined by their triangles.
+    ends = np.sort(mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    edges = np.unique(ends[:, 0] * len(mesh.vertices) + ends[:, 1], return_inverse=True)[1].reshape(-1, 3)
+    return connected_component_labels(edges[:, [0, 1, 1, 2]].reshape(-1, 2), node_count=edges.max() + 1)[edges[:, 0]]
 
 
 def _folded_edges(mesh: Mesh, pairs: NDArray[np.int64]) -> int:
@@ -481,8 +481,6 @@ def save_mesh(path: str | os.PathLike[str], mesh: Mesh, *, unit: str) -> Path:
 
     An unknown unit or format is a :class:`UsageError`.
     """
-    from brainbench.core.files import atomic_path
-
     check_name("length unit", unit, UNITS)
     path = Path(path)
     if path.suffix.lower() not in WRITABLE:

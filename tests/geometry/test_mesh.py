@@ -186,6 +186,15 @@ def test_pieces_come_apart_whole():
     assert large.diagnosis.bodies == 1
 
 
+def test_bodies_that_meet_in_a_corner_are_two_and_the_one_inside_out_is_turned():
+    cube = trimesh.creation.box()
+    pair = trimesh.util.concatenate([cube, trimesh.Trimesh(cube.vertices + 1, cube.faces[:, ::-1])])
+    pair.merge_vertices()
+    mesh = Mesh(pair.vertices, pair.faces)
+    assert (len(mesh.vertices), mesh.diagnosis.bodies, mesh.volume) == (15, 2, 0.0)
+    assert [piece.volume for piece in repair(mesh).mesh.pieces()] == pytest.approx([1, 1])
+
+
 def test_equal_meshes_have_equal_hashes_and_a_moved_vertex_changes_it():
     cube = trimesh.creation.box()
     mesh = Mesh(cube.vertices, cube.faces, "one")

@@ -157,6 +157,15 @@ def test_bars_that_cross_are_concave_although_their_volumes_add_up_to_that_of_th
     assert mesh_solid(path, unit="mm", collision="exact").parts == ()
 
 
+def test_bars_with_one_common_corner_are_concave_too(tmp_path):
+    bars = [trimesh.creation.box(bounds=[[0, 0, 0], end]) for end in ((2, 1, 1), (1, 2, 1.2))]
+    path = tmp_path / "bars.stl"
+    trimesh.util.concatenate(bars).export(path)
+    assert any("concavities are filled" in note for note in mesh_solid(path, unit="cm").notes)
+    pieces = mesh_solid(path, unit="cm", collision="pieces")
+    assert [np.ptp(part.bounds(), axis=0).max() for part in pieces.parts] == pytest.approx([0.02, 0.02])
+
+
 def test_an_open_mesh_says_so(tmp_path):
     path = tmp_path / "open.obj"
     cube = trimesh.creation.box()
