@@ -92,13 +92,15 @@ def _present(to: Path) -> list[tuple[Path, ResultRecord]]:
 
 def _question(record: ResultRecord) -> str:
     """Return what two records share when they answer the same question, the old one with what has since changed."""
+    from brainbench.scoring.demo import DEMOS
     from brainbench.scoring.jobs import asked_settings
 
     origin = record.score.provenance
-    titles = [origin.recordings.get(name) for name in ("source", "title")]
-    # The source is the last part of a path: folders of one name are told apart by their animals.
-    animals = sorted(item.subject for item in record.score.subjects)
-    return to_json([record.score.name, *titles, animals, origin.pairing, asked_settings(origin.settings)])
+    # Files of one name hold other days of the same animals; a demo is known by its name, in each of its versions.
+    source = origin.recordings.get("source")
+    brain = source if record.synthetic and str(source) in DEMOS else origin.recordings_hash
+    title, settings = origin.recordings.get("title"), asked_settings(origin.settings)
+    return to_json([record.score.name, title, brain, origin.pairing, settings])
 
 
 def command_of(job: ScoringJob) -> str:

@@ -6,6 +6,7 @@ import json
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from brainbench.cli.leaderboard.add import command_of
@@ -99,13 +100,20 @@ def test_models_are_scored_once_and_the_batch_goes_on_where_it_stopped(run, file
     assert {path.name for path in to.glob("*.json")} == {item["record"] for item in results}
 
 
-def test_recordings_of_other_animals_in_a_folder_of_the_same_name_replace_nothing(run, files, tmp_path):
+@pytest.mark.parametrize("part", ["animals", "days"])
+def test_other_recordings_in_a_file_of_the_same_name_replace_nothing(run, files, tmp_path, part):
     whole = open_recordings(files["recordings"], conditions="trials:texture")
+    animals = whole["subject"].values
+    parts = [animals == animal for animal in np.unique(animals)]
+    if part == "days":
+        # The first trials of each animal and the last, which its neurons do not tell apart.
+        early = np.concatenate([np.arange(rows.sum()) < rows.sum() // 2 for rows in parts])
+        parts = [early, ~early]
     to, states = tmp_path / "board", []
-    for animal in sorted(set(whole["subject"].values.tolist())):
-        part = whole.isel(trial=whole["subject"].values == animal, unit=whole["unit_subject"].values == animal)
-        (tmp_path / animal).mkdir()
-        path = write_recordings(tmp_path / animal / "data.h5", part)
+    for number, rows in enumerate(parts):
+        (tmp_path / str(number)).mkdir()
+        units = np.isin(whole["unit_subject"].values, animals[rows])
+        path = write_recordings(tmp_path / str(number) / "data.h5", whole.isel(trial=rows, unit=units))
         given = ("--recordings", str(path), "--model", files["features"], "--to", str(to), "--prune")
         result = run("leaderboard", "add", *given, "--json")
         states += [item["state"] + item["note"] for item in json.loads(result.out)["results"]]
