@@ -93,15 +93,15 @@ class SessionRecorder:
     def begin(self, joints: Sequence[str], fingers: Sequence[str]) -> SessionRecorder:
         """Take in the joints of a hand and the fingers that it senses, in the order of its reports; return itself."""
         finger_of = dict(zip(self.hand.tips, self.hand.fingers, strict=True))
-        tips = self.hand.layout("med", "tips")
-        layout = {link: probes for link, probes in tips.items() if finger_of[link] in fingers}
+        layout = {link: each for link, each in self.hand.layout("med", "tips").items() if finger_of[link] in fingers}
         self.joints, self.rows = tuple(joints), [list(fingers).index(finger_of[link]) for link in layout]
         self.axes = finger_axes_of(self.hand, self.hand.layout("med", "hand"))
         position, normal = (
             np.array([getattr(probes, name)[probes.active].mean(axis=0) for probes in layout.values()]).reshape(-1, 3)
             for name in ("position", "normal")
         )
-        self.points = TactilePoints(tuple(layout), position, normal)
+        # The mean of the normals of a round tip is shorter than they are.
+        self.points = TactilePoints(tuple(layout), position, normal / np.linalg.norm(normal, axis=1, keepdims=True))
         return self
 
     def __call__(self, reading: HandReading, obs: Any, action: Any, targets: NDArray[np.floating]) -> None:

@@ -102,11 +102,15 @@ def test_a_session_states_forces_in_the_unit_of_the_hand(tmp_path) -> None:
     assert recorder.write() is None
     pressure = np.zeros((5, 3))
     pressure[0] = 0.2
-    reading = HandReading(1, 0.0, 0.0, np.zeros(12), np.zeros(12), pressure)
-    recorder(reading, None, None, np.zeros(12))
-    folder = recorder.write()
-    points = json.loads((folder / "meta" / "tactile.json").read_text())
-    assert all("pressure" in unit for unit in points["units"])
+    for number in range(2):
+        reading = HandReading(number, number / 40, number / 40, np.zeros(12), np.zeros(12), pressure)
+        recorder(reading, None, None, np.zeros(12))
+    # What was recorded is read again: of the middle of a round tip, along one normal.
+    log = read_touch_log(recorder.write(), HAND, PROBES)
+    assert "pressure" in log.unit
+    np.testing.assert_allclose(np.linalg.norm(log.points.normal, axis=1), 1)
+    assert {*log.points.links} == {*TIPS}
+    assert [log.points.links[row] for row in np.flatnonzero(log.force[0])] == [TIPS[0]]
 
 
 @pytest.mark.parametrize("fingers", [None, ("thumb", "pinky", "index"), ()])
