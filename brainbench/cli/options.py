@@ -423,7 +423,6 @@ DISTRIBUTIONS = {
 }  # fmt: skip
 """Packages whose name for pip is another one than that of the module."""
 _PICTURES = Requirement(("matplotlib",), "report", "Drawing pictures")
-PICTURES_IF_PLOT = replace(_PICTURES, when=_given("plot"))
 _MP4 = Requirement(("imageio_ffmpeg",), "report", "Writing an MP4")
 _POLICIES = Requirement(("rsl_rl", "tensordict"), "policies", "Training policies")
 _CLUSTER = Requirement(("distributed",), "cluster", "A --scheduler", _given("scheduler"))

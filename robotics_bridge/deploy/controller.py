@@ -31,6 +31,7 @@ from robotics_bridge.envs import ActionMap
 from robotics_bridge.envs.step import VELOCITY
 from robotics_bridge.policies.contract import RATE, PolicyContract
 from robotics_bridge.policies.export import Runner, read_policy
+from robotics_bridge.tasks import list_tasks, load
 from robotics_bridge.tasks.task import check_measured
 
 PRIORITY = 20  # priority under SCHED_FIFO (1–99); above ordinary threads, below the kernel's own (50)
@@ -94,18 +95,16 @@ class RateMonitor:
     def __init__(self, rate: float, window: float = 1.0) -> None:
         self.rate, self.window = rate, window
         self._times: deque[float] = deque()
-        self._begun: float | None = None
+        self._full = False
 
     def tick(self, now: float) -> float:
         """Count a tick; return the rate over the window [Hz], the nominal one until a window has passed."""
         # A window that is not full yet would count too few ticks and stop every session at its beginning.
-        self._begun = now if self._begun is None else self._begun
         self._times.append(now)
-        while self._times and self._times[0] <= now - self.window:
+        while self._times[0] <= now - self.window:
             self._times.popleft()
-        if now - self._begun < self.window:
-            return self.rate
-        return len(self._times) / self.window
+            self._full = True
+        return len(self._times) / self.window if self._full else self.rate
 
 
 _log = logging.getLogger(__name__)
@@ -196,8 +195,7 @@ class Controller:
         try:
             with self.link.watched():
                 reason = self._wait()
-                start = self.clock()
-                due = start
+                due = start = self.clock()
                 while reason is None and self.clock() - start < seconds:
                     before = self.clock()
                     reason = self._tick()
@@ -314,8 +312,7 @@ class PressureCalibration:
 
     def pressure(self, fingers: tuple[str, ...], force: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the pressures [F, 3] that give an ``agg_force`` [F, 3]."""
-        scales = np.array([self.per_finger.get(finger, self.scale) for finger in fingers])
-        return force / (scales[:, None] * np.array(self.axes))
+        return force / self.force(fingers, np.ones_like(force))
 
 
 class RealTouch:
@@ -385,6 +382,12 @@ class DeployedPolicy:
         """Return group → what a hand with these sensing fingers (all by default) cannot measure of it, in words."""
         contract = self.contract
         check_measured(contract.inputs, "A policy on a hand")
+        # Contracts of earlier versions name the task alone.
+        if contract.starts or (contract.task in list_tasks() and load(contract.task).starts):
+            raise UsageError(
+                f"The policy was trained on {str(contract.task)[:80]!r}, whose episodes begin with sampled grasps; its "
+                "actions are counted from each, and no hand tells its own: run it in the simulation (policy play)."
+            )
         # What is told to the hand is no measurement; a contract that states it needs no word of the user.
         answered = ("proprio", "tactile", *(("command",) if contract.command is not None else ()))
         unmeasured = {

@@ -115,6 +115,7 @@ class _Deployment(msgspec.Struct):
     sub_steps: Annotated[int, Meta(ge=1, le=1000)] | None = None
     command: tuple[Annotated[float, Meta(ge=-1e6, le=1e6)], ...] | None = None
     action_limit: Annotated[float, Meta(ge=1e-6, le=1e6)] | None = None
+    starts: Name | None = None
 
 
 class _Written(msgspec.Struct):
@@ -161,6 +162,8 @@ class PolicyContract:
     command: tuple[float, ...] | None = None
     """What it is told by default."""
     action_limit: float | None = None
+    starts: str | None = None
+    """What episodes began with, such as ``grasps``, and actions were counted from; None: from ``action_map``."""
 
     @classmethod
     def read(cls, path: Path) -> PolicyContract:
@@ -202,7 +205,7 @@ class PolicyContract:
         return cls(
             inputs, given.rate, given.hand, joints, moved, given.action_map.rows(), given.frozen, links, observe,
             written.sha256, trained_contacts(deployment, where), given.twist, given.task, given.placement,
-            given.resolution, given.probes, given.sub_steps, command, given.action_limit,
+            given.resolution, given.probes, given.sub_steps, command, given.action_limit, given.starts,
         )  # fmt: skip
 
 

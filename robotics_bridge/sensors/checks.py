@@ -65,8 +65,7 @@ def _probe(radius: float) -> Probes:
 
 
 def _distance(device: str) -> Result:
-    sensor = SurfaceDistanceProbe(link="pad", probes=_probe(1e-3))
-    return float(_felt(device, sensor, depth=-0.01)), _GAP, 1e-5
+    return float(_felt(device, SurfaceDistanceProbe(link="pad", probes=_probe(1e-3)), depth=-0.01)), _GAP, 1e-5
 
 
 def _depth(device: str) -> Result:
@@ -102,16 +101,14 @@ def _tone(device: str) -> Result:
     return float(np.argmax(spectrum)) * 32000 / (1 << 16), 1000.0, 0.02
 
 
-def _beam(device: str) -> Result:
-    del device
+def _beam(_device: str) -> Result:
     steel = ElasticMaterial(2e11, 0.3, 7850.0, 5.0, 3e-8)
     bar = Geometry(name="bar", link="bar", kind="box", size=(0.1, 0.005, 0.005))
     frequency = find_modes(bar, steel, count=2, cells=16, cache=False).frequency[0]
     return frequency, 4.730041**2 / (2 * math.pi * 0.2**2) * math.sqrt(2e11 * 1e-4 / 12 / 7850), 0.02
 
 
-def _counts(device: str) -> Result:
-    del device
+def _counts(_device: str) -> Result:
     hand_list = [hands.load(name) for name in ("xhand1", "sharpa")]
     total = sum(layouts.active_count(hand.layout(level)) for hand in hand_list for level in layouts.RESOLUTIONS)
     return float(total), float(90 + 199 + 667 + 98 + 206 + 781), 0.0

@@ -542,6 +542,7 @@ def describe_run(config: DistillConfig, student: TactilePolicy, env: Any) -> dic
             "rate": 1 / env.step_dt,
             "sub_steps": env.decimation,
             "action_limit": env.task.action_limit,
+            "starts": env.task.starts,
             "twist": env.task.taxel_twist,
             "contacts": asdict(env.task.contacts),
             "joints": list(env.joint_names),

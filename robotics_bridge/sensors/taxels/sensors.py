@@ -16,7 +16,6 @@ if TYPE_CHECKING:
 PUBLISHED_TWIST = 2.0
 """k_ω of the published parameters (N·m·s): that of a disc of 1.4 m, which drowns every other moment when an object
 turns."""
-CONVENTIONS = ("physical", "thesis")
 _LAW = ("stiffness", "damping", "shear", "twist", "convention", "pairs")  # settings of the law alone
 
 

@@ -225,6 +225,14 @@ def test_a_command_that_the_contract_states_needs_no_word_of_the_user() -> None:
         _deployed("command", 4).require({"tactile"})
 
 
+@pytest.mark.parametrize("stated", [{"task": "screwdriver"}, {"task": "mine", "starts": "grasps"}])
+def test_actions_that_are_counted_from_a_grasp_reach_no_hand(stated: dict[str, str]) -> None:
+    """A target was off by up to .17 rad within half a second, and the session had finished."""
+    with pytest.raises(UsageError, match=f"{stated['task']}.*counted from each"):
+        _deployed("command", command=[1.0], **stated).require({"tactile"})
+    assert "tactile" in _deployed("command", command=[1.0], task="in_palm_rotate").require({"tactile"})
+
+
 def test_touch_of_a_policy_without_touch_reaches_nothing_and_is_refused() -> None:
     deployed, hand = _deployed("command", command=[0.5]), SimpleNamespace(joints=(), fingers=())
     inputs = {name: shape for name, shape in deployed.contract.inputs.items() if name != "tactile"}
