@@ -120,7 +120,7 @@ def judge_claim(claim: Mapping[str, Any], types: Sequence[str], arms: Arms, leve
         return Judged(effect, verdict_of(effect))
     effects = {" less ".join(map(in_words, pair)): difference(arms, [pair], level) for pair in pairs}
     weakest = min(effects, key=lambda name: effects[name].value)
-    verdicts = [verdict_of(effect) for effect in effects.values()]
+    verdicts: list[Verdict] = [verdict_of(effect) for effect in effects.values()]
     order = ["does not hold", "undecided", "holds"]
     verdict = min(verdicts, key=order.index)
     return Judged(effects[weakest], verdict, weakest)
@@ -299,7 +299,7 @@ def write_pages(out: Path, decorate: Callable[[Drawing], str] = standalone) -> l
     records = [record_of(EQUAL), compared(), record_of(SCREWDRIVER), record_of(PUBLISHED)]
     template = Template(Path(__file__).with_name("which-touch.md").read_text(encoding="utf-8"))
     tables = dict(zip(("students", "later", "screwdriver", "published"), map(student_table, records), strict=True))
-    text = template.substitute(tables, teachers=teacher_table(record_of(TAUGHT)))
+    text = template.substitute(**tables, teachers=teacher_table(record_of(TAUGHT)))
     return [write_text(out / TOUCH_PAGE, text), write_text(out / FIGURE, decorate(figure(records)))]
 
 

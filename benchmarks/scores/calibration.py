@@ -426,7 +426,7 @@ def faults(run: Run) -> Result:
     from tests.factories.synthetic_animals import simulate
 
     rows, metric = [], get_metric("rsa")
-    quiet = {"rate": 8.0, "window": 1.0, "modulation": 0.3, "emphasis": 0.0, "dispersion": 0.0, "shared_gain": 0.0}
+    quiet = dict[str, Any](rate=8.0, window=1.0, modulation=0.3, emphasis=0.0, dispersion=0.0, shared_gain=0.0)
     for trials in ((20, 20), (8, 32)):
         design = PopulationDesign(animals=11, sessions=3, units=20, trials=trials, **quiet)
         for given in ((), ("zero-fill",), ("first-appearance",), ("first-appearance", "zero-fill")):
