@@ -59,8 +59,9 @@ def _replace(path: Path, seed: int) -> str:
     return name
 
 
-def _bytes(path: Path, chance: random.Random) -> str:
-    data = bytearray(path.read_bytes())
+def damage_bytes(whole: bytes, chance: random.Random) -> tuple[bytes, str]:
+    """Return bytes of which a part is changed, cut off, repeated or overwritten, and how."""
+    data = bytearray(whole)
     kind = chance.choice(("flip", "truncate", "zero", "repeat", "append", "noise"))
     place = chance.randrange(max(1, len(data)))
     if kind == "flip":
@@ -78,6 +79,16 @@ def _bytes(path: Path, chance: random.Random) -> str:
     else:
         end = min(len(data), place + chance.choice((4, 16)))
         data[place:end] = b"\xff" * (end - place)
+    return bytes(data), kind
+
+
+def damaged(data: bytes, seed: int) -> bytes:
+    """Return bytes with such damage; equal seeds do the same."""
+    return damage_bytes(data, random.Random(seed))[0]
+
+
+def _bytes(path: Path, chance: random.Random) -> str:
+    data, kind = damage_bytes(path.read_bytes(), chance)
     path.write_bytes(data)
     return kind
 

@@ -14,6 +14,7 @@ from brainbench.scoring.options import ScoreOptions
 from robotics_bridge import hands
 from robotics_bridge.deploy.links.replay import PARTS, SessionFacts, TactilePoints, taxel_names, write_lerobot
 from tests.factories import policies, published_surfaces, reading_surfaces, robot_surfaces
+from tests.factories.hand_gallery import GALLERY
 from tests.factories.ringdown_table import write_ringdown
 from tests.factories.scored_files import write_study
 from tests.factories.whisker_tracks import (
@@ -27,19 +28,6 @@ from tests.factories.whisker_tracks import (
     write_whiskiwrap,
 )
 
-JAWS = """<robot name="jaws">
-<link name="base"><inertial><mass value=".1"/><inertia ixx="1e-4" iyy="1e-4" izz="1e-4" ixy="0" ixz="0" iyz="0"/>
-</inertial><collision><geometry><box size=".06 .12 .04"/></geometry></collision></link>
-<link name="left"><inertial><mass value=".1"/><inertia ixx="1e-4" iyy="1e-4" izz="1e-4" ixy="0" ixz="0" iyz="0"/>
-</inertial><collision><geometry><box size=".02 .01 .04"/></geometry></collision></link>
-<link name="right"><inertial><mass value=".1"/><inertia ixx="1e-4" iyy="1e-4" izz="1e-4" ixy="0" ixz="0" iyz="0"/>
-</inertial><collision><geometry><box size=".02 .01 .04"/></geometry></collision></link>
-<joint name="l" type="prismatic"><parent link="base"/><child link="left"/><origin xyz="0 .02 .06"/><axis xyz="0 1 0"/>
-<limit lower="0" upper=".03" effort="10" velocity="1"/></joint>
-<joint name="r" type="prismatic"><parent link="base"/><child link="right"/><origin xyz="0 -.02 .06"/>
-<axis xyz="0 -1 0"/><limit lower="0" upper=".03" effort="10" velocity="1"/><mimic joint="l" multiplier="1"/></joint>
-</robot>"""
-"""A gripper with two jaws."""
 PIXEL = 5e-5
 """m"""
 MODEL = """import torch
@@ -151,8 +139,7 @@ def angles(folder: Path) -> Path:
 
 
 def _recorded(folder: Path) -> tuple[Any, Any, np.ndarray, Any]:
-    (folder / "jaws.urdf").write_text(JAWS)
-    hand = hands.load(folder / "jaws.urdf")
+    hand = hands.load(GALLERY["urdf-mimic"].write(folder, "jaws"))
     probes = hand.layout("low", "tips")
     place, normal = ([getattr(each, name)[each.active] for each in probes.values()] for name in ("position", "normal"))
     links = np.repeat(list(probes), [len(each) for each in place])

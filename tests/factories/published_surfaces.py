@@ -103,7 +103,7 @@ PUBLISHED = (
         lambda names: len(names) > 1000,
     ),
     Surface("split halves, npz", _halves, explain_file, _bad_steps),
-    Surface("published weights, ckpt", _checkpoint, _import, not_finite),
-    Surface("published weights, imported", _checkpoint, _import_to_folder, not_finite),
-    Surface("published settings, YAML", _settings, read_settings, not_finite),
+    Surface("published weights, ckpt", _checkpoint, _import),
+    Surface("published weights, imported", _checkpoint, _import_to_folder),
+    Surface("published settings, YAML", _settings, read_settings),
 )

@@ -292,8 +292,8 @@ SURFACES = (
         "recordings, copied", _spikes, lambda path: export([path], path.with_name("copy.h5")),
         lambda copies: not copies[0].is_file(),
     ),
-    Surface("stimulus set", _stimulus_set, lambda path: load_stimuli(path).input, not_finite),
-    Surface("stimulus arrays", _arrays, lambda path: load_stimuli(path).input, not_finite),
+    Surface("stimulus set", _stimulus_set, lambda path: load_stimuli(path).input),
+    Surface("stimulus arrays", _arrays, lambda path: load_stimuli(path).input),
     # NaN in activations is a missing value, and the score of such a layer has a status.
     Surface(
         "activations", _activations, read_features,
@@ -301,33 +301,31 @@ SURFACES = (
     ),
     Surface("scene", written("scene.toml", SCENE), load_scene, _bad_scene),
     *(
-        Surface(f"mesh, {suffix[1:].upper()}", _mesh(suffix), lambda path: load_mesh(path, unit="mm"), not_finite)
+        Surface(f"mesh, {suffix[1:].upper()}", _mesh(suffix), lambda path: load_mesh(path, unit="mm"))
         for suffix in (".obj", ".stl", ".ply", ".off", ".glb")
     ),
     Surface("WHISKiT names", _run("whisker_ID.csv"), _read_run, _bad_run),
     Surface("WHISKiT table", _run("dynamics/Fx.csv"), _read_run, _bad_run),
-    Surface("trajectory", _trajectory, load_trajectory, not_finite),
-    Surface("starting angles", _angles, load_initial_angles, not_finite),
+    Surface("trajectory", _trajectory, load_trajectory),
+    Surface("starting angles", _angles, load_initial_angles),
     Surface("network, JSON", written_json("graph.json", GRAPH), read_graph, _bad_graph),
-    Surface("weights", _weights, _load, not_finite),
-    Surface(
-        "model configuration", written_json("config.json", MODEL), lambda path: read_config(path.parent), not_finite
-    ),
+    Surface("weights", _weights, _load),
+    Surface("model configuration", written_json("config.json", MODEL), lambda path: read_config(path.parent)),
     Surface(
         "training options", written("train.toml", CONFIG),
         lambda path: TrainingConfig.published("zhuang-small", **read_mapping(path)), _bad_config,
     ),
     Surface("training state", _training, _go_on, _bad_training),
     Surface("batch file", written("batch.toml", BATCH), read_batch, _bad_batch),
-    Surface("match, JSON", written_json("match.json", {"a": "b", "c": None}), read_match, not_finite),
-    Surface("match, CSV", written("match.csv", "a,b\nc,\n"), read_match, not_finite),
+    Surface("match, JSON", written_json("match.json", {"a": "b", "c": None}), read_match),
+    Surface("match, CSV", written("match.csv", "a,b\nc,\n"), read_match),
     Surface(
         "ShapeNet names", written("ids.txt", "02691156/1a04e3\n03001627/bb # a chair\n"), read_ids, lambda found: False
     ),
     Surface("ShapeNet classes, CSV", written("classes.csv", CLASSES), read_categories, lambda found: False),
-    Surface("ShapeNet classes, JSON", written_json("classes.json", {"02691156": "a"}), read_categories, not_finite),
-    Surface("manifest", _sweeps("manifest.json"), _read_sweeps, not_finite),
-    Surface("shard", _sweeps("train-00000.h5"), _read_sweeps, not_finite),
+    Surface("ShapeNet classes, JSON", written_json("classes.json", {"02691156": "a"}), read_categories),
+    Surface("manifest", _sweeps("manifest.json"), _read_sweeps),
+    Surface("shard", _sweeps("train-00000.h5"), _read_sweeps),
     Surface(
         "result record", written_json("record.json", json.loads(make_record().to_json())), _read_record, _bad_record
     ),
@@ -341,7 +339,7 @@ SURFACES = (
     ),
     Surface(
         "fidelity text", written("fidelity.txt", "fast,links=12,links_per_mm=0.3,time_step=1e-4,solver=quasistatic"),
-        typed(Fidelity.parse), not_finite,
+        typed(Fidelity.parse),
     ),
     Surface(
         "selection text",
@@ -349,7 +347,7 @@ SURFACES = (
         typed(Selection.parse), lambda selection: selection.min_spikes < 0,
     ),
     Surface("seeds text", written("seeds.txt", "0-4,7,9"), typed(parse_seeds), lambda seeds: min(seeds) < 0),
-    Surface("window text", written("window.txt", "first-contact-0.1..choice+0.25"), typed(Window.parse), not_finite),
+    Surface("window text", written("window.txt", "first-contact-0.1..choice+0.25"), typed(Window.parse)),
     Surface("trials text", written("trials.txt", "16-20"), typed(parse_trials), lambda rows: min(numbers(rows)) < 1),
     Surface(
         "whiskers text", written("whiskers.txt", "C1-C3,D*,*2"),
@@ -361,7 +359,7 @@ SURFACES = (
     ),
     Surface(
         "numbers text", written("numbers.txt", "0.5,1e-3,20"),
-        typed(lambda text: option_numbers(text, "--steps", float)), not_finite,
+        typed(lambda text: option_numbers(text, "--steps", float)),
     ),
     *PUBLISHED,
     *ROBOTS,

@@ -34,6 +34,36 @@ class HangError(BaseException):
     """Raised into a reader that takes too long; no handler of errors catches it."""
 
 
+def numbers(value: Any, *, depth: int = 12) -> Iterator[float]:
+    """Yield the numbers in nested data, the least and the greatest of each array."""
+    if depth == 0 or isinstance(value, (str, bytes, bool, type(None))):
+        return
+    if isinstance(value, (int, float, np.number)):
+        yield float(min(max(value, -1e308), 1e308)) if isinstance(value, int) else float(value)
+    elif isinstance(value, xr.Dataset):
+        for name in (*value.data_vars, *value.coords):
+            yield from numbers(value[name].values)
+    elif hasattr(value, "detach"):
+        yield from numbers(value.detach().float().numpy())
+    elif isinstance(value, np.ndarray):
+        if value.dtype.kind in "fiu" and value.size:
+            yield from (float(value.min()), float(value.max()))
+    elif isinstance(value, Mapping):
+        for item in value.values():
+            yield from numbers(item, depth=depth - 1)
+    elif isinstance(value, (list, tuple, set, frozenset)):
+        for item in value:
+            yield from numbers(item, depth=depth - 1)
+    elif dataclasses.is_dataclass(value):
+        for item in dataclasses.fields(value):
+            yield from numbers(getattr(value, item.name, None), depth=depth - 1)
+
+
+def not_finite(value: Any) -> bool:
+    """Return whether nested data holds a number that is not finite."""
+    return any(not math.isfinite(number) for number in numbers(value))
+
+
 @dataclass(frozen=True)
 class Surface:
     """One reader of users' files."""
@@ -43,7 +73,7 @@ class Surface:
     """Writes a good input into a folder and returns the file to be damaged."""
     read: Callable[[Path], Any]
     """Reads it, given the path of that file."""
-    faults: Callable[[Any], bool]
+    faults: Callable[[Any], bool] = not_finite
     """True for a result that holds a number which is not finite or out of range."""
 
 
@@ -122,36 +152,6 @@ def _memory_limit() -> Iterator[None]:
 def _entries(folder: Path) -> int:
     """Count what stands in a folder; a reader of the tests may rename a file, and none may add one."""
     return sum(1 for _ in folder.rglob("*"))
-
-
-def numbers(value: Any, *, depth: int = 12) -> Iterator[float]:
-    """Yield the numbers in nested data, the least and the greatest of each array."""
-    if depth == 0 or isinstance(value, (str, bytes, bool, type(None))):
-        return
-    if isinstance(value, (int, float, np.number)):
-        yield float(min(max(value, -1e308), 1e308)) if isinstance(value, int) else float(value)
-    elif isinstance(value, xr.Dataset):
-        for name in (*value.data_vars, *value.coords):
-            yield from numbers(value[name].values)
-    elif hasattr(value, "detach"):
-        yield from numbers(value.detach().float().numpy())
-    elif isinstance(value, np.ndarray):
-        if value.dtype.kind in "fiu" and value.size:
-            yield from (float(value.min()), float(value.max()))
-    elif isinstance(value, Mapping):
-        for item in value.values():
-            yield from numbers(item, depth=depth - 1)
-    elif isinstance(value, (list, tuple, set, frozenset)):
-        for item in value:
-            yield from numbers(item, depth=depth - 1)
-    elif dataclasses.is_dataclass(value):
-        for item in dataclasses.fields(value):
-            yield from numbers(getattr(value, item.name, None), depth=depth - 1)
-
-
-def not_finite(value: Any) -> bool:
-    """Return whether nested data holds a number that is not finite."""
-    return any(not math.isfinite(number) for number in numbers(value))
 
 
 def bad_counts(dataset: Any) -> bool:

@@ -18,6 +18,7 @@ from robotics_bridge.policies.training.distill_config import StudentSweep, read_
 from robotics_bridge.sensors.calibration.calibrate import read_log
 from robotics_bridge.sensors.noise.model import Noise
 from robotics_bridge.tasks.registry import apply_overrides
+from tests.factories.hand_gallery import GALLERY
 from tests.factories.policies import contract_of, student_folder
 from tests.factories.reading_trials import Surface, not_finite, numbers, typed, written, written_json
 
@@ -25,42 +26,6 @@ CHANGES = (
     "is_dropped=-300 rotation_progress.clip=2 episode=15 entropy=0 learning_rate_range=1e-4,1e-3 friction=0.8 "
     "object_changes.friction=0.8,1 density=300 noise.position=0.01 hidden=64,32 copies=1 solver.timestep=0.004"
 )
-MJCF = """
-<mujoco model="claw">
-  <compiler angle="radian"/>
-  <worldbody>
-    <body name="palm" pos="0 0 0.1">
-      <geom type="box" size="0.02 0.03 0.01" mass="0.3"/>
-      <body name="near" pos="0 0.03 0">
-        <joint name="a" axis="1 0 0" range="0 1.5" damping="0.1"/>
-        <geom type="capsule" fromto="0 0 0 0 0.04 0" size="0.008" mass="0.05"/>
-        <body name="tip" pos="0 0.04 0">
-          <joint name="b" axis="1 0 0" range="0 1.2" armature="0.001"/>
-          <geom type="capsule" fromto="0 0 0 0 0.03 0" size="0.007" mass="0.03" friction="0.8 0.01 0.001"/>
-        </body>
-      </body>
-    </body>
-  </worldbody>
-  <actuator><position joint="a" kp="5" ctrlrange="0 1.5" forcerange="-1 1"/></actuator>
-</mujoco>
-"""
-URDF = """
-<robot name="claw">
-  <link name="palm">
-    <inertial><mass value="0.3"/><inertia ixx="1e-4" ixy="0" ixz="0" iyy="1e-4" iyz="0" izz="1e-4"/></inertial>
-    <collision><geometry><box size="0.04 0.06 0.02"/></geometry></collision>
-  </link>
-  <link name="tip">
-    <inertial><mass value="0.05"/><inertia ixx="1e-5" ixy="0" ixz="0" iyy="1e-5" iyz="0" izz="1e-5"/></inertial>
-    <collision><origin xyz="0 0.02 0" rpy="1.57 0 0"/><geometry><cylinder radius="0.008" length="0.04"/></geometry>
-    </collision>
-  </link>
-  <joint name="a" type="revolute">
-    <parent link="palm"/><child link="tip"/><origin xyz="0 0.03 0" rpy="0 0 0"/><axis xyz="1 0 0"/>
-    <limit lower="0" upper="1.5" effort="1" velocity="5"/><dynamics damping="0.1"/>
-  </joint>
-</robot>
-"""
 STUDENTS = """
 types = ["agg_force", "bool"]
 resolutions = ["low", "med"]
@@ -165,16 +130,15 @@ ROBOTS = (
         "fault text",
         written("fault.txt", "drop=0.2 jitter=0.03 silent-after=2 seed=3"),
         typed(lambda text: Faults.parse(text.split())),
-        not_finite,
     ),
-    Surface("hand, URDF", written("hand.urdf", URDF), _read_hand, _bad_hand),
-    Surface("hand, MJCF", written("hand.xml", MJCF), _read_hand, _bad_hand),
+    Surface("hand, URDF", written("hand.urdf", GALLERY["urdf-mimic"].text), _read_hand, _bad_hand),
+    Surface("hand, MJCF", written("hand.xml", GALLERY["coupled-jaws"].text), _read_hand, _bad_hand),
     Surface("probe layout", _probes, read_probes, _bad_layout),
-    Surface("calibration log", _log, read_log, not_finite),
+    Surface("calibration log", _log, read_log),
     Surface("noise preset", _noise, Noise.load, _bad_noise),
     Surface("contract", written_json("policy.onnx.json", contract_of()), PolicyContract.read, _bad_contract),
-    Surface("student, configuration", _student("config.json"), _load_student, not_finite),
-    Surface("student, weights", _student("model.safetensors"), _load_student, not_finite),
+    Surface("student, configuration", _student("config.json"), _load_student),
+    Surface("student, weights", _student("model.safetensors"), _load_student),
     Surface("sweep of students", written("students.toml", STUDENTS), read_sweep, _bad_sweep),
     Surface("key of a hand", _key, read_key, lambda key: len(key) != KEY),
 )

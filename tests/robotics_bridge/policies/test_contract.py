@@ -24,9 +24,9 @@ from robotics_bridge.policies.shipped import stored
 from robotics_bridge.tasks.registry import apply_overrides
 from robotics_bridge.tasks.settings import CONTACTS, ContactModel
 from robotics_bridge.tasks.task import TASK_VERSION
-from tests.factories.mutations import mutate_text
+from tests.factories.damage import damaged
+from tests.factories.hand_gallery import GALLERY
 from tests.factories.policies import contract_of, teacher_in
-from tests.factories.robot_surfaces import MJCF
 from tests.factories.structures import mutate
 
 NAN, INF = math.nan, math.inf
@@ -117,7 +117,7 @@ def _check_mutants(folder, cases: int) -> None:
         contract = contract_of()
         path = folder / "policy.onnx.json"
         if seed % 2:
-            path.write_bytes(mutate_text(json.dumps(contract).encode(), seed))
+            path.write_bytes(damaged(json.dumps(contract).encode(), seed))
         else:
             path.write_text(json.dumps(mutate(copy.deepcopy(contract), seed)))
         try:
@@ -242,20 +242,21 @@ def test_a_hand_whose_file_was_changed_is_told(tmp_path: Path, caplog: pytest.Lo
         file.write_text(text)
         return SimpleNamespace(hand=hands.load(str(file)))
 
-    described = {"hand_physics": env(MJCF).hand.physics}
+    jaws = GALLERY["coupled-jaws"].text
+    described = {"hand_physics": env(jaws).hand.physics}
     with caplog.at_level(logging.WARNING):
-        check_hand(described, env(f"<!-- a remark -->{MJCF.strip()}"), "mine")
-        check_hand({}, env(MJCF), "earlier")
+        check_hand(described, env(f"<!-- a remark -->{jaws}"), "mine")
+        check_hand({}, env(jaws), "earlier")
     assert described["hand_physics"]
     assert not caplog.records
     for old, new in (
-        ('damping="0', 'damping="1'),
+        ('damping="1', 'damping="2'),
         ('kp="', 'kp="1'),
-        ('mass="0.05', 'mass="0.06'),
-        ('on="0.8', 'on="0.9'),
+        ('mass=".03"', 'mass=".04"'),
+        ('mass=".03"', 'mass=".03" friction=".9"'),
     ):
-        assert old in MJCF
+        assert old in jaws
         with caplog.at_level(logging.WARNING):
-            check_hand(described, env(MJCF.replace(old, new)), "mine")
+            check_hand(described, env(jaws.replace(old, new)), "mine")
         assert "'mine' was trained" in caplog.text
         caplog.clear()

@@ -18,7 +18,7 @@ from brainbench.core.files import write_json
 from robotics_bridge.deploy.controller import read_deployed
 from robotics_bridge.policies.export import compare, export_policy, read_policy
 from robotics_bridge.policies.student import StepPolicy, TactilePolicy
-from tests.factories.mutations import mutate_text
+from tests.factories.damage import damaged
 from tests.factories.policies import contract_of, export_small
 from tests.factories.reading_trials import time_limit
 
@@ -35,7 +35,7 @@ def _check_mutants(path, folder, cases: int) -> None:
     target = folder / path.name
     shutil.copy(path.with_name(f"{path.name}.json"), folder)
     for seed in range(cases):
-        target.write_bytes(mutate_text(whole, seed))
+        target.write_bytes(damaged(whole, seed))
         if target.read_bytes() != whole:
             with pytest.raises(DataError, match=path.name):
                 read_deployed(target)

@@ -22,7 +22,7 @@ from robotics_bridge.hands.layouts import write_probes
 from robotics_bridge.policies.evaluate import Policy
 from robotics_bridge.policies.training.distill import CONFIG, MODEL, ChunkStep, distill, load_student
 from robotics_bridge.policies.training.distill_config import DistillConfig
-from tests.factories.mutations import mutate_text
+from tests.factories.damage import damaged
 from tests.factories.policies import student_folder
 from tests.factories.structures import mutate
 from tests.factories.task_worlds import Follower, TouchWorld
@@ -42,9 +42,9 @@ def _check_mutants(folder, cases: int) -> None:
     config, weights = (folder / CONFIG).read_bytes(), (folder / MODEL).read_bytes()
     refused = longest = slowest = 0
     for seed in range(cases):
-        values = (json.dumps(mutate(json.loads(config), seed)).encode(), mutate_text(config, seed), config)[seed % 3]
+        values = (json.dumps(mutate(json.loads(config), seed)).encode(), damaged(config, seed), config)[seed % 3]
         (folder / CONFIG).write_bytes(values)
-        (folder / MODEL).write_bytes(mutate_text(weights, seed) if seed % 3 == 2 else weights)
+        (folder / MODEL).write_bytes(damaged(weights, seed) if seed % 3 == 2 else weights)
         begun = time.monotonic()
         try:
             student, _ = load_student(folder)

@@ -41,7 +41,7 @@ from robotics_bridge.policies.training.teacher import train as train_teacher
 from robotics_bridge.tasks.goals import SteppingRotation
 from robotics_bridge.tasks.settings import CONTACTS, TeacherSettings
 from robotics_bridge.tasks.task import TASK_VERSION
-from tests.factories.mutations import mutate_text
+from tests.factories.damage import damaged
 from tests.factories.policies import teacher_in
 from tests.factories.structures import mutate
 from tests.factories.task_worlds import Follower, TouchWorld
@@ -251,8 +251,8 @@ def _check_mutants(folder, cases: int) -> None:
     refused = 0
     for seed in range(cases):
         changed = json.dumps(mutate(json.loads(config), seed)).encode()
-        (folder / "config.json").write_bytes((changed, mutate_text(config, seed), config)[seed % 3])
-        (folder / newest(whole).name).write_bytes(mutate_text(weights, seed) if seed % 3 == 2 else weights)
+        (folder / "config.json").write_bytes((changed, damaged(config, seed), config)[seed % 3])
+        (folder / newest(whole).name).write_bytes(damaged(weights, seed) if seed % 3 == 2 else weights)
         try:
             policy = load_teacher(folder, env)
         except BrainbenchError:
