@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from collections import Counter
-
 import numpy as np
 
 from brainbench.core.contracts import CHANNELS
-from brainbench.datasets.ledger import Ledger
 from brainbench.datasets.sessions import Session, make_session
 from brainbench.datasets.synthetic import PopulationDesign
-from brainbench.datasets.synthetic.populations import draw_sessions, spike_session, trial_times
-from brainbench.datasets.trials.counting import UNIT_COLUMNS, ReadingOptions, SessionCounts, missing_column
+from brainbench.datasets.synthetic.populations import draw_sessions, spike_session
+from brainbench.datasets.trials.counting import ReadingOptions, count_session
 from brainbench.datasets.trials.selection import EVERYTHING, Conditions, Window
 from brainbench.datasets.trials.session_trials import join_sessions
 
@@ -84,34 +81,9 @@ def make_sessions(geometry, design=None, *, seed=0):
 
 
 def as_recordings(geometry, design=None, *, seed=0):
-    """Synthetic animals as a recordings data set, with the counts of files of the same seed."""
-    counted, length = [], (design or PopulationDesign()).window
-    for drawn in draw_sessions(geometry, design, seed):
-        trials, units = drawn.counts.shape
-        labels = tuple(geometry.labels[index] for index in drawn.labels)
-        begin, _ = trial_times(drawn)
-        counted.append(
-            SessionCounts(
-                subject=drawn.subject,
-                session=drawn.session,
-                source=f"{drawn.subject}-{drawn.session}",
-                values=tuple((label,) for label in labels),
-                labels=labels,
-                trial_ids=tuple(map(str, range(trials))),
-                unit_ids=tuple(map(str, range(units))),
-                edges=np.stack([begin, begin + length], axis=1),
-                counts=drawn.counts[:, None].astype(np.float32),
-                duration=np.full((trials, 1), length),
-                columns={name: missing_column(kind, units) for name, kind in UNIT_COLUMNS.items()},
-                covariates={},
-                ledger=Ledger(totals=Counter(trials=trials, units=units)),
-                synthetic=True,
-            )
-        )
-    options = ReadingOptions(
-        Conditions("trials", ("stimulus",)),
-        geometry.labels,
-        EVERYTHING,
-        Window("choice", offset=-length, length=length),
-    )
+    """Synthetic animals as a recordings data set, counted as files of the same seed are."""
+    length = (design or PopulationDesign()).window
+    window = Window("choice", offset=-length, length=length)
+    options = ReadingOptions(Conditions("trials", ("stimulus",)), geometry.labels, EVERYTHING, window)
+    counted = [count_session(session, options) for session in make_sessions(geometry, design, seed=seed)]
     return join_sessions(counted, options, source="synthetic", layout="", notes=[])
