@@ -1,15 +1,18 @@
-"""A chain of links in dense matrices: what the solver's O(links) passes must agree with."""
+"""A chain of links in MuJoCo's dense matrices: what the solver's O(links) passes must agree with."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
+from brainbench.core.devices import mujoco_module
 from brainbench.stimuli.engines.rod.kernels import specialize
 
+mujoco = mujoco_module()
+
 CAPACITY = 12
-AXES = np.eye(3)
 
 
 def in_double(module: str, **parameters: object):
@@ -18,11 +21,6 @@ def in_double(module: str, **parameters: object):
 
     wp.init()
     return specialize(module, real=wp.float64, capacity=CAPACITY, **parameters)
-
-
-def _turn(axis, angle):
-    k = np.cross(AXES, axis)
-    return np.eye(3) + np.sin(angle) * k + (1 - np.cos(angle)) * k @ k
 
 
 def _records(**columns):
@@ -66,7 +64,7 @@ class DenseChain:
             rest=rng.uniform(-0.2, 0.2, links),
             mass=rng.uniform(0.5, 2, links),
             centre=rng.uniform(0.3, 0.8, links),
-            inertia=rng.uniform(0.01, 0.3, (links, 2)),
+            inertia=np.sort(rng.uniform(0.01, 0.3, (links, 2))),
             stiffness=rng.uniform(1, 20, links),
             angle=rng.uniform(-0.5, 0.5, (links, 2)),
             rate=rng.normal(size=(links, 2)) * 0.2,
@@ -116,72 +114,59 @@ class DenseChain:
             "length": arc[-1:], "build": build, "inertia": inertia, "taper": taper,
         }  # fmt: skip
 
-    def pose(self, time=0.0):
-        """Base frame, joints [link + 1, 3], axes (a list [hinge, 3] per link) and frames [link, 3, 3], a time later."""
-        w, *v = self.base_quaternion
-        k = np.cross(AXES, v)
-        frame = np.eye(3) + 2 * w * k + 2 * k @ k
-        spin = self.base_twist[:3]
-        speed = np.linalg.norm(spin)
-        frame = _turn(spin / speed, speed * time) @ frame if speed else frame
-        nodes, axes, frames = [self.base_twist[3:] * time], [], []
-        for i in range(self.links):
-            half = self.rest[i] / 2 if self.torsion[i] > 0 else 0.0
-            frame = frame @ _turn(AXES[2], self.rest[i] - half)
-            first = frame[:, 1]
-            frame = frame @ _turn(AXES[1], self.angle[i, 0] + self.rate[i, 0] * time)
-            second = frame[:, 2]
-            frame = frame @ _turn(AXES[2], self.angle[i, 1] + self.rate[i, 1] * time)
-            axes.append([first, second])
-            if half:
-                axes[-1].append(frame[:, 0])
-                frame = frame @ _turn(AXES[0], self.angle[i, 2] + self.rate[i, 2] * time) @ _turn(AXES[2], half)
-            frames.append(frame)
-            nodes.append(nodes[-1] + frame[:, 0] * self.length[i])
-        return np.array(nodes), axes, np.array(frames)
+    def _engine(self) -> tuple[Any, Any, np.ndarray]:
+        """Return MuJoCo's model and state of this chain, and its velocities per twist of the base and rates."""
+        text, hinges = "", '<joint axis="0 1 0"/><joint axis="0 0 1"/>'
+        for i, start in enumerate([0.0, *self.length[:-1]]):
+            bend, turns = (self.rest[i] / 2, self.rest[i] / 2) if self.torsion[i] > 0 else (self.rest[i], 0.0)
+            more = '<joint axis="1 0 0"/>' if self.torsion[i] > 0 else ""
+            axial, transverse = self.inertia[i]
+            text += f'<body pos="{start} 0 0" euler="0 0 {bend}">{hinges}{more}<body name="{i}" euler="0 0 {turns}">'
+            text += f'<inertial mass="{self.mass[i]}" pos="{self.centre[i]} 0 0" '
+            text += f'diaginertia="{axial} {transverse} {transverse}"/>'
+        text += "</body></body>" * self.links
+        model = mujoco.MjModel.from_xml_string(
+            '<mujoco><compiler angle="radian"/><option gravity="0 0 0"/><worldbody><body><freejoint/>'
+            f'<inertial mass="1" pos="0 0 0" diaginertia="1 1 1"/>{text}</body></worldbody></mujoco>'
+        )
+        data = mujoco.MjData(model)
+        data.qpos[3:] = [*self.base_quaternion, *self.angle[self.free]]
+        mujoco.mj_kinematics(model, data)
+        change = np.eye(model.nv)
+        # The base's velocity stands first there, and its spin in its own axes.
+        change[:6, :6] = np.block([[np.zeros((3, 3)), np.eye(3)], [data.xmat[1].reshape(3, 3).T, np.zeros((3, 3))]])
+        data.qvel[:] = change @ [*self.base_twist, *self.rate[self.free]]
+        mujoco.mj_forward(model, data)
+        return model, data, change
 
-    def point_jacobian(self, point, link, pose=None):
+    @property
+    def nodes(self):
+        """Joints and tip [link + 1, 3]."""
+        _, data, _ = self._engine()
+        links = [data.body(str(i)) for i in range(self.links)]
+        tip = links[-1].xpos + links[-1].xmat.reshape(3, 3)[:, 0] * self.length[-1]
+        return np.array([*(link.xpos for link in links), tip])
+
+    def point_jacobian(self, point, link):
         """Jacobian [6, 6 + hinges] of the rotation and translation of a link at a point, by base twist and rates."""
-        nodes, axes, _ = pose or self.pose()
-        out = np.zeros((6, 6 + self.axes_count))
-        out[:3, :3] = out[3:, 3:6] = np.eye(3)
-        out[3:, :3] = -np.cross(AXES, point - nodes[0])
-        column = 6
-        for i in range(link + 1):
-            for axis in axes[i]:
-                out[:, column] = *axis, *np.cross(axis, point - nodes[i])
-                column += 1
-        return out
-
-    def _bodies(self, time=0.0):
-        """Jacobian at the centre, and inertia [3, 3], of each link."""
-        pose = self.pose(time)
-        nodes, _, frames = pose
-        for i in range(self.links):
-            centre = nodes[i] + frames[i][:, 0] * self.centre[i]
-            tensor = frames[i] @ np.diag(self.inertia[i][[0, 1, 1]]) @ frames[i].T
-            yield self.point_jacobian(centre, i, pose), tensor
+        model, data, change = self._engine()
+        moved, turned = np.zeros((2, 3, model.nv))
+        mujoco.mj_jac(model, data, moved, turned, point, model.body(str(link)).id)
+        return np.concatenate([turned, moved]) @ change
 
     def mass_matrix(self):
         """Mass matrix [6 + hinges]² of base and joints."""
-        return sum(
-            j[:3].T @ tensor @ j[:3] + m * j[3:].T @ j[3:]
-            for (j, tensor), m in zip(self._bodies(), self.mass, strict=True)
-        )
+        model, data, change = self._engine()
+        mass = np.zeros((model.nv, model.nv))
+        for row, motion in zip(mass, change.T, strict=True):
+            mujoco.mj_mulM(model, data, row, np.ascontiguousarray(motion))
+        # MuJoCo's base has a mass and inertia of its own, 1.
+        return mass @ change - np.diag(np.arange(model.nv) < 6)
 
-    def bias(self, step=1e-3):
+    def bias(self):
         """Forces [6 + hinges] of base and joints at steady rates and a base point that moves straight."""
-        speed = np.concatenate([self.base_twist, self.rate[self.free]])
-
-        def momenta(time):
-            found = [(j @ speed, tensor) for j, tensor in self._bodies(time)]
-            return np.array(
-                [np.concatenate([t @ v[:3], m * v[3:]]) for (v, t), m in zip(found, self.mass, strict=True)]
-            )
-
-        # Fourth order: exact to 1e-12.
-        change = (8 * (momenta(step) - momenta(-step)) - momenta(2 * step) + momenta(-2 * step)) / (12 * step)
-        return sum(j.T @ rate for (j, _), rate in zip(self._bodies(), change, strict=True))
+        _, data, change = self._engine()
+        return change.T @ data.qfrc_bias
 
     def implicit(self, h):
         """Mass matrix of the joints with springs and dampers at the end of a step, and their forces now."""

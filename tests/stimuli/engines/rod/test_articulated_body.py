@@ -106,7 +106,7 @@ def test_joints_accelerate_as_the_dense_equation_of_motion_says(beta, loaded, hi
     load = (5, 0.3, rng.normal(size=3)) if loaded else None
     joints, wrench, tip = _passes(chain, given, load)
     dense, bias, (implicit, spring) = chain.mass_matrix(), chain.bias(), chain.implicit(STEP)
-    nodes, _, _ = chain.pose()
+    nodes = chain.nodes
     pushed = np.zeros(6 + chain.axes_count)
     if load is not None:
         point = nodes[load[0]] + load[1] * (nodes[load[0] + 1] - nodes[load[0]])

@@ -23,7 +23,7 @@ def _run(chain, centres, radii, velocity):
     vec2 = in_double("algebra").vec2
     passes = in_double("articulated_body")
     SceneArrays, Step = kernels.SceneArrays, kernels.Step
-    PausedWhiskers, WhiskerJob = kernels.PausedWhiskers, kernels.WhiskerJob
+    ContactProblems, PausedWhiskers, WhiskerJob = kernels.ContactProblems, kernels.PausedWhiskers, kernels.WhiskerJob
     ChainState, ProximityState, WhiskerState = kernels.ChainState, kernels.ProximityState, kernels.WhiskerState
     ContactCandidates, NearShapes, row = kernels.ContactCandidates, kernels.NearShapes, kernels.row
     instant, pose_at = kernels.instant, in_double("motion").pose_at
@@ -35,6 +35,7 @@ def _run(chain, centres, radii, velocity):
     @wp.kernel(enable_backward=False, module="unique")
     def follow(
         scene: SceneArrays,
+        problems: ContactProblems,
         paused: PausedWhiskers,
         angle: wp.array(dtype=vec2),
         rate: wp.array(dtype=vec2),
@@ -72,7 +73,7 @@ def _run(chain, centres, radii, velocity):
             lower_clearance(job, proximity, near, reach)
             state.last_step = h
             step.margin = reach.margin
-            found = find_candidates(scene, paused, job, chain, proximity, near, candidates, state, step)
+            found = find_candidates(scene, problems, paused, job, chain, proximity, near, candidates, state, step)
             margin[t] = reach.margin
             for j in range(found):
                 gap[t, j] = row(candidates.gap, j)
@@ -108,7 +109,7 @@ def _run(chain, centres, radii, velocity):
     scene.motions = to_struct(structs.MotionArrays, motions, "cpu")
     scene.shapes = to_struct(structs.ShapeArrays, shapes, "cpu")
     inputs = [
-        scene, PausedWhiskers(), wp.array(chain.angle, dtype=vec2),
+        scene, ContactProblems(), PausedWhiskers(), wp.array(chain.angle, dtype=vec2),
         wp.array(chain.rate, dtype=vec2), float(speed), STEP, nodes, bound, gap, link, margin, measured,
     ]  # fmt: skip
     wp.launch(follow, 1, inputs, device="cpu")
@@ -122,7 +123,7 @@ def test_bounds_hold_and_nothing_near_is_missed(seed):
     chain = DenseChain.random(links=8, seed=seed)
     chain.rate *= 0.1
     # Spheres that begin a few millimetres beside the whisker and cross it.
-    target = chain.pose()[0][[3, 6, 8]]
+    target = chain.nodes[[3, 6, 8]]
     side = rng.normal(size=(3, 3))
     side /= np.linalg.norm(side, axis=1)[:, None]
     centres, velocity = target + 4 * side, -side * 0.25 + chain.base_twist[3:]

@@ -26,7 +26,7 @@ def _problem(count, friction, seed, links=8, hinges=2):
     """A chain that something presses from a few sides, and where it would be without contact."""
     rng = np.random.default_rng(seed)
     chain = DenseChain.random(links, seed, hinges)
-    nodes = chain.pose()[0]
+    nodes = chain.nodes
     link = np.sort(rng.choice(np.arange(1, links), count, replace=False)).astype(np.int32)
     share = rng.uniform(0.1, 0.9, count)
     point = nodes[link] + share[:, None] * (nodes[link + 1] - nodes[link])
