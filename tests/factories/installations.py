@@ -22,9 +22,6 @@ def link_installation(folder: Path, extras: tuple[str, ...]) -> Path:
     """Fill ``folder`` with links to every distribution that ``pip install '.[extras]'`` installs, and return it.
 
     Run ``python -S`` with it and the checkout on ``PYTHONPATH``: other distributions are then not there.
-
-    Raises:
-        NotInstalled: a distribution of the extras is missing here.
     """
     folder.mkdir(parents=True, exist_ok=True)
     for name in sorted(_closure(extras)):

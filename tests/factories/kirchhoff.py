@@ -84,11 +84,7 @@ class RodEquilibrium:
 
 
 def load_rod(rod: KirchhoffRod, arc: float, force: ArrayLike) -> RodEquilibrium:
-    """Return the equilibrium under a force [3] (N) that acts at arc length ``arc`` (m).
-
-    Raises:
-        DataError: no equilibrium was found.
-    """
+    """Return the equilibrium under a force [3] (N) that acts at arc length ``arc`` (m)."""
     force = np.asarray(force, dtype=float)
     unit, moment = rod.bending(0.0) / rod.length, np.zeros(3)
     for share in np.linspace(0, 1, _STAGES + 1)[1:]:
@@ -108,9 +104,6 @@ def press_rod(
 
     The peg's axis [3] is perpendicular to the unbent rod at arc length ``arc`` (m), where the peg first touches it; it
     then moves by ``travel`` (m) in the direction ``way`` [3], perpendicular to both, and the rod may slide over it.
-
-    Raises:
-        DataError: no equilibrium was found, as when the rod slips off.
     """
     axis, way = (np.asarray(vector, dtype=float) / np.linalg.norm(vector) for vector in (axis, way))
     touch, _, _ = _integrate(rod, np.zeros(3), np.zeros(3), arc)

@@ -9,7 +9,6 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.errors import UsageError, check_number
 from brainbench.stimuli.engines.fidelity import DEFAULT_ENGINE, Fidelity
 from brainbench.stimuli.motion.jobs import Load
 from brainbench.stimuli.motion.trajectories import smooth_step
@@ -18,6 +17,8 @@ from brainbench.stimuli.validation.bench_tests import BenchTest, PointLoad, job_
 from brainbench.stimuli.whiskers.whisker import Whisker
 from tests.factories.kirchhoff import KirchhoffRod, RodEquilibrium, load_rod, press_rod
 
+PEG = 2.5e-4  # radius of the peg, m
+
 
 def load_aside(
     whisker: Whisker, at: float, force: float, *, backend: str = DEFAULT_ENGINE, fidelity: Fidelity | str = "balanced"
@@ -25,12 +26,7 @@ def load_aside(
     """Load a whisker with ``force`` (N) across its plane at arc length ``at`` (m); compare with the Kirchhoff rod.
 
     The deflection is that of the loaded point along the force; its relative error is that of the stiffness.
-
-    Raises:
-        UsageError: ``at`` lies beyond the whisker, or ``at`` or ``force`` is not positive.
-        DataError: the rod has no equilibrium, or the simulation was unstable.
     """
-    _check(whisker, at=at, force=force)
     expected = load_rod(KirchhoffRod.of(whisker), at, (0.0, 0.0, force))
     job = replace(job_at_rest(whisker, np.array([settling_time(whisker)])), loads=(Load(at, (0.0, 0.0, force)),))
     trace = run_one(backend, job, fidelity)
@@ -45,7 +41,6 @@ def push_aside(
     at: float,
     offset: float,
     *,
-    peg_radius: float = 2.5e-4,
     backend: str = DEFAULT_ENGINE,
     fidelity: Fidelity | str = "balanced",
 ) -> BenchTest:
@@ -54,14 +49,9 @@ def push_aside(
     The base stands still. A long frictionless round peg lies in parallel to the whisker's plane and normal to the
     whisker at arc length ``at`` (m). It moves along the plane's normal by ``offset`` (m, positive) from touching the
     unbent whisker, and rests there. The end state is quasi-static, without gravity.
-
-    Raises:
-        UsageError: ``at`` lies beyond the whisker, or ``offset`` or ``peg_radius`` is not positive.
-        DataError: the whisker slips off the peg, or the simulation was unstable.
     """
-    _check(whisker, at=at, offset=offset, peg_radius=peg_radius)
-    expected, axis, way = _expected(whisker, at, offset, peg_radius), _axis(whisker, at), np.array([0.0, 0.0, 1.0])
-    touch = np.append(whisker.centre_line(at), -peg_radius - float(whisker.radius(at)))
+    expected, axis, way = _expected(whisker, at, offset), _axis(whisker, at), np.array([0.0, 0.0, 1.0])
+    touch = np.append(whisker.centre_line(at), -PEG - float(whisker.radius(at)))
     # The peg is slow against the first mode.
     settling = settling_time(whisker)
     duration = max(0.1, 4 * settling)
@@ -70,16 +60,9 @@ def push_aside(
         return touch + np.outer(smooth_step(times, duration) * offset, way), np.tile([1.0, 0, 0, 0], (len(times), 1))
 
     x, y, z = (whisker.arc_length * axis).tolist()
-    rod = Obstacle((Capsule((-x, -y, -z), (x, y, z), peg_radius),), motion, friction=0.0)
+    rod = Obstacle((Capsule((-x, -y, -z), (x, y, z), PEG),), motion, friction=0.0)
     trace = run_one(backend, job_at_rest(whisker, np.array([duration + settling]), rod), fidelity)
     return BenchTest(trace.wrench[-1], expected.wrench, float(trace.contact_arc[-1]), trace)
-
-
-def _check(whisker: Whisker, at: float, **others: float) -> None:
-    for name, value in {"at": at, **others}.items():
-        check_number(f"{name} of the test (SI units)", value, above=0)
-    if at > whisker.arc_length:
-        raise UsageError(f"The arc length {at:g} m lies beyond this whisker of {whisker.arc_length:g} m.")
 
 
 def _axis(whisker: Whisker, at: float) -> NDArray[np.float64]:
@@ -89,5 +72,5 @@ def _axis(whisker: Whisker, at: float) -> NDArray[np.float64]:
 
 
 @lru_cache(maxsize=256)
-def _expected(whisker: Whisker, at: float, offset: float, peg_radius: float) -> RodEquilibrium:
-    return press_rod(KirchhoffRod.of(whisker), at, _axis(whisker, at), (0.0, 0.0, 1.0), offset, peg_radius)
+def _expected(whisker: Whisker, at: float, offset: float) -> RodEquilibrium:
+    return press_rod(KirchhoffRod.of(whisker), at, _axis(whisker, at), (0.0, 0.0, 1.0), offset, PEG)

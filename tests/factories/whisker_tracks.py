@@ -7,6 +7,7 @@ import struct
 
 import h5py
 import numpy as np
+import pandas as pd
 
 
 def bent_shapes(frames=12, points=10, length=0.015, *, bend=0.2, axes=2):
@@ -37,16 +38,11 @@ def write_points(path, shapes, *, scale=5e-5, frames=None):
 def write_deeplabcut_csv(path, values, likelihood, *, individuals=None):
     """Write DeepLabCut's table of points [frame, part, 2] (pixels) with their likelihoods [frame, part]."""
     parts = [f"p{index}" for index in range(values.shape[1])]
-    heads = [("scorer", "net")] if individuals is None else [("scorer", "net"), ("individuals", individuals)]
-    with path.open("w", newline="") as stream:
-        table = csv.writer(stream)
-        for name, word in heads:
-            table.writerow([name, *[word] * (3 * len(parts))])
-        table.writerow(["bodyparts", *(part for part in parts for _ in range(3))])
-        table.writerow(["coords", *["x", "y", "likelihood"] * len(parts)])
-        for frame, (points, good) in enumerate(zip(values, likelihood, strict=True)):
-            cells = [cell for point, one in zip(points, good, strict=True) for cell in (*point, one)]
-            table.writerow([frame, *cells])
+    levels = {"scorer": ["net"], "individuals": [individuals], "bodyparts": parts, "coords": ["x", "y", "likelihood"]}
+    if individuals is None:
+        del levels["individuals"]
+    block = np.concatenate([values, likelihood[..., None]], axis=-1).reshape(len(values), -1)
+    pd.DataFrame(block, columns=pd.MultiIndex.from_product(levels.values(), names=levels)).to_csv(path)
     return path
 
 

@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import pytest
 
-from brainbench.core.errors import UsageError
 from brainbench.stimuli.validation import references
 from brainbench.stimuli.whiskers.array import WhiskerArray
 from tests.factories.out_of_plane import load_aside, push_aside
@@ -52,12 +51,3 @@ def test_poissons_ratio_softens_twist():
     assert soft.deflection > 1.01 * hard.deflection
     for test in (soft, hard):
         assert test.deflection == pytest.approx(test.reference_deflection, rel=0.003)
-
-
-def test_places_and_forces_without_meaning_are_refused():
-    with pytest.raises(UsageError, match="offset"):
-        push_aside(RAT, 0.01, -0.001)
-    with pytest.raises(UsageError, match="force"):
-        load_aside(RAT, 0.01, 0.0)
-    with pytest.raises(UsageError, match="beyond"):
-        load_aside(RAT, 0.1, 1e-6)
