@@ -314,28 +314,18 @@ class CudaGraphStep:
             generator.set_state(state)
 
 
-def record_step(
-    work: Callable[[], None],
-    device: torch.device,
-    *,
-    generators: Sequence[torch.Generator] = (),
-    warm_up: int = WARM_UP,
-) -> Callable[[], Any]:
-    """Run torch's work a few times and record it; return what repeats it. On the CPU that is ``work`` itself.
+def record_step(work: Callable[[], None], device: torch.device) -> Callable[[], Any]:
+    """Run torch's work :data:`WARM_UP` times and record it; return what repeats it. On the CPU that is ``work`` itself.
 
-    Args:
-        work: Reads and writes tensors that stay where they are.
-        device: Where it works.
-        generators: Random numbers it draws, beside torch's own on the device.
-        warm_up: Runs before the recording; what they change (weights, counters) stays changed.
+    It reads and writes tensors that stay where they are; what the first runs change (weights, counters) stays changed.
     """
     with side_stream(device) if device.type == "cuda" else contextlib.nullcontext() as side:
-        for _ in range(warm_up):
+        for _ in range(WARM_UP):
             work()
     if side is None:
         return work
     side.synchronize()
-    graph, _ = torch_recorder(generators)(work)
+    graph, _ = torch_recorder()(work)
     return graph.replay
 
 

@@ -123,6 +123,6 @@ def test_results_of_a_replay_are_copies_unless_nothing_is_to_be_copied(kept: Any
 
 def test_on_the_cpu_work_is_repeated_as_it_is() -> None:
     done: list[int] = []
-    again = record_step(lambda: done.append(1), torch.device("cpu"), warm_up=2)
+    again = record_step(lambda: done.append(1), torch.device("cpu"))
     again()
-    assert len(done) == 3
+    assert len(done) == _device.WARM_UP + 1

@@ -233,15 +233,15 @@ _VIEW = (0.85, -0.75, 0.95)
 
 
 class Stage:
-    """Draws one environment of a batch, of ``size`` (width, height) in pixels; the camera stands still."""
+    """Draws the first environment of a batch, of ``size`` (width, height) in pixels; the camera stands still."""
 
-    def __init__(self, env: Env, size: tuple[int, int] = (480, 400), number: int = 0) -> None:
-        self._env, self._number = env, number
+    def __init__(self, env: Env, size: tuple[int, int] = (480, 400)) -> None:
+        self._env = env
         self._scene = env.simulation.engine.scene
         self._parts: list[tuple[int, Any]] = []
         focus = []
         for index in range(len(self._scene.geometries)):
-            geometry = self._scene.geometry_in(number, index)
+            geometry = self._scene.geometry_in(0, index)
             link = self._scene.link_index(geometry.link)
             held = geometry.link in env.model.objects
             if (held and max(geometry.size) < 1e-3) or geometry.kind == "plane":
@@ -262,11 +262,11 @@ class Stage:
         return (255 * averaged(image)).astype(np.uint8)
 
     def _pose(self) -> NDArray[np.float64]:
-        return self._env.simulation.state.pose_torch[self._number].cpu().numpy().astype(float)
+        return self._env.simulation.state.pose_torch[0].cpu().numpy().astype(float)
 
     def _object_colors(self, link: str, solid: Any) -> NDArray[np.float64]:
         if len(self._env.model.objects) > 1:
-            hot = self._env.model.objects.index(link) == int(self._env.state.episode.target[self._number])
+            hot = self._env.model.objects.index(link) == int(self._env.state.episode.target[0])
             return np.tile(np.array(HOT if hot else BALL), (len(solid.corners), 1))
         normal = np.cross(solid.corners[:, 1] - solid.corners[:, 0], solid.corners[:, 2] - solid.corners[:, 0])
         axis = np.abs(normal).argmax(axis=1)
@@ -296,9 +296,9 @@ CLASSES = {
 class Grip:
     """A hand, palm up, that closes around a ball in every environment."""
 
-    def __init__(self, hand: str, *, envs: int = 1, device: str = "cpu", radius: float = 0.028) -> None:
-        self.hand, self.device, self.radius = hands.load(hand), device, radius
-        self.model = holding(self.hand, radius=radius, reach=0.9)
+    def __init__(self, hand: str, *, envs: int = 1, device: str = "cpu") -> None:
+        self.hand, self.device = hands.load(hand), device
+        self.model = holding(self.hand, radius=0.028, reach=0.9)
         self.engine: Any = (
             MujocoEngine(self.model, envs) if device == "cpu" else MujocoWarpEngine(self.model, envs, device=device)
         )
