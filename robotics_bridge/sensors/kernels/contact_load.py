@@ -136,6 +136,10 @@ class PressArrays:
     """[B, N] σ: friction at rest over normal force, where taxels hold what they touch."""
     body: wp.array2d(dtype=wp.int32)
     """[B, N] its link."""
+    listed: wp.array2d(dtype=wp.int32)
+    """[B, N] taxels with a weight, from the first place of their sensor on."""
+    end: wp.array2d(dtype=wp.int32)
+    """[B, S] place after the last of them."""
 
 
 @wp.struct
@@ -155,6 +159,9 @@ class ContactPush:
 class Carrier:
     """How a taxel takes part in a face."""
 
+    n: wp.int32
+    """Its number."""
+    x: wp.vec3f
     weight: wp.float32
     noisy: wp.float32
     facing: wp.float32
@@ -371,7 +378,7 @@ def spread_kernel(kinds: frozenset[int], raycast: bool, noisy: bool, sticky: boo
     """
     distance = shape_functions(kinds, raycast).distance
     cuda, group = lanes > 1, group_functions(lanes)
-    total_of, largest_of = group.total, group.largest
+    total_of, largest_of, rank_of, group_meets = group.total, group.largest, group.rank, group.meet
 
     @wp.func
     def behind(
@@ -404,28 +411,33 @@ def spread_kernel(kinds: frozenset[int], raycast: bool, noisy: bool, sticky: boo
     @wp.func
     def carrier_of(
         plan: SpreadPlan, probes: ProbeArrays, solids: SolidArrays, pairs: PairArrays, faces: ContactFaces,
-        press: PressArrays, push: ContactPush, x: wp.vec3f, radius: float, env: int,
-        n: int, slot: int, head: int, alone: bool, face: int, body: int, side: wp.vec3f, source: int,
+        press: PressArrays, push: ContactPush, env: int, place: int, slot: int, head: int, alone: bool, face: int,
+        body: int, side: wp.vec3f, source: int,
     ) -> Carrier:  # fmt: skip
         carrier = Carrier()
+        carrier.n = place
         if source == wp.static(TOUCH):
-            # All is asked for at once; most links touch one body from one side. Fillers never touch.
+            carrier.n = press.listed[env, place]
+        n = carrier.n
+        packed = load_four(probes.packed, n)
+        carrier.x = wp.vec3f(packed[0], packed[1], packed[2])
+        if source == wp.static(TOUCH):
+            # All is asked for at once; most links touch one body from one side.
             touch = load_four(press.touch[env], n)
-            extra = float(0.0)
-            if wp.static(noisy):
-                extra = press.noisy[env, n]
-            if touch[3] + extra > 0.0:
-                m = wp.vec3f(touch[0], touch[1], touch[2])
-                facing = wp.dot(m, side)
-                if press.body[env, n] == body and facing > 0.0:
-                    if alone or belongs(faces, head, face, x, m, plan.reach[n]):
-                        carrier.weight = touch[3]
-                        carrier.noisy = extra
-                        carrier.facing = facing
-                        carrier.way = m
-                        if wp.static(sticky):
-                            carrier.way = m + press.sigma[env, n]
+            owner = press.body[env, n]
+            m = wp.vec3f(touch[0], touch[1], touch[2])
+            facing = wp.dot(m, side)
+            if owner == body and facing > 0.0:
+                if alone or belongs(faces, head, face, carrier.x, m, plan.reach[n]):
+                    carrier.weight = touch[3]
+                    if wp.static(noisy):
+                        carrier.noisy = press.noisy[env, n]
+                    carrier.facing = facing
+                    carrier.way = m
+                    if wp.static(sticky):
+                        carrier.way = m + press.sigma[env, n]
         elif wp.static(deep):
+            radius = packed[3]
             if radius > 0.0 and source == wp.static(BEHIND):
                 back = behind(solids, pairs, probes, env, n, slot, body)
                 carrier.way = wp.vec3f(back[0], back[1], back[2])
@@ -434,14 +446,14 @@ def spread_kernel(kinds: frozenset[int], raycast: bool, noisy: bool, sticky: boo
                     carrier.weight = wp.max(radius - back[3], 0.0)
             elif radius > 0.0:
                 # Without a distance the taxel's own normal tells its side.
-                away = wp.length(x - push.point) / (plan.reach[n] + push.overlap)
+                away = wp.length(carrier.x - push.point) / (plan.reach[n] + push.overlap)
                 if away <= 1.0 and wp.dot(probes.normal[n], push.normal) <= 0.1:
                     carrier.weight = 1.001 - away * away
                 carrier.facing = 1.0
                 carrier.way = push.normal
             carrier.noisy = carrier.weight
         if carrier.weight + carrier.noisy > 0.0:
-            steep = wp.dot(push.lean, x - push.point)
+            steep = wp.dot(push.lean, carrier.x - push.point)
             if steep != 0.0:
                 steep = wp.exp(steep)
                 carrier.weight *= steep
@@ -482,6 +494,30 @@ def spread_kernel(kinds: frozenset[int], raycast: bool, noisy: bool, sticky: boo
             pushed = float(0.0)
             lost = wp.vec2f()
             left = bool(False)
+            # Most taxels touch nothing: the others are listed once, in their order.
+            for k in range(plan.sensors.shape[1]):
+                sensor = plan.sensors[link, k]
+                if sensor >= 0:
+                    span = plan.spans[sensor]
+                    end = span[0]
+                    n = span[0] + lane
+                    while n - lane < span[1]:
+                        # Asked for together, so that none waits for another.
+                        weights = wp.vec4f()
+                        for j in range(4):
+                            if n + j * wp.static(lanes) < span[1]:
+                                weights[j] = press.touch[env, n + j * wp.static(lanes)][3]
+                                if wp.static(noisy):
+                                    weights[j] += press.noisy[env, n + j * wp.static(lanes)]
+                        for j in range(4):
+                            rank = rank_of(weights[j] > 0.0)
+                            if weights[j] > 0.0:
+                                press.listed[env, end + rank[0]] = n + j * wp.static(lanes)
+                            end += rank[1]
+                        n += wp.static(4 * lanes)
+                    press.end[env, sensor] = end
+            if wp.static(cuda):
+                group_meets()
             here = head
             while here >= 0:
                 alone = here == head and faces.face[here].next < 0
@@ -525,18 +561,19 @@ def spread_kernel(kinds: frozenset[int], raycast: bool, noisy: bool, sticky: boo
                                 squares = wp.vec3f()
                                 products = wp.vec3f()
                                 most = float(0.0)
-                                n = span[0] + lane
-                                while n < span[1]:
-                                    packed = load_four(probes.packed, n)
-                                    x = wp.vec3f(packed[0], packed[1], packed[2])
+                                end = span[1]
+                                if source == wp.static(TOUCH):
+                                    end = press.end[env, sensor]
+                                place = span[0] + lane
+                                while place < end:
                                     c = carrier_of(
-                                        plan, probes, solids, pairs, faces, press, push, x, packed[3], env, n,
-                                        span[2], head, alone, here, body, normal, source,
+                                        plan, probes, solids, pairs, faces, press, push, env, place, span[2], head,
+                                        alone, here, body, normal, source,
                                     )  # fmt: skip
                                     if c.weight > 0.0:
-                                        if not near and first[2] == 0.0 and gap_to(sphere, x) <= plan.reach[n]:
+                                        if not near and first[2] == 0.0 and gap_to(sphere, c.x) <= plan.reach[c.n]:
                                             first[2] = 1.0
-                                        a = x - push.point
+                                        a = c.x - push.point
                                         most = wp.max(most, wp.length(a))
                                         along = c.weight * c.facing
                                         first += wp.vec3f(c.weight, along, 0.0)
@@ -545,7 +582,7 @@ def spread_kernel(kinds: frozenset[int], raycast: bool, noisy: bool, sticky: boo
                                         turns += c.weight * wp.cross(a, c.way)
                                         squares += along * wp.cw_mul(a, a)
                                         products += along * wp.vec3f(a[1] * a[2], a[2] * a[0], a[0] * a[1])
-                                    n += wp.static(lanes)
+                                    place += wp.static(lanes)
                                 if wp.static(cuda):
                                     first = total_of(first)
                                     ways = total_of(ways)
@@ -624,30 +661,31 @@ def spread_kernel(kinds: frozenset[int], raycast: bool, noisy: bool, sticky: boo
                             if carried:
                                 center += push.point
                                 total = wp.vec3f()
-                                n = span[0] + lane
-                                while n < span[1]:
-                                    packed = load_four(probes.packed, n)
-                                    x = wp.vec3f(packed[0], packed[1], packed[2])
+                                end = span[1]
+                                if source == wp.static(TOUCH):
+                                    end = press.end[env, sensor]
+                                place = span[0] + lane
+                                while place < end:
                                     c = carrier_of(
-                                        plan, probes, solids, pairs, faces, press, push, x, packed[3], env, n,
-                                        span[2], head, alone, here, body, normal, source,
+                                        plan, probes, solids, pairs, faces, press, push, env, place, span[2], head,
+                                        alone, here, body, normal, source,
                                     )  # fmt: skip
                                     if c.weight + c.noisy > 0.0:
-                                        unit = scale * c.way + c.facing * (even + wp.cross(tilt, x - center))
+                                        unit = scale * c.way + c.facing * (even + wp.cross(tilt, c.x - center))
                                         total += c.weight * unit
-                                        reading = wp.spatial_vector(c.weight * unit, wp.cross(x, c.weight * unit))
+                                        reading = wp.spatial_vector(c.weight * unit, wp.cross(c.x, c.weight * unit))
                                         if not fresh:
-                                            reading += load_planes(io.truth, env, n, 6)
-                                        store_planes(io.truth, env, n, 6, reading)
+                                            reading += load_planes(io.truth, env, c.n, 6)
+                                        store_planes(io.truth, env, c.n, 6, reading)
                                         if wp.static(noisy):
-                                            reading = wp.spatial_vector(c.noisy * unit, wp.cross(x, c.noisy * unit))
+                                            reading = wp.spatial_vector(c.noisy * unit, wp.cross(c.x, c.noisy * unit))
                                             if not fresh:
-                                                reading += load_planes(io.measured, env, n, 6)
-                                            store_planes(io.measured, env, n, 6, reading)
-                                        faces.filled[env, n] = wp.uint8(1)
+                                                reading += load_planes(io.measured, env, c.n, 6)
+                                            store_planes(io.measured, env, c.n, 6, reading)
+                                        faces.filled[env, c.n] = wp.uint8(1)
                                     elif fresh:
-                                        clear(faces, io, env, n, wp.static(noisy))
-                                    n += wp.static(lanes)
+                                        clear(faces, io, env, c.n, wp.static(noisy))
+                                    place += wp.static(lanes)
                                 if wp.static(cuda):
                                     total = total_of(total)
                                 written = written | (1 << k)
@@ -679,11 +717,10 @@ def spread_kernel(kinds: frozenset[int], raycast: bool, noisy: bool, sticky: boo
             for k in range(plan.sensors.shape[1]):
                 sensor = plan.sensors[link, k]
                 if sensor >= 0 and ((written >> k) & 1) == 0:
-                    span = plan.spans[sensor]
-                    n = span[0] + lane
-                    while n < span[1]:
-                        clear(faces, io, env, n, wp.static(noisy))
-                        n += wp.static(lanes)
+                    place = plan.spans[sensor][0] + lane
+                    while place < press.end[env, sensor]:
+                        clear(faces, io, env, press.listed[env, place], wp.static(noisy))
+                        place += wp.static(lanes)
             if lane == 0:
                 # Sensors of several groups may sit on a link: the most that one of them lacks counts.
                 plan.loads[0, env, link] = wp.max(plan.loads[0, env, link], pushed)

@@ -305,6 +305,8 @@ def kinematic_kernel(
                         press.body[env, n] = solids.link[pairs.geometry[env, place]]
                         if wp.static(sticky):
                             press.sigma[env, n] = sigma
+                    else:
+                        clear(faces, io, env, n, wp.static(mode != CLEAN))
                 else:
                     truth = wp.spatial_vectorf()
                     signal = wp.spatial_vectorf()

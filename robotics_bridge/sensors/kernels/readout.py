@@ -57,14 +57,26 @@ def store_planes(planes: wp.array3d(dtype=wp.float32), row: int, n: int, count: 
 
 @cache
 def group_functions(lanes: int) -> SimpleNamespace:
-    """Return ``total(vector)`` and ``largest(number)`` of so many threads of a GPU, a power of 2 up to 32."""
-    head = f"""
+    """Return functions of so many threads of a GPU, a power of 2 up to 32.
+
+    ``total(vector)`` and ``largest(number)`` are those of the group; ``rank(chosen)`` says how many threads before this
+    one and how many in all are chosen; after ``meet()`` each sees what the others wrote. A processor has one thread.
+    """
+    members = f"""
 #if defined(__CUDA_ARCH__)
-    const unsigned group = {2**lanes - 1}u << (threadIdx.x % 32 / {lanes} * {lanes});
+    const unsigned group = {2**lanes - 1}u << (threadIdx.x % 32 / {lanes} * {lanes});"""
+    head = f"""{members}
     #pragma unroll
     for (int half = {lanes // 2}; half; half /= 2)"""
     sums = " ".join(f"value[{axis}] += __shfl_xor_sync(group, value[{axis}], half);" for axis in range(3))
     tail = "\n#endif\n    return value;\n"
+    ranks = f"""{members}
+    const unsigned all = __ballot_sync(group, chosen) & group;
+    return wp::vec2i(__popc(all & ((1u << (threadIdx.x % 32)) - 1u)), __popc(all));
+#else
+    return wp::vec2i(0, chosen ? 1 : 0);
+#endif
+"""
 
     @wp.func_native(f"{head} {{ {sums} }}{tail}")
     def total(value: wp.vec3f) -> wp.vec3f: ...
@@ -72,7 +84,13 @@ def group_functions(lanes: int) -> SimpleNamespace:
     @wp.func_native(f"{head} value = max(value, __shfl_xor_sync(group, value, half));{tail}")
     def largest(value: float) -> float: ...
 
-    return SimpleNamespace(total=total, largest=largest)
+    @wp.func_native(ranks)
+    def rank(chosen: bool) -> wp.vec2i: ...
+
+    @wp.func_native(f"{members} __syncwarp(group);\n#endif\n")
+    def meet(): ...
+
+    return SimpleNamespace(total=total, largest=largest, rank=rank, meet=meet)
 
 
 CLEAN, FUSED, STAGED = range(3)

@@ -128,9 +128,10 @@ class ContactLoadRuntime(KinematicRuntime):
             self._spread.insert(0, (spread_kernel(*options, False), min(items, groups)))
         shape, press = (envs, self.count), self.press
         press.touch, press.body = context.zeros(shape, wp.vec4f), context.zeros(shape, int)
+        press.listed, press.end = context.zeros(shape, int), context.zeros((envs, len(configs)), int)
         press.noisy = context.zeros(shape if self.noisy else (1, 1))
         press.sigma = context.zeros(shape if sticky else (1, 1), wp.vec3f)
-        self.scratch = [press.touch, press.body]
+        self.scratch = [press.touch, press.body, press.listed, press.end]
         self.scratch += [press.noisy] * self.noisy + [press.sigma] * sticky
         faces = self.faces
         faces.head, faces.listed = (context.array(np.full((envs, len(places)), -1), int) for _ in range(2))
