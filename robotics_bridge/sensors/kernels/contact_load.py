@@ -453,11 +453,14 @@ def spread_kernel(kinds: frozenset[int], raycast: bool, noisy: bool, sticky: boo
                 carrier.way = push.normal
             carrier.noisy = carrier.weight
         if carrier.weight + carrier.noisy > 0.0:
+            # Beyond the 60° of a face less and less: the side of a block faces by no more than its tilt, and takes
+            # nothing of what pushes its bottom.
+            part = wp.min(2.0 * carrier.facing, 1.0)
             steep = wp.dot(push.lean, carrier.x - push.point)
             if steep != 0.0:
-                steep = wp.exp(steep)
-                carrier.weight *= steep
-                carrier.noisy *= steep
+                part *= wp.exp(steep)
+            carrier.weight *= part
+            carrier.noisy *= part
         return carrier
 
     @wp.kernel(
@@ -618,7 +621,8 @@ def spread_kernel(kinds: frozenset[int], raycast: bool, noisy: bool, sticky: boo
                                     # Taxels that face away by more than 60° on average would be stretched beyond all
                                     # measure; b then carries what is missing.
                                     scale = push.load / wp.max(whole, 0.5 * first[0])
-                                    mean = push.load / whole
+                                    # Normals of a face differ: what is along the first is the load less a little.
+                                    mean = wp.max(wp.dot(push.force, push.normal), 1.0e-6 * push.load) / whole
                                     center = places / whole
                                     even = (push.force - scale * ways) / whole
                                     moment -= scale * turns + whole * wp.cross(center, even)
