@@ -153,6 +153,10 @@ class ContactPush:
     overlap: wp.float32
     lean: wp.vec3f
     """λ of the weights that carry it (1/m)."""
+    body: wp.int32
+    slot: wp.int32
+    source: wp.int32
+    """Where its carriers come from: link on the other side, slot of the sensor, source."""
 
 
 @wp.struct
@@ -411,37 +415,33 @@ def spread_kernel(kinds: frozenset[int], raycast: bool, noisy: bool, sticky: boo
     @wp.func
     def carrier_of(
         plan: SpreadPlan, probes: ProbeArrays, solids: SolidArrays, pairs: PairArrays, faces: ContactFaces,
-        press: PressArrays, push: ContactPush, env: int, place: int, slot: int, head: int, alone: bool, face: int,
-        body: int, side: wp.vec3f, source: int,
+        press: PressArrays, push: ContactPush, env: int, place: int, rivals: int, face: int,
     ) -> Carrier:  # fmt: skip
         carrier = Carrier()
-        carrier.n = place
-        if source == wp.static(TOUCH):
-            carrier.n = press.listed[env, place]
-        n = carrier.n
+        touches = push.source == wp.static(TOUCH)
+        n = wp.where(touches, press.listed[env, place], place)
         packed = load_four(probes.packed, n)
+        carrier.n = n
         carrier.x = wp.vec3f(packed[0], packed[1], packed[2])
-        if source == wp.static(TOUCH):
-            # All is asked for at once; most links touch one body from one side.
+        if touches:
+            # All is asked for at once.
             touch = load_four(press.touch[env], n)
-            owner = press.body[env, n]
-            m = wp.vec3f(touch[0], touch[1], touch[2])
-            facing = wp.dot(m, side)
-            if owner == body and facing > 0.0:
-                if alone or belongs(faces, head, face, carrier.x, m, plan.reach[n]):
+            body = press.body[env, n]
+            carrier.way = wp.vec3f(touch[0], touch[1], touch[2])
+            carrier.facing = wp.dot(carrier.way, push.normal)
+            if body == push.body and carrier.facing > 0.0:
+                if rivals < 0 or belongs(faces, rivals, face, carrier.x, carrier.way, plan.reach[n]):
                     carrier.weight = touch[3]
                     if wp.static(noisy):
                         carrier.noisy = press.noisy[env, n]
-                    carrier.facing = facing
-                    carrier.way = m
                     if wp.static(sticky):
-                        carrier.way = m + press.sigma[env, n]
+                        carrier.way += press.sigma[env, n]
         elif wp.static(deep):
             radius = packed[3]
-            if radius > 0.0 and source == wp.static(BEHIND):
-                back = behind(solids, pairs, probes, env, n, slot, body)
+            if radius > 0.0 and push.source == wp.static(BEHIND):
+                back = behind(solids, pairs, probes, env, n, push.slot, push.body)
                 carrier.way = wp.vec3f(back[0], back[1], back[2])
-                carrier.facing = wp.dot(carrier.way, side)
+                carrier.facing = wp.dot(carrier.way, push.normal)
                 if carrier.facing > 0.0:
                     carrier.weight = wp.max(radius - back[3], 0.0)
             elif radius > 0.0:
@@ -523,7 +523,8 @@ def spread_kernel(kinds: frozenset[int], raycast: bool, noisy: bool, sticky: boo
                 group_meets()
             here = head
             while here >= 0:
-                alone = here == head and faces.face[here].next < 0
+                # Most links touch one body from one side.
+                rivals = wp.where(faces.face[head].next < 0, -1, head)
                 sphere = sphere_of(faces.face[here])
                 normal = faces.face[here].normal
                 body = faces.face[here].other
@@ -531,185 +532,180 @@ def spread_kernel(kinds: frozenset[int], raycast: bool, noisy: bool, sticky: boo
                 lack = wp.vec2f(size, 0.0)
                 watched = faces.watched[here]
                 for k in range(plan.sensors.shape[1]):
-                    if ((watched >> k) & 1) == 1 and not left:
-                        sensor = plan.sensors[link, k]
-                        span = plan.spans[sensor]
-                        # What this sensor does not carry of the face: force and moment.
-                        rest = wp.vec2f()
-                        fresh = ((written >> k) & 1) == 0
-                        near = bool(False)
-                        source = int(wp.static(TOUCH))
-                        node = here
-                        while node >= 0:
-                            push = ContactPush()
-                            push.point = wp.vec3f(sphere[0], sphere[1], sphere[2])
-                            push.normal = normal
-                            if wp.static(deep):
-                                if source == wp.static(NEAR):
-                                    push = push_of(plan, state, friction, env, link, node)
-                            rounds = int(0)
-                            carried = bool(False)
-                            more = bool(True)
-                            scale = float(0.0)
-                            even = wp.vec3f()
-                            tilt = wp.vec3f()
-                            center = wp.vec3f()
-                            while more:
-                                # Sums over taxels: y, y m · n and whether any is near; y q, y a, y a × q; of y a aᵀ
-                                # the diagonal and the rest, and the longest a, which leads from the point.
-                                first = wp.vec3f()
-                                ways = wp.vec3f()
-                                places = wp.vec3f()
-                                turns = wp.vec3f()
-                                squares = wp.vec3f()
-                                products = wp.vec3f()
-                                most = float(0.0)
-                                end = span[1]
-                                if source == wp.static(TOUCH):
-                                    end = press.end[env, sensor]
-                                place = span[0] + lane
-                                while place < end:
-                                    c = carrier_of(
-                                        plan, probes, solids, pairs, faces, press, push, env, place, span[2], head,
-                                        alone, here, body, normal, source,
-                                    )  # fmt: skip
-                                    if c.weight > 0.0:
-                                        if not near and first[2] == 0.0 and gap_to(sphere, c.x) <= plan.reach[c.n]:
-                                            first[2] = 1.0
-                                        a = c.x - push.point
-                                        most = wp.max(most, wp.length(a))
-                                        along = c.weight * c.facing
-                                        first += wp.vec3f(c.weight, along, 0.0)
-                                        ways += c.weight * c.way
-                                        places += along * a
-                                        turns += c.weight * wp.cross(a, c.way)
-                                        squares += along * wp.cw_mul(a, a)
-                                        products += along * wp.vec3f(a[1] * a[2], a[2] * a[0], a[0] * a[1])
-                                    place += wp.static(lanes)
+                    if ((watched >> k) & 1) == 0 or left:
+                        continue
+                    sensor = plan.sensors[link, k]
+                    span = plan.spans[sensor]
+                    # What this sensor does not carry of the face: force and moment.
+                    rest = wp.vec2f()
+                    fresh = ((written >> k) & 1) == 0
+                    near = bool(False)
+                    source = int(wp.static(TOUCH))
+                    node = here
+                    while node >= 0:
+                        push = ContactPush()
+                        push.point = wp.vec3f(sphere[0], sphere[1], sphere[2])
+                        push.normal = normal
+                        if wp.static(deep):
+                            if source == wp.static(NEAR):
+                                push = push_of(plan, state, friction, env, link, node)
+                        push.body = body
+                        push.slot = span[2]
+                        push.source = source
+                        end = wp.where(source == wp.static(TOUCH), press.end[env, sensor], span[1])
+                        rounds = int(0)
+                        carried = bool(False)
+                        more = bool(True)
+                        scale = float(0.0)
+                        even = wp.vec3f()
+                        tilt = wp.vec3f()
+                        center = wp.vec3f()
+                        while more:
+                            # Sums over taxels: y, y m · n and whether any is near; y q, y a, y a × q; of y a aᵀ
+                            # the diagonal and the rest, and the longest a, which leads from the point.
+                            first = wp.vec3f()
+                            ways = wp.vec3f()
+                            places = wp.vec3f()
+                            turns = wp.vec3f()
+                            squares = wp.vec3f()
+                            products = wp.vec3f()
+                            most = float(0.0)
+                            place = span[0] + lane
+                            while place < end:
+                                c = carrier_of(
+                                    plan, probes, solids, pairs, faces, press, push, env, place, rivals, here
+                                )
+                                if c.weight > 0.0:
+                                    if not near and first[2] == 0.0 and gap_to(sphere, c.x) <= plan.reach[c.n]:
+                                        first[2] = 1.0
+                                    a = c.x - push.point
+                                    most = wp.max(most, wp.length(a))
+                                    along = c.weight * c.facing
+                                    first += wp.vec3f(c.weight, along, 0.0)
+                                    ways += c.weight * c.way
+                                    places += along * a
+                                    turns += c.weight * wp.cross(a, c.way)
+                                    squares += along * wp.cw_mul(a, a)
+                                    products += along * wp.vec3f(a[1] * a[2], a[2] * a[0], a[0] * a[1])
+                                place += wp.static(lanes)
+                            if wp.static(cuda):
+                                first = total_of(first)
+                                ways = total_of(ways)
+                                places = total_of(places)
+                                turns = total_of(turns)
+                                squares = total_of(squares)
+                                products = total_of(products)
+                                most = largest_of(most)
+                            whole = first[1]
+                            near = near or first[2] > 0.0
+                            if not near and source == wp.static(TOUCH):
+                                # Seldom is a taxel near that carries nothing.
+                                close = wp.vec3f()
+                                n = span[0] + lane
+                                while n < span[1]:
+                                    packed = load_four(probes.packed, n)
+                                    x = wp.vec3f(packed[0], packed[1], packed[2])
+                                    if gap_to(sphere, x) <= plan.reach[n]:
+                                        close[0] = 1.0
+                                    n += wp.static(lanes)
                                 if wp.static(cuda):
-                                    first = total_of(first)
-                                    ways = total_of(ways)
-                                    places = total_of(places)
-                                    turns = total_of(turns)
-                                    squares = total_of(squares)
-                                    products = total_of(products)
-                                    most = largest_of(most)
-                                whole = first[1]
-                                near = near or first[2] > 0.0
-                                if not near and source == wp.static(TOUCH):
-                                    # Seldom is a taxel near that carries nothing.
-                                    close = wp.vec3f()
-                                    n = span[0] + lane
-                                    while n < span[1]:
-                                        packed = load_four(probes.packed, n)
-                                        x = wp.vec3f(packed[0], packed[1], packed[2])
-                                        if gap_to(sphere, x) <= plan.reach[n]:
-                                            close[0] = 1.0
-                                        n += wp.static(lanes)
-                                    if wp.static(cuda):
-                                        close = total_of(close)
-                                    near = close[0] > 0.0
-                                more = False
-                                if whole > 0.0 and (near or source == wp.static(NEAR)):
-                                    carried = True
-                                    moment = wp.vec3f()
-                                    if source != wp.static(NEAR):
-                                        face = faces.face[here]
-                                        push.load = face.load
-                                        push.force = face.force
-                                        moment = face.moment + wp.cross(face.origin - push.point, push.force)
-                                    # Taxels that face away by more than 60° on average would be stretched beyond all
-                                    # measure; b then carries what is missing.
-                                    scale = push.load / wp.max(whole, 0.5 * first[0])
-                                    # Normals of a face differ: what is along the first is the load less a little.
-                                    mean = wp.max(wp.dot(push.force, push.normal), 1.0e-6 * push.load) / whole
-                                    center = places / whole
-                                    even = (push.force - scale * ways) / whole
-                                    moment -= scale * turns + whole * wp.cross(center, even)
-                                    # Shares of the weights and of their extent, lest squares of small numbers vanish.
-                                    moment /= whole
-                                    extents = wp.mat33f(
-                                        squares[0], products[2], products[1], products[2], squares[1], products[0],
-                                        products[1], products[0], squares[2],
-                                    ) / whole  # fmt: skip
-                                    extent = extents[0, 0] + extents[1, 1] + extents[2, 2]
-                                    extents -= wp.outer(center, center)
-                                    trace = extents[0, 0] + extents[1, 1] + extents[2, 2]
-                                    # A little more on its diagonal lets a row of taxels, which bears no moment along
-                                    # it, be solved; what rounding leaves of taxels at one place is none.
-                                    tilt = wp.vec3f()
-                                    inertia = wp.mat33f()
-                                    if trace > 1.0e-4 * extent:
-                                        inertia = (1.0001 * trace) * wp.identity(n=3, dtype=wp.float32) - extents
-                                        tilt = wp.inverse(inertia / trace) @ moment / trace
-                                    # No taxel is pulled, however far it lies: what is beyond half of that moves into
-                                    # the weights, y e^(λ · r) for y (1 + λ · r). What turns about the normal pulls
-                                    # none, and drags no more than the load pushes.
-                                    far = most + wp.length(center)
-                                    spin = wp.dot(tilt, push.normal)
-                                    tilt -= spin * push.normal
-                                    spin = wp.clamp(spin, -mean / far, mean / far)
-                                    steepest = wp.length(tilt) * far / mean
-                                    if steepest > 1.0:
-                                        tilt /= steepest
-                                        rounds += 1
-                                        more = rounds < wp.static(ROUNDS)
-                                        if more:
-                                            lean = push.lean + (steepest - 0.5) / mean * wp.cross(push.normal, tilt)
-                                            push.lean = lean * wp.min(
-                                                wp.static(STEEPEST) / (far * wp.length(lean)), 1.0
-                                            )
-                                    tilt += spin * push.normal
-                                    if not more:
-                                        rest[1] += whole * wp.length(moment - inertia @ tilt)
-                            if carried:
-                                center += push.point
-                                total = wp.vec3f()
-                                end = span[1]
-                                if source == wp.static(TOUCH):
-                                    end = press.end[env, sensor]
-                                place = span[0] + lane
-                                while place < end:
-                                    c = carrier_of(
-                                        plan, probes, solids, pairs, faces, press, push, env, place, span[2], head,
-                                        alone, here, body, normal, source,
-                                    )  # fmt: skip
-                                    if c.weight + c.noisy > 0.0:
-                                        unit = scale * c.way + c.facing * (even + wp.cross(tilt, c.x - center))
-                                        total += c.weight * unit
-                                        reading = wp.spatial_vector(c.weight * unit, wp.cross(c.x, c.weight * unit))
+                                    close = total_of(close)
+                                near = close[0] > 0.0
+                            more = False
+                            if whole > 0.0 and (near or source == wp.static(NEAR)):
+                                carried = True
+                                moment = wp.vec3f()
+                                if source != wp.static(NEAR):
+                                    face = faces.face[here]
+                                    push.load = face.load
+                                    push.force = face.force
+                                    moment = face.moment + wp.cross(face.origin - push.point, push.force)
+                                # Taxels that face away by more than 60° on average would be stretched beyond all
+                                # measure; b then carries what is missing.
+                                scale = push.load / wp.max(whole, 0.5 * first[0])
+                                # Normals of a face differ: what is along the first is the load less a little.
+                                mean = wp.max(wp.dot(push.force, push.normal), 1.0e-6 * push.load) / whole
+                                center = places / whole
+                                even = (push.force - scale * ways) / whole
+                                moment -= scale * turns + whole * wp.cross(center, even)
+                                # Shares of the weights and of their extent, lest squares of small numbers vanish.
+                                moment /= whole
+                                extents = wp.mat33f(
+                                    squares[0], products[2], products[1], products[2], squares[1], products[0],
+                                    products[1], products[0], squares[2],
+                                ) / whole  # fmt: skip
+                                extent = extents[0, 0] + extents[1, 1] + extents[2, 2]
+                                extents -= wp.outer(center, center)
+                                trace = extents[0, 0] + extents[1, 1] + extents[2, 2]
+                                # A little more on its diagonal lets a row of taxels, which bears no moment along
+                                # it, be solved; what rounding leaves of taxels at one place is none.
+                                tilt = wp.vec3f()
+                                inertia = wp.mat33f()
+                                if trace > 1.0e-4 * extent:
+                                    inertia = (1.0001 * trace) * wp.identity(n=3, dtype=wp.float32) - extents
+                                    tilt = wp.inverse(inertia / trace) @ moment / trace
+                                # No taxel is pulled, however far it lies: what is beyond half of that moves into
+                                # the weights, y e^(λ · r) for y (1 + λ · r). What turns about the normal pulls
+                                # none, and drags no more than the load pushes.
+                                far = most + wp.length(center)
+                                spin = wp.dot(tilt, push.normal)
+                                tilt -= spin * push.normal
+                                spin = wp.clamp(spin, -mean / far, mean / far)
+                                steepest = wp.length(tilt) * far / mean
+                                if steepest > 1.0:
+                                    tilt /= steepest
+                                    rounds += 1
+                                    more = rounds < wp.static(ROUNDS)
+                                    if more:
+                                        lean = push.lean + (steepest - 0.5) / mean * wp.cross(push.normal, tilt)
+                                        push.lean = lean * wp.min(wp.static(STEEPEST) / (far * wp.length(lean)), 1.0)
+                                tilt += spin * push.normal
+                                if not more:
+                                    rest[1] += whole * wp.length(moment - inertia @ tilt)
+                        if carried:
+                            center += push.point
+                            total = wp.vec3f()
+                            place = span[0] + lane
+                            while place < end:
+                                c = carrier_of(
+                                    plan, probes, solids, pairs, faces, press, push, env, place, rivals, here
+                                )
+                                if c.weight + c.noisy > 0.0:
+                                    unit = scale * c.way + c.facing * (even + wp.cross(tilt, c.x - center))
+                                    total += c.weight * unit
+                                    reading = wp.spatial_vector(c.weight * unit, wp.cross(c.x, c.weight * unit))
+                                    if not fresh:
+                                        reading += load_planes(io.truth, env, c.n, 6)
+                                    store_planes(io.truth, env, c.n, 6, reading)
+                                    if wp.static(noisy):
+                                        reading = wp.spatial_vector(c.noisy * unit, wp.cross(c.x, c.noisy * unit))
                                         if not fresh:
-                                            reading += load_planes(io.truth, env, c.n, 6)
-                                        store_planes(io.truth, env, c.n, 6, reading)
-                                        if wp.static(noisy):
-                                            reading = wp.spatial_vector(c.noisy * unit, wp.cross(c.x, c.noisy * unit))
-                                            if not fresh:
-                                                reading += load_planes(io.measured, env, c.n, 6)
-                                            store_planes(io.measured, env, c.n, 6, reading)
-                                        faces.filled[env, c.n] = wp.uint8(1)
-                                    elif fresh:
-                                        clear(faces, io, env, c.n, wp.static(noisy))
-                                    place += wp.static(lanes)
-                                if wp.static(cuda):
-                                    total = total_of(total)
-                                written = written | (1 << k)
-                                fresh = False
-                                gap = wp.length(push.force - total)
-                                # Rounding of the sums is no loss.
-                                if not (gap <= 1.0e-4 * wp.length(push.force)):
-                                    rest[0] += gap
-                                node = wp.where(source == wp.static(NEAR), faces.follower[node], -1)
-                            elif source == wp.static(NEAR):
-                                rest[0] += wp.length(push.force)
-                                node = faces.follower[node]
-                            elif wp.static(deep):
-                                source = wp.where(near, source + 1, wp.static(NEAR))
-                            else:
-                                left = True
-                                node = -1
-                        # Sensors of a link need not all feel it.
-                        if not (rest[0] >= lack[0]):
-                            lack = rest
+                                            reading += load_planes(io.measured, env, c.n, 6)
+                                        store_planes(io.measured, env, c.n, 6, reading)
+                                    faces.filled[env, c.n] = wp.uint8(1)
+                                elif fresh:
+                                    clear(faces, io, env, c.n, wp.static(noisy))
+                                place += wp.static(lanes)
+                            if wp.static(cuda):
+                                total = total_of(total)
+                            written = written | (1 << k)
+                            fresh = False
+                            gap = wp.length(push.force - total)
+                            # Rounding of the sums is no loss.
+                            if not (gap <= 1.0e-4 * wp.length(push.force)):
+                                rest[0] += gap
+                            node = wp.where(source == wp.static(NEAR), faces.follower[node], -1)
+                        elif source == wp.static(NEAR):
+                            rest[0] += wp.length(push.force)
+                            node = faces.follower[node]
+                        elif wp.static(deep):
+                            source = wp.where(near, source + 1, wp.static(NEAR))
+                        else:
+                            left = True
+                            node = -1
+                    # Sensors of a link need not all feel it.
+                    if not (rest[0] >= lack[0]):
+                        lack = rest
                 pushed += size
                 lost += lack
                 here = wp.where(left, -1, faces.face[here].next)
