@@ -22,6 +22,7 @@ _RADIUS = 6e-3  # radius of the balls that press (m)
 _DEPTH = 3e-4  # depth to which they press (m)
 _AWAY = 10.0  # where a ball waits (m)
 WRONG = 0.01  # part of a load that taxels may lack without a word
+OFF = 1e-4  # how far from its place they may show it without a word (m)
 
 
 @dataclass(frozen=True)
@@ -40,6 +41,10 @@ class HandCheck:
     """Pads that a ball could touch."""
     worst: float = 0.0
     """Largest part of a press that the taxels of a pad lack."""
+    off: float = 0.0
+    """Farthest that the suite says a press may lie from where its taxels show it (m)."""
+    unbalanced: tuple[str, ...] = ()
+    """Pads whose presses may lie farther off than a sensing radius."""
     errors: tuple[str, ...] = field(default=())
     """What stopped the check, or is wrong."""
 
@@ -67,23 +72,28 @@ def check_hand(hand: Hand, pictures: Path | None = None, resolution: str = "low"
         return HandCheck(hand.name, hand.palm, hand.tips, errors=(str(error),))
     bare = tuple(link for link in hand.links() if link not in layout and link not in hand.couplers)
     errors = [f"no taxels on the tip {tip!r}" for tip in hand.tips if tip not in layout]
-    parts = {}
-    for link, (load, felt, missing) in loads.items():
-        lack, whole = float(np.linalg.norm(felt - load)), float(np.linalg.norm(load))
-        parts[link] = lack / whole
+    parts, levers = [0.0], [0.0]
+    for link, (load, felt, missing, _) in loads.items():
+        force, moment = (np.linalg.norm(part) for part in np.split(felt - load, 2))
+        whole = np.linalg.norm(load[:3])
+        parts.append(float(force / whole))
+        levers.append(float(missing[1] / whole))
         # What the suite says is missing is not wrong: the ball also touches where no taxel lies.
-        if lack - missing > WRONG * whole:
-            errors.append(f"taxels of {link!r} lack {lack / whole:.0%} of a press, of which nothing tells")
+        if force - missing[0] > WRONG * whole:
+            errors.append(f"taxels of {link!r} lack {force / whole:.0%} of a press, of which nothing tells")
+        elif force < WRONG * whole and moment - missing[1] > OFF * whole:
+            errors.append(f"taxels of {link!r} show a press {1e3 * moment / whole:.1f} mm off, of which nothing tells")
     if pictures is not None:
         draw(hand, layout, pictures / f"{hand.name}.png")
     return HandCheck(
-        hand.name, hand.palm, hand.tips, len(layout), active_count(layout), bare, len(loads),
-        max(parts.values(), default=0.0), tuple(errors),
+        hand.name, hand.palm, hand.tips, len(layout), active_count(layout), bare, len(loads), max(parts), max(levers),
+        tuple(link for link, numbers in loads.items() if numbers[3]), tuple(errors),
     )  # fmt: skip
 
 
-def press(hand: Hand, layout: Layout) -> dict[str, tuple[np.ndarray, np.ndarray, float]]:
-    """Return link → force [3] (N, link frame) of the engine, sum of its taxels, and what the suite misses (N).
+def press(hand: Hand, layout: Layout) -> dict[str, tuple[np.ndarray, np.ndarray, np.ndarray, bool]]:
+    """Return link → wrench [6] (N, N·m, link frame) of the engine, sum of its taxels, force and moment [2] that the
+    suite misses, and whether it flags the moment.
 
     A ball is pressed into each pad in turn.
 
@@ -125,16 +135,19 @@ def press(hand: Hand, layout: Layout) -> dict[str, tuple[np.ndarray, np.ndarray,
                 data.joint(ball_name).qpos[0] = 0.0 if ball_name == name else _AWAY
             engine.forward()
             suite.update(engine.state, engine.timestep)
-            force, six, body = np.zeros(3), np.zeros(6), model.body(link).id
+            wrench, six, body = np.zeros(6), np.zeros(6), model.body(link).id
             for index, contact in enumerate(data.contact):
                 mujoco.mj_contactForce(model, data, index, six)
                 links = [int(model.geom_bodyid[geom]) for geom in contact.geom]
                 if sorted(links) == sorted((body, model.body(name).id)):
                     sign = 1.0 if links[1] == body else -1.0
-                    force += sign * contact.frame.reshape(3, 3).T @ six[:3]
-            if np.linalg.norm(force) > 1e-9:
-                felt = suite.read(link)[0].reshape(-1, 6)[:, :3].sum(dim=0).numpy()
-                loads[link] = (data.body(link).xmat.reshape(3, 3).T @ force, felt, float(suite.missing[0, body]))
+                    force = sign * contact.frame.reshape(3, 3).T @ six[:3]
+                    wrench += np.concatenate([force, np.cross(contact.pos - data.body(link).xpos, force)])
+            if np.linalg.norm(wrench[:3]) > 1e-9:
+                local = (wrench.reshape(2, 3) @ data.body(link).xmat.reshape(3, 3)).ravel()
+                missing = np.array([suite.missing[0, body], suite.missing_moment[0, body]])
+                felt = suite.read(link)[0].reshape(-1, 6).sum(dim=0).numpy()
+                loads[link] = (local, felt, missing, bool(suite.unbalanced[0]))
     return loads
 
 

@@ -30,6 +30,12 @@ LARGEST = 3.0
 """Radius (m) around the probes of one sensor, or around a touched mesh, above which numbers look like millimetres."""
 WIDEST = 0.3  # sensing radius (m) of a taxel above which it does, if it also exceeds the patch of its sensor
 DEEPEST = 0.05  # depth (m) at which a contact begins above which it does
+_LACKS = (
+    "%.3g N of %.3g N on link %r are felt by no taxel: where the engine touches it, none of its taxels faces the "
+    "contact within its sensing radius. suite.missing has the force of every link.",
+    "%.3g N·m of the moment of %.3g N on link %r are shown by no taxel: it acts beyond those in touch, which push "
+    "and cannot pull, and seems off by more than a sensing radius. suite.missing_moment has that of every link.",
+)
 _CONVEX = ("sphere", "capsule", "ellipsoid", "cylinder", "box")
 
 
@@ -190,7 +196,7 @@ class SensorSuite:
         # An update as a CUDA graph, for one state and time step (s).
         self._recorded: tuple[Callable[[], None], HandState, float] | None = None
         self._pose: Any = None  # poses of the last update; None before the first
-        self._warned = self._lacked = False
+        self._warned, self._lacked = False, np.zeros(2, bool)
         self._by_depth = [name for name, sensor in self.sensors.items() if sensor.ignores_load]
 
     def update(self, state: HandState, dt: float = 0.01) -> None:
@@ -303,6 +309,13 @@ class SensorSuite:
         """Mask [B] of environments in which more than a hundredth of the load of a link was :attr:`missing`."""
         return ~(self.missing <= 0.01 * self._lack(0)).all(dim=1)
 
+    @property
+    def unbalanced(self) -> torch.Tensor:
+        """Mask [B] of environments in which the load of a link may lie farther from where its taxels show it than the
+        sensing radius of the widest: :attr:`missing_moment` over the load."""
+        load = self._lack(0)
+        return ~(self.missing_moment <= load.new_tensor(self.pairs.widths) * load).all(dim=1)
+
     def _flagged(self, bit: int) -> torch.Tensor:
         if self._pose is None:
             raise UsageError("Nothing was read yet; call update(state) first.")
@@ -326,18 +339,14 @@ class SensorSuite:
             )
 
     def _tell_of_missing(self) -> None:
-        """Say once where taxels that add up to the engine's forces lack some of them, and why."""
-        if self._lacked or not self.pairs.told.numpy()[0]:
-            return
-        self._lacked = True
-        missing, load = self.missing.nan_to_num(0.0), wp.to_torch(self.pairs.loads)[0]
-        env, link = divmod(int((missing / load.clamp_min(1e-30)).argmax()), missing.shape[1])
-        if missing[env, link] > 0:
-            _log.warning(
-                "%.3g N of %.3g N on link %r are felt by no taxel: where the engine touches it, none of its taxels "
-                "faces the contact within its sensing radius. suite.missing has the force of every link.",
-                missing[env, link], load[env, link], self.scene.links[link],
-            )  # fmt: skip
+        """Say once where taxels that add up to the engine's forces lack some of them, or of their moment, and why."""
+        for number in np.flatnonzero(self.pairs.told.numpy() > self._lacked):
+            self._lacked[number] = True
+            lack, load = self._lack(1 + number).nan_to_num(0.0), wp.to_torch(self.pairs.loads)[0]
+            env, link = divmod(int((lack / load.clamp_min(1e-30)).argmax()), lack.shape[1])
+            size, whole = float(lack[env, link]), float(load[env, link])
+            if size > 0:
+                _log.warning(_LACKS[number], size, whole, self.scene.links[link])
 
     def _tell_of_depth(self, state: HandState) -> None:
         """Say once which taxels read the depth of a contact although the engine knows its force."""

@@ -171,6 +171,8 @@ def _check_hands(folder: Path, out: Path) -> Output:
         ">taxels": "{0.taxels}",
         ">pressed": "{0.pressed}",
         ">most missing": "{0.worst:.2%}",
+        ">off (mm)": lambda check: f"{1e3 * check.off:.1f}",
+        ">unbalanced": lambda check: str(len(check.unbalanced)),
         "": lambda check: "ok" if check.passed else "; ".join(check.errors),
     }
     failed = sum(not check.passed for check in checks)

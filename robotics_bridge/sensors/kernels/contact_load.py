@@ -67,8 +67,10 @@ class SpreadPlan:
     """[3, B, L] sum of the forces that push a link, and what its taxels lack of them (N) and of their moment (N·m)."""
     fresh: wp.array(dtype=wp.int32)
     """[M] 1 in the first group with sensors on a link, which overwrites its loads of the update before."""
+    widths: wp.array(dtype=wp.float32)
+    """[L] sensing radius of the widest taxel (m)."""
     told: wp.array(dtype=wp.int32)
-    """[1] 1 once anything was missing."""
+    """[2] 1 once any force was missing, and once a load lay off by more than that."""
 
 
 @wp.struct
@@ -729,5 +731,7 @@ def spread_kernel(kinds: frozenset[int], raycast: bool, noisy: bool, sticky: boo
                     plan.loads[1 + row, env, link] = wp.where(wp.isnan(lost[row]), lost[row], most)
                 if not (lost[0] <= 0.01 * pushed):
                     plan.told[0] = 1
+                if not (lost[1] <= plan.widths[link] * pushed):
+                    plan.told[1] = 1
 
     return spread

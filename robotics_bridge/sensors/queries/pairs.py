@@ -48,8 +48,10 @@ class PairTable:
         self.loads: Any = None
         """Warp array [3, B, L] of links with taxels of ``total="engine"``: sum of the engine's forces, what taxels lack
         of them (N) and of their moment (N·m); None where there are none (:meth:`count_loads`)."""
-        self.told: Any = context.zeros(1, int)
-        """Warp array [1]: 1 once more than a hundredth of a load was missing."""
+        self.told: Any = context.zeros(2, int)
+        """Warp array [2]: 1 once more than a hundredth of a load was missing, and once its place was off by a taxel."""
+        self.widths = np.zeros(len(solids.scene.links), np.float32)
+        """[L] sensing radius of the widest taxel that adds up to these forces (m)."""
 
     def slot(
         self,
@@ -76,10 +78,14 @@ class PairTable:
         self._slots.append({**wanted, "center": np.asarray(center, np.float32), "reach": float(reach)})
         return len(self._slots) - 1
 
-    def count_loads(self, links: Sequence[int]) -> tuple[Any, list[bool]]:
-        """Return :attr:`loads`, made by the first call, and which of these links no call before has named."""
+    def count_loads(self, links: Sequence[int], widths: np.ndarray) -> tuple[Any, list[bool]]:
+        """Return :attr:`loads`, made by the first call, and which of these links no call before has named.
+
+        ``widths`` [L] are those of the caller's taxels.
+        """
         if self.loads is None:
             self.loads = self._context.zeros((3, self._context.num_envs, len(self._solids.scene.links)))
+        self.widths = np.maximum(self.widths, widths)
         fresh = [link not in self._loaded for link in links]
         self._loaded.update(links)
         return self.loads, fresh

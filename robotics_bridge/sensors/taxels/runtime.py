@@ -114,8 +114,11 @@ class ContactLoadRuntime(KinematicRuntime):
         plan.reach = context.array(np.concatenate([contact_reach(sensor.probes) for sensor in configs]), float)
         plan.whole = context.array([int(not sensor.track) for sensor in configs], int)
         plan.links = context.array(sorted(set(links)), int)
-        plan.loads, fresh = context.pairs.count_loads(sorted(set(links)))
+        widths = np.zeros(len(places), np.float32)
+        np.maximum.at(widths, links, [float(sensor.probes.radius.max(initial=0.0)) for sensor in configs])
+        plan.loads, fresh = context.pairs.count_loads(sorted(set(links)), widths)
         plan.fresh, plan.told = context.array(fresh, int), context.pairs.told
+        plan.widths = context.array(widths, float)
         plan.slip = 1.0 if configs[0].convention == "physical" else -1.0
         sticky = configs[0].sticky
         # A few threads for the taxels of a link; as many groups of them as the GPU holds take the links in turn.
