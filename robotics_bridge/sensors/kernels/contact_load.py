@@ -1,7 +1,8 @@
 """Kernels that spread every contact force of the engine over the taxels that feel it, and count what none feels.
 
 Contacts by which one body pushes a link from one side, within 60°, are a face, with force F, load P along its normal n
-and moment M about the middle c of the taxels that carry it. A taxel of weight y = d^α, at r from c, carries::
+and moment M about the middle c of the taxels that carry it. A taxel of weight y = d^α, less where it faces the face by
+more than 60° (y = d^α · 2 m · n), at r from c, carries::
 
     f = y s q + z (b + θ × r),    s = P / Σ z,    b = (F − s Σ y q) / Σ z,    J θ = M − s Σ r × y q
 
