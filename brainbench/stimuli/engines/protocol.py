@@ -193,8 +193,8 @@ class WhiskerEngine:
         """Return what surrounds a run; without the engine's package it is a :class:`MissingDependencyError`."""
         return nullcontext()
 
-    def groups(self, jobs: Sequence[Job], fidelity: Fidelity) -> list[list[int]]:
-        """Return the jobs that are simulated together, by their index."""
+    def groups(self, jobs: Sequence[Job], fidelity: Fidelity, threads: int) -> list[list[int]]:
+        """Return the jobs that are simulated together, by their index; ``threads`` groups are at a time."""
         return [[index] for index in range(len(jobs))]
 
     def threads(self, workers: int | None) -> int:
@@ -266,8 +266,8 @@ class WhiskerEngine:
 
         with self.session():
             self.check(jobs, fidelity, workers)
-            groups, threads = self.groups(jobs, fidelity), self.threads(workers)
-            return run_groups(groups, run, threads=threads, progress=progress)
+            threads = self.threads(workers)
+            return run_groups(self.groups(jobs, fidelity, threads), run, threads=threads, progress=progress)
 
     def prepare_sweeps(self, scenes: PassiveSweeps, fidelity: Fidelity) -> None:
         """Do, in a thread, what the first :meth:`run_sweeps` would wait for, such as compiling; no object is loaded."""

@@ -21,7 +21,7 @@ from brainbench.core.progress import Progress as NamedProgress
 from brainbench.core.rotations import base_rotation
 from brainbench.stimuli.engines.error_estimates import MORE, MOST
 from brainbench.stimuli.engines.fidelity import Fidelity
-from brainbench.stimuli.engines.motion_pieces import KNOT, Cutting
+from brainbench.stimuli.engines.motion_pieces import KNOT, LOOKS, Cutting
 from brainbench.stimuli.engines.protocol import PassiveSweeps, SweepBatch, WhiskerEngine
 from brainbench.stimuli.engines.reach import Reach, reachable, stays_in_plane
 from brainbench.stimuli.engines.rod.launch import (
@@ -87,7 +87,8 @@ def make_task(
 ) -> JobTask | None:
     """Return what a job needs of its scene, None when it feels nothing, unless ``silent`` jobs are wanted too.
 
-    ``bodies`` keeps anchor and track of obstacles that move by their id, of what stands still by its place.
+    ``bodies`` keeps anchor and track of obstacles that move by their id and the steps in which they are looked at, of
+    what stands still by its place.
     """
     start, stop = job.start, float(job.times[-1])
     chain = fidelity.chain(job.whisker)
@@ -100,21 +101,24 @@ def make_task(
     if place not in bodies:
         bodies[place] = np.array(place), still_track(np.array(place))
     moving = [obstacle for obstacle in job.obstacles if obstacle.motion is not None]
+    looks = min(step, KNOT / LOOKS)
     for obstacle in moving:
-        if id(obstacle) not in bodies:
+        if (id(obstacle), looks) not in bodies:
             anchor = obstacle.bounds.mean(axis=0)
-            bodies[id(obstacle)] = anchor, body_track(obstacle, anchor, cutting)
+            bodies[id(obstacle), looks] = anchor, body_track(obstacle, anchor, cutting)
     # What moves is looked at wherever its motion, or that of the base, has a knot.
     ends = np.array([start, stop])
     seen = np.unique(
-        np.concatenate([track.times for track in (base, *(bodies[id(obstacle)][1] for obstacle in moving))] + [ends])
+        np.concatenate(
+            [track.times for track in (base, *(bodies[id(obstacle), looks][1] for obstacle in moving))] + [ends]
+        )
     )
     position, euler = (np.asarray(values, dtype=float) for values in job.follicle.pose(seen))
     reach = reachable(job.whisker, position, job.obstacles, seen, surfaces=True)
     if not silent and is_silent(job, reach, position, euler):
         return None
     near = tuple(
-        TrackedObstacle(obstacle, *bodies[place if obstacle.motion is None else id(job.obstacles[which])])
+        TrackedObstacle(obstacle, *bodies[place if obstacle.motion is None else (id(job.obstacles[which]), looks)])
         for which, obstacle in zip(reach.indices, reach.obstacles, strict=True)
     )
     names = tuple(
@@ -215,6 +219,8 @@ def _approach(
 
 SLICE = 65_536
 """Whiskers of one launch on a GPU: bounds the memory of a run."""
+GROUP_STEPS = 10_000
+"""Steps of the whiskers of one launch on a processor, some .1 s: how long an interrupt may have to wait for them."""
 
 
 @dataclass(frozen=True)
@@ -263,15 +269,27 @@ class RodEngine(WhiskerEngine):
         """See :meth:`brainbench.stimuli.engines.protocol.WhiskerEngine.threads`; one on a GPU."""
         return 1 if pick_device(self.device).is_cuda else super().threads(workers)
 
-    def groups(self, jobs: Sequence[Job], fidelity: Fidelity) -> list[list[int]]:
-        """Return jobs with the same readings and capacity together, on a processor one by one."""
+    def groups(self, jobs: Sequence[Job], fidelity: Fidelity, threads: int) -> list[list[int]]:
+        """Return jobs with the same readings and capacity together, on a processor a few of them.
+
+        These share setting up, which costs a processor more than a short simulation. All threads get several groups,
+        and none of more than :data:`GROUP_STEPS`.
+        """
         groups: dict[Any, list[int]] = {}
         for index, job in enumerate(jobs):
             links = fidelity.link_count(job.whisker.arc_length)
             key = (capacity_for(links), job.times.tobytes(), job.start, tuple(job.gravity), job.air_flow)
             groups.setdefault(key, []).append(index)
-        size = SLICE if pick_device(self.device).is_cuda else 1
-        return [some[i : i + size] for some in groups.values() for i in range(0, len(some), size)]
+        parts = []
+        for some in groups.values():
+            size = SLICE
+            if not pick_device(self.device).is_cuda:
+                job = jobs[some[0]]
+                shortest = min(fidelity.step_of(fidelity.chain(jobs[index].whisker)) for index in some)
+                most = GROUP_STEPS * shortest / (float(job.times[-1]) - job.start + shortest)
+                size = max(1, min(len(some) // (3 * threads), int(most)))
+            parts += [some[first : first + size] for first in range(0, len(some), size)]
+        return parts
 
     def simulate_group(self, jobs: Sequence[Job], fidelity: Fidelity, *, record_shape: bool) -> list[Trace]:
         """See :meth:`brainbench.stimuli.engines.protocol.WhiskerEngine.simulate_group`: a launch for each kind."""

@@ -113,11 +113,22 @@ def test_a_box_and_its_triangles_are_felt_alike():
 
 def test_jobs_give_the_same_bytes_alone_together_and_on_two_threads():
     things = [_moving((Capsule((x, -0.002, -0.02), (x, -0.002, 0.02), 3e-4),), (0.0, 0.05, 0.0)) for x in (0.006, 0.01)]
-    times = np.arange(1, 61) * 1e-3
-    jobs = [Job(replace(C2, friction=mu), StillFollicle(), (thing,), times) for thing in things for mu in (0.0, 0.48)]
-    alone = [_run(job)[0].wrench.tobytes() for job in jobs]
-    assert [trace.wrench.tobytes() for trace in _run(jobs, workers=1)] == alone
-    assert [trace.wrench.tobytes() for trace in _run(jobs, workers=2)] == alone
+    whiskers = [
+        replace(C2, friction=mu, arc_length=s * C2.arc_length) for mu in (0.0, 0.48) for s in (1, 0.9, 0.8, 0.6)
+    ]
+    for frames, fidelity in ((60, COARSE), (6, replace(COARSE, steps_per_period=400.0))):
+        times = np.arange(1, frames + 1) * 1e-3
+        jobs = [Job(whisker, StillFollicle(), (thing,), times) for whisker in whiskers for thing in things]
+        assert max(map(len, RodEngine("cpu").groups(jobs, fidelity, 1))) > 1
+        alone = [_run(job, fidelity)[0].wrench.tobytes() for job in jobs]
+        assert [trace.wrench.tobytes() for trace in _run(jobs, fidelity, workers=1)] == alone
+        assert [trace.wrench.tobytes() for trace in _run(jobs, fidelity, workers=2)] == alone
+
+
+def test_whiskers_that_take_long_share_no_launch_on_a_processor():
+    jobs = [Job(C2, StillFollicle(), (), np.arange(1, 1001) * 1e-3)] * 64
+    sizes = [max(map(len, RodEngine("cpu").groups(jobs, replace(COARSE, time_step=step), 1))) for step in (1e-3, 1e-4)]
+    assert sizes == [9, 1]
 
 
 @pytest.mark.slow
