@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
 from dataclasses import replace
-from functools import cached_property, partial
+from functools import cached_property, lru_cache, partial
 from itertools import groupby
 from typing import Any
 
@@ -52,6 +52,12 @@ BLOCK = 64  # threads of one block on a GPU
 BOUNDS = (BLOCK, 8)
 """CUDA launch bounds: registers are spilled for twice as many threads at a time (benchmarks/RESULTS.md)."""
 SLICED_BOUNDS = (BLOCK, 4)  # the same for whiskers in slices, whose registers are needed more than further threads
+
+
+@lru_cache(maxsize=1)
+def _helpers() -> ThreadPoolExecutor:
+    """Return threads that stay, since each has streams of its own on a GPU."""
+    return ThreadPoolExecutor(64)
 
 
 class SweepLauncher:
@@ -213,10 +219,9 @@ class SweepLauncher:
             return error
         values, contact = result.wrench[row, :, whisker], result.contact[row, :, whisker] >= 0
         lengths = np.array([one.arc_length for one in self.whiskers])[whisker]
-        squares = np.zeros(len(row))
-        for factor, solver in self.finer:
 
-            def launch(tries: Sequence[Try], solver: WhiskerSolver = solver) -> list[LaunchResult]:
+        def square(factor: float, solver: WhiskerSolver) -> NDArray[np.float64]:
+            def launch(tries: Sequence[Try]) -> list[LaunchResult]:
                 masks = []
                 for mask, divisor in tries:
                     whole = np.zeros_like(which)
@@ -226,7 +231,15 @@ class SweepLauncher:
 
             finer = run_with_retries(launch, retry, ahead=self.ahead)
             change = changes(values, finer.wrench[:, :, 0], contact | (finer.contact[:, :, 0] >= 0), lengths)
-            squares += np.where(finer.verdict.unstable[:, 0], np.inf, factor * change) ** 2
+            return np.where(finer.verdict.unstable[:, 0], np.inf, factor * change) ** 2
+
+        # Few whiskers take a GPU long: it simulates both at the same time.
+        half, longer = self.finer
+        if self.device.is_cuda:
+            coming = _helpers().submit(square, *longer)
+            squares = square(*half) + coming.result()
+        else:
+            squares = square(*half) + square(*longer)
         error[which] = np.sqrt(squares)
         return error
 
