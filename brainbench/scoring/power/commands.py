@@ -61,9 +61,9 @@ def power(
 
     if layer is not None and (plan is None or options["layers"] != 1):
         raise UsageError("--layer is what a --plan of one layer commits to; give --plan FILE, and leave out --layers.")
-    effects = _EFFECTS if effect is None else (effect,)
-    # Whatever is wrong with the design is told before recordings are opened.
-    designs = [experiments.ExperimentDesign(effect=one, **options) for one in effects]
+    # Whatever is wrong with the design is told before recordings are opened; animals bound what is shown by default.
+    effects = [value for value in _EFFECTS if not value or value**2 <= options["consistency"]]
+    designs = [experiments.ExperimentDesign(effect=one, **options) for one in (effects if effect is None else [effect])]
     number, origin, pilot = _dimensions(dimensions, recordings, conditions, model)
     designs = [replace(design, dimensions=number) for design in designs]
     rows = []

@@ -19,6 +19,9 @@ def test_an_impossible_design_is_refused(run):
     found = run("power", "--effect", "0.99", "--consistency", "0.5")
     assert found.status == 2
     assert "bounds it by √consistency" in found.err
+    # Without an effect those are shown that such animals allow.
+    some = run("power", "--consistency", "0.4", "--animals", "3", "--simulations", "1", "--json")
+    assert [row["design"]["effect"] for row in json.loads(some.out)["results"]] == [0, 0.3, 0.5]
     few = run("power", "--stimuli", "1")
     assert few.status == 2
     assert "--stimuli must be a whole number, at least 2; received 1." in few.err
