@@ -246,7 +246,7 @@ Array = NDArray[np.float64]
 TIMES = {"time": 1.0, "time_s": 1.0, "t": 1.0, "timestamps": 1.0, "time_ms": 1e-3, "time_us": 1e-6}
 """Names of a column of times, and their unit in s."""
 _SCALES = {"N": 1.0, "mN": 1e-3, "uN": 1e-6, "nN": 1e-9, "Nm": 1.0, "mNm": 1e-3, "uNm": 1e-6, "nNm": 1e-9, "Nmm": 1e-3,
-           "mNmm": 1e-6, "uNmm": 1e-9}  # fmt: skip
+           "mNmm": 1e-6, "uNmm": 1e-9, "nNmm": 1e-12}  # fmt: skip
 # The micro sign and the Greek letter are two characters that look alike.
 _UNIT = re.compile(r"(?<![A-Za-z])[mun]?N(?:[.·* ]?m{1,2})?(?![A-Za-z/])")
 _WORDS = {"[µμ]": "u", "(?i)milli": "m", "(?i)micro": "u", "(?i)nano": "n", "(?i)newtons?": "N",

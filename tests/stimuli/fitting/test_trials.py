@@ -142,6 +142,14 @@ def test_units_are_read_however_they_are_written(tmp_path, head):
     np.testing.assert_allclose(read_wrenches(tmp_path / "a.csv")["wrench"].values[0], [1e-3, 2e-6])
 
 
+@pytest.mark.parametrize("arm", ["m", "mm"])
+@pytest.mark.parametrize(("prefix", "size"), [("", 1.0), ("m", 1e-3), ("u", 1e-6), ("n", 1e-9)])
+def test_every_unit_that_can_be_written_has_a_scale(tmp_path, prefix, size, arm):
+    (tmp_path / "a.csv").write_text(f"time,Fy_{prefix}N,Mz_{prefix}N{arm}\n0,1,2\n1,2,3\n")
+    expected = [size, 2 * size * (1e-3 if arm == "mm" else 1.0)]
+    np.testing.assert_allclose(read_wrenches(tmp_path / "a.csv")["wrench"].values[0], expected)
+
+
 @pytest.mark.parametrize("head", ["Mz_gmm", "mz", "Mz_raw"])
 def test_a_component_with_an_unknown_unit_is_not_left_out(tmp_path, head):
     (tmp_path / "a.csv").write_text(f"time,Fy_mN,Fy_raw,{head}\n0,1,1,2\n1,2,1,3\n")
