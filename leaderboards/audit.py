@@ -13,9 +13,9 @@ import os
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from itertools import islice
+from itertools import islice, product
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from brainbench.core.errors import look_alike
 from brainbench.core.files import to_plain
@@ -205,14 +205,16 @@ def compare_builds(before: Iterable[StoredRecord], after: Iterable[StoredRecord]
         pairs = [(past.pop(identity), present.pop(identity)) for identity in sorted(past.keys() & present.keys())]
         changes += [left.change("moved", left.state, right.state) for left, right in pairs if left.state != right.state]
         while past and present:
-            (_, left), (_, right) = past.popitem(), present.popitem()
+            # A name may stand on boards of several stimuli: records that agree in most inputs are of one score.
+            left, right = max(product(past.values(), present.values()), key=_likeness)
+            del past[left.record.identity], present[right.record.identity]
             changed = differences(left.record, right.record, tolerance=0.0)
             causes = tuple(str(difference) for difference in changed if difference.what in _CAUSES)
             changes.append(right.change("changed" if changed else "restated", left.state, right.state, causes))
         changes += [left.change("removed", left.state, "") for left in past.values()]
         changes += [right.change("added", "", right.state) for right in present.values()]
-    order = ("added", "removed", "changed", "moved", "restated")
-    return sorted(changes, key=lambda change: (order.index(change.kind), change.board, change.name, change.before))
+    order = get_args(Kind).index
+    return sorted(changes, key=lambda change: (order(change.kind), change.board, change.name, change.before))
 
 
 @dataclass(frozen=True)
@@ -226,6 +228,12 @@ class _Placed:
 
     def change(self, kind: Kind, before: str, after: str, causes: tuple[str, ...] = ()) -> Change:
         return Change(kind, self.board, self.name, before, after, causes)
+
+
+def _likeness(pair: tuple[_Placed, _Placed]) -> int:
+    """Return in how many inputs two records agree, in words and by hashes."""
+    inputs = ([*vars(ScoreIdentity.of(placed.record)).values(), *_wording(placed.record)] for placed in pair)
+    return sum(left == right for left, right in zip(*inputs, strict=True))
 
 
 def _by_model(stored: Iterable[StoredRecord]) -> dict[tuple[Any, ...], dict[str, _Placed]]:

@@ -148,7 +148,7 @@ def _rank(entries: list[Entry], baselines: Sequence[Baseline], lacks: str) -> li
     for entry in sorted(able, key=lambda entry: (len(entry.name), entry.name)):
         value, reach = entry.value, 1e-5 + 1e-8 * abs(entry.value)
         near = places[bisect(places, (value - reach, -1)) : bisect(places, (value + reach, len(groups)))]
-        close = (groups[place] for number, place in sorted(near, key=itemgetter(1)) if _is_close(number, value))
+        close = (groups[place] for _, place in sorted(near, key=itemgetter(1)))
         same = next((group for group in close if same_computation(group[0], entry)), None)
         if same is None:
             insort(places, (value, len(groups)))
@@ -171,10 +171,6 @@ def _rank(entries: list[Entry], baselines: Sequence[Baseline], lacks: str) -> li
             copied = "" if entry is group[0] else group[0].name
             ranked.append(replace(entry, first=first, last=last, same_as=copied, **flags))
     return ranked
-
-
-def _is_close(left: float, right: float) -> bool:
-    return math.isclose(left, right, abs_tol=1e-5)
 
 
 def _unranked(entry: Entry, lacks: str) -> str:

@@ -207,6 +207,22 @@ def test_builds_show_what_came_went_changed_and_moved(tmp_path):
     assert compare_builds(new, new) == []
 
 
+def test_scores_of_a_name_on_several_stimuli_are_compared_each_with_its_own(tmp_path):
+    """The board of other stimuli came first after three models were added, and changed places with the first."""
+
+    def on(stimuli, names, more=0.0):
+        # Of one name on both boards everything is equal but the stimuli and the values.
+        drawn = draw_board(names, seed=len(stimuli))
+        moved = [replace(record, score=replace(record.score, value=record.score.value + more)) for record in drawn]
+        return [_with(record, stimuli={"description": stimuli, "content_hash": stimuli}) for record in moved]
+
+    old = [*on("near", {"m": 0.3, "k": 0.2}), *on("farther", {"m": 0.8})]
+    new = [*on("near", {"m": 0.3, "k": 0.2}, 0.01), *on("farther", {"m": 0.8, "a": 0.1, "b": 0.1, "c": 0.2}, 0.01)]
+    builds = ([StoredRecord(tmp_path / str(place), record) for place, record in enumerate(one)] for one in (old, new))
+    changed = [change for change in compare_builds(*builds) if change.kind == "changed" and change.name.startswith("m")]
+    assert [change.causes for change in changed] == [(), ()]
+
+
 def test_a_standing_that_changes_alone_is_told(make_record, tmp_path):
     record = make_record("net")
     chance = replace(record, score=replace(record.score, p=0.4))
