@@ -80,7 +80,7 @@ def topk(answers: torch.Tensor, labels: torch.Tensor, k: int) -> int:
     correct = answers.gather(1, labels[:, None])
     # The label's own answer is among those not smaller, so it is taken off.
     ahead = (answers >= correct).sum(1) - 1
-    return int(((ahead < k) & torch.isfinite(correct[:, 0])).sum())
+    return int(((ahead < k) & torch.isfinite(answers).all(1)).sum())
 
 
 class SweepsHash:

@@ -48,6 +48,8 @@ def test_top_k_counts_labels_among_the_largest_and_ties_against_the_network():
     answers = torch.tensor([[3.0, 2.0, 1.0], [1.0, 2.0, 3.0], [1.0, 1.0, 1.0], [math.nan, 0.0, 0.0]])
     labels = torch.tensor([0, 1, 0, 0])
     assert [topk(answers, labels, k) for k in (1, 2)] == [1, 2]
+    # An answer that is no number is ahead of none, and makes no other one right.
+    assert topk(torch.tensor([[1.0, math.nan, math.nan]]), torch.tensor([0]), 1) == 0
 
 
 def test_accuracy_is_counted_over_batches():
