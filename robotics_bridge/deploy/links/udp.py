@@ -157,30 +157,31 @@ class SequenceWindow:
 
     SIZE = 1024
     """Numbers behind the newest that are told apart."""
-    _SPAN = 1 << 32
+    _NUMBERS = 1 << 32
 
     def __init__(self) -> None:
         self.newest: int | None = None
         self._seen = 0  # bit i: newest - i was seen
+        self._span = 0  # numbers from the first that was seen to the newest
 
     def judge(self, number: int) -> tuple[Verdict, int]:
-        """Count a number; return what it is, and how many were skipped if it is new."""
+        """Count a number; return what it is, and how many were skipped: if it is new, or −1 if it was one of them."""
         if self.newest is None:
             self.newest, self._seen = number, 1
             return "new", 0
-        ahead = (number - self.newest) % self._SPAN
-        if 0 < ahead < self._SPAN // 2:
+        ahead = (number - self.newest) % self._NUMBERS
+        if 0 < ahead < self._NUMBERS // 2:
             # Shifted by the whole window at most: a jump must not build a number of 2³¹ bits.
             self._seen = (self._seen << min(ahead, self.SIZE)) & ((1 << self.SIZE) - 1) | 1
-            self.newest = number
+            self.newest, self._span = number, self._span + ahead
             return "new", ahead - 1
-        behind = (self.newest - number) % self._SPAN
+        behind = (self.newest - number) % self._NUMBERS
         if behind >= self.SIZE:
             return "stale", 0
         if self._seen >> behind & 1:
             return "replayed", 0
         self._seen |= 1 << behind
-        return "late", 0
+        return "late", -(behind < self._span)
 
 
 class Receiver:
@@ -191,7 +192,7 @@ class Receiver:
         self._window, self._offset = SequenceWindow(), offset or ClockOffset()
 
     def judge(self, frame: Frame, now: float) -> tuple[Verdict, int]:
-        """Return what an authentic frame that arrives now is, and how many were skipped if it is new."""
+        """Return what an authentic frame that arrives now is, and how many more it says were skipped."""
         verdict, skipped = self._window.judge(frame.sequence)
         # A number comes back after 2³² frames, a time never does.
         age = self._offset.age(frame.time, now, now) if verdict in ("new", "late") else 0.0
@@ -316,8 +317,6 @@ class UdpDriver:
         counters.lost += skipped
         if verdict != "new":
             setattr(counters, verdict, getattr(counters, verdict) + 1)
-            # UDP may change the order: an older report that comes late was counted as lost before.
-            counters.lost = max(0, counters.lost - (verdict == "late"))
             return True
         counters.received += 1
         position, velocity, pressure = np.split(frame.values, [joints, 2 * joints])
