@@ -261,14 +261,10 @@ def _write_recordings(inputs: Path) -> None:
     import numpy as np
 
     from brainbench.datasets import write_recordings
-    from brainbench.datasets.sessions import make_session
-    from tests.factories.recordings import LABELS
+    from tests.factories.recordings import LABELS, make_simple_session
 
-    random_numbers = np.random.default_rng(0)
-    start = 2.0 * np.arange(48)
-    table = {"start_time": start, "stop_time": start + 1, "stimulus": np.resize(np.array(LABELS), 48)}
-    spikes = [np.sort(np.r_[0.0, 98.0, random_numbers.uniform(0, 98, 400)]) for _ in range(8)]
-    write_recordings(inputs / "rec.h5", make_session("m", "1", spikes, {"trials": table}))
+    columns = {"stimulus": np.resize(np.array(LABELS), 48)}
+    write_recordings(inputs / "rec.h5", make_simple_session(subject="m", trials=48, units=8, columns=columns))
 
 
 def _write_checkpoint(inputs: Path) -> None:

@@ -6,7 +6,7 @@ import contextlib
 import functools
 import json
 import math
-from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -127,29 +127,19 @@ def _activations(folder: Path) -> Path:
     return write_features(folder / "features.h5", list("abcd"), layers)
 
 
-def _mesh(suffix: str) -> Callable[[Path], Path]:
-    def make(folder: Path) -> Path:
-        tetrahedron = convex_hull(np.array([[0.0, 0, 0], [0.01, 0, 0], [0, 0.01, 0], [0, 0, 0.01]]))
-        return save_mesh(folder / f"mesh{suffix}", tetrahedron, unit="mm")
-
-    return make
+def _mesh(suffix: str, folder: Path) -> Path:
+    tetrahedron = convex_hull(np.array([[0.0, 0, 0], [0.01, 0, 0], [0, 0.01, 0], [0, 0, 0.01]]))
+    return save_mesh(folder / f"mesh{suffix}", tetrahedron, unit="mm")
 
 
-def _run(name: str) -> Callable[[Path], Path]:
-    def make(folder: Path) -> Path:
-        run = write_run(folder / "run", np.random.default_rng(0).normal(size=(110, 2, 6)))
-        found = run / name
+def _run(name: str, folder: Path) -> Path:
+    run = write_run(folder / "run", np.random.default_rng(0).normal(size=(110, 2, 6)))
+    found = run / name
+    if found.parent != run:
         # The damaged file lies directly in the folder that is copied.
-        return found if found.parent == run else _lifted(run, found)
-
-    return make
-
-
-def _lifted(run: Path, found: Path) -> Path:
-    link = run / found.name
-    found.replace(link)
-    (run / "moved").write_text(found.relative_to(run).as_posix())
-    return link
+        (run / "moved").write_text(name)
+        found = found.rename(run / found.name)
+    return found
 
 
 def _read_run(path: Path) -> Any:
@@ -226,12 +216,9 @@ def _plan() -> Any:
     return small_plan(("brick:5", "cone:5"), whiskers="C2,C3", shard_size=1000)
 
 
-def _sweeps(name: str) -> Callable[[Path], Path]:
-    def make(folder: Path) -> Path:
-        generate(_plan(), folder, workers=1)
-        return folder / name
-
-    return make
+def _sweeps(name: str, folder: Path) -> Path:
+    generate(_plan(), folder, workers=1)
+    return folder / name
 
 
 def _read_sweeps(path: Path) -> Any:
@@ -301,11 +288,11 @@ SURFACES = (
     ),
     Surface("scene", written("scene.toml", SCENE), load_scene, _bad_scene),
     *(
-        Surface(f"mesh, {suffix[1:].upper()}", _mesh(suffix), lambda path: load_mesh(path, unit="mm"))
+        Surface(f"mesh, {suffix[1:].upper()}", partial(_mesh, suffix), lambda path: load_mesh(path, unit="mm"))
         for suffix in (".obj", ".stl", ".ply", ".off", ".glb")
     ),
-    Surface("WHISKiT names", _run("whisker_ID.csv"), _read_run, _bad_run),
-    Surface("WHISKiT table", _run("dynamics/Fx.csv"), _read_run, _bad_run),
+    Surface("WHISKiT names", partial(_run, "whisker_ID.csv"), _read_run, _bad_run),
+    Surface("WHISKiT table", partial(_run, "dynamics/Fx.csv"), _read_run, _bad_run),
     Surface("trajectory", _trajectory, load_trajectory),
     Surface("starting angles", _angles, load_initial_angles),
     Surface("network, JSON", written_json("graph.json", GRAPH), read_graph, _bad_graph),
@@ -324,8 +311,8 @@ SURFACES = (
     ),
     Surface("ShapeNet classes, CSV", written("classes.csv", CLASSES), read_categories, lambda found: False),
     Surface("ShapeNet classes, JSON", written_json("classes.json", {"02691156": "a"}), read_categories),
-    Surface("manifest", _sweeps("manifest.json"), _read_sweeps),
-    Surface("shard", _sweeps("train-00000.h5"), _read_sweeps),
+    Surface("manifest", partial(_sweeps, "manifest.json"), _read_sweeps),
+    Surface("shard", partial(_sweeps, "train-00000.h5"), _read_sweeps),
     Surface(
         "result record", written_json("record.json", json.loads(make_record().to_json())), _read_record, _bad_record
     ),

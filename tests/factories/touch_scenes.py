@@ -111,12 +111,8 @@ def free_suite(*, num_envs: int = 1, **sensors) -> SensorSuite:
 
 def ball_state(*heights: float) -> HandState:
     """Return a state in which that ball touches the pad, at a height in each environment (m)."""
-    poses = np.stack([poses_at(3, {2: (0, 0, height)}).reshape(3, 7) for height in heights])
-    scene = pad_scene(FREE_BALL)
-    state = state_of(scene, poses)
-    pair = [scene.geometries_of("hand")[0], scene.geometries_of("ball")[0]]
-    state.set_contacts(range(len(heights)), [pair] * len(heights))
-    return state
+    poses = np.concatenate([poses_at(3, {2: (0, 0, height)}) for height in heights])
+    return state_of(pad_scene(FREE_BALL), poses)
 
 
 PLAIN = ThermalMaterial(2.0, 1000.0, 1000.0, 0.8)
