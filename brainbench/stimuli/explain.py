@@ -18,7 +18,7 @@ import msgspec
 import numpy as np
 
 from brainbench.core.errors import DataError, UsageError
-from brainbench.core.files import content_hash
+from brainbench.core.files import content_hash, to_json, to_plain
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.reach import Reach, reachable
 from brainbench.stimuli.motion.jobs import Job, Trace
@@ -152,8 +152,6 @@ class Explanation:
 
     def to_attribute(self) -> str:
         """Return the JSON that :meth:`of` reads, equal whenever the same is simulated."""
-        from brainbench.core.files import to_json, to_plain
-
         return to_json({key: item for key, item in to_plain(self).items() if key not in _PASSING}, indent=None)
 
     def lines(self) -> list[tuple[str, str]]:

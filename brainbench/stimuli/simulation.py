@@ -275,7 +275,11 @@ def _assemble(
     if orientation is not None:
         dataset[ORIENTATION] = (("stimulus", "time", "whisker", "row_axis", "col_axis"), orientation)
     if clipped is not None:
-        dataset.attrs["clipped"] = _count_clipped(dataset, clipped, frames.clip)
+        counts = {
+            scene.label: {"force": int(part[..., :3].sum()), "moment": int(part[..., 3:].sum())}
+            for scene, part in zip(scenes, clipped, strict=True)
+        }
+        dataset.attrs["clipped"] = text({"limit_N": frames.clip, "components": counts})
     dataset.attrs["config_hash"] = config_hash(scenes, fidelity, backend)
     dataset.attrs["content_hash"] = hash_stimulus_set(dataset)
     return check_stimulus_set(dataset)
@@ -291,15 +295,6 @@ def _to_world(scene: Scene, traces: Sequence[Trace]) -> NDArray[np.float32]:
     parts = zip(np.split(vectors, ends, axis=1), scene.split(), strict=True)
     turned = np.concatenate([own @ part.head.matrix.T for own, part in parts], axis=1)
     return turned.reshape(frames.count, len(traces), 6).astype(np.float32)
-
-
-def _count_clipped(dataset: xr.Dataset, clipped: NDArray[np.bool_], limit: float | None) -> str:
-    """JSON of how many force and moment components were clipped in each stimulus."""
-    counts = {
-        str(label): {"force": int(part[..., :3].sum()), "moment": int(part[..., 3:].sum())}
-        for label, part in zip(dataset["stimulus"].values, clipped, strict=True)
-    }
-    return to_json({"limit_N": limit, "components": counts}, indent=None)
 
 
 def config_hash(scenes: Sequence[Scene], fidelity: Fidelity, backend: str) -> str:

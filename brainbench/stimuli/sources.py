@@ -186,11 +186,7 @@ def stated_labels(source: object) -> tuple[str, ...] | None:
 
 
 def prepare_stimuli(
-    source: object,
-    *,
-    whiskers: str = "all",
-    fidelity: Fidelity | str | None = None,
-    progress: Progress | None = None,
+    source: object, *, whiskers: str = "all", fidelity: Fidelity | str | None = None, progress: Progress | None = None
 ) -> None:
     """Begin, in a thread, what :func:`load_stimuli` will wait for (:func:`brainbench.stimuli.simulation.prepare`).
 

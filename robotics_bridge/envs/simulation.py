@@ -225,7 +225,6 @@ class Actuators:
             name: torch.as_tensor(getattr(model, name), dtype=torch.float32, device=device)
             for name in ("stiffness", "damping", "effort")
         }
-
         self.lever = torch.as_tensor(model.lever, dtype=torch.float32, device=device)
         """[J] factor on imperfections and noise that are stated for hinges."""
 

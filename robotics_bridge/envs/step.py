@@ -104,7 +104,6 @@ _GROUPS: dict[str, Callable[[EnvState], torch.Tensor]] = {
     "aux_rotation_progress": lambda state: state.goals.turned.unsqueeze(1).clone(),
 }
 
-
 StepResult = tuple[dict[str, torch.Tensor], torch.Tensor, torch.Tensor, torch.Tensor, dict[str, Any]]
 
 _DIVERGED_SPEED = 1e4  # speed (m/s or rad/s) beyond which an environment counts as diverged
@@ -279,7 +278,6 @@ def _count_episodes(
 STATISTICS = ("success", "metric", "return", "length", "diverged")
 """Means over ended episodes, in the order of ``EpisodeState.totals`` after the number of episodes."""
 
-
 mujoco = mujoco_module()
 
 
@@ -383,19 +381,26 @@ class _Trial:
         self._object = self._m.body(model.objects[0]).id
         self._address = int(self._m.joint(model.objects[0]).qposadr[0])
         self._tips = [(self._m.body(link).id, np.array(point)) for link, point in model.tips.items()]
-        self._chains = [self._above(body) for body, _ in self._tips]
+        # The flexing joints that move a tip: one whose range lies about its zero spreads the finger and is left alone.
+        flexes = np.abs(model.low + model.high) >= 0.5 * (model.high - model.low)
+        owners = np.array([self._m.jnt_bodyid[self._m.joint(name).id] for name in model.joints])
+        chains = ([(owners == link) & flexes for link in lineage(self._m, body)[:-1]] for body, _ in self._tips)
+        self._chains = [np.concatenate([np.flatnonzero(moved) for moved in chain]) for chain in chains]
 
     def run(self, joints: NDArray[np.float64], place: NDArray[np.float64], yaw: float) -> dict[str, Any] | None:
         """Return the settled grasp, or None if it does not hold."""
-        s, d = self._settings, self._d
+        s, d, model = self._settings, self._d, self._model
         opened = self._opened(joints, place, yaw)
         if opened is None or self._near() < s.near_fingers:
             return None
         # Targets beyond where the fingers stand: position drives press only as far as they miss their target.
-        target = np.clip(opened + s.squeeze * self._closing, self._model.low, self._model.high)
+        target = np.clip(opened + s.squeeze * self._closing, model.low, model.high)
         start = d.xpos[self._object].copy()
         for _ in range(round(s.hold / self._m.opt.timestep)):
-            self._step(target)
+            # The same law as the environment's actuators, without their imperfections.
+            torque = model.stiffness * (target - d.qpos[self._joints]) - model.damping * d.qvel[self._speeds]
+            d.ctrl[self._drive] = np.clip(torque, -model.effort, model.effort)
+            mujoco.mj_step(self._m, d)
         pose = d.qpos[self._address : self._address + 7].copy()
         axis = d.xmat[self._object].reshape(3, 3) @ np.array([0.0, 1.0, 0.0])
         lost = np.linalg.norm(d.xpos[self._object] - start) > s.max_displacement or axis[2] < 0.995
@@ -433,21 +438,6 @@ class _Trial:
         d.qpos[self._address : self._address + 7] = (*place, *quat)
         mujoco.mj_forward(self._m, d)
 
-    def _step(self, target: NDArray[np.float64]) -> None:
-        d, model = self._d, self._model
-        # The same law as the environment's actuators, without their imperfections.
-        torque = model.stiffness * (target - d.qpos[self._joints]) - model.damping * d.qvel[self._speeds]
-        d.ctrl[self._drive] = np.clip(torque, -model.effort, model.effort)
-        mujoco.mj_step(self._m, d)
-
-    def _above(self, body: int) -> NDArray[np.int64]:
-        """Return the numbers of the flexing joints that move a body; those that spread a finger are left alone."""
-        model = self._model
-        # A joint whose range lies about its zero spreads the finger; flexion has a one-sided range.
-        flexes = np.abs(model.low + model.high) >= 0.5 * (model.high - model.low)
-        owners = np.array([self._m.jnt_bodyid[self._m.joint(name).id] for name in model.joints])
-        return np.concatenate([np.flatnonzero((owners == b) & flexes) for b in lineage(self._m, body)[:-1]])
-
     def _contacts(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """Return the other body and the depth (m) of every contact of the tool."""
         bodies = self._m.geom_bodyid[self._d.contact.geom]
@@ -460,17 +450,13 @@ class _Trial:
     def _near(self) -> int:
         """Return how many finger tips are near the tool."""
         d = self._d
-        geoms = np.flatnonzero(self._m.geom_bodyid == self._object).tolist()
-        places = [d.xpos[body] + d.xmat[body].reshape(3, 3) @ point for body, point in self._tips]
-        return sum(min(self._distance(geom, place) for geom in geoms) < self._settings.near for place in places)
-
-    def _distance(self, geom: int, point: NDArray[np.float64]) -> float:
-        """Return the distance of a point from a cylinder or capsule (m)."""
-        local = self._d.geom_xmat[geom].reshape(3, 3).T @ (point - self._d.geom_xpos[geom])
-        radius, half = self._m.geom_size[geom, :2]
-        # Distance to a cylinder from outside; a capsule is treated as one, which is near enough for "near".
-        beyond = np.array([max(np.hypot(local[0], local[1]) - radius, 0.0), max(abs(local[2]) - half, 0.0)])
-        return float(np.linalg.norm(beyond))
+        geoms = np.flatnonzero(self._m.geom_bodyid == self._object)
+        places = np.array([d.xpos[body] + d.xmat[body].reshape(3, 3) @ point for body, point in self._tips])
+        local = (places[:, None, None] - d.geom_xpos[geoms][:, None]) @ d.geom_xmat[geoms].reshape(-1, 3, 3)
+        out, along = np.hypot(local[..., 0, 0], local[..., 0, 1]), np.abs(local[..., 0, 2])
+        radius, half = self._m.geom_size[geoms, :2].T
+        distance = np.hypot((out - radius).clip(0), (along - half).clip(0))
+        return int((distance.min(axis=1) < self._settings.near).sum())
 
 
 class EpisodeReset:

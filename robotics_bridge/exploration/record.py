@@ -91,7 +91,6 @@ PROCEDURES: Mapping[str, Callable[[float], Pose]] = {
 }
 """Name → movement over one second: time from 0 to 1 s → pose; UsageError for another time."""
 
-
 _STEPS = 2  # physics steps per frame
 TWIST = 1.6e-5
 """Torsional friction of a taxel (N·m·s): that of a patch of 4 mm with the published k_t, stated since data depend on

@@ -63,15 +63,6 @@ def holding_spec(
     return spec
 
 
-def add_servo(spec: Any, joint: str, stiffness: float, damping: float) -> None:
-    """Add the position servo of a joint, of the joint's name, to a ``mujoco.MjSpec``."""
-    spec.add_actuator(
-        name=joint, target=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT, gaintype=mujoco.mjtGain.mjGAIN_FIXED,
-        biastype=mujoco.mjtBias.mjBIAS_AFFINE, gainprm=[stiffness] + [0.0] * 9,
-        biasprm=[0.0, -stiffness, -damping] + [0.0] * 7,
-    )  # fmt: skip
-
-
 def place_palm(hand: Hand, spec: Any, place: ArrayLike, turn: ArrayLike) -> Any:
     """Put the palm to a place [3] (m) and orientation (w, x, y, z) of the world; return the body that was moved.
 
@@ -189,7 +180,12 @@ def replace_drives(spec: Any) -> None:
         if joint.name in names:
             slides = joint.type == mujoco.mjtJoint.mjJNT_SLIDE
             joint.armature = max(joint.armature, ARMATURE)
-            add_servo(spec, joint.name, *(WEAK_PUSH if slides else WEAK_SERVO))
+            stiffness, damping = WEAK_PUSH if slides else WEAK_SERVO
+            spec.add_actuator(
+                name=joint.name, target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT,
+                gaintype=mujoco.mjtGain.mjGAIN_FIXED, biastype=mujoco.mjtBias.mjBIAS_AFFINE,
+                gainprm=[stiffness] + [0.0] * 9, biasprm=[0.0, -stiffness, -damping] + [0.0] * 7,
+            )  # fmt: skip
 
 
 def leading_joints(model: Any) -> NDArray[np.intp]:

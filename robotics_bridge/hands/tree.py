@@ -87,7 +87,14 @@ def cast_grid(
     if not length:
         raise UsageError("'facing' is a direction of some length; received a zero vector.")
     up = np.asarray(facing, dtype=float) / length
-    u, v = _plane(up, corners)
+    # The axis nearest to the rays is no candidate for the direction of columns.
+    span = np.ptp(corners, axis=0)
+    span[np.argmax(np.abs(up))] = -1
+    u = np.eye(3)[np.argmax(span)]
+    # Gram–Schmidt: columns run across the rays even if that axis does not.
+    u = u - up * (u @ up)
+    u = u / np.linalg.norm(u)
+    v = np.cross(up, u)
     # Extent of the link across and along the rays: the grid covers its shadow, and rays start just above its top.
     seen = corners @ np.stack([u, v, up], axis=1)
     low, high = seen.min(axis=0), seen.max(axis=0)
@@ -105,18 +112,6 @@ def cast_grid(
     if not radii.any():
         raise UsageError(f"Link {link!r} has no surface that faces {tuple(np.round(up, 3))}.")
     return Probes(position, normal, radii, (rows, columns))
-
-
-def _plane(up: NDArray, corners: NDArray) -> tuple[NDArray, NDArray]:
-    """Return the directions of columns and rows across ``up``."""
-    # The axis nearest to the rays is no candidate for the direction of columns.
-    extent = np.ptp(corners, axis=0)
-    extent[np.argmax(np.abs(up))] = -1
-    u = np.eye(3)[np.argmax(extent)]
-    # Gram–Schmidt: columns run across the rays even if that axis does not.
-    u = u - up * (u @ up)
-    u = u / np.linalg.norm(u)
-    return u, np.cross(up, u)
 
 
 def _nearest(model: Any, geoms: list[int], origin: NDArray, direction: NDArray) -> tuple[float, NDArray] | None:
@@ -396,8 +391,7 @@ class Tree:
     def followers(self) -> frozenset[int]:
         """Joints whose position follows from others: those of couplings, and of loops all but one each."""
         model = self._model
-        servos = driven(model)
-        leading = {joint for joint in servos if joint >= 0}
+        leading = {joint for joint in driven(model) if joint >= 0}
         follow = {
             leader if follower in leading and leader not in leading else follower
             for follower, leader, _ in coupled(model)

@@ -9,12 +9,4 @@ from robotics_bridge.physics.engines import MujocoEngine, MujocoWarpEngine
 from robotics_bridge.physics.scene import KINDS, Geometry, TouchScene, compile_variants
 from robotics_bridge.physics.state import HandState
 
-__all__ = [
-    "KINDS",
-    "Geometry",
-    "HandState",
-    "MujocoEngine",
-    "MujocoWarpEngine",
-    "TouchScene",
-    "compile_variants",
-]
+__all__ = ["KINDS", "Geometry", "HandState", "MujocoEngine", "MujocoWarpEngine", "TouchScene", "compile_variants"]

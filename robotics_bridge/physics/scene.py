@@ -194,7 +194,7 @@ class TouchScene:
         variants = {
             index: tuple(shapes[number] for number in order)
             for index, shapes in enumerate(zip(geometries, *rows, strict=True))
-            if any(_differs(shapes[0], shape) for shape in shapes[1:])
+            if any(_form(shape) != _form(shapes[0]) for shape in shapes[1:])
         }
         pairs = zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True)
         always = frozenset((min(pair), max(pair)) for pair in pairs)
@@ -237,11 +237,9 @@ def _mesh(model: Any, index: int) -> Mesh:
     return Mesh(vertices, model.mesh_face[face : face + faces], _name(model, 7, index))
 
 
-def _differs(first: Geometry, second: Geometry) -> bool:
-    same = all(getattr(first, name) == getattr(second, name) for name in ("kind", "size", "position", "quaternion"))
-    if same and first.mesh is not None and second.mesh is not None:
-        same = first.mesh.content_hash == second.mesh.content_hash
-    return not same
+def _form(shape: Geometry) -> tuple[Any, ...]:
+    mesh = shape.mesh and shape.mesh.content_hash
+    return shape.kind, shape.size, shape.position, shape.quaternion, mesh
 
 
 def excluded_links(model: Any) -> set[tuple[int, int]]:

@@ -96,7 +96,6 @@ def _spread(count: int) -> np.ndarray:
 
 _DIRECTIONS = _spread(200)
 
-
 wp = warp()
 _log = logging.getLogger(__name__)
 

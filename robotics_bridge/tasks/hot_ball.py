@@ -102,8 +102,7 @@ class Thermometers:
         bodies = {name: ThermalBody(thermal.ball, thermal.ambient) for name in balls}
         sensors = {}
         for link in links:
-            plain = TemperatureGrid(link=link, cells=thermal.cells)
-            low, high = plain.corners(scene)
+            low, high = TemperatureGrid(link=link, cells=thermal.cells).corners(scene)
             # Published: the source divided by the thickness of a cell gives power per volume (4.36).
             source = thermal.heat / float((high - low)[2] / thermal.cells[2])
             sensors[link] = TemperatureGrid(

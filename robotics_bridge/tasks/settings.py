@@ -75,10 +75,7 @@ class ContactModel:
             )
 
 
-CONTACTS = {
-    "published": ContactModel(),
-    "firm": ContactModel(time_constant=0.006, substeps=2, drive_scale=0.08),
-}
+CONTACTS = {"published": ContactModel(), "firm": ContactModel(time_constant=0.006, substeps=2, drive_scale=0.08)}
 """Named contact models. Under ``published`` a block lies millimetres inside the fingers that press it with the released
 efforts; ``firm``, on which we train, keeps 95 % of the contacts below 1 mm and of the forces below 20 N
 (docs/tasks.md)."""
@@ -98,7 +95,6 @@ def set_contacts(model: Any, contacts: ContactModel) -> None:
 BOUNDED = "robotics_bridge.policies.training.bounded_ppo:BoundedPPO"
 """The algorithm of runs whose learning rate has other bounds than rsl_rl's."""
 _WIDEST = (1e-5, 1e-2)
-
 
 Widths = Annotated[tuple[Annotated[int, Limit(least=1, most=65_536)], ...], Limit(shortest=1)]
 """Widths of the hidden layers of a network."""

@@ -260,13 +260,6 @@ class Task:
                 f"contacts.time_constant {of} is at least two physics steps ({least:g} s); received "
                 f"{self.contacts.time_constant:g}: take more contacts.substeps."
             )
-        self._check_terms(of)
-        if not self.objects:
-            raise UsageError(f"Task {self.name!r} needs at least one object.")
-        self._check_names(of)
-        self._check_places(of)
-
-    def _check_terms(self, of: str) -> None:
         for name, reward in self.rewards.items():
             check_number(f"weight of {name!r} {of}", reward.weight)
             check_parameters(f"reward {name!r} {of}", reward.term, reward.params)
@@ -274,8 +267,8 @@ class Task:
                 check_each(f"ending in reward {name!r} {of}", reward.params["names"], self.endings)
         for name, ending in self.endings.items():
             check_parameters(f"ending {name!r} {of}", ending.condition, ending.params)
-
-    def _check_names(self, of: str) -> None:
+        if not self.objects:
+            raise UsageError(f"Task {self.name!r} needs at least one object.")
         if self.task_state is None:
             check_name(f"success.metric {of} without task_state", self.success.metric, ("goals", "turned"))
         if self.success.metric == "turned" and self.turn_axis is None:
@@ -284,6 +277,7 @@ class Task:
             raise UsageError(f"placement.sites {of} has {len(self.placement.sites)} places for {self.copies} objects.")
         check_name(f"distances_in {of}", self.distances_in, GROUPS)
         check_each("observation group", (*self.auxiliary, *itertools.chain(*self.groups.values())), GROUPS)
+        self._check_places(of)
 
     def _check_places(self, of: str) -> None:
         poses = {}

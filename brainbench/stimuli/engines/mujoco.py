@@ -315,12 +315,7 @@ def _thickness(chain: Chain, link: int, travel: float) -> tuple[float, float]:
 
 
 def _add_obstacles(
-    world: Element,
-    assets: Element,
-    obstacles: Iterable[Obstacle],
-    whisker_friction: float,
-    times: NDArray,
-    step: float,
+    world: Element, assets: Element, obstacles: Iterable[Obstacle], whisker_friction: float, times: NDArray, step: float
 ) -> list[PrescribedMotion]:
     """Add the obstacles; return the drives of the moving ones in the order of their joints."""
     drives = []

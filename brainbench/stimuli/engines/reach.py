@@ -196,11 +196,7 @@ def _axis(part: Capsule | Cylinder) -> NDArray[np.float64]:
 
 
 def _mirrored(
-    obstacle: Obstacle,
-    path: tuple[NDArray, NDArray] | None,
-    base: NDArray,
-    normal: NDArray,
-    thickness: float,
+    obstacle: Obstacle, path: tuple[NDArray, NDArray] | None, base: NDArray, normal: NDArray, thickness: float
 ) -> bool:
     """Return True when the plane of ``normal`` through ``base`` (m) mirrors an obstacle, at all times of its motion.
 

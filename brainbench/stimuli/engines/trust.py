@@ -66,7 +66,6 @@ OK, BENT, LOST, STARTED_INSIDE, GOT_INSIDE, AT_BASE, GAVE_WAY = range(7)
 an object from the start, or later; with an object over the base point, where contact has no lever and is not felt; with
 a follicle that gave way."""
 
-
 _FARTHEST = f"{LARGEST_BEND:g} rad or {LARGEST_SLIDE:.0%} of the length of its whisker"
 _FINER = "at {0:.6g} s; choose more links or a smaller time step"
 _FAULTS = {

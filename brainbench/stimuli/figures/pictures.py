@@ -127,7 +127,12 @@ class Picture:
     @cached_property
     def lens(self) -> Lens:
         """The camera at its place, framing whiskers and the parts of objects near them."""
-        return self.camera.lens(self._framed, self.style.size)
+        whiskers, points = self._whisker_points, self._object_points
+        if len(whiskers):
+            low, high = whiskers.min(axis=0), whiskers.max(axis=0)
+            room = 0.3 * float(np.linalg.norm(high - low))
+            points = np.concatenate([whiskers, np.clip(points, low - room, high + room)])
+        return self.camera.lens(points, self.style.size)
 
     @cached_property
     def moment_limit(self) -> float:
@@ -191,18 +196,6 @@ class Picture:
             ink = 0.45 * row if self.style.color == "row" else np.full(3, 0.25)
             parts.append(ball(points[0], 1.6 * max(radii[0], float(thinnest[0])), ink))
         return Triangles.joined(parts)
-
-    @cached_property
-    def _framed(self) -> NDArray[np.float64]:
-        """Points [n, 3] that the picture must show: all whiskers, and objects as far as they are near these."""
-        whiskers = self._whisker_points
-        if not len(whiskers):
-            return self._object_points
-        low, high = whiskers.min(axis=0), whiskers.max(axis=0)
-        room = 0.3 * float(np.linalg.norm(high - low))
-        points = self._object_points
-        near = np.clip(points, low - room, high + room)
-        return np.concatenate([whiskers, near])
 
     @cached_property
     def _shown(self) -> NDArray[np.float64]:
@@ -460,8 +453,7 @@ def render(
     recording = record(scene, times, fidelity=fidelity, backend=backend, progress=progress, cache=cache)
     if recording.unstable:
         _LOG.warning("unstable whiskers are drawn black and unbent from then on: %s", listing(recording.unstable))
-    picture = Picture(recording, camera, style)
-    annotation = Annotation(picture)
+    annotation = Annotation(Picture(recording, camera, style))
     if suffix == ".png":
         return annotation.save(path)
     frames = (annotation.frame(index) for index in track(range(len(times)), "drawing frames", progress))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -12,7 +13,7 @@ from brainbench.cli.options import changed, items, option, out_file, picture_fil
 from brainbench.cli.output import Output, progress_bar, table_of
 from brainbench.cli.stimuli import scenes
 from brainbench.cli.stimuli.scenes import BackendOption, StimulusOption, WhiskersOption
-from brainbench.core.errors import UsageError, brief
+from brainbench.core.errors import UsageError, brief, check_each, check_name
 from brainbench.core.limits import read_pairs, read_value
 from brainbench.core.plugins import OptionalPart
 from brainbench.stimuli.engines.fidelity import DEFAULT_ENGINE
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
     from brainbench.stimuli.fitting import FitOptions, FitResult
-    from brainbench.stimuli.fitting.design import DesignOptions, DesignResult
+    from brainbench.stimuli.fitting.design import DesignOptions
     from brainbench.stimuli.whiskers.whisker import Whisker
 
 _FIT = "brainbench.stimuli.fitting.parameters:FitOptions"
@@ -175,9 +176,6 @@ def _text(result: FitResult, measured: xr.Dataset) -> str:
 
 def _whisker(name: str, scene: Any, properties: dict[str, Any]) -> Whisker:
     """Return the whisker that a fit starts from."""
-    from dataclasses import fields, replace
-
-    from brainbench.core.errors import check_each, check_name
     from brainbench.stimuli import Whisker, WhiskerArray
 
     if scene is not None:
@@ -240,33 +238,24 @@ def design(
             part = OptionalPart("", "--networks", "brainbench.scoring.recovery.motion:design_for_networks")
 
             result = part.load("option")(recipe.scenes, items(networks), items(variables), **how)
-            outcome = _of_networks(result)
+            rows = [
+                ("1 − similarity of responses, objects of the search", *result.contrast),
+                ("the same, held-out objects", *result.held_out),
+                ("lead of the true network, held-out objects (score)", *result.leads),
+                ("boards that it wins", *result.won),
+            ]
+            what, first = "networks", ">given"
+            layers = ", ".join(f"{layer} of {name}" for name, layer in result.layers.items())
+            gain = f"[{result.gain.low:.3g}, {result.gain.high:.3g}]" if result.gain else "none"
+            words = f"gain    {result.leads[1] - result.leads[0]:.3g} {gain}, by {result.search}\nlayers  {layers}"
         else:
             result = run(recipe.scenes, items(variables), **how)
-            outcome = _of_objects(result)
+            rows = [(pair, *both) for pair, both in result.distances.items()]
+            what, first = "objects", ">D² of a whisk, given"
+            words = f"whisks  {result.whisks:.3g} of those of the given motion, time {result.time:.3g}"
+    outcome = table_of("", rows, {what: "{0[0]}", first: "{0[1]:.3g}", ">chosen": "{0[2]:.3g}"}) + f"\n\n{words}"
     rows = [(name, result.start[name], value, VARIABLES[name].unit) for name, value in result.values.items()]
     chosen = table_of("", rows, {"variable": "{0[0]}", ">given": "{0[1]:.4g}", ">chosen": "{0[2]:.4g} {0[3]}"})
     status = f"status  {result.status} {result.reason}".rstrip()
     data = {name: value for name, value in vars(result).items() if name != "scenes"}
     return Output({**data, "options": options}, f"{chosen}\n\n{outcome}\n{status}")
-
-
-def _of_objects(result: DesignResult) -> str:
-    """Return how far objects are apart, in words."""
-    pairs = [(pair, *both) for pair, both in result.distances.items()]
-    table = table_of("", pairs, {"objects": "{0[0]}", ">D² of a whisk, given": "{0[1]:.3g}", ">chosen": "{0[2]:.3g}"})
-    return f"{table}\n\nwhisks  {result.whisks:.3g} of those of the given motion, time {result.time:.3g}"
-
-
-def _of_networks(result: Any) -> str:
-    """Return how well networks are told apart, in words."""
-    rows = [
-        ("1 − similarity of responses, objects of the search", *result.contrast),
-        ("the same, held-out objects", *result.held_out),
-        ("lead of the true network, held-out objects (score)", *result.leads),
-        ("boards that it wins", *result.won),
-    ]
-    table = table_of("", rows, {"networks": "{0[0]}", ">given": "{0[1]:.3g}", ">chosen": "{0[2]:.3g}"})
-    layers = ", ".join(f"{layer} of {name}" for name, layer in result.layers.items())
-    gain = f"[{result.gain.low:.3g}, {result.gain.high:.3g}]" if result.gain else "none"
-    return f"{table}\n\ngain    {result.leads[1] - result.leads[0]:.3g} {gain}, by {result.search}\nlayers  {layers}"

@@ -128,11 +128,7 @@ def _whisker(task: JobTask, job: Job, quasistatic: bool) -> Numbers:
     bend = np.arctan2(build["bend_sine"], build["bend_cosine"])
     numbers = [build["length"], bend, build["mass"], *(inertia[name] for name in ("centre", "axial", "transverse"))]
     numbers += [inertia["stiffness"], torsion, taper["start_radius"], taper["end_radius"]]
-    return {
-        "link": np.stack(numbers),
-        "beta": packed["beta"][0],
-        "friction": packed["friction"][0],
-    }
+    return {"link": np.stack(numbers), "beta": packed["beta"][0], "friction": packed["friction"][0]}
 
 
 def _base(task: JobTask, job: Job, span: tuple[float, float]) -> Numbers:
@@ -279,22 +275,15 @@ def contact_events(summary: Any, reason: str) -> ContactEvents:
 
     ``reason`` is why the run cannot be trusted, if so.
     """
-    close: list[Nearness] = []
-    if summary["least_force"] < SMALL_FORCE * summary["largest_force"]:
-        close.append("ending")
-    if summary["least_gap"] < SMALL_GAP:
-        close.append("beginning")
-    if summary["least_lead"] < SMALL_LEAD:
-        close.append("passing")
-    if summary["fullest_cone"] > FULL_CONE:
-        close.append("slipping")
-    if summary["slowest_slip"] < SMALL_SLIP * summary["fastest_slip"]:
-        close.append("sticking")
-    status: Literal["smooth", "one-sided", "degenerate", "unstable"] = "one-sided" if close else "smooth"
-    if summary["degenerate"]:
-        status = "degenerate"
-    if reason:
-        status = "unstable"
+    nearness: tuple[tuple[Nearness, bool], ...] = (
+        ("ending", summary["least_force"] < SMALL_FORCE * summary["largest_force"]),
+        ("beginning", summary["least_gap"] < SMALL_GAP),
+        ("passing", summary["least_lead"] < SMALL_LEAD),
+        ("slipping", summary["fullest_cone"] > FULL_CONE),
+        ("sticking", summary["slowest_slip"] < SMALL_SLIP * summary["fastest_slip"]),
+    )
+    close: list[Nearness] = [name for name, near in nearness if near]
+    status = "unstable" if reason else "degenerate" if summary["degenerate"] else "one-sided" if close else "smooth"
     begun = int(summary["begun"]) + int(summary["first"] > 0)
     return ContactEvents(status, begun, int(summary["ended"]), int(summary["slipped"]), tuple(close))
 
@@ -374,7 +363,14 @@ class GradientRun:
         """
         self.values = np.array(values, dtype=float)
         self.scales = np.abs(self.values if scales is None else np.array(scales, dtype=float))
-        _check_values(self.values, self.scales)
+        if self.values.ndim != 1 or not len(self.values) or not np.isfinite(self.values).all():
+            raise UsageError(f"Parameters are one list of finite values; received shape {self.values.shape}.")
+        if self.scales.shape != self.values.shape or not (np.isfinite(self.scales) & (self.scales > 0)).all():
+            raise UsageError(
+                "Every parameter needs a positive scale, the size of a small change of it; give scales where a value "
+                "is 0."
+            )
+        self._widths = 1e-4 * self.scales
         self.build = build
         self.fidelity = replace(Fidelity.of(fidelity), precision="double")
         self.jobs = tuple(build(self.values.copy()))
@@ -397,10 +393,6 @@ class GradientRun:
                         f"{len(jobs)}."
                     )
         self.traces, self._groups = self._simulate()
-
-    @property
-    def _widths(self) -> NDArray[np.float64]:
-        return 1e-4 * self.scales
 
     @cached_property
     def _rows(self) -> list[tuple[_Group, int]]:
@@ -477,10 +469,7 @@ class GradientRun:
         return rows
 
     def gradient(
-        self,
-        wrench: Given | None = None,
-        link_positions: Given | None = None,
-        contact_wrench: Given | None = None,
+        self, wrench: Given | None = None, link_positions: Given | None = None, contact_wrench: Given | None = None
     ) -> Gradient:
         """Return the gradient of a number from its derivatives by what :attr:`traces` hold.
 
@@ -558,12 +547,3 @@ def _leaves_plane(task: JobTask, job: Job) -> bool:
 
 def _span(job: Job) -> tuple[float, float]:
     return job.start, float(job.times[-1])
-
-
-def _check_values(values: NDArray[np.float64], scales: NDArray[np.float64]) -> None:
-    if values.ndim != 1 or not len(values) or not np.isfinite(values).all():
-        raise UsageError(f"Parameters are one list of finite values; received shape {values.shape}.")
-    if scales.shape != values.shape or not (np.isfinite(scales) & (scales > 0)).all():
-        raise UsageError(
-            "Every parameter needs a positive scale, the size of a small change of it; give scales where a value is 0."
-        )

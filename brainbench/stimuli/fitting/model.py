@@ -17,7 +17,7 @@ from brainbench.core.errors import DataError
 from brainbench.stimuli.engines import get_engine
 from brainbench.stimuli.engines.fidelity import MOST_LINKS, Fidelity
 from brainbench.stimuli.fitting.gradients import GradientRun, Tangents
-from brainbench.stimuli.fitting.parameters import Condition, FitOptions, FreeParameters
+from brainbench.stimuli.fitting.parameters import FitOptions, FreeParameters
 from brainbench.stimuli.fitting.trials import Trial
 from brainbench.stimuli.motion.jobs import Job, Trace
 from brainbench.stimuli.validation import references
@@ -154,12 +154,10 @@ class FitModel:
 
     def _jobs(self, u: Array) -> list[Job]:
         condition = self.free.condition(u)
-        return [self._job(trial, condition) for trial in self.trials]
-
-    def _job(self, trial: Trial, condition: Condition) -> Job:
-        if "deflection" not in self.free.names:  # each trial keeps its own
-            condition = condition.changed({"deflection": trial.condition["deflection"]})
-        return trial.job_of(condition)
+        if "deflection" in self.free.names:
+            return [trial.job_of(condition) for trial in self.trials]
+        bent = [trial.condition["deflection"] for trial in self.trials]  # each keeps its own
+        return [trial.job_of(condition.changed({"deflection": d})) for trial, d in zip(self.trials, bent, strict=True)]
 
     def residual(self, u: Array) -> Array:
         """Return the whitened residuals [m] at coordinates u [p]; NaN where a simulation cannot be trusted."""

@@ -438,8 +438,7 @@ class FreeParameters:
 
     def limits(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the lower and upper bounds of u [p]; a start value outside its bounds is a :class:`UsageError`."""
-        rows = [self._limits(name) for name in self.names]
-        low, high = np.array(rows).T
+        low, high = np.array([self._limits(name) for name in self.names]).T
         return low, high
 
     def _limits(self, name: str) -> tuple[float, float]:
@@ -484,14 +483,12 @@ class Prior:
         return parameter.coordinate(start, self.mean, whisker), spread
 
 
-def _log_spread(mean: float, deviation: float) -> float:
-    """Return the standard deviation of the logarithm of a log-normal law with this mean and standard deviation."""
-    return math.sqrt(math.log1p((deviation / mean) ** 2))
-
-
 PUBLISHED: Mapping[str, Prior] = {
+    # Of the logarithm of a log-normal law.
     "young_modulus": Prior(
-        3.34e9, _log_spread(3.34, 1.48), "Quist et al. (2011), J. Biomech. 44, 2775-2781: 3.34 ± 1.48 GPa"
+        3.34e9,
+        math.sqrt(math.log1p((1.48 / 3.34) ** 2)),
+        "Quist et al. (2011), J. Biomech. 44, 2775-2781: 3.34 ± 1.48 GPa",
     ),
     "density": Prior(
         1260.0,

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.contracts import CHANNELS
-from brainbench.core.errors import DataError, listing
+from brainbench.core.errors import DataError, check_name, listing
 from brainbench.core.figures import COLORS, INK, PALE, panels, save_figure
 from brainbench.core.records import Interval, Status
 from brainbench.stimuli.fitting.contacts import PER_LINK
@@ -361,8 +361,6 @@ class FitResult:
 
     def __getitem__(self, name: str) -> FittedParameter:
         """Return the estimate of a parameter."""
-        from brainbench.core.errors import check_name
-
         by_name = {one.name: one for one in self.estimates}
         check_name("fitted parameter", name, by_name)
         return by_name[name]

@@ -37,6 +37,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.errors import DataError, UsageError, brief, check_name, check_numbers, listing
+from brainbench.core.files import content_hash, to_plain
 from brainbench.core.limits import Limit, NotNegative, Positive, limited
 from brainbench.core.reading.tables import read_columns, read_numbers
 from brainbench.core.rotations import TURN, Angle, Vector, base_rotation
@@ -99,8 +100,6 @@ class Trajectory:
     @cached_property
     def content_hash(self) -> str:
         """Hash of names, velocities and rate."""
-        from brainbench.core.files import content_hash
-
         return content_hash(list(self.names), self.velocity, self.rate)
 
     def rotation(self, name: str, times: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -205,8 +204,6 @@ class Recorded:
 
     def config(self) -> dict[str, Any]:
         """Return plain values for hashing and display; the recording counts by its hash."""
-        from brainbench.core.files import to_plain
-
         return {
             "kind": "recorded",
             "trajectory": self.trajectory.content_hash,
@@ -379,8 +376,6 @@ class Tracked:
 
     def config(self) -> dict[str, Any]:
         """Return plain values for hashing and display; the track counts by its hash."""
-        from brainbench.core.files import content_hash, to_plain
-
         return {
             "kind": "track",
             "whiskers": list(self.names),

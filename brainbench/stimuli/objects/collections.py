@@ -188,7 +188,6 @@ COLLECTIONS = {"procedural-24": PROCEDURAL_24, "procedural": list_families()}
 
 DIAGONAL = 0.04  # size [m] at which objects are built; each sweep scales them to its own
 
-
 MOST_CHARACTERS = 4096  # most characters of the name of an object: as many as a path may have
 MOST_MEMBERS = 1_000_000  # most members of a family in one data set
 SURFACE = "surface"

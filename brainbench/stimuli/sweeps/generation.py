@@ -386,8 +386,14 @@ def write_data_set(
         begin_run(folder, plan.config, "data set", results="*.h5")
         _clean(folder)
         missing = [task for task in plan.shards if not is_complete(folder / task.name, task)]
-        _check_space(missing, folder)
-        report = _reporter(sum(map(len, missing)), what, progress)
+        needed, free = sum(task.bytes for task in missing), shutil.disk_usage(folder).free
+        sweeps = sum(map(len, missing))
+        if needed + _SPARE > free:
+            raise DataError(
+                f"The {sweeps:,} sweeps still to be made take {needed / 1e6:,.0f} MB and {str(folder)!r} has "
+                f"{free / 1e6:,.0f} MB free; choose another folder, fewer sweeps (--sample, --limit) or fewer whiskers."
+            )
+        report = _reporter(sweeps, what, progress)
         if len(missing) < len(plan.shards):
             _LOG.info("%d of %d shards are there already", len(plan.shards) - len(missing), len(plan.shards))
         run(missing, folder, report)
@@ -422,13 +428,3 @@ def _clean(folder: Path) -> None:
     for path in folder.iterdir():
         if is_temporary(path.name):
             path.unlink(missing_ok=True)
-
-
-def _check_space(missing: Sequence[PlannedShard], folder: Path) -> None:
-    needed = sum(task.bytes for task in missing)
-    free = shutil.disk_usage(folder).free
-    if needed + _SPARE > free:
-        raise DataError(
-            f"The {sum(map(len, missing)):,} sweeps still to be made take {needed / 1e6:,.0f} MB and {str(folder)!r} "
-            f"has {free / 1e6:,.0f} MB free; choose another folder, fewer sweeps (--sample, --limit) or fewer whiskers."
-        )

@@ -228,9 +228,9 @@ def write_shard(content: ShardContent, folder: str | os.PathLike[str]) -> int:
             offset = _allocate(file, wrench.shape)
             _name_axes(file)
         # Past the library, which copies and lets no other thread write meanwhile.
-        with temporary.open("r+b", buffering=0) as stream:
+        with temporary.open("r+b") as stream:
             stream.seek(offset)
-            _write_all(stream, wrench)
+            stream.write(wrench.data)
     return len(content.task)
 
 
@@ -321,13 +321,6 @@ def _name_axes(file: Any) -> None:
             continue
         for axis, scale in enumerate(scales):
             file[name].dims[axis].attach_scale(file[scale])
-
-
-def _write_all(stream: Any, array: NDArray[np.float32]) -> None:
-    """Write all bytes of an array; one call of the system writes at most 2 GiB."""
-    rest = memoryview(array.view(np.uint8).reshape(-1).data)
-    while rest:
-        rest = rest[stream.write(rest) :]
 
 
 SPLITS = ("train", "validation", "test")  # names of the splits, in the order of the numbers that stand for them
@@ -474,6 +467,12 @@ class ShardTask(PlannedShard):
 class Plan(Protocol):
     """Data set before its shards are made, simulated (:class:`GenerationPlan`) or converted."""
 
+    config: cached_property[dict[str, Any]]
+    """Plain values that determine every byte of the data set."""
+    config_hash: cached_property[str]
+    shards: cached_property[Any]
+    """Shards (:class:`PlannedShard`), those of training first."""
+
     @property
     def objects(self) -> Mapping[str, NamedObject]:
         """Objects by name."""
@@ -492,21 +491,6 @@ class Plan(Protocol):
     @property
     def notes(self) -> Mapping[str, Any]:
         """Further entries of the manifest."""
-        ...
-
-    @cached_property
-    def config(self) -> dict[str, Any]:
-        """Plain values that determine every byte of the data set."""
-        ...
-
-    @cached_property
-    def config_hash(self) -> str:
-        """Hash of :attr:`config`."""
-        ...
-
-    @cached_property
-    def shards(self) -> tuple[PlannedShard, ...]:
-        """Shards, those of training first."""
         ...
 
 

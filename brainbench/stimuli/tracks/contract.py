@@ -64,10 +64,7 @@ def new_shapes(times: ArrayLike, points: ArrayLike, *, noise: float | None = Non
     times = check_times(times, len(values))
     dataset = xr.Dataset(
         {"shape": (("time", "point", "axis"), values, {"units": "m"})},
-        coords={
-            "time": ("time", times, {"units": "s"}),
-            "axis": np.array(AXES[: values.shape[2]], dtype=object),
-        },
+        coords={"time": ("time", times, {"units": "s"}), "axis": np.array(AXES[: values.shape[2]], dtype=object)},
         attrs=attributes,
     )
     if noise is not None:

@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 import os
 import pickletools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, cast
@@ -79,6 +79,19 @@ class TrackOptions:
                 f"frame_rate is {self.frame_rate:g} Hz; videos of whiskers have 10 to 1e6 frames per second: give "
                 "frames per second, not the time of a frame."
             )
+
+
+def _need(wanted: tuple[str, ...], held: Iterable[str], path: str | os.PathLike[str], kind: str) -> None:
+    names = list(held)
+    if missing := [name for name in wanted if name not in names]:
+        raise DataError(f"{brief(os.fspath(path))} is no {kind}: {missing[0]!r} is missing; it holds {listing(names)}.")
+
+
+def _columns(path: str | os.PathLike[str], kind: str, wanted: tuple[str, ...]) -> dict[str, Array]:
+    """Return the columns [n] of a table by name."""
+    names, table = read_columns(path, kind, gaps=True)
+    _need(wanted, names, path, kind)
+    return dict(zip(names, table.T, strict=True))
 
 
 def read_whisk(path: str | os.PathLike[str], options: TrackOptions) -> tuple[NDArray[np.int_], Array]:
@@ -157,14 +170,7 @@ def _parse_text(rows: list[list[str]], name: str) -> Segments:
 
 def _read_identities(path: str) -> Identities:
     """Return the label and the follicle (pixels) of each trace, by frame and number."""
-    names, table = read_columns(path, "table of whisk's measurements", gaps=True)
-    if missing := [name for name in ("fid", "wid", "label") if name not in names]:
-        raise DataError(
-            f"{brief(path)} is no table of whisk's measurements: the column {missing[0]!r} is missing; it has "
-            f"{listing(names)}."
-        )
-    columns = {name: table[:, names.index(name)] for name in names}
-    return _identities(columns, path)
+    return _identities(_columns(path, "table of whisk's measurements", ("fid", "wid", "label")), path)
 
 
 def _keys(columns: Mapping[str, Array], path: str | os.PathLike[str]) -> list[tuple[int, int]]:
@@ -185,17 +191,16 @@ def _identities(columns: dict[str, Array], path: str | os.PathLike[str]) -> Iden
 
 def _read_whiskiwrap(path: str | os.PathLike[str]) -> tuple[Segments, Identities]:
     with open_hdf5(path, "HDF5 file of WhiskiWrap") as file:
-        if missing := [name for name in ("summary", "pixels_x", "pixels_y") if name not in file]:
-            raise DataError(f"{brief(os.fspath(path))} is no file of WhiskiWrap: {missing[0]!r} is missing.")
-        arrays = {name: cast("Any", file[name])[()] for name in ("summary", "pixels_x", "pixels_y")}
+        parts = ("summary", "pixels_x", "pixels_y")
+        _need(parts, file, path, "file of WhiskiWrap")
+        arrays = {name: cast("Any", file[name])[()] for name in parts}
         summary = arrays["summary"]
         if {arrays[name].shape[:1] for name in arrays} != {summary.shape}:
             raise DataError(f"{brief(os.fspath(path))} needs one row of summary, pixels_x, pixels_y for each trace.")
         # Older files call frame, number and follicle otherwise.
         renamed = {"time": "fid", "id": "wid", "fol_x": "follicle_x", "fol_y": "follicle_y"}
         columns = {str(renamed.get(name, name)): real_numbers(summary[name]) for name in summary.dtype.names or ()}
-        if not {"fid", "wid"} <= set(columns):
-            raise DataError(f"The summary of {brief(os.fspath(path))} has no frame and no number of each trace.")
+        _need(("fid", "wid"), columns, path, "file of WhiskiWrap")
         pairs = zip(arrays["pixels_x"], arrays["pixels_y"], strict=True)
         points = [np.stack([real_numbers(x), real_numbers(y)], axis=1) for x, y in pairs]
     return dict(zip(_keys(columns, path), points, strict=True)), _identities(columns, path)
@@ -414,7 +419,7 @@ def matlab_arrays(path: str) -> dict[str, Array]:
     data = loadmat(path, variable_names=["whisker"], struct_as_record=True, appendmat=False)
     if "whisker" not in data or data["whisker"].dtype.names is None:
         raise DataError(f"{brief(path)} is no track of WhiskerMan: the struct 'whisker' is missing.")
-    _need(data["whisker"].dtype.names, path)
+    _need(_STRUCT_FIELDS, data["whisker"].dtype.names, path, "track of WhiskerMan")
     structs = enumerate(data["whisker"].ravel())
     return {f"{name}{place}": real_numbers(one[name]) for place, one in structs for name in _STRUCT_FIELDS}
 
@@ -426,7 +431,7 @@ def _structs_of_hdf5(path: str | os.PathLike[str]) -> list[dict[str, Any]]:
         group = file.get("whisker")
         if not isinstance(group, h5py.Group):
             raise DataError(f"{brief(os.fspath(path))} is no track of WhiskerMan: the struct 'whisker' is missing.")
-        _need(tuple(group), path)
+        _need(_STRUCT_FIELDS, group, path, "track of WhiskerMan")
         columns: dict[str, list[Any]] = {}
         for name in _STRUCT_FIELDS:
             dataset: Any = group[name]
@@ -439,11 +444,6 @@ def _structs_of_hdf5(path: str | os.PathLike[str]) -> list[dict[str, Any]]:
     if len(counts) > 1:
         raise DataError(f"The fields of 'whisker' in {brief(os.fspath(path))} differ in length.")
     return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
-
-
-def _need(names: tuple[str, ...], path: str | os.PathLike[str]) -> None:
-    if missing := [name for name in _STRUCT_FIELDS if name not in names]:
-        raise DataError(f"'whisker' of {brief(os.fspath(path))} has no field {missing[0]!r}, which WhiskerMan writes.")
 
 
 _LAYOUTS = {".whiskers": "whisk", **dict.fromkeys((".tr4", ".tr4_2d", ".mat"), "whiskerman")}
@@ -522,10 +522,7 @@ def _look(path: str | os.PathLike[str]) -> tuple[str | None, list[str]]:
 
 def _read_points(path: str | os.PathLike[str], options: TrackOptions) -> tuple[NDArray[np.int_], Array]:
     """Return frames [n] and points [n, k, 2 or 3] of a table of points."""
-    names, table = read_columns(path, "table of points", gaps=True)
-    columns = {name: table[:, index] for index, name in enumerate(names)}
-    if missing := [name for name in ("frame", "x", "y") if name not in columns]:
-        raise DataError(f"{brief(os.fspath(path))} has no column {missing[0]!r}.")
+    columns = _columns(path, "table of points", ("frame", "x", "y"))
     if "whisker" in columns:
         present = [f"{one:g}" for one in np.unique(columns["whisker"])]
         wanted = choose_name(f"whisker of {brief(os.fspath(path))}", options.track, present, how="as track")

@@ -28,7 +28,6 @@ _Density = Annotated[float, Limit(least=LIGHTEST, unit="kg/m³")]
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(8)
 """Gauss-Legendre quadrature on [−1, 1]."""
 
-
 _Stiffness = Annotated[float, Limit(above=0)]
 _Spring = tuple[_Stiffness, _Stiffness]
 
@@ -97,21 +96,18 @@ class Whisker:
     with the end where a tip is cut. They take the place of ``base_radius`` and ``tip_radius``."""
     moduli: tuple[tuple[float, float], ...] = field(default=(), metadata={"later": True})
     """Rows (arc length [m], Young's modulus [Pa]) likewise, in place of ``young_modulus``, then that at the base."""
-
     bends: tuple[tuple[float, float, float], ...] = field(default=(), metadata={"later": True})
     """Rows (arc length [m], curvature κ, torsion τ [1/m]) likewise, in place of ``curvature``: at rest the tangent t,
     normal n and binormal b, first x, y and z, turn by t' = κ n, n' = τ b − κ t, b' = −τ n. κ < 0 bends back."""
-
     follicle: FollicleSprings | None = field(default=None, metadata={"later": True})
     """What gives way at the base; nothing when None."""
 
     def __post_init__(self) -> None:
-        tables = (
+        for name, what, least in (
             ("radii", "radius", 0.0),
             ("moduli", "Young's modulus", SOFTEST),
             ("bends", "curvature, torsion", -np.inf),
-        )
-        for name, what, least in tables:
+        ):
             rows = tuple(tuple(map(float, row)) for row in getattr(self, name))
             object.__setattr__(self, name, rows)
             if rows:

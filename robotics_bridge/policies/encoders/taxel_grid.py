@@ -296,34 +296,26 @@ def _scatter(axes: FingerAxes, link: str, probes: Probes, observe: str) -> NDArr
         # F = R f and M = R m + (x₀ − x_site) × F: the wrench about the link's origin moved to the middle of its site.
         force = turn @ wrench[index, :3]
         lever = origin - axes.centers[row, column]
-        moment = turn @ wrench[index, 3:] + _cross(lever) @ force
+        moment = turn @ wrench[index, 3:] + np.cross(lever[:, None], force, axis=0)
         part[row * GRID_SHAPE[1] + column, :, index] = np.concatenate([force, moment])
     return part
 
 
-def _cross(vector: NDArray[np.float64]) -> NDArray[np.float64]:
-    x, y, z = vector
-    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-
-
 def _of_force(points: NDArray[np.float64], force: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the maps [N, 6, C] to a wrench about the link's origin of forces [N, 3, C] that act at points [N, 3]."""
-    return np.concatenate([force, np.stack([_cross(x) @ f for x, f in zip(points, force, strict=True)])], axis=1)
-
-
-def _vector(points: NDArray[np.float64], axes: NDArray[np.float64]) -> NDArray[np.float64]:
-    return _of_force(points, np.tile(axes, (len(points), 1, 1)))
+    force = np.broadcast_to(force, (len(points), *force.shape[-2:]))
+    return np.concatenate([force, np.cross(points[:, :, None], force, axis=1)], axis=1)
 
 
 _WRENCHES: Mapping[str, Any] = {
     **dict.fromkeys(("force_torque", "proximity"), lambda points, normals: np.tile(np.eye(6), (len(points), 1, 1))),
-    **dict.fromkeys(("force", "elastomer"), lambda points, normals: _vector(points, np.eye(3))),
+    **dict.fromkeys(("force", "elastomer"), lambda points, normals: _of_force(points, np.eye(3))),
     **dict.fromkeys(("bool", "depth", "agg_bool"), lambda points, normals: _of_force(points, -normals[:, :, None])),
     # Undoes equation 4.29: axes z, y, x, and outward; its scale is left to the calibration.
-    "agg_force": lambda points, normals: _vector(points, -np.eye(3)[::-1]),
+    "agg_force": lambda points, normals: _of_force(points, -np.eye(3)[::-1]),
     # A linear map has no use for the point: the force acts in the middle of the link's taxels.
     "center_of_pressure": lambda points, normals: np.concatenate(
-        [_vector(points, np.eye(3)), np.zeros((len(points), 6, 3)), np.pad(normals, ((0, 0), (3, 0)))[:, :, None]],
+        [_of_force(points, np.eye(3)), np.zeros((len(points), 6, 3)), np.pad(normals, ((0, 0), (3, 0)))[:, :, None]],
         axis=2,
     ),
 }

@@ -157,7 +157,6 @@ NETWORK = "zhuang-intersection-ln-small"  # network of the arms `untrained`, `si
 _TRACES = (0.5, 0.9)
 """Share that traces of the short memory keep in a control step (time constants of 36 and 237 ms at 40 Hz)."""
 
-
 Features = torch.Tensor
 """[T, B, F]."""
 

@@ -293,15 +293,6 @@ def distill(
             run.log.close()
 
 
-class _Learner(nn.Module):
-    """What learns: the student, and decoders that read its latent."""
-
-    def __init__(self, student: TactilePolicy, decoders: nn.ModuleDict) -> None:
-        super().__init__()
-        self.student: TactilePolicy = student
-        self.decoders: nn.ModuleDict = decoders
-
-
 class _Run:
     """The state of a distillation and its iterations."""
 
@@ -317,10 +308,13 @@ class _Run:
             begin_with(self.student, config.start)
         self.decoders = env.task.decoders
         sizes, features = env.observation_shapes, self.student.core.features
-        heads = {
-            part.target: elu_perceptron(features, part.hidden, math.prod(sizes[part.target])) for part in self.decoders
-        }
-        self.learner = _Learner(self.student, nn.ModuleDict(heads)).to(self.device)
+        self.heads = nn.ModuleDict(
+            {
+                part.target: elu_perceptron(features, part.hidden, math.prod(sizes[part.target]))
+                for part in self.decoders
+            }
+        )
+        self.learner = nn.ModuleDict({"student": self.student, "decoders": self.heads}).to(self.device)
         weights = [weight for weight in self.learner.parameters() if weight.requires_grad]
         cuda = self.device.type == "cuda"
         self.optimizer = torch.optim.Adam(weights, lr=config.learning_rate or 1e-4, fused=cuda, capturable=cuda)
@@ -338,7 +332,9 @@ class _Run:
         self.iteration, self.loss = 0, math.nan
         self._claim()
         if (out / STATE).exists():
-            self._restore()
+            state = load_state(out / STATE)
+            with readable(out / STATE, "training state", RESTART):
+                self._go_on(state)
         self.log = RunLog(out, "step", self.iteration)
 
     def run(self, stop: Stop, progress: Progress) -> DistillResult:
@@ -356,7 +352,14 @@ class _Run:
                 break
             self.loss = losses["behaviour"]
             self.iteration += 1
-            self._report(losses, acted - begun, time.perf_counter() - acted, rollout)
+            acting, learning = acted - begun, time.perf_counter() - acted
+            steps = rollout.steps * self.env.num_envs
+            self.log.write("loss", self.iteration, **losses)
+            self.log.write("time", self.iteration, acting=acting, learning=learning, steps_per_second=steps / acting)
+            self.log.write("teacher", self.iteration, share=self.config.share(self.iteration - 1))
+            episodes = self.env.statistics()
+            if episodes.get("episodes"):
+                self.log.write("episode", self.iteration, **{key: float(value) for key, value in episodes.items()})
             progress(self.iteration, total, "distilling")
             last = self.iteration == total
             reason = "" if last else stop.reason(self.iteration)
@@ -438,7 +441,7 @@ class _Run:
         for head in self.decoders:
             # Auxiliary decoders read the latent: their losses shape it, and nothing of them remains in the policy.
             aim = given[head.target].flatten(2) * head.scale
-            parts[head.target] = head.weight * nn.functional.mse_loss(self.learner.decoders[head.target](latent), aim)
+            parts[head.target] = head.weight * nn.functional.mse_loss(self.heads[head.target](latent), aim)
         return parts, memory
 
     def _behaviour(self, action: torch.Tensor, given: Mapping[str, torch.Tensor]) -> torch.Tensor:
@@ -450,15 +453,6 @@ class _Run:
             near = old + (action - old).clamp(-self.config.clip, self.config.clip)
             error = torch.maximum(error, (near - right).pow(2) * scale)
         return error.mean()
-
-    def _report(self, losses: Mapping[str, float], acting: float, learning: float, rollout: Rollout) -> None:
-        steps = rollout.steps * self.env.num_envs
-        self.log.write("loss", self.iteration, **losses)
-        self.log.write("time", self.iteration, acting=acting, learning=learning, steps_per_second=steps / acting)
-        self.log.write("teacher", self.iteration, share=self.config.share(self.iteration - 1))
-        episodes = self.env.statistics()
-        if episodes.get("episodes"):
-            self.log.write("episode", self.iteration, **{key: float(value) for key, value in episodes.items()})
 
     def _claim(self) -> None:
         """Write the run's configuration, or check that the folder holds this run."""
@@ -498,11 +492,6 @@ class _Run:
         for path in (self.out / "rollouts").glob("*.safetensors"):
             if int(path.stem) not in numbers:
                 path.unlink()
-
-    def _restore(self) -> None:
-        state = load_state(self.out / STATE)
-        with readable(self.out / STATE, "training state", RESTART):
-            self._go_on(state)
 
     def _go_on(self, state: Mapping[str, Any]) -> None:
         """Take up what :meth:`_save` wrote."""

@@ -251,7 +251,6 @@ def sensing_policy(
     )  # fmt: skip
 
 
-_LOG = logging.getLogger(__name__)
 _IDENTITY = (
     "task", "hand", "num_envs", "seed", "settings", "observe", "contacts", "rate", "world", "sensing", "hand_physics",
 )  # fmt: skip
@@ -306,7 +305,7 @@ class Trainer:
             wrapped: Any = self.env
             config = json.loads(json.dumps(self.config))
             self.algorithm = PPO.construct_algorithm(observations, wrapped, config, str(env.device))
-        _LOG.info("%s", said.getvalue())
+        _log.info("%s", said.getvalue())
         self.iteration = 0
         self._observations = observations
         # First episodes end at different times, so that no batch holds only beginnings.
@@ -475,46 +474,40 @@ def train(
     settings, options = settings or env.task.teacher, options or TeacherRun()
     stop = Stop(None if options.minutes is None else 60 * options.minutes)
     with occupied(run, stop):
-        return _train(env, run, options, settings, stop, progress)
-
-
-def _train(
-    env: Env, run: Path, options: TeacherRun, settings: TeacherSettings, stop: Stop, progress: Progress | None
-) -> TeacherResult:
-    total = options.iterations or settings.iterations
-    trainer = Trainer(env, settings, seed=options.seed, observe=options.observe, encoder=options.encoder)
-    env.goals.start_curriculum()
-    origin = None
-    if options.start is not None and not (run / STATE).is_file():
-        start = model_file(options.start)
-        trainer.begin_from(start, std=options.start_std)
-        origin = {"file": str(start), "hash": file_hash(start)}
-    facts = {
-        "kind": "teacher", "task": env.task.name, "hand": env.hand.name,
-        "hand_path": "" if env.hand.pads else str(env.hand.path), "hand_physics": env.hand.physics,
-        "num_envs": env.num_envs, "seed": options.seed, "settings": asdict(settings), "rsl_rl": trainer.config,
-        "observation_shapes": {name: list(shape) for name, shape in env.observation_shapes.items()},
-        "action_names": list(env.action_names), "action_map": env.action_map.plain(), "start": origin,
-        "task_version": TASK_VERSION, "contacts": asdict(env.task.contacts), "observe": list(options.observe),
-        "rate": 1 / env.step_dt, "world": _plain(env.task), "sensing": to_plain(trainer.sensing),
-    }  # fmt: skip
-    _resume(trainer, run, facts)
-    # Iterations after the last checkpoint are done again.
-    rows, reason = [], ""
-    with contextlib.closing(RunLog(run, "iteration", trainer.iteration, sinks=options.loggers, facts=facts)) as log:
-        while trainer.iteration < total and not reason:
-            row = trainer.iterate()
-            rows.append({"iteration": trainer.iteration, **row})
-            log.write("", trainer.iteration, **row)
-            if progress:
-                progress(trainer.iteration, total, "training")
-            reason = "" if trainer.iteration == total else stop.reason()
-            if reason or trainer.iteration % options.save_every == 0 or trainer.iteration == total:
-                _save(trainer, run)
-                log.save()
-    steps = trainer.iteration * settings.steps_per_env * env.num_envs
-    status = "stopped" if reason else "finished"
-    return TeacherResult(status, reason, run, trainer.iteration, steps, stop.elapsed, tuple(rows))
+        total = options.iterations or settings.iterations
+        trainer = Trainer(env, settings, seed=options.seed, observe=options.observe, encoder=options.encoder)
+        env.goals.start_curriculum()
+        origin = None
+        if options.start is not None and not (run / STATE).is_file():
+            start = model_file(options.start)
+            trainer.begin_from(start, std=options.start_std)
+            origin = {"file": str(start), "hash": file_hash(start)}
+        facts = {
+            "kind": "teacher", "task": env.task.name, "hand": env.hand.name,
+            "hand_path": "" if env.hand.pads else str(env.hand.path), "hand_physics": env.hand.physics,
+            "num_envs": env.num_envs, "seed": options.seed, "settings": asdict(settings), "rsl_rl": trainer.config,
+            "observation_shapes": {name: list(shape) for name, shape in env.observation_shapes.items()},
+            "action_names": list(env.action_names), "action_map": env.action_map.plain(), "start": origin,
+            "task_version": TASK_VERSION, "contacts": asdict(env.task.contacts), "observe": list(options.observe),
+            "rate": 1 / env.step_dt, "world": _plain(env.task), "sensing": to_plain(trainer.sensing),
+        }  # fmt: skip
+        _resume(trainer, run, facts)
+        # Iterations after the last checkpoint are done again.
+        rows, reason = [], ""
+        with contextlib.closing(RunLog(run, "iteration", trainer.iteration, sinks=options.loggers, facts=facts)) as log:
+            while trainer.iteration < total and not reason:
+                row = trainer.iterate()
+                rows.append({"iteration": trainer.iteration, **row})
+                log.write("", trainer.iteration, **row)
+                if progress:
+                    progress(trainer.iteration, total, "training")
+                reason = "" if trainer.iteration == total else stop.reason()
+                if reason or trainer.iteration % options.save_every == 0 or trainer.iteration == total:
+                    _save(trainer, run)
+                    log.save()
+        steps = trainer.iteration * settings.steps_per_env * env.num_envs
+        status = "stopped" if reason else "finished"
+        return TeacherResult(status, reason, run, trainer.iteration, steps, stop.elapsed, tuple(rows))
 
 
 def _resume(trainer: Trainer, run: Path, facts: dict[str, Any]) -> None:

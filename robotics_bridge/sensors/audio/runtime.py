@@ -51,10 +51,8 @@ class ContactAudioRuntime(Runtime):
         arrays.drive = context.zeros((self.samples, envs, count))
         arrays.first, arrays.second, arrays.gain = (context.zeros((quads, count), wp.vec4) for _ in range(3))
         arrays.y1, arrays.y2 = (context.zeros((quads, envs, count), wp.vec4) for _ in range(2))
-        self._own, self.lasting = (
-            arrays,
-            [arrays.force, arrays.before, arrays.rubbing, arrays.drive, arrays.y1, arrays.y2],
-        )
+        self._own = arrays
+        self.lasting = [arrays.force, arrays.before, arrays.rubbing, arrays.drive, arrays.y1, arrays.y2]
 
     def seed(self) -> None:
         """Draw from the context's present seed from now on."""
@@ -112,8 +110,7 @@ class DriveAudioRuntime(Runtime):
     """Serves actuation sounds of one block length."""
 
     def __init__(self, sensors: Mapping[str, ActuationAudio], context: SuiteContext) -> None:
-        first = next(iter(sensors.values()))
-        self.samples = first.samples
+        self.samples = next(iter(sensors.values())).samples
         super().__init__(sensors, self.samples, context, fusable=False)
         self._drives = dict(sensors)
         arrays, shape = DriveSoundArrays(), (context.num_envs, self.count)

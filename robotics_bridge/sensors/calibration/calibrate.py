@@ -142,13 +142,6 @@ def segments(log: Log) -> list[Episode]:
     return long
 
 
-def find_dead(parts: list[Episode]) -> tuple[list[NDArray[np.bool_]], list[NDArray[np.float64]]]:
-    """Return per episode which probes [N] never change, and their values."""
-    # Exactly equal: a living probe has noise, or moves by a quantisation step now and then.
-    stuck = [np.ptp(y, axis=0) == 0 for _x, y in parts]
-    return stuck, [y[0] for _x, y in parts]
-
-
 def find_quantum(values: NDArray[np.float64]) -> float:
     """Return the step of which all readings are multiples, 0 if there is none."""
     distinct = np.unique(values)
@@ -202,7 +195,8 @@ def calibrate(log: Log, *, max_delay: float = 0.5) -> Calibration:
     parts = segments(log)
     if skipped := len(np.unique(log.episode)) - len(parts) if log.episode is not None else 0:
         notes.append(f"{skipped} episodes of fewer than {SHORTEST} readings were left out.")
-    stuck, values = find_dead(parts)
+    # Exactly equal: a living probe has noise, or moves by a quantisation step now and then.
+    stuck = [np.ptp(y, axis=0) == 0 for _x, y in parts]
     living = [(x, y[:, ~dead]) for (x, y), dead in zip(parts, stuck, strict=True) if (~dead).any()]
     if not living:
         raise DataError("Every probe of the log is stuck at one value, so nothing can be fitted.")
@@ -211,8 +205,10 @@ def calibrate(log: Log, *, max_delay: float = 0.5) -> Calibration:
         moved = [index for index, (x, _y) in enumerate(parts) if np.ptp(x) > 0]
         if not moved:
             raise DataError("The reference never changes; leave the column out for a device at rest.")
-        held, at = (np.concatenate([items[index] for index in moved]) for items in (stuck, values))
-        estimates |= _dead(held, at)
+        dead, values = (
+            np.concatenate([items[index] for index in moved]) for items in (stuck, [y[0] for _, y in parts])
+        )
+        estimates |= _dead(dead, values)
     quantum = find_quantum(np.concatenate([y.ravel() for _x, y in living]))
     how = "all readings are its multiples" if quantum else "none found"
     estimates["quantum"] = Estimate(quantum, quantum, quantum, how)

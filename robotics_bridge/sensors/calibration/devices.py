@@ -195,12 +195,9 @@ def fit_device(presses: Presses, *, max_delay: float = 0.5, names: tuple[str, ..
 
 
 def _part(presses: Presses, rows: slice) -> Presses:
-    log = presses.log
-    episode = None if log.episode is None else log.episode[rows]
-    assert log.ball is not None
-    part = replace(log, time=log.time[rows], readings=log.readings[rows], episode=episode, ball=log.ball[rows],
-                   reference=None)  # fmt: skip
-    return Presses(part, presses.probes, presses.radius)
+    names = ("time", "readings", "episode", "ball")
+    parts = {name: None if (a := getattr(presses.log, name)) is None else a[rows] for name in names}
+    return Presses(replace(presses.log, **parts, reference=None), presses.probes, presses.radius)
 
 
 def _moved(device: Device, step: NDArray[np.float64]) -> Device:

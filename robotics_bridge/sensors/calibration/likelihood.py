@@ -256,6 +256,7 @@ def _errors(target: _Likelihood, best: Dynamics, free: list[str]) -> dict[str, f
             corners = cost((i, step), (j, step)) - cost((i, step), (j, -step))
             corners += cost((i, -step), (j, -step)) - cost((i, -step), (j, step))
             hessian[i, j] = corners / (4 * step * step)
+    # The pseudo-inverse copes with parameters that the log does not tell.
     covariance = np.linalg.pinv((hessian + hessian.T) / 2)
     return {name: math.sqrt(max(covariance[index, index], 0.0)) for index, name in enumerate(free)}
 

@@ -344,7 +344,8 @@ def sample_cloud(solids: Solids, geometries: Sequence[int], points: int) -> Clou
     for row in range(rows):
         shapes = {g: scene.geometry_in(row, g) for g in geometries}
         shapes = {g: shape for g, shape in shapes.items() if shape.kind not in ("plane", "other")}
-        areas = {g: surface_area(shape) for g, shape in shapes.items()}
+        surfaces = {g: tessellate(shape) for g, shape in shapes.items()}
+        areas = {g: float(face_areas(mesh.vertices[mesh.faces])[0].sum()) for g, mesh in surfaces.items()}
         whole = sum(areas.values()) or 1.0
         for g, shape in shapes.items():
             # The same density of points on all geometries; without a point, a small one could not be felt at all.
@@ -408,12 +409,6 @@ def _within(
     listed, owners = np.concatenate(cells), np.concatenate(numbers)
     order = np.lexsort((owners, listed))
     return listed[order], owners[order]
-
-
-def surface_area(geometry: Geometry) -> float:
-    """Return the surface area of a geometry [m²]."""
-    mesh = tessellate(geometry)
-    return float(face_areas(mesh.vertices[mesh.faces])[0].sum())
 
 
 def _in_blocks(points: NDArray) -> NDArray[np.float32]:

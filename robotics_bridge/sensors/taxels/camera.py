@@ -100,7 +100,11 @@ class GelCamera:
                 places = np.meshgrid(rows, columns, indexing="ij")
                 pixels = ndimage.map_coordinates(field, places, order=3, mode="nearest")
             slopes: Any = np.gradient(pixels, self.pixel)
-            change = _looked_up(self.table, _bins(np.stack(slopes)))
+            at = _bins(np.stack(slopes))
+            planes: list[Any] = [
+                ndimage.map_coordinates(plane, at, order=1) for plane in np.moveaxis(self.table, -1, 0)
+            ]
+            change = np.stack(planes, axis=-1)
             picture[:] = np.round(255 * (self.background + change).clip(0, 1))
         return pictures
 
@@ -172,12 +176,6 @@ def _tabulate(at: NDArray[np.float64], change: NDArray[np.float64]) -> NDArray[n
     unseen = count[..., 0] < 1e-3
     nearest: Any = ndimage.distance_transform_edt(unseen, return_distances=False, return_indices=True)
     return (total / np.maximum(count, 1e-12))[tuple(nearest)]
-
-
-def _looked_up(table: NDArray[np.float64], at: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return changes of colour [H, W, 3] at places [2, H, W] of a table."""
-    planes: list[Any] = [ndimage.map_coordinates(plane, at, order=1) for plane in np.moveaxis(table, -1, 0)]
-    return np.stack(planes, axis=-1)
 
 
 def _fitted(colours: NDArray[np.float64], clear: NDArray[np.bool_]) -> NDArray[np.float64]:

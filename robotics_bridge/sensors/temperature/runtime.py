@@ -54,8 +54,10 @@ class TemperatureRuntime(Runtime):
             scene.link_index(name)
         # Grids that know other bodies have another runtime, and are touched all the same.
         grids = [sensor for sensor in context.sensors if isinstance(sensor, TemperatureGrid)]
+        bodies = {grid.link: ThermalBody(grid.material, grid.base_temperature) for grid in reversed(grids)}
+        bodies |= self._sensors[0].bodies
         # Flexes, which are no links, come last.
-        links = [*(_body(self._sensors[0], grids, name) for name in scene.links), self._sensors[0].unlisted]
+        links = [*(bodies.get(name, self._sensors[0].unlisted) for name in scene.links), self._sensors[0].unlisted]
         materials = [material(body.material) for body in links]
         temperatures = np.tile([body.temperature for body in links], (context.num_envs, 1))
         shape, many = (context.num_envs, self.count), (context.num_envs, len(structures))
@@ -185,14 +187,6 @@ def diffusion(cells: int, edge: float, spread: float) -> NDArray[np.float64]:
     modes /= np.linalg.norm(modes, axis=0)
     rate = 2 * (1 - np.cos(np.pi * np.arange(cells) / cells)) / edge**2
     return np.maximum((modes * np.exp(-spread * rate)) @ modes.T, 0.0)
-
-
-def _body(sensor: TemperatureGrid, grids: list[TemperatureGrid], link: str) -> ThermalBody:
-    """Return the body of a link: as a grid's configuration says, as a grid on the link says, or the default."""
-    if link in sensor.bodies:
-        return sensor.bodies[link]
-    own_grid = next((grid for grid in grids if grid.link == link), None)
-    return sensor.unlisted if own_grid is None else ThermalBody(own_grid.material, own_grid.base_temperature)
 
 
 def _exposed(cells: tuple[int, int, int], edges: NDArray[np.float64]) -> NDArray[np.float64]:

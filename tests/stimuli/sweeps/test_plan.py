@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import dataclasses
-import io
 import json
 import math
 from collections import Counter
@@ -28,7 +27,6 @@ from brainbench.stimuli.sweeps.plan import (
     UNUSABLE,
     GenerationPlan,
     GenerationSettings,
-    _write_all,
     make_shard,
     simulate_shard,
     simulate_sweeps,
@@ -395,13 +393,3 @@ def test_a_shard_of_another_data_set_is_not_taken_for_ones_own(tmp_path):
     other = small_plan(seed=1).shards[0]
     with pytest.raises(DataError, match=r"/train-00000\.h5' .*another"):
         is_complete(tmp_path / task.name, other)
-
-
-def test_a_write_that_the_system_cuts_short_goes_on():
-    class Short(io.BytesIO):
-        def write(self, data):
-            return super().write(data[:7])
-
-    stream, array = Short(), np.arange(100, dtype=np.float32).reshape(5, 20)
-    _write_all(stream, array)
-    assert stream.getvalue() == array.tobytes()

@@ -14,7 +14,6 @@ every gap at the end of the step ≥ 0 and obey Coulomb's law. The step damps, s
 
 from __future__ import annotations
 
-import functools
 import math
 import sys
 from collections.abc import Iterator, Sequence
@@ -28,7 +27,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.errors import MissingDependencyError, UsageError, install_command, missing_dependency
 from brainbench.core.rotations import base_rotation, from_z_axis, to_matrices
-from brainbench.stimuli.engines.reach import Reach
 from brainbench.stimuli.engines.stepping import LEAST_TAPER, SteppedEngine, SteppedJob, cone_vertices, drive_scalars
 from brainbench.stimuli.engines.trust import state_fault
 from brainbench.stimuli.motion.jobs import MICRO, MILLI, Trace
@@ -457,7 +455,15 @@ class _Run:
         self.steps = len(times) - 1
         self.stiffness = np.repeat(chain.stiffness, 2) * MICRO
         self.damping = np.repeat(chain.damping(self.step / MILLI), 2) * MICRO * MILLI
-        self._prescribe(*stepped.pose, reach)
+        position, euler = stepped.pose
+        path = np.concatenate([position * MILLI, euler + np.array([-np.pi / 2, 0.0, np.pi / 2])], axis=1)
+        self.path, self.drive = path, drive_scalars(path, self.step)
+        self.frames = base_rotation(euler)
+        still = np.zeros((len(times), 3)), np.tile([1.0, 0, 0, 0], (len(times), 1))
+        poses = [still if item.motion is None else item.motion(times) for item in reach.obstacles]
+        self.poses = [(np.asarray(where, dtype=float) * MILLI, np.asarray(turn, dtype=float)) for where, turn in poses]
+        self.turns = [to_matrices(turn) for _, turn in self.poses]
+        self.travels = [item.motion is not None for item in reach.obstacles]
         self.friction = np.array([item.friction_beside(job.whisker.friction) for item in reach.obstacles])
         self.hinges, self.rates = np.zeros(2 * chain.links), np.zeros(2 * chain.links)
         self.wrench = np.zeros((self.steps, 6))
@@ -469,16 +475,6 @@ class _Run:
         self.shapes: dict[int, NDArray] = {}
         self._shapes_at = shapes_at
         self._beyond = (chain.whisker.arc_length - np.repeat(chain.nodes[:-1], 2)) * MILLI
-
-    def _prescribe(self, position: NDArray, euler: NDArray, reach: Reach) -> None:
-        path = np.concatenate([position * MILLI, euler + np.array([-np.pi / 2, 0.0, np.pi / 2])], axis=1)
-        self.path, self.drive = path, drive_scalars(path, self.step)
-        self.frames = base_rotation(euler)
-        still = np.zeros((len(self.times), 3)), np.tile([1.0, 0, 0, 0], (len(self.times), 1))
-        poses = [still if item.motion is None else item.motion(self.times) for item in reach.obstacles]
-        self.poses = [(np.asarray(where, dtype=float) * MILLI, np.asarray(turn, dtype=float)) for where, turn in poses]
-        self.turns = [to_matrices(turn) for _, turn in self.poses]
-        self.travels = [item.motion is not None for item in reach.obstacles]
 
     def integrate(self) -> None:
         """Compute all steps, fewer when the state stops making sense; then ``reason`` says why."""
@@ -518,7 +514,10 @@ class _Run:
             force, solved = solve_contacts(to_rows @ yielding, rows.free + to_rows @ after, rows.friction)
             after = after + yielding @ force
             forces = forces - rows.jacobian.T @ force
-            self._touch(n, rows, force)
+            strength = np.linalg.norm(force.reshape(-1, 3), axis=1)
+            if strength.any():
+                self.arc[n] = float(strength @ rows.arc / strength.sum())
+            self.penetration = max(self.penetration, rows.overlap)
         # Reaction of the prescribed joints: inverse dynamics was taken with hinges that do not accelerate, so the
         # coupling inertia times their acceleration is added.
         follicle = forces[:FOLLICLE] + mass[:FOLLICLE, FOLLICLE:] @ ((after - self.rates) / h)
@@ -569,7 +568,9 @@ class _Run:
             axes.append(frame)
             jacobian.append(frame @ (linear + cross_matrix(arm) @ angular))
             # Way of the follicle less the way of the obstacle at the point: what friction feels while the hinges rest.
-            slip = frame @ (self._carried(n, point) - self._pushed(n, number, point - distance * normal))
+            carried = _way(n, self.path[:, :3], self.frames, point)
+            pushed = _way(n, self.poses[number][0], self.turns[number], point - distance * normal)
+            slip = frame @ (carried - pushed)
             gaps.append([distance, slip[1], slip[2]])
             overlap = max(overlap, slip[0] - distance)
             share = np.clip(axis @ arm, 0, self.chain.lengths[link] * MILLI)
@@ -583,23 +584,6 @@ class _Run:
             np.array(arcs),
             overlap,
         )
-
-    def _carried(self, n: int, point: NDArray) -> NDArray[np.float64]:
-        """Return the way [3] that the follicle carried a point, given at the end of step n, with the hinges at rest."""
-        back = self.frames[n] @ (self.frames[n + 1].T @ (point - self.path[n + 1, :3]))
-        return point - self.path[n, :3] - back
-
-    def _pushed(self, n: int, number: int, point: NDArray) -> NDArray[np.float64]:
-        """Return the way [3] that a point of an obstacle went in step n."""
-        where, turns = self.poses[number][0], self.turns[number]
-        return point - where[n] - turns[n] @ (turns[n + 1].T @ (point - where[n + 1]))
-
-    def _touch(self, n: int, rows: _Rows, force: NDArray) -> None:
-        """Keep where the whisker is touched, and how deep it lay in the obstacle."""
-        strength = np.linalg.norm(force.reshape(-1, 3), axis=1)
-        if strength.any():
-            self.arc[n] = float(strength @ rows.arc / strength.sum())
-        self.penetration = max(self.penetration, rows.overlap)
 
     def _action(self, n: int, follicle: NDArray, moments: NDArray) -> NDArray[np.float64]:
         """Return the whisker's action on its base [6] (N, N·m) from the reactions of follicle and first two hinges."""
@@ -619,17 +603,14 @@ class _Run:
         return -np.concatenate([follicle[:3] / MILLI, moment / MICRO])
 
 
+def _way(n: int, where: NDArray, turns: NDArray, point: NDArray) -> NDArray[np.float64]:
+    """Return the way [3] in step n of a point, given at its end, that goes with a frame (``where``, ``turns``)."""
+    return point - where[n] - turns[n] @ (turns[n + 1].T @ (point - where[n + 1]))
+
+
 def _solve(system: NDArray, right: NDArray) -> NDArray[np.float64]:
     """Solve a symmetric positive definite system; NaN where it is not."""
-    factorise, substitute = _cholesky()
-    factor, failed = factorise(system, lower=1)
-    return np.full_like(right, np.nan) if failed else substitute(factor, right, lower=1)[0]
-
-
-@functools.cache
-def _cholesky() -> tuple[Any, Any]:
-    """Return LAPACK's dpotrf and dpotrs, without the checks that would cost more than the solution."""
-    from scipy.linalg import get_lapack_funcs
-
-    factorise, substitute = get_lapack_funcs(("potrf", "potrs"), dtype=np.float64)
-    return factorise, substitute
+    # Without the checks of scipy's own functions, which would cost more than the solution.
+    lapack = import_module("scipy.linalg.lapack")
+    factor, failed = lapack.dpotrf(system, lower=1)
+    return np.full_like(right, np.nan) if failed else lapack.dpotrs(factor, right, lower=1)[0]

@@ -22,16 +22,7 @@ from ..articulated_body import (
 from ..delassus import PerContact3
 from ..motion import Instant, instant, pose_from
 from ..parameters import capacity, hinges, real
-from ..state import (
-    PerLink3,
-    PerLinkJoint,
-    SceneArrays,
-    Step,
-    WhiskerJob,
-    WhiskerState,
-    begin_step,
-    row,
-)
+from ..state import PerLink3, PerLinkJoint, SceneArrays, Step, WhiskerJob, WhiskerState, begin_step, row
 from .contacts import StepContacts, contact_row, set_state
 from .records import StepRecords
 

@@ -89,11 +89,7 @@ class ContactSummary:
 
 
 @wp.func
-def summarize(
-    summary: wp.ref[ContactSummary],
-    contacts: wp.ref[StepContacts],
-    step: StepRecord,
-):
+def summarize(summary: wp.ref[ContactSummary], contacts: wp.ref[StepContacts], step: StepRecord):
     """Add the next step."""
     if summary.steps == 0:
         summary.first = contacts.count

@@ -256,14 +256,7 @@ def record_contacts(
                 record.force = held.force
                 body = pose_from(scene.motions, scene.shapes.track[shape], step.now, step.pose)
                 record.curvature = curvature_at(
-                    scene.shapes,
-                    shape,
-                    body,
-                    start,
-                    row(chain.node, i + 1),
-                    share,
-                    given.normal,
-                    given.gap + radius,
+                    scene.shapes, shape, body, start, row(chain.node, i + 1), share, given.normal, given.gap + radius
                 )
                 paused.records.contact[place, pressing, index] = record
                 pressing = pressing + 1
