@@ -14,6 +14,8 @@ import numpy as np
 
 from brainbench.core.devices import mujoco_module
 from brainbench.geometry import Mesh
+from robotics_bridge import hands
+from robotics_bridge.hands.scenes import closing, holding
 from robotics_bridge.physics import (
     Geometry,
     HandState,
@@ -163,6 +165,33 @@ def settled(envs: int, device: str, steps: int, brought: Mapping[str, np.ndarray
     engine = engine_of(envs, device)
     engine.step(steps)
     return snapshot(engine.state)
+
+
+def totals_cases(steps: int, brought: State | None) -> dict[str, tuple[TouchScene, State, dict[str, Any]]]:
+    """Scene, settled state and taxels of bodies on a pad, a hand that holds a ball, and the pyramid, by name."""
+    cases = {}
+    ball, block = 'type="sphere" size=".01" mass=".2"', 'type="box" size=".03 .03 .03" mass=".5"'
+    for name, geom, side, width in (("ball", ball, 10, 0.03), ("ball", ball, 32, 0.1), ("block", block, 32, 0.1)):
+        model = mujoco.MjModel.from_xml_string(
+            '<mujoco><worldbody><body name="pad"><geom type="box" size=".05 .05 .01"/></body><body pos="0 0 '
+            f'{0.0405 if name == "block" else 0.0205}"><freejoint/><geom {geom}/></body></worldbody></mujoco>'
+        )
+        engine = MujocoEngine(model, 1, contacts=16)
+        engine.step(500)
+        pad = Probes.grid(side, side, size=(width, width), center=(0, 0, 0.01), radius=0.004)
+        taxels = {"pad": KinematicTaxel(link="pad", probes=pad)}
+        cases[f"{name} on a pad of {side**2:,} taxels"] = engine.scene, snapshot(engine.state), taxels
+    hand = hands.load("xhand1")
+    engine, closed = MujocoEngine(holding(hand, radius=0.028, reach=0.9), 1, contacts=64), closing(hand, 0.72)
+    for step in range(260):
+        engine.set(ctrl=closed * min(step / 200, 1.0))
+        engine.step()
+    taxels = {link: KinematicTaxel(link=link, probes=probes) for link, probes in hand.layout("med", "hand").items()}
+    cases["XHand1 holds a ball, 199 taxels"] = engine.scene, snapshot(engine.state), taxels
+    for count in (100, 1000):
+        taxels = {"box0": KinematicTaxel(link="box0", probes=grid(count), track=("box1",))}
+        cases[f"pyramid, {count:,} taxels"] = scene_of(), settled(64, "cpu", steps, brought), taxels
+    return cases
 
 
 def scene_of() -> TouchScene:

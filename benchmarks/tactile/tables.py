@@ -18,19 +18,19 @@ def tables(rows: Rows) -> dict[str, tuple[str, str]]:
     """Lay out the records of one device: part → (heading, body)."""
     device = rows[0]["device"] if rows else ""
     found = {}
-    for part, lay_out in _LAYOUTS.items():
+    for part in ("sensors", *_LISTS):
         # The last measurement of a case counts.
         kept = {(row["case"], row.get("envs"), row.get("value")): row for row in rows if row["part"] == part}
         if kept:
-            heading, body = lay_out(list(kept.values()))
+            heading, body = (_sensors if part == "sensors" else _listed)(list(kept.values()))
             found[part] = (f"{heading} ({device})", body)
     return found
 
 
-def _check(rows: Rows) -> tuple[str, str]:
-    cells = [[row["case"], f"{row['relative']:.1e}", f"{row['largest']:.1e}"] for row in rows]
-    body = table(["sensor", "99.9 % of readings agree within", "all agree within"], cells)
-    return "Tactile readings against the processor's", f"Relative to the largest reading.\n\n{body}"
+def _listed(rows: Rows) -> tuple[str, str]:
+    heading, note, columns = _LISTS[rows[0]["part"]]
+    cells = [[form.format(**row) for form in columns.values()] for row in rows]
+    return heading, note.format(**rows[0]) + table(list(columns), cells)
 
 
 def _sensors(rows: Rows) -> tuple[str, str]:
@@ -56,31 +56,31 @@ def _sensors(rows: Rows) -> tuple[str, str]:
     return f"Tactile sensors alone, {rows[0]['envs']:,} environments", f"{note}\n\n{table(columns, cells)}"
 
 
-def _step(rows: Rows) -> tuple[str, str]:
-    cells = [[f"{r['envs']:,}", r["case"], f"{r['env_steps_per_s']:,.0f}", f"{100 * r['share']:.0f} %"] for r in rows]
-    return "Tactile whole step on the pyramid", table(
-        ["environments", "sensor (100 taxels)", "env-steps/s", "of the engine alone"], cells
-    )
-
-
-def _published(rows: Rows) -> tuple[str, str]:
-    cells = [[r["case"], f"{r['envs']:,}", f"{r['ms']:.3f}", f"{r['rate']:,.0f}", f"{r['kib']:.1f}"] for r in rows]
-    columns = ["configuration", "environments", "ms / update", "sensor updates/s", "KiB / environment"]
-    return "Tactile published configurations", table(columns, cells)
-
-
-def _scaling(rows: Rows) -> tuple[str, str]:
-    cells = [[r["case"], f"{r['value']:,}", f"{r['envs']:,}", f"{r['ms']:.3f}"] for r in rows]
-    return "Tactile scaling", table(["axis", "value", "environments", "ms / update"], cells)
-
-
-_LAYOUTS = {
-    "check": _check,
-    "sensors": _sensors,
-    "step": _step,
-    "published": _published,
-    "scaling": _scaling,
-}
+_LISTS: dict[str, tuple[str, str, dict[str, str]]] = {
+    "check": (
+        "Tactile readings against the processor's", "Relative to the largest reading.\n\n",
+        {"sensor": "{case}", "99.9 % of readings agree within": "{relative:.1e}", "all agree within": "{largest:.1e}"},
+    ),
+    "totals": (
+        "Engine totals beside the law of depths", "Microseconds of one update of {envs:,} environments.\n\n",
+        {"scene": "{case}", "law of depths": "{law:,.0f}", "engine totals": "{engine:,.0f}", "× law": "{ratio:.2f}"},
+    ),
+    "step": (
+        "Tactile whole step on the pyramid", "",
+        {"environments": "{envs:,}", "sensor (100 taxels)": "{case}", "env-steps/s": "{env_steps_per_s:,.0f}",
+         "of the engine alone": "{share:.0%}"},
+    ),
+    "published": (
+        "Tactile published configurations", "",
+        {"configuration": "{case}", "environments": "{envs:,}", "ms / update": "{ms:.3f}",
+         "sensor updates/s": "{rate:,.0f}", "KiB / environment": "{kib:.1f}"},
+    ),
+    "scaling": (
+        "Tactile scaling", "",
+        {"axis": "{case}", "value": "{value:,}", "environments": "{envs:,}", "ms / update": "{ms:.3f}"},
+    ),
+}  # fmt: skip
+"""Part → heading, what stands before the table, and the form of each column."""
 
 
 def plot_scaling(rows: Rows, path: Path) -> None:

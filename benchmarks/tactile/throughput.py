@@ -2,6 +2,7 @@
 
     python -m benchmarks.tactile.throughput --device cuda --part check        # the same readings as on the processor
     python -m benchmarks.tactile.throughput --device cuda --part sensors      # sensor time alone, against its roofline
+    python -m benchmarks.tactile.throughput --device cuda --part totals       # engine totals beside the law of depths
     python -m benchmarks.tactile.throughput --device cuda --part step         # whole step against the engine alone
     python -m benchmarks.tactile.throughput --device cuda --part published    # configurations of thesis figure 4.4
     python -m benchmarks.tactile.throughput --device cuda --part scaling      # taxels, environments, triangles, points
@@ -18,6 +19,7 @@ import json
 import statistics
 import time
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -39,13 +41,14 @@ from benchmarks.tactile.scene import (
     sensors,
     settled,
     temperature,
+    totals_cases,
     with_mesh,
     write_input,
 )
 from benchmarks.tactile.tables import plot_scaling, tables
 from brainbench.core.devices import pick_device, warp
 from robotics_bridge.physics import HandState, TouchScene
-from robotics_bridge.sensors import ContactDepthProbe, ElastomerTaxel, KinematicTaxel, Probes, SensorSuite
+from robotics_bridge.sensors import ContactDepthProbe, ElastomerTaxel, KinematicTaxel, Noise, Probes, SensorSuite
 
 ROOFLINE = {False: 0.018e-3, True: 0.085e-3}
 """Seconds that the issue allows 100 taxels of 6 channels and 16,384 environments at the H200's bandwidth, clean and
@@ -137,6 +140,19 @@ def part_sensors(options: argparse.Namespace) -> Iterable[Row]:
         del suite
 
 
+def part_totals(options: argparse.Namespace) -> Iterable[Row]:
+    """Engine totals and the law of depths, sensor time alone."""
+    for label, (scene, found, taxels) in totals_cases(options.settle, options.brought).items():
+        state = restore(found, options.envs, options.device)
+        for noise in (Noise(), FULL):
+            times = {}
+            for total in ("law", "engine"):
+                config = {n: replace(taxel, total=total, noise=noise) for n, taxel in taxels.items()}
+                times[total] = 1e6 * timed(scene, config, state, options.device)[0]
+            name = f"{label}, {'noisy' if noise.active else 'clean'}"
+            yield {"case": name, "envs": options.envs, **times, "ratio": times["engine"] / times["law"]}
+
+
 def part_step(options: argparse.Namespace) -> Iterable[Row]:
     """Engine alone, and engine and one sensor read every step, taken in turns."""
     for envs in options.env_list:
@@ -220,6 +236,7 @@ def part_scaling(options: argparse.Namespace) -> Iterable[Row]:
 PARTS = {
     "check": part_check,
     "sensors": part_sensors,
+    "totals": part_totals,
     "step": part_step,
     "published": part_published,
     "scaling": part_scaling,
