@@ -29,6 +29,8 @@ from robotics_bridge.physics.kernels.state import StateArrays
 from robotics_bridge.sensors.kernels.distance import FAR, SIDED, SolidArrays, shape_functions
 from robotics_bridge.sensors.kernels.pairs import PairArrays, SlotArrays, push_side
 from robotics_bridge.sensors.kernels.readout import (
+    CLEAN,
+    STAGED,
     ProbeArrays,
     ReadoutArrays,
     group_functions,
@@ -118,7 +120,7 @@ class ContactFaces:
     count: wp.array(dtype=wp.int32)
     """[2] how many."""
     filled: wp.array2d(dtype=wp.uint8)
-    """[B, N] 1 where a reading is anything but zeros."""
+    """[B, N] 1 where a reading is anything but zeros; elsewhere measured ones, before their noise, hold anything."""
     follower: wp.array(dtype=wp.int32)
     """[2 C] next node of the same face, −1 for none."""
     watched: wp.array(dtype=wp.int32)
@@ -357,18 +359,18 @@ def belongs(faces: ContactFaces, head: int, face: int, x: wp.vec3f, m: wp.vec3f,
 
 
 @wp.func
-def clear(faces: ContactFaces, io: ReadoutArrays, env: int, n: int, noisy: bool):
+def clear(faces: ContactFaces, io: ReadoutArrays, env: int, n: int, staged: bool):
     """Write a reading of zeros, if it is anything else."""
     if faces.filled[env, n] != wp.uint8(0):
         store_planes(io.truth, env, n, 6, wp.spatial_vectorf())
         faces.filled[env, n] = wp.uint8(0)
     # Stages after this one write into the measured readings, which are then never left alone.
-    if noisy:
+    if staged:
         store_planes(io.measured, env, n, 6, wp.spatial_vectorf())
 
 
 @cache
-def spread_kernel(kinds: frozenset[int], raycast: bool, noisy: bool, sticky: bool, lanes: int, deep: bool) -> Any:
+def spread_kernel(kinds: frozenset[int], raycast: bool, mode: int, sticky: bool, lanes: int, deep: bool) -> Any:
     """Return the kernel ``spread`` that writes readings and loads. Group of threads: link of an environment.
 
     The threads of a group share its taxels, and add up what each has found, so that a contact costs no more than the
@@ -377,14 +379,14 @@ def spread_kernel(kinds: frozenset[int], raycast: bool, noisy: bool, sticky: boo
     Args:
         kinds: of the geometries tracked.
         raycast: ask triangles.
-        noisy: whether measured readings are another array.
+        mode: of the readout.
         sticky: taxels hold what they touch.
         lanes: threads of a group; a processor has one.
         deep: all sources of carriers; a GPU first takes the links where :data:`TOUCH` is enough, which needs fewer
             registers.
     """
     distance = shape_functions(kinds, raycast).distance
-    cuda, group = lanes > 1, group_functions(lanes)
+    cuda, noisy, staged, group = lanes > 1, mode != CLEAN, mode == STAGED, group_functions(lanes)
     total_of, largest_of, rank_of, group_meets = group.total, group.largest, group.rank, group.meet
 
     @wp.func
@@ -470,7 +472,7 @@ def spread_kernel(kinds: frozenset[int], raycast: bool, noisy: bool, sticky: boo
         module="unique",
         enable_backward=False,
         grid_stride=False,
-        launch_bounds=(32, 8 if deep else 16),
+        launch_bounds=(32, 8 if deep else 12 if lanes == 32 else 16),
         module_options={"fast_math": cuda and not raycast},
     )
     def spread(
@@ -647,21 +649,27 @@ def spread_kernel(kinds: frozenset[int], raycast: bool, noisy: bool, sticky: boo
                                 if trace > 1.0e-4 * extent:
                                     inertia = (1.0001 * trace) * wp.identity(n=3, dtype=wp.float32) - extents
                                     tilt = wp.inverse(inertia / trace) @ moment / trace
-                                # No taxel is pulled, however far it lies: what is beyond half of that moves into
-                                # the weights, y e^(λ · r) for y (1 + λ · r). What turns about the normal pulls
-                                # none, and drags no more than the load pushes.
+                                # No taxel is pulled, however far it lies: else the tilt moves into the weights,
+                                # y e^(λ · r) for y (1 + λ · r). What turns about the normal pulls none, and drags
+                                # no more than the load pushes.
                                 far = most + wp.length(center)
                                 spin = wp.dot(tilt, push.normal)
                                 tilt -= spin * push.normal
                                 spin = wp.clamp(spin, -mean / far, mean / far)
                                 steepest = wp.length(tilt) * far / mean
                                 if steepest > 1.0:
-                                    tilt /= steepest
                                     rounds += 1
                                     more = rounds < wp.static(ROUNDS)
                                     if more:
-                                        lean = push.lean + (steepest - 0.5) / mean * wp.cross(push.normal, tilt)
+                                        # At first more than linear, as the inverse of Langevin's function (Cohen
+                                        # 1991): weights that are even shift by less the more they lean.
+                                        lean = wp.cross(push.normal, tilt) / mean
+                                        if rounds == 1:
+                                            x2 = wp.min(wp.dot(lean, extents @ lean) / 3.0, 0.3)
+                                            lean *= (3.0 - x2) / (3.0 - 3.0 * x2)
+                                        lean += push.lean
                                         push.lean = lean * wp.min(wp.static(STEEPEST) / (far * wp.length(lean)), 1.0)
+                                    tilt /= steepest
                                 tilt += spin * push.normal
                                 if not more:
                                     rest[1] += whole * wp.length(moment - inertia @ tilt)
@@ -687,7 +695,7 @@ def spread_kernel(kinds: frozenset[int], raycast: bool, noisy: bool, sticky: boo
                                         store_planes(io.measured, env, c.n, 6, reading)
                                     faces.filled[env, c.n] = wp.uint8(1)
                                 elif fresh:
-                                    clear(faces, io, env, c.n, wp.static(noisy))
+                                    clear(faces, io, env, c.n, wp.static(staged))
                                 place += wp.static(lanes)
                             if wp.static(cuda):
                                 total = total_of(total)
@@ -722,7 +730,7 @@ def spread_kernel(kinds: frozenset[int], raycast: bool, noisy: bool, sticky: boo
                 if sensor >= 0 and ((written >> k) & 1) == 0:
                     place = plan.spans[sensor][0] + lane
                     while place < press.end[env, sensor]:
-                        clear(faces, io, env, press.listed[env, place], wp.static(noisy))
+                        clear(faces, io, env, press.listed[env, place], wp.static(staged))
                         place += wp.static(lanes)
             if lane == 0:
                 # Sensors of several groups may sit on a link: the most that one of them lacks counts.

@@ -306,7 +306,7 @@ def kinematic_kernel(
                         if wp.static(sticky):
                             press.sigma[env, n] = sigma
                     else:
-                        clear(faces, io, env, n, wp.static(mode != CLEAN))
+                        clear(faces, io, env, n, wp.static(mode == STAGED))
                 else:
                     truth = wp.spatial_vectorf()
                     signal = wp.spatial_vectorf()
@@ -347,7 +347,7 @@ def measure_kernel(hysteresis: bool, walk: bool) -> Any:
     recall_six, emit_six = readout.recall_six, readout.emit_six
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, launch_bounds=(256, 4))
-    def measure(plan: SpreadPlan, probes: ProbeArrays, faces: ContactFaces, io: ReadoutArrays):
+    def measure(probes: ProbeArrays, faces: ContactFaces, io: ReadoutArrays):
         tid = wp.uint32(wp.tid())
         count = wp.uint32(probes.radius.shape[0])
         env = int(tid // count)
@@ -359,7 +359,7 @@ def measure_kernel(hysteresis: bool, walk: bool) -> Any:
         part = probes.part[n]
         # What nothing touches was not written.
         signal = wp.spatial_vectorf()
-        if faces.head[env, plan.link[part]] >= 0:
+        if faces.filled[env, n] != wp.uint8(0):
             signal = load_planes(io.measured, env, n, 6)
         probe = probes.probe[n]
         fixed = episode_draw(io.knobs[part], env + io.env_offset, probe, io.episode[env])

@@ -124,7 +124,7 @@ class ContactLoadRuntime(KinematicRuntime):
         # A few threads for the taxels of a link; as many groups of them as the GPU holds take the links in turn.
         most, items = max(part.count for part in self.slices.values()), envs * plan.links.shape[0]
         self._lanes = 1 if not cuda else 8 if most <= 64 else 16 if most <= 256 else 32
-        options = self.kinds, configs[0].query == "raycast", self.noisy, sticky, self._lanes
+        options = self.kinds, configs[0].query == "raycast", self.mode, sticky, self._lanes
         groups = 2048 // self._lanes * context.device.sm_count if cuda else 8
         self._spread = [(spread_kernel(*options, True), min(items, groups // 8))]
         if cuda:
@@ -162,7 +162,7 @@ class ContactLoadRuntime(KinematicRuntime):
             inputs = [plan, self.probes, *scene, c.solids.struct, c.pairs.struct, faces, self.press, groups, self.io]
             c.launch(kernel, groups * self._lanes, *inputs, block=32)
         if self.mode == FUSED:
-            c.launch(measure_kernel(*self.stores), c.num_envs * self.count, plan, self.probes, faces, self.io)
+            c.launch(measure_kernel(*self.stores), c.num_envs * self.count, self.probes, faces, self.io)
 
 
 def contact_reach(probes: Probes) -> np.ndarray:
