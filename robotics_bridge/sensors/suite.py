@@ -341,7 +341,7 @@ class SensorSuite:
         """Say once where taxels that add up to the engine's forces lack some of them, or of their moment, and why."""
         for number in np.flatnonzero(self.pairs.told.numpy() > self._lacked):
             self._lacked[number] = True
-            lack, load = self._lack(1 + number).nan_to_num(0.0), wp.to_torch(self.pairs.loads)[0]
+            lack, load = self._lack(1 + int(number)).nan_to_num(0.0), wp.to_torch(self.pairs.loads)[0]
             env, link = divmod(int((lack / load.clamp_min(1e-30)).argmax()), lack.shape[1])
             size, whole = float(lack[env, link]), float(load[env, link])
             if size > 0:

@@ -31,8 +31,10 @@ from robotics_bridge.sensors.kernels.pairs import PairArrays, SlotArrays, push_s
 from robotics_bridge.sensors.kernels.readout import (
     CLEAN,
     STAGED,
+    PressArrays,
     ProbeArrays,
     ReadoutArrays,
+    clear,
     group_functions,
     load_four,
     load_planes,
@@ -119,32 +121,12 @@ class ContactFaces:
     other carriers than those that touch (on a GPU)."""
     count: wp.array(dtype=wp.int32)
     """[2] how many."""
-    filled: wp.array2d(dtype=wp.uint8)
-    """[B, N] 1 where a reading is anything but zeros; elsewhere measured ones, before their noise, hold anything."""
     follower: wp.array(dtype=wp.int32)
     """[2 C] next node of the same face, −1 for none."""
     watched: wp.array(dtype=wp.int32)
     """[2 C] bit k: sensor k of the link looks at what pushes."""
     face: wp.array(dtype=Face)
     """[2 C]."""
-
-
-@wp.struct
-class PressArrays:
-    """Contact of every taxel."""
-
-    touch: wp.array2d(dtype=wp.vec4f)
-    """[B, N] outward normal m of what is touched, where a weight is above 0, and the weight d^α."""
-    noisy: wp.array2d(dtype=wp.float32)
-    """[B, N] the same weight with radius noise and gain."""
-    sigma: wp.array2d(dtype=wp.vec3f)
-    """[B, N] σ: friction at rest over normal force, where taxels hold what they touch."""
-    body: wp.array2d(dtype=wp.int32)
-    """[B, N] its link."""
-    listed: wp.array2d(dtype=wp.int32)
-    """[B, N] taxels with a weight, from the first place of their sensor on."""
-    end: wp.array2d(dtype=wp.int32)
-    """[B, S] place after the last of them."""
 
 
 @wp.struct
@@ -358,17 +340,6 @@ def belongs(faces: ContactFaces, head: int, face: int, x: wp.vec3f, m: wp.vec3f,
     return nearest == face
 
 
-@wp.func
-def clear(faces: ContactFaces, io: ReadoutArrays, env: int, n: int, staged: bool):
-    """Write a reading of zeros, if it is anything else."""
-    if faces.filled[env, n] != wp.uint8(0):
-        store_planes(io.truth, env, n, 6, wp.spatial_vectorf())
-        faces.filled[env, n] = wp.uint8(0)
-    # Stages after this one write into the measured readings, which are then never left alone.
-    if staged:
-        store_planes(io.measured, env, n, 6, wp.spatial_vectorf())
-
-
 @cache
 def spread_kernel(kinds: frozenset[int], raycast: bool, mode: int, sticky: bool, lanes: int, deep: bool) -> Any:
     """Return the kernel ``spread`` that writes readings and loads. Group of threads: link of an environment.
@@ -476,18 +447,10 @@ def spread_kernel(kinds: frozenset[int], raycast: bool, mode: int, sticky: bool,
         module_options={"fast_math": cuda and not raycast},
     )
     def spread(
-        plan: SpreadPlan,
-        probes: ProbeArrays,
-        link_of: wp.array(dtype=wp.int32),
-        state: StateArrays,
-        friction: wp.array(dtype=wp.vec3f),
-        solids: SolidArrays,
-        pairs: PairArrays,
-        faces: ContactFaces,
-        press: PressArrays,
-        stride: int,
-        io: ReadoutArrays,
-    ):
+        plan: SpreadPlan, probes: ProbeArrays, link_of: wp.array(dtype=wp.int32), state: StateArrays,
+        friction: wp.array(dtype=wp.vec3f), solids: SolidArrays, pairs: PairArrays, faces: ContactFaces,
+        press: PressArrays, stride: int, io: ReadoutArrays,
+    ):  # fmt: skip
         item = int(wp.uint32(wp.tid()) // wp.uint32(wp.static(lanes)))
         lane = int(wp.uint32(wp.tid()) % wp.uint32(wp.static(lanes)))
         many = plan.links.shape[0]
@@ -603,19 +566,6 @@ def spread_kernel(kinds: frozenset[int], raycast: bool, mode: int, sticky: bool,
                                 most = largest_of(most)
                             whole = first[1]
                             near = near or first[2] > 0.0
-                            if not near and source == wp.static(TOUCH):
-                                # Seldom is a taxel near that carries nothing.
-                                close = wp.vec3f()
-                                n = span[0] + lane
-                                while n < span[1]:
-                                    packed = load_four(probes.packed, n)
-                                    x = wp.vec3f(packed[0], packed[1], packed[2])
-                                    if gap_to(sphere, x) <= plan.reach[n]:
-                                        close[0] = 1.0
-                                    n += wp.static(lanes)
-                                if wp.static(cuda):
-                                    close = total_of(close)
-                                near = close[0] > 0.0
                             more = False
                             if whole > 0.0 and (near or source == wp.static(NEAR)):
                                 carried = True
@@ -693,9 +643,9 @@ def spread_kernel(kinds: frozenset[int], raycast: bool, mode: int, sticky: bool,
                                         if not fresh:
                                             reading += load_planes(io.measured, env, c.n, 6)
                                         store_planes(io.measured, env, c.n, 6, reading)
-                                    faces.filled[env, c.n] = wp.uint8(1)
+                                    press.filled[env, c.n] = wp.uint8(1)
                                 elif fresh:
-                                    clear(faces, io, env, c.n, wp.static(staged))
+                                    clear(press, io, env, c.n, wp.static(staged))
                                 place += wp.static(lanes)
                             if wp.static(cuda):
                                 total = total_of(total)
@@ -710,7 +660,7 @@ def spread_kernel(kinds: frozenset[int], raycast: bool, mode: int, sticky: bool,
                             rest[0] += wp.length(push.force)
                             node = faces.follower[node]
                         elif wp.static(deep):
-                            source = wp.where(near, source + 1, wp.static(NEAR))
+                            source += 1
                         else:
                             left = True
                             node = -1
@@ -730,7 +680,7 @@ def spread_kernel(kinds: frozenset[int], raycast: bool, mode: int, sticky: bool,
                 if sensor >= 0 and ((written >> k) & 1) == 0:
                     place = plan.spans[sensor][0] + lane
                     while place < press.end[env, sensor]:
-                        clear(faces, io, env, press.listed[env, place], wp.static(staged))
+                        clear(press, io, env, press.listed[env, place], wp.static(staged))
                         place += wp.static(lanes)
             if lane == 0:
                 # Sensors of several groups may sit on a link: the most that one of them lacks counts.

@@ -12,7 +12,7 @@ from functools import cache
 from typing import Any
 
 from brainbench.core.devices import warp
-from robotics_bridge.sensors.kernels.contact_load import ContactFaces, PressArrays, SpreadPlan, clear
+from robotics_bridge.sensors.kernels.contact_load import ContactFaces, SpreadPlan
 from robotics_bridge.sensors.kernels.distance import FAR, SIDED, SolidArrays, SolidShape, shape_functions
 from robotics_bridge.sensors.kernels.noise import NoiseParams, episode_draw, radius_noise
 from robotics_bridge.sensors.kernels.noise import power as series_power
@@ -21,8 +21,10 @@ from robotics_bridge.sensors.kernels.readout import (
     CLEAN,
     FUSED,
     STAGED,
+    PressArrays,
     ProbeArrays,
     ReadoutArrays,
+    clear,
     load_four,
     load_planes,
     readout_functions,
@@ -217,13 +219,13 @@ def kinematic_kernel(
             while n < span[1]:
                 silenced(io, 6, env, n, probes.radius[n])
                 if wp.static(summed):
-                    faces.filled[env, n] = wp.uint8(1)
+                    press.filled[env, n] = wp.uint8(1)
                 n += span[2]
             return
         if wp.static(summed):
             if faces.head[env, plan.link[part]] < 0:
                 while n < span[1]:
-                    clear(faces, io, env, n, wp.static(mode == STAGED))
+                    clear(press, io, env, n, wp.static(mode == STAGED))
                     n += span[2]
                 return
         slot = probes.slot[span[0]]
@@ -306,7 +308,7 @@ def kinematic_kernel(
                         if wp.static(sticky):
                             press.sigma[env, n] = sigma
                     else:
-                        clear(faces, io, env, n, wp.static(mode == STAGED))
+                        clear(press, io, env, n, wp.static(mode == STAGED))
                 else:
                     truth = wp.spatial_vectorf()
                     signal = wp.spatial_vectorf()
@@ -347,7 +349,7 @@ def measure_kernel(hysteresis: bool, walk: bool) -> Any:
     recall_six, emit_six = readout.recall_six, readout.emit_six
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, launch_bounds=(256, 4))
-    def measure(probes: ProbeArrays, faces: ContactFaces, io: ReadoutArrays):
+    def measure(probes: ProbeArrays, press: PressArrays, io: ReadoutArrays):
         tid = wp.uint32(wp.tid())
         count = wp.uint32(probes.radius.shape[0])
         env = int(tid // count)
@@ -359,7 +361,7 @@ def measure_kernel(hysteresis: bool, walk: bool) -> Any:
         part = probes.part[n]
         # What nothing touches was not written.
         signal = wp.spatial_vectorf()
-        if faces.filled[env, n] != wp.uint8(0):
+        if press.filled[env, n] != wp.uint8(0):
             signal = load_planes(io.measured, env, n, 6)
         probe = probes.probe[n]
         fixed = episode_draw(io.knobs[part], env + io.env_offset, probe, io.episode[env])

@@ -143,6 +143,37 @@ class ReadoutArrays:
     """Time step (s)."""
 
 
+@wp.struct
+class PressArrays:
+    """Contact of every taxel."""
+
+    touch: wp.array2d(dtype=wp.vec4f)
+    """[B, N] outward normal m of what is touched, where a weight is above 0, and the weight d^α."""
+    noisy: wp.array2d(dtype=wp.float32)
+    """[B, N] the same weight with radius noise and gain."""
+    sigma: wp.array2d(dtype=wp.vec3f)
+    """[B, N] σ: friction at rest over normal force, where taxels hold what they touch."""
+    body: wp.array2d(dtype=wp.int32)
+    """[B, N] its link."""
+    listed: wp.array2d(dtype=wp.int32)
+    """[B, N] taxels with a weight, from the first place of their sensor on."""
+    end: wp.array2d(dtype=wp.int32)
+    """[B, S] place after the last of them."""
+    filled: wp.array2d(dtype=wp.uint8)
+    """[B, N] 1 where a reading is anything but zeros; elsewhere measured ones, before their noise, hold anything."""
+
+
+@wp.func
+def clear(press: PressArrays, io: ReadoutArrays, env: int, n: int, staged: bool):
+    """Write a reading of zeros, if it is anything else."""
+    if press.filled[env, n] != wp.uint8(0):
+        store_planes(io.truth, env, n, 6, wp.spatial_vectorf())
+        press.filled[env, n] = wp.uint8(0)
+    # Stages after this one write into the measured readings, which are then never left alone.
+    if staged:
+        store_planes(io.measured, env, n, 6, wp.spatial_vectorf())
+
+
 @wp.func
 def silenced(io: ReadoutArrays, channels: int, env: int, n: int, radius: float) -> bool:
     """Write the reading of a filler (radius 0), zero, or in a diverged environment, NaN; return False for others."""

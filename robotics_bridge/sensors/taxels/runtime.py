@@ -14,7 +14,6 @@ from robotics_bridge.sensors.context import fill
 from robotics_bridge.sensors.kernels.contact_load import (
     ContactFaces,
     Face,
-    PressArrays,
     SpreadPlan,
     join_faces,
     list_contacts,
@@ -22,7 +21,7 @@ from robotics_bridge.sensors.kernels.contact_load import (
 )
 from robotics_bridge.sensors.kernels.kinematic import KinematicParams, StickArrays, kinematic_kernel, measure_kernel
 from robotics_bridge.sensors.kernels.proximity import ProximityArrays, ProximityParams, proximity_kernel
-from robotics_bridge.sensors.kernels.readout import FUSED
+from robotics_bridge.sensors.kernels.readout import FUSED, PressArrays
 from robotics_bridge.sensors.probes.placement import Probes
 from robotics_bridge.sensors.queries.solids import list_by_cells, sample_cloud
 from robotics_bridge.sensors.runtime import ProbeRuntime, SuiteContext, probe_rows
@@ -139,7 +138,7 @@ class ContactLoadRuntime(KinematicRuntime):
         faces = self.faces
         faces.head, faces.listed = (context.array(np.full((envs, len(places)), -1), int) for _ in range(2))
         faces.items, faces.count = context.zeros((2, items), wp.vec2i), context.zeros(2, int)
-        faces.filled = context.zeros(shape, wp.uint8)
+        press.filled = context.zeros(shape, wp.uint8)
         self._room(0)
 
     def _room(self, contacts: int) -> None:
@@ -162,7 +161,7 @@ class ContactLoadRuntime(KinematicRuntime):
             inputs = [plan, self.probes, *scene, c.solids.struct, c.pairs.struct, faces, self.press, groups, self.io]
             c.launch(kernel, groups * self._lanes, *inputs, block=32)
         if self.mode == FUSED:
-            c.launch(measure_kernel(*self.stores), c.num_envs * self.count, self.probes, faces, self.io)
+            c.launch(measure_kernel(*self.stores), c.num_envs * self.count, self.probes, self.press, self.io)
 
 
 def contact_reach(probes: Probes) -> np.ndarray:
