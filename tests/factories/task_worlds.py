@@ -31,6 +31,7 @@ class TouchWorld:
             groups={"student": student},
             taxel_twist=None,
             action_limit=None,
+            starts=None,
             command=("on",),
             contacts=ContactModel(),
             decoders=(SimpleNamespace(target="aux_aim", weight=0.5, scale=2.0, hidden=(16,)),),
