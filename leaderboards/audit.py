@@ -71,9 +71,8 @@ def names_of(record: ResultRecord) -> list[tuple[str, str]]:
 
 def conflicting(record: ResultRecord, others: Iterable[ResultRecord]) -> Iterator[ResultRecord]:
     """Yield those of ``others`` that state the same computation as ``record`` and other numbers."""
-    key = ScoreIdentity.of(record)
-    rivals = (rival for rival in others if not _agree(record, rival) and ScoreIdentity.of(rival) == key)
-    return (rival for rival in rivals if rival.identity != record.identity)
+    rivals = (rival for rival in others if rival.identity != record.identity and not _agree(record, rival))
+    return (rival for rival in rivals if ScoreIdentity.of(rival) == ScoreIdentity.of(record))
 
 
 def _stale(record: ResultRecord, newest: dict[tuple[Any, ...], tuple[str, str]]) -> list[str]:
@@ -109,11 +108,10 @@ def _newest_stimuli(records: list[ResultRecord]) -> dict[tuple[Any, ...], tuple[
 
 def _agree(left: ResultRecord, right: ResultRecord) -> bool:
     a, b = left.score, right.score
-    same = all(
+    return a.status == b.status and all(
         (math.isnan(x) and math.isnan(y)) or abs(x - y) <= TOLERANCE
         for x, y in ((a.value, b.value), (a.r, b.r), (a.reliability, b.reliability))
     )
-    return same and a.status == b.status
 
 
 def _value(record: ResultRecord) -> str:

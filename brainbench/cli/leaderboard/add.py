@@ -97,10 +97,9 @@ def _question(record: ResultRecord) -> str:
 
     origin = record.score.provenance
     # Files of one name hold other days of the same animals; a demo is known by its name, in each of its versions.
-    source = origin.recordings.get("source")
+    source, title = (origin.recordings.get(name) for name in ("source", "title"))
     brain = source if record.synthetic and str(source) in DEMOS else origin.recordings_hash
-    title, settings = origin.recordings.get("title"), asked_settings(origin.settings)
-    return to_json([record.score.name, title, brain, origin.pairing, settings])
+    return to_json([record.score.name, title, brain, origin.pairing, asked_settings(origin.settings)])
 
 
 def command_of(job: ScoringJob) -> str:
