@@ -27,7 +27,7 @@ from brainbench.metrics.measures.rsa import lacking, parted
 from brainbench.metrics.rdms.comparison import permuted_pairs, rdm_stack, stimulus_count, upper
 from brainbench.metrics.rdms.dissimilarity import rdm
 from brainbench.metrics.reliability.noise_correction import Corrected, gated
-from brainbench.metrics.reliability.subject_rdm import SubjectRDM
+from brainbench.metrics.reliability.subject_rdm import SubjectRDM, unit_order
 from brainbench.metrics.stimulus_labels import stimulus_codes, stimulus_means
 
 
@@ -460,6 +460,11 @@ class SoftMatching(UnitMatching):
 
     name = "soft-matching"
     title = "mean correlation over stimuli of units and features of equal masses, matched by optimal transport"
+
+    def partner(self, animal: SubjectRDM, others: Sequence[SubjectRDM]) -> Floats:
+        """Return the others' units in an order that follows from their responses: a sample of them is taken."""
+        units = super().partner(animal, others)
+        return units[:, unit_order(np.sort(units, axis=0), units[:0])]
 
     def chosen(self, features: int, units: int) -> Ints:
         """Return a sample of the features, a multiple of the units in number where there are as many."""

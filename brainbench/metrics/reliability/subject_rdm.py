@@ -308,7 +308,7 @@ def denoised(patterns: Floats, noise: Floats) -> Floats:
         patterns: [K, U] mean responses.
         noise: [K, U] variance of these means.
     """
-    mean, order = patterns.mean(axis=0), _unit_order(patterns, noise)
+    mean, order = patterns.mean(axis=0), unit_order(patterns, noise)
     centred, spread = (patterns - mean)[:, order], np.sqrt(np.maximum(noise, 0.0))[:, order]
     count = min(len(patterns) - 1, patterns.shape[1])
     observed, vectors = (part[..., ::-1] for part in np.linalg.eigh(centred @ centred.T))
@@ -336,7 +336,7 @@ def denoised(patterns: Floats, noise: Floats) -> Floats:
     return mean + ((vectors * np.sqrt(values)) @ units)[:, np.argsort(order)]
 
 
-def _unit_order(patterns: Floats, noise: Floats) -> Ints:
+def unit_order(patterns: Floats, noise: Floats) -> Ints:
     """Return an order of the units that does not depend on how they were listed."""
     # Rounding makes no order.
     scale = np.abs(patterns).max(initial=0.0) or 1.0
@@ -345,7 +345,7 @@ def _unit_order(patterns: Floats, noise: Floats) -> Ints:
 
 def simulated_animals(animal: SubjectRDM, seed: int) -> tuple[Floats, list[SubjectRDM]]:
     """Return an animal's responses without noise [K, U], and copies of the animal with new noise on them."""
-    units = _unit_order(animal.patterns, animal.noise)
+    units = unit_order(animal.patterns, animal.noise)
     animal = replace(animal, patterns=animal.patterns[:, units], noise=animal.noise[:, units])
     truth = denoised(animal.patterns, animal.noise)
     generator = np.random.default_rng(seed)
