@@ -3,9 +3,10 @@
 A data set (layout v3.0) is written with our own Parquet and JSON; lerobot itself is not needed. Per frame:
 ``observation.state`` (joint positions, rad), ``observation.velocity``, ``action`` (joint targets, rad),
 ``observation.tactile`` [N, 6] (force and torque of each point, link frame, about the link's origin) and
-``observation.wrench`` [6] (their sum in the palm's frame, about its origin). Where the points sit, and the unit of the
-forces, stands once in ``meta/tactile.json``. Arrays of two axes are nested lists, as LeRobot stores them. A session is
-one episode.
+``observation.wrench`` [6] (their sum in the palm's frame, about its origin). A session has ``observation.time`` too (s
+since the first frame, by the hand's clock), since LeRobot's time stamps count frames at an even rate. Where the points
+sit, and the unit of the forces, stands once in ``meta/tactile.json``. Arrays of two axes are nested lists, as LeRobot
+stores them. A session is one episode.
 
 A log is a LeRobot episode (layouts v2 and v3) or a table of comma-separated numbers: ``time`` (s), joints by name (rad)
 and taxels as ``LINK:NUMBER`` (N along the inward normal), numbered as the hand's layout has them. Letters: T frame,
@@ -51,6 +52,7 @@ from robotics_bridge.sensors import KinematicTaxel, Probes, SensorSuite
 VERSION = "v3.0"
 PARTS = ("observation.state", "observation.velocity", "action", "observation.tactile", "observation.wrench")
 """What is recorded in each frame."""
+TIME = "observation.time"
 _DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 
 
@@ -89,6 +91,8 @@ class SessionRecorder:
         self.hand, self.contract, self.folder = hands.load(contract.hand), contract, folder
         self.frames: list[tuple[NDArray[np.floating], ...]] = []
         """:data:`PARTS` of each tick."""
+        self.times: list[float] = []
+        """When each was measured, by the hand's clock (s)."""
 
     def begin(self, joints: Sequence[str], fingers: Sequence[str]) -> SessionRecorder:
         """Take in the joints of a hand and the fingers that it senses, in the order of its reports; return itself."""
@@ -114,12 +118,14 @@ class SessionRecorder:
         points = np.concatenate([force, torque], axis=1)
         wrench = total_wrench(points, self.points.links, self.axes)
         self.frames.append((reading.position, reading.velocity, targets, points, wrench))
+        self.times.append(reading.time)
 
     def write(self) -> Path | None:
         """Write the session as a data set (:func:`write_lerobot`) and return its folder; None if no tick was kept."""
         if not self.frames:
             return None
         frames = {name: np.array([frame[part] for frame in self.frames]) for part, name in enumerate(PARTS)}
+        frames[TIME] = np.array(self.times)[:, None] - self.times[0]
         session = SessionFacts(
             task=self.contract.task or "deployed policy", fps=self.contract.rate, joints=self.joints,
             points=self.points, robot=self.hand.name, unit="unit of the hand's pressure",
@@ -160,7 +166,7 @@ def write_lerobot(folder: Path, frames: Mapping[str, NDArray[np.floating]], sess
 
     Args:
         folder: Where to; must not exist or be empty.
-        frames: :data:`PARTS` by name, [T, J], [T, N, 6] and [T, 6]; at least one frame.
+        frames: :data:`PARTS` by name, [T, J], [T, N, 6] and [T, 6], and if known :data:`TIME` [T, 1]; at least one.
         session: What is said of it.
     """
     task, fps, joints, points = session.task, session.fps, session.joints, session.points
@@ -168,7 +174,7 @@ def write_lerobot(folder: Path, frames: Mapping[str, NDArray[np.floating]], sess
     import pandas
 
     sizes: list[tuple[int, ...]] = [*[(len(joints),)] * 3, (len(points.links), 6), (6,)]
-    shapes: dict[str, tuple[int, ...]] = dict(zip(PARTS, sizes, strict=True))
+    shapes: dict[str, tuple[int, ...]] = dict(zip(PARTS, sizes, strict=True)) | ({TIME: (1,)} if TIME in frames else {})
     table, length = _columns(frames, fps, shapes), len(frames[PARTS[0]])
     _write_frames(folder / _DATA.format(chunk_index=0, file_index=0), table, shapes)
     stats: dict[str, dict[str, list[Any]]] = {}
@@ -192,7 +198,11 @@ def write_lerobot(folder: Path, frames: Mapping[str, NDArray[np.floating]], sess
         with atomic_path(folder / "meta" / f"{file}.parquet") as temporary:
             rows.to_parquet(temporary)
     write_json(folder / "meta" / "stats.json", stats)
-    names = {"observation.tactile": ["point", "channel"], "observation.wrench": ["Fx", "Fy", "Fz", "Mx", "My", "Mz"]}
+    names = {
+        "observation.tactile": ["point", "channel"],
+        "observation.wrench": ["Fx", "Fy", "Fz", "Mx", "My", "Mz"],
+        TIME: ["s"],
+    }
     features: dict[str, Any] = {
         name: {"dtype": "float32", "shape": list(shape), "names": names.get(name, list(joints))}
         for name, shape in shapes.items()
@@ -459,7 +469,7 @@ def _read_episode(folder: Path, hand: Hand, layout: Layout, episode: int) -> Tou
             "their places into meta/tactile.json, or choose --placement and --resolution."
         )
     force = tactile if tactile.ndim == 2 else -(tactile[..., :3] * points.normal).sum(axis=-1)
-    time = np.asarray(frames["timestamp"], float)
+    time = _stacked(frames, TIME, name)[:, 0] if TIME in features else np.asarray(frames["timestamp"], float)
     return TouchLog(name, time, tuple(joints), position, target, points, force, unit)
 
 
