@@ -105,20 +105,8 @@ def _data_set(source: Path, out: Path) -> dict[str, Any]:
     from brainbench.published import conversion
 
     tree = conversion.open_sweep_tree(source)
-    table = conversion.SweepTable(
-        label=tree.listed.label,
-        object=tree.listed.shape,
-        split=tree.split,
-        conditions=tree.conditions(),
-        classes=tree.classes,
-        times=tree.times,
-        source=f"published sweeps, {tree.rate} Hz",
-        source_hash=tree.content_hash,
-        read=tree.wrenches,
-        notes={"left_out": tree.left_out, "faults": tree.faults},
-    )
     with progress_bar() as progress:
-        manifest = conversion.convert_sweeps(table, out, progress=progress)
+        manifest = conversion.convert_sweeps(tree, out, progress=progress)
     about = ("sweeps", "splits", "left_out", "faults", "unstable", "content_hash", "config_hash")
     summary = {"rate_hz": tree.rate, "classes": len(tree.classes), **_frames(tree.times)}
     return {"kind": "data set", **summary, **{name: manifest[name] for name in about}}

@@ -140,130 +140,6 @@ def assemble_stimulus_set(
     return check_stimulus_set(dataset)
 
 
-@dataclass(frozen=True, eq=False)
-class SweepTable:
-    """Facts about the sweeps of a data set; arrays have one entry per sweep."""
-
-    label: NDArray[np.integer]
-    """Index into ``classes``."""
-    object: NDArray[np.str_]
-    """Name of the object."""
-    split: NDArray[np.str_]
-    """One of :data:`~brainbench.stimuli.sweeps.plan.SPLITS`."""
-    conditions: Mapping[str, NDArray[np.float64]]
-    """Speed, height, rotation, distance and size, as in :class:`~brainbench.stimuli.sweeps.sweep_scenes.Sweep`."""
-    classes: tuple[str, ...]
-    times: NDArray[np.float64]
-    """Times of the frames [s]."""
-    source: str
-    """Description of where the sweeps come from."""
-    source_hash: str
-    """Hash of everything that their files say."""
-    read: Callable[[NDArray[np.int64]], NDArray[np.float32]]
-    """Function from numbers of sweeps to their forces [sweep, frame, whisker, 6] (N, N·m; NaN where they cannot be
-    trusted) of the 30 whiskers of the mouse's right side, in the order of that array."""
-    notes: Mapping[str, Any]
-    """Further entries of the manifest, such as counts of faults."""
-    shard_size: int = USUAL_SHARD
-
-    def __post_init__(self) -> None:
-        names, owner = np.unique(self.object, return_inverse=True)
-        pairs = np.unique(np.stack([owner, self.label], axis=1), axis=0)
-        if len(pairs) > len(names):
-            twice = np.flatnonzero(np.bincount(pairs[:, 0]) > 1)[0]
-            labels = pairs[pairs[:, 0] == twice, 1].tolist()
-            raise DataError(f"The object {str(names[twice])!r} has the labels {labels}; an object has one label.")
-
-    @property
-    def sweeps(self) -> int:
-        """Number of sweeps."""
-        return len(self.label)
-
-    @cached_property
-    def array(self) -> WhiskerArray:
-        """The whiskers."""
-        return WhiskerArray.mouse()
-
-    @cached_property
-    def config(self) -> dict[str, Any]:
-        """Plain values that determine every byte of the data set."""
-        return {
-            "format": SWEEPS_FORMAT, "schema": SWEEPS_SCHEMA, "version": __version__, "recipe": self.source,
-            "source": self.source_hash, "whiskers": {"names": list(self.array.names)},
-            "classes": list(self.classes), "shard_size": self.shard_size,
-        }  # fmt: skip
-
-    @cached_property
-    def config_hash(self) -> str:
-        """Hash of :attr:`config`."""
-        return content_hash(self.config)
-
-    @property
-    def objects(self) -> dict[str, NamedObject]:
-        """The objects by name; only their names are known."""
-        names, first = np.unique(self.object, return_index=True)
-        labels = [self.classes[label] for label in self.label[first].tolist()]
-        pairs = zip(names.tolist(), labels, strict=True)
-        return {name: NamedObject(name, label, self.source, partial(_no_solid, name)) for name, label in pairs}
-
-    @cached_property
-    def shards(self) -> tuple[PlannedShard, ...]:
-        """The shards, those of training first, in the order of the table."""
-        objects_by_name, shards = self.objects, []
-        for split in SPLITS:
-            mine = np.flatnonzero(self.split == split)
-            for place, first in enumerate(range(0, len(mine), self.shard_size)):
-                index = mine[first : first + self.shard_size]
-                objects = tuple(objects_by_name[name] for name in np.unique(self.object[index]).tolist())
-                shard = PlannedShard(
-                    split=split, place=place, objects=objects, index=index, frames=len(self.times), config=self.config,
-                    config_hash=self.config_hash,
-                )  # fmt: skip
-                shards.append(shard)
-        return tuple(shards)
-
-    def content(self, shard: PlannedShard) -> ShardContent:
-        """Read the sweeps of a shard; a whisker with missing values is marked as unstable."""
-        index = shard.index
-        wrench = np.ascontiguousarray(self.read(index), dtype="<f4")
-        bad = ~np.isfinite(wrench)
-        status = np.where(bad.any(axis=(1, 3)), UNSTABLE, OK).astype(np.uint8)
-        names = [item.name for item in shard.objects]
-        arrays = {
-            **shard_tables(shard, self.array, self.times, [""] * len(names)),
-            "sweep": index.astype(np.int64),
-            "label": self.label[index].astype(np.int32),
-            "owner": np.searchsorted(names, self.object[index]).astype(np.int32),
-            **{name: np.asarray(values[index], dtype=np.float64) for name, values in self.conditions.items()},
-            "draw": np.zeros(len(index), dtype=np.int32),
-            # Which whiskers touch is in no file of theirs.
-            "contact": np.full(status.shape, np.nan, dtype=np.float32),
-            "status": status,
-            "reason": encode_texts(f"{n} values cannot be trusted" if n else "" for n in bad.sum(axis=(1, 2, 3))),
-            "wrench": wrench,
-        }
-        return ShardContent(shard, arrays, shard_attributes(shard, "world", status, dict.fromkeys(COUNTS, 0)))
-
-
-def convert_sweeps(
-    table: SweepTable, out: str | os.PathLike[str], *, progress: Progress | None = None
-) -> dict[str, Any]:
-    """Write a data set of sweeps, one shard in memory at a time, and return its manifest.
-
-    A run that was killed goes on when it is started again, and ends with the same bytes.
-    """
-
-    def run(missing: Sequence[PlannedShard], folder: Path, done: Callable[[int], None]) -> None:
-        for shard in missing:
-            done(write_shard(table.content(shard), folder))
-
-    return write_data_set(table, out, run, what="converting sweeps", progress=progress)
-
-
-def _no_solid(name: str) -> Solid:
-    raise DataError(f"Of the object {name!r} no more is known than its name.")
-
-
 FRAMES = 110
 EMPTY_CELLS = (5, 6, 12, 13, 34)
 CELLS = np.setdiff1d(np.arange(GRID_SHAPE[0] * GRID_SHAPE[1]), EMPTY_CELLS)
@@ -392,7 +268,10 @@ class Listed(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class SweepTree:
-    """The labelled sweeps of a folder, those of training first, in the order of their names."""
+    """The labelled sweeps of a folder, those of training first, in the order of their names.
+
+    They are read where they are (:meth:`open_shard`), or planned as the shards of a data set of ours.
+    """
 
     folder: Path
     listed: Listed
@@ -402,6 +281,7 @@ class SweepTree:
     """Names by the number in the files."""
     left_out: int
     """Sweeps without a label."""
+    shard_size: int = USUAL_SHARD
 
     @property
     def rate(self) -> int:
@@ -419,7 +299,7 @@ class SweepTree:
         """Values with each known fault, in all sweeps."""
         return dict(zip(FAULTS, self.listed.faults.sum(axis=0).tolist(), strict=True))
 
-    @functools.cached_property
+    @cached_property
     def content_hash(self) -> str:
         """Hash of the content of all files, their labels and splits."""
         return content_hash(self.listed.path.tolist(), self.listed.digest.tolist(), self.classes, _VERSION)
@@ -438,12 +318,89 @@ class SweepTree:
         return {
             "content_hash": self.content_hash,
             "classes": list(self.classes),
-            "sweeps": len(self.split),
-            "left_out": self.left_out,
-            "faults": self.faults,
+            "sweeps": self.sweeps,
+            **self.notes,
             "splits": {name: {"sweeps": sizes[name]} for name in dict.fromkeys(FOLDERS.values())},
             "shards": [{"name": name, "split": name, "sweeps": size} for name, size in sizes.items()],
         }
+
+    @property
+    def sweeps(self) -> int:
+        """Number of sweeps."""
+        return len(self.split)
+
+    @property
+    def notes(self) -> dict[str, Any]:
+        """What a manifest says of sweeps that are left out and of known faults."""
+        return {"left_out": self.left_out, "faults": self.faults}
+
+    @cached_property
+    def array(self) -> WhiskerArray:
+        """The whiskers."""
+        return WhiskerArray.mouse()
+
+    @cached_property
+    def config(self) -> dict[str, Any]:
+        """Plain values that determine every byte of the data set."""
+        return {
+            "format": SWEEPS_FORMAT, "schema": SWEEPS_SCHEMA, "version": __version__,
+            "recipe": f"published sweeps, {self.rate} Hz", "source": self.content_hash,
+            "whiskers": {"names": list(self.array.names)}, "classes": list(self.classes),
+            "shard_size": self.shard_size,
+        }  # fmt: skip
+
+    @cached_property
+    def config_hash(self) -> str:
+        """Hash of :attr:`config`."""
+        return content_hash(self.config)
+
+    @property
+    def objects(self) -> dict[str, NamedObject]:
+        """The objects by name; only their names are known."""
+        labels = dict(zip(self.listed.shape.tolist(), self.listed.label.tolist(), strict=True))
+        source = self.config["recipe"]
+        return {
+            name: NamedObject(name, self.classes[label], source, partial(_no_solid, name))
+            for name, label in sorted(labels.items())
+        }
+
+    @cached_property
+    def shards(self) -> tuple[PlannedShard, ...]:
+        """The shards, those of training first, in the order of the table."""
+        objects_by_name, shards = self.objects, []
+        for split in SPLITS:
+            mine = np.flatnonzero(self.split == split)
+            for place, first in enumerate(range(0, len(mine), self.shard_size)):
+                index = mine[first : first + self.shard_size]
+                objects = tuple(objects_by_name[name] for name in np.unique(self.listed.shape[index]).tolist())
+                shard = PlannedShard(
+                    split=split, place=place, objects=objects, index=index, frames=len(self.times), config=self.config,
+                    config_hash=self.config_hash,
+                )  # fmt: skip
+                shards.append(shard)
+        return tuple(shards)
+
+    def content(self, shard: PlannedShard) -> ShardContent:
+        """Read the sweeps of a shard; a whisker with missing values is marked as unstable."""
+        index = shard.index
+        wrench = np.ascontiguousarray(self.wrenches(index), dtype="<f4")
+        bad = ~np.isfinite(wrench)
+        status = np.where(bad.any(axis=(1, 3)), UNSTABLE, OK).astype(np.uint8)
+        names = [item.name for item in shard.objects]
+        arrays = {
+            **shard_tables(shard, self.array, self.times, [""] * len(names)),
+            "sweep": index.astype(np.int64),
+            "label": self.listed.label[index].astype(np.int32),
+            "owner": np.searchsorted(names, self.listed.shape[index]).astype(np.int32),
+            **{name: np.asarray(values[index], dtype=np.float64) for name, values in self.conditions().items()},
+            "draw": np.zeros(len(index), dtype=np.int32),
+            # Which whiskers touch is in no file of theirs.
+            "contact": np.full(status.shape, np.nan, dtype=np.float32),
+            "status": status,
+            "reason": encode_texts(f"{n} values cannot be trusted" if n else "" for n in bad.sum(axis=(1, 2, 3))),
+            "wrench": wrench,
+        }
+        return ShardContent(shard, arrays, shard_attributes(shard, "world", status, dict.fromkeys(COUNTS, 0)))
 
     def open_shard(self, split: str) -> FileShard:
         """Return the sweeps of one split as a shard."""
@@ -573,3 +530,26 @@ def _classes(root: Path, listed: Listed) -> tuple[str, ...]:
         choices = [name for name in choices if owners[name] == 1] + [*shapes[number]] * (len(shapes[number]) == 1)
         names.append(choices[0] if choices else f"class-{number}")
     return tuple(names)
+
+
+def convert_sweeps(tree: SweepTree, out: str | os.PathLike[str], *, progress: Progress | None = None) -> dict[str, Any]:
+    """Write a data set of sweeps, one shard in memory at a time, and return its manifest.
+
+    A run that was killed goes on when it is started again, and ends with the same bytes.
+    """
+    labels: defaultdict[str, set[int]] = defaultdict(set)
+    for name, label in zip(tree.listed.shape.tolist(), tree.listed.label.tolist(), strict=True):
+        labels[name].add(label)
+    for name, several in sorted(labels.items()):
+        if len(several) > 1:
+            raise DataError(f"The object {name!r} has the labels {sorted(several)}; an object has one label.")
+
+    def run(missing: Sequence[PlannedShard], folder: Path, done: Callable[[int], None]) -> None:
+        for shard in missing:
+            done(write_shard(tree.content(shard), folder))
+
+    return write_data_set(tree, out, run, what="converting sweeps", progress=progress)
+
+
+def _no_solid(name: str) -> Solid:
+    raise DataError(f"Of the object {name!r} no more is known than its name.")
