@@ -15,6 +15,7 @@ import math
 import os
 import re
 import resource
+import select
 import shlex
 import shutil
 import signal
@@ -31,7 +32,7 @@ from typing import Any
 import torch
 
 from tests.factories.forks import fork, sentences
-from tests.factories.reading_trials import LONGEST, not_finite
+from tests.factories.reading_trials import LONGEST, not_finite, numbers
 from tests.factories.structures import restructure
 
 FAILURES = ("traceback", "hang", "crash", "silent", "leaked", "half-written", "wordy")
@@ -173,18 +174,16 @@ def _text(path: Path) -> str:
 
 def _wait(child: int) -> int | None:
     """Return the exit status of a process, negative for a signal; None where its time was over."""
-    end, pause = time.monotonic() + PATIENCE, 0.002
-    while time.monotonic() < end:
-        ended, status = os.waitpid(child, os.WNOHANG)
-        if ended:
-            return os.waitstatus_to_exitcode(status)
-        time.sleep(pause := min(2 * pause, 0.05))
-    with suppress(ProcessLookupError):
-        os.kill(child, signal.SIGABRT)  # it says where it stands
-        time.sleep(1)
-        os.killpg(child, signal.SIGKILL)
-    os.waitpid(child, 0)
-    return None
+    process = os.pidfd_open(child)
+    ended = bool(select.select([process], [], [], PATIENCE)[0])
+    os.close(process)
+    if not ended:
+        with suppress(ProcessLookupError):
+            os.kill(child, signal.SIGABRT)  # it says where it stands
+            time.sleep(1)
+            os.killpg(child, signal.SIGKILL)
+    status = os.waitpid(child, 0)[1]
+    return os.waitstatus_to_exitcode(status) if ended else None
 
 
 def _files(folder: Path) -> set[Path]:
@@ -201,16 +200,7 @@ def _odd(out: str) -> bool:
         value = json.loads(out, parse_constant=lambda word: math.inf)
     except ValueError:
         return False
-    return any(abs(number) > LARGEST for number in _numbers(value))
-
-
-def _numbers(value: Any) -> Iterator[float]:
-    if isinstance(value, bool):
-        return
-    if isinstance(value, (int, float)):
-        yield value
-    for inner in value.values() if isinstance(value, dict) else value if isinstance(value, list) else ():
-        yield from _numbers(inner)
+    return any(abs(number) > LARGEST for number in numbers(value, depth=99))
 
 
 def _layout(path: Path) -> Any:
