@@ -25,7 +25,7 @@ from brainbench.published.estimator import explain_file
 from tests.factories.published_files import lightning_state
 from tests.factories.published_recordings import make_zero_filled, write_published
 from tests.factories.published_sweeps import write_sweep
-from tests.factories.reading_trials import Surface, bad_counts, not_finite, numbers
+from tests.factories.reading_trials import Surface, bad_counts, not_finite, numbers, written
 
 SETTINGS = """
 model:
@@ -84,15 +84,6 @@ def _bad_sweep(sweep: SweepFile) -> bool:
     return not_finite(sweep.conditions) or np.isinf(sweep.wrench()).any() or not 0 <= label < 2**31
 
 
-def _settings(folder: Path) -> Path:
-    (folder / "config.yaml").write_text(SETTINGS)
-    return folder / "config.yaml"
-
-
-def _bad_steps(steps: Any) -> bool:
-    return any(np.isinf(number) for number in numbers(steps))
-
-
 PUBLISHED = (
     Surface("published recordings, npz", _recordings, open_recordings, bad_counts),
     Surface("published sweep, npz", lambda folder: write_sweep(folder / "0.npz"), read_sweep, _bad_sweep),
@@ -102,8 +93,8 @@ PUBLISHED = (
         lambda path: open_sweep_tree(path.parent).classes,
         lambda names: len(names) > 1000,
     ),
-    Surface("split halves, npz", _halves, explain_file, _bad_steps),
+    Surface("split halves, npz", _halves, explain_file, lambda steps: np.isinf([*numbers(steps)]).any()),
     Surface("published weights, ckpt", _checkpoint, _import),
     Surface("published weights, imported", _checkpoint, _import_to_folder),
-    Surface("published settings, YAML", _settings, read_settings),
+    Surface("published settings, YAML", written("config.yaml", SETTINGS), read_settings),
 )

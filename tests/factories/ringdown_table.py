@@ -24,6 +24,5 @@ def write_ringdown(path: Path) -> Path:
     head = ",".join(["time_ms", *(f"{name}_mN" if name[0] == "F" else f"{name}_uNm" for name in names)])
     factor = [1e3 if name[0] == "F" else 1e6 for name in names]
     table = np.column_stack([1e3 * measured["time"].values, measured["wrench"].values * factor])
-    rows = (",".join(f"{cell:.9g}" for cell in row) for row in table)
-    path.write_text(head + "\n" + "\n".join(rows) + "\n", encoding="utf-8")
+    np.savetxt(path, table, delimiter=",", header=head, comments="", fmt="%.9g")
     return path

@@ -101,18 +101,9 @@ def touching(envs: int = 1, height: float = 0.0145) -> np.ndarray:
     return poses_at(3, {2: (0.001, -0.002, height)}, envs)
 
 
-FREE_BALL = Geometry(name="ball", link="ball", kind="sphere", size=(0.01,))
-
-
-def free_suite(*, num_envs: int = 1, **sensors) -> SensorSuite:
-    """Return a suite of sensors on a pad beside a ball that is its own link."""
-    return SensorSuite(pad_scene(FREE_BALL), sensors, num_envs=num_envs)
-
-
 def ball_state(*heights: float) -> HandState:
-    """Return a state in which that ball touches the pad, at a height in each environment (m)."""
-    poses = np.concatenate([poses_at(3, {2: (0, 0, height)}) for height in heights])
-    return state_of(pad_scene(FREE_BALL), poses)
+    """Return a state in which the ball touches the pad, at a height in each environment (m)."""
+    return state_of(pad_scene(BALL), np.concatenate([touching(height=height) for height in heights]))
 
 
 PLAIN = ThermalMaterial(2.0, 1000.0, 1000.0, 0.8)

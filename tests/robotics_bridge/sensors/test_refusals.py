@@ -29,7 +29,7 @@ from robotics_bridge.sensors.audio.runtime import joint_drive
 from robotics_bridge.sensors.audio.sensors import Modes
 from robotics_bridge.sensors.taxels.elastomer import contact_pressure
 from robotics_bridge.sensors.temperature.materials import ThermalBody
-from tests.factories.touch_scenes import FREE_BALL, ball_state, free_suite, pad_scene
+from tests.factories.touch_scenes import ball_state, suite_of
 
 PROBE = Probes([[0, 0, 0.005]], [[0, 0, 1.0]], 0.002)
 GRID = {"rows": 2, "columns": 2, "size": (0.01, 0.01)}
@@ -88,12 +88,12 @@ def test_parts_of_a_sensor_are_of_their_kind(name, value) -> None:
 )
 def test_numbers_of_a_suite_have_ranges(name, value) -> None:
     with pytest.raises(UsageError, match=name):
-        SensorSuite(pad_scene(FREE_BALL), {"a": ContactProbe(link="hand", probes=PROBE)}, num_envs=1, **{name: value})
+        suite_of({"a": ContactProbe(link="hand", probes=PROBE)}, **{name: value})
 
 
 @pytest.mark.parametrize("wrong", [[0.7], [float("nan")], [True], torch.ones(2, 2, dtype=torch.bool), [3], [-1]])
 def test_environments_to_reset_are_numbers_or_a_whole_mask(wrong) -> None:
-    suite, bands = free_suite(num_envs=3, a=ContactProbe(link="hand", probes=PROBE)), AfferentFilter(1000.0, "SA-I")
+    suite, bands = suite_of({"a": ContactProbe(link="hand", probes=PROBE)}, 3), AfferentFilter(1000.0, "SA-I")
     bands.step(torch.ones(3, 1))
     for reset in (suite.reset, bands.reset):
         with pytest.raises(UsageError, match=r"0 to 2|mask"):
@@ -105,7 +105,7 @@ def test_lengths_in_millimetres_are_told() -> None:
     wide = TemperatureGrid(link="hand", low=(-20, -20, -5), high=(20, 20, 5))
     for sensor in (ContactProbe(link="hand", probes=PROBE, threshold=0.5), wide):
         with pytest.warns(RuntimeWarning, match="metres"):
-            free_suite(a=sensor)
+            suite_of({"a": sensor})
 
 
 @pytest.mark.parametrize("signal", [torch.ones(1, 2, dtype=torch.int64), torch.ones(1, 2, dtype=torch.bool), [[1.0]]])
@@ -150,18 +150,19 @@ def test_a_body_is_struck_and_heard_on_its_surface(name, point) -> None:
 
 
 def test_a_source_above_half_the_sample_rate_is_told_and_a_pulse_ends_in_its_block() -> None:
+    def strike(**settings) -> None:
+        suite_of({"a": ContactAudio(link="hand", **settings)}).update(ball_state(0.014))
+
     with pytest.warns(RuntimeWarning, match="'a'.*8000 Hz"):
-        free_suite(a=ContactAudio(link="hand", modes=Modes((12_000.0,), (0.0,), (1.0,)))).update(ball_state(0.014))
+        strike(modes=Modes((12_000.0,), (0.0,), (1.0,)))
     with pytest.raises(UsageError, match="contact_time"):
-        free_suite(a=ContactAudio(link="hand", modes=Modes((500.0,), (0.0,), (1.0,)), contact_time=0.5)).update(
-            ball_state(0.014)
-        )
+        strike(modes=Modes((500.0,), (0.0,), (1.0,)), contact_time=0.5)
 
 
 def test_bodies_of_a_temperature_grid_are_links_of_the_scene() -> None:
-    with pytest.raises(UsageError, match="did you mean 'ball'"):
-        free_suite(a=TemperatureGrid(link="hand", bodies={"bal": ThermalBody("steel", 60.0)}))
-    for settings in ({"bodies": {"ball": "steel"}}, {"unlisted": None}):
+    with pytest.raises(UsageError, match="did you mean 'object'"):
+        suite_of({"a": TemperatureGrid(link="hand", bodies={"objct": ThermalBody("steel", 60.0)})})
+    for settings in ({"bodies": {"object": "steel"}}, {"unlisted": None}):
         with pytest.raises(UsageError, match="ThermalBody"):
             TemperatureGrid(link="hand", **settings)
     with pytest.raises(UsageError, match="cells"):
@@ -173,7 +174,7 @@ def test_the_pressure_of_an_environment_does_not_depend_on_its_neighbours_and_is
     sensor = ElastomerTaxel(link="hand", probes=grid, points=0)
 
     def pressure(*heights: float) -> torch.Tensor:
-        suite = free_suite(num_envs=len(heights), a=sensor)
+        suite = suite_of({"a": sensor}, len(heights))
         suite.update(ball_state(*heights))
         return contact_pressure(suite, "a", modulus=1e5)
 
@@ -184,7 +185,7 @@ def test_the_pressure_of_an_environment_does_not_depend_on_its_neighbours_and_is
     torch.testing.assert_close(beside[0], light)
     assert beside[1].isnan().all()
     with pytest.raises(UsageError, match="Nothing was read"):
-        contact_pressure(free_suite(a=sensor), "a", modulus=1e5)
+        contact_pressure(suite_of({"a": sensor}), "a", modulus=1e5)
 
 
 def test_a_suite_that_is_seeded_anew_repeats_its_noise_whatever_came_before() -> None:
@@ -204,9 +205,9 @@ def test_a_suite_that_is_seeded_anew_repeats_its_noise_whatever_came_before() ->
             found += [suite.read(name).clone() for name in ("bit", "drive")]
         return found
 
-    suite = free_suite(bit=noisy, drive=drive)
+    suite = suite_of({"bit": noisy, "drive": drive})
     first = read(suite, 7, 3)
-    other = SensorSuite(pad_scene(FREE_BALL), {"bit": noisy, "drive": drive}, num_envs=1, seed=99)
+    other = suite_of({"bit": noisy, "drive": drive}, seed=99)
     for again in (read(suite, 7, 3), read(other, 7, 3)):
         assert all(torch.equal(a, b) for a, b in zip(first, again, strict=True))
     assert not all(torch.equal(a, b) for a, b in zip(first, read(suite, 8, 3), strict=True))
@@ -215,4 +216,5 @@ def test_a_suite_that_is_seeded_anew_repeats_its_noise_whatever_came_before() ->
 def test_a_sensible_suite_warns_of_nothing() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        free_suite(a=ContactProbe(link="hand", probes=PROBE), b=TemperatureGrid(link="hand")).update(ball_state(0.014))
+        sensors = {"a": ContactProbe(link="hand", probes=PROBE), "b": TemperatureGrid(link="hand")}
+        suite_of(sensors).update(ball_state(0.014))

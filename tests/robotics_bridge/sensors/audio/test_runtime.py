@@ -14,7 +14,7 @@ from robotics_bridge.sensors.audio.sensors import ActuationAudio, ContactAudio, 
 from robotics_bridge.sensors.noise.model import Noise
 from robotics_bridge.sensors.suite import SensorSuite
 from tests.factories.struck_box import DT, MODES, RATE, K, box_scene, make_box, strike, touch_box
-from tests.factories.touch_scenes import ball_state, free_suite
+from tests.factories.touch_scenes import ball_state, suite_of
 
 
 def test_what_is_held_at_a_reset_makes_no_sound_and_what_strikes_afterwards_does():
@@ -218,7 +218,7 @@ def test_a_state_that_diverged_is_heard_as_nan():
 
 @pytest.mark.parametrize("dt", [0, -0.01, np.nan, np.inf])
 def test_a_microphone_hears_blocks_of_some_length(dt) -> None:
-    suite = free_suite(a=ContactAudio(link="hand", modes=Modes((500.0,), (0.0,), (1.0,))))
+    suite = suite_of({"a": ContactAudio(link="hand", modes=Modes((500.0,), (0.0,), (1.0,)))})
     suite.update(ball_state(0.014))
     with pytest.raises(UsageError, match="dt"):
         Microphone().build(suite).update(ball_state(0.014), dt)
