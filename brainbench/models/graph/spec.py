@@ -10,31 +10,30 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
-from brainbench.core.errors import UsageError, brief, check_name, check_number, listing
+from brainbench.core.errors import UsageError, check_name, listing
+from brainbench.core.limits import Count, Limit, Share, limited
 
 Shape = tuple[int, ...]
 Unroll = Literal["biological", "full"]
 UNROLLS: tuple[Unroll, ...] = ("biological", "full")
 MEMORIES = ("time-decay", "ugrnn", "intersection", "gru", "lstm")
-
-
-def _check_pair(what: str, pair: Any, *, least: int = 1) -> None:
-    if not isinstance(pair, (tuple, list)) or len(pair) != 2:
-        raise UsageError(f"The {what} must be two whole numbers (rows, columns); received {brief(pair)}.")
-    for size in pair:
-        check_number(f"The {what}", size, least=least, whole=True)
+Sizes = tuple[Count, Count]
+"""Rows, columns."""
+Margins = tuple[Annotated[int, Limit(least=0)], Annotated[int, Limit(least=0)]]
+"""Rows, columns at every edge."""
 
 
 @dataclass(frozen=True, kw_only=True)
+@limited
 class Operation:
     """Options that all operations share; one out of its range is a :class:`UsageError`."""
 
     use_bias: bool = True
     bias: float | None = 0.0
     """Initial bias; None draws it within 1/√fan_in."""
-    dropout: float = 0.0
+    dropout: Share = 0.0
     """Share dropped while training."""
     batch_norm: bool = False
     """Normalise each channel over the batch, before the activation; in training step by step."""
@@ -43,35 +42,21 @@ class Operation:
     initialiser: Mapping[str, Any] | None = None
     """``{"method": name in torch.nn.init, **options}``; None is the He-uniform of this package."""
 
-    def __post_init__(self) -> None:
-        check_number("dropout", self.dropout, least=0, most=1)
-        if self.bias is not None:
-            check_number("bias", self.bias)
-
     def output_shape(self, shape: Shape) -> Shape:
         """Return the shape of the output for an input (C, H, W) or (F,)."""
         raise NotImplementedError
 
 
 @dataclass(frozen=True)
+@limited(of="{} of a convolution")
 class Convolution(Operation):
     """2-D convolution of the concatenated inputs; a size out of its range is a :class:`UsageError`."""
 
-    channels: int
-    kernel_size: tuple[int, int] = (2, 2)
-    """Rows, columns."""
-    stride: tuple[int, int] = (1, 1)
-    """Rows, columns."""
-    padding: Literal["same", "valid"] | tuple[int, int] = "same"
+    channels: Count
+    kernel_size: Sizes = (2, 2)
+    stride: Sizes = (1, 1)
+    padding: Literal["same", "valid"] | Margins = "same"
     """Zeros at every edge (rows, columns); ``same`` keeps the grid, ``valid`` adds none."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_number("channels", self.channels, least=1, whole=True)
-        _check_pair("kernel size of a convolution", self.kernel_size)
-        _check_pair("stride of a convolution", self.stride)
-        if self.padding not in ("same", "valid"):
-            _check_pair("padding of a convolution, unless 'same' or 'valid',", self.padding, least=0)
 
     def output_shape(self, shape: Shape) -> Shape:
         """Return (C, H, W) for an input (C, H, W)."""
@@ -83,16 +68,13 @@ class Convolution(Operation):
 
 
 @dataclass(frozen=True)
+@limited(of="{} of a dense layer")
 class Dense(Operation):
     """Linear layer of the flattened, concatenated inputs."""
 
-    features: int
+    features: Count
     bias: float | None = field(default=0.1, kw_only=True)
     """Initial bias; None draws it within 1/√fan_in."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_number("features", self.features, least=1, whole=True)
 
     def output_shape(self, shape: Shape) -> Shape:
         """Return (features,)."""
@@ -101,12 +83,13 @@ class Dense(Operation):
 
 
 @dataclass(frozen=True)
+@limited(of="{} of a memory")
 class Memory:
     """A recurrent cell of :mod:`brainbench.models.cells`, channels unchanged."""
 
     kind: str = "time-decay"
     """One of :data:`MEMORIES`."""
-    kernel_size: tuple[int, int] = (2, 2)
+    kernel_size: Sizes = (2, 2)
     """Kernel of the gates, rows and columns."""
     layer_norm: bool = False
     """Normalise each gate over channels."""
@@ -117,32 +100,24 @@ class Memory:
 
     def __post_init__(self) -> None:
         check_name("memory", self.kind, MEMORIES)
-        _check_pair("kernel size of a memory", self.kernel_size)
-        check_number("tau", self.tau)
 
 
 @dataclass(frozen=True)
+@limited(of="{} of a pool")
 class Pool:
     """Pooling at the end of a node: ``max``, or ``average`` to a fixed output size."""
 
     kind: Literal["max", "average"]
-    size: tuple[int, int]
+    size: Sizes
     """Window of a maximum; output size of an average."""
-    stride: tuple[int, int] | None = None
+    stride: Sizes | None = None
     """Step of the window of a maximum; None: as large as the window."""
-    padding: tuple[int, int] = (0, 0)
+    padding: Margins = (0, 0)
     """Cells added at every edge, for a maximum."""
     ceil_mode: bool = False
     """Let a window of a maximum reach beyond the edge."""
     flatten: bool = False
     """Give one vector in place of a grid."""
-
-    def __post_init__(self) -> None:
-        check_name("kind of pool", self.kind, ("max", "average"))
-        _check_pair("size of a pool", self.size)
-        if self.stride is not None:
-            _check_pair("stride of a pool", self.stride)
-        _check_pair("padding of a pool", self.padding, least=0)
 
     def output_shape(self, shape: Shape) -> Shape:
         """Return the shape after pooling (C, H, W)."""
