@@ -51,19 +51,9 @@ class UniquePart:
 
         span = stated.get("interval")
         low, high = span if isinstance(span, (list, tuple)) and len(span) == 2 else (math.nan, math.nan)
-        return cls(
-            status=_text(stated.get("status")),
-            reasons=texts(stated.get("reasons")),
-            unique=number(stated.get("unique")),
-            low=number(low),
-            high=number(high),
-            total=number(stated.get("total")),
-            shared=number(stated.get("shared")),
-            controls_alone=number(stated.get("controls_alone")),
-            controls=texts(stated.get("controls")),
-            layer=_text(stated.get("layer")) or None,
-            monte_carlo_error=number(stated.get("monte_carlo_error")),
-        )
+        kinds = {"reasons": texts, "controls": texts, "status": _text, "layer": lambda value: _text(value) or None}
+        values = {item.name: kinds.get(item.name, number)(stated.get(item.name)) for item in fields(cls)}
+        return cls(**{**values, "low": number(low), "high": number(high)})
 
     @property
     def stated(self) -> dict[str, Any]:
