@@ -8,23 +8,14 @@ from collections.abc import Collection, Hashable, Iterable, Iterator, Mapping, S
 from dataclasses import dataclass, replace
 from difflib import SequenceMatcher
 from itertools import combinations
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core import contracts
-from brainbench.core.errors import (
-    DataError,
-    UsageError,
-    brief,
-    check_number,
-    check_once,
-    listing,
-    nearest,
-    repeats,
-    unknown_name,
-)
+from brainbench.core.errors import DataError, UsageError, brief, check_once, listing, nearest, repeats, unknown_name
+from brainbench.core.limits import Limit, limited
 from brainbench.datasets.ledger import Ledger
 from brainbench.datasets.sessions import Session, SessionTable
 
@@ -133,6 +124,7 @@ def _check_texts(what: str, texts: Any) -> None:
 
 
 @dataclass(frozen=True)
+@limited(of="{} of a rule")
 class Rule:
     """One condition on one column; rows that fail it are removed and counted.
 
@@ -158,9 +150,6 @@ class Rule:
         values = (*self.allow, *self.refuse)
         if not all(values) or (not values and self.low is None and self.high is None):
             raise UsageError(f"The rule on {self.column!r} has an empty value; write a|b or low..high.")
-        for name, end in (("low", self.low), ("high", self.high)):
-            if end is not None:
-                check_number(f"{name} of the rule on {self.column!r}", end)
         if self.low is not None and self.high is not None and self.low > self.high:
             raise UsageError(f"The rule {self} keeps nothing: the lower end of a range stands first.")
 
@@ -210,19 +199,19 @@ class Rule:
 
 
 @dataclass(frozen=True)
+@limited
 class Selection:
     """Rules for trials and units. Each row is counted under the first rule that removes it."""
 
     trials: tuple[Rule, ...] = ()
     units: tuple[Rule, ...] = ()
-    min_spikes: int = 1
+    min_spikes: Annotated[int, Limit(least=0)] = 1
     """A unit needs this many spikes in its file; 0 keeps silent units."""
     subjects: tuple[str, ...] = ()
     """Keep only these subjects; empty keeps all."""
     name: str = "custom"
 
     def __post_init__(self) -> None:
-        check_number("min_spikes", self.min_spikes, least=0, whole=True)
         _check_texts("subjects", self.subjects)
 
     @classmethod
@@ -370,6 +359,7 @@ _WITH_UNIT = re.compile(r"(?P<number>[+-]\d*\.?\d+) ?(?P<unit>s|sec|ms|us|µs)$"
 
 
 @dataclass(frozen=True)
+@limited(of="A window's {}")
 class Window:
     """The part of each trial that is read, [anchor + offset, end), in seconds.
 
@@ -382,10 +372,10 @@ class Window:
     """
 
     anchor: str = "start"
-    offset: float = 0.0
+    offset: Annotated[float, Limit(unit="s")] = 0.0
     stop: str | None = None
-    stop_offset: float = 0.0
-    length: float | None = None
+    stop_offset: Annotated[float, Limit(unit="s")] = 0.0
+    length: Annotated[float, Limit(above=0, unit="s")] | None = None
     fallback: Window | None = None
     """Used for all trials of a session that has no contact tables at all, and said in the notes."""
     baseline: Window | None = None
@@ -398,10 +388,6 @@ class Window:
     def __post_init__(self) -> None:
         if self.stop is None and self.length is None:
             raise UsageError(f"The window from {self.anchor!r} has no end; give stop (an anchor) or length (s).")
-        check_number("A window's offset (s)", self.offset)
-        check_number("A window's stop_offset (s)", self.stop_offset)
-        if self.length is not None:
-            check_number("A window's length (s)", self.length, above=0)
         if self.stop is None and self.stop_offset:
             raise UsageError("stop_offset is after an event, and this window has no stop; give length alone.")
         if self.anchor != FIRST_CONTACT and self.fallback is not None:
