@@ -1,4 +1,4 @@
-"""What the tactile benchmarks measure: the published pyramid, its sensors, and states of it, kept in a file.
+"""What the tactile benchmarks measure: the published pyramid, its sensors, and states of it.
 
 One sensor of 10 × 10 taxels on the top of ``box0``, which ``box1`` half covers.
 """
@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -158,16 +157,14 @@ def restore(found: State, envs: int, device: str, target: HandState | None = Non
     return target
 
 
-def settled(envs: int, device: str, steps: int, brought: Mapping[str, np.ndarray] | None) -> dict[str, np.ndarray]:
-    """A snapshot of the settled pyramid, computed here or read from what was brought along."""
-    if brought is not None:
-        return {name.removeprefix("settled."): brought[name] for name in brought if name.startswith("settled.")}
+def settled(envs: int, device: str, steps: int) -> dict[str, np.ndarray]:
+    """A snapshot of the settled pyramid."""
     engine = engine_of(envs, device)
     engine.step(steps)
     return snapshot(engine.state)
 
 
-def totals_cases(steps: int, brought: State | None) -> dict[str, tuple[TouchScene, State, dict[str, Any]]]:
+def totals_cases(steps: int) -> dict[str, tuple[TouchScene, State, dict[str, Any]]]:
     """Scene, settled state and taxels of bodies on a pad, a hand that holds a ball, and the pyramid, by name."""
     cases = {}
     ball, block = 'type="sphere" size=".01" mass=".2"', 'type="box" size=".03 .03 .03" mass=".5"'
@@ -190,7 +187,7 @@ def totals_cases(steps: int, brought: State | None) -> dict[str, tuple[TouchScen
     cases["XHand1 holds a ball, 199 taxels"] = engine.scene, snapshot(engine.state), taxels
     for count in (100, 1000):
         taxels = {"box0": KinematicTaxel(link="box0", probes=grid(count), track=("box1",))}
-        cases[f"pyramid, {count:,} taxels"] = scene_of(), settled(64, "cpu", steps, brought), taxels
+        cases[f"pyramid, {count:,} taxels"] = scene_of(), settled(64, "cpu", steps), taxels
     return cases
 
 
@@ -239,32 +236,6 @@ def replay(states: list[dict[str, np.ndarray]], device: str) -> dict[str, np.nda
         for name, kept in read.items():
             kept.append(suite.read(name).cpu().numpy().copy())
     return {name: np.stack(kept) for name, kept in read.items()}
-
-
-def write_input(path: Path, steps: int) -> None:
-    """Write a settled state, an episode and its readings on this processor, to be taken to a GPU machine."""
-    states = episode()
-    arrays = {f"settled.{name}": value for name, value in settled(64, "cpu", steps, None).items()}
-    arrays |= {f"episode{k}.{name}": value for k, state in enumerate(states) for name, value in state.items()}
-    arrays |= {f"reading.{name}": value for name, value in replay(states, "cpu").items()}
-    path.parent.mkdir(parents=True, exist_ok=True)
-    np.savez_compressed(path, allow_pickle=False, **arrays)
-
-
-def read_input(path: Path) -> dict[str, np.ndarray]:
-    """Read what :func:`write_input` wrote."""
-    with np.load(path, allow_pickle=False) as kept:
-        return {name: kept[name] for name in kept.files}
-
-
-def brought_episode(brought: Mapping[str, np.ndarray]) -> tuple[list[dict[str, np.ndarray]], dict[str, np.ndarray]]:
-    """The episode and its readings among what was brought along."""
-    states = []
-    for k in range(CHECKED):
-        head = f"episode{k}."
-        states.append({name.removeprefix(head): brought[name] for name in brought if name.startswith(head)})
-    readings = {name.removeprefix("reading."): brought[name] for name in brought if name.startswith("reading.")}
-    return states, readings
 
 
 def bumpy_box(edge: float, triangles: int) -> Mesh:

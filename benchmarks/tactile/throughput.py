@@ -7,9 +7,8 @@
     python -m benchmarks.tactile.throughput --device cuda --part published    # configurations of thesis figure 4.4
     python -m benchmarks.tactile.throughput --device cuda --part scaling      # taxels, environments, triangles, points
 
-Every case is printed, and with ``--out FILE`` appended as a JSON line, as soon as it is measured. A machine whose
-Warp has no processor compiler takes along what it needs of one: ``--write-input FILE`` here, ``--input FILE`` there.
-``--from FILE`` lays out records that were measured elsewhere, ``--write`` puts tables into RESULTS.md.
+Every case is printed, and with ``--out FILE`` appended as a JSON line, as soon as it is measured. ``--from FILE`` lays
+out records that were measured elsewhere, ``--write`` puts tables into RESULTS.md.
 """
 
 from __future__ import annotations
@@ -30,11 +29,9 @@ from benchmarks.tactile.scene import (
     CELLS,
     CLASSES,
     FULL,
-    brought_episode,
     engine_of,
     episode,
     grid,
-    read_input,
     replay,
     restore,
     scene_of,
@@ -43,7 +40,6 @@ from benchmarks.tactile.scene import (
     temperature,
     totals_cases,
     with_mesh,
-    write_input,
 )
 from benchmarks.tactile.tables import plot_scaling, tables
 from brainbench.core.devices import pick_device, warp
@@ -96,9 +92,8 @@ def timed(scene: TouchScene, config: dict, state: HandState, device: str) -> tup
 
 def part_check(options: argparse.Namespace) -> Iterable[Row]:
     """Readings on the device against those on the processor, clean and noisy, over updates that replay a graph."""
-    states, truth = brought_episode(options.brought) if options.brought else (episode(), {})
-    if not truth:
-        truth = replay(states, "cpu")
+    states = episode()
+    truth = replay(states, "cpu")
     for name, there in replay(states, options.device).items():
         here = truth[name]
         scale = np.abs(here[np.isfinite(here)]).max() + 1e-12
@@ -110,7 +105,7 @@ def part_check(options: argparse.Namespace) -> Iterable[Row]:
 
 def part_sensors(options: argparse.Namespace) -> Iterable[Row]:
     """Sensor time alone at one number of environments."""
-    found = settled(min(options.envs, 64), options.device, options.settle, options.brought)
+    found = settled(min(options.envs, 64), options.device, options.settle)
     state, scene = restore(found, options.envs, options.device), scene_of()
     few = options.taxels[0]
     cases = [("kinematic", few, scene, None), ("kinematic", few, scene, FULL)]
@@ -142,7 +137,7 @@ def part_sensors(options: argparse.Namespace) -> Iterable[Row]:
 
 def part_totals(options: argparse.Namespace) -> Iterable[Row]:
     """Engine totals and the law of depths, sensor time alone."""
-    for label, (scene, found, taxels) in totals_cases(options.settle, options.brought).items():
+    for label, (scene, found, taxels) in totals_cases(options.settle).items():
         state = restore(found, options.envs, options.device)
         for noise in (Noise(), FULL):
             times = {}
@@ -178,7 +173,7 @@ def part_step(options: argparse.Namespace) -> Iterable[Row]:
 def part_published(options: argparse.Namespace) -> Iterable[Row]:
     """Configurations of thesis figure 4.4, sensor time and memory."""
     envs = options.envs
-    found = settled(min(envs, 64), options.device, options.settle, options.brought)
+    found = settled(min(envs, 64), options.device, options.settle)
     common = {"link": "box0", "track": ("box1",)}
     five = [f"box{i}" for i in range(5)]
     patch = Probes.grid(5, 4, size=(0.2, 0.16), center=(0, 0, 0.125))
@@ -207,7 +202,7 @@ def part_published(options: argparse.Namespace) -> Iterable[Row]:
 def part_scaling(options: argparse.Namespace) -> Iterable[Row]:
     """Cost against taxels, environments, triangles and points."""
     envs = options.envs
-    found, scene = settled(min(envs, 64), options.device, options.settle, options.brought), scene_of()
+    found, scene = settled(min(envs, 64), options.device, options.settle), scene_of()
     state = restore(found, envs, options.device)
 
     def case(axis: str, value: int, scene: TouchScene, config: dict, where: HandState) -> Row:
@@ -266,15 +261,10 @@ def main() -> None:
     parser.add_argument("--taxels", type=int, nargs="+", default=[100, 1000, 10_000])
     parser.add_argument("--settle", type=int, default=200, help="steps before anything is measured")
     parser.add_argument("--only", nargs="+", choices=CLASSES[:-1], help="classes of --part sensors and scaling")
-    parser.add_argument("--write-input", type=Path)
-    parser.add_argument("--input", type=Path)
     parser.add_argument("--from", type=Path, nargs="+", dest="records")
     parser.add_argument("--out", type=Path)
     parser.add_argument("--figure", type=Path, help="draw the figure of scaling")
     options = parser.parse_args()
-    if options.write_input:
-        write_input(options.write_input, options.settle)
-        return
     rows: list[Row] = []
     if options.records:
         rows = [json.loads(line) for path in options.records for line in path.read_text("utf-8").splitlines()]
@@ -283,7 +273,6 @@ def main() -> None:
     small = options.device == "cpu"
     options.envs = options.envs or (64 if small else 16_384)
     options.env_list = options.env_list or ([64, 256] if small else [1024, 4096, 8192, 16_384])
-    options.brought = read_input(options.input) if options.input else None
     where = pick_device(options.device)
     options.name = where.name if where.is_cuda else "2 shared cores"
     chosen = list(PARTS) if options.part == "all" else [options.part]
