@@ -10,7 +10,7 @@ parts() { cat <<'TABLE'
 tests     pytest -n 0 -m gpu
 golden    pytest -n 0 tests/stimuli/engines/test_golden_wrenches.py -k rod
 free      python -m benchmarks.whiskers.throughput
-sweeps    python -m benchmarks.whiskers.public_rate --objects procedural-24:32 --parts command --write
+sweeps    python -m benchmarks.whiskers.public_rate --objects procedural-24:32 --write
 touch     python -m benchmarks.tactile.throughput --device cuda --part sensors --write
 step      python -m benchmarks.tactile.throughput --device cuda --part step --write
 tasks     python -m benchmarks.policies.tasks --part speed --device cuda --write

@@ -1,22 +1,32 @@
-"""Estimated errors of whiskers beside their true ones, in scenes that no table was measured on.
+"""Estimated errors of whiskers beside their true ones, in scenes that no table was measured on, by the public command.
 
-``python -m benchmarks.whiskers.errors [--seed 1] [--settings fast,auto=0.1] [--groups hard] [--write]``
+``python -m benchmarks.whiskers.errors [--seed 1] [--settings fast,auto=0.1] [--groups hard] [--rounds 3] [--write]``
 
 The scenes are those of :mod:`brainbench.stimuli.validation.bench_tests`, one of each kind, and whiskers at rest that
-objects strike. The truth is the converged simulation of the trade-off, for blows with steps of 1 µs. Whiskers for which
-twice its step and two thirds of its links give other forces have no known truth, and stand in a group of their own.
-The promise is that of ``Fidelity.auto(error=…)``: kept where the true error is no larger, or where a remark says so.
+objects strike, each a scene file of its own. ``brainbench stimuli simulate`` runs them: status, error and remark are
+what it prints and writes. The truth is the converged simulation of the trade-off, for blows with steps of 1 µs.
+Whiskers for which twice its step and two thirds of its links give other forces have no known truth, and stand in a
+group of their own. The promise is that of ``Fidelity.auto(error=…)``: kept where the true error is no larger, or where
+a remark says so.
 """
 
 from __future__ import annotations
 
+import io
+import json
 import math
+import os
+import tempfile
 from collections.abc import Sequence
-from dataclasses import replace
+from contextlib import redirect_stderr, redirect_stdout
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
 from benchmarks.report import publish, script_parser, table
+from benchmarks.whiskers.scene_tables import write_scene
+from brainbench.cli import app
 from brainbench.core.statistics import wilson_interval
 from brainbench.stimuli.engines import get_engine
 from brainbench.stimuli.engines.error_estimates import difference
@@ -24,6 +34,8 @@ from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.motion.jobs import Job, StillFollicle, Trace
 from brainbench.stimuli.motion.trajectories import Translation
 from brainbench.stimuli.objects.solid import PlacedObject, box, capsule, sphere
+from brainbench.stimuli.scenes.scene_files import load_scene
+from brainbench.stimuli.stimulus_set import read_stimulus_set
 from brainbench.stimuli.validation.bench_tests import HARD_OBJECTS, OBJECTS, contact_jobs
 from brainbench.stimuli.whiskers.array import SPECIES, WhiskerArray
 from brainbench.tradeoffs.whiskers import REFERENCE
@@ -57,26 +69,63 @@ def struck_jobs(seed: int, count: int) -> list[Job]:
     return jobs
 
 
-def converged(jobs: Sequence[Job], fidelity: Fidelity) -> dict[bool, list[tuple[Job, Trace]]]:
-    """Return the jobs whose finest simulation can be trusted and touches something, by whether it is the truth."""
+@dataclass(frozen=True, eq=False)
+class SceneRun:
+    """A scene file, its job, and the finest simulation of that."""
+
+    path: Path
+    job: Job
+    finest: Trace
+
+
+def converged(jobs: Sequence[Job], fidelity: Fidelity, folder: Path) -> dict[bool, list[SceneRun]]:
+    """Return the scenes whose finest simulation can be trusted and touches something, by whether it is the truth.
+
+    Each is written into a folder of its own, and read from there.
+    """
+    paths = [write_scene(job, folder / str(index)) for index, job in enumerate(jobs)]
+    jobs = [load_scene(path).scenes[0].jobs()[0] for path in paths]
     coarser = replace(fidelity, links=round(fidelity.links / 1.5), time_step=2 * fidelity.time_step)
     engine = get_engine(REFERENCE.backend)
     traces, others = (engine.run(jobs, setting.resolved(True)) for setting in (fidelity, coarser))
-    pairs: dict[bool, list[tuple[Job, Trace]]] = {True: [], False: []}
-    for job, trace, coarse in zip(jobs, traces, others, strict=True):
+    scenes: dict[bool, list[SceneRun]] = {True: [], False: []}
+    for path, job, trace, coarse in zip(paths, jobs, traces, others, strict=True):
         if trace.status == "ok" and trace.contact.any():
             settled = coarse.status == "ok" and true_error(job, coarse, trace) <= UNSETTLED
-            pairs[settled].append((job, trace))
-    return pairs
+            scenes[settled].append(SceneRun(path, job, trace))
+    return scenes
 
 
-def measure(backend: str, setting: str, group: str, scenes: Sequence[tuple[Job, Trace]]) -> list[str]:
-    """Return a row of the table: true errors, and how many estimates cover them."""
-    fidelity = Fidelity.parse(setting)
-    traces = get_engine(backend, errors=True).run([job for job, _ in scenes], fidelity)
+def simulate(scene: Path, setting: str, backend: str) -> tuple[Trace, float]:
+    """Run ``brainbench stimuli simulate``; return what it wrote and said of the whisker, and its processor time (s)."""
+    out, said, before = scene.with_name("set.h5"), io.StringIO(), os.times()
+    words = ["stimuli", "simulate", str(scene), "--fidelity", setting, "--backend", backend, "--out", str(out)]
+    with redirect_stdout(said), redirect_stderr(io.StringIO()):
+        app([*words, "--no-cache", "--explain", "--json"], standalone_mode=False)
+    spent = sum(os.times()[:2]) - sum(before[:2])
+    report, written = json.loads(said.getvalue()), read_stimulus_set(out).isel(stimulus=0, whisker=0)
+    trace = Trace(
+        written["wrench"].values.astype(float),
+        written["contact"].values,
+        written["contact_arc"].values,
+        status="unstable" if report["unstable"] else "ok",
+        remark="".join(entry["remark"] for entry in report["inexact"]),
+        error=float(written["error"]),
+        seconds=report["explanation"]["seconds"]["processor"],
+    )
+    return trace, spent
+
+
+def measure(backend: str, setting: str, group: str, scenes: Sequence[SceneRun], rounds: int) -> list[str]:
+    """Return a row of the table: true errors, how many estimates cover them, and the cost over some rounds."""
+    promise = Fidelity.parse(setting).error
+    repeated = [[simulate(scene.path, setting, backend) for scene in scenes] for _ in range(rounds)]
+    whisker_time = sum(scene.job.times[-1] for scene in scenes)
+    costs = sorted(sum(trace.seconds for trace, _ in runs) / whisker_time for runs in repeated)
+    whole = min(sum(spent for _, spent in runs) for runs in repeated) / len(scenes)
     trusted = [
-        (trace, true_error(job, trace, reference))
-        for (job, reference), trace in zip(scenes, traces, strict=True)
+        (trace, true_error(scene.job, trace, scene.finest))
+        for scene, (trace, _) in zip(scenes, repeated[0], strict=True)
         if trace.status == "ok"
     ]
     errors, estimates = np.array([(error, trace.error) for trace, error in trusted]).T
@@ -89,9 +138,10 @@ def measure(backend: str, setting: str, group: str, scenes: Sequence[tuple[Job, 
         f"{covered / len(errors):.1%} [{interval.low:.1%}, {interval.high:.1%}]",
         *(f"{np.quantile(estimates / errors, share, method='higher'):.2g}" for share in (0.5, 0.9)),
         str(int((silent & (errors > LARGE)).sum())),
-        str(int((silent & (errors > fidelity.error)).sum())) if fidelity.error else "–",
+        str(int((silent & (errors > promise)).sum())) if promise else "–",
         str(int((~silent).sum())),
-        f"{sum(trace.seconds for trace in traces) / sum(job.times[-1] for job, _ in scenes):.2g}",
+        f"{costs[len(costs) // 2]:.2g} [{costs[0]:.2g}, {costs[-1]:.2g}]",
+        f"{whole:.2g}",
     ]  # fmt: skip
 
 
@@ -107,38 +157,41 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--settings", default="fast,balanced,accurate,auto=0.2,auto=0.1,auto=0.05")
     parser.add_argument("--groups", default="one-side,hard,struck")
+    parser.add_argument("--rounds", type=int, default=3, help="times that each scene is simulated, for its cost")
     parser.add_argument("--backend", default="rod")
     args = parser.parse_args()
-    blows = replace(REFERENCE.fidelity, time_step=1e-6)
-    makers = {
-        "one-side": lambda: converged(contact_jobs(args.seed, each=1), REFERENCE.fidelity),
-        "hard": lambda: converged(contact_jobs(args.seed, each=1, objects=HARD_OBJECTS), REFERENCE.fidelity),
-        "struck": lambda: converged(struck_jobs(args.seed, 72), blows),
+    drawn = {
+        "one-side": (contact_jobs(args.seed, each=1), REFERENCE.fidelity),
+        "hard": (contact_jobs(args.seed, each=1, objects=HARD_OBJECTS), REFERENCE.fidelity),
+        "struck": (struck_jobs(args.seed, 72), replace(REFERENCE.fidelity, time_step=1e-6)),
     }
-    scenes_of = {name: makers[name]() for name in args.groups.split(",")}
-    groups = {name: pairs[True] for name, pairs in scenes_of.items()}
-    groups[NO_LIMIT] = [pair for pairs in scenes_of.values() for pair in pairs[False]]
     rows = []
-    for setting in args.settings.split(","):
-        for group, scenes in groups.items():
-            if not scenes:
-                continue
-            rows.append(measure(args.backend, setting, group, scenes))
-            print(rows[-1], flush=True)
+    with tempfile.TemporaryDirectory() as folder:
+        scenes_of = {name: converged(*drawn[name], Path(folder, name)) for name in args.groups.split(",")}
+        groups = {name: scenes[True] for name, scenes in scenes_of.items()}
+        groups[NO_LIMIT] = [scene for scenes in scenes_of.values() for scene in scenes[False]]
+        for setting in args.settings.split(","):
+            for group, scenes in groups.items():
+                if scenes:
+                    rows.append(measure(args.backend, setting, group, scenes, args.rounds))
+                    print(rows[-1], flush=True)
     text = (
-        f"Engine `{args.backend}`, seed {args.seed}. One side: {', '.join(OBJECTS)}. Hard: {', '.join(HARD_OBJECTS)}. "
+        f"`brainbench stimuli simulate SCENE --fidelity SETTING --backend {args.backend} --no-cache --explain --json "
+        f"--out SET`, seed {args.seed}. One side: {', '.join(OBJECTS)}. Hard: {', '.join(HARD_OBJECTS)}. "
         f"Struck: at {', '.join(f'{speed:g}' for speed in SPEEDS)} m/s. Left out: what touches nothing or cannot be "
         "trusted at the finest setting. True error, in %, of base force or moment (root mean square over the "
         f"readings in contact, the larger) against `{REFERENCE.fidelity}`, for blows with steps of 1 µs. Covered: the "
         "estimate is no smaller. In silence: without a remark. No limit: whiskers of all groups whose truth changes by "
         f"more than {UNSETTLED:.0%} with twice its step and two thirds of its links ("
-        + ", ".join(f"{len(pairs[False])} {name}" for name, pairs in scenes_of.items())
-        + "); their error is the difference from it. Cost with estimates.\n\n"
+        + ", ".join(f"{len(scenes[False])} {name}" for name, scenes in scenes_of.items())
+        + "); their error is the difference from it. Cost: processor seconds of the simulation per whisker-second, as "
+        f"`--explain` tells, with estimates: median and range of {args.rounds} rounds. Command: processor seconds of "
+        "all that it does for one scene in a process that has run it before, least of the rounds.\n\n"
     )
     head = ["setting", "scenes", "trusted", "error %, median", "90 %", "worst", "covered", "estimate/error, median"]
-    head += ["90 %", f"above {LARGE:.0%} in silence", "above the promise in silence", "remarks"]
-    head += ["processor s / whisker-s"]
-    publish(args, "Errors of whiskers and their estimates", text + table(head, rows), f"--seed {args.seed}")
+    head += ["90 %", f"above {LARGE:.0%} in silence", "above the promise in silence", "remarks", "cost", "command s"]
+    words = f"--seed {args.seed} --rounds {args.rounds}"
+    publish(args, "Errors of whiskers and their estimates", text + table(head, rows), words)
 
 
 if __name__ == "__main__":
