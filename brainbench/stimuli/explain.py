@@ -154,35 +154,28 @@ class Explanation:
         """Return the JSON that :meth:`of` reads, equal whenever the same is simulated."""
         return to_json({key: item for key, item in to_plain(self).items() if key not in _PASSING}, indent=None)
 
-    def lines(self) -> list[tuple[str, str]]:
-        """Return (what, how much) for people, in reading order."""
+    def __str__(self) -> str:
         low, high = self.links
         links = f"{low}" if low == high else f"{low}–{high}"
         elapsed = ", ".join(f"{name} {value:.2f} s" for name, value in self.seconds.items())
-        rows = [
-            ("asked for", f"{self.stimuli} stimuli × {self.whiskers} whiskers = {self.runs} runs of {links} links"),
-            ("simulated", f"{self.simulated} runs, {self.steps:,} of {self.steps_in_full:,} time steps"),
-            ("shared", f"{self.shared} runs equal to another stimulus's"),
-            ("silent", f"{self.silent} runs that can feel nothing: exactly zero without simulation"),
-            ("not solved", f"contact forces of {self.unsolved:,} time steps"),
-            ("contact pairs", f"{self.pairs:,} of {self.pairs_in_full:,} (links × {self.bodies}) can ever meet"),
-            ("saved", f"{self._saved_steps()}, {_share(self.pairs, self.pairs_in_full)} of the contact pairs"),
-            ("time", elapsed or "not known: made by another process"),
-            ("made", "now" if self.source is None else f"earlier, read from {self.source}"),
-        ]  # fmt: skip
-        return [row for row in rows if self.unsolved or row[0] != "not solved"]
-
-    def _saved_steps(self) -> str:
-        if self.steps <= self.steps_in_full:
-            return f"{_share(self.steps, self.steps_in_full)} of the steps"
         more = self.steps / max(1, self.steps_in_full) - 1
-        return f"none of the steps ({100 * more:.0f} % more: some contacts needed shorter ones)"
-
-    def __str__(self) -> str:
+        saved = f"{_share(self.steps, self.steps_in_full)} of the steps"
+        if more > 0:
+            saved = f"none of the steps ({100 * more:.0f} % more: some contacts needed shorter ones)"
         far = [f"{label}: {', '.join(names) or 'none'}" for label, names in self.out_of_reach.items()]
-        rows = [*self.lines(), *zip(["out of reach", *[""] * len(far)], far, strict=False)]
-        width = max(len(name) for name, _ in rows)
-        return "\n".join(f"{name:<{width}}  {value}" for name, value in rows)
+        rows = {
+            "asked for": f"{self.stimuli} stimuli × {self.whiskers} whiskers = {self.runs} runs of {links} links",
+            "simulated": f"{self.simulated} runs, {self.steps:,} of {self.steps_in_full:,} time steps",
+            "shared": f"{self.shared} runs equal to another stimulus's",
+            "silent": f"{self.silent} runs that can feel nothing: exactly zero without simulation",
+            "not solved": f"contact forces of {self.unsolved:,} time steps" if self.unsolved else "",
+            "contact pairs": f"{self.pairs:,} of {self.pairs_in_full:,} (links × {self.bodies}) can ever meet",
+            "saved": f"{saved}, {_share(self.pairs, self.pairs_in_full)} of the contact pairs",
+            "time": elapsed or "not known: made by another process",
+            "made": "now" if self.source is None else f"earlier, read from {self.source}",
+            "out of reach": f"\n{'':15}".join(far),
+        }
+        return "\n".join(f"{name:<13}  {value}" for name, value in rows.items() if value)
 
 
 def explain(scenes: Sequence[Scene], plan: JobSchedule, traces: Sequence[Trace], fidelity: Fidelity) -> Explanation:

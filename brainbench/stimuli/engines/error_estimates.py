@@ -48,7 +48,7 @@ def with_errors(run: Run, jobs: Sequence[Job], fidelity: Fidelity) -> list[Trace
 
     Where the fidelity promises an ``error``, whiskers beyond it are simulated again with what errs most made finer, one
     by one. An estimate falls by no more than theory allows: to take the first that happens to be small would favour
-    those that are too small.
+    those that are too small. Where a whisker may jam, short steps must agree as well.
     """
     traces = list(run(jobs, fidelity))
     settings, errors = [fidelity] * len(traces), np.zeros((len(traces), 2))
@@ -64,14 +64,11 @@ def with_errors(run: Run, jobs: Sequence[Job], fidelity: Fidelity) -> list[Trace
 
     pending: dict[int, Fidelity] = {}
     for index, (job, trace) in enumerate(zip(jobs, traces, strict=True)):
-        if trace.status == "ok" and not trace.steps:
-            # Nothing came near enough to take a step.
-            traces[index] = replace(trace, error=0.0)
-        elif trace.status == "ok":
-            if (error := calm_error(job, trace, fidelity)) > (fidelity.error or math.inf):
-                error = math.nan
+        if trace.status == "ok":
+            # Where nothing came near enough to take a step, there is no error.
+            error = calm_error(job, trace, fidelity) if trace.steps else 0.0
             traces[index] = replace(trace, error=error)
-            if math.isnan(error):
+            if not error <= (fidelity.error or math.inf):
                 pending[index], runs[index, fidelity] = fidelity, trace
     for place in range(ROUNDS if fidelity.error is not None else 1):
         simulate(pending)

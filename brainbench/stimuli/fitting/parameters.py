@@ -484,8 +484,8 @@ class Prior:
 
 
 PUBLISHED: Mapping[str, Prior] = {
-    # Of the logarithm of a log-normal law.
     "young_modulus": Prior(
+        # Standard deviation of the logarithm of a log-normal law with this mean and standard deviation.
         3.34e9,
         math.sqrt(math.log1p((1.48 / 3.34) ** 2)),
         "Quist et al. (2011), J. Biomech. 44, 2775-2781: 3.34 ± 1.48 GPa",

@@ -107,8 +107,10 @@ def beam_matrices(whisker: Whisker) -> tuple[NDArray[np.float64], NDArray[np.flo
 
 
 @lru_cache(maxsize=256)
-def elastica(whisker: Whisker, at: float, offset: float) -> Contact:
+def elastica(whisker: Whisker, at: float, offset: float, peg_radius: float | None = None) -> Contact:
     """Return the equilibrium of large bending by a frictionless point peg at the point (``at``, ``offset``) [m].
+
+    With a ``peg_radius`` [m] the axis of a round peg is there, a sum of both radii from the centre line of the rod.
 
     Solves x' = cos θ, y' = sin θ, E I(s)(θ' − κ₀(s)) = (a − x) Fy − (d − y) Fx with F normal to the rod at
     the contact, on the branch that starts from the undeformed rod. The peg pushes towards +y when
@@ -116,16 +118,7 @@ def elastica(whisker: Whisker, at: float, offset: float) -> Contact:
     """
     _check_at(whisker, at)
     rest = whisker.curvature * at**2
-    return _Branch(whisker, at, 1 if offset >= rest else -1).reach(offset)
-
-
-def elastica_finite_peg(whisker: Whisker, centre: tuple[float, float], peg_radius: float) -> Contact:
-    """Return the equilibrium with a frictionless round peg of radius ``peg_radius`` at ``centre`` [m], pushed to +y.
-
-    The rod's own radius counts: its centre line passes one radius sum from the axis.
-    """
-    _check_at(whisker, centre[0])
-    return _Branch(whisker, centre[0], 1, peg_radius).reach(centre[1])
+    return _Branch(whisker, at, 1 if offset >= rest else -1, peg_radius).reach(offset)
 
 
 def peg_centre(whisker: Whisker, contact: Contact, peg_radius: float) -> tuple[float, float]:
