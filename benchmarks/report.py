@@ -25,7 +25,7 @@ PAGE = Path(__file__).with_name("RESULTS.md")
 SUBJECTS = ("commands", "whiskers", "models", "scores", "leaderboards", "tactile", "policies")
 QUESTIONS = (
     ("How exact is a simulated whisker?", "whiskers", "accura|agree|bases|bullet|chosen|finer|friction|nothing in rod"
-     "|plane|presets|random scenes|tolerance|trust|twist|Contact forces solved"),
+     "|plane|presets|random scenes|tolerance|trust|twist|their estimates|Contact forces solved"),
     ("What can be fitted to a real whisker?", "whiskers", "Fitted|Contact forces from|Gradients|Motions|Ring-downs"),
     ("How fast are whiskers simulated?", "whiskers", ""),
     ("What do networks cost, and how were the shipped ones trained?", "models", ""),

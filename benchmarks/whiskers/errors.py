@@ -159,7 +159,7 @@ def main() -> None:
     parser = script_parser(__doc__)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--settings", default="fast,balanced,accurate,auto=0.2,auto=0.1,auto=0.05")
-    parser.add_argument("--groups", default="one-side,hard,struck")
+    parser.add_argument("--groups", default="one-side,hard,struck", help="slip-off: 72 of those alone")
     parser.add_argument("--rounds", type=int, default=3, help="times that scenes are simulated for their cost")
     parser.add_argument("--backend", default="rod")
     args = parser.parse_args()
@@ -167,6 +167,7 @@ def main() -> None:
         "one-side": (contact_jobs(args.seed, each=1), REFERENCE.fidelity),
         "hard": (contact_jobs(args.seed, each=1, objects=HARD_OBJECTS), REFERENCE.fidelity),
         "struck": (struck_jobs(args.seed, 72), replace(REFERENCE.fidelity, time_step=1e-6)),
+        "slip-off": (contact_jobs(args.seed, each=4, objects=("slip-off",)), REFERENCE.fidelity),
     }
     rows = []
     with tempfile.TemporaryDirectory() as folder:
@@ -194,8 +195,10 @@ def main() -> None:
     )
     head = ["setting", "scenes", "trusted", "error %, median", "90 %", "worst", "covered", "estimate/error, median"]
     head += ["90 %", f"above {LARGE:.0%} in silence", "above the promise in silence", "remarks", "cost", "command s"]
-    words = f"--seed {args.seed} --rounds {args.rounds}"
-    publish(args, "Errors of whiskers and their estimates", text + table(head, rows), words)
+    given = {name: value for name, value in vars(args).items() if value != parser.get_default(name)}
+    words = " ".join(f"--{name} {value}" for name, value in given.items() if name != "write")
+    title = "Errors of whiskers and their estimates" + (f": {args.groups}" if "groups" in given else "")
+    publish(args, title, text + table(head, rows), words)
 
 
 if __name__ == "__main__":
