@@ -121,7 +121,7 @@ def _netcdf(file: h5py.File, mode: str) -> H5NetCDFStore:
     import h5netcdf
     from xarray.backends import H5NetCDFStore
 
-    return H5NetCDFStore(h5netcdf.File(file, mode))
+    return H5NetCDFStore(h5netcdf.File(file, mode, decode_vlen_strings=True))
 
 
 ORIENTATION = "orientation"

@@ -17,6 +17,7 @@ from brainbench.stimuli.stimulus_set import (
     SHIPPED,
     SHIPPED_INDEX,
     find_kept,
+    hash_stimulus_set,
     read_stimulus_set,
     to_grid,
     write_stimulus_set,
@@ -38,6 +39,14 @@ def test_a_hundred_and_ten_frames_become_twenty_two_steps_of_thirty_channels():
     grid = to_grid(dataset)
     assert grid.shape == (2, 22, 30, 5, 7)
     assert grid.dtype == np.float32
+
+
+def test_a_written_set_keeps_texts_with_letters_of_any_language(tmp_path: Path):
+    dataset = _dataset("C2").isel(stimulus=[0]).assign_coords(stimulus=np.array(["köşe, 触覚"], dtype=object))
+    dataset["remark"][0, 0] = "10 µs"
+    dataset.attrs["content_hash"] = hash_stimulus_set(dataset)
+    kept = read_stimulus_set(write_stimulus_set(dataset, tmp_path / "set.h5"))
+    assert (kept["stimulus"].item(), kept["remark"].item()) == ("köşe, 触覚", "10 µs")
 
 
 def test_frame_channel_and_whisker_find_their_place():

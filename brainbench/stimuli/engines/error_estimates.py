@@ -214,5 +214,5 @@ def remark_on(error: float, promise: float = LARGEST_ERROR, *, jams: bool = Fals
     words = f"an error of {error:.0%}" if np.isfinite(error) else "an error that cannot be told"
     words += f" (root mean square), above {promise:.0%}"
     if jams:
-        return f"steps of {1e6 * SHORT_STEP:g} µs tell {words}; between bodies with friction forces may have no limit"
+        return f"steps of {1e3 * SHORT_STEP:g} ms tell {words}; between bodies with friction forces may have no limit"
     return f"half the step and more links estimate {words}; choose a finer fidelity, or auto=ERROR"
