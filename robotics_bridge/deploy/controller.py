@@ -127,7 +127,7 @@ class Report:
     processor: dict[str, Any]
     """The same in processor time of the loop's thread, which does not count waiting for a busy machine."""
     rate: float
-    """Ticks per second."""
+    """Ticks per second from the first report on."""
     overruns: int
     """Ticks that took longer than a control step."""
     limited: int
@@ -190,7 +190,7 @@ class Controller:
     def run(self, seconds: float) -> Report:
         """Control for so many seconds, or until something is wrong; the hand is told to hold in the end."""
         check_duration(seconds)
-        begun = self.clock()
+        begun = start = self.clock()
         reason: str | None = "the control loop was interrupted"
         try:
             with self.link.watched():
@@ -210,10 +210,11 @@ class Controller:
             self.link.stop()
             if reason:
                 _log.warning("Safe stop: %s.", reason)
-        elapsed = self.clock() - begun
+        ended = self.clock()
         return Report(
-            "stopped" if reason else "finished", reason or "", self.ticks, elapsed, self.latency.summary(),
-            self.processor.summary(), self.ticks / elapsed if elapsed > 0 else math.nan, self.overruns, self.limited,
+            "stopped" if reason else "finished", reason or "", self.ticks, ended - begun, self.latency.summary(),
+            self.processor.summary(), self.ticks / (ended - start) if ended > start else math.nan, self.overruns,
+            self.limited,
             dict(vars(self.driver.counters)),
         )  # fmt: skip
 

@@ -68,7 +68,7 @@ def decode(
     1.0
     """
     matrix = response_matrix(responses, "trials").astype(np.float64)
-    rows = np.asarray(stimuli, dtype=np.int64)
+    rows = np.asarray(stimuli)
     names, codes = np.unique(np.asarray(classes, dtype=str), return_inverse=True)
     if rows.shape != (len(matrix),) or sorted(set(rows.tolist())) != list(range(len(codes))):
         raise UsageError(
@@ -80,7 +80,7 @@ def decode(
     if not np.isfinite(matrix).all():
         raise UsageError("Responses to be decoded must be finite; leave out units or trials with missing values.")
     check_number("The penalty of decoding", penalty, above=0)
-    decoder = Decoder(matrix, rows, penalty=penalty)
+    decoder = Decoder(matrix, rows.astype(np.int64), penalty=penalty)
     orders = np.concatenate(list(label_orders(len(codes), seed, exact=most_exact(ORDERS), draws=ORDERS)))
     accuracy = np.array([decoder(codes[order]) for order in orders])
     means = accuracy.mean(axis=1)
@@ -175,10 +175,12 @@ def label_properties(stimuli: Sequence[str]) -> dict[str, Ints]:
     if len({len(part) for part in parts}) != 1:
         return {}
     properties = {}
-    for values in zip(*parts, strict=True):
+    for place, values in enumerate(zip(*parts, strict=True), start=1):
         names, codes = np.unique(np.asarray(values, dtype=str), return_inverse=True)
         if len(names) > 1 and np.bincount(codes).min() > 1:
-            properties["/".join(names.tolist())] = codes.astype(np.int64)
+            name = "/".join(names.tolist())
+            # Two places may take the same values, as the sides of two things do.
+            properties[f"{name} ({place})" if name in properties else name] = codes.astype(np.int64)
     return properties
 
 

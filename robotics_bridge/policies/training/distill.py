@@ -329,7 +329,7 @@ class _Run:
         self.memory = self.student.zeros(env.num_envs, stored=self.front is not None)
         self.touched = self.front.init_state(env.num_envs) if self.front is not None else self.memory[:, :0]
         self.kept: list[tuple[int, Rollout]] = []
-        self.iteration, self.loss = 0, math.nan
+        self.iteration, self.saved, self.loss = 0, 0, math.nan
         self._claim()
         if (out / STATE).exists():
             state = load_state(out / STATE)
@@ -479,16 +479,18 @@ class _Run:
             self.memory, self.touched = torch.zeros_like(self.memory), torch.zeros_like(self.touched)
         numbers = [number for number, _ in self.kept]
         for number, rollout in self.kept:
-            path = self.out / "rollouts" / f"{number}.safetensors"
-            if not path.is_file():
-                rollout.save(path)
+            # A file of this number from before the last state was left by a run that ended while it saved.
+            if number >= self.saved:
+                rollout.save(self.out / "rollouts" / f"{number}.safetensors")
         reached = {"iteration": self.iteration, "loss": self.loss, "rollouts": numbers}
         world = {"env": self.env.state_dict(), "memory": self.memory, "touched": self.touched}
         random = random_state(self.device)
+        # The student first: a run that its state says is finished is not saved again.
+        write_tensors(self.out / MODEL, self.student.state_dict())
         save_state(
             self.out / STATE, {**learner_state(self.learner, self.optimizer), **reached, **world, "random": random}
         )
-        write_tensors(self.out / MODEL, self.student.state_dict())
+        self.saved = self.iteration
         for path in (self.out / "rollouts").glob("*.safetensors"):
             if int(path.stem) not in numbers:
                 path.unlink()
@@ -496,7 +498,8 @@ class _Run:
     def _go_on(self, state: Mapping[str, Any]) -> None:
         """Take up what :meth:`_save` wrote."""
         restore_learner(state, self.learner, self.optimizer, self.out / STATE)
-        self.iteration, self.loss = int(state["iteration"]), float(state["loss"])
+        self.iteration = self.saved = int(state["iteration"])
+        self.loss = float(state["loss"])
         cuda = self.device.type == "cuda"
         for group in self.optimizer.param_groups:
             group |= {"fused": cuda, "capturable": cuda}

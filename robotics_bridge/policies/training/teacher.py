@@ -478,10 +478,10 @@ def train(
         trainer = Trainer(env, settings, seed=options.seed, observe=options.observe, encoder=options.encoder)
         env.goals.start_curriculum()
         origin = None
-        if options.start is not None and not (run / STATE).is_file():
+        if options.start is not None:
             start = model_file(options.start)
             trainer.begin_from(start, std=options.start_std)
-            origin = {"file": str(start), "hash": file_hash(start)}
+            origin = {"file": str(start), "hash": file_hash(start), "std": options.start_std}
         facts = {
             "kind": "teacher", "task": env.task.name, "hand": env.hand.name,
             "hand_path": "" if env.hand.pads else str(env.hand.path), "hand_physics": env.hand.physics,
@@ -520,9 +520,10 @@ def _resume(trainer: Trainer, run: Path, facts: dict[str, Any]) -> None:
         settings = from_json(TeacherSettings, document_of_run.get("settings"), f"settings of {document}")
         return {**document_of_run, "settings": to_plain(settings)}
 
-    claim(
-        document, {name: facts[name] for name in _IDENTITY}, lambda: facts | {"provenance": provenance()}, stated=stated
-    )
+    # Without a state the run has yet to begin with it, and who names another expects that one.
+    free = facts["start"] is None and (run / STATE).exists()
+    identity = {name: facts[name] for name in (_IDENTITY if free else (*_IDENTITY, "start"))}
+    claim(document, identity, lambda: facts | {"provenance": provenance()}, stated=stated)
     if not (run / STATE).exists():
         return
     state = load_state(run / STATE)

@@ -78,6 +78,8 @@ def test_misuse_is_told_in_a_sentence():
         decode(rng.normal(size=(6, 3)), range(6), ["a", "a", "a", "a", "a", "b"])
     with pytest.raises(UsageError, match="one stimulus 0 … 5"):
         decode(rng.normal(size=(5, 3)), range(5), SHAPES)
+    with pytest.raises(UsageError, match="one stimulus 0 … 5"):
+        decode(rng.normal(size=(7, 3)), [0, 0.9, 1, 2, 3, 4, 5], SHAPES)
     with pytest.raises(UsageError, match="must be finite"):
         decode(np.full((6, 3), np.nan), range(6), SHAPES)
     for penalty in (0.0, -1.0, np.nan):
@@ -105,6 +107,12 @@ def test_labels_name_their_properties_in_any_number_of_parts():
     assert label_properties(["a-x", "b-x", "c-x"]) == {}
     assert label_properties(["a-1", "a-2", "b"]) == {}
     assert list(label_properties(["go", "go", "nogo", "nogo"])) == ["go/nogo"]
+    # Sides of two things take the same values, and both count.
+    sides = label_properties(["left-left", "left-right", "right-left", "right-right"])
+    assert {name: codes.tolist() for name, codes in sides.items()} == {
+        "left/right": [0, 0, 1, 1],
+        "left/right (2)": [0, 1, 0, 1],
+    }
 
 
 @pytest.mark.slow

@@ -83,6 +83,18 @@ def test_a_quiet_session_runs_at_its_rate_and_ends_with_the_hand_holding() -> No
     assert len(controller.latency) == report.ticks
 
 
+def test_the_rate_is_that_of_control_and_not_of_waiting_for_the_first_report() -> None:
+    clock = OwnClock()
+    hand = PaperHand(clock)
+    controller = Controller(lambda obs, forget: np.zeros(2), hand, make_contract(), make_limits(), clock=clock)
+    read, begun = controller.link.read, clock()
+    controller.link.read = lambda: read() if clock() - begun > 2 else None  # type: ignore[method-assign]
+    report = controller.run(2.0)
+    assert report.status == "finished"
+    assert report.seconds == pytest.approx(4.0, abs=0.1)
+    assert report.rate == pytest.approx(40, rel=0.02)
+
+
 def test_observations_are_those_of_the_tasks() -> None:
     seen = []
 

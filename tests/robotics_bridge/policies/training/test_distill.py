@@ -20,6 +20,7 @@ from brainbench.core.files import lock_folder
 from robotics_bridge import hands
 from robotics_bridge.hands.layouts import write_probes
 from robotics_bridge.policies.evaluate import Policy
+from robotics_bridge.policies.training import distill as training
 from robotics_bridge.policies.training.distill import CONFIG, MODEL, ChunkStep, distill, load_student
 from robotics_bridge.policies.training.distill_config import DistillConfig
 from tests.factories.damage import damaged
@@ -199,6 +200,31 @@ def test_a_killed_run_goes_on_exactly(tmp_path, changes) -> None:
     for name, value in first.items():
         torch.testing.assert_close(second[name], value, rtol=0, atol=0, msg=name)
     assert _losses(tmp_path / "a") == _losses(tmp_path / "b")
+
+
+@pytest.mark.parametrize("written", [False, True])
+def test_a_run_that_is_killed_while_it_saves_goes_on_exactly(tmp_path, monkeypatch, written) -> None:
+    changes = {"iterations": 2, "encoder": "mlp", "noisy": True, "aggregate": 2}
+    _run(tmp_path / "a", **changes)
+    save = training.save_state
+
+    def killed(path, tree):
+        if written:
+            save(path, tree)
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(training, "save_state", killed)
+        with pytest.raises(KeyboardInterrupt):
+            _run(tmp_path / "b", **changes)
+    stored = tmp_path / "b" / "rollouts" / "0.safetensors"
+    if not written:  # what no state names is of another course of the run, as on a device that is not exact
+        save_file({name: value * 0 for name, value in load_file(stored).items()}, stored)
+    assert _run(tmp_path / "b", **changes).status == "finished"
+    for name in (MODEL, "rollouts/0.safetensors", "rollouts/1.safetensors"):
+        first, second = (load_file(tmp_path / run / name) for run in "ab")
+        assert first.keys() == second.keys()
+        assert all(torch.equal(value, second[key]) for key, value in first.items()), name
 
 
 def test_a_run_that_stops_after_some_iterations_goes_on_exactly(tmp_path) -> None:

@@ -152,6 +152,20 @@ def test_a_run_may_begin_with_the_networks_of_another(tmp_path: Path) -> None:
         Trainer(env, replace(settings, hidden=(32, 16))).begin_from(tmp_path / "first")
 
 
+def test_what_a_run_begins_with_is_not_changed_before_its_first_state_nor_named_anew(tmp_path: Path) -> None:
+    first, second = tmp_path / "first", tmp_path / "second"
+    train(_env(), first, settings=SMALL, iterations=1)
+    train(_env(), second, settings=SMALL, iterations=1, start=first)
+    stated = json.loads((second / "config.json").read_text())["start"]["hash"]
+    for changes in ({"start": first, "start_std": 0.3}, {"start": second}):
+        with pytest.raises(UsageError, match=r"holds another run: start\."):
+            train(_env(), second, settings=SMALL, iterations=2, **changes)
+    assert train(_env(), second, settings=SMALL, iterations=2).iterations == 2
+    (second / STATE).unlink()
+    with pytest.raises(UsageError, match=rf"start\.hash '{stated[:8]}.*now None"):
+        train(_env(), second, settings=SMALL, iterations=3)
+
+
 def test_exploration_may_begin_anew_with_the_networks_of_another(tmp_path: Path) -> None:
     train(_env(), tmp_path / "first", settings=SMALL, iterations=1)
     settings = replace(SMALL, std_range=(0.1, 0.5), learning_rate_range=(9e-4, 1.1e-3), entropy=10.0)
