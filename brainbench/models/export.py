@@ -355,7 +355,9 @@ def try_onnx(path: str) -> tuple[str, str]:
         tensors = list(_tensors(model))
         if any(tensor.external_data for tensor in tensors):
             return "keeps weights in other files; export it again", ""
-        check_finite({tensor.name: onnx.numpy_helper.to_array(tensor) for tensor in tensors}, path)
+        # A number alone may be infinite, as what attention does not see; what the file computes of it is tried below.
+        weights = [tensor for tensor in tensors if tensor.dims]
+        check_finite({tensor.name: onnx.numpy_helper.to_array(tensor) for tensor in weights}, path)
         session = _session(content, 1)
         # A side without a number is the batch.
         shapes = {
@@ -364,7 +366,9 @@ def try_onnx(path: str) -> tuple[str, str]:
         for name, shape in shapes.items():
             if not 0 <= math.prod(shape) <= MOST_INPUT:
                 return f"takes {math.prod(shape):,} numbers as {brief(name)}; at most {MOST_INPUT:,} are allowed", ""
-        session.run(None, {name: np.zeros(shape, np.float32) for name, shape in shapes.items()})
+        values = session.run(None, {name: np.zeros(shape, np.float32) for name, shape in shapes.items()})
+        if not all(np.isfinite(value).all() for value in values):
+            return "gives values that are not finite; export it again", ""
     except DataError as error:
         return f"cannot be used: {error}".removesuffix("."), ""
     except Exception as error:  # noqa: BLE001 - ONNX and ONNX Runtime have no common public base of errors

@@ -4,13 +4,15 @@ import json
 from pathlib import Path
 
 import numpy as np
+import onnx
 import pytest
 import torch
+from onnx import TensorProto, helper
 from torch import nn
 
 from brainbench.core.errors import DataError, UsageError
 from brainbench.models import export
-from brainbench.models.export import READERS, StreamingStep, export_model
+from brainbench.models.export import INPUTS, OUTPUTS, READERS, StreamingStep, export_model
 from brainbench.models.registry import load_model
 from tests.factories.training_sweeps import random_sweeps
 
@@ -161,6 +163,26 @@ def test_every_kind_of_network_can_be_an_onnx_file(name, tmp_path):
     made = _streams_alike(name, tmp_path / "model", "onnx")
     full = json.loads(made.contract.read_text())["full"]
     assert ("after 32 steps" in full) if "gpt" in name else full is None
+
+
+@pytest.mark.parametrize(("number", "sound"), [(-np.inf, True), (np.nan, False)])
+def test_a_mask_may_be_infinite_and_what_is_computed_may_not(tmp_path, number, sound):
+    inputs = [helper.make_tensor_value_info(name, TensorProto.FLOAT, ["batch", 2]) for name in INPUTS]
+    outputs = [helper.make_tensor_value_info(name, TensorProto.FLOAT, ["batch", 2]) for name in OUTPUTS]
+    nodes = [
+        helper.make_node("Max", ["obs", "mask"], ["features"]),
+        helper.make_node("Identity", ["h_in"], ["h_out"]),
+    ]
+    mask = helper.make_tensor("mask", TensorProto.FLOAT, [], [number])
+    graph = helper.make_graph(nodes, "step", inputs, outputs, [mask])
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", export.OPSET)], ir_version=9)
+    onnx.save(model, tmp_path / "model.onnx")
+    x = np.ones((1, 2), np.float32)
+    if sound:
+        np.testing.assert_array_equal(READERS["onnx"](tmp_path / "model.onnx")(x, x)[0], x)
+    else:
+        with pytest.raises(DataError, match=r"model\.onnx' gives values that are not finite"):
+            READERS["onnx"](tmp_path / "model.onnx")
 
 
 @pytest.mark.parametrize("name", ["s4-small", pytest.param("zhuang-small+mamba", marks=pytest.mark.slow)])

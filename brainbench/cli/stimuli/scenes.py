@@ -309,12 +309,19 @@ def _file(
 
 
 def _measures(mesh: Mesh, solid: Solid) -> dict[str, Any]:
+    import numpy as np
+
+    from brainbench.geometry import winding_number
+
     low, high = mesh.bounds
+    # What two bodies share would count twice; the surface winds about it twice.
+    points = low + (high - low) * np.random.default_rng(0).random((4096, 3))
+    twice = mesh.diagnosis.bodies > 1 and bool((winding_number(mesh, points) > 1.5).any())
     return {
         "name": solid.name,
         "size_mm": ((high - low) * _MILLI).tolist(),
         "diagonal_mm": mesh.diagonal * _MILLI,
-        "volume_mm3": mesh.volume * _MILLI**3 if mesh.diagnosis.watertight else None,
+        "volume_mm3": None if twice or not mesh.diagnosis.watertight else mesh.volume * _MILLI**3,
         "triangles": len(mesh.faces),
         "diagnosis": str(mesh.diagnosis),
         "content_hash": mesh.content_hash,
@@ -325,7 +332,7 @@ def _measures(mesh: Mesh, solid: Solid) -> dict[str, Any]:
 
 def _object_text(data: dict[str, Any]) -> str:
     size = " × ".join(f"{value:.4g}" for value in data["size_mm"])
-    volume = "unknown: not closed" if data["volume_mm3"] is None else f"{data['volume_mm3']:.4g} mm³"
+    volume = "unknown: not closed, or bodies overlap" if data["volume_mm3"] is None else f"{data['volume_mm3']:.4g} mm³"
     touched = "the triangles of its surface (engine rod; for others choose --collision decomposition)"
     if parts := data["convex_parts"]:
         touched = f"{parts} convex part{'' if parts == 1 else 's'}"

@@ -80,6 +80,18 @@ def test_the_families_are_listed(run):
     assert "family:NAME" in run("stimuli", "objects").out
 
 
+@pytest.mark.parametrize(("shift", "volume"), [(5, None), (20, 2000)])
+def test_what_two_bodies_share_is_not_counted_twice(run, tmp_path, shift, volume):
+    boxes = [trimesh.creation.box(extents=(10, 10, 10)) for _ in range(2)]
+    boxes[1].apply_translation((shift, shift / 10, 0))
+    path = tmp_path / "two.stl"
+    trimesh.util.concatenate(boxes).export(path)
+    arguments = ("stimuli", "objects", str(path), "--unit", "mm")
+    value = json.loads(run(*arguments, "--json").out)["volume_mm3"]
+    assert value == (volume if volume is None else pytest.approx(volume))
+    assert ("bodies overlap" in run(*arguments).out) == (volume is None)
+
+
 @pytest.mark.slow
 def test_a_member_of_a_family_is_described_and_written(run, tmp_path):
     out = tmp_path / "torus.obj"
