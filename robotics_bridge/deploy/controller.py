@@ -183,6 +183,7 @@ class Controller:
         self._order = [driver.joints.index(name) for name in contract.joints]
         self._action = np.zeros(len(contract.moved), np.float32)
         self._targets: NDArray[np.float64] | None = None
+        self._limited = -math.inf  # time of these targets (s)
         self._monitor = RateMonitor(self.rate, limits.rate_window)
         self.latency, self.processor = LatencyHistogram(), LatencyHistogram()
         self.limited = self.overruns = self.ticks = 0
@@ -214,8 +215,7 @@ class Controller:
         return Report(
             "stopped" if reason else "finished", reason or "", self.ticks, ended - begun, self.latency.summary(),
             self.processor.summary(), self.ticks / (ended - start) if ended > start else math.nan, self.overruns,
-            self.limited,
-            dict(vars(self.driver.counters)),
+            self.limited, dict(vars(self.driver.counters)),
         )  # fmt: skip
 
     def _wait(self) -> str | None:
@@ -274,7 +274,10 @@ class Controller:
         # The speed limit runs from target to target: measured from the joints, a load that holds them would slow the
         # targets.
         before = reading.position if self._targets is None else self._targets
-        self._targets = self.limits.limit(wanted, before, 1 / self.rate)
+        # Ticks that are made up for come at once: a target moves on for the time that has passed since the last.
+        now = self.clock()
+        self._targets = self.limits.limit(wanted, before, min(1 / self.rate, max(0.0, now - self._limited)))
+        self._limited = now
         self.limited += bool(np.any(np.abs(self._targets - wanted) > 1e-9))
         return self._targets
 

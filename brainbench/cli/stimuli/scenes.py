@@ -314,8 +314,8 @@ def _measures(mesh: Mesh, solid: Solid) -> dict[str, Any]:
     from brainbench.geometry import winding_number
 
     low, high = mesh.bounds
-    # What two bodies share would count twice; the surface winds about it twice.
-    points = low + (high - low) * np.random.default_rng(0).random((4096, 3))
+    # What two bodies share would count twice; the surface winds about it twice. Fine meshes get fewer points.
+    points = low + (high - low) * np.random.default_rng(0).random((64 + 4_000_000 // len(mesh.faces), 3))
     twice = mesh.diagnosis.bodies > 1 and bool((winding_number(mesh, points) > 1.5).any())
     return {
         "name": solid.name,

@@ -342,7 +342,7 @@ class _Run:
         total = self.config.iterations or 0
         status: Literal["finished", "stopped", "diverged"] = "finished"
         reason = ""
-        while self.iteration < total:
+        while self.iteration < total and not reason:
             begun = time.perf_counter()
             rollout = self._act(self.config.share(self.iteration))
             acted = time.perf_counter()
@@ -365,9 +365,7 @@ class _Run:
             reason = "" if last else stop.reason(self.iteration)
             if last or reason or self.iteration % self.config.save_interval == 0:
                 self._save()
-            if reason:
-                status = "stopped"
-                break
+            status = "stopped" if reason else "finished"
         return DistillResult(status, reason, self.out, self.iteration, self.loss, stop.elapsed)
 
     @torch.no_grad()

@@ -95,6 +95,26 @@ def test_the_rate_is_that_of_control_and_not_of_waiting_for_the_first_report() -
     assert report.rate == pytest.approx(40, rel=0.02)
 
 
+def test_targets_move_no_faster_than_allowed_where_ticks_are_made_up_for() -> None:
+    clock, limits, sent = OwnClock(), make_limits(), []
+    hand, calls = PaperHand(clock), iter(range(10_000))
+
+    def stalls(obs, forget):
+        number = next(calls)
+        clock.now += 0.07 if number % 7 == 6 else 0.0
+        return np.full(2, 50.0 if number % 14 < 7 else -50.0)
+
+    controller = Controller(stalls, hand, make_contract(), limits, clock=clock)
+    send = controller.link.send
+    controller.link.send = lambda command: (sent.append((clock(), command.targets)), send(command))[1]  # type: ignore
+    assert controller.run(2.0).status == "finished"
+    times, targets = (np.array(part) for part in zip(*sent, strict=True))
+    assert np.diff(times).min() < 1e-4  # ticks at once
+    allowed = limits.speed * np.diff(times)[:, None]
+    assert (np.abs(np.diff(targets, axis=0)) <= allowed + 1e-9).all()
+    assert (np.abs(np.diff(targets, axis=0)) > 0.9 * allowed).any()
+
+
 def test_observations_are_those_of_the_tasks() -> None:
     seen = []
 
