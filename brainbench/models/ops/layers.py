@@ -36,6 +36,12 @@ def seeded(seed: int) -> Iterator[None]:
 def load_named(targets: Mapping[str, torch.Tensor], state: Mapping[str, Any], *, what: str) -> None:
     """Copy arrays or tensors of ``state`` into ``targets``, which has the same names; all or nothing."""
     check_named({name: tuple(value.shape) for name, value in targets.items()}, state, what=what)
+    floating = (name for name, value in targets.items() if value.is_floating_point())
+    # Copied as they are, quantised weights (integers, or floating point in one byte) would be other numbers.
+    exact = (torch.float64, torch.float32, torch.float16, torch.bfloat16)
+    if quantised := [name for name in floating if torch.as_tensor(state[name]).dtype not in exact]:
+        names = listing(quantised, limit=3)
+        raise DataError(f"{names} of {what} must be real numbers in floating point; save them as float32.")
     copy_named(targets, state)
 
 

@@ -47,6 +47,9 @@ def test_parameters_are_loaded_all_or_none():
     for change, words in (
         ({"bias": torch.zeros(3)}, r"'bias' has shape \[3\], expected \[2\]"),
         ({"wieght": torch.zeros(1)}, "did you mean 'wieght' → 'weight'"),
+        ({"bias": torch.full((2,), 127, dtype=torch.int8)}, r"'bias' of the layer must be .* floating point"),
+        ({"bias": torch.ones(2, dtype=torch.float8_e4m3fn)}, r"'bias' of the layer must be .* floating point"),
+        ({"bias": torch.ones(2, dtype=torch.complex64)}, r"'bias' of the layer must be .* floating point"),
     ):
         with pytest.raises(DataError, match=words):
             load_named(targets, given | change, what="the layer")
