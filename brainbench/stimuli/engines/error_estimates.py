@@ -101,7 +101,8 @@ def with_errors(run: Run, jobs: Sequence[Job], fidelity: Fidelity) -> list[Trace
         short = {
             index: replace(halved_step(setting, job.whisker, job.spacing), time_step=SHORT_STEP, steps_per_period=None)
             for index, (job, trace, setting) in enumerate(zip(jobs, traces, settings, strict=True))
-            if trace.error <= promise and setting.time_step > SHORT_STEP and may_jam(job, trace)
+            if trace.error <= promise and setting.step_of(setting.chain(job.whisker)) > SHORT_STEP
+            if may_jam(job, trace)
         }
         simulate(short)
         for index, chosen in short.items():

@@ -45,8 +45,9 @@ wp = warp()
 
 SORTED, BEYOND = 8, 2**31 - 1  # nodes that a thread sorts at once, and a number beyond all
 Nodes = wp.types.vector(length=SORTED, dtype=wp.int32)
-ROUNDS = 6  # times that weights lean over at most
-STEEPEST = 10.0  # largest exponent of a weight
+ROUNDS = 12  # times that weights lean over at most
+STEEPEST, STRIDE = 40.0, 6.0  # largest exponent of a weight, and the most by which a round changes it
+ASIDE = 1e-4  # share of a face's normal below which a taxel lies beside it: rounding of a right angle carries nothing
 TOUCH, BEHIND, NEAR = range(3)  # sources of carriers
 
 
@@ -405,7 +406,7 @@ def spread_kernel(kinds: frozenset[int], raycast: bool, mode: int, sticky: bool,
             body = press.body[env, n]
             carrier.way = wp.vec3f(touch[0], touch[1], touch[2])
             carrier.facing = wp.dot(carrier.way, push.normal)
-            if body == push.body and carrier.facing > 0.0:
+            if body == push.body and carrier.facing > wp.static(ASIDE):
                 if rivals < 0 or belongs(faces, rivals, face, carrier.x, carrier.way, plan.reach[n]):
                     carrier.weight = touch[3]
                     if wp.static(noisy):
@@ -418,7 +419,7 @@ def spread_kernel(kinds: frozenset[int], raycast: bool, mode: int, sticky: bool,
                 back = behind(solids, pairs, probes, env, n, push.slot, push.body)
                 carrier.way = wp.vec3f(back[0], back[1], back[2])
                 carrier.facing = wp.dot(carrier.way, push.normal)
-                if carrier.facing > 0.0:
+                if carrier.facing > wp.static(ASIDE):
                     carrier.weight = wp.max(radius - back[3], 0.0)
             elif radius > 0.0:
                 # Without a distance the taxel's own normal tells its side.
@@ -617,6 +618,9 @@ def spread_kernel(kinds: frozenset[int], raycast: bool, mode: int, sticky: bool,
                                         if rounds == 1:
                                             x2 = wp.min(wp.dot(lean, extents @ lean) / 3.0, 0.3)
                                             lean *= (3.0 - x2) / (3.0 - 3.0 * x2)
+                                        # From weights on the wrong side a whole step of Newton's leaps over the right
+                                        # ones, to and fro.
+                                        lean *= wp.min(wp.static(STRIDE) / (far * wp.length(lean)), 1.0)
                                         lean += push.lean
                                         push.lean = lean * wp.min(wp.static(STEEPEST) / (far * wp.length(lean)), 1.0)
                                     tilt /= steepest
@@ -664,8 +668,8 @@ def spread_kernel(kinds: frozenset[int], raycast: bool, mode: int, sticky: bool,
                         else:
                             left = True
                             node = -1
-                    # Sensors of a link need not all feel it.
-                    if not (rest[0] >= lack[0]):
+                    # Sensors of a link need not all feel it: the best counts, whatever their order.
+                    if not (rest[0] > lack[0] or (rest[0] == lack[0] and rest[1] >= lack[1])):
                         lack = rest
                 pushed += size
                 lost += lack

@@ -160,6 +160,7 @@ def test_an_estimate_that_happens_to_be_small_is_not_believed():
         (0.4, (1, -1), Fidelity(error=0.5), 0.3),
         (0.4, (1, -1), Fidelity(), 0.0),
         (0.4, (1, -1), Fidelity(error=0.1, time_step=1e-3, solver="quasistatic"), 0.0),
+        (0.4, (1, -1), Fidelity(error=0.1, steps_per_period=1e4), 0.0),
         (0.4, (1,), Fidelity(error=0.1), 0.0),
         (0.0, (1, -1), Fidelity(error=0.1), 0.0),
         (0.4, (1, -100), Fidelity(error=0.1), 0.0),

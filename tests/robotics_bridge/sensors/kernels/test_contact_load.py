@@ -191,6 +191,44 @@ def test_the_side_of_a_block_is_not_pushed_by_its_bottom() -> None:
         assert (reading - readings[0]).abs().max() < 0.01 * readings[0].abs().max()
 
 
+@pytest.mark.parametrize("degrees", [9, 15, 27, 49, 49.5, 57, 66])
+@pytest.mark.parametrize("turned", [0, 33])
+def test_the_load_of_a_tilted_block_lies_where_its_edge_presses(degrees: float, turned: float) -> None:
+    """Depths lie on one side of the edge that bears the load, so that weights lean far, without leaping over it."""
+    tilt, half = np.radians(degrees), np.array([0.01, 0.012, 0.008])
+    height = 0.01 + half[0] * np.sin(tilt) + half[2] * np.cos(tilt) - 0.002
+    place = f'pos="0.0013 0.0007 {height}" quat="{np.cos(tilt / 2)} 0 {np.sin(tilt / 2)} 0"'
+    block = f'<body name="b" mocap="true" {place}><geom type="box" size="{" ".join(map(str, half))}"/></body>'
+    pad = f'<body name="pad" euler="0 0 {turned}"><joint type="slide" axis="0 0 1" stiffness="3000" damping="20"/>'
+    engine = _engine(block, pad=f'{pad}<geom mass=".5" type="box" size=".05 .05 .01"/></body>')
+    expected, here = _on(engine), engine.data[0].body("pad")
+    readings, suite = _read(engine)
+    turn = here.xmat.reshape(3, 3)
+    load = np.linalg.norm(expected[:3])
+    assert load > 0.5
+    moment = turn.T @ (expected[3:] - np.cross(here.xpos, expected[:3]))
+    # A twentieth of a millimetre; taxels lie 6.7 mm apart.
+    np.testing.assert_allclose(readings[3:5], moment[:2], atol=5e-5 * load)
+    assert not suite.unbalanced.any()
+
+
+@pytest.mark.parametrize("geom", ["cylinder", "box"])
+def test_taxels_beside_a_body_whose_side_is_a_right_angle_read_finite_numbers(geom: str) -> None:
+    """Of the taxels of this patch some overlap the side of a body alone, whose normal rounding tips up or down."""
+    rng = np.random.default_rng(0)
+    size = {"cylinder": ".01 .01", "box": ".01 .01 .01"}[geom]
+    for _ in range(20):
+        x, y, turn = *rng.uniform(-0.002, 0.002, 2), rng.uniform(0, 360)
+        block = f'{x} {y} .0199" euler="0 0 {turn}'
+        engine = _engine(_free("b", block, f'type="{geom}" size="{size}" mass=".3"'), steps=20)
+        around = Probes.grid(4, 1, size=(0.003, 0.001), center=(x + 0.0125, y, 0.01), radius=0.004)
+        total, suite = _read(engine, around)
+        load = np.linalg.norm(_on(engine)[:3])
+        assert load > 1
+        assert np.isfinite(total).all()
+        assert np.linalg.norm(total[:3]) + _missing(suite) == pytest.approx(load, rel=0.02)
+
+
 def _press(geom: str, place: np.ndarray, way: np.ndarray, force: float, pad: str, drag: float = 0.0) -> MujocoEngine:
     """Return an engine in which a body slides along ``way`` onto a pad that stands still, and is dragged across."""
     across = np.cross(way, [1.0, 0.0, 0.0])
@@ -407,8 +445,10 @@ def test_sensors_added_in_any_order_give_the_same_bits() -> None:
     bodies = _free("box", "0 0 .0205", 'type="box" size=".01 .012 .01" mass=".5"')
     engine = _engine(bodies)
     half = Probes.grid(8, 8, size=(0.05, 0.05), center=(0.01, 0, 0.01), radius=0.004)
+    aside = Probes.grid(2, 2, size=(0.002, 0.002), center=(0.006, 0.006, 0.01), radius=0.004)
     sensors = {
         "fine": KinematicTaxel(link="pad", probes=GRID), "half": KinematicTaxel(link="pad", probes=half),
+        "aside": KinematicTaxel(link="pad", probes=aside),
         "bit": ContactProbe(link="pad", probes=half), "law": KinematicTaxel(link="pad", probes=half, total="law"),
     }  # fmt: skip
     readings = []
@@ -417,6 +457,8 @@ def test_sensors_added_in_any_order_give_the_same_bits() -> None:
         for _ in range(2):
             suite.update(engine.state, 0.002)
         readings.append({name: suite.read(name).numpy().copy() for name in sensors})
+        # The best of the sensors counts: one bears the moment.
+        assert suite.missing_moment.max() < 1e-6
     for name in sensors:
         np.testing.assert_array_equal(readings[0][name], readings[1][name], err_msg=name)
 
