@@ -262,7 +262,8 @@ def _values(fixed: bool, kinds: Sequence[Any], limit: msgspec.Meta) -> Check | N
     noun = "values" if None in checks else "numbers"
 
     def check(name: str, value: Any) -> None:
-        several = isinstance(value, Iterable) and not isinstance(value, str | bytes | Mapping | Iterator)
+        no_row = str | bytes | Mapping | set | frozenset | Iterator
+        several = isinstance(value, Iterable) and not isinstance(value, no_row)
         values: list[Any] = list(value) if several else []
         if not several or (fixed and len(values) != len(checks)):
             raise UsageError(f"{name} holds {f'{len(checks)} {noun}' if fixed else noun}; received {brief(value)}.")

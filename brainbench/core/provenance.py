@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any
@@ -44,7 +45,7 @@ class UniquePart:
 
         def number(value: Any) -> float:
             real = isinstance(value, (int, float)) and not isinstance(value, bool)
-            return float(value) if real and math.isfinite(value) else math.nan
+            return float(value) if real and abs(value) <= sys.float_info.max else math.nan
 
         def texts(value: Any) -> tuple[str, ...]:
             return tuple(map(_text, value)) if isinstance(value, (list, tuple)) else ()

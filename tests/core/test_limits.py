@@ -189,6 +189,7 @@ class Grid:
         ({"order": "frist"}, "Unknown order of a grid 'frist'; did you mean 'first'? Allowed: 'first', 'second'."),
         ({"corner": (1, 2)}, "corner of a grid holds 3 numbers; received (1, 2)."),
         ({"corner": 3}, "corner of a grid holds 3 numbers; received 3."),
+        ({"corner": {1, 2, 3}}, "corner of a grid holds 3 numbers; received {1, 2, 3}."),
         ({"sizes": (1, 0)}, "sizes of a grid must be a whole number, at least 1; received 0."),
         ({"sizes": ()}, "sizes of a grid holds at least 1 and at most 3 values; received []."),
         ({"width": (1.0,)}, "width of a grid holds 2 numbers; received (1.0,)."),

@@ -3,7 +3,7 @@ import math
 from dataclasses import replace
 
 from brainbench.core.files import to_json
-from brainbench.core.provenance import Provenance
+from brainbench.core.provenance import Provenance, UniquePart
 from brainbench.core.records import (
     Ceiling,
     Interval,
@@ -78,3 +78,9 @@ def test_a_unique_part_is_read_where_numbers_state_it():
         assert part is not None
         assert math.isnan(part.unique)
         assert math.isnan(part.low)
+
+
+def test_a_number_beyond_every_float_is_none():
+    part = UniquePart.of({"unique": 10**400, "total": -(10**400), "interval": [10**400, 1], "shared": 1})
+    assert math.isnan(part.unique + part.low + part.total)
+    assert (part.high, part.shared) == (1, 1)

@@ -527,4 +527,4 @@ def _edge(text: str) -> tuple[str, str]:
 
 
 def _signed(seconds: float) -> str:
-    return f"{'+' * (seconds > 0)}{contracts.as_label(float(seconds))}" if seconds else ""
+    return f"{'+' if seconds > 0 else ''}{contracts.as_label(float(seconds))}" if seconds else ""

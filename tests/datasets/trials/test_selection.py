@@ -321,3 +321,7 @@ def test_an_area_that_names_no_unit_is_answered_with_the_nearest(tmp_path):
     path = write_recordings(tmp_path / "a.h5", make_simple_session(unit_columns={"area": ["S1", "S1", "M1"]}))
     with pytest.raises(UsageError, match=r"Unknown area value 'S2'; did you mean 'S1'\?"):
         open_recordings(path, conditions="trials:stimulus", select="units.area=S2")
+
+
+def test_a_window_of_numbers_of_numpy_is_written_as_one_of_python():
+    assert str(Window(offset=np.float32(0.5), length=np.float32(1.5))) == str(Window(offset=0.5, length=1.5))
