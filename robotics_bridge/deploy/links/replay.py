@@ -440,6 +440,9 @@ def _read_episode(folder: Path, hand: Hand, layout: Layout, episode: int) -> Tou
     if absent := {"observation.state", "observation.tactile"} - set(features):
         raise DataError(f"{name} lacks {listing(sorted(absent))}: joints and touch are what is replayed.")
     frames = _frames(folder, version, episode, info)
+    if TIME in features:
+        # Of the ticks that used one report the last counts, whose targets hold.
+        frames = frames[np.append(np.diff(_stacked(frames, TIME, name)[:, 0]) != 0, True)]
     joints = _joint_names(features["observation.state"].get("names"))
     position = _stacked(frames, "observation.state", name)
     tactile = _stacked(frames, "observation.tactile", name)
