@@ -3,10 +3,9 @@
 A data set (layout v3.0) is written with our own Parquet and JSON; lerobot itself is not needed. Per frame:
 ``observation.state`` (joint positions, rad), ``observation.velocity``, ``action`` (joint targets, rad),
 ``observation.tactile`` [N, 6] (force and torque of each point, link frame, about the link's origin) and
-``observation.wrench`` [6] (their sum in the palm's frame, about its origin). A session has ``observation.time`` too (s
-since the first frame, by the hand's clock), since LeRobot's time stamps count frames at an even rate. Where the points
-sit, and the unit of the forces, stands once in ``meta/tactile.json``. Arrays of two axes are nested lists, as LeRobot
-stores them. A session is one episode.
+``observation.wrench`` [6] (their sum in the palm's frame, about its origin), and ``observation.time`` (s since the first
+frame, by the hand's clock): LeRobot's time stamps count frames. Where the points sit, and the unit of the forces, stands
+once in ``meta/tactile.json``. Arrays of two axes are nested lists, as LeRobot stores them. A session is one episode.
 
 A log is a LeRobot episode (layouts v2 and v3) or a table of comma-separated numbers: ``time`` (s), joints by name (rad)
 and taxels as ``LINK:NUMBER`` (N along the inward normal), numbered as the hand's layout has them. Letters: T frame,
@@ -91,8 +90,7 @@ class SessionRecorder:
         self.hand, self.contract, self.folder = hands.load(contract.hand), contract, folder
         self.frames: list[tuple[NDArray[np.floating], ...]] = []
         """:data:`PARTS` of each tick."""
-        self.times: list[float] = []
-        """When each was measured, by the hand's clock (s)."""
+        self.times: list[float] = []  # of measurement, by the hand's clock (s)
 
     def begin(self, joints: Sequence[str], fingers: Sequence[str]) -> SessionRecorder:
         """Take in the joints of a hand and the fingers that it senses, in the order of its reports; return itself."""
@@ -198,11 +196,8 @@ def write_lerobot(folder: Path, frames: Mapping[str, NDArray[np.floating]], sess
         with atomic_path(folder / "meta" / f"{file}.parquet") as temporary:
             rows.to_parquet(temporary)
     write_json(folder / "meta" / "stats.json", stats)
-    names = {
-        "observation.tactile": ["point", "channel"],
-        "observation.wrench": ["Fx", "Fy", "Fz", "Mx", "My", "Mz"],
-        TIME: ["s"],
-    }
+    wrench = [f"{part}{axis}" for part in "FM" for axis in "xyz"]
+    names = {"observation.tactile": ["point", "channel"], "observation.wrench": wrench, TIME: ["s"]}
     features: dict[str, Any] = {
         name: {"dtype": "float32", "shape": list(shape), "names": names.get(name, list(joints))}
         for name, shape in shapes.items()

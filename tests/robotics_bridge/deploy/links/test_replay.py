@@ -105,11 +105,11 @@ def test_a_session_states_forces_in_the_unit_of_the_hand(tmp_path) -> None:
     # A loop may miss ticks, and two may use one report.
     for number, time in enumerate((7.0, 7.025, 7.025, 7.075)):
         reading = HandReading(number, time, time, np.zeros(12), np.zeros(12), pressure)
-        recorder(reading, None, None, np.full(12, float(number)))
+        recorder(reading, None, None, np.full(12, 0.01 * number))
     # What was recorded is read again: when it was measured, of the middle of a round tip, along one normal.
     log = read_touch_log(recorder.write(), HAND, PROBES)
     np.testing.assert_allclose(log.time, [0, 0.025, 0.075], atol=1e-6)
-    assert log.target[:, 0].tolist() == [0, 0, 2]
+    assert log.target[:, 0].tolist() == pytest.approx([0, 0, 0.02])
     assert "pressure" in log.unit
     np.testing.assert_allclose(np.linalg.norm(log.points.normal, axis=1), 1)
     assert {*log.points.links} == {*TIPS}
