@@ -3,9 +3,9 @@
 A data set (layout v3.0) is written with our own Parquet and JSON; lerobot itself is not needed. Per frame:
 ``observation.state`` (joint positions, rad), ``observation.velocity``, ``action`` (joint targets, rad),
 ``observation.tactile`` [N, 6] (force and torque of each point, link frame, about the link's origin) and
-``observation.wrench`` [6] (their sum in the palm's frame, about its origin), and ``observation.time`` (s since the first
-frame, by the hand's clock): LeRobot's time stamps count frames. Where the points sit, and the unit of the forces, stands
-once in ``meta/tactile.json``. Arrays of two axes are nested lists, as LeRobot stores them. A session is one episode.
+``observation.wrench`` [6] (their sum in the palm's frame, about its origin), and ``observation.time`` (s since the
+first frame, by the hand's clock; LeRobot's time stamps count frames). Where the points sit, and the unit of forces, is
+said in ``meta/tactile.json``. Arrays of two axes are nested lists, as LeRobot stores them. A session is one episode.
 
 A log is a LeRobot episode (layouts v2 and v3) or a table of comma-separated numbers: ``time`` (s), joints by name (rad)
 and taxels as ``LINK:NUMBER`` (N along the inward normal), numbered as the hand's layout has them. Letters: T frame,
