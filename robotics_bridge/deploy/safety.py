@@ -190,6 +190,8 @@ class SafeLink:
                     f"a command came {1e3 * age:.0f} ms after the report it was decided from (allowed "
                     f"{1e3 * timeout:.0f} ms)"
                 )
+            if self._overdue(now):
+                return self._stopped
             origin: dict[str, Any] = {"report": command.reading, "allowed": timeout} if self._carries else {}
             self._driver.send(targets, **origin)
             self._before, self._due = np.array(targets), now + self._step + SILENCE
@@ -206,8 +208,7 @@ class SafeLink:
         def watch() -> None:
             while not ended.wait(SILENCE / 10):
                 with self._turn:
-                    if self._clock() > self._due and not self._stopped:
-                        self._stopped = f"no command came for {1e3 * (self._step + SILENCE):.0f} ms"
+                    if self._overdue(self._clock()):
                         self._driver.stop()
 
         thread = threading.Thread(target=watch, daemon=True) if type(self._clock) is Clock else None
@@ -224,6 +225,15 @@ class SafeLink:
         """Tell the hand to hold where it is."""
         self._stopped = self._stopped or "the hand was stopped"
         self._driver.stop()
+
+    def _overdue(self, now: float) -> bool:
+        """Note that no command came in time, once; whoever has the turn then stops the hand.
+
+        In a process that was suspended and goes on, the loop may come before the thread that watches it.
+        """
+        if overdue := now > self._due and not self._stopped:
+            self._stopped = f"no command came for {1e3 * (self._step + SILENCE):.0f} ms"
+        return overdue
 
     def _age(self, reading: HandReading) -> float:
         return self._offset.age(reading.time, reading.arrived, self._clock())

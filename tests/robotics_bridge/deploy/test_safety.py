@@ -140,6 +140,17 @@ def test_the_link_stops_the_hand_while_the_loop_hangs() -> None:
     assert len(hand.sent) == 1
 
 
+def test_a_loop_that_goes_on_before_its_watch_sends_nothing_from_a_fresh_report_either() -> None:
+    link, hand, reading, clock = _link()
+    assert link.send(Command(np.zeros(3), reading, link.deadline(reading))) is None
+    clock.now += SILENCE + 0.03
+    reading = link.read()
+    assert link.fault(reading) is None
+    assert "no command came for" in link.send(Command(np.zeros(3), reading, link.deadline(reading)))
+    assert "no command came for" in link.fault(reading)
+    assert len(hand.sent) == 1
+
+
 @pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="signals")
 def test_a_session_that_was_suspended_stops_when_it_goes_on() -> None:
