@@ -5,8 +5,16 @@
 
 from __future__ import annotations
 
-from robotics_bridge.physics.engines import MujocoEngine, MujocoWarpEngine
+from typing import TYPE_CHECKING
+
+from brainbench.core.lazy import lazy_exports
 from robotics_bridge.physics.scene import KINDS, Geometry, TouchScene, compile_variants
-from robotics_bridge.physics.state import HandState
+
+if TYPE_CHECKING:
+    from robotics_bridge.physics.engines import MujocoEngine, MujocoWarpEngine
+    from robotics_bridge.physics.state import HandState
 
 __all__ = ["KINDS", "Geometry", "HandState", "MujocoEngine", "MujocoWarpEngine", "TouchScene", "compile_variants"]
+
+# Tasks are made of geometries; only engines need torch.
+__getattr__, __dir__ = lazy_exports(__name__)

@@ -84,7 +84,7 @@ def test_a_student_plays_with_its_own_touch_and_is_exported(tmp_path: Path) -> N
     assert (out["agent"], out["contacts"]) == (name, "firm")
     run_policy("export", name, "--out", str(file))
     deployed = read_deployed(file)
-    assert (deployed.contract.observe, deployed.contract.more["contacts"]) == ("force_torque", CONTACTS["firm"])
+    assert (deployed.contract.observe, deployed.contract.contacts) == ("force_torque", CONTACTS["firm"])
     # What a hand measures or is told is all that it reads: nothing but touch is asked for.
     assert list(deployed.contract.inputs) == ["proprio", "command", "tactile"]
     assert list(deployed.require({"tactile"})) == ["tactile"]

@@ -81,7 +81,7 @@ for line in lines:
     ended, told = play(training, *agents)
     assert ended == ["ended 0"] * 2, told
     assert "CUDA" not in told
-    ended, told = play(f"{training} torch warp mujoco", "--agent in_palm_rotate.teachr", "--video x.mpx")
+    ended, told = play(f"{training} torch warp", "--agent in_palm_rotate.teachr", "--video x.mpx")
     assert (ended, told.count("\n")) == (["ended 2"] * 2, 2), told
 
 
