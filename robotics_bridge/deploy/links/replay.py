@@ -89,8 +89,7 @@ class SessionRecorder:
         check_folder(folder, contract.rate)
         self.hand, self.contract, self.folder = hands.load(contract.hand), contract, folder
         self.frames: list[tuple[NDArray[np.floating], ...]] = []
-        """:data:`PARTS` of each tick."""
-        self.times: list[float] = []  # of measurement, by the hand's clock (s)
+        """:data:`PARTS` of each tick, and when it was measured by the hand's clock (s)."""
 
     def begin(self, joints: Sequence[str], fingers: Sequence[str]) -> SessionRecorder:
         """Take in the joints of a hand and the fingers that it senses, in the order of its reports; return itself."""
@@ -115,15 +114,15 @@ class SessionRecorder:
         torque = np.cross(self.points.position, force).astype(float)
         points = np.concatenate([force, torque], axis=1)
         wrench = total_wrench(points, self.points.links, self.axes)
-        self.frames.append((reading.position, reading.velocity, targets, points, wrench))
-        self.times.append(reading.time)
+        self.frames.append((reading.position, reading.velocity, targets, points, wrench, np.array([reading.time])))
 
     def write(self) -> Path | None:
         """Write the session as a data set (:func:`write_lerobot`) and return its folder; None if no tick was kept."""
         if not self.frames:
             return None
-        frames = {name: np.array([frame[part] for frame in self.frames]) for part, name in enumerate(PARTS)}
-        frames[TIME] = np.array(self.times)[:, None] - self.times[0]
+        parts = zip(*self.frames, strict=True)
+        frames = {name: np.array(values) for name, values in zip((*PARTS, TIME), parts, strict=True)}
+        frames[TIME] -= frames[TIME][0]
         session = SessionFacts(
             task=self.contract.task or "deployed policy", fps=self.contract.rate, joints=self.joints,
             points=self.points, robot=self.hand.name, unit="unit of the hand's pressure",
@@ -435,9 +434,12 @@ def _read_episode(folder: Path, hand: Hand, layout: Layout, episode: int) -> Tou
     if absent := {"observation.state", "observation.tactile"} - set(features):
         raise DataError(f"{name} lacks {listing(sorted(absent))}: joints and touch are what is replayed.")
     frames = _frames(folder, version, episode, info)
+    time = np.asarray(frames["timestamp"], float)
     if TIME in features:
         # Of the ticks that used one report the last counts, whose targets hold.
-        frames = frames[np.append(np.diff(_stacked(frames, TIME, name)[:, 0]) != 0, True)]
+        time = _stacked(frames, TIME, name)[:, 0]
+        last = np.append(np.diff(time) != 0, True)
+        frames, time = frames[last], time[last]
     joints = _joint_names(features["observation.state"].get("names"))
     position = _stacked(frames, "observation.state", name)
     tactile = _stacked(frames, "observation.tactile", name)
@@ -467,7 +469,6 @@ def _read_episode(folder: Path, hand: Hand, layout: Layout, episode: int) -> Tou
             "their places into meta/tactile.json, or choose --placement and --resolution."
         )
     force = tactile if tactile.ndim == 2 else -(tactile[..., :3] * points.normal).sum(axis=-1)
-    time = _stacked(frames, TIME, name)[:, 0] if TIME in features else np.asarray(frames["timestamp"], float)
     return TouchLog(name, time, tuple(joints), position, target, points, force, unit)
 
 

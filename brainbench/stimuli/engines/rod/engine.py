@@ -280,10 +280,10 @@ class RodEngine(WhiskerEngine):
             links = fidelity.link_count(job.whisker.arc_length)
             key = (capacity_for(links), job.times.tobytes(), job.start, tuple(job.gravity), job.air_flow)
             groups.setdefault(key, []).append(index)
-        parts = []
+        parts, cuda = [], pick_device(self.device).is_cuda
         for some in groups.values():
             size = SLICE
-            if not pick_device(self.device).is_cuda:
+            if not cuda:
                 job = jobs[some[0]]
                 shortest = min(fidelity.step_of(fidelity.chain(jobs[index].whisker)) for index in some)
                 most = GROUP_STEPS * shortest / (float(job.times[-1]) - job.start + shortest)
