@@ -199,12 +199,14 @@ class _Sampled:
         side = side_of(pieces)
         early = (self.start >= 0) & (knots < side)
         before = np.where(early, knots, knots - side)
-        ahead = self.at(knots + side)
-        slope = (ahead - self.at(before)) / (knots + side - before)[..., None]
-        if early.any():
-            # At the very start there is no instant before: the line through two differences.
-            slope[early] = 2 * slope[early] - (self.at(knots[early] + 2 * side) - self.at(knots[early])) / (2 * side)
-        x = self.at(begin + KNOT * np.arange(looks + 1) / looks)
+        # All in one call: calls of a motion cost more than its values.
+        times = np.concatenate([before, knots + side, begin + KNOT * np.arange(looks + 1) / looks], axis=1)
+        x = self.at(np.append(times, knots[early] + 2 * side))
+        beyond, x = x[times.size :], x[: times.size].reshape(*times.shape, -1)
+        behind, ahead, x = np.split(x, [pieces + 1, 2 * pieces + 2], axis=1)
+        slope = (ahead - behind) / (knots + side - before)[..., None]
+        # At the very start there is no instant before: the line through two differences.
+        slope[early] = 2 * slope[early] - (beyond - behind[early]) / (2 * side)
         each = looks // pieces
         # Coordinates that stand still, as those of a body that does not turn, are followed whatever the pieces.
         moves = (x != x[:1, :1]).any(axis=(0, 1)) | (slope != 0).any(axis=(0, 1))

@@ -41,18 +41,19 @@ def run_groups(
     """
     traces: dict[int, Trace] = {}
     total = sum(map(len, groups))
-    with ThreadPoolExecutor(max_workers=threads) as pool:
+    # Starting a thread costs as much as simulating 10 ms.
+    with ThreadPoolExecutor(max_workers=threads) if len(groups) > 1 else nullcontext() as pool:
         try:
-            # Starting a thread costs as much as simulating 10 ms.
-            futures = [pool.submit(run, group) for group in groups] if len(groups) > 1 else []
-            parts = (future.result() for future in as_completed(futures)) if futures else map(run, groups)
+            futures = [pool.submit(run, group) for group in groups] if pool else []
+            parts = (future.result() for future in as_completed(futures)) if pool else map(run, groups)
             for index, trace in (pair for part in parts for pair in part.items()):
                 traces[index] = trace
                 if progress is not None:
                     progress(len(traces), total)
         except BaseException:
             # Without this an interrupt or a failed job would wait for every job that is still queued.
-            pool.shutdown(wait=False, cancel_futures=True)
+            if pool:
+                pool.shutdown(wait=False, cancel_futures=True)
             raise
     return [traces[index] for index in range(total)]
 

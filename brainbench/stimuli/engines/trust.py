@@ -175,7 +175,7 @@ def judge(facts: RunFacts) -> Verdict:
         for index in zip(*np.nonzero(which), strict=True):
             reasons[index] = words(index)
 
-    for status in _FAULTS:
+    for status in _FAULTS.keys() & set(facts.status.ravel().tolist()):
         blame(facts.status == status, lambda i, status=status: fault(status, facts.failed[i], facts.depth[i]))
     # Faults with a time: the earliest counts, and what comes before it may be used.
     strong = facts.strong_at < until

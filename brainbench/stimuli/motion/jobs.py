@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Annotated, ClassVar, Literal, Protocol
 
 import numpy as np
@@ -106,7 +107,7 @@ class Job:
         object.__setattr__(self, "obstacles", tuple(self.obstacles))
         object.__setattr__(self, "loads", tuple(self.loads))
 
-    @property
+    @cached_property
     def spacing(self) -> float:
         """Time between two frames, as a rule [s]; inf for a single one at the start."""
         return float(np.median(np.diff(self.times, prepend=self.start))) or math.inf

@@ -176,6 +176,30 @@ _COUNTS = ("status", "steps", "touching", "crowded", "unsolved")
 """Counts of each job, of those that its kernel keeps."""
 
 
+FEW, SMALL = 64, 2**16
+"""Jobs of a launch, and numbers that go in and out, up to which its memory is kept for the next one."""
+
+
+@dataclass(frozen=True, eq=False)
+class Room:
+    """Memory of a launch, which on a processor the next one of the same shapes takes: it costs as much as 50 ms."""
+
+    shapes: list[Any]
+    scene: list[Any]
+    problems: Any
+    results: Any
+
+    def refill(self, parts: Mapping[Any, Mapping[str, NDArray]]) -> None:
+        """Upload what the structures of the scene hold, and clear those of contact problems and results."""
+        for struct, part in zip(self.scene, parts.values(), strict=True):
+            for name, values in part.items():
+                if values.size:
+                    getattr(struct, name).numpy()[...] = values
+        for array in (*vars(self.problems).values(), *vars(self.results).values()):
+            if isinstance(array, warp().array):
+                array.zero_()
+
+
 @dataclass(eq=False)
 class LaunchResult:
     """Results of a launch in a table of jobs, whose rows and columns the launch names."""
@@ -309,6 +333,8 @@ class WhiskerSolver:
         self.steps = np.array([fidelity.step_of(chain) * MILLI for chain in self.chains])
         """[whisker] longest time step (ms)."""
         self.strongest = np.array([strongest_force(chain.whisker) for chain in self.chains])
+        self.rooms = threading.local()
+        """Of each thread the :class:`Room` of its last launch, if that was small and on a processor."""
         self.tuning: dict[str, Any] = {}
         """Arguments of :class:`Slices`."""
         self.slices = 0
@@ -327,7 +353,7 @@ class WhiskerSolver:
         clock.append(time.perf_counter())
         stream = self._take_steps(scene, problems, results, jobs)
         clock.append(time.perf_counter())
-        values = download({name: getattr(results, name) for name in (*shapes_of, "contact")}, stream)
+        values = download({name: getattr(results, name) for name in shapes_of}, stream)
         with lock_of(device):
             # What a GPU holds of this launch is given back under the lock too.
             del scene, problems, results
@@ -373,7 +399,7 @@ class WhiskerSolver:
 
     def _upload(self, given: Launch) -> tuple[SceneParts, Any, Any, dict[str, Any]]:
         """Return scene, contact problems and results on the device, and the shapes of the results."""
-        wp, structs, device, jobs = warp(), self.kernels.structs, self.device, given.jobs
+        structs, device, jobs = self.kernels.structs, self.device, given.jobs
         size, count, frames = given.size, len(jobs), len(given.readings)
         options = structs.StepOptions()
         options.quasistatic = int(self.quasistatic)
@@ -386,29 +412,41 @@ class WhiskerSolver:
         options.shape = int(given.record_shape)
         # Readings end a step: where they are nearer than a step, a part of it could be the same step once more.
         steps = self.steps[jobs.whisker]
-        between = float(np.median(np.diff(given.readings, prepend=given.start))) * MILLI
-        steps = np.where(jobs.finer > 1, np.minimum(steps, max(between, 1e-4)), steps)
-        parts = (
-            (structs.MotionArrays, given.motions.arrays()),
-            (structs.ShapeArrays, given.shapes.arrays()),
-            (structs.JobArrays, jobs.arrays(self.chains, steps, given.start)),
-            (structs.ReadingArrays, _readings(given.readings - given.start)),
-        )
+        if (jobs.finer > 1).any():
+            between = float(np.median(np.diff(given.readings, prepend=given.start))) * MILLI
+            steps = np.where(jobs.finer > 1, np.minimum(steps, max(between, 1e-4)), steps)
+        parts = {
+            structs.MotionArrays: given.motions.arrays(),
+            structs.ShapeArrays: given.shapes.arrays(),
+            structs.JobArrays: jobs.arrays(self.chains, steps, given.start),
+            structs.ReadingArrays: _readings(given.readings - given.start),
+        }
         shapes_of = {
-            "state": count,
+            "state": (count,),
             "wrench": (size[0], frames, size[1], 6),
             "points": (frames, self.capacity + 1, count) if given.record_shape else (1, 1, 1),
             "contact_wrench": (frames, 2, count) if given.record_shape else (1, 1, 1),
+            "contact": (size[0], frames, size[1]),
         }
         if self.yields:
             shapes_of["displacement"] = shapes_of["wrench"]
+        shapes = [*shapes_of.values(), *(np.shape(values) for part in parts.values() for values in part.values())]
+        room = getattr(self.rooms, "last", None)
         with lock_of(device):
-            results = allocate(structs.ResultArrays, device, **shapes_of)
-            results.contact = wp.full((size[0], frames, size[1]), -1.0, dtype=self.real, device=device)
-            arrays = (to_struct(kind, values, device, copy=False) for kind, values in parts)
-            scene = SceneParts._make((self.chain_arrays, *arrays, options))
-            problems = make_problems(self.kernels, self.capacity, count, device, self.iterations)
-        return scene, problems, results, shapes_of
+            if room is None or room.shapes != shapes:
+                small = device.is_cpu and count <= FEW and sum(map(math.prod, shapes)) <= SMALL
+                room = Room(
+                    shapes,
+                    [to_struct(kind, values, device, copy=small) for kind, values in parts.items()],
+                    make_problems(self.kernels, self.capacity, count, device, self.iterations),
+                    allocate(structs.ResultArrays, device, **shapes_of),
+                )
+                if small:
+                    self.rooms.last = room
+            else:
+                room.refill(parts)
+            room.results.contact.fill_(-1.0)
+        return SceneParts(self.chain_arrays, *room.scene, options), room.problems, room.results, shapes_of
 
     def _take_steps(self, scene: SceneParts, problems: Any, results: Any, jobs: PackedJobs) -> Any:
         """Take all whiskers to their last reading; return the stream in which that is done, None of a processor."""
@@ -526,6 +564,8 @@ def run_with_retries(
                 result = result.replaced(some, part)
         suspicious = result.verdict.suspicious & left
         doubtful = suspicious | result.verdict.retryable
+        if not doubtful.any():
+            break
         # Contacts may cut the step of a blow and its half to the same.
         divisors = np.where(result.verdict.struck, max(retry, 2 * finer), 2 * finer)
         compared = {int(divisor): suspicious & (divisors == divisor) for divisor in np.unique(divisors)}

@@ -120,8 +120,13 @@ def follicle_track(follicle: Follicle, size: float, cutting: Cutting) -> Track:
     # Looking for motion takes as long as simulating a short whisker.
     if getattr(follicle, "finest", None) == math.inf:
         place, euler = (np.asarray(values, dtype=float) for values in follicle.pose(np.array([cutting.start])))
-        return still_track(place[0], rotations.from_matrices(base_rotation(euler))[0])
+        return still_track(place[0], _still_quaternion(*euler[0].tolist()))
     return _track(follicle.pose, base_rotation, cutting.follicle(follicle, size), cutting.start)
+
+
+@lru_cache(256)
+def _still_quaternion(*euler: float) -> NDArray[np.float64]:
+    return rotations.from_matrices(base_rotation(euler))
 
 
 def body_track(obstacle: Obstacle, anchor: NDArray[np.float64], cutting: Cutting) -> Track:
@@ -187,19 +192,19 @@ def _knots(pose: Pose, to_matrices: Callable[[NDArray], NDArray], times: NDArray
     """Return knots [n] of a pose from its places and rotations ``sides`` [n] (s) before, at and after the knots."""
     # At the very start there is no instant before: values there are those of the line through two differences.
     early = times[0] >= 0 and times[0] < sides[0]
-    around = []
-    for side in (-sides, 0.0, sides):
-        place, rotation = pose(np.maximum(times + side, times[0]) if early else times + side)
-        around.append((np.asarray(place, dtype=float), to_matrices(np.asarray(rotation, dtype=float))))
-    (place0, rotation0), (place, rotation), (place1, rotation1) = around
+    before = np.maximum(times - sides, times[0]) if early else times - sides
+    # All in one call: calls of a motion cost more than its values.
+    values, turns = pose(np.concatenate([before, times, times + sides, times[: int(early)] + 2 * sides[: int(early)]]))
+    borders = np.arange(1, 4) * len(times)
+    place0, place, place1, place2 = np.split(np.asarray(values, dtype=float), borders)
+    rotation0, rotation, rotation1, rotation2 = np.split(to_matrices(np.asarray(turns, dtype=float)), borders)
     span = sides[:, None]
     spin0, spin1 = rotation_vectors(rotation0, rotation) / span, rotation_vectors(rotation, rotation1) / span
     # Central differences, whose error is of second order; m per s are mm per ms.
     velocity = (place1 - place0) / (2 * span)
     if early:
-        place2, rotation2 = pose(times[:1] + 2 * sides[:1])
-        there = (np.asarray(place2, dtype=float) - place1[:1]) / sides[0]
-        beyond = rotation_vectors(rotation1[:1], to_matrices(np.asarray(rotation2, dtype=float))) / sides[0]
+        there = (place2 - place1[:1]) / sides[0]
+        beyond = rotation_vectors(rotation1[:1], rotation2) / sides[0]
         velocity[0] = (3 * (place1[0] - place[0]) / sides[0] - there[0]) / 2
         spin0[0] = 2 * spin1[0] - beyond[0]
     knots = np.empty(len(times), dtype=KNOT)

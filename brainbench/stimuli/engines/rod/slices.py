@@ -83,7 +83,8 @@ def wait_for(event: Any) -> None:
 def download(arrays: Mapping[str, Any], stream: Any) -> dict[str, NDArray[Any]]:
     """Return arrays of a device as they are once a stream has come so far; None for those of a processor."""
     if stream is None:
-        return {name: array.numpy() for name, array in arrays.items()}
+        # The next launch may take the memory.
+        return {name: array.numpy().copy() for name, array in arrays.items()}
     wp = warp()
     host = {name: wp.empty(array.shape, dtype=array.dtype, device="cpu") for name, array in arrays.items()}
     with lock_of(stream.device):
