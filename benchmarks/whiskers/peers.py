@@ -96,6 +96,7 @@ def ours(test: str, setting: str, count: int) -> Outcome:
         def motion(moments: NDArray) -> tuple[NDArray, NDArray]:
             return np.pad(peg_place(moments), ((0, 0), (0, 1))), np.tile([1.0, 0, 0, 0], (len(moments), 1))
 
+        vars(motion)["finest"] = 2 * MOVING  # as motions of scene files say of themselves
         peg = Obstacle((Capsule((0, 0, -LENGTH), (0, 0, LENGTH), PEG_RADIUS),), motion, friction=0.0)
         times = np.array([MOVING + RESTING])
         job = Job(replace(WHISKER, damping_ratio=1.0), StillFollicle(), (peg,), times)

@@ -136,12 +136,9 @@ class Cutting:
 
         def path(times: NDArray[np.float64]) -> NDArray[np.float64]:
             place, turn = pose(times)
-            values = np.empty((len(times), 12))
-            values[:, :3] = place * MILLI
-            # The first alone where all share its memory.
-            turn = turn[: None if turn.strides[0] else 1]
-            values[:, 3:] = turn.reshape(-1, 9) * size * MILLI
-            return values
+            # All share the memory of one where it does not turn.
+            turns = turn.reshape(-1, 9) * size if turn.strides[0] else np.empty((len(times), 0))
+            return np.concatenate([place, turns], axis=1) * MILLI
 
         return self.cut(path, getattr(obstacle.motion, "finest", None), "an object")
 
