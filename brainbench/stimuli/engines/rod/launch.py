@@ -218,8 +218,8 @@ class LaunchResult:
     """[row, column] as :func:`brainbench.stimuli.engines.trust.residual`."""
     verdict: Verdict
     """[row, column]"""
-    retried: NDArray[np.bool_]
-    """[row, column] True where a whisker was simulated again."""
+    divisor: NDArray[np.integer]
+    """[row, column] what divided the time steps; 1 unless a whisker was simulated again."""
     displacement: NDArray[np.floating] | None = None
     """[row, reading, column, 6] as :attr:`brainbench.stimuli.motion.jobs.Trace.displacement`; None if all are rigid."""
     points: NDArray[np.floating] | None = None
@@ -239,8 +239,8 @@ class LaunchResult:
         which = np.repeat(np.arange(len(counts)), counts)
         return [self] if len(counts) == 1 else [self.picked(which == part) for part in range(len(counts))]
 
-    def picked(self, which: NDArray[np.bool_]) -> LaunchResult:
-        """Return some rows [row] of these results; their steps count for the first who asks."""
+    def picked(self, which: NDArray[np.bool_ | np.integer]) -> LaunchResult:
+        """Return some rows of these results, by mask or in an order; their steps count for the first who asks."""
         arrays = {name: values[which] for name, values in vars(self).items() if isinstance(values, np.ndarray)}
         counts = {name: values[which] for name, values in self.counts.items()}
         verdict = Verdict(**{name: values[which] for name, values in vars(self.verdict).items()})
@@ -262,7 +262,7 @@ class LaunchResult:
             self.displacement[row, :, column] = finer.displacement[:, :, 0]
         if self.points is not None and self.contact_wrench is not None:
             self.points[row], self.contact_wrench[row] = finer.points, finer.contact_wrench
-        self.retried |= which
+        self.divisor[which] = finer.divisor[:, 0]
         return self
 
     def compared(self, which: NDArray[np.bool_], half: LaunchResult) -> LaunchResult:
@@ -386,9 +386,7 @@ class WhiskerSolver:
             peak=peak,
             third=np.partition(force, -3, axis=1)[:, -3] if len(given.readings) >= FEWEST_READINGS else peak,
         )
-        result = LaunchResult(
-            wrench, values["contact"], counts, depth, missed, judge(facts), np.zeros(size, dtype=bool)
-        )
+        result = LaunchResult(wrench, values["contact"], counts, depth, missed, judge(facts), table(jobs.finer))
         result.displacement = values.get("displacement")
         result.seconds = dict(zip(("upload", "kernel", "download"), np.diff(clock).tolist(), strict=True))
         if given.record_shape:

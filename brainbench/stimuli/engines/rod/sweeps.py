@@ -181,7 +181,7 @@ class SweepLauncher:
             reasons=describe_unstable(self.scenes.array.names, unstable, result.verdict.reasons),
             steps=int(result.steps.sum()),
             steps_in_full=self.steps_in_full * len(unstable),
-            retried=int(result.retried.any(axis=1).sum()),
+            retried=int((result.divisor > 1).any(axis=1).sum()),
             unsolved=int(result.counts["unsolved"].sum()),
         )
 
@@ -203,14 +203,15 @@ class SweepLauncher:
         if estimated is None:
             return self.batch(result)
         which = estimated[:, None] & ~result.verdict.unstable
-        return replace(self.batch(result), error=self._errors(objects, result, which, retry))
+        return replace(self.batch(result), error=self._errors(objects, result, which))
 
     def _errors(
-        self, objects: Sequence[tuple[str, Sequence[Any]]], result: LaunchResult, which: NDArray[np.bool_], retry: int
+        self, objects: Sequence[tuple[str, Sequence[Any]]], result: LaunchResult, which: NDArray[np.bool_]
     ) -> NDArray[np.float32]:
         """Return the errors of some whiskers (``which`` [sweep, whisker]), NaN of the others.
 
-        A whisker that felt nothing has none: its base stands still.
+        A whisker that felt nothing has none: its base stands still. Finer runs divide their steps as the run did that
+        they are compared with, by twice that where they cannot be trusted: few whiskers take a GPU long.
         """
         error = np.where(which, 0.0, np.nan).astype(np.float32)
         which = which & (result.wrench != 0).any(axis=(1, 3))
@@ -221,19 +222,22 @@ class SweepLauncher:
         lengths = np.array([one.arc_length for one in self.whiskers])[whisker]
 
         def square(factor: float, solver: WhiskerSolver) -> NDArray[np.float64]:
-            def launch(tries: Sequence[Try]) -> list[LaunchResult]:
-                masks = []
-                for mask, divisor in tries:
-                    whole = np.zeros_like(which)
-                    whole[which] = True if mask is None else mask[:, 0]
-                    masks.append((whole, divisor))
-                return self.launch(objects, masks, solver).split([int(whole.sum()) for whole, _ in masks])
+            def launch(divisors: NDArray[np.integer]) -> LaunchResult:
+                whole = np.zeros_like(result.divisor)
+                whole[which] = divisors
+                tries = [(whole == divisor, int(divisor)) for divisor in np.unique(divisors[divisors > 0])]
+                order = np.argsort(np.concatenate([np.flatnonzero(mask) for mask, _ in tries]))
+                return self.launch(objects, tries, solver).picked(order)
 
-            finer = run_with_retries(launch, retry, ahead=self.ahead)
+            divisors = result.divisor[which]
+            finer = launch(divisors)
+            left = finer.verdict.retryable.copy()
+            if left.any():
+                finer = finer.replaced(left, launch(np.where(left[:, 0], 2 * divisors, 0)))
             change = changes(values, finer.wrench[:, :, 0], contact | (finer.contact[:, :, 0] >= 0), lengths)
             return np.where(finer.verdict.unstable[:, 0], np.inf, factor * change) ** 2
 
-        # Few whiskers take a GPU long: it simulates both at the same time.
+        # A GPU simulates both at the same time.
         half, longer = self.finer
         if self.device.is_cuda:
             coming = _helpers().submit(square, *longer)

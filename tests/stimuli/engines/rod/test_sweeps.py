@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from brainbench.core.errors import UsageError
+from brainbench.stimuli.engines.error_estimates import HALF_STEP, MORE_LINKS, changes
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.rod.sweeps import SweepLauncher
 from brainbench.stimuli.objects.collections import resolve_objects
@@ -84,6 +85,30 @@ def test_whiskers_that_finer_steps_do_not_mend_take_steps_twice_as_fine(monkeypa
     np.testing.assert_array_equal(np.moveaxis(result.wrench[0], 1, 0)[left[0]], ten.wrench[:, :, 0])
     # All that was computed is counted.
     assert result.steps == once.steps.sum() + five.steps.sum() + ten.steps.sum()
+
+
+def test_the_error_of_a_whisker_in_finer_steps_is_told_by_half_of_these():
+    objects = resolve_objects(["brick-0"], surfaces=True)
+    scenes = SweepScenes(GRIDS["thesis-high"], {name: item.load for name, item in objects.items()}, whiskers="A1,A2,C1")
+    launcher = SweepLauncher(scenes, Fidelity(links=12, time_step=5e-4))
+    chosen = [("brick-0", [scenes.grid.sweeps("brick-0")[74]])]
+    batch = launcher.trusted(chosen, 5, np.ones(1, dtype=bool))
+    lengths = np.array([whisker.arc_length for whisker in launcher.whiskers])
+    # What the whiskers count with: steps over 5, 1 and 10.
+    for column, divisor in enumerate((5, 1, 10)):
+        which = np.arange(3)[None] == column
+        run, *finer = (launcher.launch(chosen, [(which, divisor)], solver) for solver in (None, *_finer(launcher)))
+        assert run.wrench[0, :, 0].tobytes() == batch.wrench[0, :, column].tobytes()
+        touching = [each.contact[:, :, 0] >= 0 for each in (run, *finer)]
+        shares = [
+            factor * changes(run.wrench[:, :, 0], each.wrench[:, :, 0], touching[0] | there, lengths[[column]])[0]
+            for factor, each, there in zip((HALF_STEP, MORE_LINKS), finer, touching[1:], strict=True)
+        ]
+        assert batch.error[0, column] == pytest.approx(np.hypot(*shares), rel=1e-5)
+
+
+def _finer(launcher):
+    return [solver for _, solver in launcher.finer]
 
 
 def test_a_whisker_that_cannot_be_trusted_says_why():
