@@ -71,9 +71,9 @@ def base_rotation(euler: ArrayLike) -> NDArray[np.float64]:
 def _about(axis: str, angle: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return rotation matrices [..., 3, 3] about one coordinate axis."""
     # The cyclic order of the axes gives all three rotations the right-handed sign.
-    own, first, second = {"x": (0, 1, 2), "y": (1, 2, 0), "z": (2, 0, 1)}[axis]
+    fixed, first, second = {"x": (0, 1, 2), "y": (1, 2, 0), "z": (2, 0, 1)}[axis]
     matrix, sine = np.zeros((*np.shape(angle), 3, 3)), np.sin(angle)
-    matrix[..., own, own] = 1.0
+    matrix[..., fixed, fixed] = 1.0
     matrix[..., first, first] = matrix[..., second, second] = np.cos(angle)
     matrix[..., second, first], matrix[..., first, second] = sine, -sine
     return matrix

@@ -34,7 +34,6 @@ from brainbench.stimuli.engines.rod.launch import (
     load_kernels,
     real_type,
     run_with_retries,
-    tries_ahead,
 )
 from brainbench.stimuli.engines.rod.packing import (
     GRID,
@@ -368,7 +367,7 @@ def _simulate(
         np.add.at(seconds, rows, (time.thread_time() - started) / len(rows))
         return result.split(counts)
 
-    result = run_with_retries(launch, retry, ahead=lambda: tries_ahead(device))
+    result = run_with_retries(launch, retry)
     traces = (trace_of(result, row, task.job, fidelity, seconds[row]) for row, task in enumerate(given))
     return dict(zip(tasks, traces, strict=True))
 

@@ -1,11 +1,6 @@
 """One launch of the whisker kernel: packed jobs go in, judged results come out, and who is in doubt is tried again.
 
 Kernels are compiled when a machine first needs them and kept by Warp.
-
-Few whiskers take a GPU as long as the one with most steps. With steps over 2, 5, 10 and 20 one after the other these
-waits add up to 38 times that of the first simulation; with 2 and 5, then 10 and 20 at the same time to 26. But half of
-the tries that are simulated ahead are not needed: where other whiskers would have the GPU meanwhile, they cost more
-time than they save (benchmarks/RESULTS.md, "Sweeps on a GPU, by the public command").
 """
 
 from __future__ import annotations
@@ -13,10 +8,8 @@ from __future__ import annotations
 import math
 import threading
 import time
-from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
@@ -500,25 +493,9 @@ def _first_beyond(
 
 Try = tuple[NDArray[np.bool_] | None, int]
 """Whiskers to simulate, all when None, and what divides their steps."""
-Ahead = tuple[Sequence[int], Sequence[int]]
-"""Multiples of ``retry`` by which steps are divided at once for whiskers in doubt: right after the first simulation,
-and after that with steps over ``retry``."""
-ONE_BY_ONE: Ahead = (), (2,)
-"""Only what is needed: who is in doubt with steps over ``retry`` needs those over twice that, as a half or as a try."""
-ON_AN_IDLE_GPU: Ahead = (1,), (2, 4)
-"""Tries at the same time where nothing else waits for the GPU."""
-
-_FIRST: Counter[str] = Counter()
-"""First simulations that threads of this process have under way, by device."""
-_LOCK = threading.Lock()
 
 
-def run_with_retries(
-    simulate: Callable[[Sequence[Try]], Sequence[LaunchResult]],
-    retry: int,
-    *,
-    ahead: Callable[[], Ahead] = lambda: ONE_BY_ONE,
-) -> LaunchResult:
+def run_with_retries(simulate: Callable[[Sequence[Try]], Sequence[LaunchResult]], retry: int) -> LaunchResult:
     """Simulate whiskers, and those that finer steps may mend again: with steps over ``retry``, then over twice that.
 
     After each of these, suspicious whiskers are compared with half the step (:func:`.trust.halved`), at first
@@ -528,8 +505,6 @@ def run_with_retries(
         simulate: gives the results of tries, which may be simulated at the same time; whiskers of a mask are in its
             order, and alone.
         retry: 1 leaves all whiskers as they are.
-        ahead: gives the tries to simulate before it is known whether they are needed, where further whiskers cost
-            less time than further launches; asked before each. Results do not depend on it.
     """
     (result,) = simulate([(None, 1)])
     if retry == 1:
@@ -554,7 +529,7 @@ def run_with_retries(
                 yield some, part.picked(some[mask])
 
     left = np.ones_like(result.verdict.retryable)
-    for place, finer in enumerate((1, retry, 2 * retry)):
+    for finer in (1, retry, 2 * retry):
         if finer > 1:
             left = result.verdict.retryable.copy()
             run({finer: left})
@@ -567,29 +542,9 @@ def run_with_retries(
         # Contacts may cut the step of a blow and its half to the same.
         divisors = np.where(result.verdict.struck, max(retry, 2 * finer), 2 * finer)
         compared = {int(divisor): suspicious & (divisors == divisor) for divisor in np.unique(divisors)}
-        run(compared | {retry * k: doubtful for k in (*ahead(), ())[place]})
+        # Steps over twice ``retry`` are a half for some and a try for others.
+        run(compared | ({2 * retry: doubtful} if finer == retry else {}))
         for divisor, which in compared.items():
             for some, half in parts(which, divisor):
                 result = result.compared(some, half)
     return result
-
-
-@contextmanager
-def first_simulation(device: Any) -> Iterator[None]:
-    """Tell other threads that all whiskers of some sweeps are simulated on a device, which fills a GPU."""
-    with _LOCK:
-        _FIRST[device.alias] += 1
-    try:
-        yield
-    finally:
-        with _LOCK:
-            _FIRST[device.alias] -= 1
-
-
-def tries_ahead(device: Any) -> Ahead:
-    """Return the tries ahead (:func:`run_with_retries`) as the device is busy now.
-
-    One by one on a processor, and on a GPU while any thread simulates sweeps for the first time: as long as shards
-    queue, one of those that run does.
-    """
-    return ON_AN_IDLE_GPU if device.is_cuda and not _FIRST[device.alias] else ONE_BY_ONE

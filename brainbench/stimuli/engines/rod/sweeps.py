@@ -5,10 +5,8 @@ The object's surface is uploaded once and scaled, turned and moved inside the ke
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import nullcontext
 from dataclasses import replace
 from functools import cached_property, lru_cache, partial
 from itertools import groupby
@@ -24,16 +22,13 @@ from brainbench.stimuli.engines.error_estimates import HALF_STEP, MORE_LINKS, ch
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.protocol import PassiveSweeps, SweepBatch, describe_unstable, join_batches
 from brainbench.stimuli.engines.rod.launch import (
-    Ahead,
     Approach,
     Launch,
     LaunchResult,
     Try,
     WhiskerSolver,
-    first_simulation,
     followed,
     run_with_retries,
-    tries_ahead,
 )
 from brainbench.stimuli.engines.rod.limits import MESHES
 from brainbench.stimuli.engines.rod.packing import (
@@ -78,10 +73,6 @@ class SweepLauncher:
         sliced = bool(self.device.is_cuda) if sliced is None else sliced
         bounds = SLICED_BOUNDS if sliced else BOUNDS
         self.scenes, self.grid = scenes, grid
-        self.ahead: Callable[[], Ahead] = partial(tries_ahead, self.device)
-        """As in :func:`.launch.run_with_retries`."""
-        self.seconds: dict[str, float] = {}
-        """Elapsed time of the last launch for placing objects, uploading, and computing."""
         mounts = list(scenes.array)
         self.whiskers = [mount.whisker for mount in mounts]
         self._solver_of = partial(
@@ -131,7 +122,6 @@ class SweepLauncher:
             solver: one of :attr:`finer`, or the usual one.
         """
         solver = solver or self.solver
-        started = time.perf_counter()
         motions, shapes = PackedMotions(), PackedShapes()
         bases = motions.add_straight(np.concatenate(self._bases))
         prepared = self._prepare([name for name, _ in objects])
@@ -156,12 +146,9 @@ class SweepLauncher:
         approach = Approach(*(np.empty(size, dtype=values.dtype) for values in numbers))
         for whole, values in zip(vars(approach).values(), numbers, strict=True):
             whole[row, column] = values
-        placed = time.perf_counter() - started
         jobs = PackedJobs(whisker, sweep, bases[whisker], row, column, finer)
         readings = self.grid.frames.readings
-        result = solver.launch(Launch(jobs, motions, shapes, readings, size, axes=self._head, approach=approach))
-        self.seconds = {"objects": placed, **result.seconds}
-        return result
+        return solver.launch(Launch(jobs, motions, shapes, readings, size, axes=self._head, approach=approach))
 
     def batch(self, result: LaunchResult) -> SweepBatch:
         """Return a result as frames in the form of data generation."""
@@ -195,11 +182,10 @@ class SweepLauncher:
 
         def launch(tries: Sequence[Try]) -> list[LaunchResult]:
             some = [(which, finer) for which, finer in tries if which is not None]
-            with nullcontext() if some else first_simulation(self.device):
-                result = self.launch(objects, some)
+            result = self.launch(objects, some)
             return result.split([int(which.sum()) for which, _ in some] or [len(result.wrench)])
 
-        result = run_with_retries(launch, retry, ahead=self.ahead)
+        result = run_with_retries(launch, retry)
         if estimated is None:
             return self.batch(result)
         which = estimated[:, None] & ~result.verdict.unstable

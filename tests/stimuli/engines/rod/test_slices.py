@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import threading
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import fields
-from itertools import cycle, groupby
 from types import SimpleNamespace
 
 import numpy as np
@@ -14,9 +12,7 @@ import pytest
 from brainbench.core.devices import warp
 from brainbench.core.files import content_hash, portable
 from brainbench.stimuli.engines.fidelity import Fidelity
-from brainbench.stimuli.engines.protocol import SweepBatch
 from brainbench.stimuli.engines.rod import launch, slices, sweeps
-from brainbench.stimuli.engines.rod.launch import ON_AN_IDLE_GPU, ONE_BY_ONE, first_simulation, tries_ahead
 from brainbench.stimuli.engines.rod.sweeps import SweepLauncher
 from brainbench.stimuli.objects.collections import resolve_objects
 from brainbench.stimuli.sweeps.sweep_scenes import GRIDS, SweepGrid, SweepScenes
@@ -130,72 +126,3 @@ def test_whiskers_that_are_simulated_again_do_not_depend_on_what_comes_with_them
     np.testing.assert_array_equal(together.wrench, np.concatenate([one.wrench for one in alone]))
     assert together.reasons == tuple(reason for one in alone for reason in one.reasons)
     assert together.steps == sum(one.steps for one in alone)
-
-
-@pytest.mark.parametrize("sliced", [False, pytest.param(True, marks=pytest.mark.slow)])
-def test_tries_at_the_same_time_give_the_bytes_of_tries_one_after_the_other(sliced):
-    picked = {"brick-0": 72, "chair-0": 24, "gear-0": 24, "gear-1": 36, "brick-1": 24}
-    objects = resolve_objects(list(picked), surfaces=True)
-    array = "C1,C2,D2,B1,A1"
-    scenes = SweepScenes(GRIDS["thesis-high"], {name: item.load for name, item in objects.items()}, whiskers=array)
-    chosen = [(name, [scenes.grid.sweeps(name)[index]]) for name, index in picked.items()]
-    launcher = SweepLauncher(scenes, Fidelity(links=12, time_step=1e-3), sliced=sliced)
-    batches, launches = [], []
-    launch = launcher.launch
-
-    def seen(objects, tries=()):
-        launches.append({finer: int(which.sum()) for which, finer in tries})
-        return launch(objects, tries)
-
-    launcher.launch = seen
-    at_once = (1,), (2, 4)
-    for answers in ([ONE_BY_ONE], [at_once], [((1, 2, 4), ())], [at_once, ONE_BY_ONE], [ONE_BY_ONE, at_once]):
-        launcher.ahead = cycle(answers).__next__
-        batches.append(launcher.trusted(chosen, 5))
-        launches.append(None)
-    one, two, all_, *mixed = (list(some) for which, some in groupby(launches, lambda seen: seen is not None) if which)
-    one_by_one, *others = batches
-    (suspicious, doubtful), tenths = two[1].values(), sum(launch.get(10, 0) for launch in one)
-    # Of the suspicious some are confirmed by half the step and some are not; of those that are simulated again some are
-    # mended by the first try, others by the second, one by none, and one is suspicious after the second.
-    changed = one[2][5] - (doubtful - suspicious)
-    assert 0 < changed < suspicious
-    assert 0 < tenths < one[2][5]
-    assert any(20 in launch for launch in one)
-    assert one_by_one.unstable.any()
-    assert (two[2:], all_[2:]) == ([{10: tenths, 20: tenths}], [])
-    assert [len(some) for some in mixed] == [4, 4]
-    for batch in others:
-        for field in fields(SweepBatch):
-            np.testing.assert_array_equal(getattr(batch, field.name), getattr(one_by_one, field.name))
-
-
-def test_tries_run_ahead_only_while_no_thread_simulates_sweeps_for_the_first_time(monkeypatch):
-    gpu, other = (SimpleNamespace(is_cuda=True, alias=f"cuda:{place}") for place in range(2))
-    assert tries_ahead(warp().get_device("cpu")) == ONE_BY_ONE
-    assert tries_ahead(gpu) == ON_AN_IDLE_GPU
-    with first_simulation(gpu), first_simulation(gpu):
-        with ThreadPoolExecutor(1) as pool:
-            assert pool.submit(tries_ahead, gpu).result() == ONE_BY_ONE
-        assert tries_ahead(other) == ON_AN_IDLE_GPU
-    assert tries_ahead(gpu) == ON_AN_IDLE_GPU
-
-    scenes = SweepScenes(GRID, {"brick-0": resolve_objects(["brick-0"], surfaces=True)["brick-0"].load})
-    launcher = SweepLauncher(scenes, COARSE)
-    launcher.device, states = gpu, []
-
-    def run(launch, retry, *, ahead):
-        for tries in ([(None, 1)], [(np.ones((2, 1), dtype=bool), 5)]):
-            launch(tries)
-        states.append(ahead())
-
-    def launched(objects, tries):
-        states.append(tries_ahead(gpu))
-        return SimpleNamespace(wrench=np.zeros(2), split=lambda counts: counts)
-
-    monkeypatch.setattr(launcher, "launch", launched)
-    monkeypatch.setattr(launcher, "batch", lambda result: result)
-    monkeypatch.setattr(sweeps, "run_with_retries", run)
-    launcher.ahead = lambda: tries_ahead(gpu)
-    launcher.trusted([], 5)
-    assert states == [ONE_BY_ONE, ON_AN_IDLE_GPU, ON_AN_IDLE_GPU]
