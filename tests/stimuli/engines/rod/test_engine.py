@@ -12,7 +12,7 @@ import pytest
 from brainbench.core.errors import UsageError
 from brainbench.geometry import Mesh
 from brainbench.stimuli.engines.fidelity import Fidelity
-from brainbench.stimuli.engines.rod.engine import RodEngine
+from brainbench.stimuli.engines.rod.engine import RodEngine, _solver_of
 from brainbench.stimuli.motion.jobs import Job, StillFollicle
 from brainbench.stimuli.objects.collections import resolve_objects
 from brainbench.stimuli.objects.obstacle import Box, Capsule, Obstacle
@@ -54,6 +54,26 @@ def test_a_steady_load_does_not_depend_on_the_time_step(step):
     )  # fmt: skip
     assert found.moment_error < 5e-3
     assert found.force_error < 5e-3
+
+
+def test_a_run_takes_the_memory_of_the_last_one_and_leaves_its_results_as_they_were():
+    def job(speed, size):
+        peg = _moving((Capsule((0.01, -0.004, -0.01), (0.01, -0.004, 0.01), 5e-4),), (0.0, speed, 0.0))
+        still = Obstacle((Box((0.012, size, 0.0), (1e-3, 1e-3, 1e-3)),))
+        return Job(C2, StillFollicle(), (peg, still), np.linspace(0.002, 0.04, 20))
+
+    def numbers(trace):
+        return b"".join(getattr(trace, name).tobytes() for name in ("wrench", "contact_arc", "link_positions"))
+
+    jobs = [job(0.1, 0.004), job(0.2, 0.003), job(0.1, 0.004)]
+    first, second, third = (_run(each, workers=1, record_shape=True)[0] for each in jobs)
+    assert first.contact.any()
+    before = numbers(first)
+    assert numbers(third) == before != numbers(second)
+    # A solver that has launched nothing before.
+    _solver_of.cache_clear()
+    assert numbers(_run(jobs[1], workers=1, record_shape=True)[0]) == numbers(second)
+    assert numbers(first) == before
 
 
 @pytest.mark.parametrize("kind", ["peg", "knife"])
