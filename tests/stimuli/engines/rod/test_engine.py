@@ -4,15 +4,18 @@ import os
 import subprocess
 import sys
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from brainbench.core.devices import pick_device
 from brainbench.core.errors import UsageError
 from brainbench.geometry import Mesh
 from brainbench.stimuli.engines.fidelity import Fidelity
-from brainbench.stimuli.engines.rod.engine import RodEngine, _solver_of
+from brainbench.stimuli.engines.rod.engine import PackedTasks, RodEngine, make_task
+from brainbench.stimuli.engines.rod.launch import WhiskerSolver
 from brainbench.stimuli.motion.jobs import Job, StillFollicle
 from brainbench.stimuli.objects.collections import resolve_objects
 from brainbench.stimuli.objects.obstacle import Box, Capsule, Obstacle
@@ -62,18 +65,19 @@ def test_a_run_takes_the_memory_of_the_last_one_and_leaves_its_results_as_they_w
         still = Obstacle((Box((0.012, size, 0.0), (1e-3, 1e-3, 1e-3)),))
         return Job(C2, StillFollicle(), (peg, still), np.linspace(0.002, 0.04, 20))
 
-    def numbers(trace):
-        return b"".join(getattr(trace, name).tobytes() for name in ("wrench", "contact_arc", "link_positions"))
-
-    jobs = [job(0.1, 0.004), job(0.2, 0.003), job(0.1, 0.004)]
-    first, second, third = (_run(each, workers=1, record_shape=True)[0] for each in jobs)
-    assert first.contact.any()
-    before = numbers(first)
-    assert numbers(third) == before != numbers(second)
-    # A solver that has launched nothing before.
-    _solver_of.cache_clear()
-    assert numbers(_run(jobs[1], workers=1, record_shape=True)[0]) == numbers(second)
-    assert numbers(first) == before
+    packed = [PackedTasks.of([make_task(each, COARSE, {})]) for each in (job(0.1, 0.004), job(0.2, 0.003))]
+    packed.append(packed[0])
+    task = packed[0].tasks[0]
+    make = partial(WhiskerSolver, packed[0].chains, COARSE, pick_device("cpu"), 1, twists=task.twists)
+    solver = make()
+    results = [each.launch(solver, record_shape=True) for each in packed]
+    alone = [each.launch(make(), record_shape=True) for each in packed]
+    assert vars(solver.rooms)["last"].results is not None
+    for name in ("wrench", "contact", "points", "contact_wrench", "depth"):
+        after, fresh = ([getattr(result, name).tobytes() for result in some] for some in (results, alone))
+        assert after == fresh
+    assert (results[0].contact >= 0).any()
+    assert results[0].wrench.tobytes() == results[2].wrench.tobytes() != results[1].wrench.tobytes()
 
 
 @pytest.mark.parametrize("kind", ["peg", "knife"])
