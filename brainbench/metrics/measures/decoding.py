@@ -203,6 +203,11 @@ class LabelledFeatures:
         return np.array([self.decoder(codes[order]) for codes in self.classes.values()])
 
 
+def _classes_of(classes: Mapping[str, Ints], stimuli: Ints) -> dict[str, Ints]:
+    """Return the classes of some stimuli, those that are left numbered anew."""
+    return {name: np.unique(codes[stimuli], return_inverse=True)[1] for name, codes in classes.items()}
+
+
 class LabelDecoding(Metric):
     """Accuracy of decoding the labels' properties, leaving one stimulus out."""
 
@@ -218,13 +223,13 @@ class LabelDecoding(Metric):
         return np.isfinite(layer.features).all(axis=1)
 
     def varies(self, layer: Any) -> bool:
-        """Return whether classes can be learnt: each has two stimuli that the layer has a value for."""
-        return all(np.bincount(codes)[np.unique(codes)].min() > 1 for codes in layer.classes.values())
+        """Return whether classes can be learnt: at least two, each of two stimuli that the layer has a value for."""
+        counts = [np.bincount(codes)[np.unique(codes)] for codes in layer.classes.values()]
+        return all(len(part) > 1 and part.min() > 1 for part in counts)
 
     def take(self, layer: Any, stimuli: Ints) -> Any:
         """Return a layer with some stimuli, in this order."""
-        classes = {name: np.unique(codes[stimuli], return_inverse=True)[1] for name, codes in layer.classes.items()}
-        return LabelledFeatures(layer.features[stimuli], classes)
+        return LabelledFeatures(layer.features[stimuli], _classes_of(layer.classes, stimuli))
 
     def compare_layers(
         self, layers: Sequence[Any], animals: Sequence[SubjectRDM], chunks: Iterable[Ints], device: Any = None
@@ -300,7 +305,7 @@ class _BoundDecoding(LabelDecoding):
 
     def among(self, stimuli: Ints) -> LabelDecoding:
         """Return the decoding of the same properties of some stimuli."""
-        return _BoundDecoding({name: codes[stimuli] for name, codes in self._classes.items()})
+        return _BoundDecoding(_classes_of(self._classes, stimuli))
 
     def attainable(self, animals: Sequence[SubjectRDM], seed: int) -> Floats:
         """Return the accuracy [A] of each animal's responses without their noise."""

@@ -162,6 +162,21 @@ def test_labels_without_a_shared_property_are_undefined_in_words():
     assert broken.reasons[0] == "activations of every layer are constant or not finite"
 
 
+def test_a_layer_without_values_for_a_whole_class_is_not_decoded():
+    labels = [f"{shape}-{place}-{side}" for shape in ("convex", "concave") for place in "ab" for side in "xy"]
+    metric, rng = get_metric("decoding"), np.random.default_rng(0)
+    animals = [
+        metric.animal(name, [Trials(rng.normal(size=(16, 4)), np.arange(16) % 8)], 8, splits=3) for name in ("m1", "m2")
+    ]
+    features = np.concatenate([rng.normal(size=(4, 3)), np.full((4, 3), np.nan)])
+    score = metric.score({"l": features}, animals, name="x", stimuli=labels)
+    # Of one class every guess is right: the mean over properties had a part of 1.
+    assert (score.status, math.isnan(score.value)) == ("undefined", True)
+    # A class that is left out of three has no number that could be guessed.
+    classes = metric.take(LabelledFeatures(np.eye(6), {"p": np.array([0, 0, 1, 1, 2, 2])}), np.arange(2, 6)).classes
+    assert classes["p"].tolist() == [0, 0, 1, 1]
+
+
 @pytest.mark.slow
 def test_intervals_over_stimuli_hold_the_mean_accuracy_as_often_as_they_say():
     shape, place = np.repeat([0, 1], 6), np.tile([0, 1], 6)
