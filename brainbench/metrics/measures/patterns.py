@@ -443,6 +443,12 @@ def _unit_tunings(patterns: Floats) -> Floats:
     return np.divide(centred, length, out=np.zeros_like(centred), where=length > floor)
 
 
+def _ordered(patterns: Floats) -> Floats:
+    """Return units or features in an order that follows from their responses alone, for a sample of them is taken."""
+    finite = patterns[np.isfinite(patterns).all(axis=1)]
+    return patterns[:, unit_order(np.sort(finite, axis=0), finite[:0])]
+
+
 class OneToOne(UnitMatching):
     """Each unit has a feature of its own, so that the mean correlation is the largest (an assignment)."""
 
@@ -461,10 +467,13 @@ class SoftMatching(UnitMatching):
     name = "soft-matching"
     title = "mean correlation over stimuli of units and features of equal masses, matched by optimal transport"
 
+    def layer(self, features: ArrayLike) -> Floats:
+        """Return a layer's features [K, F] in an order of their own."""
+        return _ordered(super().layer(features))
+
     def partner(self, animal: SubjectRDM, others: Sequence[SubjectRDM]) -> Floats:
-        """Return the others' units in an order that follows from their responses: a sample of them is taken."""
-        units = super().partner(animal, others)
-        return units[:, unit_order(np.sort(units, axis=0), units[:0])]
+        """Return the others' units in an order of their own."""
+        return _ordered(super().partner(animal, others))
 
     def chosen(self, features: int, units: int) -> Ints:
         """Return a sample of the features, a multiple of the units in number where there are as many."""

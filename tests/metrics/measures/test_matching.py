@@ -90,6 +90,18 @@ def test_agreement_of_animals_does_not_depend_on_how_they_and_their_units_are_li
     assert second == pytest.approx(first, abs=1e-12)
 
 
+def test_a_score_does_not_depend_on_how_the_features_of_a_layer_are_listed():
+    metric, rng = get_metric("soft-matching"), np.random.default_rng(7)
+    truth = rng.normal(size=(STIMULI, 20))
+    animals, layer = _make_animals(metric, [truth] * 3), truth[:, rng.permutation(20)] @ rng.normal(size=(20, 30))
+    lacking = np.where(np.arange(STIMULI)[:, None] == 2, np.nan, layer)
+    order = rng.permutation(30)
+    # Of the 30 features a sample of 20 is taken.
+    for values in (layer, lacking):
+        first, second = (_matched_score(metric, {"layer": part}, animals) for part in (values, values[:, order]))
+        assert (second.value, second.chance) == pytest.approx((first.value, first.chance), abs=1e-12)
+
+
 @pytest.mark.parametrize("name", ["soft-matching", "one-to-one"])
 def test_networks_that_know_nothing_have_uniform_p(name):
     metric, p = get_metric(name), []
