@@ -105,9 +105,9 @@ def extract(
     what was not read, and why.
 
     The model runs in evaluation mode without gradients on copies of the stimuli; modes are put back and no hook stays.
-    The proof runs a copy of it on 8 probes and an eighth of the stimuli; probes beyond an eighth of ``memory`` lie in
-    temporary files. Memory beyond the result is that copy, which is gone before all stimuli run, and
-    half of ``memory``, or one stimulus and the probes where these need more.
+    The proof runs a copy of it on 8 probes and an eighth of the stimuli, and at the end itself on two of these again;
+    probes beyond an eighth of ``memory`` lie in temporary files. Memory beyond the result is that copy, which is gone
+    before all stimuli run, and half of ``memory``, or one stimulus and the probes where these need more.
 
     Args:
         model: Maps [B, T, C, H, W] to anything.
@@ -205,6 +205,7 @@ class _Run:
         self.count, self.steps = values.shape[:2]
         self.like = next((p for p in model.parameters() if p.is_floating_point()), torch.zeros(()))
         self.sample = proof.draw_sample(self.count)
+        self.first = np.sort(self.sample)[:2]  # met again at the end, which shows what the model kept since then
         self.notes: list[str] = []
 
     def stimuli(self, rows: slice | np.ndarray) -> torch.Tensor:
@@ -398,13 +399,17 @@ def _read_named(run: _Run, read: Any, rooms: _Rooms, chunk: int, *, proven: bool
                 sketches.add(0, (name, None), rows, range(place.start, place.stop))
     if sketches is None:
         return
-    again = read if fresh is None else named_reader(fresh, tuple(rooms.order))
-    for start in range(0, len(run.sample), _SAMPLED):
-        picks = run.sample[start : start + _SAMPLED]
-        for name, rows in layers(run.stimuli(picks), again):
-            sketches.add(1, (name, None), rows, picks)
-    for name in sketches.unequal():
-        raise run.refusal(name)
+
+    def compare(reader: Any, stimuli: np.ndarray) -> None:
+        for start in range(0, len(stimuli), _SAMPLED):
+            picks = stimuli[start : start + _SAMPLED]
+            for name, rows in layers(run.stimuli(picks), reader):
+                sketches.add(1, (name, None), rows, picks)
+        for name in sketches.unequal():
+            raise run.refusal(name)
+
+    compare(read if fresh is None else named_reader(fresh, tuple(rooms.order)), run.sample)
+    compare(read, run.first)
 
 
 @dataclass(frozen=True)
@@ -458,9 +463,11 @@ class _HookedReader:
         except UsageError:  # a model may be made for batches of one size
             self.fill = min(chunk, run.count)
             sketches = self._prove()
-        self._run_sample(sketches)
+        self._run_again(self.fresh or run.model, run.sample[_PROBED:], sketches)
         self.fresh = None  # its memory is that of the layers from here on
         self._run_all(max(1, min(chunk, rooms.memory // 2 // self.size)), sketches)
+        rooms.not_read = sketches.unequal() | rooms.not_read
+        self._run_again(run.model, run.first, sketches)
         rooms.not_read = sketches.unequal() | rooms.not_read
         self._check(rooms.not_read)
 
@@ -602,18 +609,17 @@ class _HookedReader:
         misfit, before = min(choices)
         return (layout, before, count // steps // before) if misfit < 1 else None
 
-    def _run_sample(self, sketches: _Sketches) -> None:
-        """Run the other sampled stimuli in their own order and batches."""
-        run, rest = self.run, self.run.sample[_PROBED:]
-        for part in np.array_split(rest, -(-len(rest) // _SAMPLED)) if len(rest) else ():
-            picks = np.resize(part, max(len(part), self.fill))
+    def _run_again(self, model: nn.Module, picks: np.ndarray, sketches: _Sketches) -> None:
+        """Run sampled stimuli in their own order and batches."""
+        for part in np.array_split(picks, -(-len(picks) // _SAMPLED)) if len(picks) else ():
+            rows = np.resize(part, max(len(part), self.fill))
 
-            def take(name: str, index: int, tensor: Any, picks: Any = picks) -> None:
+            def take(name: str, index: int, tensor: Any, rows: Any = rows) -> None:
                 place = self.places.get((name, index))
-                if place is not None and tensor is not None and place.layout.fits(tuple(tensor.shape), len(picks)):
-                    sketches.add(1, (place.layer, place.step), place.layout.split(tensor, len(picks)), picks)
+                if place is not None and tensor is not None and place.layout.fits(tuple(tensor.shape), len(rows)):
+                    sketches.add(1, (place.layer, place.step), place.layout.split(tensor, len(rows)), rows)
 
-            self._forward(self.fresh or run.model, run.stimuli(picks), take)
+            self._forward(model, self.run.stimuli(rows), take)
 
     def _run_all(self, chunk: int, sketches: _Sketches) -> None:
         """Run all stimuli once, and write what is a response."""

@@ -454,6 +454,25 @@ def test_a_state_that_only_another_batch_size_resets_is_refused():
         extract(Leaky(), torch.randn(32, 4, 6, 5, 7))
 
 
+@pytest.mark.parametrize("named", [False, True])
+def test_a_state_that_begins_in_a_later_batch_is_refused(named):
+    class Warmed(nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.read, self.calls, self.layers = nn.Linear(210, 6), 0, ("read",) if named else None
+
+        def forward(self, x):
+            self.calls += 1
+            return self.read(x.flatten(2)) + (self.calls > 2)
+
+        def activations(self, x, layers):
+            return {"read": self(x)}
+
+    # Neither the copy, which is called twice or thrice, nor the stimuli of the sample tell: the third batch is of five.
+    with pytest.raises(UsageError, match="Warmed answers the same stimuli otherwise"):
+        extract(Warmed(), torch.randn(37, 4, 6, 5, 7))
+
+
 def test_compiled_parts_and_models_are_read_as_written(stimuli):
     plain = nn.Sequential(nn.Flatten(2), nn.Sequential(nn.Linear(1050, 3), nn.ReLU()))
     expected = extract(plain, stimuli)
@@ -541,7 +560,8 @@ def test_stimuli_run_once_beyond_the_proof():
             return x.flatten(2)
 
     extract(Counted(), torch.randn(40, 4, 6, 5, 7))
-    assert Counted.rows == 40 + 8 + 5
+    # The probes, the sample, and again two of it at the end.
+    assert Counted.rows == 40 + 8 + 5 + 2
 
 
 def test_a_model_of_one_batch_size_is_read_in_it():
