@@ -121,6 +121,13 @@ def test_blocks_whose_times_explain_nothing_are_believed_and_unknown_times_make_
     assert CONTROL not in _score(tmp_path, _rank(), unknown).baselines
 
 
+def test_trials_that_begin_together_have_one_place_however_they_are_listed(tmp_path):
+    recordings, _ = _make_recordings(blocked=True)
+    alike = recordings.assign_coords(window_start=("trial", np.zeros(recordings.sizes["trial"])))
+    # In the order of their labels the trials of one time were a clock, which explains the drift of these rates.
+    assert _score(tmp_path, _rank(), alike).baselines[CONTROL].status == "undefined"
+
+
 def test_runs_of_each_stimulus_under_drift_are_reliable_in_random_halves_alone(tmp_path):
     # Four runs each, as in many experiments: the label explains nothing of the times, and random halves share the runs.
     recordings, geometry = _make_recordings(blocked=True, blocks=4)
