@@ -96,8 +96,9 @@ def with_errors(run: Run, jobs: Sequence[Job], fidelity: Fidelity) -> list[Trace
         runs = {(index, setting): trace for (index, setting), trace in runs.items() if finer.get(index) == setting}
         pending = finer
     promise = fidelity.error or LARGEST_ERROR
-    remarks = [remark_on(trace.error, promise) if trace.status == "ok" else "" for trace in traces]
-    if fidelity.error is not None and fidelity.solver == "dynamic":
+    tried = fidelity.error is not None
+    remarks = [remark_on(trace.error, promise, tried=tried) if trace.status == "ok" else "" for trace in traces]
+    if tried and fidelity.solver == "dynamic":
         short = {
             index: replace(halved_step(setting, job.whisker, job.spacing), time_step=SHORT_STEP, steps_per_period=None)
             for index, (job, trace, setting) in enumerate(zip(jobs, traces, settings, strict=True))
@@ -208,12 +209,16 @@ def _finer(fidelity: Fidelity, job: Job, by_step: float, by_links: float) -> Fid
     return fidelity
 
 
-def remark_on(error: float, promise: float = LARGEST_ERROR, *, jams: bool = False) -> str:
-    """Return in words that an estimated error is beyond what is promised; empty where it is not."""
+def remark_on(error: float, promise: float = LARGEST_ERROR, *, jams: bool = False, tried: bool = False) -> str:
+    """Return in words that an estimated error is beyond what is promised; empty where it is not.
+
+    Where finer settings were ``tried``, as ``auto`` does, they are no advice.
+    """
     if not error > promise:
         return ""
     words = f"an error of {error:.0%}" if np.isfinite(error) else "an error that cannot be told"
     words += f" (root mean square), above {promise:.0%}"
     if jams:
         return f"steps of {1e3 * SHORT_STEP:g} ms tell {words}; between bodies with friction forces may have no limit"
-    return f"half the step and more links estimate {words}; choose a finer fidelity, or auto=ERROR"
+    advice = "auto has no finer setting that helps" if tried else "choose a finer fidelity, or auto=ERROR"
+    return f"half the step and more links estimate {words}; {advice}"
