@@ -199,7 +199,9 @@ def unknown_name(kind: str, name: object, options: Iterable[str], *, hint: str =
 
 def check_name(kind: str, name: object, options: Iterable[str], *, hint: str = "") -> None:
     """Raise the error of :func:`unknown_name` unless a name is among the options."""
-    if name not in (choices := list(options)):
+    choices = list(options)
+    # Of an array every entry would be compared.
+    if not isinstance(name, Hashable) or name not in choices:
         raise unknown_name(kind, name, choices, hint=hint)
 
 

@@ -263,7 +263,7 @@ def _values(fixed: bool, kinds: Sequence[Any], limit: msgspec.Meta) -> Check | N
 
     def check(name: str, value: Any) -> None:
         no_row = str | bytes | Mapping | set | frozenset | Iterator
-        several = isinstance(value, Iterable) and not isinstance(value, no_row)
+        several = isinstance(value, Iterable) and not isinstance(value, no_row) and getattr(value, "ndim", 1) > 0
         values: list[Any] = list(value) if several else []
         if not several or (fixed and len(values) != len(checks)):
             raise UsageError(f"{name} holds {f'{len(checks)} {noun}' if fixed else noun}; received {brief(value)}.")

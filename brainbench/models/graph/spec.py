@@ -58,6 +58,10 @@ class Convolution(Operation):
     padding: Literal["same", "valid"] | Margins = "same"
     """Zeros at every edge (rows, columns); ``same`` keeps the grid, ``valid`` adds none."""
 
+    def __post_init__(self) -> None:
+        if not isinstance(self.padding, str):  # an array would be compared entry by entry
+            object.__setattr__(self, "padding", tuple(map(int, self.padding)))
+
     def output_shape(self, shape: Shape) -> Shape:
         """Return (C, H, W) for an input (C, H, W)."""
         if self.padding == "same":

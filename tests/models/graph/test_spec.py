@@ -1,3 +1,4 @@
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -46,6 +47,7 @@ def test_a_wrong_graph_is_answered_in_one_sentence(edges, changes, message):
 @pytest.mark.parametrize(
     ("make", "message"),
     [
+        (lambda: Convolution(3, padding=np.array(3)), "Unknown padding of a convolution"),
         (lambda: Convolution(3, padding=(-1, 0)), "padding of a convolution.* at least 0; received -1"),
         (lambda: Convolution(3, padding="sam"), "padding of a convolution 'sam'; did you mean 'same'"),
         (lambda: Convolution(3, (0, 2)), "kernel_size of a convolution .*at least 1; received 0"),
@@ -65,6 +67,11 @@ def test_a_wrong_graph_is_answered_in_one_sentence(edges, changes, message):
 def test_impossible_sizes_are_refused(make, message):
     with pytest.raises(UsageError, match=message):
         make()
+
+
+def test_margins_may_be_an_array():
+    assert Convolution(3, padding=np.array([1, 0])) == Convolution(3, padding=(1, 0))
+    assert Convolution(3, padding=[1, 0]).output_shape((2, 5, 7)) == (3, 6, 6)
 
 
 @pytest.mark.parametrize(
