@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import json
+import math
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
@@ -171,7 +172,9 @@ def _run(source: Path, out: Path, **options: Any) -> dict[str, Any]:
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
     units = "mN and µN·m; action of the whisker on its base, world axes"
-    return {"kind": "run", "frames": dataset.sizes["time"], "whiskers": dataset.sizes["whisker"], "units": units}
+    frames = _frames(dataset["time"].values)
+    times = f"none in a run: convert it back with --rate {1e3 / (frames['interval_ms'] or math.inf):.6g}"
+    return {"kind": "run", **frames, "times": times, "whiskers": dataset.sizes["whisker"], "units": units}
 
 
 def _frames(times: Any) -> dict[str, Any]:

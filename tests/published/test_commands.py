@@ -66,6 +66,8 @@ def test_a_run_becomes_a_set_and_a_run_again(run, tmp_path):
     back = run("stimuli", "convert", str(tmp_path / "a.h5"), str(tmp_path / "back"))
     assert back.status == 0
     assert "mN" in back.out
+    # A run of 110 rows is taken as one second, whatever its stimulus lasted.
+    assert "with --rate 110\n" in back.out
     written = np.loadtxt(tmp_path / "back" / "dynamics" / "Mx.csv", delimiter=",")
     np.testing.assert_allclose(written, dynamics[:, :, 3], rtol=2e-7)
     assert (tmp_path / "back" / "whisker_ID.csv").read_text() == "RC1\nRC2\n"
