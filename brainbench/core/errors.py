@@ -200,8 +200,7 @@ def unknown_name(kind: str, name: object, options: Iterable[str], *, hint: str =
 def check_name(kind: str, name: object, options: Iterable[str], *, hint: str = "") -> None:
     """Raise the error of :func:`unknown_name` unless a name is among the options."""
     choices = list(options)
-    # Of an array every entry would be compared.
-    if not isinstance(name, Hashable) or name not in choices:
+    if not isinstance(name, Hashable) or name not in choices:  # an array would compare its entries
         raise unknown_name(kind, name, choices, hint=hint)
 
 

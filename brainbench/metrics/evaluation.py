@@ -449,11 +449,8 @@ class _Votes:
     def null(self, seed: int) -> Callable[[], Iterable[Floats]]:
         """Return what gives the comparisons [N, L, A] under the orders of the stimuli, in chunks, as often as asked."""
         judged, draws = self.permuted, self.permuted.metric.orders
-        count, size, exact = (
-            judged.animals[0].count,
-            len(judged.layers) * len(judged.animals),
-            permutation.most_exact(draws),
-        )
+        count, exact = judged.animals[0].count, permutation.most_exact(draws)
+        size = len(judged.layers) * len(judged.animals)
         # Of many stimuli no more than one order is held at a time.
         step = max(1, _CHUNK_ELEMENTS // max(len(judged.layers) * min(count, 64) ** 2, size))
         orders = partial(permutation.label_orders, count, seed, exact=exact, draws=draws, step=step)

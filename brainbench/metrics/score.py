@@ -283,9 +283,8 @@ def score_agreement(
     pairs = []
     for i in compared:
         animal, partner = animals.subjects[i], metric.partner(animals.subjects[i], others[i])
-        pairs.append(
-            evaluation.LayerComparisons(metric, [metric.take(partner, animals.order)], [animal.take(animals.order)])
-        )
+        sides = [metric.take(partner, animals.order)], [animal.take(animals.order)]
+        pairs.append(evaluation.LayerComparisons(metric, *sides))
     raw = {i: float(pair.given()[0, 0]) for i, pair in zip(compared, pairs, strict=True)}
     values = {i: raw[i] * factors[i].value for i in compared}
     valid = [i for i in compared if math.isfinite(values[i])]

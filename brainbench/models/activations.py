@@ -338,8 +338,7 @@ class _Rooms:
                 filename, room = room.filename, None
                 Path(str(filename)).unlink(missing_ok=True)
             self.result.nonfinite.pop(name, None)
-        layers = sorted(self.result, key=self._place)
-        for name in layers:
+        for name in sorted(self.result, key=self._place):
             self.result[name] = room = self.result.pop(name)
             if isinstance(room, np.memmap):
                 room.flush()
@@ -401,8 +400,7 @@ def _read_named(run: _Run, read: Any, rooms: _Rooms, chunk: int, *, proven: bool
         return
 
     def compare(reader: Any, stimuli: np.ndarray) -> None:
-        for start in range(0, len(stimuli), _SAMPLED):
-            picks = stimuli[start : start + _SAMPLED]
+        for picks in np.split(stimuli, range(_SAMPLED, len(stimuli), _SAMPLED)):
             for name, rows in layers(run.stimuli(picks), reader):
                 sketches.add(1, (name, None), rows, picks)
         for name in sketches.unequal():

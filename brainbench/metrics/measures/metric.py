@@ -114,8 +114,7 @@ def _enter(name: str, target: Any) -> None:
         raise UsageError(
             f"The entry point {name!r} of {ENTRY_POINTS} makes a metric named {metric.name!r}; use one name."
         )
-    if name not in _METRICS:
-        _METRICS[name] = metric
+    _METRICS.setdefault(name, metric)
 
 
 def list_metrics() -> tuple[str, ...]:

@@ -166,9 +166,7 @@ def _factor(animal: SubjectRDM, factor: float, halves: Sequence[Ints], compariso
     agreement, size, cosines = 0.0, 0.0, []
     for half in halves:
         pairs = permuted_pairs(half[None], animal.count)[0]
-        first, second, every = (
-            LINEAR[comparison](part[..., pairs]) for part in (trials[:, 0], trials[:, 1], animal.rdm)
-        )
+        first, second, every = (LINEAR[comparison](part[..., pairs]) for part in (*trials.swapaxes(0, 1), animal.rdm))
         product = (first * second).sum(axis=-1)
         agreement, size = agreement + float(np.nanmean(product)), size + float((every**2).sum())
         if not unbiased:
@@ -257,11 +255,7 @@ class _Sides:
 
 def _fitted_to(gram: Floats, sums: Floats, part: str, rivals: int) -> Floats:
     """Return the weights [V, J + 1] of a sum that lacks some RDMs; equal distances come first, the layer last."""
-    used = np.ones(rivals + 1, dtype=bool)
-    if part in ("controls", "equal"):
-        used[-1] = False
-    if part in ("network", "equal"):
-        used[1:-1] = False
+    used = [True, *[part not in ("network", "equal")] * (rivals - 1), part not in ("controls", "equal")]
     return non_negative(gram, sums, used)
 
 
@@ -453,15 +447,12 @@ def _linear_agreement(matrices: Floats, factors: Floats, orders: Ints) -> Floats
 def _comparisons_without(layers: Floats, animals: Floats, comparison: str) -> Floats:
     """Return comparisons [L, A, K] of RDMs without each stimulus; NaN where nothing of one is left."""
     both = products_without(layers, animals, comparison)
-    left, right = (
-        np.stack([products_without(part[None], part[None], comparison)[0, 0] for part in side])
-        for side in (layers, animals)
-    )
-    # What rounding leaves of an RDM that has no other distance is no distance.
-    left, right = (
-        np.where(part > _ROUNDING * part.max(axis=-1, keepdims=True), part, np.nan) for part in (left, right)
-    )
-    return both / np.sqrt(left[:, None] * right[None])
+    squares = []
+    for side in (layers, animals):
+        part = np.stack([products_without(rdm[None], rdm[None], comparison)[0, 0] for rdm in side])
+        # What rounding leaves of an RDM that has no other distance is no distance.
+        squares.append(np.where(part > _ROUNDING * part.max(axis=-1, keepdims=True), part, np.nan))
+    return both / np.sqrt(squares[0][:, None] * squares[1][None])
 
 
 def score_rdms(

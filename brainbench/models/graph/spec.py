@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Annotated, Any, Literal
 
-from brainbench.core.errors import UsageError, check_name, listing
+from brainbench.core.errors import UsageError, check_name, listing, repeats
 from brainbench.core.limits import Count, Limit, Share, limited
 
 Shape = tuple[int, ...]
@@ -200,10 +200,8 @@ class GraphSpec:
         referenced += [(node.shape_from, "shape_from node") for node in self.nodes if node.shape_from is not None]
         for name, kind in referenced:
             check_name(kind, name, names)
-        ends = [(edge.source, edge.target) for edge in self.edges]
-        for end in ends:
-            if ends.count(end) > 1:
-                raise UsageError(f"The edge {end[0]} → {end[1]} appears more than once.")
+        for end in repeats((edge.source, edge.target) for edge in self.edges):
+            raise UsageError(f"The edge {end[0]} → {end[1]} appears more than once.")
         if len(self.input_shape) != 3 or min(self.input_shape) < 1:
             raise UsageError(f"The input shape must be (channels, rows, columns); received {self.input_shape!r}.")
         if lost := [name for name in names if not any(name in self._reach[source] for source in self.inputs)]:
