@@ -5,6 +5,7 @@ import xarray as xr
 
 from brainbench.core.errors import DataError, UsageError
 from brainbench.datasets import open_recordings, write_recordings
+from brainbench.datasets.trials.session_trials import fingerprint
 from tests.factories.recordings import make_simple_session
 
 
@@ -34,6 +35,19 @@ def test_counted_recordings_come_back_as_they_were(tmp_path):
     assert again.attrs["vocabulary"] == ["a", "b", "c"]
     assert again.attrs["synthetic"] is True
     assert again.attrs["content_hash"] == counted.attrs["content_hash"]
+
+
+def test_counts_of_another_byte_order_are_the_same_recordings(tmp_path):
+    write_recordings(tmp_path / "a.h5", make_simple_session())
+    path = write_recordings(tmp_path / "b.h5", open_recordings(tmp_path / "a.h5", conditions="trials:stimulus"))
+    with h5py.File(path, "a") as file:
+        for name in ("counts", "duration", "time"):
+            values = file[name][...]
+            del file[name]
+            file[name] = values.astype(values.dtype.newbyteorder(">"))
+    again = open_recordings(path)
+    # Another fingerprint is that of an edited copy, whose scores stand on a board of their own.
+    assert fingerprint(again) == again.attrs["fingerprint"]
 
 
 def test_options_cannot_apply_to_counted_recordings(tmp_path):
