@@ -145,8 +145,8 @@ def read_mjspec(path: Path) -> Any:
     mujoco = mujoco_module()
     folder, root = path.parent, checked_xml(path)
     with readable(path, "URDF or MJCF file"):
-        if path.suffix.lower() == ".mjcf":
-            # MuJoCo chooses how to read a file by its ending, and has no reader for this one.
+        if path.suffix not in (".urdf", ".xml"):
+            # MuJoCo chooses how to read a file by its ending, and has no reader for .mjcf, .URDF and .XML.
             spec = mujoco.MjSpec.from_string(ElementTree.tostring(root, encoding="unicode"))
             spec.modelfiledir = str(folder)
         else:

@@ -157,14 +157,17 @@ def _check_hands(folder: Path, out: Path) -> Output:
 
     from robotics_bridge.hands.gallery import check_file
 
-    paths = [folder] if folder.is_file() else sorted(p for p in folder.rglob("*") if p.suffix in _HAND_FILES)
+    paths = [folder] if folder.is_file() else sorted(p for p in folder.rglob("*") if p.suffix.lower() in _HAND_FILES)
     if not paths:
         what = f"holds no hand file ({', '.join(_HAND_FILES)})" if folder.is_dir() else "is no folder or hand file"
         raise UsageError(f"{brief(str(folder))} {what}.")
-    out.mkdir(parents=True, exist_ok=True)
-    checks = [check for path in tracked(paths, "checking hands") for check in check_file(path, out)]
+    top, checks = folder.parent if folder.is_file() else folder, []
+    for path in tracked(paths, "checking hands"):
+        pictures = out / path.parent.relative_to(top)
+        pictures.mkdir(parents=True, exist_ok=True)
+        checks += check_file(path, pictures)
     columns = {
-        "hand": "{0.name}",
+        "file": lambda check: str(Path(check.file).relative_to(top)),
         "palm": "{0.palm}",
         ">tips": lambda check: str(len(check.tips)),
         ">pads": "{0.pads}",

@@ -1,4 +1,5 @@
 import json
+from pathlib import Path
 
 from tests.factories.hand_gallery import GALLERY
 
@@ -46,6 +47,17 @@ def test_check_of_a_folder_presses_every_pad_and_draws_every_hand(run, tmp_path)
     found = run("tactile", "check", str(tmp_path / "broken.xml"), "--out", str(tmp_path / "pictures"))
     assert found.status == 1
     assert "no joints" in " ".join(found.out.split())
+
+
+def test_hands_of_one_name_are_told_apart_by_their_files(run, tmp_path):
+    text = GALLERY["jaws-slide"].text
+    for place in ("a/hand.xml", "b c/hand.XML", "b c/hand.mjcf"):
+        (tmp_path / place).parent.mkdir(exist_ok=True)
+        (tmp_path / place).write_text(text)
+    found = run("tactile", "check", str(tmp_path), "--out", str(tmp_path / "pictures"), "--json")
+    files = [str(Path(hand["file"]).relative_to(tmp_path)) for hand in json.loads(found.out)["hands"]]
+    assert files == ["a/hand.xml", "b c/hand.XML", "b c/hand.mjcf"]
+    assert len(list((tmp_path / "pictures").rglob("*.png"))) == 3
 
 
 def test_check_fails_where_a_truth_is_missed(run, monkeypatch):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 
@@ -49,7 +51,7 @@ def test_a_file_that_cannot_be_read_is_one_sentence(tmp_path) -> None:
 
 def test_a_picture_of_each_hand_is_drawn(tmp_path) -> None:
     check_file(GALLERY["two-hands"].write(tmp_path, "two"), tmp_path)
-    assert sorted(path.name for path in tmp_path.glob("*.png")) == ["two-left_palm.png", "two-right_palm.png"]
+    assert sorted(path.name for path in tmp_path.glob("*.png")) == ["two-left_palm-xml.png", "two-right_palm-xml.png"]
 
 
 def test_a_urdf_without_links_is_one_sentence(tmp_path):
@@ -57,3 +59,24 @@ def test_a_urdf_without_links_is_one_sentence(tmp_path):
     path.write_text('<robot name="x"/>')
     (check,) = check_file(path, tmp_path)
     assert check.errors == (f"{str(path)!r} holds no hand: it has no links.",)
+
+
+def test_a_hand_that_nothing_can_press_is_not_sound(tmp_path):
+    model = GALLERY["three-fingers-box"]
+    ghost = model.text.replace("<geom ", '<geom contype="0" conaffinity="0" ')
+    (tmp_path / "ghost.xml").write_text(ghost)
+    (check,) = check_file(tmp_path / "ghost.xml")
+    assert check.errors == tuple(f"no ball can press the tip {tip!r}" for tip in model.tips)
+
+
+@pytest.mark.parametrize("scale", [1e3, 1e-3])
+def test_a_hand_in_another_unit_of_length_is_told(scale, tmp_path):
+    def scaled(match):
+        values = " ".join(f"{scale * float(word):.9g}" for word in match[2].split())
+        return f'{match[1]}="{values}"'
+
+    text = re.sub(r'\b(pos|size)="([^"]+)"', scaled, GALLERY["three-fingers-box"].text)
+    (tmp_path / "large.xml").write_text(text)
+    (check,) = check_file(tmp_path / "large.xml")
+    assert not check.passed
+    assert "lengths are in metres" in check.errors[0]
