@@ -105,13 +105,17 @@ def deploy(
         with realtime() if ahead else contextlib.nullcontext():
             report = controller.run(seconds)
     facts: dict[str, Any] = {**vars(report), "unmeasured": unmeasured}
+    followed = ""
+    if shadow_touch is not None:
+        facts["shadow"] = {"apart": fallback.apart, "lost": fallback.lost}
+        followed = f"{fallback.summary()}\n"
     if recorder is not None and (episode := recorder.write()) is not None:
         facts["episode"] = str(episode)
     reason = f" ({report.reason})" if report.reason else ""
     latency = report.latency
     absent = "".join(f"not measured by the hand: {name} ({what})\n" for name, what in unmeasured.items())
     text = (
-        f"{absent}{report.status}{reason}: {report.ticks} ticks in {report.seconds:.1f} s\n"
+        f"{absent}{followed}{report.status}{reason}: {report.ticks} ticks in {report.seconds:.1f} s\n"
         f"control tick: p50 {latency['p50']:.2f} ms, p99 {latency['p99']:.2f} ms, max {latency['max']:.2f} ms; "
         f"{report.overruns} longer than a control step\n"
         f"reports: {report.link['received']} received, {report.link['lost']} lost, {report.link['late']} late, "

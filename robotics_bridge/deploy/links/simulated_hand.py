@@ -6,9 +6,12 @@ Runs as a process of its own: ``with simulated_hand() as address: …``. It hold
 from __future__ import annotations
 
 import contextlib
+import logging
+import math
 import multiprocessing
 import socket
 import time
+from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Annotated, Any
@@ -30,6 +33,8 @@ from robotics_bridge.policies.contract import PolicyContract
 from robotics_bridge.sensors import SensorSuite
 from robotics_bridge.tasks.scenes import drives_of
 from robotics_bridge.tasks.settings import CONTACTS, ContactModel, set_contacts
+
+_LOG = logging.getLogger(__name__)
 
 HOLD_AFTER = 0.25  # seconds without a command after which the hand holds by itself
 _Delay = Annotated[float, Limit(least=0, below=3600, unit="s")]
@@ -116,6 +121,10 @@ class SimulatedHand:
         self._positions = [int(model.joint(name).qposadr[0]) for name in self.joints]
         self._speeds = [int(model.joint(name).dofadr[0]) for name in self.joints]
         self._driven, self._drives = [self.joints.index(name) for name in servos], [*servos.values()]
+        stiffness, damping = body.actuator_gainprm[self._drives, 0], -body.actuator_biasprm[self._drives, 2]
+        self.lag = np.zeros(len(self.joints))
+        """Time [J] (s) by which a damped drive follows a target that moves."""
+        self.lag[self._driven] = np.divide(damping, stiffness, out=np.zeros(len(servos)), where=stiffness > 0)
         self._rows = [self.hand.tips.index(link) for link in self.layout if link in self.hand.tips]
         # The first step and reading load what later ones use; real time begins after them.
         self.step()
@@ -137,6 +146,12 @@ class SimulatedHand:
         """Joint positions [J] (rad)."""
         return self.engine.data[0].qpos[self._positions].copy()
 
+    def place(self, position: NDArray[np.float64]) -> None:
+        """Put the joints [J] (rad) at rest where they are said to be; what was felt before is forgotten."""
+        self.engine.data[0].qpos[self._positions] = position
+        self.engine.forward()
+        self.suite.reset()
+
     def step(self) -> None:
         """Advance by one report."""
         self.engine.step(self._substeps)
@@ -155,11 +170,17 @@ class SimulatedHand:
         return np.concatenate([self.position, self.engine.data[0].qvel[self._speeds], raw.ravel()])
 
 
+APART = 0.3  # difference of a joint (rad; of a slide by its lever) at which a shadow is out of step
+LOST = 0.25  # way of the ball (m) at which it has left the hand
+MOST_STEPS = 2  # control steps that are made up for in one call
+
+
 class ShadowTouch:
     """The tactile group [S, N, C] of a simulated hand that holds a ball and follows the reported joints.
 
-    What lies in the real hand is not known to it: the ball stands for the object, so touch that is not measured is a
-    guess.
+    It begins where the first report has the joints, and keeps the time of the reports. What lies in the real hand is
+    not known to it: the ball stands for the object, so touch that is not measured is a guess. Where that is none any
+    more, because joints are blocked or the ball is gone, :meth:`summary` and a warning say so.
 
     Args:
         contract: Of the policy; hand, skin and contacts are those in which it was trained.
@@ -179,17 +200,59 @@ class ShadowTouch:
         # A hand need not report a joint that mimics another; the coupling moves it here too.
         reported = [(own, joints.index(name)) for own, name in enumerate(self.hand.joints) if name in joints]
         self._own, self._reported = (list(part) for part in zip(*reported, strict=True))
+        self._lever = self.hand.hand.lever(self.hand.joints)[self._own]
+        self._felt: deque[NDArray[np.float32]] = deque(maxlen=self.sub_steps)
+        self._start, self._place, self._steps = math.nan, self._ball, 0
+        self.apart = 0.0
+        """Largest difference of a joint from the report that it followed (rad; of a slide by its lever)."""
+        self.lost: float | None = None
+        """Time (s) at which the ball left the hand."""
 
     def __call__(self, reading: HandReading) -> NDArray[np.float32]:
-        """Advance by one control step towards the reported joints and return what is felt on the way."""
-        targets = self.hand.position
-        targets[self._own] = reading.position[self._reported]
-        self.hand.drive(targets)
-        felt = []
-        for _ in range(self.sub_steps):
-            self.hand.step()
-            felt.append(self.hand.touch().copy())
-        return np.stack(felt)
+        """Advance to the time of a report, towards its joints, and return what was felt in the last control step."""
+        where, hand = reading.position[self._reported], self.hand
+        targets = hand.position
+        targets[self._own] = where
+        if math.isnan(self._start):
+            hand.place(targets)
+            self._start = reading.time - self.sub_steps / hand.rate
+        # A damped drive would stay behind joints that move.
+        targets[self._own] += hand.lag[self._own] * reading.velocity[self._reported]
+        hand.drive(targets)
+        behind = round((reading.time - self._start) * hand.rate) - self._steps
+        for _ in range(min(behind, MOST_STEPS * self.sub_steps)):
+            hand.step()
+            self._felt.append(hand.touch().copy())
+            self._steps += 1
+        self._look(where)
+        return np.stack(self._felt)
+
+    @property
+    def _ball(self) -> NDArray[np.float64]:
+        return self.hand.engine.data[0].body(OBJECT).xpos.copy()
+
+    def _look(self, where: NDArray[np.float64]) -> None:
+        """Note how far the joints are from the reported ones, and whether the ball is gone; say each once."""
+        differences = np.abs(self.hand.position[self._own] - where) / self._lever
+        apart = float(differences.max())
+        if self.apart <= APART < apart:
+            joint = self.hand.joints[self._own[int(differences.argmax())]]
+            _LOG.warning(
+                "The simulated hand beside yours is %.2g rad from the report at joint %r, because the ball or a finger "
+                "is in its way: its touch is that of another pose.", apart, joint,
+            )  # fmt: skip
+        self.apart = max(self.apart, apart)
+        if self.lost is None and not np.linalg.norm(self._ball - self._place) <= LOST:
+            self.lost = self._steps / self.hand.rate
+            _LOG.warning(
+                "The ball left the simulated hand after %.1f s: from now on its touch is that of an empty hand.",
+                self.lost,
+            )
+
+    def summary(self) -> str:
+        """Return how well the shadow followed, in words."""
+        gone = "" if self.lost is None else f"; the ball left it after {self.lost:.1f} s"
+        return f"joints of the simulated hand within {self.apart:.2g} rad of the reported ones{gone}"
 
 
 def serve(hand: SimulatedHand, link: HandLink, faults: Faults, seconds: float = 3600.0) -> None:

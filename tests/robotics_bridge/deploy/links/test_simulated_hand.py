@@ -20,9 +20,10 @@ from tests.robotics_bridge.hands.test_grippers import JAWS, LINK, URDF
 HAND = hands.load("xhand1")
 
 
-def _reading(position, pressure=None) -> HandReading:
+def _reading(position, pressure=None, *, step: int = 0, velocity=None) -> HandReading:
     pressure = np.zeros((5, 3)) if pressure is None else pressure
-    return HandReading(0, 0.0, 0.0, np.asarray(position), np.zeros(12), pressure)
+    velocity = np.zeros(12) if velocity is None else velocity
+    return HandReading(step, step / 40, step / 40, np.asarray(position), velocity, pressure)
 
 
 def _contract(observe: str, joints: tuple[str, ...] = HAND.joints) -> PolicyContract:
@@ -39,12 +40,49 @@ def test_it_follows_the_reported_joints_whatever_their_order_and_feels_the_ball(
     order = [joints.index(name) for name in HAND.joints]
     reported = np.empty(12)
     reported[order] = closed[[HAND.joints.index(name) for name in HAND.joints]]
-    for _ in range(40):
-        felt = shadow(_reading(reported))
+    for step in range(40):
+        felt = shadow(_reading(reported, step=step))
     assert felt.shape == (5, 90, 6)
     assert np.isfinite(felt).all()
     assert np.abs(felt[..., :3]).max() > 0.01
     assert np.abs(shadow.hand.position - reported[order]).mean() < 0.2
+
+
+def test_a_shadow_begins_where_the_hand_is_and_does_not_stay_behind_joints_that_move() -> None:
+    pinky, rate = np.arange(12) == 10, 2 * np.pi
+    middle, amplitude = 0.7 * pinky, 0.2 * pinky
+    shadow = ShadowTouch(_contract("force_torque"), HAND.joints)
+    apart = []
+    for step in range(60):
+        phase = rate * step / 40
+        position, velocity = middle + amplitude * np.sin(phase), rate * amplitude * np.cos(phase)
+        shadow(_reading(position, step=step, velocity=velocity))
+        apart.append(np.abs(shadow.hand.position - position).max())
+    assert max(apart) < 0.05  # a drive of .1 s stays .12 rad behind
+    assert shadow.apart == max(apart)
+    assert "0.0" in shadow.summary()
+
+
+def test_a_shadow_keeps_the_time_of_the_reports() -> None:
+    """Of ten reports two were lost and one came twice."""
+    shadow = ShadowTouch(_contract("force_torque"), HAND.joints)
+    for step in (0, 1, 4, 5, 5, 6, 7, 8, 9):
+        assert shadow(_reading(np.zeros(12), step=step)).shape == (5, 90, 6)
+    assert shadow.hand.engine.data[0].time == pytest.approx(10 / 40)
+
+
+def test_a_shadow_that_is_blocked_or_lost_its_ball_says_so(caplog) -> None:
+    shadow = ShadowTouch(_contract("force_torque"), HAND.joints)
+    low, high = HAND.model.jnt_range.T  # all at once: thumb and fingers meet
+    for step in range(100):
+        shadow(_reading(low + (high - low) * min(1, step / 40), step=step))
+    assert shadow.apart > 0.3
+    assert shadow.lost is not None
+    assert 0.5 < shadow.lost < 2.5
+    assert [text for record in caplog.records if "simulated hand" in (text := record.getMessage())] == [
+        text for text in caplog.messages if "rad from the report" in text or "empty hand" in text
+    ]
+    assert f"the ball left it after {shadow.lost:.1f} s" in shadow.summary()
 
 
 @pytest.mark.parametrize("armature", ["", 'armature=".01"'])
@@ -74,8 +112,8 @@ def test_a_joint_that_mimics_another_need_not_be_reported_and_drives_are_those_o
     contract = replace(_contract("agg_force", ("l",)), hand=str(tmp_path / "jaws.urdf"))
     shadow = ShadowTouch(replace(contract, inputs={"tactile": (5, 3, 3)}), ("l",))
     model, data = shadow.hand.engine.model, shadow.hand.engine.data[0]
-    for _ in range(40):
-        shadow(_reading([0.02], np.zeros((2, 3))))
+    for step in range(40):
+        shadow(_reading([0.02], np.zeros((2, 3)), step=step))
         assert np.abs(data.actuator_force).max() <= 0.8 + 1e-9  # 8 % of the 10 N that the file states
     assert data.qpos[[model.joint(name).qposadr[0] for name in "lr"]] == pytest.approx([0.02, 0.02], abs=2e-3)
 
@@ -105,8 +143,8 @@ def test_measured_links_replace_simulated_ones() -> None:
     tips = {chain[-1]: finger for finger, chain in HAND.fingers.items()}
     touch = RealTouch(contract, tuple(HAND.fingers), fallback=shadow)
     pressure = np.full((5, 3), 0.01)
-    for _ in range(20):
-        felt = touch(_reading(np.zeros(12), pressure))
+    for step in range(20):
+        felt = touch(_reading(np.zeros(12), pressure, step=step))
     tip_rows = [row for row, link in enumerate(layout) if link in tips]
     np.testing.assert_allclose(felt[:, tip_rows], np.broadcast_to([-10.0, -10.0, 10.0], (5, 5, 3)), rtol=1e-5)
     palm = list(layout).index(HAND.palm)
