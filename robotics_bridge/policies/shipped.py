@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 from typing import Any
 
-from brainbench.core.errors import check_name
+from brainbench.core.errors import DataFileNotFoundError, check_name
 from brainbench.core.files import read_json, read_mapping
 
 AGENTS = ("zero", "random")  # agents that every trained one is held against
@@ -43,3 +43,17 @@ def policy_path(kind: str, name: str | os.PathLike[str]) -> Path:
         return path
     check_name(kind, str(name), list_policies(kind), hint=HINT)
     return FOLDER / str(name)
+
+
+def newest(run: Path) -> Path:
+    """Return the last ``model_<iteration>.safetensors`` of a teacher's run."""
+    numbers = [path.stem.removeprefix("model_") for path in run.glob("model_*.safetensors")]
+    if not (iterations := [int(number) for number in numbers if number.isdecimal()]):
+        raise DataFileNotFoundError(f"{str(run)!r} holds no trained policy (model_<iteration>.safetensors).")
+    return run / f"model_{max(iterations)}.safetensors"
+
+
+def model_file(teacher: str | os.PathLike[str]) -> Path:
+    """Return the last model of a run, given its folder or the name of a shipped one, or the model itself."""
+    located = policy_path("teacher", teacher)
+    return newest(located) if located.is_dir() else located

@@ -11,6 +11,7 @@ from aggregated ones, together with decoders of what the teacher knows (thesis, 
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import math
 import time
@@ -26,7 +27,7 @@ from safetensors.torch import load_file
 from torch import nn
 
 from brainbench.core.devices import WARM_UP, CudaGraphStep, Graph, torch_recorder
-from brainbench.core.errors import DataError, needing
+from brainbench.core.errors import BrainbenchError, DataError, needing
 from brainbench.core.files import file_hash, provenance, read_mapping, write_tensors
 from brainbench.core.progress import Progress
 from brainbench.core.reading.regular import readable
@@ -51,7 +52,7 @@ from robotics_bridge.hands.layouts import check_probes, is_probe_file
 from robotics_bridge.policies.contract import JOINTS, Groups, check_hand, check_version, from_json, shapes_of
 from robotics_bridge.policies.encoders.arms import EncoderConfig, elu_perceptron
 from robotics_bridge.policies.evaluate import Policy
-from robotics_bridge.policies.shipped import policy_path, student_folder
+from robotics_bridge.policies.shipped import model_file, policy_path, student_folder
 from robotics_bridge.policies.student import TACTILE, TactilePolicy
 from robotics_bridge.policies.training.distill_config import DistillConfig
 from robotics_bridge.tasks.task import TASK_VERSION, check_measured
@@ -90,6 +91,23 @@ def begin_with(student: TactilePolicy, start: str | Path) -> None:
             "acts alike."
         )
     student.load_state_dict(weights)
+
+
+def origins_of(config: DistillConfig) -> dict[str, str]:
+    """Return the hashes of the teacher and of the weights that a student begins with; of what is not there, none.
+
+    By name alone, a teacher that was trained anew in its folder would be the one before.
+    """
+    files: dict[str, Callable[[], Path]] = {}
+    if config.teacher:
+        files["teacher_hash"] = lambda: model_file(config.teacher)
+    if config.start is not None:
+        files["start_hash"] = lambda: policy_path("student", str(config.start)) / MODEL
+    hashes = {}
+    for name, file in files.items():
+        with contextlib.suppress(BrainbenchError, OSError):
+            hashes[name] = file_hash(file())
+    return hashes
 
 
 def load_student(folder: str | Path, *, device: str = "cpu") -> tuple[TactilePolicy, dict[str, Any]]:
@@ -455,16 +473,18 @@ class _Run:
     def _claim(self) -> None:
         """Write the run's configuration, or check that the folder holds this run."""
         earlier: dict[str, Any] = {}
+        origins = origins_of(self.config)
 
         def stated(document: dict[str, Any]) -> object:
             check_version(document, str(self.out))
             earlier.update(document)
-            return document.get("distill")
+            # Runs of earlier versions do not say what they learned from.
+            return {**document.get("distill", {}), **origins, **(document.get("origins") or {})}
 
         def begin() -> dict[str, Any]:
-            return describe_run(self.config, self.student, self.env)
+            return {**describe_run(self.config, self.student, self.env), "origins": origins}
 
-        claim(self.out / CONFIG, asdict(self.config), begin, stated=stated, what="student")
+        claim(self.out / CONFIG, asdict(self.config) | origins, begin, stated=stated, what="student")
         if earlier:
             check_hand(earlier, self.env, str(self.out))
             check_probes(self.config.resolution, earlier.get("deployment", {}).get("probes"))

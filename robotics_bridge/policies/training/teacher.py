@@ -21,7 +21,7 @@ from typing import Any, cast
 
 import torch
 
-from brainbench.core.errors import BrainbenchError, DataError, DataFileNotFoundError, UsageError, check_name, needing
+from brainbench.core.errors import BrainbenchError, DataError, UsageError, brief, check_name, needing
 from brainbench.core.files import file_hash, provenance, read_json, read_mapping, to_plain, write_json, write_tensors
 from brainbench.core.limits import Count, Positive, Seed, limited
 from brainbench.core.progress import Progress, track
@@ -47,9 +47,17 @@ from robotics_bridge.policies.contract import check_fit, check_version, from_jso
 from robotics_bridge.policies.encoders.arms import ARMS, EncoderConfig
 from robotics_bridge.policies.encoders.taxel_grid import CONTROL_SUB_STEP, HandCalibration
 from robotics_bridge.policies.evaluate import Policy, evaluate
-from robotics_bridge.policies.shipped import SENSING, list_policies, policy_path
+from robotics_bridge.policies.shipped import SENSING, list_policies, model_file
 from robotics_bridge.policies.student import TACTILE, ActingModel
-from robotics_bridge.policies.training.distill import CONFIG, MODEL, DistillResult, describe_run, distill, load_student
+from robotics_bridge.policies.training.distill import (
+    CONFIG,
+    MODEL,
+    DistillResult,
+    describe_run,
+    distill,
+    load_student,
+    origins_of,
+)
 from robotics_bridge.policies.training.distill_config import DistillConfig
 from robotics_bridge.tasks.settings import CONTACTS, TeacherSettings, contacts_name
 from robotics_bridge.tasks.task import GROUPS, TASK_VERSION, Task, check_measured
@@ -154,6 +162,9 @@ def is_done(config: DistillConfig, out: Path, stop_at: int | None = None) -> boo
     # Contacts and calibration that a student does not state are chosen when it begins.
     settings = {**stored.encoder_settings, **mine.encoder_settings}
     mine = replace(mine, encoder_settings=settings, contacts=mine.contacts or stored.contacts)
+    origins = described.get("origins") or {}
+    if any(origins.get(name, now) != now for name, now in origins_of(mine).items()):
+        return False
     total = stored.iterations or 0
     rows = read_json(out / EVALUATION)
     return mine == stored and all(row.get("iterations", total) >= min(total, stop_at or total) for row in rows)
@@ -377,17 +388,23 @@ class Trainer:
         """
         file = model_file(path)
         given, state = load_state(file), self.algorithm.save()
-        for name in ("actor", "critic"):
-            trees = (given[name], state[f"{name}_state_dict"])
+        parts = {name: tree for name in ("actor", "critic") if isinstance(tree := given.get(name), dict) and tree}
+        if missing := [name for name in ("actor", "critic") if name not in parts]:
+            raise DataError(
+                f"{brief(str(file))} holds no {missing[0]}, and a run begins with actor and critic of another: give a "
+                "folder of brainbench policy train, one of its model_<iteration>.safetensors, or a shipped teacher."
+            )
+        for name, tree in parts.items():
+            trees = (tree, state[f"{name}_state_dict"])
             if odd := odd_shape(*trees):
                 key, theirs, mine = odd
                 raise DataError(
                     f"The {name} of {str(file)!r} does not fit: {key!r} has the shape {theirs}, here {mine}. Take a "
                     "run of a task with the same observations, actions and layers."
                 )
-            state[f"{name}_state_dict"] = given[name]
-        parts = {"actor": True, "critic": True, "optimizer": False, "iteration": False, "rnd": False}
-        self.algorithm.load(state, parts, strict=True)
+            state[f"{name}_state_dict"] = tree
+        wanted = {"actor": True, "critic": True, "optimizer": False, "iteration": False, "rnd": False}
+        self.algorithm.load(state, wanted, strict=True)
         if std is not None:
             spread: Any = self.algorithm.get_policy().distribution
             log = spread.std_type == "log"
@@ -547,20 +564,6 @@ def _save(trainer: Trainer, run: Path) -> None:
         write_tensors(run / SENSING / MODEL, weights)
         write_json(run / SENSING / CONFIG, describe_run(trainer.sensing, actor, trainer.env.unwrapped))
     save_state(run / STATE, trainer.state())
-
-
-def newest(run: Path) -> Path:
-    """Return the last ``model_<iteration>.safetensors`` of a run."""
-    numbers = [path.stem.removeprefix("model_") for path in run.glob("model_*.safetensors")]
-    if not (iterations := [int(number) for number in numbers if number.isdecimal()]):
-        raise DataFileNotFoundError(f"{str(run)!r} holds no trained policy (model_<iteration>.safetensors).")
-    return run / f"model_{max(iterations)}.safetensors"
-
-
-def model_file(path: Path) -> Path:
-    """Return the last model of a run, given its folder or the name of a shipped one, or the model itself."""
-    located = policy_path("teacher", path)
-    return newest(located) if located.is_dir() else located
 
 
 def load_teacher(run: str | Path, env: Env) -> Policy:

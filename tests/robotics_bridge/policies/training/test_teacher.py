@@ -7,6 +7,7 @@ import json
 import logging
 import math
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -20,12 +21,12 @@ import torch
 
 from brainbench.core.errors import BrainbenchError, DataError, UsageError
 from brainbench.core.files import read_json, write_json
-from brainbench.core.runs.folder import STATE, load_state
+from brainbench.core.runs.folder import STATE, load_state, save_state
 from robotics_bridge import tasks
 from robotics_bridge.envs import Env
 from robotics_bridge.policies.contract import trained_contacts
 from robotics_bridge.policies.evaluate import Policy, evaluate
-from robotics_bridge.policies.shipped import FOLDER, SENSING
+from robotics_bridge.policies.shipped import FOLDER, SENSING, newest
 from robotics_bridge.policies.training.distill import load_student
 from robotics_bridge.policies.training.distill_config import DistillConfig
 from robotics_bridge.policies.training.teacher import (
@@ -34,7 +35,6 @@ from robotics_bridge.policies.training.teacher import (
     calibrated,
     is_done,
     load_teacher,
-    newest,
     train_student,
 )
 from robotics_bridge.policies.training.teacher import train as train_teacher
@@ -429,6 +429,31 @@ def test_a_student_is_done_once_the_very_one_was_evaluated_after_its_last_iterat
     write_json(tmp_path / "config.json", {"distill": asdict(stored), "task_version": TASK_VERSION - 1})
     with pytest.raises(DataError, match=r"version 2 of the tasks.*train it again"):
         is_done(config, tmp_path)
+
+
+def test_a_student_of_a_teacher_that_was_trained_anew_in_its_folder_is_another(tmp_path) -> None:
+    teacher, student = tmp_path / "teacher", tmp_path / "student"
+    train(_env(), teacher, settings=SMALL, iterations=1)
+    config = DistillConfig(
+        task="in_palm_rotate", teacher=str(teacher), observe="none", num_envs=2, iterations=2, steps_per_env=2
+    )
+    train_student(config, student, episodes=2, evaluations=1)
+    assert is_done(config, student)
+    train(_env(), teacher, settings=SMALL, iterations=2)
+    assert not is_done(config, student)
+    with pytest.raises(UsageError, match="holds another student: teacher_hash"):
+        train_student(config, student, episodes=0)
+    # Without the teacher, nothing says that it changed.
+    shutil.rmtree(teacher)
+    assert is_done(config, student)
+
+
+def test_a_run_does_not_begin_with_a_file_without_actor_and_critic(tmp_path) -> None:
+    for name, tree in (("actor", {"critic": {}}), ("critic", load_state(newest(FOLDER / "hot_ball.teacher")))):
+        tree.pop(name, None)
+        save_state(tmp_path / "state.safetensors", tree | {"iteration": 3})
+        with pytest.raises(DataError, match=f"state.safetensors' holds no {name}, and a run begins with"):
+            Trainer(_env(), SMALL).begin_from(tmp_path / "state.safetensors")
 
 
 def test_resampled_time_is_for_readings_as_often_as_the_encoder_assumes(tmp_path, monkeypatch) -> None:
