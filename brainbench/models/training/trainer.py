@@ -26,7 +26,7 @@ from brainbench.core.files import read_mapping, write_json, write_tensors
 from brainbench.core.progress import Progress
 from brainbench.core.reading.regular import readable
 from brainbench.core.runs import folder
-from brainbench.core.runs.log import RunLog
+from brainbench.core.runs.log import RunLog, read_log
 from brainbench.models.activations import evaluating
 from brainbench.models.ops.layers import seeded
 from brainbench.models.registry import load_model
@@ -335,7 +335,9 @@ class _Run:
                 )
             self._publish(result, split)
             if result is not None:
-                self.log.write("test", self.at.step, top1=result.top1, top5=result.top5, spread=result.spread)
+                # A run that was killed after this line, and before it is marked as finished, has it already.
+                if not read_log(self.out, "test"):
+                    self.log.write("test", self.at.step, top1=result.top1, top5=result.top5, spread=result.spread)
                 if result.collapsed:
                     _log.warning("%s has collapsed: %s.", self.config.model, result.reason)
             controls = {name: asdict(item) for name, item in self.controls.items()}

@@ -12,6 +12,7 @@ import torch
 from safetensors.torch import load_file
 
 from brainbench.core.errors import DataError, UsageError
+from brainbench.core.runs.folder import mark
 from brainbench.core.runs.log import read_log
 from brainbench.models.registry import describe_model, load_model
 from brainbench.models.training import trainer
@@ -176,6 +177,20 @@ def test_a_finished_run_is_not_repeated(tmp_path):
     again = train(_config(epochs=1), tiny(), out=tmp_path, device="cpu")
     assert again.evaluation == first.evaluation
     assert len(_lines(tmp_path)) == 3
+
+
+def test_a_run_killed_before_it_is_marked_as_finished_logs_its_test_once(tmp_path, monkeypatch):
+    def killed(document, **values):
+        if values.get("status") == "finished":
+            raise KeyboardInterrupt
+        mark(document, **values)
+
+    with monkeypatch.context() as patch:
+        patch.setattr("brainbench.models.training.trainer.folder.mark", killed)
+        with pytest.raises(KeyboardInterrupt):
+            train(_config(epochs=1), tiny(), out=tmp_path, device="cpu")
+    result = train(_config(epochs=1), tiny(), out=tmp_path, device="cpu")
+    assert [line["top1"] for line in read_log(tmp_path, "test")] == [result.evaluation.top1]
 
 
 @pytest.mark.slow
