@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -11,11 +12,13 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike
 
-from brainbench.core.errors import UsageError, check_name
+from brainbench.core.errors import UsageError, check_name, listing, repeats
 from brainbench.core.progress import Progress, track
 from brainbench.core.statistics import wilson_interval
 from robotics_bridge.envs.env import Env
 from robotics_bridge.policies.shipped import AGENTS
+
+_log = logging.getLogger(__name__)
 
 Acting = Callable[[Mapping[str, torch.Tensor]], torch.Tensor]  # observations by group → actions [B, A]
 QUANTITIES = ("metric", "returns", "lengths", "goals", "turn_rate", "seconds", "dropped")
@@ -148,6 +151,15 @@ def evaluate(
     seeds = (seed,) if isinstance(seed, int) else tuple(seed)
     if episodes < 1 or not seeds:
         raise UsageError(f"An evaluation needs at least one episode and one seed; received {episodes} and {seeds}.")
+    if twice := repeats(seeds):
+        raise UsageError(f"The seed {twice[0]} stands there twice; its episodes would count twice in the interval.")
+    shapes, held = env.model.shapes, set(env.state.shape_of.tolist())
+    if missing := [shape.name for number, shape in enumerate(shapes) if number not in held]:
+        _log.warning(
+            "%d environments hold %d of the %d objects of the task, and success is that with these alone; there is no "
+            "%s. Take at least %d environments.",
+            env.num_envs, len(held), len(shapes), listing(missing, limit=3), len(shapes),
+        )  # fmt: skip
     each = math.ceil(episodes / env.num_envs)
     rows: list[list[Any]] = []
     rates = []
@@ -171,12 +183,12 @@ def evaluate(
             left -= done.long()
         rates.append(sum(row[0] for row in ended) / len(ended))
         rows += ended
-    success, metric, returns, lengths, diverged, goals, turned, dropped, shapes = zip(*rows, strict=True)
+    success, metric, returns, lengths, diverged, goals, turned, dropped, placed = zip(*rows, strict=True)
     seconds = tuple(n * env.step_dt for n in lengths)
     return PolicyEvaluation(
         agent=name, task=env.task.name, seeds=seeds, success=tuple(map(bool, success)), metric=metric,
         returns=returns, lengths=tuple(int(n) for n in lengths), diverged=int(sum(diverged)),
         per_seed=tuple(rates), goals=goals, seconds=seconds, dropped=tuple(map(bool, dropped)),
         turn_rate=tuple(angle / time for angle, time in zip(turned, seconds, strict=True)),
-        objects=tuple(env.model.shapes[int(shape)].name for shape in shapes),
+        objects=tuple(shapes[int(shape)].name for shape in placed),
     )  # fmt: skip

@@ -146,3 +146,18 @@ def test_wrong_requests_are_refused() -> None:
         agent("zeros", env)
     with pytest.raises(UsageError, match="did you mean 'returns'"):
         _made(1, 2).mean("return")
+
+
+def test_episodes_that_would_count_twice_are_refused() -> None:
+    with pytest.raises(UsageError, match="seed 4 stands there twice"):
+        evaluate(_env(), agent("zero", _env()), episodes=3, seed=(4, 0, 4))
+
+
+def test_objects_that_no_environment_holds_are_named(caplog) -> None:
+    evaluate(_env(), agent("zero", _env()), episodes=3, seed=0)
+    assert "3 environments hold 3 of the 17 objects of the task" in caplog.text
+    caplog.clear()
+    env = tasks.make(replace(tasks.load("in_palm_rotate"), episode=0.1), num_envs=17, threads=1)
+    found = evaluate(env, agent("zero", env), episodes=3, seed=0)
+    assert len(found.objects) == 17
+    assert "objects of the task" not in caplog.text
