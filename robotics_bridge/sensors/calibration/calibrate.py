@@ -25,6 +25,7 @@ from scipy.stats import beta
 from brainbench.core.errors import DataError, UsageError, check_number, listing
 from brainbench.core.reading.tables import read_columns
 from robotics_bridge.sensors.calibration.likelihood import (
+    MOST_HYSTERESIS,
     Z95,
     Episode,
     Estimate,
@@ -79,6 +80,12 @@ class Log:
             raise UsageError(f"Readings are [T, N] with T = {len(self.time)}; received {self.readings.shape}.")
         if self.probes and len(self.probes) != self.readings.shape[1]:
             raise UsageError(f"{self.readings.shape[1]} probes have as many names; received {len(self.probes)}.")
+        gaps = np.diff(self.time)[np.diff(self.episode) == 0] if self.episode is not None else np.diff(self.time)
+        if len(gaps) and not (gaps.min() > 0 and gaps.max() <= 1.5 * gaps.min()):
+            raise UsageError(
+                "Times of a log must rise in equal steps within an episode; received steps of "
+                f"{gaps.min():g} to {gaps.max():g} s. Begin an episode at a gap, and leave out what was written twice."
+            )
         if len(self.time) > 1 and not 0 < self.step <= SLOWEST:
             raise UsageError(
                 f"Times of a log (s) rise by at most {SLOWEST:g} s; received steps of {self.step:g} s. Scale "
@@ -119,15 +126,13 @@ def read_log(path: str | os.PathLike[str]) -> Log:
         episode = columns["episode"].astype(np.int64)
         if (np.abs(columns["episode"]) > 1e9).any() or (episode != columns["episode"]).any():
             raise DataError(f"{name}: episodes are whole numbers of at most a billion.")
-    time = columns["time"]
-    gaps = np.diff(time)[np.diff(episode) == 0] if episode is not None else np.diff(time)
-    if not len(gaps) or gaps.min() <= 0 or gaps.max() > 1.5 * gaps.min():
-        raise DataError(
-            f"{name}: times must rise in equal steps within an episode; found "
-            f"{f'{gaps.min():g}…{gaps.max():g} s' if len(gaps) else 'no two rows of one episode'}."
-        )
+    if episode is not None and not (np.diff(episode) == 0).any():
+        raise DataError(f"{name}: no two rows are of one episode.")
     ball = np.stack([columns[name] for name in _PLACE], axis=1) if pressed else None
-    return Log(time, readings, columns.get("reference"), episode, tuple(probes), ball)
+    try:
+        return Log(columns["time"], readings, columns.get("reference"), episode, tuple(probes), ball)
+    except UsageError as error:
+        raise DataError(f"{name}: {error}") from None
 
 
 def segments(log: Log) -> list[Episode]:
@@ -164,6 +169,8 @@ def find_quantum(values: NDArray[np.float64]) -> float:
 
 NOT_FITTED = ("radius", "crosstalk")  # knobs that a log of one signal cannot tell: they need known places
 _ROUNDS = 12
+_ROUGH = 0.5  # noise of the reference, as a part of the probes' in its unit, from which it is mentioned
+_BETTER = 0.97  # part of the variance that must remain for readings to be called early
 ORDER = (
     "gain_low", "gain_high", "hysteresis", "hysteresis_tau", "walk", "white", "bias", "quantum", "dead_probability",
     "dead_low", "dead_high", "read_delay", "jitter",
@@ -214,12 +221,7 @@ def calibrate(log: Log, *, max_delay: float = 0.5) -> Calibration:
     estimates["quantum"] = Estimate(quantum, quantum, quantum, how)
     moving = log.reference is not None
     longest = round(max_delay / log.step)
-    guess = find_delays(living, longest) if moving else (0, 0)
-    if moving and guess[1] == longest < find_delays(living, longest + 1)[1]:
-        raise DataError(
-            f"The readings come later after the reference than the longest delay that was tried ({max_delay:g} s, "
-            f"{longest} readings); allow a longer one (max_delay)."
-        )
+    guess = _delays(living, log.step, longest) if moving else (0, 0)
     fit = fit_dynamics(align(living, *guess, longest), log.step, quantum, moving=moving)
     lags = np.zeros(0, int)
     if moving and guess[1]:
@@ -234,6 +236,8 @@ def calibrate(log: Log, *, max_delay: float = 0.5) -> Calibration:
                 "Where the reference moves, readings differ more from the model than where it rests: delay, jitter, "
                 "hysteresis and white noise may be wrong; log more presses."
             )
+    if moving:
+        notes += _reference_notes(living, fit)
     if log.reference is None:
         notes.append("Without a column 'reference' the true signal counts as 0: gain, delay, hysteresis and dead "
                      "probes were not fitted.")  # fmt: skip
@@ -249,6 +253,49 @@ def calibrate(log: Log, *, max_delay: float = 0.5) -> Calibration:
     estimates = {name: estimates[name] for name in ORDER if name in estimates}
     about = {"readings": int(log.readings.size), "probes": list(log.probes), "episodes": len(parts), "step": log.step}
     return Calibration(_noise(estimates), estimates, tuple(notes), about)
+
+
+def _delays(parts: list[Episode], step: float, longest: int) -> tuple[int, int]:
+    """Return the range of lags of the readings; DataError where they lie beyond ``longest``, or before the reference.
+
+    Early readings follow the reference better when they are put later, which those of hysteresis do not.
+    """
+    guess = find_delays(parts, longest)
+    if guess[1] == longest < find_delays(parts, longest + 1)[1]:
+        raise DataError(
+            f"The readings come later after the reference than the longest delay that was tried ({longest * step:g} s, "
+            f"{longest} readings); allow a longer one (max_delay)."
+        )
+    reach = min(max(longest, 1), min(len(x) for x, _y in parts) // 4)
+    lead = reach - find_delays([(x[reach:], y[:-reach]) for x, y in parts], 2 * reach)[1]
+    if lead > 0:
+        shifted = ([(x[shift:], y[: len(y) - shift]) for x, y in parts] for shift in (0, lead))
+        fits = (fit_dynamics(align(each, 0, 0, longest), step, 0.0, moving=True) for each in shifted)
+        now, put = map(_spread, fits)
+        if put < _BETTER * now:
+            raise DataError(
+                f"The readings come {lead * step:g} s before the reference: the clock of one is wrong. Put the "
+                f"reference earlier by that ({lead} rows)."
+            )
+    return guess
+
+
+def _reference_notes(parts: list[Episode], fit: Fit) -> list[str]:
+    """Return what the reference spoils; DataError where the readings hardly follow it."""
+    if abs(fit.dynamics.hysteresis) > 0.99 * MOST_HYSTERESIS:
+        raise DataError(
+            f"No delay and hysteresis explain the readings (a hysteresis of {MOST_HYSTERESIS:g} or more): the "
+            "reference is noisy, of another clock, or of something else."
+        )
+    # Second differences of presses are small; their median is that of noise.
+    bends = np.concatenate([np.diff(x, 2) for x, _y in parts])
+    rough = 1.4826 * float(np.median(np.abs(bends))) / math.sqrt(6)
+    if rough <= _ROUGH * fit.dynamics.white / abs(float(np.median(fit.gains))):
+        return []
+    return [
+        f"The reference has noise of its own of about {rough:.2g}: white noise counts both, and gain, delay and "
+        "hysteresis may be wrong; smooth the reference."
+    ]
 
 
 def _spread(fit: Fit) -> float:

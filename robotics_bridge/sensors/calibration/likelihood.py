@@ -30,6 +30,7 @@ _SIGNIFICANT = 6.63
 """Twice the gain in log-likelihood (χ², one degree, 1 %) that drift or hysteresis must bring to be kept."""
 _UNTOLD = 7.0
 """Half width of the interval of a logarithm, a factor of a thousand, at which a log does not tell a number."""
+MOST_HYSTERESIS = 5.0  # largest |β| of a device; beyond it the signal itself counts for nothing
 _LOAD = 0.01  # share of the largest load above which an episode begins under load
 
 
@@ -193,6 +194,7 @@ def fit_dynamics(parts: list[Aligned], dt: float, quantum: float, *, moving: boo
 
     def dynamics_of(white: float, walk: float, hysteresis: float, tau: float) -> Dynamics:
         # White noise far below the drift changes nothing. Hysteresis of less than a reading is a delay by another name.
+        hysteresis = min(max(hysteresis, -MOST_HYSTERESIS), MOST_HYSTERESIS)
         return Dynamics(max(white, walk - 14), walk, hysteresis, min(max(tau, math.log(dt)), math.log(100 * duration)))
 
     def minimum(dynamics: Callable[[list[float]], Dynamics], start: list[float]) -> tuple[list[float], float]:

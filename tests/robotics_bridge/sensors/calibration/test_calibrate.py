@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -32,6 +33,35 @@ from tests.factories.calibration_logs import DT, READINGS, SIGNAL, TIME, log_of,
 def test_a_log_holds_finite_numbers_that_fit_each_other_at_rising_times(parts) -> None:
     with pytest.raises(UsageError, match=rf"{next(iter(parts))}|Times|names|Readings"):
         Log(**{"time": TIME, "readings": READINGS, "reference": SIGNAL, **parts})
+
+
+@pytest.mark.parametrize("rows", [np.r_[0:80, 120:200], np.r_[0:80, 79:199], np.r_[0:80, 81, 80, 82:200]])
+def test_a_log_with_a_gap_or_rows_written_twice_or_swapped_is_refused(rows) -> None:
+    with pytest.raises(UsageError, match="must rise in equal steps within an episode"):
+        Log(TIME[rows], READINGS[rows], SIGNAL[rows])
+    # An episode may begin at a gap.
+    if len(rows) == 160:
+        Log(TIME[rows], READINGS[rows], SIGNAL[rows], (rows >= 120).astype(int))
+
+
+def test_readings_before_their_reference_are_refused_and_hysteresis_is_not_taken_for_that() -> None:
+    knobs = {"white": 0.02, "gain": (0.9, 1.1)}
+    early = log_of(Noise(**knobs), 1200, 4)
+    assert early.reference is not None
+    with pytest.raises(DataError, match=r"come 0\.015 s before the reference.*\(3 rows\)"):
+        calibrate(replace(early, reference=np.roll(early.reference, 3)), max_delay=0.05)
+    springy = calibrate(log_of(Noise(**knobs, hysteresis=1.5, hysteresis_tau=0.02), 1200, 4), max_delay=0.05)
+    assert springy.noise.hysteresis == pytest.approx(1.5, rel=0.05)
+
+
+def test_the_noise_of_a_reference_is_mentioned_or_refused() -> None:
+    log, noise = log_of(Noise(white=0.02), 1200, 4), np.random.default_rng(1).normal(size=1200)
+    assert log.reference is not None
+    noted = calibrate(replace(log, reference=log.reference + 0.02 * noise), max_delay=0.05).notes
+    assert any("The reference has noise of its own of about 0.02" in note for note in noted)
+    assert not any("of its own" in note for note in calibrate(log, max_delay=0.05).notes)
+    with pytest.raises(DataError, match="No delay and hysteresis explain the readings"):
+        calibrate(replace(log, reference=log.reference + 0.2 * noise), max_delay=0.05)
 
 
 @pytest.mark.parametrize("step", [0.0, 0.01, 0.25, 1.0])
@@ -172,7 +202,7 @@ def test_unusable_logs_are_explained(tmp_path):
     with pytest.raises(DataError, match=r"log\.csv.*0,x"):
         read_log(path)
     path.write_text("time,a\n" + "0,1\n" * 30)
-    with pytest.raises(DataError, match=r"log\.csv: times .*0…0 s"):
+    with pytest.raises(DataError, match=r"log\.csv: Times .*0 to 0 s"):
         read_log(path)
     with pytest.raises(DataError, match="Every probe"):
         calibrate(Log(np.arange(50) * 0.1, np.ones((50, 2)), np.arange(50.0)))

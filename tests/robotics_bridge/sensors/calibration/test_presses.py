@@ -76,7 +76,7 @@ def test_a_log_of_presses_has_the_centre_of_the_ball(tmp_path) -> None:
     assert log.ball is not None
     assert log.ball[3] == pytest.approx([0, 0, 0.0197])
     path.write_text("\n".join(["time,x,y,z,0", *rows, rows[-1]]))
-    with pytest.raises(DataError, match="times must rise in equal steps"):
+    with pytest.raises(DataError, match="Times of a log must rise in equal steps"):
         read_log(path)
     path.write_text("\n".join(["time,x,y,z,0", *rows, "0.3,nan,0,0,1"]))
     with pytest.raises((DataError, UsageError), match=r"nan|finite"):
