@@ -10,6 +10,7 @@ from typing import Any, cast
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from brainbench.core.devices import warp
 from brainbench.core.errors import UsageError, check_kind, check_number
@@ -45,6 +46,7 @@ class ContactAudioRuntime(Runtime):
         super().__init__(sensors, self.samples, context, fusable=False)
         count, envs = len(sensors), context.num_envs
         self._dt = math.nan
+        self._turns: NDArray[np.float64] | None = None
         arrays, quads = ContactSoundArrays(), self._quads
         arrays.sources, arrays.link_of = context.zeros(count, SourceParams), context.solids.struct.link
         arrays.force, arrays.before, arrays.rubbing = (context.zeros((envs, count)) for _ in range(3))
@@ -75,6 +77,7 @@ class ContactAudioRuntime(Runtime):
         self._dt = dt
         step = dt / self.samples
         poles = np.zeros((3, self._quads * 4, len(self._sensors)))
+        turns = np.zeros((2, self._quads * 4, len(self._sensors)))
         sources = []
         for column, (name, sensor) in enumerate(self._sensors.items()):
             frequency, decay, gain = (np.array(values) for values in zip(*sensor.modes.rows(), strict=True))
@@ -88,14 +91,36 @@ class ContactAudioRuntime(Runtime):
             # The resonator answers an impulse with sin(kθ) / sin θ; this factor makes it the velocity per impulse.
             poles[2, rows, column] = np.where(heard, gain * np.sin(theta), 0.0)
             poles[:2, rows, column] *= heard
+            turns[:, rows, column] = theta * heard, radius
             pulse = int(np.clip(round(sensor.contact_time / step), 1, self.samples))
             link, key = self.context.scene.link_index(sensor.link), stream_key(self.context.seed, f"{name}/sound")
             sources.append(fill(SourceParams, sensor, link=link, pulse=pulse, **key))
+        # Four modes side by side in one vector: a thread loads them at once.
+        poles, turns = (
+            np.moveaxis(each.reshape(-1, self._quads, 4, len(self._sensors)), 2, 3) for each in (poles, turns)
+        )
         for array, values in zip((self._own.first, self._own.second, self._own.gain), poles, strict=True):
-            # Four modes side by side in one vector: a thread loads them at once.
-            quads = values.reshape(self._quads, 4, -1).transpose(0, 2, 1)
-            array.assign(np.ascontiguousarray(quads, dtype=np.float32))
+            array.assign(np.ascontiguousarray(values, dtype=np.float32))
+        if self._turns is not None:
+            self._resample(self._turns, turns)
+        self._turns = turns
         self._own.sources.assign(self.context.array(sources, SourceParams))
+
+    def _resample(self, before: NDArray[np.float64], now: NDArray[np.float64]) -> None:
+        """Let modes ring on at another sample rate: angle and radius [2, Q, S, 4] of the poles before and now.
+
+        The last two values are Im Z and Im Z e^(−iθ) / r of a phasor Z, whose size goes with 1 / sin θ; what is silent
+        at one of the rates stops.
+        """
+        (old, decay), (new, radius) = before[:, :, None], now[:, :, None]
+        y1, y2 = (array.numpy().astype(float) for array in (self._own.y1, self._own.y2))
+        rings = (old > 0) & (new > 0)
+        sines = np.where(rings, np.sin(old), 1.0), np.where(rings, np.sin(new), 1.0)
+        real = (y1 * np.cos(old) - decay * y2) / sines[0]
+        scale = np.where(rings, sines[0] / sines[1], 0.0)
+        last = scale * (y1 * np.cos(new) - real * np.sin(new)) / np.where(rings, radius, 1.0)
+        self._own.y1.assign((scale * y1).astype(np.float32))
+        self._own.y2.assign(last.astype(np.float32))
 
     def run_kernels(self, state: HandState, dt: float) -> None:
         """Make the next block from the contacts."""
@@ -201,19 +226,19 @@ class Listener:
         self.diverged = torch.zeros(suite.num_envs, dtype=torch.bool, device=warp().to_torch(self._out).device)
         """Mask [B] of environments in which a source was not finite since their reset; their blocks are NaN."""
         self._ring: Any = None
-        self._slot = 0
+        self._slot, self._dt = 0, math.nan
 
     def update(self, state: HandState, dt: float) -> None:
         """Take the suite's latest block, of ``dt`` seconds."""
         check_number("dt (time of a block, s)", dt, above=0)
         c, m, envs = self._suite.context, self.microphone, self._suite.num_envs
         rate, age, block = self.samples / dt, c.age, (self.samples, envs)
-        # The ring holds the longest delay, reach / c, a few samples for the interpolation, and the block being written.
-        blocks = math.ceil((m.reach / m.speed_of_sound * rate + 3) / self.samples) + 1
         fresh = self._ring is None
         if fresh:
-            self._ring = c.zeros((blocks * self.samples, envs, len(self._sources)))
-        if self._ring.shape[0] != blocks * self.samples:
+            # The longest delay, reach / c, a few samples for the interpolation, and the block being written.
+            blocks = math.ceil((m.reach / m.speed_of_sound * rate + 3) / self.samples) + 1
+            self._ring, self._dt = c.zeros((blocks * self.samples, envs, len(self._sources))), dt
+        if dt != self._dt:
             raise UsageError(f"The time step of a microphone stays as it was; received another, {dt:g} s.")
         self.diverged &= warp().to_torch(age) > 0
         for index, (name, runtime) in enumerate(self._sources.items()):

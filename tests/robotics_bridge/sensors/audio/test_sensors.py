@@ -29,6 +29,32 @@ def test_an_impact_rings_as_the_sum_of_damped_modes():
     assert heard == pytest.approx(expected, abs=2e-3 * np.abs(expected).max())
 
 
+def test_what_rings_rings_on_when_the_time_step_changes():
+    suite, state = make_box()
+    heard, times, now = [strike(suite, state, 1)], [np.arange(1, K + 1) / RATE], DT
+    for dt in (DT, DT / 2, DT / 2, DT, 0.8 * DT, DT):
+        suite.update(state, dt)
+        heard.append(suite.read("sound")[0, 0].numpy().copy())
+        times.append(now + dt / K * np.arange(1, K + 1))
+        now += dt
+    t, impulse = np.concatenate(times), 10 * DT
+    expected = sum(
+        impulse * gain * np.exp(-decay * (t - 1 / RATE)) * np.sin(2 * np.pi * frequency * t)
+        for frequency, decay, gain in MODES.rows()
+    )
+    assert np.concatenate(heard) == pytest.approx(expected, abs=5e-3 * np.abs(expected).max())
+
+
+def test_a_microphone_keeps_its_time_step():
+    suite, state = make_box()
+    listener = Microphone().build(suite)
+    for dt in (DT, DT):
+        suite.update(state, dt)
+        listener.update(state, dt)
+    with pytest.raises(UsageError, match=r"stays as it was; received another, 0\.00495 s"):
+        listener.update(state, 0.99 * DT)
+
+
 def test_the_spectrum_peaks_at_the_modal_frequencies():
     suite, state = make_box()
     heard = strike(suite, state, 60)
