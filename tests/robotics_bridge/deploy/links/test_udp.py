@@ -197,15 +197,22 @@ def test_the_simulated_xhand1_follows_and_feels_the_ball_it_holds() -> None:
 
 @pytest.mark.slow
 def test_a_process_of_its_own_serves_the_simulated_xhand1() -> None:
-    with simulated_hand(seconds=60) as (*ends, key), UdpDriver(*ends, key) as driver:
-        joints = driver.joints
-        limits = SafetyLimits(np.full(12, -1.0), np.full(12, 2.2), np.full(12, 8.0), timeout=1.0, rate_share=0.2)
-        policy = lambda obs, forget: np.zeros(12)  # noqa: E731
-        report = Controller(policy, driver, _contract(joints, 0.3, 0.0), limits).run(1.5)
-        assert report.status == "finished", report.reason
-        reading = driver.read()
-        assert reading is not None
-        assert np.abs(reading.position - 0.3).max() < 0.2
+    """A busy machine may hold the loop up for longer than the link waits; the hand is then connected anew."""
+    policy = lambda obs, forget: np.zeros(12)  # noqa: E731
+    stops: list[str] = []
+    for _ in range(4):
+        with simulated_hand(seconds=60) as (*ends, key), UdpDriver(*ends, key) as driver:
+            joints = driver.joints
+            limits = SafetyLimits(np.full(12, -1.0), np.full(12, 2.2), np.full(12, 8.0), timeout=1.0, rate_share=0.2)
+            report = Controller(policy, driver, _contract(joints, 0.3, 0.0), limits).run(1.5)
+            stops.append(report.reason)
+            if report.status == "finished":
+                reading = driver.read()
+                assert reading is not None
+                assert np.abs(reading.position - 0.3).max() < 0.2
+                return
+        assert report.reason.startswith("no command came for"), stops
+    pytest.fail(str(stops))
 
 
 J, F = 2, 1
