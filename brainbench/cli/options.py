@@ -456,7 +456,7 @@ EXTRAS: dict[str, tuple[Requirement, ...]] = {
 
 CACHED = (
     "score", "train", "stimuli simulate", "stimuli render", "stimuli plot", "stimuli separability",
-    "tactile demo", "tactile bench", "policy play", "policy train", "policy evaluate", "policy distill",
+    "tactile demo", "policy play", "policy train", "policy evaluate", "policy distill",
     "leaderboard add", "leaderboard verify",
 )  # fmt: skip
 """Commands that keep what they compute in the cache."""

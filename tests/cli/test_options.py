@@ -187,7 +187,6 @@ WORDS = {
     "leaderboard verify": ("none",),
     "tradeoff score": (),
     "tactile demo": ("--hand", "no-such-hand"),
-    "tactile bench": (),
     "train": ("no-such-model", "--data", "none"),
     "score": ("no-such-model",),
     "recordings compare": ("none.h5", "no-such-model"),

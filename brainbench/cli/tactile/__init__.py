@@ -1,4 +1,4 @@
-"""``brainbench tactile``: look at tactile sensors, layouts and their speed."""
+"""``brainbench tactile``: look at tactile sensors and layouts."""
 
 from __future__ import annotations
 
@@ -6,6 +6,6 @@ import typer
 
 from brainbench.cli.tactile import commands
 
-app = typer.Typer(no_args_is_help=True, help="Tactile sensors of robot hands: demo, layouts, speed, checks, noise.")
-for _command in (commands.demo, commands.layouts, commands.bench, commands.check):
+app = typer.Typer(no_args_is_help=True, help="Tactile sensors of robot hands: demo, layouts, checks, noise.")
+for _command in (commands.demo, commands.layouts, commands.check):
     app.command(_command.__name__)(_command)

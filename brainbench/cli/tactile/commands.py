@@ -1,4 +1,4 @@
-"""``brainbench tactile demo | layouts | bench | check``."""
+"""``brainbench tactile demo | layouts | check``."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import typer
 
 from brainbench.cli.options import out_folder_option, with_options
 from brainbench.cli.output import Output, table, table_of, tracked
-from brainbench.cli.policy.train import ENV, ENVS_FLAG, DeviceOption, HandOption
+from brainbench.cli.policy.train import ENV, DeviceOption, HandOption
 from brainbench.core.errors import UsageError, brief
 
 _HAND_FILES = (".urdf", ".xml", ".mjcf")
@@ -82,43 +82,6 @@ def layouts(
     about = {name: getattr(chosen, name) for name in ("palm", "joints", "fingers")}
     data = {"hand": chosen.name, **about, "counts": counts}
     return Output(data, text)
-
-
-@with_options(ENV, ("num_envs", "device"), parameter="batch", flags=ENVS_FLAG, defaults={"num_envs": 256}, build=False)
-@with_options(ENV, ("resolution", "placement", "noisy"), build=False)
-def bench(
-    batch: dict[str, Any],
-    options: dict[str, Any],
-    hand: HandOption = "xhand1",
-    repeats: Annotated[int, typer.Option(help="Timed updates; the median counts.")] = 20,
-) -> Output:
-    """Time one update of each sensor class on a hand that holds a ball, with the memory per environment.
-
-    The benchmark against peers and rooflines is benchmarks/tactile/throughput.py in the repository.
-    """
-    from brainbench.cli.tactile import scenes
-    from brainbench.core.errors import check_number
-
-    check_number("--repeats", repeats, least=1)
-    envs, device = batch["num_envs"], batch["device"]
-    grip = scenes.Grip(hand, envs=envs, device=device)
-    grip.run(60)
-    results = [
-        scenes.time_class(grip, name, **options, repeats=repeats)
-        for name in tracked(list(scenes.CLASSES), "timing sensors")
-    ]
-    noise = ", published noise" if options["noisy"] else ""
-    columns = {
-        "sensor": "{0[sensor]}",
-        ">probes": "{0[probes]}",
-        ">ms per update": lambda row: f"{1e3 * row['seconds']:.3f}",
-        ">ns per probe": "{0[per_probe_ns]:.1f}",
-        ">readings/s": lambda row: f"{envs / row['seconds']:,.0f}",
-        ">bytes/environment": "{0[state_bytes]:,}",
-    }
-    layout = f"{options['resolution']} {options['placement']}"
-    text = table_of(f"{hand}, {layout}, {envs} environments on {device}{noise}", results, columns)
-    return Output({"results": results, "envs": envs, "device": device}, text)
 
 
 def check(

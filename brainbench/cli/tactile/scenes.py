@@ -1,12 +1,10 @@
-"""The grip, the objects and the pictures of ``brainbench tactile demo``, ``bench`` and ``policy play``.
+"""The grip, the objects and the pictures of ``brainbench tactile demo`` and ``policy play``.
 
 Pictures need no display and no OpenGL.
 """
 
 from __future__ import annotations
 
-import statistics
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -17,18 +15,23 @@ from numpy.typing import NDArray
 from scipy.signal import spectrogram
 
 from brainbench.core.devices import mujoco_module as mujoco
-from brainbench.core.devices import warp
-from brainbench.core.errors import check_name
 from brainbench.core.figures import COLORS, new_figure, panels, save_figure
 from brainbench.core.rotations import to_matrices
 from brainbench.stimuli.figures import surfaces
 from brainbench.stimuli.figures.pictures import Style, write_film
-from robotics_bridge import hands, sensors
+from robotics_bridge import hands
 from robotics_bridge.hands.scenes import closing, holding
-from robotics_bridge.physics import Geometry, HandState, MujocoEngine, MujocoWarpEngine, TouchScene
-from robotics_bridge.sensors import ContactAudio, ElastomerTaxel, Noise, Probes, SensorSuite, TemperatureGrid
+from robotics_bridge.physics import Geometry, HandState, MujocoEngine, TouchScene
+from robotics_bridge.sensors import (
+    ContactAudio,
+    ElastomerTaxel,
+    KinematicTaxel,
+    Noise,
+    Probes,
+    SensorSuite,
+    TemperatureGrid,
+)
 from robotics_bridge.sensors.audio.modes import find_modes
-from robotics_bridge.sensors.audio.sensors import Modes
 from robotics_bridge.sensors.queries.solids import tessellate
 from robotics_bridge.sensors.temperature.materials import ThermalBody
 
@@ -280,28 +283,13 @@ def write_video(path: Path, frames: Sequence[NDArray[np.uint8]], size: tuple[int
     write_film(path, frames, style, palette_from=sample)
 
 
-CLASSES = {
-    "ContactProbe": "published-bool",
-    "ContactDepthProbe": "published-depth",
-    "SurfaceDistanceProbe": "none",
-    "KinematicTaxel": "published-force",
-    "ProximityTaxel": "published-proximity",
-    "ElastomerTaxel": "published-elastomer",
-    "TemperatureGrid": "none",
-    "ContactAudio": "none",
-}
-"""Sensor class → its published noise."""
-
-
 class Grip:
-    """A hand, palm up, that closes around a ball in every environment."""
+    """A hand, palm up, that closes around a ball."""
 
-    def __init__(self, hand: str, *, envs: int = 1, device: str = "cpu") -> None:
-        self.hand, self.device = hands.load(hand), device
+    def __init__(self, hand: str) -> None:
+        self.hand = hands.load(hand)
         self.model = holding(self.hand, radius=0.028, reach=0.9)
-        self.engine: Any = (
-            MujocoEngine(self.model, envs) if device == "cpu" else MujocoWarpEngine(self.model, envs, device=device)
-        )
+        self.engine = MujocoEngine(self.model, 1)
         self._closed = closing(self.hand, 0.72)
         # What slides has the ball between its jaws at once; fingers close by and by.
         moved = self.model.actuator_trnid[:, 0]
@@ -316,49 +304,15 @@ class Grip:
                 self.engine.set(ctrl=self._closed * np.where(self._slow, min(self._steps / 200, 1.0), 1.0))
             self.engine.step()
 
-    def sensors(self, name: str, resolution: str, placement: str, *, noisy: bool = False) -> dict[str, Any]:
-        """Return a sensor of one class on every link of a layout, by link."""
-        check_name("sensor class", name, CLASSES)
-        kind = getattr(sensors, name)
-        layout = self.hand.layout(resolution, placement)
-        common = {"noise": sensors.Noise.preset(CLASSES[name])} if noisy else {}
-        if name == "TemperatureGrid":
-            body = {"object": ThermalBody("steel", 45.0)}
-            return {link: kind(link=link, cells=(3, 3, 3), bodies=body, **common) for link in layout}
-        if name == "ContactAudio":
-            modes = Modes(tuple(np.geomspace(300, 9000, 16).tolist()), (30.0,) * 16, (1.0,) * 16)
-            return {"object": kind(link="object", modes=modes, **common)}
-        extra: dict[str, Any] = {"track": ("object",)}
-        if name in ("ElastomerTaxel", "ProximityTaxel"):
-            extra["points"] = 500
-        return {link: kind(link=link, probes=probes, **extra, **common) for link, probes in layout.items()}
-
-
-def time_class(grip: Grip, name: str, resolution: str, placement: str, *, noisy: bool, repeats: int) -> dict[str, Any]:
-    """Return the median time of an update of one class and its memory per environment."""
-    wp, engine = warp(), grip.engine
-    members = grip.sensors(name, resolution, placement, noisy=noisy)
-    suite = SensorSuite(engine.scene, members, num_envs=engine.state.num_envs, device=grip.device)
-    times = []
-    for _ in range(repeats + 3):
-        wp.synchronize()
-        start = time.perf_counter()
-        suite.update(engine.state, engine.timestep)
-        wp.synchronize()
-        times.append(time.perf_counter() - start)
-    seconds = statistics.median(times[3:])
-    probes = sum(runtime.slices[key].count for runtime in suite.runtimes for key in runtime.slices)
-    envs = engine.state.num_envs
-    return {
-        "sensor": name, "probes": probes, "seconds": seconds, "per_probe_ns": 1e9 * seconds / (probes * envs),
-        "state_bytes": suite.state_bytes["sensors"],
-    }  # fmt: skip
-
 
 def forces(path: Path, hand: str, resolution: str, *, noisy: bool) -> dict[str, float]:
     """Draw the forces on all taxels of a hand that holds a ball."""
     grip = Grip(hand)
-    members = grip.sensors("KinematicTaxel", resolution, "hand", noisy=noisy)
+    noise = Noise.preset("published-force") if noisy else Noise()
+    members = {
+        link: KinematicTaxel(link=link, probes=probes, track=("object",), noise=noise)
+        for link, probes in grip.hand.layout(resolution, "hand").items()
+    }
     suite = SensorSuite(grip.engine.scene, members, num_envs=1)
     for _ in range(300):
         grip.run(1)

@@ -69,12 +69,6 @@ def test_check_fails_where_a_truth_is_missed(run, monkeypatch):
     assert "OFF" in found.out
 
 
-def test_bench_refuses_an_empty_batch(run):
-    found = run("tactile", "bench", "--envs", "0")
-    assert found.status == 2
-    assert "at least 1" in found.err
-
-
 def test_a_folder_of_hands_that_is_not_there_is_said(run, tmp_path):
     found = run("tactile", "check", str(tmp_path / "nowhere"))
     assert (found.status, "is no folder or hand file" in found.err) == (2, True)
