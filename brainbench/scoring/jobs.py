@@ -6,14 +6,18 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
+
+import msgspec
 
 from brainbench.core.contracts import BY_TRIAL
-from brainbench.core.errors import DataError, UsageError, brief, check_number, listing, unknown_name
+from brainbench.core.errors import DataError, UsageError, brief, unknown_name
 from brainbench.core.files import to_plain
 from brainbench.core.identity import ScoreIdentity
+from brainbench.core.limits import Limit, Seed
 from brainbench.core.provenance import Provenance
 from brainbench.core.reading.texts import read_toml
+from brainbench.core.reading.values import read_table
 from brainbench.core.records import ESTIMATOR_VERSION, ResultRecord
 from brainbench.scoring.model_responses import follows_seed
 from brainbench.scoring.options import ScoreOptions
@@ -165,28 +169,24 @@ def parse_seeds(text: str) -> tuple[int, ...]:
     return tuple(dict.fromkeys(seeds))
 
 
+class _Entry(msgspec.Struct):
+    models: Annotated[tuple[str, ...], Limit(shortest=1)]
+    seeds: Annotated[tuple[Seed, ...], Limit(shortest=1)] | None = None
+
+
+class _Batch(msgspec.Struct):
+    options: dict[str, Any] = {}
+    entries: tuple[_Entry, ...] = ()
+
+
 def read_batch(path: Path) -> list[ScoringJob]:
     """Read the scores that a batch file asks for: TOML with ``[[entries]]`` of ``models`` and ``seeds``.
 
     ``[options]`` are the fields of :class:`~brainbench.scoring.options.ScoreOptions` that hold for all of them.
     """
-    data = read_toml(path, "batch file")
-    given, entries = data.get("options", {}), data.get("entries", [])
-    if set(data) - {"options", "entries"} or not isinstance(given, dict) or not isinstance(entries, list):
-        raise DataError(f"{str(path)!r} has a table [options] and lists [[entries]]; received {listing(data)}.")
-    options = vars(ScoreOptions.of(given))
-    jobs = []
-    for entry in entries:
-        if not isinstance(entry, dict) or set(entry) - {"models", "seeds"} or "models" not in entry:
-            raise DataError(f"An entry of {str(path)!r} has 'models' and maybe 'seeds'; received {brief(entry)}.")
-        models, seeds = entry["models"], entry.get("seeds")
-        if not isinstance(models, list) or not models or not all(isinstance(name, str) for name in models):
-            raise DataError(f"'models' of {str(path)!r} is a list of one or more names; received {brief(models)}.")
-        if seeds is not None and (not isinstance(seeds, list) or not seeds):
-            raise DataError(f"'seeds' of {str(path)!r} is a list of whole numbers, not empty; received {brief(seeds)}.")
-        for seed in seeds or ():
-            check_number("A seed of a batch", seed, least=0, whole=True)
-        jobs += jobs_of(models, seeds, options)
+    file = read_table(_Batch, read_toml(path, "batch file"), f"the batch file {str(path)!r}")
+    options = vars(ScoreOptions.of(file.options))
+    jobs = [job for entry in file.entries for job in jobs_of(entry.models, entry.seeds, options)]
     if not jobs:
         raise DataError(f'{str(path)!r} names no model; give [[entries]] with models = ["NAME"].')
     return jobs

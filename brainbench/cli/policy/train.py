@@ -272,7 +272,9 @@ def sweep(
         more = numbers["students"] - numbers["published"]
         extra = f" ({numbers['published']} without {', '.join(plan.extra_types)})" if more else ""
         text = table("", ["entry or type", "students"], rows, right=(1,))
-        return Output(numbers, f"{text}\n\n{numbers['students']} students in {plan.name}, {subset}{extra}")
+        return Output(
+            numbers, f"{text}\n\n{numbers['students']} students in {Path(file or PUBLISHED).stem}, {subset}{extra}"
+        )
     part, parts = part_of(shard, "--shard takes")
     students = [replace(student, **changes) for student in plan.students(subset)][part::parts]
     if names:

@@ -1,16 +1,18 @@
-"""Parsed JSON as typed values, and what is wrong with it in words."""
+"""Parsed JSON and TOML as typed values, and what is wrong with them in words."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from typing import Any, TypeVar
+from typing import Any, TypeVar, get_args
 
 import msgspec
 
-from brainbench.core.errors import DataError, listing
+from brainbench.core.errors import DataError, UsageError, brief, check_each, listing
+from brainbench.core.limits import check_value
 
 T = TypeVar("T")
+Table = TypeVar("Table", bound=msgspec.Struct)
 _WORDS = {
     "float": "a number", "int": "an integer", "str": "text", "bool": "true or false", "null": "null",
     "object": "an object", "array": "a list",
@@ -52,3 +54,41 @@ def fault_in_words(fault: str, data: Any, where: str, choices: Mapping[str, Sequ
     for step in re.findall(r"[^.\[\]]+", place):
         data = data[int(step)] if isinstance(data, list) else data[step]
     return f"{place or where} is {repr(data)[:60]}; {allowed}"
+
+
+_TABLES = {
+    "list": "a list of tables in double brackets", "tuple[str": "a list of texts", "tuple": "a list of tables",
+    "dict": "a table", "str": "a text",
+}  # fmt: skip
+"""Beginnings of types that hold no numbers, in words."""
+
+
+def read_table(kind: type[Table], data: Any, name: str) -> Table:
+    """Return the data of a TOML file, or of one table in it, as a structure; tables within become structures too.
+
+    Errors say which key of ``name`` is unknown, missing or of another kind.
+    """
+    if not isinstance(data, Mapping):
+        raise UsageError(f"{name} must be a table; received {brief(data)}.")
+    fields = {field.encode_name: field for field in msgspec.structs.fields(kind)}
+    check_each(f"key of {name}", data, sorted(fields))
+    for key, field in fields.items():
+        if field.required and key not in data:
+            raise UsageError(f"{name} needs the key {key!r}.")
+    return kind(**{fields[key].name: _read_key(fields[key].type, value, key, name) for key, value in data.items()})
+
+
+def _read_key(kind: Any, value: Any, key: str, name: str) -> Any:
+    tables = [part for part in (kind, *get_args(kind)) if isinstance(part, type) and issubclass(part, msgspec.Struct)]
+    inner = tables[0] if tables else None
+    if inner is kind:
+        return read_table(kind, value, f"[{key}] of {name}")
+    if inner is not None and isinstance(value, list):
+        return tuple(read_table(inner, entry, f"[[{key}]] of {name}") for entry in value)
+    check_value(f"{key!r} of {name}", value, kind)
+    try:
+        return msgspec.convert(value, kind)
+    except msgspec.ValidationError as error:
+        word = next(word for start, word in _TABLES.items() if start in str(kind))
+        word = "a table of tables, one for each name" if isinstance(value, Mapping) else word
+        raise UsageError(f"{key!r} of {name} must be {word}; received {brief(value)}.") from error

@@ -10,7 +10,7 @@ import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any
 
 import msgspec
 
@@ -28,6 +28,7 @@ from brainbench.core.errors import (
 from brainbench.core.limits import Limit, check_value
 from brainbench.core.reading.regular import readable
 from brainbench.core.reading.texts import read_toml
+from brainbench.core.reading.values import read_table
 from brainbench.core.rotations import Length, Vector
 from brainbench.geometry import DecompositionSettings
 from brainbench.stimuli.motion import trajectories
@@ -225,9 +226,6 @@ _PRIMITIVES: dict[str, tuple[Callable[..., Solid], list[Any]]] = {
     "rodgers": (rodgers_solid, [("diagonal_mm", float | None, None), ("segments", int | None, None)]),
 }
 """Shape → function, and keys with their types and defaults."""
-_WORDS = {"list": "a list of tables in double brackets", "dict": "a table", "str": "a text"}
-"""Beginnings of types that hold no numbers, in words."""
-Kind = TypeVar("Kind", bound=Table)
 
 
 @dataclass(frozen=True)
@@ -259,29 +257,6 @@ def load_scene(path: str | os.PathLike[str], *, whiskers: str = "all") -> Recipe
             return _recipe(path, data, whiskers)
     except BrainbenchError as error:
         raise type(error)(f"{os.fspath(path)}: {error}") from error
-
-
-def read_table(kind: type[Kind], data: Any, name: str) -> Kind:
-    """Convert the data of one table; errors say which key of ``name`` is unknown, missing or of another kind."""
-    if not isinstance(data, Mapping):
-        raise UsageError(f"{name} must be a table; received {brief(data)}.")
-    fields = {field.name: field for field in msgspec.structs.fields(kind)}
-    for key in data:
-        if key not in fields:
-            raise unknown_name(f"key of {name}", key, sorted(fields))
-    for key, field in fields.items():
-        if field.required and key not in data:
-            raise UsageError(f"{name} needs the key {key!r}.")
-    values = {}
-    for key, value in data.items():
-        check_value(f"{key!r} of {name}", value, fields[key].type)
-        try:
-            values[key] = msgspec.convert(value, fields[key].type)
-        except msgspec.ValidationError as error:
-            word = next(word for kind, word in _WORDS.items() if kind in str(fields[key].type))
-            word = "a table of tables, one for each name" if isinstance(value, Mapping) else word
-            raise UsageError(f"{key!r} of {name} must be {word}; received {brief(value)}.") from error
-    return kind(**values)
 
 
 def _unit_of(key: str) -> tuple[str, float | None]:

@@ -16,10 +16,13 @@ from itertools import product
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import msgspec
+
 from brainbench.core.errors import UsageError, brief, check_each, check_name, listing, repeats
 from brainbench.core.limits import Count, Limit, Seed, Share, limited
 from brainbench.core.reading.regular import readable
 from brainbench.core.reading.texts import read_toml
+from brainbench.core.reading.values import read_table
 from brainbench.models.recipes import Architecture
 from robotics_bridge.hands.layouts import check_names
 from robotics_bridge.hands.observations import observation_type
@@ -188,30 +191,43 @@ class DistillConfig:
 PUBLISHED = Path(__file__).parents[1] / "sweeps" / "table-4.10.toml"
 """The sweep of the thesis."""
 SUBSETS = ("all", "types", "encoders")
-_KEYS = (
-    "types", "extra_types", "resolutions", "noisy", "seeds", "variant", "teacher", "pinned", "encoders", "entries",
-    "settings", "students",
-)  # fmt: skip
-_ENTRY = ("task", "hand", "placements", "iterations", "settings")
+_OF_PRODUCT = ("types", "extra_types", "pinned", "encoders", "resolutions", "noisy")
 
 
-@dataclass(frozen=True)
-class SweepEntry:
+class SweepEntry(msgspec.Struct, frozen=True):
     """A line of table 4.10."""
 
     task: str
     hand: str
-    placements: tuple[str, ...]
-    settings: Mapping[str, Any]
-    """Further fields of every student, such as ``iterations``."""
+    placements: tuple[str, ...] = ()
+    iterations: int | None = None
+    settings: dict[str, Any] = {}
+    """Further fields of every student."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class StudentSweep:
+class Pinned(msgspec.Struct, frozen=True):
+    """What the subsets ``types`` and ``encoders`` hold still."""
+
+    resolution: str = "med"
+    noisy: bool = False
+
+
+class Encoders(msgspec.Struct, frozen=True):
+    """Observation types of the subset ``encoders``, and the encoders there, each with its settings."""
+
+    types: tuple[str, ...] = ()
+    arms: tuple[dict[str, Any], ...] = ()
+
+    def __post_init__(self) -> None:
+        for arm in self.arms:
+            if "encoder" not in arm:
+                raise UsageError(f"An arm of a sweep names no 'encoder': {brief(arm)}.")
+
+
+class StudentSweep(msgspec.Struct, frozen=True, kw_only=True):
     """A file of students."""
 
-    name: str
-    entries: tuple[SweepEntry, ...]
+    entries: tuple[SweepEntry, ...] = ()
     types: tuple[str, ...] = ()
     """Observation types, each at every placement of an entry."""
     extra_types: tuple[str, ...] = ()
@@ -222,20 +238,31 @@ class StudentSweep:
     """Without noise, with it, or both; in the same subsets."""
     seeds: tuple[int, ...] = (0,)
     """Training seeds, every student once with each."""
-    pinned_resolution: str
-    """The one resolution of the subsets ``types`` and ``encoders``."""
-    pinned_noisy: bool
-    """Noise of the taxels in these."""
-    encoder_types: tuple[str, ...]
-    """Observation types of the subset ``encoders``."""
-    arms: tuple[Mapping[str, Any], ...]
-    """Encoder and its settings, for the subset ``encoders``."""
-    listed: tuple[Mapping[str, Any], ...] = ()
+    pinned: Pinned = Pinned()
+    encoders: Encoders = Encoders()
+    settings: dict[str, Any] = {}
+    """Further fields of every student of all entries."""
+    listed: tuple[dict[str, Any], ...] = msgspec.field(default=(), name="students")
     """Settings of every student of an entry and a seed, in place of the product."""
     variant: str = "default"
     """Configuration of the tasks."""
     teacher: str = "teachers/{task}-{hand}"
     """Folder of a teacher's run, with ``{task}`` and ``{hand}``."""
+
+    def __post_init__(self) -> None:
+        if not self.entries:
+            raise UsageError("A sweep has no entries; each is a table [[entries]] with a task and a hand.")
+        placed = [bool(entry.placements) for entry in self.entries]
+        defaults = zip(self.__struct_fields__, self.__struct_defaults__, strict=True)
+        idle = [name for name, default in defaults if name in _OF_PRODUCT and getattr(self, name) != default]
+        if self.listed and (idle or any(placed)):
+            fields = listing([*idle, *["placements"] * any(placed)])
+            raise UsageError(f"A sweep that lists its students one by one has no {fields}; leave them out.")
+        if not self.listed and not all(placed):
+            raise UsageError("An entry of a sweep needs 'placements', unless the sweep lists its students.")
+        # Every student is made once, so that no value is found wrong in the middle of a sweep.
+        for subset in ("all",) if self.listed else SUBSETS:
+            self.students(subset)
 
     def students(self, subset: str = "all") -> list[DistillConfig]:
         """Return every student of a subset: ``all``, ``types``, ``encoders`` or an observation type."""
@@ -246,30 +273,33 @@ class StudentSweep:
         each = product(self.entries, self.seeds)
         students = [student for entry, seed in each for student in self._of_entry(entry, seed, subset, every)]
         if twice := repeats(student.name for student in students):
-            raise UsageError(f"The sweep {self.name!r} names the student {twice[0]!r} twice.")
+            raise UsageError(f"The sweep names the student {twice[0]!r} twice.")
         return students
 
     def _of_entry(self, entry: SweepEntry, seed: int, subset: str, every: Sequence[str]) -> list[DistillConfig]:
         common = {
-            "task": entry.task, "hand": entry.hand, "variant": self.variant, "seed": seed, **entry.settings,
+            "task": entry.task, "hand": entry.hand, "variant": self.variant, "seed": seed,
+            **self.settings, **entry.settings,
             "teacher": self.teacher.format(task=entry.task, hand=entry.hand),
         }  # fmt: skip
+        if entry.iterations is not None:
+            common["iterations"] = entry.iterations
+        if self.listed:
+            chosen = [arm for arm in self.listed if subset in ("all", arm.get("observe"))]
+            return [DistillConfig.of({**common, **arm}) for arm in chosen]
         if subset == "encoders":
-            pinned = {"resolution": self.pinned_resolution, "noisy": self.pinned_noisy}
+            pinned = {"resolution": self.pinned.resolution, "noisy": self.pinned.noisy}
             return [
                 DistillConfig(
                     **common, **pinned, observe=kind, placement=placement, encoder=arm["encoder"],
                     encoder_settings={key: value for key, value in arm.items() if key != "encoder"},
                 )
-                for kind, placement, arm in product(self.encoder_types, entry.placements, self.arms)
+                for kind, placement, arm in product(self.encoders.types, entry.placements, self.encoders.arms)
             ]  # fmt: skip
-        if self.listed:
-            chosen = [arm for arm in self.listed if subset in ("all", arm.get("observe"))]
-            return [DistillConfig.of({**common, **arm}) for arm in chosen]
         types = every if subset in SUBSETS else (subset,)
         pin = subset == "types"
-        resolutions = (self.pinned_resolution,) if pin else self.resolutions
-        noises = (self.pinned_noisy,) if pin else self.noisy
+        resolutions = (self.pinned.resolution,) if pin else self.resolutions
+        noises = (self.pinned.noisy,) if pin else self.noisy
         return [
             DistillConfig(**{name: value for name, value in common.items() if name not in FELT}, observe="none"),
             *(
@@ -291,56 +321,7 @@ def read_sweep(path: str | Path = PUBLISHED) -> StudentSweep:
     """Read a sweep: a file, or one that ships, by its name without ending."""
     shipped = PUBLISHED.parent / f"{path}.toml"
     path = shipped if not Path(path).exists() and shipped.is_file() else path
-    document = read_toml(
-        path, f"sweep (shipped: {', '.join(sorted(one.stem for one in PUBLISHED.parent.glob('*.toml')))})"
-    )
+    names = ", ".join(sorted(one.stem for one in PUBLISHED.parent.glob("*.toml")))
+    document = read_toml(path, f"sweep (shipped: {names})")
     with readable(path, "sweep of students"):
-        return _sweep(Path(path), document)
-
-
-def _sweep(path: Path, document: Mapping[str, Any]) -> StudentSweep:
-    """Return the sweep of a file's values, every student of which is made once."""
-    check_each("key of a sweep", document, _KEYS)
-    listed = tuple(document.get("students", ()))
-    if listed and (
-        idle := sorted({"types", "extra_types", "resolutions", "noisy", "pinned", "encoders"} & set(document))
-    ):
-        raise UsageError(f"The sweep {path.name!r} lists its students one by one; leave out {listing(idle)}.")
-    settings = document.get("settings", {})
-    entries = tuple(_entry(item, settings, bool(listed)) for item in document.get("entries", ()))
-    if not entries:
-        raise UsageError(f"The sweep {str(path)!r} has no entries; each is a table [[entries]] with a task and a hand.")
-    pinned, encoders = document.get("pinned", {}), document.get("encoders", {})
-    check_each("key of 'pinned'", pinned, ("resolution", "noisy"))
-    check_each("key of 'encoders'", encoders, ("types", "arms"))
-    lists = ("types", "extra_types", "resolutions", "noisy", "seeds")
-    sweep = StudentSweep(
-        name=path.stem, entries=entries, pinned_resolution=pinned.get("resolution", "med"),
-        pinned_noisy=pinned.get("noisy", False), encoder_types=tuple(encoders.get("types", ())),
-        arms=tuple(encoders.get("arms", ())), listed=listed,
-        **{key: tuple(document[key]) for key in lists if key in document},
-        **{key: document[key] for key in ("variant", "teacher") if key in document},
-    )  # fmt: skip
-    for kind in (*sweep.types, *sweep.extra_types, *sweep.encoder_types):
-        observation_type(kind)
-    for entry in entries:
-        for placement, resolution in product(entry.placements, (*sweep.resolutions, sweep.pinned_resolution)):
-            check_names(resolution, placement)
-    for arm in sweep.arms:
-        if "encoder" not in arm:
-            raise UsageError(f"An arm of the sweep {path.name!r} names no 'encoder': {brief(dict(arm))}.")
-    # Every student is made once, so that no value is found wrong in the middle of a sweep.
-    for subset in ("all",) if listed else SUBSETS:
-        sweep.students(subset)
-    return sweep
-
-
-def _entry(table: Mapping[str, Any], settings: Mapping[str, Any], listed: bool) -> SweepEntry:
-    check_each("key of a sweep's entry", table, [key for key in _ENTRY if not (listed and key == "placements")])
-    for key in ("task", "hand") if listed else ("task", "hand", "placements"):
-        if not table.get(key):
-            raise UsageError(f"An entry of a sweep needs {key!r}; received {brief(dict(table))}.")
-    combined = {**settings, **table.get("settings", {})}
-    if "iterations" in table:
-        combined["iterations"] = table["iterations"]
-    return SweepEntry(table["task"], table["hand"], tuple(table.get("placements", ())), combined)
+        return read_table(StudentSweep, document, f"the sweep {Path(path).name!r}")

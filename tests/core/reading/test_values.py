@@ -9,9 +9,9 @@ from typing import Annotated, Literal
 import msgspec
 import pytest
 
-from brainbench.core.errors import DataError
+from brainbench.core.errors import DataError, UsageError
 from brainbench.core.reading import values
-from brainbench.core.reading.values import typed_values
+from brainbench.core.reading.values import read_table, typed_values
 
 
 @dataclass(frozen=True)
@@ -49,3 +49,34 @@ def test_advice_ends_the_message():
 
 def test_the_examples_hold():
     assert doctest.testmod(values).failed == 0
+
+
+class _Part(msgspec.Struct, frozen=True):
+    size: Annotated[int, msgspec.Meta(ge=1)]
+    names: tuple[str, ...] = ()
+
+
+class _Whole(msgspec.Struct):
+    first: _Part = _Part(1)
+    parts: tuple[_Part, ...] = msgspec.field(default=(), name="part")
+
+
+def test_tables_within_a_table_become_structures():
+    table = read_table(_Whole, {"first": {"size": 2}, "part": [{"size": 3, "names": ["a"]}]}, "the file")
+    assert table == _Whole(_Part(2), (_Part(3, ("a",)),))
+
+
+@pytest.mark.parametrize(
+    ("data", "sentence"),
+    [
+        ([], "the file must be a table"),
+        ({"frist": {}}, "key of the file 'frist'; did you mean 'first'"),
+        ({"first": {}}, r"\[first\] of the file needs the key 'size'"),
+        ({"first": {"size": 0}}, r"'size' of \[first\] of the file must be a whole number, at least 1"),
+        ({"part": [{"size": 1, "names": "a"}]}, r"'names' of \[\[part\]\] of the file must be a list of texts"),
+        ({"part": {"size": 1}}, "'part' of the file must be a table of tables"),
+    ],
+)
+def test_the_place_of_what_is_wrong_in_a_table_is_named(data, sentence):
+    with pytest.raises(UsageError, match=sentence):
+        read_table(_Whole, data, "the file")

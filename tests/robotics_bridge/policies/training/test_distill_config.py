@@ -58,8 +58,8 @@ def test_the_published_sweep_is_the_product_that_the_released_settings_describe(
         if s.observe not in sweep.extra_types
     }
     assert found == expected
-    assert (sweep.pinned_resolution, sweep.pinned_noisy) == (menu["pinned_resolution"], menu["pinned_noisy"])
-    assert set(menu["tactile_encoders"]) <= {arm["encoder"] for arm in sweep.arms}
+    assert (sweep.pinned.resolution, sweep.pinned.noisy) == (menu["pinned_resolution"], menu["pinned_noisy"])
+    assert set(menu["tactile_encoders"]) <= {arm["encoder"] for arm in sweep.encoders.arms}
 
 
 def test_its_counts_are_those_of_the_table() -> None:
@@ -71,7 +71,7 @@ def test_its_counts_are_those_of_the_table() -> None:
     assert len(count["types"]) == 9
     assert sweep.count("types")["students"] == (1 + 8 * 2) + 3 * (1 + 8)
     assert sweep.count("force_torque")["students"] == (1 + 12) + 3 * (1 + 6)
-    assert sweep.count("encoders")["students"] == 5 * len(sweep.arms)
+    assert sweep.count("encoders")["students"] == 5 * len(sweep.encoders.arms)
     names = [student.name for student in sweep.students()]
     assert len(set(names)) == len(names)
 
@@ -88,7 +88,7 @@ def test_a_file_of_ones_own_expands_and_its_faults_are_named(tmp_path) -> None:
         (f'types = ["bol"]\n{ENTRY}', "did you mean 'bool'"),
         ('types = ["bool"]\n', "has no entries"),
         ('[[entries]]\ntask = "t"\nhand = "xhand1"\n', "needs 'placements'"),
-        (ENTRY.replace("tips", "tip"), "did you mean 'tips'"),
+        (f'types = ["bool"]\n{ENTRY}'.replace("tips", "tip"), "did you mean 'tips'"),
         (f'[encoders]\narms = [{{learning = "frozen"}}]\n{ENTRY}', "names no 'encoder'"),
     ):
         path.write_text(text)
@@ -118,7 +118,7 @@ def test_students_of_every_subset_are_looked_at_when_a_sweep_is_read(tmp_path) -
     with pytest.raises(UsageError, match=r"'time' = 'resampled' is for .*'mlp'"):
         read_sweep(path)
     path.write_text(f'types = ["bool"]\n[pinned]\nnoisy = "no"\n{ENTRY}')
-    with pytest.raises(UsageError, match="'noisy' of a student must be True or False"):
+    with pytest.raises(UsageError, match=r"'noisy' of \[pinned\] of the sweep 's\.toml' must be True or False"):
         read_sweep(path)
     path.write_text(f'types = ["bool"]\n[settings]\nencoder = "rnn"\n{ENTRY}')
     assert [student.encoder for student in read_sweep(path).students()] == ["auto", "rnn"]
@@ -137,8 +137,9 @@ def test_a_sweep_may_list_its_students_one_by_one(tmp_path) -> None:
     with pytest.raises(UsageError, match="did you mean 'bool'"):
         sweep.students("bol")
     for text, message in (
-        (f'types = ["bool"]\n{entry}{some}', r"lists its students one by one; leave out 'types'"),
-        (f"{ENTRY}{some}", "key of a sweep's entry 'placements'"),
+        (f'types = ["bool"]\n{entry}{some}', r"lists its students one by one has no 'types'"),
+        (f"{ENTRY}{some}", "has no 'placements'"),
+        (f"noisy = [true]\n{entry}{some}", "has no 'noisy'"),
         (f'{entry}[[students]]\nobserv = "bool"\n', "did you mean 'observe'"),
         (f"{entry}{some}{some}", "twice"),
     ):
