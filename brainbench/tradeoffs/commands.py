@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
-from brainbench.cli.options import items, needs, numbers, out_file_option, with_options
+from brainbench.cli.options import items, numbers, out_file_option
 from brainbench.cli.output import Output, progress_bar, table_of
 from brainbench.stimuli.engines.fidelity import DEFAULT_ENGINE
 
@@ -65,27 +65,6 @@ def whisker(
         columns = {**error, **cost, **pieces, **setting, "backend": "{0[backend]}", "note": "{0[note]}"}
         text += "\n\n" + table_of("whisking into the hollow of concave objects:", hollow, columns)
     return Output({"points": rows, "front": best, "path": out}, f"{text}\n\ntable  {out}")
-
-
-@app.command("score")
-@needs(cache=True)
-@with_options("brainbench.tradeoffs.scores:SyntheticData")
-def score(options: Any) -> Output:
-    """Measure the Monte-Carlo error of a score against its time: split halves and permutations."""
-    from brainbench.tradeoffs import scores, study
-
-    with progress_bar() as progress:
-        rows = study.run_study(scores.study(options), progress=progress)
-    columns = {
-        "quantity": lambda row: row["quantity"].replace("_", " "),
-        "number": lambda row: f"{row['count']:,}" + ("  (default)" if row["default"] else ""),
-        ">error": "{0[error]:.2g}",
-        "of": "{0[of]}",
-        ">s": "{0[seconds]:.2f}",
-    }
-    of = f"{options.animals} animals, {options.units} units, {options.trials} trials per stimulus"
-    title = f"{of}; standard deviation over {options.repeats} seeds"
-    return Output({"points": rows}, table_of(title, rows, columns))
 
 
 @app.command("tactile")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 import platform
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -34,26 +33,23 @@ class Study:
     """Part of the head that must be the same for rows to share a table."""
 
 
-def run_study(
-    study: Study, path: str | os.PathLike[str] | None = None, *, progress: Progress | None = None
-) -> list[Row]:
+def run_study(study: Study, path: Path, *, progress: Progress | None = None) -> list[Row]:
     """Measure the settings that the table at ``path`` lacks, writing it whole after each; return all its rows."""
     head = {"made_by": study.name, **study.about, **study.fixed, "machine": platform.machine()}
     rows: list[Row] = []
-    if path is not None and Path(path).exists():
+    if path.exists():
         table = read_json(path)
         if not isinstance(table, dict) or any(table.get(key) != value for key, value in study.fixed.items()):
             words = ", ".join(f"{key} {value}" for key, value in study.fixed.items())
             raise DataError(
-                f"{os.fspath(path)!r} was not measured with {words}; write to another file, or delete it to measure "
+                f"{str(path)!r} was not measured with {words}; write to another file, or delete it to measure "
                 "everything again."
             )
         rows = list(table["points"])
     missing = [setting for setting in study.settings if not any(_is_of(row, setting) for row in rows)]
     for setting in track(missing, "measuring settings", progress):
         rows.append({**setting, **study.measure(setting)})
-        if path is not None:
-            write_json(path, {**head, "points": rows})
+        write_json(path, {**head, "points": rows})
     return rows
 
 

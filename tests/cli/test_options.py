@@ -185,7 +185,6 @@ WORDS = {
     "leaderboard add": ("no-such-model", "--scheduler", "tcp://127.0.0.1:9"),
     "leaderboard report": ("none", "--out", "x.pdf"),
     "leaderboard verify": ("none",),
-    "tradeoff score": (),
     "tactile demo": ("--hand", "no-such-hand"),
     "train": ("no-such-model", "--data", "none"),
     "score": ("no-such-model",),

@@ -29,15 +29,7 @@ def test_the_cost_of_tactile_queries_is_measured_against_their_error(
     assert errors["primitive"][0] < 1e-5
 
 
-@pytest.mark.slow
-def test_the_error_of_a_score_is_measured_against_its_time(run):
-    result = run("tradeoff", "score", "--animals", "2", "--units", "10", "--trials", "12", "--repeats", "2", "--json")
-    assert result.status == 0, result.err
-    points = json.loads(result.out)["points"]
-    assert {point["quantity"] for point in points} == {"splits", "permutations"}
-
-
 def test_misuse_is_told_in_a_sentence(run):
-    result = run("tradeoff", "score", "--repeats", "1")
+    result = run("tradeoff", "whisker", "--links", "few")
     assert result.status == 2
-    assert "--repeats must be a whole number, at least 2; received 1." in result.err
+    assert "--links takes whole numbers joined by commas; received 'few'." in result.err
