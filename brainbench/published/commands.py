@@ -47,9 +47,6 @@ def convert(
         float | None, typer.Option(help="Rows of a run per second; 1000 and 110 rows are one second.")
     ] = None,
     stimulus: Annotated[str | None, typer.Option("--stimulus", "-s", help="Stimulus of a set to write.")] = None,
-    dialect: Annotated[
-        str | None, typer.Option(help="Of a written run: thesis (default), or sense-lab, where commas end lines.")
-    ] = None,
 ) -> Output:
     """Convert published sweeps to a data set, sweeps and WHISKiT runs to a stimulus set, or a stimulus set to a run.
 
@@ -61,7 +58,7 @@ def convert(
     if not source.exists():
         raise DataFileNotFoundError(f"There is no file or folder {str(source)!r}.")
     of_runs: dict[str, Any] = {"--cleaning": cleaning, "--rate": rate}
-    of_sets = {"--stimulus": stimulus, "--dialect": dialect}
+    of_sets = {"--stimulus": stimulus}
     if source.is_dir() and is_sweep_tree(source):
         _check("a folder of sweeps", of_runs | of_sets, out, "a data set, which is a folder", not _is_set(out))
         result = _data_set(source, out)
@@ -73,7 +70,7 @@ def convert(
         free = not out.is_file() and not (out.is_dir() and any(out.iterdir()))
         _check("a stimulus set", of_runs, out, "a run, which is a new folder", free)
         with progress_bar("writing the run"):
-            result = _run(source, out, stimulus=stimulus, dialect=dialect or "thesis")
+            result = _run(source, out, stimulus)
     elif runs := find_runs(source):
         _check("runs", of_sets, out, _SET, _is_set(out))
         with progress_bar("converting the runs"):
@@ -155,7 +152,7 @@ def _write_set(dataset: xr.Dataset, out: Path) -> dict[str, Any]:
     }
 
 
-def _run(source: Path, out: Path, **options: Any) -> dict[str, Any]:
+def _run(source: Path, out: Path, stimulus: str | None) -> dict[str, Any]:
     from brainbench.published.whiskit import save_run
     from brainbench.stimuli import read_stimulus_set
 
@@ -164,7 +161,7 @@ def _run(source: Path, out: Path, **options: Any) -> dict[str, Any]:
     # A run is many files: they appear together, or not at all.
     temporary = temporary_path(out.absolute())
     try:
-        save_run(dataset, temporary, **options).rename(out)
+        save_run(dataset, temporary, stimulus=stimulus, dialect="thesis").rename(out)
     except OSError as error:
         if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
             raise

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import warnings
 from collections.abc import Callable, Mapping
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import torch
@@ -19,7 +19,7 @@ from robotics_bridge.physics.state import MOST_ENVS, EnvIds, HandState, select_e
 from robotics_bridge.sensors.context import memory_of
 from robotics_bridge.sensors.kernels.pairs import clear_readings, count_update, reset_clock
 from robotics_bridge.sensors.probes.placement import Probes, enclosing_sphere
-from robotics_bridge.sensors.probes.sensors import ContactProbe, DistanceRuntime, SurfaceDistanceProbe
+from robotics_bridge.sensors.probes.sensors import ContactProbe, SurfaceDistanceProbe
 from robotics_bridge.sensors.queries.pairs import DIVERGED, OVERFULL, PairTable
 from robotics_bridge.sensors.queries.solids import Solids
 from robotics_bridge.sensors.runtime import History, Runtime, SuiteContext
@@ -250,15 +250,6 @@ class SensorSuite:
         window = wp.to_torch(history.ring)[first : first + history.length]
         tensor = window.permute(2, 0, 3, 1).unflatten(2, history.part.layout)
         return tensor.squeeze(-1) if history.part.scalar else tensor
-
-    def read_nearest(self, name: str) -> torch.Tensor:
-        """Return the nearest surface points [B, N, 3] of a SurfaceDistanceProbe (m, link frame); a view."""
-        runtime, sensor = self.runtime_of(name), self.sensors[name]
-        if not (isinstance(sensor, SurfaceDistanceProbe) and sensor.nearest):
-            raise UsageError(f"{name!r} keeps no nearest points; it needs SurfaceDistanceProbe(..., nearest=True).")
-        part = runtime.slices[name]
-        points = wp.to_torch(cast(DistanceRuntime, runtime).points)[:, :, part.span]
-        return points.permute(1, 2, 0).unflatten(1, part.layout)
 
     def reset(self, env_ids: EnvIds | None = None) -> None:
         """Start a new episode in some environments (all by default): memories are cleared, new errors drawn."""

@@ -109,7 +109,7 @@ def _mixed(folder):
         (_mixed, (), "'110', '1000'"),
         (lambda f: (write_run(f / "a", np.zeros((110, 2, 6))), f / "o"), (), ".h5"),
         (lambda f: (write_run(f / "a", np.zeros((99, 2, 6))), f / "o.h5"), (), "--rate"),
-        (lambda f: (write_run(f / "a", np.zeros((110, 2, 6))), f / "o.h5"), ("--dialect", "thesis"), "--dialect"),
+        (lambda f: (write_run(f / "a", np.zeros((110, 2, 6))), f / "o.h5"), ("--stimulus", "a"), "--stimulus"),
         (lambda f: (write_tree(f / "t", (1, 1, 1)), f / "o.h5"), (), "o.h5"),
         (lambda f: (write_tree(f / "t", (1, 1, 1)), f / "o"), ("--rate", "9"), "--rate"),
         (lambda f: (write_tree(f / "t", (1, 1, 1)), f / "t"), (), "not empty"),

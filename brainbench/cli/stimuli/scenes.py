@@ -1,6 +1,6 @@
 """``brainbench stimuli list | show | objects | render | plot``: what a SOURCE names, and pictures of it.
 
-Objects are shape families, mesh files and ShapeNet folders; what whiskers touch of them is told.
+Objects are shape families and mesh files; what whiskers touch of them is told.
 """
 
 from __future__ import annotations
@@ -218,9 +218,7 @@ _MILLI = 1e3
 @with_options("brainbench.geometry.pieces:DecompositionSettings", ("method", "threshold"), parameter="settings")
 def objects(
     settings: Any,
-    source: Annotated[
-        str | None, typer.Argument(help="A shape family, a mesh file or a ShapeNet folder; all families without.")
-    ] = None,
+    source: Annotated[str | None, typer.Argument(help="A shape family or a mesh file; all families without.")] = None,
     seed: Annotated[int, typer.Option(help="Which member of the family.")] = 0,
     detail: Annotated[int, typer.Option(help="About how many triangles a family's member has, 2000 to 20000.")] = 4_000,
     unit: Annotated[str | None, typer.Option(help="Length unit of a mesh file: m, cm, mm, um or in.")] = None,
@@ -231,8 +229,6 @@ def objects(
         str | None,
         typer.Option(help="What whiskers touch: exact, hull, pieces or decomposition; default as in scene files."),
     ] = None,
-    ids: Annotated[Path | None, typer.Option(help="For a ShapeNet folder: file of synset/model names.")] = None,
-    categories: Annotated[Path | None, typer.Option(help="For a ShapeNet folder: CSV or JSON of labels.")] = None,
     export: Annotated[
         Path | None, typer.Option(callback=out_file, help="Write the repaired mesh, in mm (.obj .stl .ply .glb .off).")
     ] = None,
@@ -241,12 +237,10 @@ def objects(
     from brainbench.geometry import save_mesh
 
     diagonal = None if diagonal_mm is None else diagonal_mm / _MILLI
-    if source is None or Path(source).is_dir():
+    if source is None:
         single = {"--unit": unit, "--diagonal-mm": diagonal_mm, "--collision": collision, "--export": export}
         refuse(single, "without a family or a mesh file")
-        data, text = _families() if source is None else _folder(source, ids, categories)
-        return Output(data, text)
-    refuse({"--ids": ids, "--categories": categories}, "for one object")
+        return Output(*_families())
     with progress_bar("preparing the object"):
         if Path(source).is_file():
             refuse({"--seed": seed or None, "--detail": detail != 4_000}, "for a file")
@@ -267,15 +261,6 @@ def _families() -> tuple[dict[str, Any], str]:
     return data, table("", ["family", ""], [[name, text] for name, text in data.items()]) + hint
 
 
-def _folder(source: str, ids: Path | None, categories: Path | None) -> tuple[dict[str, Any], str]:
-    from brainbench.stimuli.objects.collections import load_shapenet
-
-    bodies = load_shapenet(source, ids=ids, categories=categories)
-    data = {"models": len(bodies), "labels": bodies.counts, "missing": list(bodies.missing)}
-    text = table("", ["label", "models"], [[label, str(n)] for label, n in bodies.counts.items()], right=(1,))
-    return data, f"{len(bodies)} models of {len(bodies.labels)} labels, {len(bodies.missing)} missing\n\n{text}"
-
-
 def _member(
     name: str, seed: int, detail: int, diagonal: float | None, collision: str | None, settings: DecompositionSettings
 ) -> tuple[dict[str, Any], Solid]:
@@ -284,7 +269,7 @@ def _member(
     from brainbench.stimuli.objects.solid import shape_solid
 
     family = name.removeprefix("family:")
-    hint = "Or the path of a mesh file or of a ShapeNet folder."
+    hint = "Or the path of a mesh file."
     check_name("object", family, procedural.list_families(), hint=hint)
     shape = procedural.make(family, seed, detail=detail)
     size = 0.04 if diagonal is None else diagonal

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.sparse.linalg import eigsh
 from scipy.spatial import KDTree
 
-from brainbench.core.errors import UsageError, brief, check_number, check_numbers, needing
+from brainbench.core.errors import UsageError, check_number, needing
 from brainbench.core.files import cache_dir, content_hash, to_plain
 from brainbench.core.reading.sealed import read_sealed, write_sealed
 from brainbench.geometry import Mesh, winding_number
@@ -136,56 +136,33 @@ def find_modes(
     *,
     count: int = 16,
     cells: int = 12,
-    strike: ArrayLike | None = None,
-    hear: ArrayLike | None = None,
     cache: bool = True,
 ) -> Modes:
-    """Return the lowest elastic modes of a free solid.
+    """Return the lowest elastic modes of a free solid, struck and heard anywhere: by the mean square over its surface.
 
     Args:
         solid: A box, sphere, ellipsoid, cylinder or closed mesh; link and pose do not matter.
         material: What it is made of; decays follow from its Rayleigh damping.
         cells: Elements along the longest edge.
-        strike: Point [3] (m, frame of the solid) that is struck; the nearest of the surface counts. None takes the root
-            mean square over the surface.
-        hear: Point [3] (m, frame of the solid) whose normal velocity is heard; otherwise as ``strike``.
         cache: Whether the result is kept in the cache folder.
     """
     for name, value in {"count": count, "cells": cells}.items():
         check_number(name, value, least=1, whole=True)
     chosen = elastic_material(material)
-    for name, point in {"strike": strike, "hear": hear}.items():
-        if point is not None:
-            check_numbers(f"{name} (m)", point, 3)
     shape = (solid.kind, list(solid.size), None if solid.mesh is None else solid.mesh.content_hash)
-    points = [None if point is None else np.asarray(point, float).tolist() for point in (strike, hear)]
-    path = cache_dir("modes") / f"{content_hash(_VERSION, shape, to_plain(chosen), count, cells, points)}.npz"
+    path = cache_dir("modes") / f"{content_hash(_VERSION, shape, to_plain(chosen), count, cells)}.npz"
     if cache and (cached := read_sealed(path, "modes of a solid")) is not None:
         return Modes(*(tuple(cached[name].tolist()) for name in ("frequency", "decay", "gain")))
-    frequency, normal, place = solve(fill(solid, cells), chosen, count)
-    weights = []
-    for point in (strike, hear):
-        if point is None:
-            weights.append(np.sqrt(np.mean(normal**2, axis=0)))
-            continue
-        away = np.linalg.norm(place - np.asarray(point, float), axis=1)
-        if away.min() > (most := float(np.ptp(place, axis=0).max()) / 2):
-            raise UsageError(
-                f"The point {brief(point)} lies {away.min():g} m off the surface of {solid.name!r}, which is "
-                f"{2 * most:g} m long; points are in metres, in the frame of the solid."
-            )
-        weights.append(normal[np.argmin(away)])
+    frequency, normal = solve(fill(solid, cells), chosen, count)
     decay = tuple(chosen.decay(f) for f in frequency)
-    modes = Modes(tuple(frequency.tolist()), decay, tuple((weights[0] * weights[1]).tolist()))
+    modes = Modes(tuple(frequency.tolist()), decay, tuple(np.mean(normal**2, axis=0).tolist()))
     if cache:
         write_sealed(path, "modes of a solid", vars(modes))
     return modes
 
 
-def solve(
-    mesh: Any, material: ElasticMaterial, count: int
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Return frequencies [M] (Hz), normal components [V, M] (1/√kg) of mass-normalised modes, and points [V, 3].
+def solve(mesh: Any, material: ElasticMaterial, count: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return frequencies [M] (Hz) and normal components [V, M] (1/√kg) of mass-normalised modes.
 
     V are the corners on the surface.
     """
@@ -209,7 +186,7 @@ def solve(
     corners = np.unique(mesh.facets[:, mesh.boundary_facets()])
     dofs = basis.nodal_dofs[:, corners]
     outward = _corner_normals(mesh)[corners]
-    return frequency, np.einsum("vi,ivm->vm", outward, shapes[dofs]), mesh.p[:, corners].T
+    return frequency, np.einsum("vi,ivm->vm", outward, shapes[dofs])
 
 
 def _corner_normals(mesh: Any) -> NDArray[np.float64]:

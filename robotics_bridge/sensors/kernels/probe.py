@@ -66,9 +66,7 @@ def deepest_function(kinds: frozenset[int], raycast: bool) -> Any:
 
 
 @cache
-def distance_kernel(
-    kinds: frozenset[int], raycast: bool, nearest: bool, mode: int, hysteresis: bool, walk: bool
-) -> Any:
+def distance_kernel(kinds: frozenset[int], raycast: bool, mode: int, hysteresis: bool, walk: bool) -> Any:
     """Return the kernel of SurfaceDistanceProbe. Dim [B, N]."""
     deepest, emit = deepest_function(kinds, raycast), readout_functions(mode, hysteresis, walk, 1).emit
 
@@ -79,22 +77,13 @@ def distance_kernel(
         pairs: PairArrays,
         io: ReadoutArrays,
         limits: wp.array(dtype=wp.float32),
-        points: wp.array3d(dtype=wp.float32),
     ):
         env, n = wp.tid()
         if silenced(io, 1, env, n, probes.radius[n]):
-            if wp.static(nearest):
-                for axis in range(3):
-                    points[axis, env, n] = wp.where(probes.radius[n] > 0.0, wp.nan, 0.0)
             return
         part = probes.part[n]
         probe = probes.probe[n]
-        best, normal, place = deepest(probes, solids, pairs, env, n, wp.static(FAR))
-        if wp.static(nearest):
-            # The gradient of a signed distance has unit length: one step of that distance along it ends on the surface.
-            near = probes.position[n] - best * normal
-            for axis in range(3):
-                points[axis, env, n] = wp.where(place >= 0, near[axis], wp.static(float("nan")))
+        best, _normal, place = deepest(probes, solids, pairs, env, n, wp.static(FAR))
         d = wp.where(place >= 0, wp.min(best, limits[part]), limits[part])
         signal = d
         if wp.static(mode != CLEAN):

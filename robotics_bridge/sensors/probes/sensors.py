@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
 
@@ -27,14 +27,11 @@ class SurfaceDistanceProbe(QuerySensor):
     Needs no contact. Its noise knob ``radius`` is an error of the distance.
     """
 
-    nearest: bool = False
-    """True if the nearest surface points are kept too (``SensorSuite.read_nearest``)."""
     max_range: Annotated[float, Limit(above=0, infinite=True)] = math.inf
     """Distance (m) that is read where nothing is nearer."""
 
     units: ClassVar[str] = "m"
     knobs: ClassVar[frozenset[str]] = PROBE_KNOBS
-    shared: ClassVar[tuple[str, ...]] = ("query", "nearest")
     runtime: ClassVar[str] = "robotics_bridge.sensors.probes.sensors:DistanceRuntime"
 
 
@@ -73,18 +70,14 @@ class DistanceRuntime(ProbeRuntime):
     def __init__(self, sensors: Mapping[str, SurfaceDistanceProbe], context: SuiteContext) -> None:
         super().__init__(sensors, 1, context, reach=None)
         first = next(iter(sensors.values()))
-        self._kernel = distance_kernel(self.kinds, first.query == "raycast", first.nearest, self.mode, *self.stores)
+        self._kernel = distance_kernel(self.kinds, first.query == "raycast", self.mode, *self.stores)
         self._limits = context.array([sensor.max_range for sensor in sensors.values()], float)
-        self.points: Any = context.zeros((3, context.num_envs, self.count) if first.nearest else (1, 1, 1))
-        """Nearest points [3, B, N] in the link frame (m)."""
-        self.lasting = [self.points] if first.nearest else []
-        self.readable += self.lasting
 
     def run_kernels(self, state: HandState, dt: float) -> None:
         """Run the kernels."""
         c = self.context
         inputs = [self.probes, c.solids.struct, c.pairs.struct, self.io]
-        self.launch(self._kernel, *inputs, self._limits, self.points)
+        self.launch(self._kernel, *inputs, self._limits)
 
 
 class DepthRuntime(ProbeRuntime):

@@ -125,17 +125,6 @@ def test_a_decomposition_states_its_deviation(run, tmp_path):
     assert "of its diagonal (sampled)" in result.out
 
 
-def test_a_shapenet_folder_is_counted(run, tmp_path):
-    path = tmp_path / "02691156" / "aa" / "models" / "model_normalized.obj"
-    path.parent.mkdir(parents=True)
-    trimesh.creation.box().export(path)
-    ids = tmp_path / "ids.txt"
-    ids.write_text("02691156/aa\n02691156/bb\n")
-    data = json.loads(run("stimuli", "objects", str(tmp_path), "--ids", str(ids), "--json").out)
-    assert data == {"models": 1, "labels": {"airplane": 1}, "missing": ["02691156/bb"]}
-    assert "1 models of 1 labels, 0 missing" in run("stimuli", "objects", str(tmp_path)).out
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -146,7 +135,6 @@ def test_a_shapenet_folder_is_counted(run, tmp_path):
         (("torus", "--export", "x.dae"), "Unknown mesh format '.dae'"),
         (("--export", "x.obj"), "--export cannot be used without a family or a mesh file"),
         (("torus", "--unit", "mm"), "--unit cannot be used for a family"),
-        (("torus", "--ids", "ids.txt"), "--ids cannot be used for one object"),
         (("torus", "--method", "cocad"), "did you mean 'coacd'"),
     ],
 )

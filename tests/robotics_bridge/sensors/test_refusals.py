@@ -11,7 +11,6 @@ import torch
 
 from brainbench.core.errors import UsageError
 from brainbench.geometry import Mesh
-from robotics_bridge.physics import Geometry
 from robotics_bridge.sensors import (
     ActuationAudio,
     AfferentFilter,
@@ -24,7 +23,6 @@ from robotics_bridge.sensors import (
     SensorSuite,
     TemperatureGrid,
 )
-from robotics_bridge.sensors.audio.modes import find_modes
 from robotics_bridge.sensors.audio.runtime import joint_drive
 from robotics_bridge.sensors.audio.sensors import Modes
 from robotics_bridge.sensors.taxels.elastomer import contact_pressure
@@ -138,15 +136,6 @@ def test_the_torsion_of_a_copied_taxel_is_that_of_its_own_radius_and_shear() -> 
     assert wide.torsion == KinematicTaxel(link="hand", probes=PROBE.with_radius(0.01)).torsion > taxel.torsion
     assert replace(taxel, shear=20.0).torsion == pytest.approx(10 * taxel.torsion)
     assert (replace(taxel, convention="thesis").torsion, replace(taxel, twist=0.5).torsion) == (2.0, 0.5)
-
-
-@pytest.mark.parametrize("name", ["strike", "hear"])
-@pytest.mark.parametrize("point", [(np.nan, 0, 0), (50.0, 0, 0), (0.05,), (0.0, 0.0)])
-def test_a_body_is_struck_and_heard_on_its_surface(name, point) -> None:
-    pytest.importorskip("skfem")
-    bar = Geometry(name="bar", link="bar", kind="box", size=(0.05, 0.01, 0.01))
-    with pytest.raises(UsageError, match=rf"{name}|metres"):
-        find_modes(bar, "steel", count=1, cells=4, cache=False, **{name: point})
 
 
 def test_a_source_above_half_the_sample_rate_is_told_and_a_pulse_ends_in_its_block() -> None:

@@ -143,7 +143,7 @@ def test_after_a_reset_nothing_of_the_old_episode_can_be_read(delay: float) -> N
     noise = Noise(white=1e-4, read_delay=delay)
     sensors = {
         "depth": ContactDepthProbe(link="hand", probes=GRID, noise=noise, history=3),
-        "near": SurfaceDistanceProbe(link="hand", probes=GRID, nearest=True),
+        "near": SurfaceDistanceProbe(link="hand", probes=GRID),
         "load": KinematicTaxel(link="hand", probes=GRID, total="engine"),
         "warm": TemperatureGrid(link="hand", tau=0.1),
     }
@@ -155,7 +155,7 @@ def test_after_a_reset_nothing_of_the_old_episode_can_be_read(delay: float) -> N
 
     def readings() -> list[torch.Tensor]:
         values = [read(name) for name in sensors for read in (suite.read, suite.read_ground_truth)]
-        return [*values, suite.read_history("depth"), suite.read_nearest("near")]
+        return [*values, suite.read_history("depth")]
 
     before = [values.clone() for values in readings()]
     assert all(values[1].any() for values in before)
@@ -267,8 +267,6 @@ def test_states_and_names_that_do_not_fit_are_refused() -> None:
         suite.read("dept")
     with pytest.raises(UsageError, match=r"'depth' .*history="):
         suite.read_history("depth")
-    with pytest.raises(UsageError, match=r"'depth' .*nearest=True"):
-        suite.read_nearest("depth")
     with pytest.raises(UsageError, match="are 0 to 1"):
         suite.reset([2])
 

@@ -86,19 +86,9 @@ def test_frequencies_scale_with_the_speed_of_sound_and_against_size():
 def test_shapes_are_normalised_by_mass_and_normals_point_outward():
     half = (0.03, 0.02, 0.01)
     mesh = fill(_solid("box", *half), 6)
-    _frequency, normal, points = solve(mesh, STEEL, 3)
-    assert len(points) == len(normal)
+    _frequency, normal = solve(mesh, STEEL, 3)
     mass = STEEL.density * 8 * math.prod(half)
     assert 0.1 < np.sqrt(np.mean(normal**2, axis=0)).max() * math.sqrt(mass) < 5
-
-
-@pytest.mark.slow
-def test_a_point_of_rest_does_not_excite_a_mode():
-    solid = _solid("box", 0.1, 0.005, 0.004)
-    ends = find_modes(solid, STEEL, count=1, cells=40, strike=(0.1, 0, 0.004), hear=(0.1, 0, 0.004))
-    # The free beam's first mode rests at 0.224 of its length.
-    node = find_modes(solid, STEEL, count=1, cells=40, strike=(0.1 - 0.2 * 0.224, 0, 0.004), hear=(0.1, 0, 0.004))
-    assert abs(node.gain[0]) < 0.1 * abs(ends.gain[0])
 
 
 def test_decays_follow_rayleigh_and_results_are_cached(tmp_path, monkeypatch):

@@ -30,35 +30,30 @@ def _points(count: int = 60) -> np.ndarray:
     return np.random.default_rng(0).uniform(-0.02, 0.02, (count, 3))
 
 
-def _read(query: str) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray], dict[str, np.ndarray]]:
+def _read(query: str) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
     scene, rng = pad_scene(*OBJECTS), np.random.default_rng(1)
     probes = Probes(_points(), np.tile([0, 0, 1.0], (60, 1)), 0.001)
-    sensors = {
-        g.link: SurfaceDistanceProbe(link="hand", probes=probes, track=(g.link,), query=query, nearest=True)
-        for g in OBJECTS
-    }
+    sensors = {g.link: SurfaceDistanceProbe(link="hand", probes=probes, track=(g.link,), query=query) for g in OBJECTS}
     poses = np.stack([np.stack([random_pose(rng, 0.01) for _ in scene.links])])
     suite = SensorSuite(scene, sensors, num_envs=1, resolution=64)
     suite.update(state_of(scene, poses, touch=False))
     hand = poses[0, 1]
     world = rotation_of(hand[3:]).apply(_points()) + hand[:3]
-    local, nearest = {}, {}
+    local = {}
     for g in OBJECTS:
         pose = poses[0, scene.link_index(g.link)]
         back = rotation_of(pose[3:]).inv()
         local[g.link] = back.apply(world - pose[:3])
-        near = rotation_of(hand[3:]).apply(suite.read_nearest(g.link)[0].numpy()) + hand[:3]
-        nearest[g.link] = back.apply(near - pose[:3])
-    return {name: suite.read(name)[0].numpy() for name in sensors}, local, nearest
+    return {name: suite.read(name)[0].numpy() for name in sensors}, local
 
 
 @pytest.fixture(scope="module")
-def by_fields() -> tuple[dict[str, np.ndarray], dict[str, np.ndarray], dict[str, np.ndarray]]:
+def by_fields() -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
     return _read("sdf")
 
 
 @pytest.fixture(scope="module")
-def by_triangles() -> tuple[dict[str, np.ndarray], dict[str, np.ndarray], dict[str, np.ndarray]]:
+def by_triangles() -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
     return _read("raycast")
 
 
@@ -97,7 +92,7 @@ def _exact(kind: str, x: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("kind", list(SIZES))
 def test_distance_to_a_primitive_is_its_closed_form(kind: str, by_fields: tuple) -> None:
-    read, local, _ = by_fields
+    read, local = by_fields
     np.testing.assert_allclose(read[kind], _exact(kind, local[kind]), atol=2e-7)
 
 
@@ -112,7 +107,7 @@ def test_distance_field_of_a_mesh_comes_within_a_tenth_of_a_cell_of_its_triangle
 
 
 def test_triangles_of_a_torus_lie_within_their_sagitta(by_triangles: tuple) -> None:
-    read, local, _ = by_triangles
+    read, local = by_triangles
     sagitta = 0.005 * (1 - np.cos(np.pi / 24)) + 0.017 * (1 - np.cos(np.pi / 48))
     error = read["mesh"] - _exact("mesh", local["mesh"])
     assert error.max() < sagitta
@@ -123,12 +118,6 @@ def test_triangles_of_a_torus_lie_within_their_sagitta(by_triangles: tuple) -> N
 def test_triangles_agree_with_fields(kind: str, by_fields: tuple, by_triangles: tuple) -> None:
     difference = np.abs(by_fields[0][kind] - by_triangles[0][kind]).max()
     assert difference < (1e-7 if kind == "box" else 4e-5)
-
-
-@pytest.mark.parametrize("kind", [*SIZES, "mesh"])
-def test_nearest_points_lie_on_the_surface(kind: str, by_fields: tuple) -> None:
-    _, _, nearest = by_fields
-    assert np.abs(_exact(kind, nearest[kind])).max() < (8e-5 if kind == "mesh" else 1e-6)
 
 
 def test_a_field_far_away_still_tells_the_distance_to_the_surface() -> None:
