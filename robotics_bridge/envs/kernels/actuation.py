@@ -44,7 +44,7 @@ def actuate(
     ctrl: wp.array2d(dtype=wp.float32),
     power: wp.array2d(dtype=wp.float32),
 ):
-    # A thread is a joint of an environment.
+    """Write the torque (N·m) of each joint of each environment, dim [B, J], and its mean power in a control step."""
     env, joint = wp.tid()
     q = qpos[env, d.position[joint]]
     v = qvel[env, d.speed[joint]]
@@ -89,7 +89,7 @@ def add_contact_forces(
     row: wp.array(dtype=wp.int32),  # [G] row of each geometry; -1 for none
     total: wp.array2d(dtype=wp.vec3f),  # [B, R] (N), added to
 ):
-    # A thread is a contact: its force acts on the second geometry, the opposite one on the first.
+    """Add the force of each contact, dim [C], to the second geometry, and the opposite one to the first."""
     c = wp.tid()
     if c >= count[0]:
         return

@@ -70,11 +70,13 @@ class SolidShape:
 
 @wp.func
 def plane(size: wp.vec3f, x: wp.vec3f) -> wp.vec4f:
+    """Return the outward normal at a point (m, frame of the solid), and its signed distance (m), as do those below."""
     return wp.vec4f(0.0, 0.0, 1.0, x[2])
 
 
 @wp.func
 def sphere(size: wp.vec3f, x: wp.vec3f) -> wp.vec4f:
+    """Return normal and signed distance (m); ``size`` is the radius. Upwards in the middle."""
     far = wp.length(x)
     n = wp.vec3f(0.0, 0.0, 1.0)
     if far > 1.0e-12:
@@ -84,13 +86,14 @@ def sphere(size: wp.vec3f, x: wp.vec3f) -> wp.vec4f:
 
 @wp.func
 def capsule(size: wp.vec3f, x: wp.vec3f) -> wp.vec4f:
+    """Return normal and signed distance (m); ``size`` is the radius and half the length between the round ends."""
     return sphere(size, wp.vec3f(x[0], x[1], x[2] - wp.clamp(x[2], -size[1], size[1])))
 
 
 @wp.func
 def cylinder(size: wp.vec3f, x: wp.vec3f) -> wp.vec4f:
-    # Signed distance to a capped cylinder: Euclidean to the rim where both are exceeded, else the nearer of side and
-    # end.
+    """Return normal and signed distance (m) of a capped cylinder; ``size`` is the radius and half the height."""
+    # Euclidean to the rim where both are exceeded, else the nearer of side and end.
     radial = wp.sqrt(x[0] * x[0] + x[1] * x[1])
     side = radial - size[0]
     end = wp.abs(x[2]) - size[1]
@@ -110,8 +113,9 @@ def cylinder(size: wp.vec3f, x: wp.vec3f) -> wp.vec4f:
 
 @wp.func
 def box(size: wp.vec3f, x: wp.vec3f) -> wp.vec4f:
-    # Signed distance to a box by symmetry in one octant: length of the positive excesses outside, the largest of the
-    # three (all negative) inside, with that face's normal.
+    """Return normal and signed distance (m); ``size`` holds half the edges."""
+    # By symmetry in one octant: length of the positive excesses outside, the largest of the three (all negative)
+    # inside, with that face's normal.
     ox = wp.abs(x[0]) - size[0]
     oy = wp.abs(x[1]) - size[1]
     oz = wp.abs(x[2]) - size[2]

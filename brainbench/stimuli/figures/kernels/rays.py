@@ -20,6 +20,7 @@ def first_hit(
     face: wp.array(dtype=int),
     weights: wp.array(dtype=wp.vec3),
 ):
+    """Write the face that the ray of each pixel of a block meets first (−1: none), and the weights of its corners."""
     i = wp.tid()
     x = float((first + i) % width)
     y = float((first + i) / width)
@@ -34,6 +35,7 @@ def first_hit(
 
 @wp.kernel
 def blocked(mesh: wp.uint64, start: wp.array(dtype=wp.vec3), along: wp.vec3, dark: wp.array(dtype=wp.uint8)):
+    """Write for each point ``start`` [n] whether a triangle stands between it and the light (1) or none does (0)."""
     i = wp.tid()
     hit = wp.mesh_query_ray(mesh, start[i], along, FAR)
     dark[i] = wp.uint8(0)
