@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cache
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -163,70 +163,20 @@ _LOG = logging.getLogger(__name__)
 WARM_UP = 3  # runs before a recording: they choose algorithms, fill caches and allocate
 
 
-class Graph(Protocol):
-    """A recorded piece of work."""
-
-    def replay(self) -> Any:
-        """Do it again, on the memory that it was recorded with."""
-        ...
+Recorder = Callable[[Callable[[], Any]], tuple[Any, Any]]
+"""Records a piece of work, which does not run; returns its graph, whose ``replay()`` does it on the memory that it was
+recorded with, and the tensors that replays fill."""
 
 
-Recorder = Callable[[Callable[[], Any]], tuple[Graph, Any]]
-"""Records a piece of work, which does not run, and returns its graph and the tensors that replays fill."""
+def record_torch(work: Callable[[], Any]) -> tuple[torch.cuda.CUDAGraph, Any]:
+    """Record torch's work; a :data:`Recorder`."""
+    import torch
 
-
-def torch_recorder(generators: Sequence[torch.Generator] = ()) -> Recorder:
-    """Return a recorder of torch's work; ``generators`` are those it draws from, beside torch's own on the device."""
-
-    def record(work: Callable[[], Any]) -> tuple[Graph, Any]:
-        import torch
-
-        graph = torch.cuda.CUDAGraph()
-        for generator in generators:
-            graph.register_generator_state(generator)
-        # Other threads may work on the same device meanwhile.
-        with torch.cuda.graph(graph, capture_error_mode="thread_local"):
-            result = work()
-        return graph, result
-
-    return record
-
-
-def warp_recorder(device: Any, generators: Sequence[torch.Generator] = ()) -> Recorder:
-    """Return a recorder of work of torch and Warp together, without gradients.
-
-    Args:
-        device: Warp's CUDA device.
-        generators: Random numbers that the work draws, beside torch's own on the device.
-    """
-
-    def record(work: Callable[[], Any]) -> tuple[Graph, Any]:
-        import torch
-
-        wp = warp()
-        where = wp.device_to_torch(device)
-        # What Python throws away meanwhile could free device memory, which ends a recording.
-        gc.collect()
-        external = torch.cuda.ExternalStream(device.stream.cuda_stream, device=where)
-        graph, side = torch.cuda.CUDAGraph(), torch.cuda.Stream(where)
-        for generator in generators:
-            graph.register_generator_state(generator)
-        stream = wp.stream_from_torch(side)
-        with contextlib.ExitStack() as scope:
-            scope.enter_context(no_collection())
-            scope.enter_context(torch.cuda.device(where))
-            # A recording that breaks off leaves torch on its stream.
-            scope.enter_context(torch.cuda.stream(torch.cuda.current_stream(where)))
-            # Results outlive the caller's inference mode, tensors of which no gradient could ever pass.
-            scope.enter_context(torch.inference_mode(False))
-            scope.enter_context(torch.no_grad())
-            scope.enter_context(torch.cuda.graph(graph, stream=side, capture_error_mode="thread_local"))
-            # Waiting for Warp's own stream would tie the recording to work outside of it.
-            scope.enter_context(wp.ScopedStream(stream, sync_enter=False))
-            result = work()
-        return _BetweenStreams(graph, external), result
-
-    return record
+    graph = torch.cuda.CUDAGraph()
+    # Other threads may work on the same device meanwhile.
+    with torch.cuda.graph(graph, capture_error_mode="thread_local"):
+        result = work()
+    return graph, result
 
 
 class CudaGraphStep:
@@ -235,7 +185,7 @@ class CudaGraphStep:
     Args:
         work: Returns tensors in dictionaries and tuples, or None. Random numbers are those that it would draw
             unrecorded.
-        recorder: :func:`torch_recorder` or :func:`warp_recorder`, made with the same generators.
+        recorder: :func:`record_torch`, or another that knows the same generators.
         subject: What is recorded, for messages: ``"The control step"``.
         advice: What to do if it cannot be, for the error where a recording is required.
         warm_up: Calls before the recording.
@@ -262,7 +212,7 @@ class CudaGraphStep:
         self.work, self.recorder = work, recorder
         self._subject, self._advice, self._required = subject, advice, required
         self._left, self._aside, self._generators, self._kept = warm_up, aside, tuple(generators), retained
-        self._graph: Graph | None = None
+        self._graph: Any = None
         self._result: Any = None
         self.failed: str = ""
         """Reason why the work could not be recorded; empty if it was, or was not tried yet."""
@@ -325,7 +275,7 @@ def record_step(work: Callable[[], None], device: torch.device) -> Callable[[], 
     if side is None:
         return work
     side.synchronize()
-    graph, _ = torch_recorder()(work)
+    graph, _ = record_torch(work)
     return graph.replay
 
 
@@ -348,22 +298,6 @@ def side_stream(device: torch.device | None = None) -> Iterator[torch.cuda.Strea
     with torch.cuda.stream(side):
         yield side
     torch.cuda.current_stream(device).wait_stream(side)
-
-
-class _BetweenStreams:
-    """A recorded graph that is replayed on torch's stream, between what Warp does on its own."""
-
-    def __init__(self, graph: torch.cuda.CUDAGraph, warp_stream: torch.cuda.Stream) -> None:
-        self._graph, self._warp = graph, warp_stream
-
-    def replay(self) -> None:
-        """Launch the graph on torch's current stream, in order with what Warp is given before and after."""
-        import torch
-
-        current = torch.cuda.current_stream(self._warp.device)
-        current.wait_stream(self._warp)
-        self._graph.replay()
-        self._warp.wait_stream(current)
 
 
 @contextlib.contextmanager

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from brainbench.core.devices import CudaGraphStep, warp_recorder
+from brainbench.core.devices import CudaGraphStep
 from brainbench.core.errors import UsageError, check_kind, check_number, needing
 from robotics_bridge import hands
-from robotics_bridge.envs.simulation import EnvOptions
+from robotics_bridge.envs.simulation import EnvOptions, warp_recorder
 from robotics_bridge.envs.state import EnvState
 from robotics_bridge.envs.step import (
     STATISTICS,

@@ -10,14 +10,16 @@ B environment, J joint, F finger tip, K object, S physics step of a control step
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import contextlib
+import gc
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 
 import numpy as np
 import torch
 
-from brainbench.core.devices import mujoco_module, pick_device, warp
+from brainbench.core.devices import Recorder, mujoco_module, no_collection, pick_device, warp
 from brainbench.core.errors import UsageError, check_kind
 from brainbench.core.limits import Count, Limit, limited
 from brainbench.core.rotations import conjugate, from_xyzw, rotate
@@ -416,3 +418,52 @@ class TactileObservation:
         """Begin new episodes in some environments [B] bool."""
         self.suite.reset(mask)
         self.reading.masked_fill_(mask[:, None, None, None], 0.0)
+
+
+def warp_recorder(device: Any, generators: Sequence[torch.Generator]) -> Recorder:
+    """Return a recorder of work of torch and Warp together, without gradients.
+
+    Args:
+        device: Warp's CUDA device.
+        generators: Random numbers that the work draws, beside torch's own on the device.
+    """
+
+    def record(work: Callable[[], Any]) -> tuple[Any, Any]:
+        wp = warp()
+        where = wp.device_to_torch(device)
+        # What Python throws away meanwhile could free device memory, which ends a recording.
+        gc.collect()
+        external = torch.cuda.ExternalStream(device.stream.cuda_stream, device=where)
+        graph, side = torch.cuda.CUDAGraph(), torch.cuda.Stream(where)
+        for generator in generators:
+            graph.register_generator_state(generator)
+        stream = wp.stream_from_torch(side)
+        with contextlib.ExitStack() as scope:
+            scope.enter_context(no_collection())
+            scope.enter_context(torch.cuda.device(where))
+            # A recording that breaks off leaves torch on its stream.
+            scope.enter_context(torch.cuda.stream(torch.cuda.current_stream(where)))
+            # Results outlive the caller's inference mode, tensors of which no gradient could ever pass.
+            scope.enter_context(torch.inference_mode(False))
+            scope.enter_context(torch.no_grad())
+            scope.enter_context(torch.cuda.graph(graph, stream=side, capture_error_mode="thread_local"))
+            # Waiting for Warp's own stream would tie the recording to work outside of it.
+            scope.enter_context(wp.ScopedStream(stream, sync_enter=False))
+            result = work()
+        return _BetweenStreams(graph, external), result
+
+    return record
+
+
+class _BetweenStreams:
+    """A recorded graph that is replayed on torch's stream, between what Warp does on its own."""
+
+    def __init__(self, graph: torch.cuda.CUDAGraph, warp_stream: torch.cuda.Stream) -> None:
+        self._graph, self._warp = graph, warp_stream
+
+    def replay(self) -> None:
+        """Launch the graph on torch's current stream, in order with what Warp is given before and after."""
+        current = torch.cuda.current_stream(self._warp.device)
+        current.wait_stream(self._warp)
+        self._graph.replay()
+        self._warp.wait_stream(current)

@@ -26,7 +26,7 @@ from safetensors import safe_open
 from safetensors.torch import load_file
 from torch import nn
 
-from brainbench.core.devices import WARM_UP, CudaGraphStep, Graph, torch_recorder
+from brainbench.core.devices import WARM_UP, CudaGraphStep, record_torch
 from brainbench.core.errors import BrainbenchError, DataError, needing
 from brainbench.core.files import file_hash, provenance, read_mapping, write_tensors
 from brainbench.core.progress import Progress
@@ -246,10 +246,10 @@ class ChunkStep:
         self._optimizer.step()
         return {name: value.detach() for name, value in parts.items()}, memory.detach()
 
-    def _recorder(self, work: Callable[[], Any]) -> tuple[Graph, Any]:
+    def _recorder(self, work: Callable[[], Any]) -> tuple[Any, Any]:
         # Gradients are then allocated in the memory of the graph.
         self._optimizer.zero_grad(set_to_none=True)
-        return torch_recorder()(work)
+        return record_torch(work)
 
 
 _log = logging.getLogger(__name__)
