@@ -76,16 +76,6 @@ def write_whiskers(path, traces):
     return path
 
 
-def write_whiskers_text(path, traces):
-    """Write whisk's text file of traces."""
-    lines = ["whisker1 (frame,id,time,n,x1,y1,thick1,score1...,xn,yn,thickn,scoren)"]
-    for (frame, number), points in traces.items():
-        cells = [frame, number, frame, len(points), *(cell for x, y in points for cell in (x, y, 1, 1))]
-        lines.append(",".join(map(str, cells)))
-    path.write_text("\n".join(lines) + "\n")
-    return path
-
-
 def write_measurements(path, labels, follicles):
     """Write the table of whisk's measurements: labels and follicles (pixels) by (frame, number)."""
     with path.open("w", newline="") as stream:
@@ -117,12 +107,4 @@ def write_whiskerman(path, control, follicle, tracked):
     whisker[0, 0] = (control, follicle, tracked[:, None])
     whisker[0, 1] = (control, follicle, 0 * tracked[:, None])
     savemat(path, {"whisker": whisker}, appendmat=False)
-    return path
-
-
-def write_whiskerman_hdf5(path, control, follicle, tracked):
-    """Write the same of one whisker in MATLAB's format 7.3, whose axes are reversed."""
-    with h5py.File(path, "w", userblock_size=512) as file:
-        for name, values in (("r3all", control), ("fp3_all", follicle), ("tracked", tracked[:, None])):
-            file[f"whisker/{name}"] = np.asarray(values, dtype=float).T
     return path

@@ -1,29 +1,155 @@
-"""No command comes from an old report, and none is beyond the limits, wherever time is lost."""
+"""No command comes from an old report, and none is beyond the limits, wherever time is lost.
+
+Time is lost in the policy, in a source of observations, in reading, in the recorder and in garbage collection, at the
+first command and at a later one, by clocks that jitter, and by SIGSTOP.
+"""
 
 from __future__ import annotations
 
+import gc
+import itertools
+import json
 import os
 import re
+import signal
+import subprocess
+import sys
 import time
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from brainbench.core.errors import UsageError
-from robotics_bridge.deploy.controller import Controller
+from robotics_bridge.deploy.controller import Controller, Report
 from robotics_bridge.deploy.driver import Clock
 from robotics_bridge.deploy.safety import SILENCE, ClockOffset, Command, SafeLink, SafetyLimits
-from tests.factories.paper_hands import (
-    PLACES,
-    OwnClock,
-    PaperHand,
-    jitter,
-    make_contract,
-    make_limits,
-    run_session,
-    stalls,
-    suspended,
-)
+from tests.factories.paper_hands import NotingHand, OwnClock, PaperHand, make_contract, make_limits, run_session
+
+
+class JitteringClock(OwnClock):
+    """Time that passes between any two looks at it, sometimes much."""
+
+    def __init__(self, seed: int) -> None:
+        super().__init__()
+        self.chance = np.random.default_rng(seed)
+
+    def __call__(self) -> float:
+        self.now += float(self.chance.exponential(0.001)) + (self.chance.random() < 0.01) * self.chance.uniform(0, 20)
+        return self.now
+
+
+PLACES = ("policy", "source", "read", "record", "collection")
+STALLS = (0.05, 0.09, 0.2, 0.5, 1.0, 2.0, 5.0, 20.0)  # s
+TIMEOUTS = (0.06, 0.1, 0.3, 1.0, 2.0)  # s, oldest report to act upon
+
+
+@dataclass(frozen=True)
+class Stall:
+    """A session in which time was lost."""
+
+    length: float
+    """Time lost at once [s]; 0 where a clock jitters."""
+    timeout: float
+    """Oldest report to act upon [s]."""
+    ages: tuple[float, ...]
+    """Age of the newest report at each command [s]."""
+    status: str
+    reason: str
+    stops: int
+    """Times that the hand was stopped."""
+
+    @property
+    def stale(self) -> int:
+        """Number of commands from a report that was too old."""
+        return sum(age > self.timeout for age in self.ages)
+
+
+def stalls(place: str, call: int) -> Iterator[Stall]:
+    """Lose time at a place once, at a call of it, by each of the stalls with each of the timeouts."""
+    for length, timeout in itertools.product(STALLS, TIMEOUTS):
+        clock, calls = OwnClock(), Counter()
+
+        def lose_time(where: str, length=length, clock=clock, calls=calls) -> None:
+            calls[where] += 1
+            # The first report is only waited for.
+            if where == place and calls[where] == call + (where == "read"):
+                clock.now += length
+
+        def collect(phase: str, info: dict, lose_time=lose_time) -> None:
+            if phase == "stop":
+                lose_time("collection")
+
+        def policy(obs, forget, lose_time=lose_time):
+            lose_time("policy")
+            if place == "collection":
+                gc.collect(0)
+            return np.zeros(2, np.float32)
+
+        def source(reading, lose_time=lose_time):
+            lose_time("source")
+            return np.zeros(1)
+
+        hand = NotingHand(clock, lose_time)
+        controller = Controller(
+            policy, hand, make_contract(("proprio", "goal")), make_limits(timeout=timeout), sources={"goal": source},
+            clock=clock, record=lambda *_, lose_time=lose_time: lose_time("record"),
+        )  # fmt: skip
+        gc.callbacks.append(collect)
+        try:
+            report = controller.run(2.0)
+        finally:
+            gc.callbacks.remove(collect)
+        yield _stall(length, timeout, hand, report)
+
+
+def jitter(seeds: range) -> Iterator[Stall]:
+    """Run a session by a clock that jitters, for each seed."""
+    for seed in seeds:
+        clock = JitteringClock(seed)
+        hand = NotingHand(clock)
+        hand.clock = lambda clock=clock: clock.now  # the hand's own look takes no time
+        report = Controller(lambda obs, forget: np.zeros(2), hand, make_contract(), make_limits(), clock=clock).run(5.0)
+        yield _stall(0.0, 0.1, hand, report)
+
+
+def _stall(length: float, timeout: float, hand: NotingHand, report: Report) -> Stall:
+    return Stall(length, timeout, tuple(hand.ages), report.status, report.reason, hand.stops)
+
+
+SIGNAL_DELAY = 0.01
+"""Between the link's look at its clock and the hand's a signal may fall, of which nobody is told [s]."""
+_SESSION = """
+import json
+import numpy as np
+from robotics_bridge.deploy.controller import Clock, Controller
+from tests.factories.paper_hands import NotingHand, make_contract, make_limits
+
+hand = NotingHand(Clock())
+limits = make_limits(rate_share=0.01)
+controller = Controller(lambda obs, forget: np.zeros(2), hand, make_contract(), limits, clock=hand.clock)
+print("running", flush=True)
+report = controller.run(2.0)
+print(json.dumps([hand.ages, report.status, report.reason, hand.stops]))
+"""
+
+
+def suspended(length: float) -> Stall:
+    """Suspend the process of a session by SIGSTOP for a time [s]."""
+    process = subprocess.Popen(
+        [sys.executable, "-c", _SESSION], stdout=subprocess.PIPE, text=True, cwd=Path(__file__).parents[3]
+    )
+    assert process.stdout is not None
+    process.stdout.readline()
+    time.sleep(0.5)
+    process.send_signal(signal.SIGSTOP)
+    time.sleep(length)
+    process.send_signal(signal.SIGCONT)
+    ages, *rest = json.loads(process.communicate(timeout=60)[0])
+    return Stall(length, 0.1 + SIGNAL_DELAY, tuple(ages), *rest)
 
 
 def test_targets_keep_to_limits_of_joint_and_speed() -> None:

@@ -18,6 +18,24 @@ SHAPES = tracks.bent_shapes()
 PIXELS = SHAPES / SCALE * [1, -1]
 
 
+def write_whiskers_text(path, traces):
+    """Write whisk's text file of traces."""
+    lines = ["whisker1 (frame,id,time,n,x1,y1,thick1,score1...,xn,yn,thickn,scoren)"]
+    for (frame, number), points in traces.items():
+        cells = [frame, number, frame, len(points), *(cell for x, y in points for cell in (x, y, 1, 1))]
+        lines.append(",".join(map(str, cells)))
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def write_whiskerman_hdf5(path, control, follicle, tracked):
+    """Write the same of one whisker in MATLAB's format 7.3, whose axes are reversed."""
+    with h5py.File(path, "w", userblock_size=512) as file:
+        for name, values in (("r3all", control), ("fp3_all", follicle), ("tracked", tracked[:, None])):
+            file[f"whisker/{name}"] = np.asarray(values, dtype=float).T
+    return path
+
+
 def _options(**changes):
     return TrackOptions(metres_per_pixel=SCALE, frame_rate=RATE, **changes)
 
@@ -32,7 +50,7 @@ def _two_whiskers():
     return traces, labels, follicles
 
 
-@pytest.mark.parametrize("write", [tracks.write_whiskers, tracks.write_whiskers_text])
+@pytest.mark.parametrize("write", [tracks.write_whiskers, write_whiskers_text])
 def test_whisk_traces_are_chosen_by_label_and_turned_by_follicle(tmp_path, write):
     traces, labels, follicles = _two_whiskers()
     path = write(tmp_path / "a.whiskers", traces)
@@ -128,7 +146,7 @@ def test_names_in_a_pickle_are_read_and_nothing_is_executed():
         pickled_names(pickle.dumps([Bomb()]), "file")
 
 
-@pytest.mark.parametrize("write", [tracks.write_whiskerman, tracks.write_whiskerman_hdf5])
+@pytest.mark.parametrize("write", [tracks.write_whiskerman, write_whiskerman_hdf5])
 def test_whiskerman_curves_are_evaluated_from_the_follicle(tmp_path, write):
     rng = np.random.default_rng(0)
     t = np.array([0.0, 0.5, 1.0])
