@@ -48,6 +48,7 @@ Nodes = wp.types.vector(length=SORTED, dtype=wp.int32)
 ROUNDS = 12  # times that weights lean over at most
 STEEPEST, STRIDE = 40.0, 6.0  # largest exponent of a weight, and the most by which a round changes it
 ASIDE = 1e-4  # share of a face's normal below which a taxel lies beside it: rounding of a right angle carries nothing
+LOUDEST = 2.0  # loads of a contact that a taxel shows at most, whatever its noise
 TOUCH, BEHIND, NEAR = range(3)  # sources of carriers
 
 
@@ -643,8 +644,12 @@ def spread_kernel(kinds: frozenset[int], raycast: bool, mode: int, sticky: bool,
                                         reading += load_planes(io.truth, env, c.n, 6)
                                     store_planes(io.truth, env, c.n, 6, reading)
                                     if wp.static(noisy):
-                                        reading = wp.spatial_vector(c.noisy * unit, wp.cross(c.x, c.noisy * unit))
-                                        if not fresh:
+                                        # Radius noise of a taxel that hardly touches is beyond all that it weighs.
+                                        loudest = wp.static(LOUDEST) * wp.length(push.force)
+                                        shown = wp.min(c.noisy, loudest / wp.max(wp.length(unit), 1.0e-30)) * unit
+                                        reading = wp.spatial_vector(shown, wp.cross(c.x, shown))
+                                        # Until it is filled, what is measured may be anything.
+                                        if not fresh and press.filled[env, c.n] != wp.uint8(0):
                                             reading += load_planes(io.measured, env, c.n, 6)
                                         store_planes(io.measured, env, c.n, 6, reading)
                                     press.filled[env, c.n] = wp.uint8(1)

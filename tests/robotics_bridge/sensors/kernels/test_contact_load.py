@@ -376,6 +376,41 @@ CLOTH = (
 )
 
 
+def test_noisy_readings_of_two_balls_on_one_pad_stay_the_same_at_every_update() -> None:
+    ball = 'type="sphere" size=".01" mass='
+    engine = _engine(_free("left", "-.02 0 .0205", f'{ball}".1"') + _free("right", ".02 0 .0205", f'{ball}".2"'))
+    taxels = KinematicTaxel(link="pad", probes=GRID, total="engine", noise=Noise(white=1e-9))
+    suite = SensorSuite(engine.scene, {"t": taxels}, num_envs=1)
+    for _ in range(4):
+        suite.update(engine.state, 0.002)
+        np.testing.assert_allclose(suite.read("t"), suite.read_ground_truth("t"), atol=1e-6)
+    np.testing.assert_allclose(suite.read("t")[0].reshape(-1, 6).sum(0)[:3], _on(engine)[:3], atol=1e-3)
+
+
+def test_radius_noise_of_taxels_that_hardly_touch_shows_at_most_twice_the_load() -> None:
+    engine = _engine(_free("ball", "0 0 .0205", 'type="sphere" size=".01" mass=".1"'))
+    centre = engine.data[0].body("ball").xpos
+    points = np.array([[x, y, 0.01] for x in (-0.002, 0.002) for y in (-0.002, 0.002)])
+    gap = float(np.linalg.norm(points - centre, axis=1).min()) - 0.01
+    probes = Probes(points, np.tile([0.0, 0.0, 1.0], (4, 1)), radius=gap * (1 + 1e-5))
+    taxels = KinematicTaxel(link="pad", probes=probes, total="engine", noise=Noise(radius=3e-4))
+    suite, load, shown = SensorSuite(engine.scene, {"t": taxels}, num_envs=1), _on(engine)[2], []
+    for _ in range(20):
+        suite.update(engine.state, 0.002)
+        shown.append(float(suite.read("t")[0].reshape(-1, 6)[:, :3].norm(dim=1).max()))
+    assert abs(load) < max(shown) <= 2.001 * abs(load)
+
+
+def test_states_with_room_for_more_and_for_fewer_contacts_are_read_in_turn() -> None:
+    few = _engine(_free("ball", "0 0 .0205", 'type="sphere" size=".01" mass=".1"'))
+    suite = SensorSuite(few.scene, {"t": KinematicTaxel(link="pad", probes=GRID, total="engine")}, num_envs=1)
+    many = MujocoEngine(few.model, 1, contacts=4000)
+    many.step(500)
+    for engine in (few, many, few, many):
+        suite.update(engine.state, 0.002)
+        np.testing.assert_allclose(suite.read("t")[0].reshape(-1, 6).sum(0)[2], _on(engine)[2], rtol=1e-4)
+
+
 def test_a_flex_is_felt_by_the_contacts_of_the_engine_and_refused_by_name_elsewhere() -> None:
     engine = _engine(CLOTH, steps=600)
     expected, (total, suite) = _on(engine), _read(engine)
