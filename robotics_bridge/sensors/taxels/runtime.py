@@ -139,16 +139,19 @@ class ContactLoadRuntime(KinematicRuntime):
         faces.head, faces.listed = (context.array(np.full((envs, len(places)), -1), int) for _ in range(2))
         faces.items, faces.count = context.zeros((2, items), wp.vec2i), context.zeros(2, int)
         press.filled = context.zeros(shape, wp.uint8)
+        # Launches that were packed or recorded for other states go on with what they had.
+        self._rooms = list[Any]()
         self._room(0)
 
     def _room(self, contacts: int) -> None:
         for name, dtype in (("follower", int), ("watched", int), ("chain", int), ("face", Face)):
-            setattr(self.faces, name, self.context.zeros(2 * contacts, dtype))
+            self._rooms.append(self.context.zeros(2 * contacts, dtype))
+            setattr(self.faces, name, self._rooms[-1])
 
     def run_kernels(self, state: HandState, dt: float) -> None:
         """Run the kernels."""
         c, room, cuda = self.context, state.contact_env.shape[0], self.context.device.is_cuda
-        if self.faces.face.shape[0] != 2 * room:
+        if self.faces.face.shape[0] < 2 * room:
             self._room(room)
         plan, faces, link_of = self.plan, self.faces, c.solids.struct.link
         scene = [link_of, state.arrays, state.contact_friction]
