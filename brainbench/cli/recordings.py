@@ -251,12 +251,13 @@ def export(
 def fetch(
     name: Annotated[str, typer.Argument(help="A layout ('rodgers') or the six digits of a dandiset.")],
     out: Annotated[Path, out_folder_option("Folder to put it in.")] = Path(),
+    assets: Annotated[str | None, typer.Option(help="Glob of the files wanted, e.g. 'sub-231CR/*'.")] = None,
 ) -> Output:
     """Download a public data set with the dandi client; without a network or that client, nothing is tried."""
     from brainbench.datasets import fetch as fetch_files
 
     with progress_bar("downloading"):
-        folder = fetch_files(name, out)
+        folder = fetch_files(name, out, assets=assets)
     return Output({"folder": folder}, str(folder))
 
 

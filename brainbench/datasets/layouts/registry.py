@@ -202,15 +202,15 @@ SYNTHETIC = RecordingLayout(
 )
 
 
-def fetch(name: str, folder: str | os.PathLike[str] = ".") -> Path:
+def fetch(name: str, folder: str | os.PathLike[str] = ".", *, assets: str | None = None) -> Path:
     """Download a data set of the DANDI archive (https://dandiarchive.org).
 
-    What is there already is kept if unchanged, so an interrupted download goes on. Files that the layout cannot use are
-    left out.
+    What is there already is kept if unchanged, so an interrupted download goes on.
 
     Args:
         name: a layout's name, or the six digits of a dandiset.
         folder: where to put it.
+        assets: glob of the files wanted, such as ``"sub-231CR/*"``; by default those that the layout can use, else all.
 
     Returns:
         The folder of the data set, ``folder/NUMBER``.
@@ -223,6 +223,7 @@ def fetch(name: str, folder: str | os.PathLike[str] = ".") -> Path:
             f"{install_command('dandi')}; or get DANDI:{number} elsewhere: every other command works on files, "
             "without a network."
         )
+    pattern = assets or pattern
     source = f"dandi://dandi/{number}/{pattern}" if pattern else f"DANDI:{number}"
     target = Path(folder)
     # Keeping the tree keeps two animals' files of the same name apart.
