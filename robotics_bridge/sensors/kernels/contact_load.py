@@ -37,8 +37,7 @@ from robotics_bridge.sensors.kernels.readout import (
     clear,
     group_functions,
     load_four,
-    load_planes,
-    store_planes,
+    put_push,
 )
 
 wp = warp()
@@ -639,19 +638,14 @@ def spread_kernel(kinds: frozenset[int], raycast: bool, mode: int, sticky: bool,
                                 if c.weight + c.noisy > 0.0:
                                     unit = scale * c.way + c.facing * (even + wp.cross(tilt, c.x - center))
                                     total += c.weight * unit
-                                    reading = wp.spatial_vector(c.weight * unit, wp.cross(c.x, c.weight * unit))
-                                    if not fresh:
-                                        reading += load_planes(io.truth, env, c.n, 6)
-                                    store_planes(io.truth, env, c.n, 6, reading)
+                                    put_push(io.truth, env, c.n, c.x, c.weight * unit, not fresh)
                                     if wp.static(noisy):
                                         # Radius noise of a taxel that hardly touches is beyond all that it weighs.
                                         loudest = wp.static(LOUDEST) * wp.length(push.force)
-                                        shown = wp.min(c.noisy, loudest / wp.max(wp.length(unit), 1.0e-30)) * unit
-                                        reading = wp.spatial_vector(shown, wp.cross(c.x, shown))
+                                        force = wp.min(c.noisy, loudest / wp.max(wp.length(unit), 1.0e-30)) * unit
                                         # Until it is filled, what is measured may be anything.
-                                        if not fresh and press.filled[env, c.n] != wp.uint8(0):
-                                            reading += load_planes(io.measured, env, c.n, 6)
-                                        store_planes(io.measured, env, c.n, 6, reading)
+                                        adds = not fresh and press.filled[env, c.n] != wp.uint8(0)
+                                        put_push(io.measured, env, c.n, c.x, force, adds)
                                     press.filled[env, c.n] = wp.uint8(1)
                                 elif fresh:
                                     clear(press, io, env, c.n, wp.static(staged))

@@ -55,6 +55,15 @@ def store_planes(planes: wp.array3d(dtype=wp.float32), row: int, n: int, count: 
     ...
 
 
+@wp.func
+def put_push(planes: wp.array3d(dtype=wp.float32), row: int, n: int, x: wp.vec3f, force: wp.vec3f, add: bool):
+    """Write force (N) and torque (N·m) of a push at x (m), or add them to what is there."""
+    value = wp.spatial_vector(force, wp.cross(x, force))
+    if add:
+        value += load_planes(planes, row, n, 6)
+    store_planes(planes, row, n, 6, value)
+
+
 @cache
 def group_functions(lanes: int) -> SimpleNamespace:
     """Return functions of so many threads of a GPU, a power of 2 up to 32.
