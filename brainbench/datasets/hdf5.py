@@ -124,9 +124,10 @@ def read_counts(file: h5py.File, path: Path) -> xr.Dataset:
     try:
         attributes = parse_json(text(_need(file, "attributes", path)[()]), f"{path}/attributes")
         dims = {"counts": ("trial", "time", "unit"), "duration": ("trial", "time")}
-        arrays = (_need(file, name, path)[...] for name in dims)
-        native = (array.astype(array.dtype.newbyteorder("="), copy=False) for array in arrays)  # hashes are of bytes
-        variables = {name: (own, array) for (name, own), array in zip(dims.items(), native, strict=True)}
+        arrays = {name: _need(file, name, path)[...] for name in dims}
+        # In the byte order of this machine: hashes are of bytes.
+        native = {name: array.astype(array.dtype.newbyteorder("="), copy=False) for name, array in arrays.items()}
+        variables = {name: (own, native[name]) for name, own in dims.items()}
         dataset = xr.Dataset(variables, coordinates, attributes)
     except ValueError as error:
         raise DataError(f"{path} does not hold a consistent recordings data set ({error}).") from error

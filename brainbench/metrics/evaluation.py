@@ -134,7 +134,7 @@ def ceiling_of(animals: Animals, comparison: str) -> Ceiling | None:
     if len(animals.scored) < 2:
         return None
     bounds = noise_ceiling(animals.rdms(animals.scored), method=comparison)
-    return Ceiling(*bounds) if np.isfinite(bounds).all() else None
+    return None if bounds.reason else Ceiling(bounds.lower, bounds.upper)
 
 
 def mean_rdm(animals: Animals) -> tuple[float, ...]:

@@ -133,5 +133,6 @@ def _control(metric: Metric, animals: Sequence[SubjectRDM], labels: Sequence[str
 
 def _mean_places(start: NDArray[Any], codes: NDArray[Any], count: int) -> NDArray[np.float64]:
     """Return the mean place [K] of each stimulus' trials in their session, from 0 to 1."""
+    # Trials that begin together have one place: the order in which they are listed is that of their labels.
     places = mean_ranks(start) / max(1, len(start) - 1)
     return np.bincount(codes, weights=places, minlength=count) / np.bincount(codes, minlength=count)

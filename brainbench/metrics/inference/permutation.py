@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from brainbench.core.errors import UsageError, check_number
+from brainbench.core.records import Status
 from brainbench.metrics.arrays import Floats, Ints, find_device
 from brainbench.metrics.rdms import comparison
 
@@ -47,6 +48,11 @@ class PermutationTest:
     """[count] statistics, first the observed one."""
     reason: str = ""
     """Reason for an undefined p; empty otherwise."""
+
+    @property
+    def status(self) -> Status:
+        """``undefined`` without a p (the reason says why), else ``ok``."""
+        return "undefined" if math.isnan(self.p) else "ok"
 
     @property
     def monte_carlo_error(self) -> float:

@@ -446,6 +446,7 @@ def _unit_tunings(patterns: Floats) -> Floats:
 def _ordered(patterns: Floats) -> Floats:
     """Return units or features in an order that follows from their responses alone, for a sample of them is taken."""
     finite = patterns[np.isfinite(patterns).all(axis=1)]
+    # Whatever the order of the stimuli; of equal values, what each has in common with all of them decides.
     common = finite.mean(axis=1) @ finite
     return patterns[:, unit_order(np.sort(finite, axis=0), np.stack([finite @ common**2 @ finite, common]))]
 

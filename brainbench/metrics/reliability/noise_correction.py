@@ -187,6 +187,13 @@ class NoiseCeiling(NamedTuple):
     upper: float
     """Mean comparison of each animal with the pool of all, itself included."""
 
+    @property
+    def reason(self) -> str:
+        """Reason for bounds that are NaN; empty when they are not."""
+        if math.isfinite(self.lower) and math.isfinite(self.upper):
+            return ""
+        return "a noise ceiling needs at least two animals whose RDMs share pairs that differ"
+
 
 def noise_ceiling(rdms: ArrayLike, *, method: str = "pearson") -> NoiseCeiling:
     """Return the leave-one-out lower and all-mean upper noise ceiling of animals' RDMs [A, P].

@@ -210,7 +210,10 @@ def _finer(fidelity: Fidelity, job: Job, by_step: float, by_links: float) -> Fid
 
 
 def remark_on(error: float, promise: float = LARGEST_ERROR, *, jams: bool = False, tried: bool = False) -> str:
-    """Return in words that an error is beyond what is promised, else nothing; settings ``tried`` are no advice."""
+    """Return in words that an estimated error is beyond what is promised; empty where it is not.
+
+    Where finer settings were ``tried``, as ``auto`` does, they are no advice.
+    """
     if not error > promise:
         return ""
     words = f"an error of {error:.0%}" if np.isfinite(error) else "an error that cannot be told"

@@ -47,7 +47,7 @@ def test_the_smallest_p_is_reached_by_the_truth():
     model = make_rdm(np.random.default_rng(2))
     found = permutation_test(model, model)
     assert found.p == found.smallest == pytest.approx(0.00139, abs=5e-6)
-    assert found.reason == ""
+    assert found.status == "ok"
 
 
 def test_orders_that_map_an_rdm_onto_itself_tie_with_the_observed_one():
@@ -63,6 +63,7 @@ def test_fewer_than_four_stimuli_have_no_p_but_state_the_smallest(stimuli, small
     found = permutation_test(make_rdm(rng, stimuli), make_rdm(rng, stimuli))
     assert np.isnan(found.p)
     assert found.smallest == pytest.approx(smallest)
+    assert found.status == "undefined"
     assert found.reason.startswith(f"{stimuli} stimuli allow no p below")
 
 

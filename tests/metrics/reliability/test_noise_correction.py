@@ -232,9 +232,12 @@ def test_the_ceiling_brackets_the_true_geometry():
     assert np.mean(inside, axis=0).min() > 0.9
 
 
-def test_one_animal_has_no_ceiling():
-    assert np.isnan(noise_ceiling(_make_animals(1))).all()
-    assert np.isfinite(noise_ceiling(_make_animals(2))).all()
+def test_one_animal_has_no_ceiling_and_says_why():
+    found = noise_ceiling(_make_animals(1))
+    lower, upper = found
+    assert np.isnan([lower, upper]).all()
+    assert "at least two animals" in found.reason
+    assert noise_ceiling(_make_animals(2)).reason == ""
 
 
 def test_the_order_of_animals_is_irrelevant():
