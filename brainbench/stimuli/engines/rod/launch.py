@@ -169,7 +169,7 @@ _COUNTS = ("status", "steps", "touching", "crowded", "unsolved")
 """Counts of each job, of those that its kernel keeps."""
 
 
-FEW, SMALL = 64, 2**16
+MOST_JOBS, MOST_NUMBERS = 64, 2**16
 """Jobs of a launch, and numbers that go in and out, up to which its memory is kept for the next one."""
 
 
@@ -425,7 +425,7 @@ class WhiskerSolver:
         room = getattr(self.rooms, "last", None)
         with lock_of(device):
             if room is None or room.shapes != shapes:
-                small = device.is_cpu and count <= FEW and sum(map(math.prod, shapes)) <= SMALL
+                small = device.is_cpu and count <= MOST_JOBS and sum(map(math.prod, shapes)) <= MOST_NUMBERS
                 room = Room(
                     shapes,
                     [to_struct(kind, values, device, copy=small) for kind, values in parts.items()],
