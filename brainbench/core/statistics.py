@@ -138,12 +138,6 @@ class PresentationOrder:
         return f"the label explains {share} % of the variance of trial times ({expected} % if shuffled)"
 
 
-def mean_ranks(values: ArrayLike) -> NDArray[np.float64]:
-    """Return the ranks [R] of values from 0; equal ones have the mean of theirs."""
-    _, place, number = np.unique(np.asarray(values), return_inverse=True, return_counts=True)
-    return (np.cumsum(number) - (number + 1) / 2)[place]
-
-
 def presentation_order(times: ArrayLike, labels: ArrayLike) -> PresentationOrder | None:
     """Return what labels [R] explain of the times [R] of a session's trials; None below three labels of two trials.
 
@@ -151,13 +145,15 @@ def presentation_order(times: ArrayLike, labels: ArrayLike) -> PresentationOrder
     0.9
     """
     from scipy.special import fdtrc
+    from scipy.stats import rankdata
 
     names, codes = np.unique(np.asarray(labels), return_inverse=True)
     order = np.asarray(times, dtype=np.float64)
     counts = np.bincount(codes)
     if len(names) < 3 or counts.min() < 2 or not np.isfinite(order).all() or not np.ptp(order):
         return None
-    ranks = mean_ranks(order)
+    # Trials that begin together have the mean of their ranks.
+    ranks = rankdata(order)
     ranks = ranks - ranks.mean()
     share = float((np.bincount(codes, weights=ranks) ** 2 / counts).sum() / (ranks**2).sum())
     between, within = len(names) - 1, len(order) - len(names)

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.records import Score
-from brainbench.core.statistics import PresentationOrder, mean_ranks, presentation_order
+from brainbench.core.statistics import PresentationOrder, presentation_order
 
 if TYPE_CHECKING:
     from brainbench.metrics import Metric
@@ -133,6 +133,8 @@ def _control(metric: Metric, animals: Sequence[SubjectRDM], labels: Sequence[str
 
 def _mean_places(start: NDArray[Any], codes: NDArray[Any], count: int) -> NDArray[np.float64]:
     """Return the mean place [K] of each stimulus' trials in their session, from 0 to 1."""
+    from scipy.stats import rankdata
+
     # Trials that begin together have one place: the order in which they are listed is that of their labels.
-    places = mean_ranks(start) / max(1, len(start) - 1)
+    places = (rankdata(start) - 1) / max(1, len(start) - 1)
     return np.bincount(codes, weights=places, minlength=count) / np.bincount(codes, minlength=count)
