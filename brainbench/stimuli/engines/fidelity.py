@@ -54,11 +54,12 @@ class Fidelity:
     twist: bool | None = field(default=None, metadata={"later": True, "before": False})
     """True lets whiskers twist about their axis; one that stays in one plane is computed without in any case. None: as
     the scenes say (:attr:`brainbench.stimuli.scenes.scene.Scene.twist`), where the backend can."""
-    contact_line: Literal["links", "rod"] = field(default="links", metadata={"later": True})
+    contact_line: Literal["links", "rod"] | None = field(default=None, metadata={"later": True, "before": "links"})
     """What contacts touch: the straight links, whose direction jumps at each joint, or the centre line of the bent rod,
     as beam theory tells it between the joints: with the same links many times nearer where a whisker is held between
     contacts or slides past one. The backend ``rod`` alone knows it, for objects of spheres, capsules, cylinders and
-    boxes; gradients and fits take the links."""
+    boxes; gradients and fits take the links. None: the rod where all objects of the scenes are round, the links where
+    there is a box or a mesh, on whose flat faces the forces of a whisker that lies flush swing to and fro otherwise."""
     contact_tolerance: Annotated[float, Limit(least=1e-12, most=1e-3)] | None = field(
         default=None, metadata={"later": True}
     )
@@ -112,9 +113,10 @@ class Fidelity:
         check_number("error (0.05 = 5 %)", error, above=0)
         return cls(**cheapest(measured(backend), error).settings, error=error)
 
-    def resolved(self, twist: bool) -> Fidelity:
-        """Return this fidelity with ``twist`` where it leaves that open."""
-        return replace(self, twist=twist) if self.twist is None else self
+    def resolved(self, twist: bool, contact_line: Literal["links", "rod"] = "links") -> Fidelity:
+        """Return this fidelity with ``twist`` and ``contact_line`` where it leaves them open."""
+        line = contact_line if self.contact_line is None else self.contact_line
+        return replace(self, twist=twist if self.twist is None else self.twist, contact_line=line)
 
     def chain(self, whisker: Whisker) -> Chain:
         """Return the chain of links that stands for a whisker; errors as for :meth:`link_count`."""

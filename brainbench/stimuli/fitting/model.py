@@ -133,6 +133,7 @@ class FitModel:
             precision="double",
             solver=options.solver,
             twist=options.twist,
+            contact_line="links",
         )
 
     def least_damping(self, u: Array) -> float:

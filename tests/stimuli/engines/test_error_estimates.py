@@ -63,7 +63,9 @@ def _difference(values, reference, contact, length):
 
 @pytest.mark.parametrize("preset", ["fast", "balanced"])
 def test_a_whisker_between_opposed_posts_carries_an_error_no_smaller_than_the_elastica_says(preset):
-    (trace,) = get_engine("rod", errors=True).run([_opposed_posts()], Fidelity.of(preset), workers=1)
+    (trace,) = get_engine("rod", errors=True).run(
+        [_opposed_posts()], Fidelity.parse(f"{preset},contact_line=links"), workers=1
+    )
     off = np.linalg.norm(trace.wrench[-1, :2] - HELD) / np.linalg.norm(HELD)
     assert off <= trace.error
     assert trace.status == "ok"

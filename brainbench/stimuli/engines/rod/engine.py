@@ -256,9 +256,13 @@ class RodEngine(WhiskerEngine):
             what = f"compiling the whisker solver for {capacity} links (once; it is kept)"
             tell = progress or (lambda done, total, what: None)
             real = real_type(fidelity)
-            hinges = 2 + (fidelity.twist is not False)
             load_kernels(
-                device, real, capacity, hinges=hinges, compiling=lambda begins: tell(0 if begins else 1, 1, what)
+                device,
+                real,
+                capacity,
+                hinges=2 + (fidelity.twist is not False),
+                features=("smooth",) if fidelity.contact_line == "rod" else (),
+                compiling=lambda begins: tell(0 if begins else 1, 1, what),
             )
 
         with ThreadPoolExecutor(max_workers=max(1, len(sizes))) as pool:

@@ -306,7 +306,7 @@ class WhiskerSolver:
             options["sliced"] = sliced
         self.yields = any(chain.whisker.follicle is not None for chain in self.chains)
         rolls = any(chain.rest_rolls.any() for chain in self.chains)
-        smooth = fidelity.contact_line == "rod" and needs > NOTHING
+        smooth = fidelity.contact_line == "rod" and (needs > NOTHING or device.is_cpu)
         if smooth and (needs == MESHES or options.get("recorder")):
             raise UsageError(
                 "contact_line=rod knows spheres, capsules, cylinders and boxes, but no meshes, gradients or fits; leave"
