@@ -9,7 +9,7 @@ import numpy as np
 
 from brainbench.benchmarks.opening import make, pack
 from brainbench.core.files import write_json
-from brainbench.core.identity import SealedPlan, content_hash
+from brainbench.core.identity import content_hash
 from brainbench.scoring.options import ScoreOptions
 from robotics_bridge import hands
 from robotics_bridge.deploy.links.replay import PARTS, SessionFacts, TactilePoints, taxel_names, write_lerobot
@@ -67,12 +67,7 @@ count = 5
 label = "played"
 """
 
-student, student_weights = robot_surfaces._student("config.json"), robot_surfaces._student("model.safetensors")
-layout, log, checkpoint = robot_surfaces._probes, robot_surfaces._log, published_surfaces._checkpoint
-batch, sweep = (
-    next(surface.make for surface in reading_surfaces.SURFACES if surface.name == name)
-    for name in ("batch file", "sweep of students")
-)
+checkpoint, log = published_surfaces._checkpoint, robot_surfaces._log
 
 
 def _pixels() -> np.ndarray:
@@ -197,14 +192,6 @@ def task(folder: Path) -> Path:
     return folder / "task.py"
 
 
-def plan(folder: Path) -> Path:
-    sealed = SealedPlan(
-        "power", 4, 3, layer="area", names=("a", "b", "c", "d"), models=("zhuang-small",), units=5, trials=8,
-        expected={"0.2": 0.8}, command="brainbench power --plan p.json",
-    )  # fmt: skip
-    return sealed.write(folder / "plan.json")
-
-
 def benchmark(folder: Path) -> Path:
     write_study(folder)
     options = ScoreOptions(
@@ -218,8 +205,3 @@ def benchmark(folder: Path) -> Path:
 def packed(folder: Path) -> Path:
     pack(benchmark(folder), folder / "lab.zip")
     return folder / "lab.zip"
-
-
-def hub(folder: Path) -> Path:
-    (folder / "name.txt").write_text("hf-hub:owner/model/inner@main")
-    return folder / "name.txt"

@@ -6,9 +6,12 @@ import contextlib
 import functools
 import json
 import math
+import sys
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
+from unittest import mock
 
 import h5py
 import numpy as np
@@ -16,9 +19,11 @@ import torch
 from safetensors.torch import save_file
 
 from brainbench.cli.options import numbers as option_numbers
+from brainbench.core import identity
 from brainbench.core.contracts import read_match
 from brainbench.core.errors import DataError
 from brainbench.core.files import read_mapping
+from brainbench.core.identity import SealedPlan
 from brainbench.core.records import ResultRecord, record_identity
 from brainbench.core.runs.folder import STATE
 from brainbench.datasets import export, open_recordings, write_recordings
@@ -28,7 +33,7 @@ from brainbench.geometry.mesh import convex_hull, load_mesh, save_mesh
 from brainbench.models.features import read_features, write_features
 from brainbench.models.graph.tnn_import import read_graph
 from brainbench.models.training.batches import Processes
-from brainbench.models.training.checkpoints import load_weights, read_config
+from brainbench.models.training.checkpoints import find_folder, load_weights, read_config
 from brainbench.models.training.config import TrainingConfig
 from brainbench.models.training.trainer import _Run
 from brainbench.published.whiskit import read_runs
@@ -268,6 +273,42 @@ def _bad_batch(jobs: Any) -> bool:
     )
 
 
+def _plan_file(folder: Path) -> Path:
+    plan = SealedPlan(
+        "power", 4, 3, layer="area", names=("a", "b", "c", "d"), models=("zhuang-small",), units=5, trials=8,
+        expected={"0.2": 0.8}, command="brainbench power --plan p.json",
+    )  # fmt: skip
+    return plan.write(folder / "plan.json")
+
+
+def _read_plan(path: Path) -> SealedPlan:
+    """Read a plan under the hash that its content has: whoever edits one can seal it again."""
+    with contextlib.suppress(ValueError, TypeError, AttributeError, RecursionError, OSError):
+        if path.is_file():
+            data = json.loads(path.read_text())
+            data.pop("hash", None)
+            path.write_text(json.dumps({**data, "hash": identity._hash(data)}))
+    return SealedPlan.read(path)
+
+
+def _ask_hub(name: str) -> tuple[Path, list[str]]:
+    """Return the folder that a name is taken for by a hub that has everything, and what was ordered there."""
+    orders: list[str] = []
+
+    def download(repository: str, *, revision: str | None = None, allow_patterns: Any = ()) -> str:
+        orders.extend((repository, revision or "", *allow_patterns))
+        return "hub"
+
+    with mock.patch.dict(sys.modules, huggingface_hub=SimpleNamespace(snapshot_download=download)):
+        return find_folder(name), orders
+
+
+def _bad_order(answer: tuple[Path, list[str]]) -> bool:
+    folder, orders = answer
+    odd = any(".." in order.split("/") or not order.isascii() or not order.isprintable() for order in orders)
+    return odd or ".." in folder.parts
+
+
 SURFACES = (
     Surface(
         "recordings, NWB", lambda folder: write_nwb(folder / "sub-m1_ses-s1.nwb"),
@@ -304,6 +345,8 @@ SURFACES = (
     ),
     Surface("training state", _training, _go_on, _bad_training),
     Surface("batch file", written("batch.toml", BATCH), read_batch, _bad_batch),
+    Surface("plan", _plan_file, _read_plan),
+    Surface("hub name", written("name.txt", "hf-hub:owner/model/inner@main"), typed(_ask_hub), _bad_order),
     Surface("match, JSON", written_json("match.json", {"a": "b", "c": None}), read_match),
     Surface("match, CSV", written("match.csv", "a,b\nc,\n"), read_match),
     Surface(
