@@ -12,6 +12,7 @@ import subprocess
 import sys
 import tomllib
 from collections.abc import Callable
+from functools import cache
 from importlib.metadata import entry_points
 from pathlib import Path
 
@@ -73,22 +74,40 @@ def _commands(package: str) -> list[str]:
     ]
 
 
-def _listed(tree: Path) -> set[str]:
-    """Return the commands that the help of the program and of each group shows, as entry points name them."""
+def _listed(tree: Path, *missing: str) -> tuple[set[str], list[tuple[int, str]]]:
+    """Return the commands that the help shows, as entry points name them, and what becomes of calls of missing ones."""
     code = """
-import json, typer
-from brainbench.cli import app
-commands = typer.main.get_command(app).commands
-print(json.dumps([*commands, *(f"{name}.{inner}" for name, one in commands.items() for inner in getattr(one, "commands", []))]))
-"""  # noqa: E501
-    done = _run(tree, "-c", code)
+import contextlib, io, json, sys, typer
+from brainbench.cli import app, main
+commands, ends = typer.main.get_command(app).commands, []
+for command in sys.argv[1:]:
+    sys.argv = ["brainbench", *command.split(".")]
+    with contextlib.redirect_stderr(io.StringIO()) as words:
+        try:
+            main()
+        except SystemExit as end:
+            ends.append((end.code, words.getvalue()))
+inner = [f"{name}.{word}" for name, one in commands.items() for word in getattr(one, "commands", [])]
+print(json.dumps([[*commands, *inner], ends]))
+"""
+    done = _run(tree, "-c", code, *missing)
     assert done.returncode == 0, done.stderr
-    return set(json.loads(done.stdout))
+    shown, ends = json.loads(done.stdout)
+    return set(shown), ends
 
 
-@pytest.fixture(scope="module")
-def everything() -> set[str]:
-    return _listed(ROOT)
+def _check_commands(tree: Path, *packages: str) -> None:
+    """Without some folders their commands alone are missing, and each says in a line which folder it was in."""
+    off = {command: package for package in packages for command in _commands(package)}
+    everything, _ = _listed(ROOT)
+    inner = {name for name in everything if name.partition(".")[0] in off}
+    rest, ends = _listed(tree, *off)
+    assert rest == everything - {*off} - inner
+    for (command, package), (status, words) in zip(off.items(), ends, strict=True):
+        assert status == 1
+        assert package.replace(".", "/") in words
+        assert command.replace(".", " ") in words
+        assert len(words.strip().splitlines()) == 1
 
 
 def _check_score(tree: Path, files: dict[str, str]) -> None:
@@ -115,43 +134,35 @@ def test_every_entry_point_is_there_and_belongs_to_an_optional_folder():
         assert any(target.startswith(f"{package}.") for package in OPTIONAL), target
 
 
+@cache
+def _imports(path: Path) -> set[str]:
+    names = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.ImportFrom) and node.module:
+            names |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
+        elif isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+    return names
+
+
 @pytest.mark.parametrize("package", OPTIONAL)
 def test_nobody_imports_an_optional_folder(package: str):
     own = ROOT.joinpath(*package.split("."))
     for path in (file for name in PACKAGES for file in (ROOT / name).rglob("*.py") if not file.is_relative_to(own)):
-        text = path.read_text(encoding="utf-8")
-        if package.rpartition(".")[2] not in text:
-            continue
-        for node in ast.walk(ast.parse(text)):
-            names = []
-            if isinstance(node, ast.ImportFrom) and node.module:
-                names = [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
-            elif isinstance(node, ast.Import):
-                names = [alias.name for alias in node.names]
-            assert not any(f"{name}.".startswith(f"{package}.") for name in names), f"{path} imports {package}"
+        assert not any(f"{name}.".startswith(f"{package}.") for name in _imports(path)), f"{path} imports {package}"
 
 
-@pytest.mark.parametrize("package", OPTIONAL)
-def test_without_a_folder_its_commands_alone_are_missing_and_say_which_folder_it_was(package: str, without, everything):
-    tree, commands = without(package), _commands(package)
-    inner = {name for name in everything if name.partition(".")[0] in commands}
-    assert _listed(tree) == everything - {*commands} - inner
-    for command in commands:
-        done = _run(tree, "-m", "brainbench", *command.split("."))
-        assert done.returncode == 1
-        assert package.replace(".", "/") in done.stderr
-        assert command.replace(".", " ") in done.stderr
-        assert len(done.stderr.strip().splitlines()) == 1
-
-
-def test_without_any_optional_folder_a_model_is_scored(without, files):
-    _check_score(without(*OPTIONAL), files)
+def test_without_any_optional_folder_their_commands_alone_are_missing_and_a_model_is_scored(without, files):
+    tree = without(*OPTIONAL)
+    _check_commands(tree, *OPTIONAL)
+    _check_score(tree, files)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("package", OPTIONAL)
-def test_without_a_folder_every_other_module_imports_and_a_model_is_scored(package: str, without, files):
+def test_without_a_folder_the_rest_lists_its_commands_imports_and_scores_a_model(package: str, without, files):
     tree = without(package)
+    _check_commands(tree, package)
     # Kernels of derivatives are a part of the rod's and are imported with them alone.
     modules = sorted(
         path.relative_to(tree).with_suffix("").as_posix().replace("/", ".").removesuffix(".__init__")
