@@ -2,15 +2,12 @@ import json
 
 import pytest
 
-from brainbench.stimuli.sweeps.generation import generate
-from tests.factories.sweep_batches import small_plan
+from tests.factories.sweep_batches import small_set
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    path = tmp_path_factory.mktemp("sweeps")
-    generate(small_plan(("brick:5", "cone:5"), whiskers="C2,C3"), path, workers=1)
-    return path
+def folder():
+    return small_set()
 
 
 def test_accuracy_stands_beside_chance_and_its_interval(run, folder):

@@ -9,15 +9,12 @@ import pytest
 from brainbench.datasets.whisking.dataset import Shard, WhiskingDataset
 from brainbench.models.training import config, trainer
 from brainbench.models.training.batches import Augmentation
-from brainbench.stimuli.sweeps.generation import generate
-from tests.factories.sweep_batches import small_plan
+from tests.factories.sweep_batches import small_set
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    path = tmp_path_factory.mktemp("sweeps")
-    generate(small_plan(("brick:5", "cone:5"), whiskers="C2,C3,D1", shard_size=10), path, workers=1)
-    return str(path)
+def folder():
+    return str(small_set())
 
 
 def _options(folder, out):

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import contextlib
-import functools
 import json
 import math
+import shutil
 import sys
 from functools import partial
 from pathlib import Path
@@ -45,7 +45,6 @@ from brainbench.stimuli.motion.recorded import load_initial_angles, load_traject
 from brainbench.stimuli.objects.collections import read_categories, read_ids, resolve_objects
 from brainbench.stimuli.scenes.scene_files import load_scene
 from brainbench.stimuli.stimulus_set import hash_stimulus_set, write_stimulus_set
-from brainbench.stimuli.sweeps.generation import generate
 from leaderboards import build_leaderboard, read_records
 from leaderboards.held_out import Commitment
 from leaderboards.site.build import MANIFEST, check_site
@@ -57,7 +56,7 @@ from tests.factories.recordings import make_simple_session, make_stimuli
 from tests.factories.records import make_record
 from tests.factories.robot_surfaces import ROBOTS
 from tests.factories.scene_files import POLE
-from tests.factories.sweep_batches import small_plan
+from tests.factories.sweep_batches import small_set
 from tests.factories.training_sweeps import tiny
 
 SCENE = POLE.replace("interval_ms = 1", "interval_ms = 1\naverage = 2\nlowpass_hz = 40")
@@ -216,14 +215,8 @@ def _bad_training(run: _Run) -> bool:
     return not_finite([run.learner.state_dict(), run.optimizer.state_dict()]) or min(run.at.step, run.at.epoch) < 0
 
 
-@functools.cache
-def _plan() -> Any:
-    return small_plan(("brick:5", "cone:5"), whiskers="C2,C3", shard_size=1000)
-
-
 def _sweeps(name: str, folder: Path) -> Path:
-    generate(_plan(), folder, workers=1)
-    return folder / name
+    return shutil.copytree(small_set(), folder, dirs_exist_ok=True) / name
 
 
 def _read_sweeps(path: Path) -> Any:

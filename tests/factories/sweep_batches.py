@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import atexit
 import dataclasses
+import functools
 import math
+import shutil
+import tempfile
+from pathlib import Path
 
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.objects.collections import resolve_objects
 from brainbench.stimuli.scenes.scene import Frames
+from brainbench.stimuli.sweeps.generation import generate
 from brainbench.stimuli.sweeps.plan import GenerationPlan, GenerationSettings
 from brainbench.stimuli.sweeps.sweep_scenes import GRIDS, SweepGrid, SweepScenes
 
@@ -46,6 +52,20 @@ def small_plan(objects=("brick:2", "cone:2"), *, whiskers="C3", grid=GRID, fidel
     if chosen.backend == "mujoco":
         grid = _Smooth(**{item.name: getattr(grid, item.name) for item in dataclasses.fields(grid) if item.init})
     return GenerationPlan("small", grid, found, chosen, whiskers)
+
+
+def forty_sweeps():
+    """The plan of :func:`small_set`."""
+    return small_plan(("brick:5", "cone:5"), whiskers="C2,C3,D1", shard_size=10)
+
+
+@functools.cache
+def small_set():
+    """The folder of forty sweeps, generated once in a process; a test that changes it copies it before."""
+    folder = Path(tempfile.mkdtemp())
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    generate(forty_sweeps(), folder, workers=1)
+    return folder
 
 
 def killed_plan():

@@ -17,19 +17,17 @@ from brainbench.stimuli.scenes.scene import Frames
 from brainbench.stimuli.sweeps.generation import generate
 from brainbench.stimuli.sweeps.plan import GenerationPlan, GenerationSettings
 from brainbench.stimuli.sweeps.sweep_scenes import SweepScenes
-from tests.factories.sweep_batches import GRID, small_plan
+from tests.factories.sweep_batches import GRID, forty_sweeps, small_plan, small_set
 
 
 @pytest.fixture(scope="module")
 def plan():
-    return small_plan(("brick:5", "cone:5"), whiskers="C2,C3,D2", shard_size=10)
+    return forty_sweeps()
 
 
 @pytest.fixture(scope="module")
-def folder(plan, tmp_path_factory):
-    path = tmp_path_factory.mktemp("sweeps")
-    generate(plan, path, workers=1)
-    return path
+def folder():
+    return small_set()
 
 
 @pytest.fixture

@@ -67,7 +67,7 @@ def test_stiff_whisker_rings_on_its_spring(backend, ratio):
     omega = math.sqrt(stiffness / inertia)
     spring = stiffness, 2 * ratio * math.sqrt(stiffness * inertia)
     whisker = replace(STRAIGHT, young_modulus=1e13, follicle=FollicleSprings(about_z=spring))
-    times = np.linspace(0, 1, 201)[1:] * 4 / (ratio * omega)
+    times = np.linspace(0, 1, 101)[1:] * 2 / (ratio * omega)
 
     trace = run(whisker, backend=backend, times=times, gravity=(0.0, -0.5, 0.0), fidelity="accurate")
 

@@ -1,6 +1,7 @@
 """Rest shapes in space: closed forms, balance without loads, and stiffness beside Kirchhoff's equations."""
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -33,6 +34,12 @@ def run(whisker, *, backend="rod", times=(0.3,), fidelity=FINE, **job):
     (trace,) = get_engine(backend).run([given], fidelity, record_shape=True)
     assert trace.status == "ok", trace.reason
     return trace
+
+
+@cache
+def _equilibrium(whisker, arc, force):
+    rod = KirchhoffRod.of(whisker)
+    return rod, load_rod(rod, arc, force)
 
 
 def test_constant_curvature_and_torsion_are_a_helix():
@@ -113,8 +120,7 @@ def test_without_load_a_whisker_keeps_its_shape(whisker, backend):
 def test_stiffness_is_that_of_a_kirchhoff_rod(whisker, backend, force):
     arc = 0.024
     loaded = run(whisker, backend=backend, loads=(Load(arc, force),))
-    rod = KirchhoffRod.of(whisker)
-    exact = load_rod(rod, arc, force)
+    rod, exact = _equilibrium(whisker, arc, force)
     unbent = whisker.rest_points([arc])[0]
 
     scale = np.abs(exact.wrench).reshape(2, 3).max(axis=1).repeat(3)

@@ -143,13 +143,11 @@ def test_neighbouring_frames_of_one_contact_make_a_small_force_more_certain():
 
 
 def test_frames_whose_contacts_change_by_no_line_stay_as_they_are():
-    truths = [
-        _press(MOUSE, arc, depth) for arc, depth in [(0.4, 0.1), (0.7, 0.06), (0.5, 0.12), (0.6, 0.05), (0.45, 0.09)]
-    ]
+    truths = [_press(MOUSE, arc, depth) for arc, depth in [(0.4, 0.1), (0.7, 0.06), (0.5, 0.12)]]
     points = np.stack([_shape(MOUSE, *truth)[0] for truth in truths])
-    shapes = new_shapes(np.arange(5) / 500, points + np.random.default_rng(4).normal(size=points.shape) * 1e-5)
+    shapes = new_shapes(np.arange(3) / 500, points + np.random.default_rng(4).normal(size=points.shape) * 1e-5)
     alone, together = (
-        find_contacts(shapes, MOUSE, options=ContactOptions(noise=1e-5, frames=frames)) for frames in (1, 5)
+        find_contacts(shapes, MOUSE, options=ContactOptions(noise=1e-5, frames=frames)) for frames in (1, 3)
     )
     np.testing.assert_array_equal(together["force"], alone["force"])
     z = (together["force"] - [force for _, force in truths]) / together["force_deviation"]
@@ -229,14 +227,14 @@ def test_few_points_are_refused_in_words():
 def test_a_frame_without_its_first_or_last_point_takes_no_other_for_it(end, options):
     arc, force = _press(MOUSE, 0.5, 0.15)
     points, place = _shape(MOUSE, arc, force, points=12, traced=1.0)
-    frames = np.tile(points, (3, 1, 1))
+    frames = np.tile(points, (2, 1, 1))
     frames[1, end] = np.nan
-    shapes = new_shapes(np.arange(3.0), frames)
+    shapes = new_shapes(np.arange(2.0), frames)
     found = find_contacts(shapes, MOUSE, options=options)
-    assert list(found["status"].values) == ["ok", "undefined", "ok"]
+    assert list(found["status"].values) == ["ok", "undefined"]
     assert ("first" if end == 0 else "last") in str(found["reason"].values[1])
     # The contact point makes up for it.
-    held = find_contacts(shapes, MOUSE, contact_points=np.tile(place, (3, 1)), options=options)
+    held = find_contacts(shapes, MOUSE, contact_points=np.tile(place, (2, 1)), options=options)
     np.testing.assert_allclose(held["force"], force, rtol=0.03)
 
 
@@ -261,7 +259,7 @@ def _track(way, *, begin=0.0, frames=3):
     [(lambda points: points[:, ::-1], "from the tip to the base"), (lambda points: points * [1, -1], "mirrored")],
 )
 def test_reversed_and_mirrored_tracks_are_named_as_such(way, words):
-    contacts = find_contacts(_track(way)[0], RAT)
+    contacts = find_contacts(_track(way, frames=1)[0], RAT)
     assert (contacts["status"] == "unreliable").all()
     assert all(words in reason for reason in contacts["reason"].values)
 
