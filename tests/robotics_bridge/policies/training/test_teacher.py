@@ -435,9 +435,9 @@ def test_a_student_of_a_teacher_that_was_trained_anew_in_its_folder_is_another(t
     teacher, student = tmp_path / "teacher", tmp_path / "student"
     train(_env(), teacher, settings=SMALL, iterations=1)
     config = DistillConfig(
-        task="in_palm_rotate", teacher=str(teacher), observe="none", num_envs=2, iterations=2, steps_per_env=2
+        task="in_palm_rotate", teacher=str(teacher), observe="none", num_envs=1, iterations=2, steps_per_env=2
     )
-    train_student(config, student, episodes=2, evaluations=1)
+    train_student(config, student, episodes=1, evaluations=1)
     assert is_done(config, student)
     train(_env(), teacher, settings=SMALL, iterations=2)
     assert not is_done(config, student)

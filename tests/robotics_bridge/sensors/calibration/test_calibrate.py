@@ -57,9 +57,9 @@ def test_readings_before_their_reference_are_refused_and_hysteresis_is_not_taken
 def test_the_noise_of_a_reference_is_mentioned_or_refused() -> None:
     log, noise = log_of(Noise(white=0.02), 1200, 4), np.random.default_rng(1).normal(size=1200)
     assert log.reference is not None
-    noted = calibrate(replace(log, reference=log.reference + 0.02 * noise), max_delay=0.05).notes
+    noted = calibrate(replace(log, reference=log.reference + 0.02 * noise), max_delay=0.02).notes
     assert any("The reference has noise of its own of about 0.02" in note for note in noted)
-    assert not any("of its own" in note for note in calibrate(log, max_delay=0.05).notes)
+    assert not any("of its own" in note for note in calibrate(log, max_delay=0.02).notes)
     with pytest.raises(DataError, match="No delay and hysteresis explain the readings"):
         calibrate(replace(log, reference=log.reference + 0.2 * noise), max_delay=0.05)
 

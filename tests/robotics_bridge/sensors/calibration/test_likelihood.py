@@ -20,7 +20,7 @@ def test_jitter_is_recovered_with_what_it_would_otherwise_blur(jitter, seed):
     noise = Noise(
         white=0.02, gain=(0.8, 1.2), hysteresis=0.4, hysteresis_tau=0.06, read_delay=0.03, jitter=jitter, bias=0.1
     )
-    found = calibrate(log_of(noise, steps=1500, probes=20, seed=seed))
+    found = calibrate(log_of(noise, steps=1500, probes=12, seed=seed))
     assert found.noise.jitter == pytest.approx(jitter, abs=1e-9)
     assert found.noise.read_delay == pytest.approx(0.03, abs=1e-9)
     assert found.noise.white == pytest.approx(0.02, rel=0.1)
