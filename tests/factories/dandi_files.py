@@ -45,12 +45,39 @@ def _table(file, path, kind, columns, ids):
     return group
 
 
+def _units(file, spikes, spans, ids, electrodes, kinds, **columns):
+    """Write a table of units: spans of observation [n, 2] of all, ``electrodes`` of each, and types of the indices."""
+    count = len(spikes)
+    indices = (
+        np.cumsum([len(times) for times in spikes]),
+        *(each * np.arange(1, count + 1) for each in (len(spans), electrodes)),
+    )
+    values = (np.concatenate(spikes), np.tile(spans, (count, 1)), np.arange(count * electrodes))
+    table = {}
+    for name, held, index, kind in zip(
+        ("spike_times", "obs_intervals", "electrodes"), values, indices, kinds, strict=True
+    ):
+        table |= {name: held, f"{name}_index": index.astype(kind)}
+    return _table(file, "units", "Units", table | columns, ids)
+
+
 def _series(file, path, data, stamps, kind="TimeSeries"):
     group = file.create_group(path)
     group.attrs.update({"namespace": "core", "neurodata_type": kind})
     group.create_dataset("data", data=data).attrs.update({"unit": "a.u.", "conversion": 1.0})
     group.create_dataset("timestamps", data=stamps).attrs.update({"interval": 1, "unit": "seconds"})
     return group
+
+
+def _behavior(file, name, touches, stamps, signals, random):
+    """Write touches (30 ms long) as flags of their begins and ends, and signals of noise."""
+    file.create_group(f"acquisition/{name}").attrs["neurodata_type"] = "BehavioralTimeSeries"
+    for signal, when in (("touch_onset", touches), ("touch_offset", touches + 0.03)):
+        flags = np.zeros(len(stamps))
+        flags[np.searchsorted(stamps, when - 1e-6)] = 1
+        _series(file, f"acquisition/{name}/{signal}", flags, stamps)
+    for signal in signals:
+        _series(file, f"acquisition/{name}/{signal}", random.standard_normal(len(stamps)), stamps)
 
 
 def make_pole_task(trials=24, seed=0):
@@ -95,46 +122,24 @@ def write_yu(path, *, trials=24, units=5):
         _base(file, subject="anm186997", identifier="anm186997_2013-03-17_ANM186997_20130317")
         _series(file, "acquisition/lick_trace/lick_trace", np.zeros(len(stamps), np.uint8), stamps)
         file["acquisition/lick_trace"].attrs["neurodata_type"] = "BehavioralTimeSeries"
-        for name, own in (("principal_whisker_c1", touches), ("whisker_c2", touches[::3] + 0.2)):
-            file.create_group(f"acquisition/{name}").attrs["neurodata_type"] = "BehavioralTimeSeries"
-            for signal, when in (("touch_onset", own), ("touch_offset", own + 0.03)):
-                flags = np.zeros(len(stamps))
-                flags[np.searchsorted(stamps, when - 1e-6)] = 1
-                _series(file, f"acquisition/{name}/{signal}", flags, stamps)
-            for signal in ("pole_available", "whisker_angle", "whisker_curvature"):
-                _series(file, f"acquisition/{name}/{signal}", random.standard_normal(len(stamps)), stamps)
+        signals = ("pole_available", "whisker_angle", "whisker_curvature")
+        for name, felt in (("principal_whisker_c1", touches), ("whisker_c2", touches[::3] + 0.2)):
+            _behavior(file, name, felt, stamps, signals, random)
         first = np.array([np.append(touches[touches > begin], np.nan)[0] for begin in columns["pole_in_time"]])
-        _table(
-            file,
-            "intervals/trials",
-            "TimeIntervals",
-            columns
-            | {
-                "first_touch_time": first,
-                "pole_pos_time": columns["start_time"],
-                "photo_stim_mode": np.where(columns["stim_present"] == 1, "PoleInOut", "No stim"),
-                "photo_stim_power": np.where(columns["stim_present"] == 1, "5.0", ""),
-            },
-            np.arange(trials) + 2,
-        )
+        columns |= {
+            "first_touch_time": first,
+            "pole_pos_time": columns["start_time"],
+            "photo_stim_mode": np.where(columns["stim_present"] == 1, "PoleInOut", "No stim"),
+            "photo_stim_power": np.where(columns["stim_present"] == 1, "5.0", ""),
+        }
+        _table(file, "intervals/trials", "TimeIntervals", columns, np.arange(trials) + 2)
         spikes = [answer(random, touches, end) for _ in range(units)]
-        group = _table(
-            file,
-            "units",
-            "Units",
-            {
-                "spike_times": np.concatenate(spikes),
-                "spike_times_index": np.cumsum([len(item) for item in spikes]).astype(np.int32),
-                "obs_intervals": np.tile([[0.0, end]], (units, 1)),
-                "obs_intervals_index": np.arange(1, units + 1, dtype=np.int32),
-                "cell_desc": np.full(units, "N/A"),
-                "sampling_rate": np.full(units, 19531.0),
-                "electrodes": np.arange(8 * units),
-                "electrodes_index": np.arange(8, 8 * units + 8, 8, dtype=np.int32),
-                "waveform_mean": random.standard_normal((units, 25, 8)).astype(np.float32),
-            },
-            np.arange(units),
-        )
+        more = {
+            "cell_desc": np.full(units, "N/A"),
+            "sampling_rate": np.full(units, 19531.0),
+            "waveform_mean": random.standard_normal((units, 25, 8)).astype(np.float32),
+        }
+        group = _units(file, spikes, [[0.0, end]], np.arange(units), 8, (np.int32,) * 3, **more)
         group["electrodes"].attrs["neurodata_type"] = "DynamicTableRegion"
     return spikes, touches
 
@@ -143,7 +148,6 @@ def write_hires(path, *, trials=24, cell="AH0040_AAAA"):
     """DANDI 000013: one cell, spikes as a 0/1 PatchClampSeries sampled in trials only, no units table."""
     random = np.random.default_rng(2)
     columns, touches = make_pole_task(trials)
-    columns = {name: values for name, values in columns.items()}
     runs = [
         np.arange(begin, end, 0.0001) for begin, end in zip(columns["start_time"], columns["stop_time"], strict=True)
     ]
@@ -164,13 +168,8 @@ def write_hires(path, *, trials=24, cell="AH0040_AAAA"):
             ("SpikeTrain", "PatchClampSeries", train),
         ):
             _series(file, f"acquisition/{name}", data, stamps, kind)["electrode"] = h5py.SoftLink(electrode.name)
-        file.create_group("acquisition/behavior").attrs["neurodata_type"] = "BehavioralTimeSeries"
-        for signal, when in (("touch_onset", touches), ("touch_offset", touches + 0.03)):
-            flags = np.zeros(len(slow))
-            flags[np.searchsorted(slow, when - 1e-6)] = 1
-            _series(file, f"acquisition/behavior/{signal}", flags, slow)
-        for signal in ("amplitude", "phase", "theta_at_base", "distance_to_pole", "pole_available"):
-            _series(file, f"acquisition/behavior/{signal}", random.standard_normal(len(slow)), slow)
+        signals = ("amplitude", "phase", "theta_at_base", "distance_to_pole", "pole_available")
+        _behavior(file, "behavior", touches, slow, signals, random)
         _table(file, "intervals/trials", "TimeIntervals", columns, np.arange(trials) + 1)
     return stamps[where], touches
 
@@ -213,19 +212,6 @@ def write_area2(path, *, trials=96, units=6, test=False):
         _base(file, subject="Han", identifier="c32b334c-0b8e-11ec-b9b7-0bfeb2c344ea")
         file.create_dataset("general/session_id", data="20171207", dtype=TEXT)
         _table(file, "intervals/trials", "TimeIntervals", columns, np.arange(trials))
-        _table(
-            file,
-            "units",
-            "Units",
-            {
-                "spike_times": np.concatenate(spikes),
-                "spike_times_index": np.cumsum([len(item) for item in spikes]).astype(np.uint32),
-                "obs_intervals": np.tile(spans, (units, 1)),
-                "obs_intervals_index": np.arange(2, 2 * units + 2, 2, dtype=np.uint16),
-                "heldout": np.arange(units) % 4 == 3,
-                "electrodes": np.arange(units),
-                "electrodes_index": np.arange(1, units + 1, dtype=np.uint8),
-            },
-            np.arange(units) * 10 + 1,
-        )
+        numbers, kinds = np.arange(units), (np.uint32, np.uint16, np.uint8)
+        _units(file, spikes, spans, numbers * 10 + 1, 1, kinds, heldout=numbers % 4 == 3)
     return spikes, columns
