@@ -13,6 +13,8 @@ import math
 import random
 import tomllib
 from collections.abc import Callable
+from contextlib import suppress
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -29,11 +31,6 @@ CELLS = (
     "true", "-1e-320", "1e18", "a\x00b", "''", "2147483648.0",
 )  # fmt: skip
 """What takes the place of a cell of a table."""
-TABLE_CHANGES = (
-    *["cell"] * 4, "column", "scale", "drop row", "drop column", "double row", "double column", "name", "twin", "short",
-    "long", "shuffle", "constant", "semicolons", "mark", "empty", "many", "reverse",
-)  # fmt: skip
-"""Kinds of changes to a table; the first is drawn four times as often."""
 TWINS = str.maketrans({"a": "а", "e": "е", "o": "о", "i": "і", "x": "х", "p": "р", "c": "с"})
 """Latin letters and the Cyrillic ones that look like them."""
 STATEMENTS = (
@@ -84,7 +81,11 @@ def _alter(value: Any, chance: random.Random) -> str:
     places = _places(value)
     if not places:
         return "nothing"
-    holder, key = chance.choice(places)
+    return _change(*chance.choice(places), chance)
+
+
+def _change(holder: Any, key: Any, chance: random.Random) -> str:
+    """Change what stands at a key or index of a mapping or list."""
     kinds = ["odd"] * 5
     if isinstance(holder, dict):
         kinds += ["drop", "drop", "rename", "extra"]
@@ -153,59 +154,37 @@ def _document(path: Path, chance: random.Random) -> str:
 
 
 def _table(path: Path, chance: random.Random) -> str:
-    rows = list(csv.reader(io.StringIO(path.read_bytes().decode(errors="replace").replace("\0", ""))))
+    """Change a cell, a row or a column of a table, its unit, or how it is written."""
+    rows: list[Any] = list(csv.reader(io.StringIO(path.read_bytes().decode(errors="replace").replace("\0", ""))))
     rows = [row for row in rows if row] or [[""]]
-    place, kind = chance.randrange(len(rows)), chance.choice(TABLE_CHANGES)
+    kind = chance.choice(("cell", "cell", "text", "row", "column", "scale", "short", "long", "semicolons", "mark"))
+    turned = kind in ("column", "scale")
+    if turned:
+        rows = [list(column) for column in zip_longest(*rows, fillvalue="")]
+    place, what = chance.randrange(len(rows)), kind
     row = rows[place]
-    column = chance.randrange(len(row))
-    everywhere = [other for other in rows[1:] if len(other) > column]
-    if kind == "cell":
-        row[column] = chance.choice(CELLS)
-    elif kind in ("column", "constant"):
-        text = chance.choice(CELLS) if kind == "column" else "1"
-        for other in everywhere:
-            other[column] = text
+    if kind in ("row", "column"):
+        what = f"{kind}: {_change(rows, place, chance)}"
+    elif kind == "text":
+        what = f"{kind}: {_change(row, chance.randrange(len(row)), chance)}"
+    elif kind == "cell":
+        row[chance.randrange(len(row))] = chance.choice(CELLS)
     elif kind == "scale":
         factor = 10.0 ** chance.choice((-300, -9, -6, -3, 3, 6, 9, 12, 290))
-        for other in everywhere:
-            try:
-                other[column] = repr(float(other[column]) * factor)
-            except ValueError:
-                continue
-    elif kind == "drop row":
-        del rows[place]
-    elif kind == "double row":
-        rows.insert(place, list(row))
-    elif kind in ("drop column", "double column"):
-        for other in (other for other in rows if len(other) > column):
-            if kind == "drop column":
-                del other[column]
-            else:
-                other.insert(column, other[column])
-    elif kind in ("name", "twin"):
-        head = rows[0]
-        column = chance.randrange(len(head)) if head else 0
-        if head:
-            names = ("", "x" * 5000, "time", head[0], "\x1b[31m", "нет", head[column].upper())
-            head[column] = head[column].translate(TWINS) if kind == "twin" else chance.choice(names)
+        for index, cell in enumerate(row):
+            with suppress(ValueError):
+                row[index] = repr(float(cell) * factor)
     elif kind == "short":
-        del row[column:]
+        del row[chance.randrange(len(row)) :]
     elif kind == "long":
         row += ["1"] * chance.choice((1, 100))
-    elif kind == "shuffle":
-        body = rows[1:]
-        chance.shuffle(body)
-        rows[1:] = body
-    elif kind == "reverse":
-        rows[1:] = rows[:0:-1]
-    elif kind == "many":
-        rows += rows[1:] * 20
-    elif kind == "empty":
-        del rows[1:]
+    lists = [row if isinstance(row, list) else [row] for row in rows]
     stream = io.StringIO()
-    csv.writer(stream, delimiter=";" if kind == "semicolons" else ",").writerows(rows)
-    path.write_text(("\ufeff\ufeff" if kind == "mark" else "") + stream.getvalue(), newline="")
-    return kind
+    writer = csv.writer(stream, delimiter=";" if kind == "semicolons" else ",")
+    writer.writerows(zip_longest(*lists, fillvalue="") if turned else lists)
+    text = ("\ufeff\ufeff" if kind == "mark" else "") + stream.getvalue()
+    path.write_bytes(text.encode(errors="replace"))
+    return what
 
 
 def _code(path: Path, chance: random.Random) -> str:

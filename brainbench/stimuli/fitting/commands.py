@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from brainbench.cli.options import changed, items, option, out_file, picture_file, refuse, with_options
+from brainbench.cli.options import changed, items, option, out_file_option, picture_file, refuse, with_options
 from brainbench.cli.output import Output, progress_bar, table_of
 from brainbench.cli.stimuli import scenes
 from brainbench.cli.stimuli.scenes import BackendOption, StimulusOption, WhiskersOption
@@ -74,9 +74,7 @@ def fit(
         float | None,
         typer.Option(help="Arc length of the first traced point, mm; nan for anywhere. [default: the base]"),
     ] = None,
-    out: Annotated[
-        Path | None, typer.Option("--out", "-o", callback=out_file, help="Write the result as JSON.")
-    ] = None,
+    out: Annotated[Path | None, out_file_option("Write the result as JSON.")] = None,
     picture: Annotated[
         Path | None, typer.Option(callback=picture_file, help="Draw fit and residuals (.png, .svg or .pdf).")
     ] = None,
