@@ -14,8 +14,8 @@ from brainbench.scoring.options import ScoreOptions
 from robotics_bridge import hands
 from robotics_bridge.deploy.links.replay import PARTS, SessionFacts, TactilePoints, taxel_names, write_lerobot
 from tests.factories import policies, published_surfaces, reading_surfaces, robot_surfaces
+from tests.factories.fitted_ringdown import write_ringdown
 from tests.factories.hand_gallery import GALLERY
-from tests.factories.ringdown_table import write_ringdown
 from tests.factories.scored_files import write_study
 from tests.factories.whisker_tracks import (
     bent_shapes,

@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-import numpy as np
 import pytest
 
 from brainbench.stimuli.fitting import Trial, fit
-from tests.factories.fitted_ringdown import KNOWN, PERIOD, QUICK, SAME, TRUTH, ringdown_shapes, ringdown_wrenches
-from tests.factories.whisker_measurements import blank_wrenches, simulate_trial
+from tests.factories.fitted_ringdown import KNOWN, QUICK, ringdown_shapes, ringdown_wrenches, simulate_ringdown
 
 
 @pytest.fixture(scope="session")
 def rung():
     """A plucked whisker and its simulation."""
-    times = np.arange(1, 61) * PERIOD / 15
-    trial = Trial.ringdown(TRUTH, blank_wrenches(times), 1e-3)
-    return trial, simulate_trial(trial, options=SAME)
+    return simulate_ringdown()
 
 
 @pytest.fixture(scope="session")
