@@ -13,9 +13,9 @@ free      python -m benchmarks.whiskers.throughput
 sweeps    python -m benchmarks.whiskers.public_rate --objects procedural-24:32 --write
 touch     python -m benchmarks.tactile.throughput --device cuda --part sensors --write
 step      python -m benchmarks.tactile.throughput --device cuda --part step --write
-tasks     python -m benchmarks.policies.tasks --part speed --device cuda --write
+tasks     python -m benchmarks.policies.tasks --device cuda --write
 encoders  python -m benchmarks.policies.encoder_step --device cuda --write
-training  python -m benchmarks.models.training_step --part train --write
+training  python -m benchmarks.models.training_step --write
 TABLE
 }
 

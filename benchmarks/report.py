@@ -84,6 +84,9 @@ HEADLINES = (
 """What is measured, title of its section, where the figure stands in the body, and its unit."""
 EARLIER = "f0af6943"
 """Commit that holds the scripts whose results stand here and that no release repeats."""
+CHANGED, BEFORE = "2026-11-30", "0266d1cf"
+PARTS = r"training_step --part (forward|stream|length)|metrics --device|--part published|tasks --part|encoder_step"
+"""Commands of scripts that do something else since that day, and the commit that holds them as they were."""
 HEAD = (
     "# Measured results\n\n"
     "Every figure stands with the command that made it, the date and the machine. This page is written by "
@@ -142,24 +145,17 @@ def measure_once(
     return found
 
 
-def with_notes(text: str, notes: Path | None) -> str:
-    """Return the body of a section and, below it, the text of a file that was written by hand."""
-    return text if notes is None else f"{text}\n\n{notes.read_text(encoding='utf-8').strip()}"
-
-
-def script_parser(doc: str | None, *, notes: bool = False) -> argparse.ArgumentParser:
-    """Return a parser whose help is a script's docstring, with ``--write`` and, where asked for, ``--notes``."""
+def script_parser(doc: str | None) -> argparse.ArgumentParser:
+    """Return a parser whose help is a script's docstring, with ``--write``."""
     parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--write", action="store_true", help="keep the section and write RESULTS.md anew")
-    if notes:
-        parser.add_argument("--notes", type=Path, help="text that follows the tables")
     return parser
 
 
 def publish(
     options: argparse.Namespace, title: str, body: str, words: str = "", *, subject: str = "", where: str = ""
 ) -> None:
-    """Print the body of a section, with the notes that were given, and keep it with ``--write``.
+    """Print the body of a section, and keep it with ``--write``.
 
     Args:
         options: what a parser of :func:`script_parser` understood.
@@ -169,7 +165,6 @@ def publish(
         subject: one of :data:`SUBJECTS`; that of the script's folder if empty.
         where: what measured it, if not this machine.
     """
-    body = with_notes(body, getattr(options, "notes", None))
     print(body)
     if options.write:
         script = sys.modules["__main__"].__spec__
@@ -248,6 +243,8 @@ def page(sections: list[Section]) -> str:
             body = re.sub(r"^(#{2,4} )", r"#\1", section.body, flags=re.MULTILINE)
             gone = removed_scripts(f"{section.command}\n{body}")
             note = f" Not in the tree any more, but in commit {EARLIER}: {', '.join(gone)}." if gone else ""
+            if section.date < CHANGED and re.search(PARTS, section.command):
+                note += f" The script as it was then: commit {BEFORE}."
             parts.append(f"### {section.title}\n\n{command}{section.date}, {where}.{note}\n\n{body}\n")
     return "\n".join(parts)
 

@@ -35,7 +35,6 @@ BUDGETS = {
     "brainbench/scoring": 4_320,  # presentation time, plans, areas and layers, stimuli of single trials, doubts
     "brainbench/geometry": 1_020,
     "brainbench/published": 2_480,
-    "brainbench/tradeoffs": 630,
     "brainbench/benchmarks": 730,
     "benchmarks": 7_500,  # calibration, claims corrected together, students and their pages, devices that are fitted
 }

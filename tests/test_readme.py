@@ -34,7 +34,6 @@ PARSED_ONLY = {
     "brainbench train": "trains for hours",
     "brainbench policy train": "needs a GPU",
     "brainbench recovery": "takes minutes",
-    "brainbench tradeoff": "measures for minutes",
     "brainbench stimuli sweep thesis-low --objects": "simulates for minutes",
 }
 """Commands that are not run here, with the reason; ``test_docs`` parses them like all others."""

@@ -9,7 +9,6 @@ float32.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Collection
 from itertools import product
 from pathlib import Path
@@ -21,6 +20,7 @@ from torch import nn
 
 import brainbench
 from benchmarks.report import publish, script_parser, table
+from benchmarks.timing import seconds
 from brainbench.datasets import WhiskingDataset
 from brainbench.models.registry import load_model
 from brainbench.models.training.evaluation import evaluate
@@ -70,18 +70,6 @@ def round_weights(model: nn.Module) -> None:
             weight.copy_((weight / scale).round() * scale)
 
 
-@torch.no_grad()
-def latency(network: Reduced, x: torch.Tensor) -> tuple[float, float]:
-    """Return the median and the 99th percentile [ms] of one sweep at batch 1."""
-    times = []
-    for _ in range(REPEATS + 1):
-        start = time.perf_counter()
-        network(x[:1])
-        times.append((time.perf_counter() - start) * 1e3)
-    p50, p99 = np.percentile(times[1:], [50, 99])
-    return float(p50), float(p99)
-
-
 def main() -> None:
     """Measure every combination and print a table."""
     parser = script_parser(__doc__)
@@ -99,8 +87,9 @@ def main() -> None:
         network = Reduced(name, precision, unroll, steps)
         with torch.no_grad():
             expected, answers = load_model(name)(x), network(x)
+            times = 1e3 * seconds(lambda network=network: network(x[:1]), REPEATS)
         error = float((answers - expected).norm() / expected.norm().clamp_min(1e-30))
-        p50, p99 = latency(network, x)
+        p50, p99 = np.percentile(times, [50, 99])
         score = f"{brainbench.score(network).value:.3f}" if args.score else ""
         accuracy = evaluate(network, WhiskingDataset(args.data, split="test", shuffle=False)) if args.data else None
         top1 = "" if accuracy is None else f"{accuracy.top1:.3f}"

@@ -1,8 +1,6 @@
-"""Speed of a training step, of a forward pass, of streaming and of long sweeps; peers measured in the same run.
+"""Speed of a training step and of its forward pass; peers measured in the same run.
 
-    python -m benchmarks.models.training_step --part train --model zhuang-intersection-ln+gpt --batch 256
-    python -m benchmarks.models.training_step --part stream --model zhuang-intersection-ln-small
-    python -m benchmarks.models.training_step --part length
+    python -m benchmarks.models.training_step --model zhuang-intersection-ln+gpt --batch 256
 
 The peer is what a reader of the published description would write: a loop over time steps and, within it, over areas;
 inputs concatenated, convolved, concatenated with the state and convolved again; every step's outputs kept; float32. It
@@ -16,11 +14,9 @@ import argparse
 import json
 import subprocess
 import sys
-import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import nullcontext
-from pathlib import Path
 from typing import Any
 from unittest import mock
 
@@ -28,11 +24,10 @@ import numpy as np
 import torch
 
 from benchmarks.report import publish, script_parser, table
+from benchmarks.timing import seconds
 from brainbench.core.devices import record_step
 from brainbench.models.activations import evaluating
-from brainbench.models.export import StreamingStep, export_model, read_onnx
 from brainbench.models.ops import dispatch
-from brainbench.models.ops.layers import packed
 from brainbench.models.registry import describe_model, load_model
 from brainbench.models.training.objectives import compiled, fuse
 
@@ -86,18 +81,8 @@ class Loop(torch.nn.Module):
 
 def clock(device: torch.device, work: Callable[[], Any], repeats: int, warm: int = 2) -> float:
     """Return the median seconds of one call."""
-    for _ in range(warm):
-        work()
-    times = []
-    for _ in range(repeats):
-        if device.type == "cuda":
-            torch.cuda.synchronize()
-        start = time.perf_counter()
-        work()
-        if device.type == "cuda":
-            torch.cuda.synchronize()
-        times.append(time.perf_counter() - start)
-    return float(np.median(times))
+    wait = torch.cuda.synchronize if device.type == "cuda" else None
+    return float(np.median(seconds(work, repeats, warm=warm, wait=wait)))
 
 
 def ceiling(device: torch.device, dtype: torch.dtype) -> float:
@@ -109,10 +94,10 @@ def ceiling(device: torch.device, dtype: torch.dtype) -> float:
     return best
 
 
-def sweeps(batch: int, device: torch.device, steps: int = STEPS) -> torch.Tensor:
+def sweeps(batch: int, device: torch.device) -> torch.Tensor:
     scale = torch.tensor(([1e-4] * 3 + [1e-6] * 3) * 5)[:, None, None]
     generator = torch.Generator().manual_seed(0)
-    return (torch.randn(batch, steps, 30, 5, 7, generator=generator) * scale).to(device)
+    return (torch.randn(batch, STEPS, 30, 5, 7, generator=generator) * scale).to(device)
 
 
 def training_step(module: Any, model: Any, x: torch.Tensor, labels: torch.Tensor, autocast: Any) -> Callable[[], None]:
@@ -131,7 +116,8 @@ def training_step(module: Any, model: Any, x: torch.Tensor, labels: torch.Tensor
     return step
 
 
-def train_part(options: argparse.Namespace, device: torch.device) -> str:
+def compare(options: argparse.Namespace, device: torch.device) -> str:
+    """Return the table of all ways to compute a step."""
     x = sweeps(2, device)
     model = load_model(options.model).to(device).eval()
     with torch.no_grad():
@@ -156,18 +142,8 @@ def train_part(options: argparse.Namespace, device: torch.device) -> str:
             [peer, precision, how, *cells, f"{options.batch / forward:,.1f}", f"{share_forward:.0%}", f"{memory:.1f}"]
         )
         print(rows[-1], flush=True)
-    head = [
-        "who",
-        "precision",
-        "compiled",
-        "first step s",
-        "step ms",
-        "sweeps/s",
-        "of ceiling",
-        "forward sweeps/s",
-        "of ceiling",
-        "memory GB",
-    ]
+    head = ["who", "precision", "compiled", "first step s", "step ms", "sweeps/s", "of ceiling", "forward sweeps/s"]
+    head += ["of ceiling", "memory GB"]
     reference = rates.get("loop:float32:off")
     if not rates:
         return "\n".join(failed)
@@ -239,110 +215,8 @@ def time_one(options: argparse.Namespace, device: torch.device) -> tuple[float, 
     return first, seconds, spent, memory
 
 
-def forward_part(options: argparse.Namespace, device: torch.device) -> str:
-    x = sweeps(options.batch, device)
-    model = load_model(options.model).to(device)
-    operations = 2 * describe_model(options.model).multiply_adds * STEPS * options.batch
-    rows = []
-    for precision, dtype in (("float32", torch.float32), ("bf16", torch.bfloat16)):
-        with torch.no_grad(), torch.autocast(device.type, dtype=torch.bfloat16, enabled=precision == "bf16"):
-            model(x[:8])
-            pairs = []
-            for _ in range(options.repeats):
-                # Taken in turns, since others use the machine too.
-                before = ceiling(device, dtype)
-                seconds = clock(device, lambda: model(x), 1, warm=0)
-                pairs.append((operations / seconds, max(before, ceiling(device, dtype))))
-        rate, most = sorted(pairs)[len(pairs) // 2]
-        cells = [f"{options.batch * rate / operations:.2f}", f"{rate / 1e9:.0f}", f"{most / 1e9:.0f}"]
-        rows.append([precision, *cells, f"{rate / most:.0%}"])
-        print(rows[-1], flush=True)
-    head = ["precision", "sweeps/s", "GFLOP/s", "matrix ceiling GFLOP/s", "of ceiling"]
-    return f"Forward pass of {options.model}, batch {options.batch} × {STEPS} steps.\n\n{table(head, rows)}"
-
-
-def bandwidth() -> float:
-    """Return the rate at which one thread reads memory [bytes/s]."""
-    a = torch.ones(64 * 2**20)
-    return 4 * a.numel() / clock(torch.device("cpu"), a.sum, 5)
-
-
-def stream_part(options: argparse.Namespace, device: torch.device) -> str:
-    torch.set_num_threads(1)
-    rows = []
-    speed = bandwidth() if device.type == "cpu" else float("nan")
-    for name in options.model.split(","):
-        model = load_model(name).to(device)
-        weights = 4 * sum(p.numel() for p in model.parameters())
-        bound = weights / speed * 1e3
-        for what, stream in streams(model, name, device):
-            times = stream(options.repeats * 20)
-            least, p50, p99 = np.percentile(times[10:], [0, 50, 99])
-            cells = [f"{least:.2f}", f"{p50:.2f}", f"{p99:.2f}", f"{weights / 1e6:.1f}", f"{bound:.2f}"]
-            rows.append([name, what, *cells, f"{p50 / bound:.1f}"])
-            print(rows[-1], flush=True)
-    head = ["model", "way", "least ms", "p50 ms", "p99 ms", "float32 weights MB", "ms to read them once", "p50 of that"]
-    rate = ceiling(device, torch.float32), ceiling(device, torch.bfloat16)
-    text = f"Batch 1, one thread; memory read at {speed / 1e9:.1f} GB/s by a plain sum; matrix products at "
-    text += f"{rate[0] / 1e9:.0f} GFLOP/s in float32 and {rate[1] / 1e9:.0f} in bf16."
-    return f"{text}\n\n{table(head, rows)}"
-
-
-def streams(model: Any, name: str, device: torch.device) -> Iterator[tuple[str, Callable[[int], list[float]]]]:
-    """Yield ways to stream a network: by name, a function that takes steps and returns how long each took [ms]."""
-    x = sweeps(1, device)[:, 0]
-    limit = model.spec.max_steps or 10**9
-
-    def timed(call: Callable[[Any], Any], start: Callable[[], Any]) -> Callable[[int], list[float]]:
-        def run(count: int) -> list[float]:
-            times, state = [], start()
-            with torch.no_grad():
-                for index in range(count):
-                    state = start() if index % limit == 0 else state
-                    began = time.perf_counter()
-                    state = call(state)
-                    if device.type == "cuda":
-                        torch.cuda.synchronize()
-                    times.append((time.perf_counter() - began) * 1e3)
-            return times
-
-        return run
-
-    yield "step", timed(lambda state: model.step(x, state)[1], lambda: model.init_state(1))
-    flat = StreamingStep(model)
-    yield "flat state", timed(lambda state: flat(x, state)[1], lambda: flat.init_state(1))
-    if device.type == "cpu":
-        for precision in ("float32", "bf16"):
-            fast: Any = packed(model, precision=precision)
-            yield (
-                f"packed {precision}",
-                timed(lambda state, fast=fast: fast.step(x, state)[1], lambda fast=fast: fast.init_state(1)),
-            )
-        with tempfile.TemporaryDirectory() as folder:
-            run = read_onnx(export_model(model, Path(folder) / "step.onnx", name=name).path, threads=1)
-            yield "ONNX Runtime", timed(lambda state: run(x.numpy(), state)[1], lambda: flat.init_state(1).numpy())
-
-
-def length_part(options: argparse.Namespace, device: torch.device) -> str:
-    rows = []
-    for name in ("s4-small", "resnet18-small+mamba"):
-        model = load_model(name).to(device)
-        for steps in (100, 1000, 10_000):
-            x = sweeps(1, device, steps)
-            with torch.no_grad():
-                seconds = clock(device, lambda model=model, x=x: model(x), 2, warm=1)
-            rows.append([name, f"{steps:,}", f"{seconds:.3f}", f"{seconds / steps * 1e6:.0f}"])
-            print(rows[-1], flush=True)
-    return table(["model", "steps", "s", "µs per step"], rows)
-
-
-PARTS = {"train": train_part, "forward": forward_part, "stream": stream_part, "length": length_part}
-TITLES = {"train": "Training step", "forward": "Forward pass", "stream": "Streaming step", "length": "Long sweeps"}
-
-
 def main() -> None:
     parser = script_parser(__doc__)
-    parser.add_argument("--part", choices=PARTS, default="train")
     parser.add_argument("--model", default="zhuang-intersection-ln-small")
     parser.add_argument("--batch", type=int, default=32)
     parser.add_argument("--repeats", type=int, default=5)
@@ -364,10 +238,8 @@ def main() -> None:
             print(json.dumps(time_one(options, device)))
         return
     name = torch.cuda.get_device_name(device) if device.type == "cuda" else f"{torch.get_num_threads()} threads"
-    body = f"{name}. " + PARTS[options.part](options, device)
-    words = f"--part {options.part} --model {options.model}"
-    words += f" --batch {options.batch}" if options.part in ("train", "forward") else ""
-    publish(options, f"{TITLES[options.part]} ({options.model}, {device.type})", body, words)
+    words = f"--model {options.model} --batch {options.batch}"
+    publish(options, f"Training step ({options.model}, {device.type})", f"{name}. {compare(options, device)}", words)
 
 
 if __name__ == "__main__":

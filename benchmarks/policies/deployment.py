@@ -180,7 +180,7 @@ def deploy(
 
 
 def main() -> None:
-    parser = script_parser(__doc__, notes=True)
+    parser = script_parser(__doc__)
     parser.add_argument("--student", nargs="+", default=["in_palm_rotate.student"])
     parser.add_argument("--faulty", action="store_true", help="hands that lag, drop and drift")
     parser.add_argument("--envs", type=int, default=102)

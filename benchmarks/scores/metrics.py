@@ -2,42 +2,28 @@
 
     python -m benchmarks.scores.metrics [--large] [--write]
     python -m benchmarks.scores.metrics --parity [--write]
-    python -m benchmarks.scores.metrics --device cuda [--write]
 
-``--large`` adds the RDM of 2,000 stimuli and 100,000 units; ``--device`` times instead what a torch device
-computes beside numpy, with the largest difference; ``--parity`` compares every method and comparison with
+``--large`` adds the RDM of 2,000 stimuli and 100,000 units; ``--parity`` compares every method and comparison with
 rsatoolbox on balanced data; ``--write`` puts the tables into RESULTS.md.
 """
 
 from __future__ import annotations
 
 import resource
-import statistics
 import time
 import warnings
-from collections.abc import Callable, Iterator
-from functools import partial
+from collections.abc import Callable
 
 import numpy as np
 
 from benchmarks.report import publish, script_parser, table
+from benchmarks.timing import seconds
 from brainbench.core.contracts import Trials
-from brainbench.metrics import compare_models, noise_precision, permutation_test, rdm
+from brainbench.metrics import compare_models, noise_precision, rdm
 from brainbench.metrics.measures.rsa import RSA, score_rdms
 from brainbench.metrics.reliability.subject_rdm import subject_rdm
 
 STIMULI = [f"s{k}" for k in range(6)]
-
-
-def median_seconds(job: Callable[[], object], repeats: int) -> float:
-    """Return the median wall time of several runs after one that warms up."""
-    job()
-    times = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        job()
-        times.append(time.perf_counter() - start)
-    return statistics.median(times)
 
 
 def rsatoolbox_rows() -> list[list[str]]:
@@ -52,7 +38,7 @@ def rsatoolbox_rows() -> list[list[str]]:
     rows = []
 
     def add(what: str, theirs: Callable[[], object], ours: Callable[[], object], goal: str, difference: str) -> None:
-        slow, fast = median_seconds(theirs, 1), median_seconds(ours, 15)
+        slow, fast = (float(np.median(seconds(job, count))) for job, count in ((theirs, 1), (ours, 15)))
         rows.append([what, f"{slow * 1e3:.3g}", f"{fast * 1e3:.3g}", f"{slow / fast:.0f}×", goal, difference])
 
     responses, labels = rng.normal(size=(600, 999)), np.repeat(np.arange(6), 100)
@@ -228,75 +214,16 @@ def large_row() -> list[str]:
     return [what, f"{watch.wall:.1f}", f"{watch.processor:.1f}", f"{extra:.2f} GiB above the input (2)"]
 
 
-def device_rows(device: str) -> Iterator[list[str]]:
-    """Time numpy and a torch device on the same numbers, small jobs first; one row as soon as it is known."""
-    import torch
-
-    rng = np.random.default_rng(4)
-    trials, labels, folds = rng.normal(size=(600, 999)), np.repeat(np.arange(6), 100), np.tile(np.arange(5), 120)
-    crossnobis = partial(rdm, labels=labels, method="crossnobis", folds=folds)
-    shrunk = partial(crossnobis, precision="shrinkage_diag")
-
-    def row(what: str, plain: Callable[[], np.ndarray], *moved: Callable[[], np.ndarray]) -> list[str]:
-        with Stopwatch() as first:
-            expected = plain()
-        # A run of seconds needs no second one to be timed.
-        slow = first.wall if first.wall > 1 else median_seconds(plain, 3)
-        error = max(np.abs(expected - job()).max() for job in moved)
-        times = [median_seconds(job, 5) for job in moved]
-        cells = [f"{slow * 1e3:.3g}", *(f"{t * 1e3:.3g}" for t in times), *["–"] * (2 - len(times))]
-        return [what, *cells, f"{slow / min(times):.1f}×", f"{error:.0e}"]
-
-    def both(what: str, job: Callable[..., np.ndarray], given: np.ndarray) -> list[str]:
-        there = torch.from_numpy(given).to(device)
-        return row(what, partial(job, given), partial(job, given, device=device), partial(job, there))
-
-    def permutations(stimuli: int) -> list[str]:
-        brain = np.stack([rdm(rng.normal(size=(stimuli, 40))) for _ in range(11)])
-        model = brain.mean(axis=0) + rdm(rng.normal(size=(stimuli, 40)))
-
-        def null(device: str | None) -> np.ndarray:
-            return permutation_test(model, brain, device=device).null
-
-        return row(f"10,000 permutations of {stimuli} stimuli, 11 animals", partial(null, None), partial(null, device))
-
-    yield both("noise precision, 600 trials × 999", partial(noise_precision, labels=labels), trials)
-    yield both("crossnobis, 600 trials × 999", crossnobis, trials)
-    yield both("crossnobis, shrinkage_diag, 600 trials × 999", shrunk, trials)
-    yield permutations(50)
-    bins = rng.normal(size=(600, 22_000)).astype(np.float32)
-    yield both("crossnobis, shrinkage_diag, 600 trials × 22,000", shrunk, bins)
-    for stimuli, units in ((200, 2000), (2000, 20_000)):
-        wide = rng.normal(size=(stimuli, units)).astype(np.float32)
-        size = f"{stimuli:,} × {units:,} float32"
-        yield both(f"correlation, {size}", rdm, wide)
-        yield both(f"sqeuclidean, {size}", partial(rdm, method="sqeuclidean"), wide)
-        yield both(f"poisson, {size}", partial(rdm, method="poisson"), np.abs(wide))
-    yield permutations(200)
-
-
 def main() -> None:
     parser = script_parser(__doc__)
     parser.add_argument("--large", action="store_true")
     parser.add_argument("--parity", action="store_true")
-    parser.add_argument("--device")
     options = parser.parse_args()
     if options.parity:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             body = table(["quantity", "largest relative difference"], parity_rows())
         publish(options, "Metrics: parity with rsatoolbox", body, "--parity")
-        return
-    if options.device:
-        columns = ["job", "numpy ms", f"{options.device} ms", "already there ms", "ratio", "largest difference"]
-        print(table(columns, []), flush=True)
-        rows = []
-        for row in device_rows(options.device):
-            print(table(columns, [row]).splitlines()[-1], flush=True)
-            rows.append(row)
-        publish(
-            options, f"Metrics on a torch device ({options.device})", table(columns, rows), f"--device {options.device}"
-        )
         return
     large = [large_row()] if options.large else []
     with warnings.catch_warnings():

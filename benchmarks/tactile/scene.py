@@ -99,15 +99,10 @@ def sensors(name: str, count: int = 100, points: int = 500, noise: Noise | None 
         "kinematic": lambda: KinematicTaxel(**common, total="law"),
         "proximity": lambda: ProximityTaxel(**common, points=points),
         "elastomer": lambda: ElastomerTaxel(**common, points=points),
-        "temperature": temperature,
+        "temperature": lambda: TemperatureGrid(link="box0", cells=(2, 2, 2)),
         "audio": _audio,
     }
     return {name: makers[name]()}
-
-
-def temperature(link: str = "box0") -> TemperatureGrid:
-    """The published grid of 2 × 2 × 2 cells."""
-    return TemperatureGrid(link=link, cells=(2, 2, 2))
 
 
 def _audio() -> ContactAudio:

@@ -70,11 +70,6 @@ _LISTS: dict[str, tuple[str, str, dict[str, str]]] = {
         {"environments": "{envs:,}", "sensor (100 taxels)": "{case}", "env-steps/s": "{env_steps_per_s:,.0f}",
          "of the engine alone": "{share:.0%}"},
     ),
-    "published": (
-        "Tactile published configurations", "",
-        {"configuration": "{case}", "environments": "{envs:,}", "ms / update": "{ms:.3f}",
-         "sensor updates/s": "{rate:,.0f}", "KiB / environment": "{kib:.1f}"},
-    ),
     "scaling": (
         "Tactile scaling", "",
         {"axis": "{case}", "value": "{value:,}", "environments": "{envs:,}", "ms / update": "{ms:.3f}"},

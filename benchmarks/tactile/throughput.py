@@ -4,7 +4,6 @@
     python -m benchmarks.tactile.throughput --device cuda --part sensors      # sensor time alone, against its roofline
     python -m benchmarks.tactile.throughput --device cuda --part totals       # engine totals beside the law of depths
     python -m benchmarks.tactile.throughput --device cuda --part step         # whole step against the engine alone
-    python -m benchmarks.tactile.throughput --device cuda --part published    # configurations of thesis figure 4.4
     python -m benchmarks.tactile.throughput --device cuda --part scaling      # taxels, environments, triangles, points
 
 Every case is printed, and with ``--out FILE`` appended as a JSON line, as soon as it is measured. ``--from FILE`` lays
@@ -37,14 +36,13 @@ from benchmarks.tactile.scene import (
     scene_of,
     sensors,
     settled,
-    temperature,
     totals_cases,
     with_mesh,
 )
 from benchmarks.tactile.tables import plot_scaling, tables
 from brainbench.core.devices import pick_device, warp
 from robotics_bridge.physics import HandState, TouchScene
-from robotics_bridge.sensors import ContactDepthProbe, ElastomerTaxel, KinematicTaxel, Noise, Probes, SensorSuite
+from robotics_bridge.sensors import KinematicTaxel, Noise, SensorSuite
 
 ROOFLINE = {False: 0.018e-3, True: 0.085e-3}
 """Seconds that the issue allows 100 taxels of 6 channels and 16,384 environments at the H200's bandwidth, clean and
@@ -170,35 +168,6 @@ def part_step(options: argparse.Namespace) -> Iterable[Row]:
         del engine
 
 
-def part_published(options: argparse.Namespace) -> Iterable[Row]:
-    """Configurations of thesis figure 4.4, sensor time and memory."""
-    envs = options.envs
-    found = settled(min(envs, 64), options.device, options.settle)
-    common = {"link": "box0", "track": ("box1",)}
-    five = [f"box{i}" for i in range(5)]
-    patch = Probes.grid(5, 4, size=(0.2, 0.16), center=(0, 0, 0.125))
-    cases: dict[str, tuple[int, dict[str, Any]]] = {
-        "kinematic 10 × 10": (envs, {"k": KinematicTaxel(probes=grid(100), **common)}),
-        "5 temperature grids 2 × 2 × 2": (envs, {f"t{i}": temperature(link) for i, link in enumerate(five)}),
-        "5 elastomers 5 × 4": (
-            min(envs, 1024),
-            {f"e{i}": ElastomerTaxel(link=link, probes=patch, points=1000) for i, link in enumerate(five)},
-        ),
-        "5 depth sensors, 10,000 taxels": (
-            min(envs, 1024),
-            {f"d{i}": ContactDepthProbe(link=link, probes=grid(2025)) for i, link in enumerate(five)},
-        ),
-        "kinematic 100 × 100": (envs, {"k": KinematicTaxel(probes=grid(10_000), **common)}),
-    }
-    for label, (count, config) in cases.items():
-        state = restore(found, count, options.device)
-        seconds, first, suite = timed(scene_of(), config, state, options.device)
-        held = suite.state_bytes
-        row = {"case": label, "envs": count, "ms": seconds * 1e3, "rate": count / seconds, "first_s": first}
-        yield row | {"kib": (held["sensors"] + held["shared"] + held["scratch"]) / 1024}
-        del suite, state
-
-
 def part_scaling(options: argparse.Namespace) -> Iterable[Row]:
     """Cost against taxels, environments, triangles and points."""
     envs = options.envs
@@ -233,7 +202,6 @@ PARTS = {
     "sensors": part_sensors,
     "totals": part_totals,
     "step": part_step,
-    "published": part_published,
     "scaling": part_scaling,
 }
 

@@ -25,6 +25,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.report import publish, script_parser, table
+from benchmarks.tradeoffs.whiskers import REFERENCE
 from benchmarks.whiskers.scene_tables import write_scene
 from brainbench.cli import app
 from brainbench.core.statistics import wilson_interval
@@ -38,7 +39,6 @@ from brainbench.stimuli.scenes.scene_files import load_scene
 from brainbench.stimuli.stimulus_set import read_stimulus_set
 from brainbench.stimuli.validation.bench_tests import HARD_OBJECTS, OBJECTS, contact_jobs
 from brainbench.stimuli.whiskers.array import SPECIES, WhiskerArray
-from brainbench.tradeoffs.whiskers import REFERENCE
 
 SPEEDS = (0.2, 0.7, 1.5, 2.9)
 """Speeds of the objects that strike [m/s]."""
@@ -87,7 +87,7 @@ def converged(jobs: Sequence[Job], fidelity: Fidelity, folder: Path) -> dict[boo
     paths = [write_scene(job, folder / str(index)) for index, job in enumerate(jobs)]
     jobs = [load_scene(path).scenes[0].jobs()[0] for path in paths]
     coarser = replace(fidelity, links=round(fidelity.links / 1.5), time_step=2 * fidelity.time_step)
-    engine = get_engine(REFERENCE.backend)
+    engine = get_engine("rod")
     traces, others = (engine.run(jobs, setting.resolved(True)) for setting in (fidelity, coarser))
     scenes: dict[bool, list[SceneRun]] = {True: [], False: []}
     for path, job, trace, coarse in zip(paths, jobs, traces, others, strict=True):
@@ -164,10 +164,10 @@ def main() -> None:
     parser.add_argument("--backend", default="rod")
     args = parser.parse_args()
     drawn = {
-        "one-side": (contact_jobs(args.seed, each=1), REFERENCE.fidelity),
-        "hard": (contact_jobs(args.seed, each=1, objects=HARD_OBJECTS), REFERENCE.fidelity),
-        "struck": (struck_jobs(args.seed, 72), replace(REFERENCE.fidelity, time_step=1e-6)),
-        "slip-off": (contact_jobs(args.seed, each=4, objects=("slip-off",)), REFERENCE.fidelity),
+        "one-side": (contact_jobs(args.seed, each=1), REFERENCE),
+        "hard": (contact_jobs(args.seed, each=1, objects=HARD_OBJECTS), REFERENCE),
+        "struck": (struck_jobs(args.seed, 72), replace(REFERENCE, time_step=1e-6)),
+        "slip-off": (contact_jobs(args.seed, each=4, objects=("slip-off",)), REFERENCE),
     }
     rows = []
     with tempfile.TemporaryDirectory() as folder:
@@ -184,7 +184,7 @@ def main() -> None:
         f"--out SET`, seed {args.seed}. One side: {', '.join(OBJECTS)}. Hard: {', '.join(HARD_OBJECTS)}. "
         f"Struck: at {', '.join(f'{speed:g}' for speed in SPEEDS)} m/s. Left out: what touches nothing or cannot be "
         "trusted at the finest setting. True error, in %, of base force or moment (root mean square over the "
-        f"readings in contact, the larger) against `{REFERENCE.fidelity}`, for blows with steps of 1 µs. Covered: the "
+        f"readings in contact, the larger) against `{REFERENCE}`, for blows with steps of 1 µs. Covered: the "
         "estimate is no smaller. In silence: without a remark. No limit: whiskers of all groups whose truth changes by "
         f"more than {UNSETTLED:.0%} with twice its step and two thirds of its links ("
         + ", ".join(f"{len(scenes[False])} {name}" for name, scenes in scenes_of.items())

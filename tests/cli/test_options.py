@@ -128,7 +128,6 @@ def test_other_commands_refuse_such_an_out_too(run, tmp_path, command):
 @pytest.mark.parametrize(
     ("command", "option"),
     [
-        (("tradeoff", "whisker"), "--out"),
         (("stimuli", "fit", "none"), "--picture"),
         (("policy", "play", "in_palm_rotate"), "--video"),
         (("policy", "sweep"), "--out"),

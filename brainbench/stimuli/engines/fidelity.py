@@ -1,7 +1,7 @@
 """Accuracy of a whisker simulation: presets, and the cheapest setting for a wanted error.
 
 Errors and costs are measured, not assumed: ``fidelity_table.json`` beside this module is written by
-``brainbench tradeoff whisker`` (``brainbench/tradeoffs``) and states how.
+``python -m benchmarks.tradeoffs whisker`` and states how.
 """
 
 from __future__ import annotations

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping
 from functools import cache
 from typing import Any, cast
 
@@ -25,7 +24,6 @@ from numpy.typing import NDArray
 from trimesh.triangles import closest_point
 
 from brainbench.geometry import Mesh, winding_number
-from brainbench.tradeoffs.study import Row, Study
 from robotics_bridge.physics import Geometry, HandState, TouchScene
 from robotics_bridge.sensors.probes.placement import Probes
 from robotics_bridge.sensors.queries.solids import surface_points
@@ -33,32 +31,32 @@ from robotics_bridge.sensors.sensor import Sensor
 from robotics_bridge.sensors.suite import SensorSuite
 from robotics_bridge.sensors.taxels.sensors import KinematicTaxel, ProximityTaxel
 
+Row = dict[str, Any]
 RESOLUTIONS = (16, 32, 64, 128)
 POINTS = (250, 500, 1000, 2000, 4000, 16_000)
 TAXELS = (5, 10, 20, 40, 80)
 HEIGHTS = {"mesh": 0.010, "primitive": 0.017}  # height (m) above the pad at which the torus and the sphere touch it
 WITHOUT_CELLS = {"mesh": "raycast", "primitive": "sdf"}  # query of the parts that need no distance field
+ABOUT = {
+    "error": "relative RMS of forces against double precision", "cost": "microseconds per environment and update",
+}  # fmt: skip
+FIXED: dict[str, Any] = {}
 _POSES = 12
 _CYLINDER = Geometry(name="o", link="object", kind="cylinder", size=(0.008, 0.012))
 _PAD = Geometry(name="pad", link="hand", kind="box", size=(0.03, 0.03, 0.005))
 
 
-def study() -> Study:
-    """Return the study of every setting; its rows have ``part``, what was set, ``error`` and ``cost``."""
-    measures = {"mesh": _field, "primitive": _field, "points": _proximity, "taxels": _pad}
-    settings = [{"part": "mesh", "query": "sdf", "resolution": cells} for cells in RESOLUTIONS]
-    settings += [{"part": part, "query": query, "resolution": None} for part, query in WITHOUT_CELLS.items()]
-    settings += [{"part": "points", "points": count} for count in POINTS]
-    settings += [{"part": "taxels", "taxels": side * side} for side in TAXELS]
-    return Study(
-        "brainbench tradeoff tactile",
-        settings,
-        lambda row: measures[row["part"]](row),
-        about={
-            "error": "relative RMS of forces against double precision",
-            "cost": "microseconds per environment and update",
-        },
-    )
+def settings() -> list[Row]:
+    """Return every setting: ``part``, and what is set in it."""
+    rows: list[Row] = [{"part": "mesh", "query": "sdf", "resolution": cells} for cells in RESOLUTIONS]
+    rows += [{"part": part, "query": query, "resolution": None} for part, query in WITHOUT_CELLS.items()]
+    rows += [{"part": "points", "points": count} for count in POINTS]
+    return rows + [{"part": "taxels", "taxels": side * side} for side in TAXELS]
+
+
+def measure(row: Row) -> Row:
+    """Return ``error`` and ``cost`` of a setting."""
+    return {"mesh": _field, "primitive": _field, "points": _proximity, "taxels": _pad}[row["part"]](row)
 
 
 def triangle_distance(mesh: Mesh, points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -140,7 +138,7 @@ def _exact_field(part: str) -> NDArray[np.float64]:
     return exact
 
 
-def _field(row: Mapping[str, Any]) -> Row:
+def _field(row: Row) -> Row:
     part, resolution = row["part"], row["resolution"]
     solid = _torus() if part == "mesh" else Geometry(name="o", link="object", kind="sphere", size=(0.012,))
     taxel = KinematicTaxel(link="hand", probes=_grid(), query=row["query"])
@@ -166,13 +164,13 @@ def _pads() -> Probes:
     return Probes.grid(6, 6, size=(0.02, 0.02), center=(0, 0, 0.005), radius=0.008)
 
 
-def _proximity(row: Mapping[str, Any]) -> Row:
+def _proximity(row: Row) -> Row:
     read, cost = _run(_CYLINDER, ProximityTaxel(link="hand", probes=_pads(), points=row["points"]), _places(0.019))
     exact = _exact_proximity()
     return {"error": _error(read[..., 2].reshape(exact.shape), exact), "cost": cost}
 
 
-def _pad(row: Mapping[str, Any]) -> Row:
+def _pad(row: Row) -> Row:
     side = math.isqrt(row["taxels"])
     solid = Geometry(name="o", link="object", kind="sphere", size=(0.012,))
     places, pitch = _places(0.017), 0.03 / side

@@ -1,11 +1,7 @@
-"""The pictures of error against cost in docs/images, from the tables that ``brainbench tradeoff`` measures.
-
-python -m benchmarks.tradeoff_pictures [--folder docs/images]
-"""
+"""The pictures of error against cost in docs/images, from the tables that ship."""
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import cycle
@@ -16,9 +12,10 @@ from matplotlib.patheffects import withStroke
 
 from brainbench.core.figures import COLORS, panels, save_figure
 from brainbench.core.files import read_json
+from brainbench.core.tradeoffs import TradeoffPoint, pareto_front
 from brainbench.stimuli.engines.fidelity import RESOLUTION, Fidelity, list_presets
-from brainbench.tradeoffs.study import Row, front
 
+Row = dict[str, Any]
 SIDES = (6, 5, "left"), (-6, -3, "right"), (6, -11, "left"), (-6, -11, "right")
 """Places of labels beside their points (points of the page), and how they are aligned."""
 HALO = withStroke(linewidth=2.5, foreground="white")
@@ -55,7 +52,7 @@ def draw_study(charts: Sequence[Panel], path: Path) -> Path:
         for name in names:
             rows = [row for row in usable if chart.series(row) == name]
             colour = COLORS[series.index(name) % len(COLORS)]
-            best = front(rows, chart.error, ())
+            best = pareto_front(TradeoffPoint(row[chart.error], row["cost"]) for row in rows)
             axis.scatter(
                 [row["cost"] for row in rows], [row[chart.error] for row in rows], s=18, color=colour, alpha=0.6
             )
@@ -124,14 +121,7 @@ def plain_log_ticks(axes: Any) -> None:
         axis.set_minor_formatter(NullFormatter())
 
 
-def main() -> None:
-    """Draw every table."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--folder", type=Path, default=Path("docs/images"))
-    folder = parser.parse_args().folder
+def draw_tables(folder: Path) -> None:
+    """Draw every table that ships."""
     for (name, table), charts in zip(TABLES.items(), (whisker_charts, tactile_charts), strict=True):
         print(draw_study(charts(read_json(table)["points"]), folder / f"{name}-tradeoff.png"))
-
-
-if __name__ == "__main__":
-    main()
