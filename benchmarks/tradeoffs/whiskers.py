@@ -93,10 +93,10 @@ def settings(backends: Sequence[str], solvers: Sequence[str], collisions: Sequen
         Fidelity(links=n, time_step=step, solver="quasistatic", contact_tolerance=CONTACT_TOLERANCES[0])
         for n, (step, _) in steps
     ]
-    fidelities = {"dynamic": [*presets, *grid], "quasistatic": still}
+    fidelities = {"dynamic": list(dict.fromkeys([*presets, *grid])), "quasistatic": still}
     check_each("solver", solvers, fidelities)
     rows = [
-        {**asdict(fidelity), "backend": get_engine(backend).name}
+        {**asdict(fidelity), "backend": get_engine(backend).name, "collision": None}
         for solver, backend in itertools.product(solvers, backends)
         if solver == "dynamic" or backend == "rod"
         for fidelity in fidelities[solver]
