@@ -1,10 +1,10 @@
 """Error and cost of whisker simulations over their settings: the data behind ``Fidelity.auto``.
 
-Per setting, in the random scenes of contact of :mod:`brainbench.stimuli.validation.bench_tests`, against a converged
+Per setting, in the random scenes of contact of :mod:`tests.factories.contact_scenes`, against a converged
 simulation (:data:`REFERENCE`):
 
 - ``error_50``, ``error_90``, ``error_95``, ``worst``: what so many per cent of the whiskers with an object on one side
-  stay below (:func:`.bench_tests.difference`), and all; null where more of them cannot be trusted;
+  stay below (:func:`~tests.factories.contact_scenes.difference`), and all; null where more of them cannot be trusted;
 - ``hard_50``, ``hard_90``, ``hard_worst``: the same of those with objects on both sides, slipping off or released;
 - ``untrusted``: share of the whiskers with an object on one side that were flagged;
 - ``cost``: processor seconds per simulated second of one of them.
@@ -41,8 +41,9 @@ from brainbench.stimuli.engines.reach import touched
 from brainbench.stimuli.motion.jobs import Job, Trace
 from brainbench.stimuli.objects.obstacle import Obstacle
 from brainbench.stimuli.objects.solid import rodgers_solid, touchable
-from brainbench.stimuli.validation.bench_tests import HARD_OBJECTS, OBJECTS, contact_jobs, difference, peg, ringdown
+from brainbench.stimuli.validation.bench_tests import peg, ringdown
 from brainbench.stimuli.whiskers.array import WhiskerArray
+from tests.factories.contact_scenes import HARD_OBJECTS, OBJECTS, contact_jobs, difference
 
 Row = dict[str, Any]
 PEGS = ((0.3, 0.05), (0.5, 0.1), (0.5, 0.2), (0.7, 0.2), (0.8, 0.02))

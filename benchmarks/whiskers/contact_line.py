@@ -16,7 +16,7 @@ from benchmarks.report import publish, script_parser, table
 from brainbench.core.statistics import wilson_interval
 from brainbench.stimuli.engines import get_engine
 from brainbench.stimuli.engines.fidelity import Fidelity
-from brainbench.stimuli.validation.bench_tests import HARD_OBJECTS, contact_jobs, difference
+from tests.factories.contact_scenes import HARD_OBJECTS, contact_jobs, difference
 
 TRUTH = "accurate,links=50,time_step=2e-5,steps_per_period=400,contact_tolerance=1e-6"
 LINES = "links", "rod"

@@ -2,7 +2,7 @@
 
 ``python -m benchmarks.whiskers.errors [--seed 1] [--settings fast,auto=0.1] [--groups hard] [--rounds 3] [--write]``
 
-The scenes are those of :mod:`brainbench.stimuli.validation.bench_tests`, one of each kind, and whiskers at rest that
+The scenes are those of :mod:`tests.factories.contact_scenes`, one of each kind, and whiskers at rest that
 objects strike, each a scene file of its own. ``brainbench stimuli simulate`` runs them: status, error and remark are
 what it prints and writes. The truth is the converged simulation of the trade-off, for blows with steps of 1 µs.
 Whiskers for which twice its step and two thirds of its links give other forces have no known truth, and stand in a
@@ -37,8 +37,8 @@ from brainbench.stimuli.motion.trajectories import Translation
 from brainbench.stimuli.objects.solid import PlacedObject, box, capsule, sphere
 from brainbench.stimuli.scenes.scene_files import load_scene
 from brainbench.stimuli.stimulus_set import read_stimulus_set
-from brainbench.stimuli.validation.bench_tests import HARD_OBJECTS, OBJECTS, contact_jobs
 from brainbench.stimuli.whiskers.array import SPECIES, WhiskerArray
+from tests.factories.contact_scenes import HARD_OBJECTS, OBJECTS, contact_jobs
 
 SPEEDS = (0.2, 0.7, 1.5, 2.9)
 """Speeds of the objects that strike [m/s]."""

@@ -3,181 +3,25 @@
 Each function sets up a known experiment, drives the real backend with it and returns what it measured
 beside the reference of :mod:`brainbench.stimuli.validation.references`. Frame: base at the origin, whisker along +x,
 bending in the x-y plane. Wrenches are the action of the whisker on its base, about the base point; SI.
-Here too: random scenes of whiskers in contact, in which settings are compared with a converged simulation.
 """
 
 from __future__ import annotations
 
-import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.errors import DataError, UsageError, check_number
-from brainbench.core.rotations import base_rotation, euler_matrix
 from brainbench.stimuli.engines import get_engine
 from brainbench.stimuli.engines.fidelity import DEFAULT_ENGINE, Fidelity
 from brainbench.stimuli.motion.jobs import Job, Load, StillFollicle, Trace
-from brainbench.stimuli.motion.trajectories import ArrayFollicle, Whisking, smooth_step
-from brainbench.stimuli.objects.obstacle import Box, Capsule, Cylinder, Obstacle, Part, RigidMotion
-from brainbench.stimuli.objects.solid import Solid, box, capsule, rodgers_solid, sphere
+from brainbench.stimuli.motion.trajectories import smooth_step
+from brainbench.stimuli.objects.obstacle import Capsule, Cylinder, Obstacle, RigidMotion
 from brainbench.stimuli.validation import references
-from brainbench.stimuli.whiskers.array import SPECIES, MountedWhisker, WhiskerArray
 from brainbench.stimuli.whiskers.whisker import Whisker, build_chain
-
-OBJECTS = ("post", "ball", "edge", "hollow")
-"""One object on one side of a whisker, which stays in contact until it retracts."""
-HARD_OBJECTS = ("opposed", "slot", "comb", "slip-off", "release")
-"""Contacts from both sides (two posts, the second farther out; two bars; six posts), a post that the whisker slips past
-with its tip, and one that is pulled away from it."""
-FRICTIONS = (0.0, 0.4, 0.8)
-FREQUENCIES = (5.0, 10.0, 20.0)  # whisks per second [Hz]
-_RETRACTION = math.radians(12)
-_PULL = 0.01
-"""Time in which an object of the kind ``release`` is pulled away [s]."""
-
-
-def contact_jobs(
-    seed: int, *, each: int = 3, objects: Sequence[str] = OBJECTS, hollow: Solid | None = None
-) -> list[Job]:
-    """Return jobs of one whisker that whisks against one object, ``each`` of every combination, in a random order.
-
-    Whisker, point of contact (.4 to .85 of the length; .9 to .97 to slip off), azimuth of first contact (−3° to 3°; .1°
-    to .6° between objects on both sides), depth (4° to 14° beyond it; three times as much to slip off), size and turn
-    of the object are drawn. Read every ms. Other seeds are other scenes of the same kinds.
-
-    Args:
-        objects: kinds of objects, of :data:`OBJECTS` and :data:`HARD_OBJECTS`.
-        hollow: another solid of the shape and size of :func:`rodgers_solid`, touched in its place.
-    """
-    random = np.random.default_rng(seed)
-    solid = rodgers_solid() if hollow is None else hollow
-    cells = [cell for cell in itertools.product(SPECIES, objects, FRICTIONS, FREQUENCIES) for _ in range(each)]
-    arrays = {species: WhiskerArray.of(species) for species in SPECIES}
-    jobs = [
-        _draw(arrays[species].mounts, kind, friction, frequency, solid, random)
-        for species, kind, friction, frequency in cells
-    ]
-    return [jobs[index] for index in random.permutation(len(jobs))]
-
-
-def difference(trace: Trace, reference: Trace) -> float:
-    """Return the larger of the relative errors of base force and moment, root mean square over the readings.
-
-    Infinite where the trace cannot be trusted.
-    """
-    if trace.status != "ok":
-        return math.inf
-    gap, whole = (np.sqrt(np.mean(part.reshape(-1, 2, 3) ** 2, axis=(0, 2))) for part in (
-        trace.wrench - reference.wrench, reference.wrench
-    ))  # fmt: skip
-    return float(np.max(gap / whole))
-
-
-def _draw(
-    mounts: tuple[MountedWhisker, ...],
-    kind: str,
-    friction: float,
-    frequency: float,
-    hollow: Solid,
-    random: np.random.Generator,
-) -> Job:
-    mount = mounts[random.integers(len(mounts))]
-    around, past = kind in ("opposed", "slot", "comb"), kind == "slip-off"
-    touch, depth = np.radians(random.uniform((0.1 if around else -3, 4), (0.6 if around else 3, 14)))
-    # Whiskers between objects rest there.
-    whisking = Whisking(frequency, touch + (3 if past else 1) * depth, 0 if around else _RETRACTION, onset=0.025)
-    point, axes = _contact(mount, whisking, touch, random.uniform(*((0.9, 0.97) if past else (0.4, 0.85))))
-    scale = mount.whisker.arc_length / 0.02
-    if kind in HARD_OBJECTS:
-        gap = 2 * (abs(touch) * float(np.linalg.norm(point - mount.position)) + mount.whisker.base_radius)
-        parts = _hard_parts(kind, scale, gap, random)
-        obstacle = Obstacle(parts, friction=friction).moved(axes, point)
-        if kind == "release":
-            # Against the whisker's way, near the end of the protraction, when it is bent most.
-            start, way = 0.4 / frequency, 0.005 * scale * axes[:, 1]
-            motion = _sliding(lambda times: np.outer(smooth_step(times - start, _PULL), way))
-            motion.finest = _PULL  # type: ignore[attr-defined]
-            obstacle = replace(obstacle, motion=motion)
-    else:
-        solid, turn, place = _object(kind, scale, hollow, random)
-        rotation = axes @ turn
-        body = Obstacle(solid.parts, friction=friction, surface=solid.surface)
-        obstacle = body.moved(rotation, point - rotation @ place)
-    duration = max(0.15, 1.5 / frequency)
-    return Job(mount.whisker, ArrayFollicle(mount, whisking), (obstacle,), np.arange(1e-3, duration, 1e-3))
-
-
-def _hard_parts(kind: str, scale: float, gap: float, random: np.random.Generator) -> tuple[Part, ...]:
-    """Return parts that touch at the origin of the axes of the contact: the whisker comes along y and lies along x."""
-    radius, half, way = 2e-4 * scale * random.uniform(1, 3), 0.015 * scale, scale * random.uniform(0.5e-3, 3e-3)
-    ahead, behind = radius, -radius - gap
-    if kind == "slot":
-        return tuple(Box((0.0, y, 0.0), (way, radius, half)) for y in (ahead, behind))
-    places = [(0.0, ahead)]
-    if kind == "opposed":
-        places.append((way, behind))
-    elif kind == "comb":
-        places = [(x * way, y) for x in (-1, 0, 1) for y in (ahead, behind)]
-    return tuple(Capsule((x, y, -half), (x, y, half), radius) for x, y in places)
-
-
-def _contact(
-    mount: MountedWhisker, whisking: Whisking, azimuth: float, fraction: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the point [3] (m) of a whisker turned by an azimuth (rad), and axes there as columns of [3, 3].
-
-    y is where the point moves, z crosses whisker and motion.
-    """
-    rates = np.array(whisking.rotations.rates(mount))
-    arc = fraction * mount.whisker.arc_length + np.array([0.0, 1e-5])
-    line = np.column_stack([mount.whisker.centre_line(arc), np.zeros(2)])
-    before, now = (
-        mount.position + line @ base_rotation(mount.angles + turn * rates).T for turn in (azimuth - 1e-4, azimuth)
-    )
-    tangent, motion = now[1] - now[0], now[0] - before[0]
-    across = np.cross(tangent, motion)
-    across /= np.linalg.norm(across)
-    ahead = np.cross(across, tangent / np.linalg.norm(tangent))
-    # The surface touches the whisker's surface, not its centre line.
-    return now[0] + mount.whisker.radius(arc[0]) * ahead, np.column_stack([np.cross(ahead, across), ahead, across])
-
-
-def _object(
-    kind: str, scale: float, hollow: Solid, random: np.random.Generator
-) -> tuple[Solid, NDArray[np.float64], NDArray[np.float64]]:
-    """Return a solid, its turn in the axes of the contact [3, 3], and which point of it touches [3] (m)."""
-    size = scale * random.uniform(1, 2)
-    roll = random.uniform(-0.4, 0.4)
-    turn = euler_matrix((0.0, roll, 0.0))
-    if kind == "post":
-        return capsule(4e-4 * size, 0.03 * scale), turn, np.array([0.0, -4e-4 * size, 0.0])
-    if kind == "ball":
-        return sphere(2e-3 * size), np.eye(3), np.array([0.0, -2e-3 * size, 0.0])
-    if kind == "edge":
-        # The edge at −x, −y looks backwards once the box is turned by 45° about z.
-        width = 6e-3 * size
-        turn = turn @ euler_matrix((0.0, 0.0, math.pi / 4))
-        return box((width, width, 0.03 * scale)), turn, np.array([-width / 2, -width / 2, 0.0])
-    # The trough lies along the whisker: its axis z becomes the contact's −x.
-    factor = 0.36 * size
-    turn = euler_matrix((0.0, roll - math.pi / 2, 0.0))
-    # A point of the hollow face, a fraction of the way along its curve.
-    along = round(random.uniform(0.35, 0.65) * (len(_faces()) - 1))
-    return hollow.scaled(factor), turn, factor * _faces()[along, 2:].mean(axis=0)
-
-
-@cache
-def _faces() -> NDArray[np.float64]:
-    """Corners [ring, 4, 3] (m) of the Rodgers solid: convex low, convex high, concave high, concave low."""
-    mesh = rodgers_solid().mesh
-    assert mesh is not None
-    return mesh.vertices.reshape(-1, 4, 3)
-
 
 _CLEARANCE = 1.2  # half width of a pulley's groove in base radii of the whisker
 
@@ -279,7 +123,7 @@ def peg(
     settling = settling_time(whisker)
     # Slow against the first mode, so that little swings when the peg stops.
     duration = max(0.1, 4 * settling)
-    motion = _sliding(lambda times: start + smooth_step(times, duration)[:, None] * (end - start))
+    motion = sliding(lambda times: start + smooth_step(times, duration)[:, None] * (end - start))
     rod = _peg_obstacle(whisker, peg_radius, motion)
     trace = run_one(backend, job_at_rest(whisker, np.array([duration + settling]), rod), fidelity)
     return BenchTest(trace.wrench[-1], contact.wrench, float(trace.contact_arc[-1]), trace)
@@ -310,7 +154,7 @@ def slip_off(
         return expected * np.interp(times, [0.0, approach, duration], [0.0, 0.94, 1.12])
 
     times = np.linspace(0, duration, 2001)[1:]
-    rod = _pulley(whisker, peg_radius, _sliding(lambda t: np.column_stack([np.full(len(t), at), touch + depth(t)])))
+    rod = _pulley(whisker, peg_radius, sliding(lambda t: np.column_stack([np.full(len(t), at), touch + depth(t)])))
     trace = run_one(backend, job_at_rest(whisker, times, rod), fidelity)
     held = np.flatnonzero(trace.contact)
     if not len(held) or held[-1] == len(times) - 1:
@@ -330,7 +174,7 @@ def job_at_rest(whisker: Whisker, times: NDArray[np.float64], *obstacles: Obstac
     return Job(replace(whisker, damping_ratio=1.0), StillFollicle(), obstacles, times)
 
 
-def _sliding(place: Callable[[NDArray[np.float64]], NDArray[np.float64]]) -> RigidMotion:
+def sliding(place: Callable[[NDArray[np.float64]], NDArray[np.float64]]) -> RigidMotion:
     """Return the motion of a body that does not turn, through points [n, 3] (m), or [n, 2] in the plane of bending."""
 
     def motion(times: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

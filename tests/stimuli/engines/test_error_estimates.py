@@ -24,7 +24,7 @@ from brainbench.stimuli.engines.fidelity import list_presets
 from brainbench.stimuli.motion.jobs import Job, Load, StillFollicle, Trace
 from brainbench.stimuli.motion.trajectories import ArrayFollicle, Whisking
 from brainbench.stimuli.objects.obstacle import Capsule, Obstacle, Sphere
-from brainbench.stimuli.validation import bench_tests
+from tests.factories.contact_scenes import HARD_OBJECTS, contact_jobs
 from tests.factories.whiskers import C2
 
 RAT = replace(WhiskerArray.of("rat")["C2"].whisker, curvature=0.0, friction=0.0)
@@ -76,8 +76,8 @@ def test_a_whisker_between_opposed_posts_carries_an_error_no_smaller_than_the_el
 
 @pytest.mark.slow
 def test_estimates_cover_the_error_of_contacts_of_all_kinds():
-    kinds = (*bench_tests.HARD_OBJECTS, "post", "hollow")
-    jobs = bench_tests.contact_jobs(3, each=1, objects=kinds)[::3]
+    kinds = (*HARD_OBJECTS, "post", "hollow")
+    jobs = contact_jobs(3, each=1, objects=kinds)[::3]
     finest = Fidelity(links=40, time_step=1e-5, precision="double", contact_tolerance=1e-9)
     references = get_engine("rod").run(jobs, finest)
     traces = get_engine("rod", errors=True).run(jobs, Fidelity.of("balanced"))

@@ -14,7 +14,7 @@ from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.trust import GAVE_WAY, LARGEST_OVERLAP, LARGEST_STRAIN, LOST, halved, judge
 from brainbench.stimuli.motion.jobs import Job, Load, StillFollicle
 from brainbench.stimuli.objects.obstacle import Box, Capsule, Obstacle, Sphere
-from brainbench.stimuli.validation.bench_tests import contact_jobs, difference
+from tests.factories.contact_scenes import contact_jobs, difference
 from tests.factories.trust import facts
 from tests.factories.whiskers import C2
 

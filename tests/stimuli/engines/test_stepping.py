@@ -10,7 +10,7 @@ from brainbench.stimuli.engines import get_engine
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.motion.jobs import Job, StillFollicle
 from brainbench.stimuli.objects.obstacle import Box, Cylinder, Obstacle, Sphere
-from brainbench.stimuli.validation.bench_tests import contact_jobs
+from tests.factories.contact_scenes import contact_jobs
 from tests.factories.whiskers import C2
 
 ESTIMATED = get_engine("mujoco", errors=True)

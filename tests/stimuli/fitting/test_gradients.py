@@ -23,7 +23,7 @@ from brainbench.stimuli.fitting.gradients import (
 from brainbench.stimuli.fitting.recorded_run import RecordingSolver
 from brainbench.stimuli.motion.jobs import Job, Load, StillFollicle
 from brainbench.stimuli.objects.obstacle import Box, Capsule, Cylinder, Obstacle, Sphere
-from brainbench.stimuli.validation.bench_tests import contact_jobs
+from tests.factories.contact_scenes import contact_jobs
 from tests.factories.gradients import COARSE, WHISKER, Swing, gradient_errors, touching_job, traces_at
 
 POST = Capsule((11e-3, 2.2e-3, -8e-3), (11e-3, 2.7e-3, 8e-3), 5e-4)

@@ -11,7 +11,7 @@ from brainbench.core.devices import pick_device
 from brainbench.stimuli.engines.rod.engine import PackedTasks, RodEngine, make_task
 from brainbench.stimuli.fitting.recorded_run import RecordingSolver
 from brainbench.stimuli.objects.obstacle import Capsule
-from brainbench.stimuli.validation.bench_tests import contact_jobs
+from tests.factories.contact_scenes import contact_jobs
 from tests.factories.gradients import COARSE, touching_job
 
 FINE = replace(COARSE, precision="double")

@@ -13,7 +13,8 @@ from brainbench.stimuli.engines import get_engine
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.motion.jobs import Trace
 from brainbench.stimuli.validation import bench_tests, references
-from brainbench.stimuli.validation.bench_tests import HARD_OBJECTS, PointLoad, contact_jobs, difference, ringdown
+from brainbench.stimuli.validation.bench_tests import PointLoad, ringdown
+from tests.factories.contact_scenes import HARD_OBJECTS, contact_jobs, difference
 from tests.factories.whiskers import C2, GATE_WHISKERS, RAT
 
 

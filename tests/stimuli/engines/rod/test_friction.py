@@ -14,9 +14,9 @@ from brainbench.stimuli.engines.mujoco import build_model, engine
 from brainbench.stimuli.engines.reach import Reach
 from brainbench.stimuli.motion.jobs import Job, StillFollicle
 from brainbench.stimuli.objects.obstacle import Cylinder, Obstacle, Sphere
-from brainbench.stimuli.validation.bench_tests import contact_jobs, difference
 from brainbench.stimuli.whiskers.array import WhiskerArray
 from brainbench.stimuli.whiskers.whisker import Whisker, build_chain
+from tests.factories.contact_scenes import contact_jobs, difference
 
 SPEED = 0.03
 """Of the object (m/s), a brisk sweep of the recipes."""
