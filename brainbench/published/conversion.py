@@ -548,7 +548,8 @@ def convert_sweeps(tree: SweepTree, out: str | os.PathLike[str], *, progress: Pr
         for shard in missing:
             done(write_shard(tree.content(shard), folder))
 
-    return write_data_set(tree, out, run, what="converting sweeps", progress=progress)
+    objects, notes = tree.objects, tree.notes
+    return write_data_set(tree.shards, objects, out, run, what="converting sweeps", notes=notes, progress=progress)
 
 
 def _no_solid(name: str) -> Solid:

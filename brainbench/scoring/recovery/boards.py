@@ -112,7 +112,7 @@ class Recovery:
     def answer(self, wanted: float = WANTED) -> str:
         """Say in one sentence whether the design can tell the candidates apart.
 
-        Yes or no where the interval of the win rate lies above or below ``wanted``. Yes also needs that as many$
+        Yes or no where the interval of the win rate lies above or below ``wanted``. Yes also needs that as many
         of the pairs with the true network are told apart: a tied pair may stand in another order for other stimuli.
         """
         interval = self.wins()

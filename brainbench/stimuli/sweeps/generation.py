@@ -10,7 +10,7 @@ import shutil
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, ThreadPoolExecutor, as_completed, wait
 from concurrent.futures.process import BrokenProcessPool
 from datetime import timedelta
@@ -41,6 +41,7 @@ from brainbench.core.runs.jobs import (
 )
 from brainbench.stimuli.engines import get_engine
 from brainbench.stimuli.engines.error_estimates import LARGEST_ERROR
+from brainbench.stimuli.objects.collections import NamedObject
 from brainbench.stimuli.sweeps.plan import (
     COUNTS,
     OK,
@@ -48,7 +49,6 @@ from brainbench.stimuli.sweeps.plan import (
     UNUSABLE,
     BuiltObject,
     GenerationPlan,
-    Plan,
     PlannedShard,
     ShardTask,
     build_object,
@@ -240,17 +240,22 @@ def is_complete(path: Path, task: PlannedShard) -> bool:
     return whole
 
 
-def make_manifest(plan: Plan, folder: str | os.PathLike[str]) -> dict[str, Any]:
+def make_manifest(
+    tasks: Sequence[PlannedShard],
+    sources: Mapping[str, NamedObject],
+    folder: str | os.PathLike[str],
+    notes: Mapping[str, Any],
+) -> dict[str, Any]:
     """Put together the manifest of a finished data set from what its shards say.
 
     Equal data sets have equal manifests on one machine: there is no time in it.
     """
     objects: dict[str, dict[str, Any]] = {
         name: {"label": source.label, "source": source.source, "hash": None, "sweeps": {}, "untouched": True}
-        for name, source in plan.objects.items()
+        for name, source in sources.items()
     }
     errors: list[NDArray[np.float32]] = []
-    shards = [_read(Path(folder) / task.name, task, objects, errors) for task in plan.shards]
+    shards = [_read(Path(folder) / task.name, task, objects, errors) for task in tasks]
     for name, entry in objects.items():
         if not entry["untouched"]:
             del entry["untouched"]
@@ -265,8 +270,8 @@ def make_manifest(plan: Plan, folder: str | os.PathLike[str]) -> dict[str, Any]:
     return {
         "format": SWEEPS_FORMAT, "schema": SWEEPS_SCHEMA,
         "content_hash": content_hash([[shard["name"], shard["content_hash"]] for shard in shards]),
-        "config_hash": plan.config_hash, "config": plan.config, "provenance": about, "classes": list(plan.classes),
-        "sweeps": plan.sweeps, **totals, **_spread(errors), **plan.notes,
+        "config_hash": tasks[0].config_hash, "config": tasks[0].config, "provenance": about,
+        "classes": list(tasks[0].classes), "sweeps": sum(map(len, tasks)), **totals, **_spread(errors), **notes,
         "splits": {split: _summary(item for item in shards if item["split"] == split) for split in SPLITS},
         "shards": shards, "objects": objects,
     }  # fmt: skip
@@ -366,26 +371,30 @@ def generate(
         elif missing:
             run_here(missing, folder, workers, done)
 
-    return write_data_set(plan, out, run, what="simulating sweeps", progress=progress)
+    return write_data_set(plan.shards, plan.objects, out, run, what="simulating sweeps", progress=progress)
 
 
 def write_data_set(
-    plan: Plan,
+    shards: Sequence[PlannedShard],
+    objects: Mapping[str, NamedObject],
     out: str | os.PathLike[str],
     run: Callable[[Sequence[Any], Path, Callable[[int], None]], None],
     *,
     what: str,
+    notes: Mapping[str, Any] | None = None,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
     """Let ``run(missing shards, folder, done)`` write the shards that are missing, then write and return the manifest.
 
-    ``run`` calls ``done`` with the number of sweeps of each shard that it wrote. Errors are those of :func:`generate`.
+    ``run`` calls ``done`` with the number of sweeps of each shard that it wrote; ``shards`` are those of training
+    first, past ``objects`` by name, and ``notes`` further entries of the manifest. Errors are those of
+    :func:`generate`.
     """
     folder = Path(out).absolute()
     with lock_folder(folder, wait=False):
-        begin_run(folder, plan.config, "data set", results="*.h5")
+        begin_run(folder, shards[0].config, "data set", results="*.h5")
         _clean(folder)
-        missing = [task for task in plan.shards if not is_complete(folder / task.name, task)]
+        missing = [task for task in shards if not is_complete(folder / task.name, task)]
         needed, free = sum(task.bytes for task in missing), shutil.disk_usage(folder).free
         sweeps = sum(map(len, missing))
         if needed + _SPARE > free:
@@ -394,11 +403,11 @@ def write_data_set(
                 f"{free / 1e6:,.0f} MB free; choose another folder, fewer sweeps (--sample, --limit) or fewer whiskers."
             )
         report = _reporter(sweeps, what, progress)
-        if len(missing) < len(plan.shards):
-            _LOG.info("%d of %d shards are there already", len(plan.shards) - len(missing), len(plan.shards))
+        if len(missing) < len(shards):
+            _LOG.info("%d of %d shards are there already", len(shards) - len(missing), len(shards))
         run(missing, folder, report)
         _clean(folder)
-        manifest = make_manifest(plan, folder)
+        manifest = make_manifest(shards, objects, folder, notes or {})
         write_json(folder / MANIFEST, manifest)
     return manifest
 

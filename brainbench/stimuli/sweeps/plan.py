@@ -14,7 +14,7 @@ from dataclasses import dataclass, fields
 from functools import cached_property
 from importlib import metadata
 from pathlib import Path
-from typing import Annotated, Any, Literal, Protocol
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -464,36 +464,6 @@ class ShardTask(PlannedShard):
     settings: GenerationSettings
 
 
-class Plan(Protocol):
-    """Data set before its shards are made, simulated (:class:`GenerationPlan`) or converted."""
-
-    config: cached_property[dict[str, Any]]
-    """Plain values that determine every byte of the data set."""
-    config_hash: cached_property[str]
-    shards: cached_property[Any]
-    """Shards (:class:`PlannedShard`), those of training first."""
-
-    @property
-    def objects(self) -> Mapping[str, NamedObject]:
-        """Objects by name."""
-        ...
-
-    @property
-    def classes(self) -> Sequence[str]:
-        """Class labels; a label's place is its number in the shards."""
-        ...
-
-    @property
-    def sweeps(self) -> int:
-        """Number of sweeps."""
-        ...
-
-    @property
-    def notes(self) -> Mapping[str, Any]:
-        """Further entries of the manifest."""
-        ...
-
-
 @dataclass(frozen=True, eq=False)
 class GenerationPlan:
     """The shards of a data set, which needs an object."""
@@ -509,11 +479,6 @@ class GenerationPlan:
     def __post_init__(self) -> None:
         if not self.objects:
             raise UsageError("A data set of sweeps needs at least one object.")
-
-    @property
-    def notes(self) -> Mapping[str, Any]:
-        """Further entries of the manifest: none."""
-        return {}
 
     @cached_property
     def array(self) -> WhiskerArray:
