@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import functools
 import glob
+import itertools
 import json
 import logging
 import math
 import os
 import re
 import zlib
-from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from importlib import resources
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -39,54 +38,19 @@ SYNSETS: dict[str, str] = json.loads(
 """The 55 categories of ShapeNetCore: WordNet 3.0 noun offset and what it means."""
 
 
+DIAGONAL = 0.04  # size [m] at which objects are built; each sweep scales them to its own
+
+
 @dataclass(frozen=True)
-class ShapeNetModel:
-    """One model of the tree."""
+class NamedObject:
+    """One object of a collection; it can be sent to another process and is built there."""
 
     name: str
-    """``synset/model``."""
     label: str
-    """Class label from the category map."""
-    path: Path
-
-    def solid(self, *, diagonal: float = 0.04, **options: Any) -> Solid:
-        """Load and repair the mesh; options and errors are those of :func:`~.solid.mesh_solid`."""
-        # The unit cannot matter: the diagonal is set.
-        return replace(mesh_solid(self.path, unit="m", diagonal=diagonal, **options), name=self.name)
-
-
-@dataclass(frozen=True)
-class ShapeNet:
-    """The models that were asked for and found, and the names of those that were not."""
-
-    root: Path
-    models: tuple[ShapeNetModel, ...]
-    """In the order of the id list; sorted by name without one."""
-    missing: tuple[str, ...] = ()
-    """Names of the id list that the tree does not hold."""
-
-    def __iter__(self) -> Iterator[ShapeNetModel]:
-        return iter(self.models)
-
-    def __len__(self) -> int:
-        return len(self.models)
-
-    @property
-    def labels(self) -> tuple[str, ...]:
-        """The class labels that occur, sorted."""
-        return tuple(sorted({model.label for model in self.models}))
-
-    @property
-    def counts(self) -> dict[str, int]:
-        """Number of models of each label."""
-        return dict(sorted(Counter(model.label for model in self.models).items()))
-
-    def solids(self, **options: Any) -> dict[str, Callable[[], Solid]]:
-        """Return, by name, functions that load each model when it is needed, as sweeps take them.
-
-        ``options`` are those of :meth:`ShapeNetModel.solid`.
-        """
-        return {model.name: functools.partial(model.solid, **options) for model in self.models}
+    """Class label."""
+    source: str
+    """Description of what it is made from: equal sources make equal objects."""
+    load: Callable[[], Solid]
 
 
 def load_shapenet(
@@ -94,15 +58,17 @@ def load_shapenet(
     *,
     ids: str | os.PathLike[str] | Iterable[str] | None = None,
     categories: str | os.PathLike[str] | Mapping[str, str] | None = None,
-) -> ShapeNet:
-    """Find models in the tree of a folder of synset folders; no mesh is read yet.
+    collision: str = "hull",
+) -> dict[str, NamedObject]:
+    """Return, by name, the models in the tree of a folder of synset folders; no mesh is read yet.
 
     Args:
         root: the folder.
-        ids: names ``synset/model`` or a file of them, one a line; every model of the tree when None. Names
-            that the tree lacks are listed in :attr:`ShapeNet.missing` and logged.
+        ids: names ``synset/model`` or a file of them, one a line, in their order; every model of the tree, sorted by
+            name, when None. Names that the tree lacks are logged.
         categories: class labels by ``synset/model`` (first choice) or by synset, or a file of them (see
             :func:`read_categories`); :data:`SYNSETS` when None. Unlisted synsets are their own labels.
+        collision: as for :func:`brainbench.stimuli.objects.solid.mesh_solid`.
     """
     folder = Path(root)
     if not folder.is_dir():
@@ -116,14 +82,17 @@ def load_shapenet(
         names = _checked(ids, "the ids")
     given = read_categories(categories) if isinstance(categories, (str, os.PathLike)) else categories
     labels = SYNSETS if given is None else given
-    models, missing = [], []
+    models: dict[str, NamedObject] = {}
+    missing = []
     for name in names:
         path = next((file for mesh in MESHES if (file := folder / name / mesh).is_file()), None)
         synset = name.partition("/")[0]
         if path is None:
             missing.append(name)
         else:
-            models.append(ShapeNetModel(name, labels.get(name, labels.get(synset, synset)), path))
+            load = functools.partial(_load_model, name, path, collision)
+            label = labels.get(name, labels.get(synset, synset))
+            models[name] = NamedObject(name, label, f"shapenet {name}, {collision}", load)
     if not models:
         raise DataError(
             f"{os.fspath(root)!r} holds none of the {len(names)} models asked for, as SYNSET/MODEL/{MESHES[0]};"
@@ -131,7 +100,12 @@ def load_shapenet(
         )
     if missing:
         _LOG.warning("%d of %d ShapeNet models are missing: %s", len(missing), len(names), listing(missing, limit=4))
-    return ShapeNet(folder, tuple(models), tuple(missing))
+    return models
+
+
+def _load_model(name: str, path: Path, collision: str) -> Solid:
+    # The unit cannot matter: the diagonal is set.
+    return replace(mesh_solid(path, unit="m", diagonal=DIAGONAL, collision=collision), name=name)
 
 
 def read_ids(path: str | os.PathLike[str]) -> tuple[str, ...]:
@@ -186,24 +160,10 @@ PROCEDURAL_24 = (
 COLLECTIONS = {"procedural-24": PROCEDURAL_24, "procedural": list_families()}
 """Named collections of shape families; ``procedural-24:40`` is 40 members of each of its 24 families."""
 
-DIAGONAL = 0.04  # size [m] at which objects are built; each sweep scales them to its own
-
 MOST_CHARACTERS = 4096  # most characters of the name of an object: as many as a path may have
 MOST_MEMBERS = 1_000_000  # most members of a family in one data set
 SURFACE = "surface"
 """Stands for ``surfaces`` where shape families are built; other kinds of objects have their default then."""
-
-
-@dataclass(frozen=True)
-class NamedObject:
-    """One object of a collection; it can be sent to another process and is built there."""
-
-    name: str
-    label: str
-    """Class label."""
-    source: str
-    """Description of what it is made from: equal sources make equal objects."""
-    load: Callable[[], Solid]
 
 
 def resolve_objects(
@@ -315,9 +275,7 @@ def _files(pattern: str, unit: str | None, collision: str) -> Iterator[NamedObje
 
 def _shapenet(text: str, collision: str) -> Iterator[NamedObject]:
     folder, _, number = text.rpartition(":") if re.search(r":\d+$", text) else (text, "", "")
-    models = load_shapenet(Path(folder).absolute()).models
+    models = load_shapenet(Path(folder).absolute(), collision=collision).values()
     if number and int(number) > len(models):
         raise UsageError(f"{folder!r} has {len(models)} models, fewer than the {number} asked for.")
-    for model in models[: int(number) if number else None]:
-        load = functools.partial(model.solid, diagonal=DIAGONAL, collision=collision)
-        yield NamedObject(model.name, model.label, f"shapenet {model.name}, {collision}", load)
+    yield from itertools.islice(models, int(number) if number else None)
