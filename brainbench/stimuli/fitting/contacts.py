@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from brainbench.core.errors import DataError, UsageError, check_number
 from brainbench.core.limits import Count, Limit, limited
 from brainbench.stimuli.tracks.contract import check_length, check_track, traced_lengths
+from brainbench.stimuli.validation.references import bent_by_contact, rest_curvature
 from brainbench.stimuli.whiskers.whisker import Whisker
 
 if TYPE_CHECKING:
@@ -97,13 +98,8 @@ STEPS = 48  # runge-Kutta steps from the contact to the base; the force is then 
 BEYOND = 12  # samples from the contact to the tip
 
 
-# With the angle ψ of the rod against its direction at the contact, the equations of the elastica (Antman 2005,
-# Nonlinear Problems of Elasticity, chapter 4) from the contact at arc a back to the base are
-#
-#     dψ/ds = κ₀(s) + M/(E I(s)),   dM/ds = −f cos ψ,   ψ(a) = 0,   M(a) = 0
-#
-# for a force f normal to the rod. They need no angle and no position: those of the base turn and move the finished
-# shape, so no boundary-value problem is solved. Beyond the contact the rod has its rest curvature.
+# From the contact to the base no angle and no position is needed: those of the base turn and move the finished shape,
+# so no boundary-value problem is solved. Beyond the contact the rod has its rest curvature.
 @dataclass(frozen=True, eq=False)
 class LoadedShapes:
     """Shapes of a whisker under one contact each; sampled from the base to the tip."""
@@ -145,7 +141,7 @@ class LoadedWhisker:
     def __init__(self, whisker: Whisker) -> None:
         self.whisker = whisker
         self._grid = np.linspace(0.0, whisker.arc_length, 1001)
-        self._rest = 2 * whisker.curvature * np.cos(whisker.tangent_angle(self._grid)) ** 3
+        self._rest = rest_curvature(whisker, self._grid)
         self._turn = whisker.tangent_angle(self._grid)
         self._line = whisker.centre_line(self._grid)
 
@@ -159,31 +155,11 @@ class LoadedWhisker:
         ``base`` [b, 3] is the position (m) and the direction (rad) of the clamped base.
         """
         whisker = self.whisker
-        share = np.linspace(1.0, 0.0, 2 * STEPS + 1)
-        half = arc[:, None] * share
-        flexibility = 1 / whisker.bending_stiffness(half)
-        rest = self.rest_curvature(half)
-        step = -arc / STEPS
-        count = len(arc)
-        psi, moment, x, y = (np.zeros((STEPS + 1, count)) for _ in range(4))
-        bend = np.empty((STEPS + 1, count))
-        for k in range(STEPS):
-            # Classical Runge-Kutta step; positions are integrated with its weights.
-            (f0, f1, f2), (c0, c1, c2) = flexibility[:, 2 * k : 2 * k + 3].T, rest[:, 2 * k : 2 * k + 3].T
-            p, m = psi[k], moment[k]
-            bend[k] = c0 + m * f0
-            a1, m1 = bend[k], -force * np.cos(p)
-            p2 = p + step / 2 * a1
-            a2, m2 = c1 + (m + step / 2 * m1) * f1, -force * np.cos(p2)
-            p3 = p + step / 2 * a2
-            a3, m3 = c1 + (m + step / 2 * m2) * f1, -force * np.cos(p3)
-            p4 = p + step * a3
-            a4, m4 = c2 + (m + step * m3) * f2, -force * np.cos(p4)
-            psi[k + 1] = p + step / 6 * (a1 + 2 * a2 + 2 * a3 + a4)
-            moment[k + 1] = m + step / 6 * (m1 + 2 * m2 + 2 * m3 + m4)
-            x[k + 1] = x[k] + step / 6 * (np.cos(p) + 2 * np.cos(p2) + 2 * np.cos(p3) + np.cos(p4))
-            y[k + 1] = y[k] + step / 6 * (np.sin(p) + 2 * np.sin(p2) + 2 * np.sin(p3) + np.sin(p4))
-        bend[STEPS] = rest[:, -1] + moment[STEPS] * flexibility[:, -1]
+        half = arc[:, None] * np.linspace(1.0, 0.0, 2 * STEPS + 1)
+        flexibility, rest = 1 / whisker.bending_stiffness(half), self.rest_curvature(half)
+        steps = bent_by_contact(flexibility.T, rest.T, -arc / STEPS, force)
+        psi, moment, x, y = (np.array(values) for values in zip(*steps, strict=True))
+        bend = rest[:, ::2].T + moment * flexibility[:, ::2].T
         loaded = np.stack([x, y], axis=-1)[::-1].swapaxes(0, 1)
         free = arc[:, None] + (whisker.arc_length - arc)[:, None] * np.linspace(0, 1, BEYOND + 1)[1:]
         # The free end is the rest shape, turned so that it leaves the contact along ψ = 0.

@@ -8,9 +8,10 @@ against published tables and independent quadrature in the tests.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -144,8 +145,8 @@ def slip_off_offset(whisker: Whisker, at: float, *, peg_radius: float | None = N
 class _Branch:
     """Equilibria with one peg, ordered by the slope θc of the rod at the contact.
 
-    Given θc, the force f and the contact arc follow from integrating backwards from the contact, where
-    the moment is zero: θ' = κ₀ + M/(E I), M' = −f cos(θ − θc). Everything is mirrored to a push to +y.
+    Given θc, the force f and the contact arc follow from integrating backwards from the contact
+    (:func:`bent_by_contact`). Everything is mirrored to a push to +y.
     """
 
     _STRIDE = math.radians(2.0)
@@ -263,27 +264,41 @@ class _Branch:
         """Return base angle, contact point (x, y) and base moment: Runge-Kutta steps from contact to base."""
         half = np.linspace(arc, 0.0, 2 * _STEPS + 1)
         flexibility = 1 / np.maximum(self.whisker.bending_stiffness(half), 1e-300)
-        # Curvature of the rest shape, a parabola: y″/(1 + y′²)^(3/2) = 2A cos³ψ with tan ψ = y′.
-        rest = 2 * self.curvature * np.cos(self.whisker.tangent_angle(np.abs(half))) ** 3
-        step = -arc / _STEPS
-        angle, moment, x, y = slope, 0.0, 0.0, 0.0
-        pairs = list(zip(flexibility.tolist(), rest.tolist(), strict=True))
-        for k in range(_STEPS):
-            # Classical Runge-Kutta step of θ′ = κ₀ + M/(E I) and M′ = −f cos(θ − θc); x and y are integrated with its
-            # weights.
-            (f0, c0), (f1, c1), (f2, c2) = pairs[2 * k : 2 * k + 3]
-            a1, m1 = c0 + moment * f0, -force * math.cos(angle - slope)
-            t2 = angle + step / 2 * a1
-            a2, m2 = c1 + (moment + step / 2 * m1) * f1, -force * math.cos(t2 - slope)
-            t3 = angle + step / 2 * a2
-            a3, m3 = c1 + (moment + step / 2 * m2) * f1, -force * math.cos(t3 - slope)
-            t4 = angle + step * a3
-            a4, m4 = c2 + (moment + step * m3) * f2, -force * math.cos(t4 - slope)
-            x -= step / 6 * (math.cos(angle) + 2 * math.cos(t2) + 2 * math.cos(t3) + math.cos(t4))
-            y -= step / 6 * (math.sin(angle) + 2 * math.sin(t2) + 2 * math.sin(t3) + math.sin(t4))
-            angle += step / 6 * (a1 + 2 * a2 + 2 * a3 + a4)
-            moment += step / 6 * (m1 + 2 * m2 + 2 * m3 + m4)
-        return angle, x, y, moment
+        rest = self.side * rest_curvature(self.whisker, np.abs(half))
+        *_, (turn, moment, x, y) = bent_by_contact(flexibility.tolist(), rest.tolist(), -arc / _STEPS, force, math)
+        cosine, sine = math.cos(slope), math.sin(slope)
+        return slope + turn, sine * y - cosine * x, -sine * x - cosine * y, moment
+
+
+def rest_curvature(whisker: Whisker, s: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the curvature (1/m) at rest at arcs s (m): of the parabola y = A x², 2 A cos³ψ with tan ψ = y′."""
+    return 2 * whisker.curvature * np.cos(whisker.tangent_angle(s)) ** 3
+
+
+def bent_by_contact(flexibility: Any, rest: Any, step: Any, force: Any, xp: Any = np) -> Iterator[tuple[Any, ...]]:
+    """Yield angle ψ (rad), moment (N·m) and place (m) of a rod in steps (m, negative) from its contact to the base.
+
+    Against its direction at the contact, where all are 0, dψ/ds = κ₀ + M/(E I) and dM/ds = −f cos ψ (Antman 2005,
+    Nonlinear Problems of Elasticity, chapter 4), with a force f (N) normal to the rod. ``flexibility`` 1/(E I) and
+    ``rest`` κ₀ are at ends and middles of the steps: numbers, for which ``xp`` is ``math``, or arrays of several rods.
+    """
+    angle = moment = x = y = 0.0 * force
+    yield angle, moment, x, y
+    for k in range(0, len(rest) - 1, 2):
+        # Classical Runge-Kutta step; positions are integrated with its weights.
+        (f0, f1, f2), (c0, c1, c2) = flexibility[k : k + 3], rest[k : k + 3]
+        a1, m1 = c0 + moment * f0, -force * xp.cos(angle)
+        p2 = angle + step / 2 * a1
+        a2, m2 = c1 + (moment + step / 2 * m1) * f1, -force * xp.cos(p2)
+        p3 = angle + step / 2 * a2
+        a3, m3 = c1 + (moment + step / 2 * m2) * f1, -force * xp.cos(p3)
+        p4 = angle + step * a3
+        a4, m4 = c2 + (moment + step * m3) * f2, -force * xp.cos(p4)
+        x = x + step / 6 * (xp.cos(angle) + 2 * xp.cos(p2) + 2 * xp.cos(p3) + xp.cos(p4))
+        y = y + step / 6 * (xp.sin(angle) + 2 * xp.sin(p2) + 2 * xp.sin(p3) + xp.sin(p4))
+        angle = angle + step / 6 * (a1 + 2 * a2 + 2 * a3 + a4)
+        moment = moment + step / 6 * (m1 + 2 * m2 + 2 * m3 + m4)
+        yield angle, moment, x, y
 
 
 def _check_at(whisker: Whisker, at: float) -> None:
