@@ -394,7 +394,6 @@ def library_versions() -> dict[str, str]:
 def provenance(**extra: Any) -> dict[str, Any]:
     """Return what a result needs to be made again: versions, machine, time, and what the caller adds."""
     import datetime
-    import platform
 
     from brainbench.core.version import __version__
 

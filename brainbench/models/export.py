@@ -408,8 +408,6 @@ def read_onnx(path: str | Path, *, threads: int | None = None) -> Callable[[Any,
 
 def read_torch(path: str | Path) -> Callable[[Any, Any], tuple[Any, Any]]:
     """Return the step of an exported PyTorch program as a function of NumPy arrays (obs, h_in) → (features, h_out)."""
-    import torch
-
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         module = torch.export.load(path).module()
@@ -427,8 +425,6 @@ READERS = {"onnx": read_onnx, "torch": read_torch}  # readers of exported files,
 
 def _difference(step: Any, run: Callable[[Any, Any], tuple[Any, Any]]) -> float:
     """Compare the file with the network's own streaming on random touch, at two batch sizes."""
-    import torch
-
     model, worst = step.model, 0.0
     generator = torch.Generator().manual_seed(0)
     steps = min(_STEPS, model.spec.max_steps or _STEPS)

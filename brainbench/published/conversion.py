@@ -57,7 +57,6 @@ from brainbench.stimuli.whiskers.array import ROWS, WhiskerArray
 
 if TYPE_CHECKING:
     import xarray as xr
-    from numpy.typing import NDArray
 
 FRAME_STATUSES = ("ok", "missing", "too large", "unwritten", "repeated")
 """Texts of ``frame_status``, 0 to 4. ``unwritten``: row 0 of a simulator that stores a row before it computes it, even

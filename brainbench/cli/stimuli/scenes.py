@@ -264,7 +264,6 @@ def _families() -> tuple[dict[str, Any], str]:
 def _member(
     name: str, seed: int, detail: int, diagonal: float | None, collision: str | None, settings: DecompositionSettings
 ) -> tuple[dict[str, Any], Solid]:
-    from brainbench.core.errors import check_name
     from brainbench.stimuli.objects import procedural
     from brainbench.stimuli.objects.solid import shape_solid
 
@@ -282,7 +281,6 @@ def _member(
 def _file(
     source: str, unit: str | None, diagonal: float | None, collision: str, settings: DecompositionSettings
 ) -> tuple[dict[str, Any], Solid]:
-    from brainbench.core.errors import UsageError
     from brainbench.geometry import UNITS, load_mesh
     from brainbench.stimuli.objects.solid import mesh_solid
 
@@ -425,9 +423,6 @@ def plot(
     backend: BackendOption = DEFAULT_ENGINE,
 ) -> Output:
     """Plot forces or moments of every whisker on the 5 × 7 layout, to one scale, contacts shaded."""
-    import math
-
-    from brainbench.core.errors import check_name
     from brainbench.core.figures import check_format
     from brainbench.stimuli.figures.pictures import PLOT_FORMATS, QUANTITIES
     from brainbench.stimuli.figures.pictures import plot as draw

@@ -32,8 +32,6 @@ from brainbench.datasets.sessions import Session
 from brainbench.datasets.trials.selection import DEFAULT, FIRST_CONTACT, Conditions, Selection, Window
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     import xarray as xr
 
 ENTRY_POINTS = "brainbench.recordings"
