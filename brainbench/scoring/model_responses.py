@@ -69,17 +69,22 @@ class ModelResponses:
     """Duration of the stimuli, over which the steps of every layer are spread evenly; None where unknown."""
     stimulus_error: float | None = None
     """Estimated error of the forces of simulated stimuli, as a share of them; None where unknown."""
+    stimulus_promise: float | None = None  # error that their fidelity promised (``auto``), if it did
 
     @property
     def doubts(self) -> tuple[str, ...]:
         """What is to be known of the stimuli that every score of them rests on."""
         from brainbench.stimuli.engines.error_estimates import LARGEST_ERROR
 
-        if self.stimulus_error is None or self.stimulus_error <= LARGEST_ERROR:
+        error, promise = self.stimulus_error or 0.0, self.stimulus_promise
+        if error <= LARGEST_ERROR:
             return ()
-        error, bound = self.stimulus_error, f"{LARGEST_ERROR:.0%}"
+        bound, advice = f"{LARGEST_ERROR:.0%}", "simulate them with a finer --fidelity, or with --fidelity auto=ERROR"
         size = f"estimated error of {error:.0%}, above {bound}" if math.isfinite(error) else "error that cannot be told"
-        advice = "simulate them with a finer --fidelity, or with --fidelity auto=ERROR"
+        if promise is not None:
+            advice = (
+                "auto has no finer setting that helps" if error > promise else f"promise less than auto={promise:g}"
+            )
         return (f"the forces of the stimuli have an {size}: {advice}",)
 
     def features(self, rows: list[int]) -> Mapping[str, NDArray[np.floating]]:
@@ -132,13 +137,15 @@ class ResolvedModel:
 
             source = options.stimuli if options.stimuli is not None else DEFAULT_STIMULI
             simulated = load_stimuli(source, whiskers=options.whiskers, fidelity=options.fidelity, progress=progress)
-            labels, origin = simulated.labels, {**origin, "stimuli": _stated(simulated)}
+            stated = {name: getattr(simulated, name) for name in ("description", "content_hash", "config_hash")}
+            backend = None if simulated.dataset is None else simulated.dataset.attrs.get("backend")
+            stated |= {"backend": str(backend)} if backend else {}
+            labels, origin = simulated.labels, {**origin, "stimuli": stated}
         if self.module is None or simulated is None:
             computed = self.activations or {}
             check_each("layer", options.layers or (), computed)
-            activations = {
-                layer: _as_steps(layer, computed[layer], len(labels)) for layer in options.layers or computed
-            }
+            wanted = options.layers or computed
+            activations = {layer: _as_steps(layer, computed[layer], len(labels)) for layer in wanted}
         else:
             from brainbench.models.activations import extract, named_reader
 
@@ -161,8 +168,10 @@ class ResolvedModel:
             model_input = steps.reshape(*steps.shape[:2], -1)
         seconds = None if simulated is None else _seconds(simulated)
         kinematics = {} if simulated is None else contact_kinematics(simulated.dataset)
-        error = None if simulated is None else simulated.error
-        return ModelResponses(card, labels, activations, options.time, model_input, origin, kinematics, seconds, error)
+        errors = () if simulated is None else (simulated.error, simulated.promise)
+        return ModelResponses(
+            card, labels, activations, options.time, model_input, origin, kinematics, seconds, *errors
+        )
 
 
 def follows_seed(model: Any) -> bool:
@@ -258,13 +267,6 @@ def _as_steps(layer: str, values: Any, rows: int) -> NDArray[np.floating]:
     if array.ndim not in (2, 3) or array.shape[0] != rows:
         raise UsageError(f"Layer {layer!r} has shape {list(array.shape)}; expected [{rows}, F] or [{rows}, T, F].")
     return array[:, None, :] if array.ndim == 2 else array
-
-
-def _stated(stimuli: Stimuli) -> dict[str, Any]:
-    """Return the provenance of stimuli."""
-    stated = {name: getattr(stimuli, name) for name in ("description", "content_hash", "config_hash")}
-    backend = None if stimuli.dataset is None else stimuli.dataset.attrs.get("backend")
-    return {**stated, "backend": str(backend)} if backend else stated
 
 
 def _seconds(stimuli: Stimuli) -> float | None:

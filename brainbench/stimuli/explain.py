@@ -18,7 +18,7 @@ import msgspec
 import numpy as np
 
 from brainbench.core.errors import DataError, UsageError
-from brainbench.core.files import content_hash, to_json, to_plain
+from brainbench.core.files import content_hash
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.reach import Reach, reachable
 from brainbench.stimuli.motion.jobs import Job, Trace
@@ -88,7 +88,6 @@ def reach_of(job: Job, *, surfaces: bool = False) -> Reach:
 ATTRIBUTE = "explanation"  # attribute of a stimulus set that holds the explanation as JSON
 SECONDS = "seconds"
 """Key of a stimulus set's ``encoding`` under which this process keeps what took how long."""
-_PASSING = ("seconds", "source")  # fields that are not kept
 
 
 @dataclass(frozen=True)
@@ -124,10 +123,11 @@ class Explanation:
     """Time steps whose contact forces were not solved (:attr:`Trace.unsolved`)."""
     bodies: str = "convex parts"
     """Bodies that the contact pairs count: ``convex parts``, ``triangles`` or both."""
-    seconds: Mapping[str, float] = field(default_factory=dict)
+    # What is not known yet when a set is kept is not in it, so that equal sets are equal.
+    seconds: Mapping[str, float] = field(default_factory=dict, metadata={"later": True, "before": {}})
     """Elapsed time of each part [s]: ``plan``, ``simulate``, ``assemble``, and ``processor``, the processor time of
     ``simulate`` on all threads together; or ``read`` alone. Empty when this process did not make the set."""
-    source: str | None = None
+    source: str | None = field(default=None, metadata={"later": True})
     """File from which the finished set was read; None when it was simulated now."""
 
     @property
@@ -149,10 +149,6 @@ class Explanation:
         return replace(
             explanation, seconds=dataset.encoding.get(SECONDS, {}), source=None if source is None else str(source)
         )
-
-    def to_attribute(self) -> str:
-        """Return the JSON that :meth:`of` reads, equal whenever the same is simulated."""
-        return to_json({key: item for key, item in to_plain(self).items() if key not in _PASSING}, indent=None)
 
     def __str__(self) -> str:
         low, high = self.links

@@ -28,6 +28,7 @@ from brainbench.core.reading import sealed
 from brainbench.core.reading.sealed import keep_entry, read_sealed, write_sealed
 from brainbench.core.rotations import base_rotation
 from brainbench.stimuli.engines import PHYSICS_VERSION, get_engine
+from brainbench.stimuli.engines.error_estimates import RULE
 from brainbench.stimuli.engines.fidelity import DEFAULT_ENGINE, Fidelity
 from brainbench.stimuli.engines.protocol import WhiskerEngine
 from brainbench.stimuli.explain import ATTRIBUTE, SECONDS, explain, plan
@@ -203,7 +204,7 @@ def simulate_uncached(
     dataset = _assemble(scenes, rows, fidelity, engine.name)
     clock.append(time.perf_counter())
     seconds = dict(zip(("plan", "simulate", "assemble"), np.diff(clock).tolist(), strict=True))
-    dataset.attrs[ATTRIBUTE] = explain(scenes, planned, traces, fidelity).to_attribute()
+    dataset.attrs[ATTRIBUTE] = to_json(explain(scenes, planned, traces, fidelity), indent=None)
     dataset.encoding[SECONDS] = {**seconds, "processor": sum(trace.seconds for trace in traces)}
     return dataset
 
@@ -315,7 +316,9 @@ def cache_path(
     from importlib import metadata
 
     library = metadata.version(engine.package) + engine.revision if engine.package else ""
-    key = content_hash(config_hash(scenes, fidelity, engine.name), library, PHYSICS_VERSION, *more, length=24)
+    # Forces that keep a promise depend on how their errors are estimated.
+    versions = PHYSICS_VERSION if fidelity.error is None else (PHYSICS_VERSION, RULE)
+    key = content_hash(config_hash(scenes, fidelity, engine.name), library, versions, *more, length=24)
     return cache_dir(folder) / f"{key}.h5"
 
 
@@ -373,7 +376,11 @@ def record(
     if stored is not None:
         local: list[NDArray[np.float64]] = [stored[name].astype(float) for name in names]
     else:
-        local = _simulate(jobs, fidelity, engine, progress)
+        report = None if progress is None else lambda done, total: progress(done, total, "simulating shapes")
+        traces = engine.run(jobs, fidelity, progress=report, record_shape=True)
+        local = [trace.link_positions for trace in traces if trace.link_positions is not None]
+        if len(local) < len(traces):
+            raise UsageError(f"The backend {engine.name!r} reports no shapes of whiskers; use 'rod' or 'mujoco'.")
         if path is not None:
             write_sealed(path, "shapes of whiskers", dict(zip(names, local, strict=True)), compress=True)
     moments = tuple(bending_moments(job, points) for job, points in zip(jobs, local, strict=True))
@@ -410,16 +417,3 @@ def bending_moments(job: Job, joints: NDArray[np.float64]) -> NDArray[np.float64
     if job.whisker.follicle is not None:  # the turn of the first joint is that of the follicle too
         moments[:, 0] = 2 * moments[:, 1] - moments[:, 2]
     return moments
-
-
-def _simulate(
-    jobs: Sequence[Job], fidelity: Fidelity, engine: WhiskerEngine, progress: Progress | None
-) -> list[NDArray[np.float64]]:
-    report = None if progress is None else lambda done, total: progress(done, total, "simulating shapes")
-    traces = engine.run(jobs, fidelity, progress=report, record_shape=True)
-    shapes: list[Any] = [trace.link_positions for trace in traces]
-    if any(shape is None for shape in shapes):
-        raise UsageError(
-            f"The backend {engine.name!r} reports no whisker shapes, so nothing can be drawn; use 'rod' or 'mujoco'."
-        )
-    return shapes

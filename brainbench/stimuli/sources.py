@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import json
 import os
 from dataclasses import dataclass
 from pathlib import Path
@@ -67,6 +68,11 @@ class Stimuli:
                 felt = np.where((power > 0) & ~np.isnan(errors), errors, 0.0)
                 shares.append(np.sqrt(np.average(felt**2, weights=power)))
         return float(max(shares))
+
+    @property
+    def promise(self) -> float | None:
+        """Error that the fidelity promised each whisker; None where it promised none, or is not known."""
+        return None if self.dataset is None else json.loads(self.dataset.attrs.get("fidelity", "{}")).get("error")
 
     def __repr__(self) -> str:
         shape = " × ".join(map(str, self.input.shape))

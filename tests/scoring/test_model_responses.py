@@ -10,10 +10,11 @@ from torch import nn
 
 import brainbench
 from brainbench.core.errors import UsageError
+from brainbench.core.records import ModelCard
 from brainbench.datasets import open_recordings, write_recordings
 from brainbench.datasets.sessions import make_session
 from brainbench.models.registry import load_model
-from brainbench.scoring.model_responses import contact_kinematics, resolve_model
+from brainbench.scoring.model_responses import ModelResponses, contact_kinematics, resolve_model
 from brainbench.scoring.options import ScoreOptions
 from brainbench.stimuli import Frames, Scene, Stimuli, WhiskerArray, simulate
 
@@ -181,3 +182,21 @@ def test_contacts_are_their_beginning_duration_and_place():
     np.testing.assert_allclose(kinematics["contact duration"], [[0.5, 0], [0, 0]])
     np.testing.assert_allclose(kinematics["contact arc"], [[0.01, 0], [0, 0]])
     assert contact_kinematics(dataset.drop_vars("contact")) == contact_kinematics(None) == {}
+
+
+@pytest.mark.parametrize(
+    ("error", "promise", "advice"),
+    [
+        (0.27, None, "an estimated error of 27%, above 10%: simulate them with a finer --fidelity, or with"),
+        (0.27, 0.5, "above 10%: promise less than auto=0.5"),
+        (0.27, 0.05, "above 10%: auto has no finer setting that helps"),
+        (np.inf, None, "an error that cannot be told: simulate them"),
+        (0.09, None, ""),
+        (None, None, ""),
+    ],
+)
+def test_stimuli_in_doubt_are_not_advised_to_try_what_they_were_made_with(error, promise, advice):
+    card = ModelCard("features")
+    responses = ModelResponses(card, (), {}, "mean", stimulus_error=error, stimulus_promise=promise)
+    assert advice in "".join(responses.doubts)
+    assert bool(responses.doubts) == bool(advice)

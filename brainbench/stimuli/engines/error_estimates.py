@@ -23,6 +23,9 @@ from brainbench.stimuli.whiskers.whisker import Whisker
 HALF_STEP, MORE_LINKS = 2.0, 3.0
 """Error over what half the step changes, and over what half as many links again change. Errors that fall with the first
 power of the step and of the links have exactly these."""
+BESIDE_TOUCH = 1.7
+"""What these are multiplied by at readings beside the begin or end of a contact. Forces jump there, at a time that is
+off by a step: their error (root mean square) falls with the root, and 1/(1 − 1/√2) stands in place of 2."""
 MORE = 1.5  # links of the second finer simulation, over those that were asked for
 MOST = 60  # most links of finer simulations, which every engine can take
 TOLERANCE = 1e-6
@@ -39,13 +42,16 @@ bodies with friction agree within a few per cent in steps from .5 to .05 ms, and
 MARGIN = 0.8  # share of a promised error from which a whisker is simulated again, since estimates have errors too
 FINEST_STEP = 2e-6  # step (s) below which none is halved to keep a promise: single precision ends there
 
+RULE = 2  # counts up when the same forces get other errors, so that no data set is made by two rules
+
 Run = Callable[[Sequence[Job], Fidelity], Sequence[Trace]]
-"""Simulates jobs, each as often as it takes to be trusted."""
+"""Simulates jobs."""
 
 
-def with_errors(run: Run, jobs: Sequence[Job], fidelity: Fidelity) -> list[Trace]:
+def with_errors(run: Run, jobs: Sequence[Job], fidelity: Fidelity, once: Run) -> list[Trace]:
     """Return the traces of jobs with their estimated errors.
 
+    ``run`` simulates each as often as it takes to be trusted, and finer ones ``once``: changes are what they are for.
     Where the fidelity promises an ``error``, whiskers beyond it are simulated again with what errs most made finer, one
     by one. An estimate falls by no more than theory allows: to take the first that happens to be small would favour
     those that are too small. Where a whisker may jam, short steps must agree as well.
@@ -58,7 +64,7 @@ def with_errors(run: Run, jobs: Sequence[Job], fidelity: Fidelity) -> list[Trace
     def simulate(chosen: Mapping[int, Fidelity]) -> None:
         for setting in dict.fromkeys(chosen.values()):
             missing = [index for index in chosen if chosen[index] == setting and (index, setting) not in runs]
-            for index, trace in zip(missing, run([jobs[i] for i in missing], setting) if missing else (), strict=True):
+            for index, trace in zip(missing, once([jobs[i] for i in missing], setting) if missing else (), strict=True):
                 runs[index, setting] = trace
                 seconds[index] += trace.seconds
 
@@ -69,7 +75,9 @@ def with_errors(run: Run, jobs: Sequence[Job], fidelity: Fidelity) -> list[Trace
             error = calm_error(job, trace, fidelity) if trace.steps else 0.0
             traces[index] = replace(trace, error=error)
             if not error <= (fidelity.error or math.inf):
-                pending[index], runs[index, fidelity] = fidelity, trace
+                # Finer runs begin with the steps that counted.
+                pending[index] = divided_step(fidelity, trace.divisor, job.whisker, job.spacing)
+                runs[index, pending[index]] = trace
     for place in range(ROUNDS if fidelity.error is not None else 1):
         simulate(pending)
         pending = {index: chosen for index, chosen in pending.items() if runs[index, chosen].status == "ok"}
@@ -89,7 +97,11 @@ def with_errors(run: Run, jobs: Sequence[Job], fidelity: Fidelity) -> list[Trace
             errors[index] = np.maximum(np.multiply((HALF_STEP, MORE_LINKS), changes_by), least)
             steps = trace.steps + (traces[index].steps if place else 0)
             settings[index], error = chosen, math.hypot(*errors[index])
-            traces[index] = replace(trace, error=error, steps=steps)
+            best = replace(trace, error=error)
+            if place and (fidelity.error or 0) < traces[index].error < error:
+                # None is good enough: more links in the same steps can make a blow worse.
+                best = traces[index]
+            traces[index] = replace(best, steps=steps)
             following = _finer(chosen, job, *errors[index])
             if error > MARGIN * (fidelity.error or math.inf) and following != chosen:
                 finer[index] = following
@@ -144,11 +156,14 @@ def changes(
 ) -> NDArray[np.float64]:
     """Return the share [n] by which finer simulations change base force or moment, whichever is larger.
 
-    The blow that undoes an overlap at the start is the larger the shorter the step; it is no error. Arguments are those
-    of :func:`difference`.
+    The blow that undoes an overlap at the start is the larger the shorter the step; it is no error. What changes where
+    contact begins or ends counts :data:`BESIDE_TOUCH` times. Arguments are those of :func:`difference`.
     """
     calm = ~start_jump(values[:, :, None, :3], finer[:, :, None, :3])[:, :, 0]
-    return difference(values, finer, contact, lengths, calm).max(axis=1)
+    ends = contact[:, 1:] != contact[:, :-1]
+    beside = np.pad(ends, ((0, 0), (0, 1))) | np.pad(ends, ((0, 0), (1, 0)))
+    counted = finer + np.where(beside, BESIDE_TOUCH, 1.0)[:, :, None] * (values - finer)
+    return difference(counted, finer, contact, lengths, calm).max(axis=1)
 
 
 def difference(
@@ -174,14 +189,24 @@ def difference(
     return shares
 
 
-def halved_step(fidelity: Fidelity, whisker: Whisker, spacing: float) -> Fidelity:
-    """Return a fidelity with half the step that it and readings (``spacing``, s) leave, and solved contact forces."""
-    period, tolerance = fidelity.steps_per_period, fidelity.contact_tolerance
+def divided_step(fidelity: Fidelity, divisor: int, whisker: Whisker, spacing: float) -> Fidelity:
+    """Return a fidelity with a part of the step that it and readings (``spacing``, s) leave."""
+    period = fidelity.steps_per_period
+    if divisor == 1:
+        return fidelity
     return replace(
         fidelity,
-        time_step=max(min(fidelity.time_step, spacing) / 2, 1e-7),
-        steps_per_period=None if period is None else min(2 * max(period, steps_to_ring(whisker.damping_ratio)), 1e4),
-        contact_tolerance=TOLERANCE if tolerance is None else tolerance,
+        time_step=max(min(fidelity.time_step, spacing) / divisor, 1e-7),
+        steps_per_period=period and min(divisor * max(period, steps_to_ring(whisker.damping_ratio)), 1e4),
+    )
+
+
+def halved_step(fidelity: Fidelity, whisker: Whisker, spacing: float) -> Fidelity:
+    """Return a fidelity with half of these steps, of those too that an object near cuts, and solved contact forces."""
+    return replace(
+        divided_step(fidelity, 2, whisker, spacing),
+        contact_travel=fidelity.contact_travel / 2,
+        contact_tolerance=fidelity.contact_tolerance or TOLERANCE,
     )
 
 

@@ -264,11 +264,13 @@ class WhiskerEngine:
             workers: native threads; all usable processors when None. On a GPU they mean nothing.
             record_shape: fill :attr:`Trace.link_positions`.
         """
-        simulate = partial(self.simulate_group, record_shape=record_shape)
+        simulate, once = (
+            partial(engine.simulate_group, record_shape=record_shape) for engine in (self, replace(self, retry=1))
+        )
 
         def run(group: Sequence[int]) -> dict[int, Trace]:
             some = [jobs[index] for index in group]
-            traces = with_errors(simulate, some, fidelity) if self.errors else simulate(some, fidelity)
+            traces = with_errors(simulate, some, fidelity, once) if self.errors else simulate(some, fidelity)
             return dict(zip(group, traces, strict=True))
 
         with self.session():

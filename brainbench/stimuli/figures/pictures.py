@@ -155,7 +155,9 @@ class Picture:
         thin = draw(whiskers, lens)
         near, front = (layer.nearness.reshape(-1)[thin.pixels] for layer in (thin, solid))
         # A contact lets a tip sink in by micrometres; drawn exactly, it would vanish in the face it lies on.
-        behind = near + lens.nearness_of(_SINKS * self.lens.width, near) <= front
+        sinks = _SINKS * self.lens.width
+        # d(1/r) = −dr/r², and nearness is 1/r in perspective.
+        behind = near + (sinks if lens.distance is None else sinks * near**2) <= front
         colors = shade(thin, lens, light, gloss=0.25, bias=16.0)
         image.reshape(-1, 3)[thin.pixels[behind]] = colors[behind]
         paint(solid, shade(solid, lens, light, gloss=0.06), image, style.opacity)

@@ -148,11 +148,6 @@ class Lens:
         local = np.stack([(x - self.size[0] / 2) * factor, (self.size[1] / 2 - y) * factor, depth], axis=-1)
         return self.target + local @ self.axes
 
-    def nearness_of(self, length: float, nearness: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return by how much nearness [n] grows over a short ``length`` (m) towards the camera."""
-        # d(1/r) = −dr/r², and nearness is 1/r in perspective.
-        return np.full(np.shape(nearness), length) if self.distance is None else length * nearness**2
-
     def pixel_size(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the length [...] (m) that one pixel covers at each of the points [..., 3] (m, world)."""
         depth = (points - self.target) @ self.axes[2]

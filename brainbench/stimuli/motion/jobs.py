@@ -137,6 +137,8 @@ class Trace:
     """Damping ratio of the first mode that the time step leaves; at least the whisker's own."""
     steps: int = 0
     """Time steps computed; 0 when the whisker was proven silent and not simulated."""
+    divisor: int = 1
+    """What divided its time steps; more than 1 where the first simulation could not be trusted."""
     unsolved: int = 0
     """Steps whose contact forces were not solved to the tolerance of the fidelity, or to 1e-4 where that is None;
     of engines that count them (``rod`` does)."""

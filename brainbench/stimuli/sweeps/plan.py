@@ -25,6 +25,7 @@ from brainbench.core.files import atomic_path, content_hash, create_hdf5, hash_a
 from brainbench.core.limits import Count, Limit, Seed, limited
 from brainbench.core.version import __version__
 from brainbench.stimuli.engines import PHYSICS_VERSION, get_engine
+from brainbench.stimuli.engines.error_estimates import RULE
 from brainbench.stimuli.engines.fidelity import DEFAULT_ENGINE, Fidelity
 from brainbench.stimuli.engines.protocol import SweepBatch, WhiskerEngine, describe_unstable, join_batches
 from brainbench.stimuli.explain import Explanation
@@ -510,6 +511,7 @@ class GenerationPlan:
             "shard_size": self.settings.sweeps_per_shard,
             "version": __version__,
             "physics": PHYSICS_VERSION,
+            **({"error_rule": RULE} if self.settings.errors else {}),
             "engine": f"{engine.package} {metadata.version(engine.package)}{engine.revision}",
         }
 

@@ -102,7 +102,8 @@ def read_whisk(path: str | os.PathLike[str], options: TrackOptions) -> tuple[NDA
     else:
         segments, labels, follicles = _read_segments(path), {}, {}
     if options.identities is not None:
-        labels, follicles = _read_identities(options.identities)
+        columns = _columns(options.identities, "table of whisk's measurements", ("fid", "wid", "label"))
+        labels, follicles = _identities(columns, options.identities)
     wanted = options.track
     if labels:
         present = sorted({label for key, label in labels.items() if key in segments and label >= 0})
@@ -166,11 +167,6 @@ def _parse_text(rows: list[list[str]], name: str) -> Segments:
             raise DataError(f"{name} is damaged: line {index} is no trace ({brief(','.join(row))}).") from error
         segments[frame, number] = values[:, :2]
     return segments
-
-
-def _read_identities(path: str) -> Identities:
-    """Return the label and the follicle (pixels) of each trace, by frame and number."""
-    return _identities(_columns(path, "table of whisk's measurements", ("fid", "wid", "label")), path)
 
 
 def _keys(columns: Mapping[str, Array], path: str | os.PathLike[str]) -> list[tuple[int, int]]:

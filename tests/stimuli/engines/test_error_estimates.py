@@ -22,8 +22,9 @@ from brainbench.stimuli.engines.error_estimates import (
 )
 from brainbench.stimuli.engines.fidelity import list_presets
 from brainbench.stimuli.motion.jobs import Job, Load, StillFollicle, Trace
-from brainbench.stimuli.motion.trajectories import ArrayFollicle, Whisking
+from brainbench.stimuli.motion.trajectories import ArrayFollicle, Translation, Whisking
 from brainbench.stimuli.objects.obstacle import Capsule, Obstacle, Sphere
+from brainbench.stimuli.objects.solid import PlacedObject, sphere
 from tests.factories.contact_scenes import HARD_OBJECTS, contact_jobs
 from tests.factories.whiskers import C2
 
@@ -99,10 +100,10 @@ def test_half_the_step_and_more_links_each_count_by_the_order_of_their_error():
         error = 0.0 if setting == fidelity else 0.01 if setting.links == 10 else -0.02
         return [_trace(error) for _ in jobs]
 
-    (trace,) = with_errors(run, [job], fidelity)
+    (trace,) = with_errors(run, [job], fidelity, run)
     assert trace.error == pytest.approx(np.hypot(2 * 0.01 / 1.01, 3 * 0.02 / 0.98))
     assert (trace.status, trace.remark) == ("ok", "")
-    (trace,) = with_errors(run, [job], replace(fidelity, links=10, contact_tolerance=1e-4))
+    (trace,) = with_errors(run, [job], replace(fidelity, links=10, contact_tolerance=1e-4), run)
     assert trace.error != 0
 
 
@@ -110,14 +111,56 @@ def test_a_whisker_whose_finer_simulation_fails_has_a_remark_without_a_number():
     def run(jobs, setting):
         return [_trace(status="ok" if setting.links == 10 else "unstable") for _ in jobs]
 
-    (trace,) = with_errors(run, [Job(C2, StillFollicle(), (), TIMES)], Fidelity(links=10))
+    (trace,) = with_errors(run, [Job(C2, StillFollicle(), (), TIMES)], Fidelity(links=10), run)
     assert trace.error == np.inf
     assert "cannot be told" in trace.remark
 
 
 def test_a_whisker_that_needed_no_step_has_no_error():
     still = Trace(np.zeros((100, 6)), np.zeros(100, bool), np.full(100, np.nan), steps=0)
-    (trace,) = with_errors(lambda jobs, setting: [still], [Job(C2, StillFollicle(), (), TIMES)], Fidelity(links=10))
+
+    def run(jobs, setting):
+        return [still]
+
+    (trace,) = with_errors(run, [Job(C2, StillFollicle(), (), TIMES)], Fidelity(links=10), run)
+    assert trace.error == 0
+
+
+def test_half_the_step_is_half_where_a_blow_cuts_it_too():
+    """A ball strikes a short whisker, and steps are cut to .25 mm of its way, whatever step was asked for."""
+    whisker = WhiskerArray.of("mouse")["E5"].whisker
+    velocity, radius = np.array([0.0, 1.5, 0.0]), 2e-3
+    middle = np.append(whisker.centre_line(0.6 * whisker.arc_length), 0.0)
+    start = middle - velocity * ((radius + whisker.base_radius) / 1.5 + 2.3e-3)
+    ball = PlacedObject(sphere(radius), tuple(start), motion=Translation(tuple(velocity), 0), friction=0.0).obstacle()
+    job = Job(whisker, StillFollicle(), (ball,), np.arange(1, 21) * 1e-3)
+    fidelity = Fidelity(links=10, time_step=5e-4, contact_tolerance=1e-6)
+    half = halved_step(fidelity, whisker, job.spacing)
+    asked = [fidelity, half, replace(half, contact_travel=fidelity.contact_travel), replace(half, time_step=1e-5)]
+    engine = get_engine("rod", retry=1)
+    trace, halved, uncut, finest = (engine.run([job], setting, workers=1)[0] for setting in asked)
+
+    def change(finer):
+        touching = trace.contact | finer.contact
+        return _difference(trace.wrench, finer.wrench, touching, whisker.arc_length).max()
+
+    assert 2 * change(halved) > change(finest) > 0.04
+    assert 2 * change(uncut) < 0.01
+
+
+def test_finer_simulations_begin_with_the_steps_that_counted():
+    settings = []
+
+    def run(jobs, setting):
+        return [_trace(divisor=5) for _ in jobs]
+
+    def once(jobs, setting):
+        settings.append((setting.links, setting.time_step, setting.steps_per_period))
+        return [_trace() for _ in jobs]
+
+    job = Job(replace(C2, damping_ratio=0.5), StillFollicle(), (), TIMES)
+    (trace,) = with_errors(run, [job], Fidelity(links=10, time_step=1e-4, steps_per_period=30), once)
+    np.testing.assert_allclose(settings, [(10, 1e-5, 300), (15, 2e-5, 150)])
     assert trace.error == 0
 
 
@@ -129,7 +172,7 @@ def test_a_promise_makes_only_those_finer_that_need_it():
         counts.extend((job.whisker == RAT, setting.links) for job in some)
         return [_trace(1 / setting.links if job.whisker == RAT else 0.0) for job in some]
 
-    plain, refined = with_errors(run, jobs, Fidelity(links=10, error=0.05))
+    plain, refined = with_errors(run, jobs, Fidelity(links=10, error=0.05), run)
     assert plain.error == 0
     assert 0 < refined.error <= 0.05
     assert (refined.remark, max(links for rat, links in counts if not rat)) == ("", 15)
@@ -144,13 +187,13 @@ def test_an_estimate_that_happens_to_be_small_is_not_believed():
         # More than twelve links err alike, as whiskers do that stick in another place than the true one.
         return [_trace(0.1 if setting.links < 12 else 0.0) for _ in jobs]
 
-    (trace,) = with_errors(run, [Job(C2, StillFollicle(), (), TIMES)], Fidelity(links=10, error=0.05))
+    (trace,) = with_errors(run, [Job(C2, StillFollicle(), (), TIMES)], Fidelity(links=10, error=0.05), run)
     first = 3 * 0.1
     assert trace.error == pytest.approx(first / 1.5**4)
     # What was tried already is no advice.
     assert ("above 5%" in trace.remark, "auto=ERROR" in trace.remark) == (True, False)
     # The second estimate, .2, is within the promise, but not by the margin.
-    (trace,) = with_errors(run, [Job(C2, StillFollicle(), (), TIMES)], Fidelity(links=10, error=0.21))
+    (trace,) = with_errors(run, [Job(C2, StillFollicle(), (), TIMES)], Fidelity(links=10, error=0.21), run)
     assert trace.error == pytest.approx(first / 1.5**2)
     assert not trace.remark
     # The finer run of an estimate is the next to be judged; none is made twice.
@@ -178,7 +221,7 @@ def test_a_promise_is_kept_only_where_short_steps_agree_between_rough_bodies(fri
         # Steps that resolve a vibration give other forces, as no longer ones do.
         return [_trace(0.3 / 0.7 if setting.time_step <= SHORT_STEP else 0.0) for _ in jobs]
 
-    (trace,) = with_errors(run, [Job(C2, StillFollicle(), bodies, TIMES)], fidelity)
+    (trace,) = with_errors(run, [Job(C2, StillFollicle(), bodies, TIMES)], fidelity, run)
     assert trace.error == pytest.approx(error)
     assert trace.status == "ok"
     assert ("no limit" in trace.remark) == (error > (fidelity.error or 1))

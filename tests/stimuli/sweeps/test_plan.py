@@ -13,7 +13,9 @@ from hypothesis import strategies as st
 
 from brainbench.core.errors import DataError, UsageError
 from brainbench.core.files import hash_arrays
+from brainbench.core.runs.folder import begin_run
 from brainbench.stimuli import Fidelity, simulate
+from brainbench.stimuli.engines.error_estimates import RULE
 from brainbench.stimuli.engines.fidelity import DEFAULT_ENGINE
 from brainbench.stimuli.engines.protocol import SweepBatch, join_batches
 from brainbench.stimuli.explain import Explanation
@@ -177,6 +179,18 @@ def test_what_determines_the_bytes_is_in_the_hash():
     ]
     assert len({plan.config_hash for plan in plans}) == len(plans)
     assert small_plan().config_hash == plans[0].config_hash
+
+
+def test_a_data_set_goes_on_only_by_the_rule_of_errors_that_it_was_begun_with(tmp_path, monkeypatch):
+    asked = small_plan().config
+    assert asked["error_rule"] == RULE
+    assert "error_rule" not in small_plan(errors=0.0).config
+    begin_run(tmp_path, asked, "data set", results="*.h5")
+    (tmp_path / "shard.h5").touch()
+    begin_run(tmp_path, asked, "data set", results="*.h5")
+    monkeypatch.setattr("brainbench.stimuli.sweeps.plan.RULE", RULE + 1)
+    with pytest.raises(UsageError, match=rf"holds another data set: error_rule {RULE} \(now {RULE + 1}\)\."):
+        begin_run(tmp_path, small_plan().config, "data set", results="*.h5")
 
 
 def test_shards_are_small_where_sweeps_are_slow():

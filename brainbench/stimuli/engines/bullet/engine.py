@@ -99,12 +99,6 @@ class BulletWorld:
         """Return the joint-space inertia [6 + 2N, 6 + 2N] at the joint positions ``q``."""
         return np.array(self.bullet.calculateMassMatrix(self.whisker, q))
 
-    def inverse_dynamics(
-        self, q: Sequence[float], rate: Sequence[float], acceleration: Sequence[float]
-    ) -> NDArray[np.float64]:
-        """Return the joint forces [6 + 2N] that cause the accelerations without contacts, gravity included."""
-        return np.array(self.bullet.calculateInverseDynamics(self.whisker, q, rate, acceleration))
-
     def place(self, q: Sequence[float]) -> None:
         """Put the whisker's joints at ``q`` [6 + 2N]."""
         joints = range(len(q))
@@ -494,7 +488,9 @@ class _Run:
         h, world = self.step, self.world
         q = [*self.path[n], *self.hinges]
         rates = [*self.drive.velocity[n], *self.rates]
-        forces = world.inverse_dynamics(q, rates, [*self.drive.acceleration[n], *([0.0] * len(self.rates))])
+        # Without contacts, gravity included.
+        accelerations = [*self.drive.acceleration[n], *([0.0] * len(self.rates))]
+        forces = np.array(world.bullet.calculateInverseDynamics(world.whisker, q, rates, accelerations))
         mass = world.mass_matrix(q)
         # (M + h D + h² K) v⁺ = M v − h (c + K q): springs and dampers at the end of the step, inertia and bias at its
         # start. The follicle's rows are left out since its motion is prescribed.

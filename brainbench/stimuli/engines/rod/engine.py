@@ -405,6 +405,7 @@ def trace_of(result: LaunchResult, row: int, job: Job, fidelity: Fidelity, secon
         status="unstable" if reason else "ok",
         reason=reason,
         steps=int(result.steps[row, 0]),
+        divisor=int(result.divisor[row, 0]),
         unsolved=int(result.counts["unsolved"][row, 0]),
         displacement=displacement,
         seconds=seconds,

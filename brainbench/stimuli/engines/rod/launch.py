@@ -300,6 +300,7 @@ class WhiskerSolver:
         self.real = real_type(fidelity)
         self.capacity = capacity_for(max(chain.links for chain in chains))
         self.quasistatic = fidelity.solver == "quasistatic"
+        self.travel = fidelity.contact_travel * MILLI
         self.iterations = TO_ROUNDING if options.get("recorder") else contact_iterations(fidelity.contact_tolerance)
         hinges = 2 + (fidelity.twist is not False if twists is None else twists)
         if options:
@@ -393,6 +394,7 @@ class WhiskerSolver:
         structs, device, jobs = self.kernels.structs, self.device, given.jobs
         size, count, frames = given.size, len(jobs), len(given.readings)
         options = structs.StepOptions()
+        options.travel = self.travel
         options.quasistatic = int(self.quasistatic)
         weight = LIGHT if self.quasistatic else 1.0
         # Quasistatic whiskers have masses that are scaled by LIGHT; gravity is scaled back, so that their weight stays.

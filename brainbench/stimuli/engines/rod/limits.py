@@ -64,10 +64,8 @@ LEVELS = 7
 """Levels of boxes that a search keeps track of: enough for 16 million triangles."""
 LONGEST_SPAN = 32.0
 """Longest time (ms) between two places where time is kept exactly."""
-TRAVEL = 0.25
-"""Longest way (mm) of any point of a whisker in one step while something is near; steps are shortened to keep it."""
 FINEST = 16
-"""Most parts into which a step is split for that."""
+"""Most parts into which a step is split while something is near (``Fidelity.contact_travel``)."""
 AFTERMATH = 10.0
 """Longest steps after a contact for which steps stay split so."""
 LISTED = 32

@@ -180,6 +180,8 @@ class StepOptions:
     gravity: vec3
     axes: mat33
     """Rotation of the results."""
+    travel: real
+    """Longest way of any point of a whisker in one step while something is near; steps are split to keep it."""
     quasistatic: wp.int32
     """1: rates are forgotten after each step, and a reading takes the wrench of the step that ends at it."""
     shape: wp.int32

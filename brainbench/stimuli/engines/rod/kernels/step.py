@@ -8,7 +8,7 @@ Units: mg, mm, ms, mN, µN·m; results are in N, N·m and m.
 
 import warp as wp
 
-from brainbench.stimuli.engines.rod.limits import AFTERMATH, FINEST, NOTHING, REST, TRAVEL
+from brainbench.stimuli.engines.rod.limits import AFTERMATH, FINEST, NOTHING, REST
 
 from .algebra import Spatial, vec3
 from .articulated_body import (
@@ -106,8 +106,8 @@ def preferred_step(scene: SceneArrays, job: WhiskerJob, state: wp.ref[WhiskerSta
     if job.limits > 0:
         wanted = wp.min(wanted, scene.jobs.limit[job.first_limit + cell_at(now, job.limits)])
     pace = state.top_speed + state.near_speed
-    if state.split_time > real(0.0) and pace * wanted > real(wp.static(TRAVEL)):
-        wanted = wp.max(wanted / real(wp.static(FINEST)), real(wp.static(TRAVEL)) / pace)
+    if state.split_time > real(0.0) and pace * wanted > scene.options.travel:
+        wanted = wp.max(wanted / real(wp.static(FINEST)), scene.options.travel / pace)
     return wanted
 
 
@@ -316,7 +316,7 @@ def run(
                 # Steps are split only for what is about to be touched: whatever else stands near changes nothing.
                 if wp.static(against > NOTHING):
                     if state.closes == 1 and state.split_time <= zero:
-                        if (state.top_speed + state.closing_speed) * h > real(wp.static(TRAVEL)):
+                        if (state.top_speed + state.closing_speed) * h > scene.options.travel:
                             # Too long for what comes: the same step again, split.
                             state.split_time = real(2.0) * job.longest_step
                             state.near_speed = state.closing_speed
