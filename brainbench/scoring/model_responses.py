@@ -82,9 +82,7 @@ class ModelResponses:
         bound, advice = f"{LARGEST_ERROR:.0%}", "simulate them with a finer --fidelity, or with --fidelity auto=ERROR"
         size = f"estimated error of {error:.0%}, above {bound}" if math.isfinite(error) else "error that cannot be told"
         if promise is not None:
-            advice = (
-                "auto has no finer setting that helps" if error > promise else f"promise less than auto={promise:g}"
-            )
+            advice = "auto has no finer setting that helps" if error > promise else f"take less than auto={promise:g}"
         return (f"the forces of the stimuli have an {size}: {advice}",)
 
     def features(self, rows: list[int]) -> Mapping[str, NDArray[np.floating]]:

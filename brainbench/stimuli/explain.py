@@ -130,11 +130,6 @@ class Explanation:
     source: str | None = field(default=None, metadata={"later": True})
     """File from which the finished set was read; None when it was simulated now."""
 
-    @property
-    def runs(self) -> int:
-        """Runs that were asked for."""
-        return self.stimuli * self.whiskers
-
     @classmethod
     def of(cls, dataset: xr.Dataset) -> Explanation:
         """Read the explanation that :func:`brainbench.stimuli.simulate` left in a stimulus set."""
@@ -151,7 +146,7 @@ class Explanation:
         )
 
     def __str__(self) -> str:
-        low, high = self.links
+        (low, high), runs = self.links, self.stimuli * self.whiskers
         links = f"{low}" if low == high else f"{low}–{high}"
         elapsed = ", ".join(f"{name} {value:.2f} s" for name, value in self.seconds.items())
         more = self.steps / max(1, self.steps_in_full) - 1
@@ -160,7 +155,7 @@ class Explanation:
             saved = f"none of the steps ({100 * more:.0f} % more: some contacts needed shorter ones)"
         far = [f"{label}: {', '.join(names) or 'none'}" for label, names in self.out_of_reach.items()]
         rows = {
-            "asked for": f"{self.stimuli} stimuli × {self.whiskers} whiskers = {self.runs} runs of {links} links",
+            "asked for": f"{self.stimuli} stimuli × {self.whiskers} whiskers = {runs} runs of {links} links",
             "simulated": f"{self.simulated} runs, {self.steps:,} of {self.steps_in_full:,} time steps",
             "shared": f"{self.shared} runs equal to another stimulus's",
             "silent": f"{self.silent} runs that can feel nothing: exactly zero without simulation",

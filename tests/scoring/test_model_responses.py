@@ -188,7 +188,7 @@ def test_contacts_are_their_beginning_duration_and_place():
     ("error", "promise", "advice"),
     [
         (0.27, None, "an estimated error of 27%, above 10%: simulate them with a finer --fidelity, or with"),
-        (0.27, 0.5, "above 10%: promise less than auto=0.5"),
+        (0.27, 0.5, "above 10%: take less than auto=0.5"),
         (0.27, 0.05, "above 10%: auto has no finer setting that helps"),
         (np.inf, None, "an error that cannot be told: simulate them"),
         (0.09, None, ""),

@@ -74,7 +74,7 @@ def test_runs_are_counted_as_simulated_shared_or_silent():
     scenes = [_scene("near", NEAR), _scene("far", FAR), _scene("nothing")]
     told = Explanation.of(simulate(scenes, fidelity=FAST, backend="mujoco", cache=False))
     # C1 and C2 reach the ball; all three whisk through air once, for both other scenes and D6 for all.
-    assert (told.runs, told.simulated, told.shared, told.silent) == (9, 5, 4, 0)
+    assert (told.stimuli * told.whiskers, told.simulated, told.shared, told.silent) == (9, 5, 4, 0)
     assert told.out_of_reach == {"near": ("D6",), "far": ("C1", "C2", "D6"), "nothing": ("C1", "C2", "D6")}
     assert told.steps == 5 * told.steps_in_full // 9
     assert told.links == (6, 6)

@@ -41,11 +41,9 @@ SHORT_STEP = 1e-5
 bodies with friction agree within a few per cent in steps from .5 to .05 ms, and change by up to 50 % below 25 µs."""
 MARGIN = 0.8  # share of a promised error from which a whisker is simulated again, since estimates have errors too
 FINEST_STEP = 2e-6  # step (s) below which none is halved to keep a promise: single precision ends there
-
 RULE = 2  # counts up when the same forces get other errors, so that no data set is made by two rules
 
-Run = Callable[[Sequence[Job], Fidelity], Sequence[Trace]]
-"""Simulates jobs."""
+Run = Callable[[Sequence[Job], Fidelity], Sequence[Trace]]  # simulates jobs
 
 
 def with_errors(run: Run, jobs: Sequence[Job], fidelity: Fidelity, once: Run) -> list[Trace]:

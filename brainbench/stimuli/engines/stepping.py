@@ -214,10 +214,6 @@ class SteppedJob:
         """First step at which the whisker starts in an object or one reaches its base, why, and overlap at first."""
         return overlap_fault(self.reach.obstacles, self.chain, *self.pose, self.times)
 
-    def silence(self) -> Trace:
-        """Return the trace of a job that is silent."""
-        return silent_trace(self.job, self.fidelity, self.record_shape, time.thread_time() - self.started)
-
     def end(self, failed: int, reason: str) -> tuple[int, str]:
         """Return the first step that cannot be trusted and why, given what the integration found."""
         missed = passed_unseen(self.job, self.reach, *self.pose, self.times)
@@ -311,5 +307,8 @@ class SteppedEngine(WhiskerEngine, ABC):
         traces = []
         for stepped in (SteppedJob(job, fidelity, record_shape) for job in jobs):
             silent = is_silent(stepped.job, stepped.reach, *stepped.pose)
-            traces.append(stepped.silence() if silent else self.simulate(stepped))
+            spent = time.thread_time() - stepped.started
+            traces.append(
+                silent_trace(stepped.job, fidelity, record_shape, spent) if silent else self.simulate(stepped)
+            )
         return traces

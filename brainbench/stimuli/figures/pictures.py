@@ -127,7 +127,7 @@ class Picture:
     @cached_property
     def lens(self) -> Lens:
         """The camera at its place, framing whiskers and the parts of objects near them."""
-        whiskers, points = self._whisker_points, self._object_points
+        whiskers, points = self._shown
         if len(whiskers):
             low, high = whiskers.min(axis=0), whiskers.max(axis=0)
             room = 0.3 * float(np.linalg.norm(high - low))
@@ -148,8 +148,9 @@ class Picture:
         objects, solid = self._objects(index, lens)
         whiskers = self._whiskers(index, lens)
         throwing = Triangles.joined([objects, whiskers])
-        light = lamp(lens, style.supersampling, self._shown, throwing, style.opacity)
-        low = self._shown[:, 2].min() - 0.03 * self.lens.width
+        shown = np.concatenate(self._shown)
+        light = lamp(lens, style.supersampling, shown, throwing, style.opacity)
+        low = shown[:, 2].min() - 0.03 * self.lens.width
         ground = floor(self.lens, light, float(low)).repeat(style.supersampling, 0).repeat(style.supersampling, 1)
         image = np.repeat(ground[..., None], 3, axis=2)
         thin = draw(whiskers, lens)
@@ -200,17 +201,9 @@ class Picture:
         return Triangles.joined(parts)
 
     @cached_property
-    def _shown(self) -> NDArray[np.float64]:
-        return np.concatenate([self._whisker_points, self._object_points, np.zeros((0, 3))])
-
-    @cached_property
-    def _whisker_points(self) -> NDArray[np.float64]:
+    def _shown(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Points of the whiskers [n, 3], and corners of the objects at the first, middle and last instant."""
         points = np.concatenate([joints.reshape(-1, 3) for joints in self.recording.joints])
-        return points[np.isfinite(points).all(axis=1)]
-
-    @cached_property
-    def _object_points(self) -> NDArray[np.float64]:
-        """Corners of the objects [n, 3] at the first, middle and last instant."""
         times = self.recording.times
         moments = {0, len(times) // 2, len(times) - 1}
         corners = [
@@ -218,7 +211,7 @@ class Picture:
             for surface in self._surfaces
             for index in ({0} if surface.motion is None else moments)
         ]
-        return np.concatenate([np.zeros((0, 3)), *corners])
+        return points[np.isfinite(points).all(axis=1)], np.concatenate([np.zeros((0, 3)), *corners])
 
 
 AXES = ("right", "rostral", "dorsal")

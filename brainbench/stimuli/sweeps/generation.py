@@ -298,8 +298,7 @@ def _read(
     """Return what the manifest says of a shard, and add what it says to its ``objects`` and to ``errors``."""
     with open_hdf5(path, "shard", "Run the same command again.") as opened:
         file: Any = opened
-        # Shards of data sets that were begun before steps were counted as unsolved do not tell.
-        counts = {name: int(file.attrs.get(name, 0) if name == "unsolved" else file.attrs[name]) for name in _COUNTS}
+        counts = {name: int(file.attrs[name]) for name in _COUNTS}
         digest = str(file.attrs["content_hash"])
         hashes = [value.decode() for value in file["object_hash"][:]]
         owner, status, reasons = file["owner"][:], file["status"][:], file["reason"][:]
