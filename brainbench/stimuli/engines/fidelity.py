@@ -70,7 +70,7 @@ class Fidelity:
     contact_travel: Annotated[float, Limit(above=0, most=2.5e-4, unit="m")] = field(
         default=2.5e-4, metadata={"later": True}
     )
-    """Longest way [m] of any point of a whisker in one step while an object is near: ``rod`` splits steps to keep it."""
+    """Longest way [m] of any point of a whisker in one step near an object: ``rod`` splits steps to keep it."""
     error: Positive | None = field(default=None, metadata={"later": True})
     """Estimated error (:attr:`brainbench.stimuli.motion.jobs.Trace.error`) that is promised to each whisker: those
     beyond it are simulated again with more links and shorter steps, and those still beyond it have a remark. None:
