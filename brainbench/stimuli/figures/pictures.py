@@ -148,9 +148,9 @@ class Picture:
         objects, solid = self._objects(index, lens)
         whiskers = self._whiskers(index, lens)
         throwing = Triangles.joined([objects, whiskers])
-        shown = np.concatenate(self._shown)
-        light = lamp(lens, style.supersampling, shown, throwing, style.opacity)
-        low = shown[:, 2].min() - 0.03 * self.lens.width
+        scene = np.concatenate(self._shown)
+        light = lamp(lens, style.supersampling, scene, throwing, style.opacity)
+        low = scene[:, 2].min() - 0.03 * self.lens.width
         ground = floor(self.lens, light, float(low)).repeat(style.supersampling, 0).repeat(style.supersampling, 1)
         image = np.repeat(ground[..., None], 3, axis=2)
         thin = draw(whiskers, lens)

@@ -129,11 +129,6 @@ class LoadedShapes:
         """[b, m, 2] unit tangents."""
         return np.stack([np.cos(self.angle), np.sin(self.angle)], axis=-1)
 
-    @property
-    def bend(self) -> Array:
-        """[b, m, 2] second derivatives of the position by arc (1/m)."""
-        return self.curvature[..., None] * np.stack([-np.sin(self.angle), np.cos(self.angle)], axis=-1)
-
 
 class LoadedWhisker:
     """A clamped whisker that one frictionless contact bends by any amount, in its plane."""
@@ -346,7 +341,8 @@ class ContactSolver:
         points = frame[np.isfinite(frame).all(axis=-1)]
         shapes, options, length = self.shapes(unknowns), self.options, self.whisker.arc_length
         traced = np.broadcast_to(points, (len(unknowns), *points.shape))
-        rows = [offsets_of_samples(shapes.place, shapes.along, shapes.bend, traced)[..., 0] / noise]
+        bend = shapes.curvature[..., None] * np.stack([-np.sin(shapes.angle), np.cos(shapes.angle)], axis=-1)
+        rows = [offsets_of_samples(shapes.place, shapes.along, bend, traced)[..., 0] / noise]
         if self.first_arc is not None and np.isfinite(frame[0]).all():
             where = np.clip(self.first_arc / (unknowns[:, 3] * length), 0, 1) * STEPS
             low = np.minimum(where.astype(int), STEPS - 1)
