@@ -15,6 +15,7 @@ from brainbench.stimuli.engines.error_estimates import (
     SHORT_STEP,
     SLOW,
     calm_error,
+    changes,
     difference,
     halved_step,
     more_links,
@@ -198,6 +199,30 @@ def test_an_estimate_that_happens_to_be_small_is_not_believed():
     assert not trace.remark
     # The finer run of an estimate is the next to be judged; none is made twice.
     assert [setting.links for setting in runs[-7:]] == [10, 10, 15, 15, 23, 23, 35]
+
+
+def test_where_no_run_is_good_enough_the_forces_are_those_of_the_best():
+    def run(jobs, setting):
+        # More links in the same steps make it worse.
+        return [_trace({10: 0.0, 15: 0.1}.get(setting.links, 0.6)) for _ in jobs]
+
+    (trace,) = with_errors(run, [Job(C2, StillFollicle(), (), TIMES)], Fidelity(links=10, error=0.05), run)
+    assert trace.error == pytest.approx(3 * 0.1 / 1.1)
+    np.testing.assert_array_equal(trace.wrench, _trace().wrench)
+    assert "an error of 27%" in trace.remark
+
+
+def test_what_changes_where_contact_begins_or_ends_counts_by_the_root_of_the_step():
+    contact = np.array([[False, False, True, True, True, True, False, False]])
+    values = np.zeros((8, 1, 8, 6))
+    values[:, 0, 2:6, 0] = 1e-3
+    finer = values.copy()
+    for reading in range(8):
+        finer[reading, 0, reading, 0] += 1e-6
+    told = [changes(values[k], finer[k], contact, np.array([0.01]))[0] for k in range(8)]
+    # Readings without contact count by their share of all.
+    plain = 1e-3 / np.sqrt(4) * np.ones(8)
+    np.testing.assert_allclose(told, plain * [1, 1.7, 1.7, 1, 1, 1.7, 1.7, 1], rtol=1e-2)
 
 
 @pytest.mark.parametrize(
