@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import functools
-import json
 import os
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeGuard
@@ -72,7 +72,8 @@ class Stimuli:
     @property
     def promise(self) -> float | None:
         """Error that the fidelity promised each whisker; None where it promised none, or is not known."""
-        return None if self.dataset is None else json.loads(self.dataset.attrs.get("fidelity", "{}")).get("error")
+        text = "" if self.dataset is None else str(self.dataset.attrs.get("fidelity"))
+        return next(map(float, re.findall(r'"error": (\d+\.?\d*(?:e-\d+)?)', text)), None)
 
     def __repr__(self) -> str:
         shape = " × ".join(map(str, self.input.shape))

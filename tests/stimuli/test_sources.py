@@ -4,6 +4,7 @@ import pytest
 import xarray as xr
 
 from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError
+from brainbench.core.files import to_json
 from brainbench.stimuli import Stimuli, load_stimuli, read_stimulus_set, to_grid, write_stimulus_set
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.scenes.recipes import get_recipe
@@ -53,6 +54,17 @@ def test_the_error_of_all_forces_counts_whiskers_by_what_they_feel(errors, whole
         variables["error"] = (("stimulus", "whisker"), np.array([errors], dtype=float))
     stimuli = Stimuli(("a",), np.zeros((1, 4, 1)), xr.Dataset(variables), "", "", "")
     assert stimuli.error == (whole if whole is None else pytest.approx(whole))
+
+
+@pytest.mark.parametrize(
+    ("fidelity", "promise"),
+    [(to_json(Fidelity.auto(error=0.2), indent=None), 0.2), (to_json(Fidelity(error=1e-5), indent=None), 1e-5),
+     (to_json(Fidelity(), indent=None), None), ("{}", None), ("of another lab", None), (None, None)],
+)  # fmt: skip
+def test_stimuli_say_what_error_their_fidelity_promised(fidelity, promise):
+    dataset = xr.Dataset(attrs={} if fidelity is None else {"fidelity": fidelity})
+    assert Stimuli(("a",), np.zeros((1, 4, 1)), dataset, "", "", "").promise == promise
+    assert Stimuli(("a",), np.zeros((1, 4, 1)), None, "", "", "").promise is None
 
 
 def test_a_scene_file_is_simulated(tmp_path):

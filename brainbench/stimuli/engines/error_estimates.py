@@ -95,11 +95,10 @@ def with_errors(run: Run, jobs: Sequence[Job], fidelity: Fidelity, once: Run) ->
             errors[index] = np.maximum(np.multiply((HALF_STEP, MORE_LINKS), changes_by), least)
             steps = trace.steps + (traces[index].steps if place else 0)
             settings[index], error = chosen, math.hypot(*errors[index])
-            best = replace(trace, error=error)
-            if place and (fidelity.error or 0) < traces[index].error < error:
-                # None is good enough: more links in the same steps can make a blow worse.
-                best = traces[index]
-            traces[index] = replace(best, steps=steps)
+            traces[index] = replace(traces[index], steps=steps)
+            # Where none is good enough the best stays: more links in the same steps can make a blow worse.
+            if not (place and (fidelity.error or 0) < traces[index].error < error):
+                traces[index] = replace(trace, error=error, steps=steps)
             following = _finer(chosen, job, *errors[index])
             if error > MARGIN * (fidelity.error or math.inf) and following != chosen:
                 finer[index] = following
