@@ -57,8 +57,8 @@ _SWEEPS, _TOLERANCE = 100, 1e-8
 _TRIAL_SPLITS, _FEWEST_TRIAL_SPLITS, _FEW_STIMULI = 40, 4, 40
 """Splits of the trials for each half of up to 40 stimuli, of more in proportion fewer, and the fewest."""
 _LEAST_SHARE = 0.25  # smallest reliability of halves, as a share of that of all stimuli, which is divided by
-_PARTS = ("both", "controls", "network", "equal")
-"""Sums that are compared: controls and layer, controls, layer; each with equal distances, and these alone."""
+_PARTS = ((True, True), (True, False), (False, True), (False, False))
+"""Sums that are compared, by whether controls and the layer take part; equal distances come first in each."""
 
 
 def unique_part(
@@ -232,7 +232,8 @@ class _Sides:
         layers = first_best(fit[..., None])[..., 0]
         rows = np.arange(len(products))
         gram, sums = gram[rows, layers], sums[rows, layers]
-        weights = np.stack([full[rows, layers], *(_fitted_to(gram, sums, part, rivals) for part in _PARTS[1:])], axis=1)
+        used = [[True, *[controls] * (rivals - 1), network] for controls, network in _PARTS[1:]]
+        weights = np.stack([full[rows, layers], *(non_negative(gram, sums, part) for part in used)], axis=1)
         # Of the RDMs as they are, not of unit vectors, which have other lengths on the other half.
         raw = np.concatenate([scale[:, :rivals], scale[rows, rivals + layers][:, None]], axis=1)
         return weights * raw[:, None], layers
@@ -251,12 +252,6 @@ class _Sides:
         product = weights @ products[rows, index][:, :, ends:]
         # A sum of nothing explains nothing.
         return np.divide(product, length, out=np.zeros_like(product), where=length > 0)
-
-
-def _fitted_to(gram: Floats, sums: Floats, part: str, rivals: int) -> Floats:
-    """Return the weights [V, J + 1] of a sum that lacks some RDMs; equal distances come first, the layer last."""
-    used = [True, *[part not in ("network", "equal")] * (rivals - 1), part not in ("controls", "equal")]
-    return non_negative(gram, sums, used)
 
 
 def non_negative(gram: Floats, sums: Floats, used: Any = None) -> Floats:

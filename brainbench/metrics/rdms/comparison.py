@@ -414,6 +414,8 @@ def _rho_a(rdms: Floats) -> Floats:
 
 
 def _signs(rdms: Floats) -> Floats:
+    if rdms.shape[-1] < 2:
+        return np.full((*rdms.shape[:-1], 1), np.nan)
     rows, cols = np.triu_indices(rdms.shape[-1], k=1)
     return np.sign(rdms[..., rows] - rdms[..., cols])
 
@@ -421,12 +423,7 @@ def _signs(rdms: Floats) -> Floats:
 def _tau_a(rdms: Floats) -> Floats:
     count = rdms.shape[-1]
     # Kendall's τ-a: mean product of the signs of all differences between pairs; tied ones are zero.
-    return _signs(rdms) / np.sqrt(count * (count - 1) / 2) if count > 1 else np.full((*rdms.shape[:-1], 1), np.nan)
-
-
-def _tau_b(rdms: Floats) -> Floats:
-    # τ-b divides by the root of each side's untied differences, which is the length of its vector of signs.
-    return _unit(_signs(rdms)) if rdms.shape[-1] > 1 else np.full((*rdms.shape[:-1], 1), np.nan)
+    return _signs(rdms) / np.sqrt(count * (count - 1) / 2)
 
 
 def _second_moment(rdms: Floats) -> Floats:
@@ -453,7 +450,8 @@ _METHODS: dict[str, tuple[Transform, Transform]] = {
     "spearman": (lambda rdms: _pearson(_ranks(rdms)), _ranks),
     "rho-a": (_rho_a, _ranks),
     "tau-a": (_tau_a, _ranks),
-    "tau-b": (_tau_b, _ranks),
+    # τ-b divides by the root of each side's untied differences, which is the length of its vector of signs.
+    "tau-b": (lambda rdms: _unit(_signs(rdms)), _ranks),
     "cosine": (_unit, _unit),
     "whitened-cosine": (lambda rdms: _unit(_second_moment(rdms)), _unit),
     "whitened-pearson": (lambda rdms: _unit(_second_moment(_centred(rdms)), rdms), _pearson),

@@ -56,11 +56,8 @@ class NoiseModel:
     def dual(self) -> bool:
         """True when inner products of trials are fewer numbers than those of units, and good enough."""
         trials, units = self.trials.shape
-        return trials < units and self.ridge >= _DUAL_RIDGE * (self.ridge + self.weight * self._power)
-
-    @property
-    def _power(self) -> float:
-        return float((self.trials * self.trials).mean()) * len(self.trials)
+        power = float((self.trials * self.trials).mean()) * trials
+        return trials < units and self.ridge >= _DUAL_RIDGE * (self.ridge + self.weight * power)
 
     def sides(self, left: Array, right: Array) -> tuple[Array, Array]:
         """Return vectors [N, V] and [M, V] whose inner products are those of both sides with C⁻¹ between them."""
@@ -320,7 +317,7 @@ def _added(total: Array, part: Array) -> Array:
 def _products_of_present(left: Array, right: Array) -> Array:
     xp = library(left)
     present = xp.isfinite(left) & xp.isfinite(right)
-    weight = _ones(present, left)
+    weight = xp.where(present, xp.ones_like(left), 0.0)
     a = xp.where(present, left - _unit_mean(left, present, weight), 0.0)
     b = xp.where(present, right - _unit_mean(right, present, weight), 0.0)
     turned = weight.swapaxes(-1, -2)
@@ -328,12 +325,6 @@ def _products_of_present(left: Array, right: Array) -> Array:
     both, sums, cross = weight @ turned, (a * b) @ turned, a @ b.swapaxes(-1, -2)
     total = sums + sums.swapaxes(-1, -2) - cross - cross.swapaxes(-1, -2)
     return upper(xp.where(both > 0, total / xp.where(both > 0, both, 1.0), np.nan))
-
-
-def _ones(present: Array, like: Array) -> Array:
-    """Return 1 where a value is present, else 0, in the type and place of ``like``."""
-    xp = library(like)
-    return xp.where(present, xp.ones_like(like), 0.0)
 
 
 def _unit_mean(patterns: Array, present: Array, weight: Array) -> Array:
@@ -345,7 +336,7 @@ def _correlation_of_present(patterns: Array) -> Array:
     xp = library(patterns)
     present = xp.isfinite(patterns)
     filled = xp.where(present, patterns, 0.0)
-    weight = _ones(present, patterns)
+    weight = xp.where(present, xp.ones_like(patterns), 0.0)
     mean = (filled.sum(-1) / weight.sum(-1).clip(1.0))[..., None]
     x = xp.where(present, patterns - mean, 0.0)
     turned = weight.swapaxes(-1, -2)
@@ -384,10 +375,6 @@ class _Responses:
     def patterns(self) -> Array:
         """Return patterns [K, U], unlabelled ones as given."""
         return self.responses if self.codes is None else self.means(self.codes, self.count)
-
-    def placed(self) -> Array:
-        """Return patterns [K, U] in float64 on the device."""
-        return place(self.patterns(), self.device)
 
     def means(self, cells: Ints, count: int) -> Array:
         """Return the mean response [count, U] to the trials of each cell."""
@@ -484,7 +471,7 @@ def _sqeuclidean(given: _Responses) -> Array:
 def _mahalanobis(given: _Responses) -> Array:
     if given.precision is None:
         return _sqeuclidean(given)
-    patterns = given.placed()
+    patterns = place(given.patterns(), given.device)
     # The shift per unit must go before the product mixes units.
     centred = without_shift(patterns)
     # (x_i − x_j) C⁻¹ (x_i − x_j) from inner products of vectors whitened by a factor of C⁻¹ (Walther 2016).
@@ -540,7 +527,7 @@ def _crossnobis_of_present(given: _Responses, means: Array) -> Array:
 
 
 def _poisson(given: _Responses) -> Array:
-    patterns = given.placed()
+    patterns = place(given.patterns(), given.device)
     values = patterns[~library(patterns).isnan(patterns)]
     low = float(values.min()) if len(values) else 0.0
     if low < 0:

@@ -200,26 +200,39 @@ def members(random: Hashes) -> Floats:
     return member
 
 
-def split_members(session: SortedTrials, count: int, index: Ints, seed: int) -> Floats:
+def split_members(session: SortedTrials, index: Ints, seed: int) -> Floats:
     """Return 1 for the trials [S, R] in the first half of their stimulus, in the splits ``index`` [S]."""
-    return first_halves(draws(session.hashes, index, seed), session.labels, count)
+    return first_halves(draws(session.hashes, index, seed), session)
 
 
-def time_members(session: SortedTrials, count: int) -> Floats:
+def time_members(session: SortedTrials) -> Floats:
     """Return 1 for the earlier trials [1, R] of each stimulus; an odd trial goes to either half by its hash."""
     places = np.argsort(np.argsort(session.times, kind="stable")).astype(np.uint64)
-    return first_halves((places[None] << np.uint64(1)) | (session.hashes & np.uint64(1)), session.labels, count)
+    return first_halves((places[None] << np.uint64(1)) | (session.hashes & np.uint64(1)), session)
 
 
-def first_halves(random: Hashes, labels: Ints, count: int) -> Floats:
-    """Return 1 for the lower half of the numbers [S, R] of each stimulus' trials."""
+def first_halves(random: Hashes, session: SortedTrials) -> Floats:
+    """Return 1 for the lower half of the numbers [S, R] of each stimulus' trials, and of those with the same units."""
+    if not session.complete:
+        # Halves of other units would differ by these, not by noise.
+        random = _by_groups(random, session.groups)
     first = np.empty(random.shape)
-    sizes = np.bincount(labels, minlength=count)[labels]
+    sizes = np.bincount(session.labels)[session.labels]
     # Trials are sorted by stimulus; stimuli with as many trials are drawn in one call.
     for size in np.unique(sizes):
         rows = np.flatnonzero(sizes == size)
         first[:, rows] = members(random[:, rows].reshape(len(random), -1, size)).reshape(len(random), -1)
     return first
+
+
+def _by_groups(random: Hashes, groups: Ints) -> Hashes:
+    """Return numbers [S, R] in whose lower half of a stimulus is the lower half of each of its groups."""
+    sizes = np.bincount(groups)
+    ranks = np.arange(len(groups)) - np.repeat(np.cumsum(sizes) - sizes, sizes)
+    shares, order = np.empty(random.shape), np.lexsort((random, np.broadcast_to(groups, random.shape)))
+    np.put_along_axis(shares, order, ((ranks + 0.5) / np.repeat(sizes, sizes))[None], axis=-1)
+    places = np.argsort(np.lexsort((random, shares))).astype(np.uint64)
+    return (places << np.uint64(1)) | (random & np.uint64(1))
 
 
 def half_rdms(sessions: list[SortedTrials], count: int, method: str, index: Ints, seed: int) -> tuple[Floats, Floats]:
@@ -232,7 +245,7 @@ def half_rdms(sessions: list[SortedTrials], count: int, method: str, index: Ints
         step = min(step, _PATTERN_BYTES // (8 * count * sum(session.responses.shape[1] for session in sessions)))
     step = max(1, step)
     parts = [
-        every.halves([split_members(session, count, index[start : start + step], seed) for session in sessions])
+        every.halves([split_members(session, index[start : start + step], seed) for session in sessions])
         for start in range(0, len(index), step)
     ]
     return np.concatenate([part[0] for part in parts]), np.concatenate([part[1] for part in parts])
@@ -260,7 +273,7 @@ def unit_reliability(blocks: Sequence[Trials], n_stimuli: int, *, seed: int = 0)
         session = SortedTrials.sort(responses, codes, trial_hashes(block, responses, codes))
         total, number = np.zeros(responses.shape[1]), np.zeros(responses.shape[1])
         for start in range(0, _SPLITS, _CHUNK):
-            member = split_members(session, n_stimuli, np.arange(start, start + _CHUNK), seed)
+            member = split_members(session, np.arange(start, start + _CHUNK), seed)
             # Split by split, so that memory holds a chunk of splits of one session.
             halves = [mean_patterns(session, w, n_stimuli, variances=False)[0] for w in (member, 1.0 - member)]
             # Pearson's r over stimuli between the halves' mean responses, of all units and splits at once.

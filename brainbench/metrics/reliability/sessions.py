@@ -141,6 +141,12 @@ class SortedTrials(Trials):
         return bool(np.isfinite(self.responses).all())
 
     @cached_property
+    def groups(self) -> Ints:
+        """[R] numbers of the trials of one stimulus in which the same units were recorded."""
+        recorded = np.packbits(np.isfinite(self.responses), axis=1)
+        return np.unique(np.column_stack([self.labels, recorded]), axis=0, return_inverse=True)[1].ravel()
+
+    @cached_property
     def factor(self) -> Floats:
         """[R, ≤ R] patterns with the same inner products as the trials' responses, and no more columns than trials."""
         if self.responses.shape[1] <= len(self.labels):

@@ -267,7 +267,7 @@ def _in_time(sessions: list[SortedTrials], count: int, method: str, comparison: 
         },
     }
     if all(session.times is not None for session in sessions):
-        first, second = SplitRDMs(sessions, count, method).halves([time_members(each, count) for each in sessions])
+        first, second = SplitRDMs(sessions, count, method).halves([time_members(each) for each in sessions])
         stated["by_time"] = float(compare(first, second, method=comparison)[0])
     if len(ordered) >= FEWEST_SESSIONS:
         rdms = np.stack([SplitRDMs([each], count, method).whole() for each in ordered])

@@ -14,10 +14,10 @@ from brainbench.core.contracts import Trials
 from brainbench.core.errors import DataError, UsageError
 from brainbench.metrics import compare, rdm
 from brainbench.metrics.rdms.comparison import permuted_pairs
-from brainbench.metrics.reliability.halves import SplitRDMs, members, reliable_units, unit_reliability
+from brainbench.metrics.reliability.halves import SplitRDMs, members, reliable_units, split_members, unit_reliability
 from brainbench.metrics.reliability.noise_correction import spearman_brown
-from brainbench.metrics.reliability.sessions import draws, key_hashes
-from brainbench.metrics.reliability.subject_rdm import subject_rdm
+from brainbench.metrics.reliability.sessions import SortedTrials, draws, key_hashes
+from brainbench.metrics.reliability.subject_rdm import drift_within, subject_rdm
 from tests.factories.animals import STIMULI, make_block, make_latent
 
 
@@ -231,3 +231,41 @@ def test_the_order_of_trials_and_units_is_irrelevant():
 def test_misuse_of_units_is_told_in_a_sentence():
     with pytest.raises(UsageError, match="at least 3 stimuli"):
         unit_reliability([_make_units()], 2)
+
+
+@pytest.mark.parametrize("method", ["crossnobis", "correlation"])
+def test_units_that_are_recorded_in_some_trials_only_cost_no_reliability_and_make_none(method):
+    comparison = "whitened-cosine" if method == "crossnobis" else "pearson"
+    values, drifts = [], []
+    for seed in range(12):
+        random = np.random.default_rng(seed)
+        # Two groups of units, the quieter one recorded in the earlier half of each stimulus' trials, the other later.
+        latent = random.normal(size=(10, 20)) * np.repeat([0.5, 1.0], 10)
+        labels = np.tile(np.arange(10), 16)
+        responses = latent[labels] + random.normal(size=(160, 20))
+        responses[:80, 10:] = responses[80:, :10] = np.nan
+        block = Trials(responses, labels, times=np.arange(160.0))
+        animal = subject_rdm("a", [block], 10, method=method, comparison=comparison, splits=100, noise="none")
+        truth = rdm(latent, method="sqeuclidean" if method == "crossnobis" else method)
+        values.append(float(compare(truth, animal.rdm, method=comparison)) / np.sqrt(animal.reliability))
+        drift = drift_within([animal])
+        drifts.append(drift is not None and drift.present)
+    assert np.mean(values) == pytest.approx(1.0, abs=0.06)
+    assert sum(drifts) <= 2
+
+
+def test_trials_with_the_same_units_go_to_both_halves_alike():
+    random = np.random.default_rng(0)
+    responses, labels = random.normal(size=(42, 6)), np.repeat([0, 1], 21)
+    units = np.array([[0, 1, 2, 3, 4, 5], [0, 1, 2, 3, 6, 6], [2, 3, 4, 5, 6, 6]])[np.arange(42) % 3]
+    for trial, present in enumerate(units):
+        responses[trial, np.setdiff1d(np.arange(6), present)] = np.nan
+    session = SortedTrials.sort(responses, labels, key_hashes([str(trial) for trial in range(42)]))
+    first = split_members(session, np.arange(200), 0)
+    for stimulus in (0, 1):
+        inside = session.labels == stimulus
+        assert set(first[:, inside].sum(axis=1)) == {10.0, 11.0}
+        for units in np.unique(np.isfinite(session.responses), axis=0):
+            rows = inside & (np.isfinite(session.responses) == units).all(axis=1)
+            assert set(first[:, rows].sum(axis=1)) == {3.0, 4.0}
+    np.testing.assert_allclose(first.mean(axis=0), 0.5, atol=0.12)

@@ -54,7 +54,7 @@ def test_halves_by_products_and_by_patterns_are_the_same(method, monkeypatch):
     session = SortedTrials.sort(block.responses, block.labels, key_hashes(block.keys))
     index = np.arange(7)
     first, second = half_rdms([session], 6, method, index, seed=3)
-    member = split_members(session, 6, index, 3)
+    member = split_members(session, index, 3)
     monkeypatch.setattr("brainbench.metrics.reliability.halves.BY_PRODUCTS", ())
     for half, by_patterns in zip((first, second), SplitRDMs([session], 6, method).halves([member]), strict=True):
         np.testing.assert_allclose(half, by_patterns, atol=1e-11)
