@@ -92,10 +92,12 @@ def rdm(
     labels = brain.vocabulary
     animals = brain.animals(labels, measure, ScoreOptions(seed=seed))
     columns = ("subject", "units", "trials", "reliability", "problem", "notes", "rdm")
-    rows = [{name: getattr(item, name) for name in columns} for item in animals]
-    data = {"labels": labels, "recordings": brain.origin, "animals": rows}
+    rows = [{**{name: getattr(item, name) for name in columns}, "verdict": _verdict(item)} for item in animals]
+    about = {name: str(brain.dataset.attrs[name]) for name in ("conditions", "window")}
+    data = {**about, "distance": measure.brain_method, "labels": labels, "recordings": brain.origin}
+    data |= {"doubts": brain.doubts, "animals": rows}
     text = table_of(
-        f"{brain.dataset.attrs['conditions']}, {brain.dataset.attrs['window']}; RDM: {measure.brain_method} distance",
+        f"{about['conditions']}, {about['window']}; RDM: {measure.brain_method} distance",
         animals,
         {
             "animal": "{0.subject}",
@@ -109,8 +111,8 @@ def rdm(
     names, rdms = [item.subject for item in animals], [item.rdm for item in animals]
     text += _matrices("RDM of animal", labels, names, rdms)
     if out is not None:
-        about = {name: str(brain.dataset.attrs[name]) for name in ("conditions", "window", "content_hash")}
-        about |= {"recordings": brain.source, "responses": str(brain.dataset.attrs.get("measure", "spikes"))}
+        about |= {"content_hash": str(brain.dataset.attrs["content_hash"]), "recordings": brain.source}
+        about["responses"] = str(brain.dataset.attrs.get("measure", "spikes"))
         more = {name: [getattr(item, name) for item in animals] for name in ("units", "trials", "reliability")}
         write_rdms(out, StoredRDMs(np.stack(rdms), labels, tuple(names), measure.brain_method, more, about))
         text += f"\n\nWritten: {out}"

@@ -283,6 +283,7 @@ def score(
 ) -> Output:
     """Score a model against neural recordings and write a result record and an HTML report."""
     from brainbench.core.files import to_plain
+    from brainbench.core.statistics import compare_scores
     from brainbench.scoring.kept_records import keep, read_kept, record_path
     from leaderboards.site.build import write_report
     from leaderboards.store import write_record
@@ -309,6 +310,8 @@ def score(
     path = write_record(record, out)
     page = write_report(record, path.with_suffix(".html"))
     data: dict[str, Any] = {"record": record, "record_path": path, "report_path": page}
+    if (raw := record.baselines.get(RAW_INPUT)) and record.score.status == raw.status == "ok":
+        data["against_raw_input"] = compare_scores(record.score, raw)
     text = f"{score_text(record)}\n\nrecord  {path}{note}\nreport  {page}"
     if report is not None:
         from leaderboards.report.paper import write_paper

@@ -71,6 +71,22 @@ def test_a_session_that_an_rdm_leaves_out_is_named(run, tmp_path):
     assert (animal["units"], len(animal["notes"])) == (9, 1)
 
 
+def test_json_of_rdms_says_all_that_the_table_says(run, tmp_path):
+    random = np.random.default_rng(0)
+    start = np.sort(random.uniform(1, 40, 60))  # windows of half a second that overlap
+    table = {"start_time": start, "stop_time": start + 0.5, "stimulus": [*"abcd" * 15]}
+    spikes = [np.sort(random.uniform(0, 42, 900)) for _ in range(9)]
+    write_recordings(tmp_path / "m.h5", make_session("m", "1", spikes, {"trials": table}))
+    given = ("recordings", "rdm", str(tmp_path), "--conditions", "trials:stimulus")
+    text, data = run(*given).out, json.loads(run(*given, "--json").out)
+    title, _, row, *rest = text.splitlines()
+    assert title == f"{data['conditions']}, {data['window']}; RDM: {data['distance']} distance"
+    assert row.endswith(data["animals"][0]["verdict"])
+    assert "unreliable" in row
+    assert data["doubts"]
+    assert [line for line in rest if line.startswith("Note: ")] == [f"Note: {doubt}." for doubt in data["doubts"]]
+
+
 def test_the_reliability_of_scores_is_shown_before_scoring(run, folder):
     result = run("recordings", "rdm", str(folder), "--conditions", "trials:stimulus", "--metric", "rsa", "--json")
     ours = [animal["reliability"] for animal in json.loads(result.out)["animals"]]

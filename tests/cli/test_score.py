@@ -99,6 +99,19 @@ def test_json_is_one_document_on_stdout(run, files):
     assert data["record"]["score"]["stimuli"] == list(LABELS)
 
 
+def test_json_holds_the_test_against_raw_input_that_is_printed(run, tmp_path, monkeypatch):
+    (record,) = draw_board({"good": 0.8}, raw=0.1)
+    doubtful = replace(record, score=replace(record.score, status="unreliable"))
+    data = []
+    for stored in (record, doubtful):
+        monkeypatch.setattr("brainbench.scoring.kept_records.read_kept", lambda path, stored=stored: stored)
+        data.append(json.loads(run("score", "zhuang-small", "--out", str(tmp_path), "--json").out))
+    found = data[0]["against_raw_input"]
+    assert f"difference {found['difference']:.2f}" in score_text(record).splitlines()[1]
+    assert f"p = {found['p']:.2g}" in score_text(record).splitlines()[1]
+    assert "against_raw_input" not in data[1], "an unreliable score is not compared"
+
+
 def test_a_users_file_is_scored_on_a_users_arrays(run, files):
     result = _score(run, files, files["model"], "--stimuli", files["arrays"], "--json")
     assert result.status == 0, result.err
