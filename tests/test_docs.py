@@ -7,7 +7,7 @@ import shlex
 import subprocess
 import sys
 from functools import cache
-from itertools import groupby
+from itertools import groupby, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -184,25 +184,35 @@ def test_the_code_of_a_page_runs_from_top_to_bottom(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("page", ["docs/score.md", "docs/stimuli.md"])
-def test_what_a_page_prints_is_printed(page: str, tmp_path: Path):
-    text = (ROOT / page).read_text(encoding="utf-8")
-    command, (shown, *_) = (
-        _blocks(page, "bash")[0],
-        re.findall(r"```(?:text)?\n(.*?)```", text.split("prints", 1)[1], re.S),
-    )
+@pytest.mark.parametrize(
+    ("page", "commands"),
+    [
+        ("docs/score.md", ["score zhuang-small"]),
+        ("docs/stimuli.md", ["stimuli simulate"]),
+        ("docs/recordings.md", ["recordings inspect"]),
+        ("docs/two-photon.md", ["recordings inspect", "recordings rdm", "score zhuang-small"]),
+    ],
+)
+def test_what_a_page_prints_is_printed(page: str, commands: list[str], tmp_path: Path):
+    from brainbench.scoring.demo import demo_recordings
+
+    # The page on recordings shows the first of these.
+    example = min(demo_recordings("demo-rodgers").glob("*.nwb"))
     (tmp_path / "poles.toml").write_text("".join(_blocks(page, "toml")[:1]))
-    line = next(
-        line
-        for line in command.splitlines()
-        if line.split()[1:3] in (["score", "zhuang-small"], ["stimuli", "simulate"])
-    )
-    done = subprocess.run(
-        [sys.executable, "-m", *shlex.split(line, comments=True)], cwd=tmp_path, capture_output=True, text=True,
-        env={**os.environ, "PYTHONPATH": str(ROOT)}, check=True,
-    )  # fmt: skip
-    printed = {" ".join(line.split()) for line in done.stdout.splitlines()}
-    assert not {" ".join(line.split()) for line in shown.splitlines()} - printed
+
+    def run(*words: str) -> str:
+        options: dict[str, Any] = {"cwd": tmp_path, "env": {**os.environ, "PYTHONPATH": str(ROOT)}}
+        return subprocess.run([sys.executable, *words], check=True, capture_output=True, text=True, **options).stdout
+
+    if page == "docs/two-photon.md":
+        run("-c", _blocks(page, "py")[0])
+    blocks = re.findall(r"```(\w*)\n(.*?)```", (ROOT / page).read_text(encoding="utf-8"), re.DOTALL)
+    pairs = [(code, shown) for (kind, code), (after, shown) in pairwise(blocks) if (kind, after) == ("bash", "text")]
+    for command, (code, shown) in zip(commands, pairs, strict=False):
+        line = next(line for line in code.splitlines() if line.startswith(f"brainbench {command}"))
+        words = shlex.split(line.replace("data/mouse-1.nwb", str(example)), comments=True)
+        printed = {" ".join(line.split()) for line in run("-m", *words).splitlines()}
+        assert not {" ".join(line.split()) for line in shown.splitlines()} - printed, line
 
 
 @pytest.fixture
