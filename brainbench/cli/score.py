@@ -29,11 +29,12 @@ def score_text(record: ResultRecord) -> str:
     score = record.score
     parts = ["\n".join(_headline(record)), table("", ["", "", ""], list(_rows(score)))]
     parts += _details(score.provenance.statistics)
-    if notes := list(_notes(record)):
+    # A file of a record keeps its baselines in another order than they were scored in.
+    others = {"animal to animal": record.animal_to_animal, **dict(sorted(record.baselines.items(), reverse=True))}
+    if notes := list(_notes(record, others)):
         parts.append("\n".join(f"Note: {note}." for note in notes))
     if walk := score.provenance.statistics.get("estimator_walk"):
         parts.append(walk_text(walk))
-    others = {"animal to animal": record.animal_to_animal, **record.baselines}
     rows = [[name, _scaled_text(item), _p(item.p), item.status] for name, item in others.items() if item is not None]
     if rows:
         parts.append(table("Baselines, same metric and animals", ["", "score", "p", "status"], rows))
@@ -128,13 +129,12 @@ def _rows(score: Score) -> Iterator[list[str]]:
     yield ["estimator", score.estimator, "" if math.isfinite(score.value) else score.metric]
 
 
-def _notes(record: ResultRecord) -> Iterator[str]:
+def _notes(record: ResultRecord, others: Mapping[str, Score | None]) -> Iterator[str]:
     """Yield notes on intervals that run past what can exist."""
     score, span = record.score, record.score.reliability_interval
     if span is not None and span.high > 1:
         yield "the interval of the reliability is cut at 1, the largest that can exist"
-    scores = {"the score": score, "animal to animal": record.animal_to_animal, **record.baselines}
-    spans = {name: item.scaled_interval for name, item in scores.items() if item is not None}
+    spans = {name: item.scaled_interval for name, item in {"the score": score, **others}.items() if item is not None}
     beyond = [name for name, found in spans.items() if found is not None and found.high > 1]
     if beyond:
         yield (

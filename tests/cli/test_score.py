@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from brainbench.cli.score import left_out, score_text
-from brainbench.core.records import Interval, ModelCard
+from brainbench.core.records import Interval, ModelCard, ResultRecord
 from brainbench.core.statistics import compare_scores
 from brainbench.models.features import write_features
-from tests.factories.records import draw_board, make_record
+from tests.factories.records import draw_board, make_record, make_score
 
 
 def test_the_first_lines_say_what_the_weights_are_and_whether_raw_input_is_beaten():
@@ -40,6 +40,12 @@ def test_an_undefined_score_prints_its_reason_and_nothing_that_does_not_exist():
     assert "None" not in text
     assert "nan" not in text
     assert "two of three animals are noise" in text.splitlines()[1]
+
+
+def test_a_score_that_was_kept_is_printed_as_it_was():
+    names = ("raw input", "random features", "presentation time")
+    record = replace(make_record(), baselines={name: make_score(name, 0.99) for name in names})
+    assert score_text(ResultRecord.from_json(json.loads(record.to_json()))) == score_text(record)
 
 
 def test_an_interval_past_what_can_exist_is_cut_and_noted():
