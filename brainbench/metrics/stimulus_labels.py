@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from brainbench.core.errors import DataError, UsageError, listing
+from brainbench.core.errors import DataError, UsageError
 from brainbench.metrics.arrays import Array, Floats, Ints, is_tensor, library, place, slices
 
 _SLICE_ELEMENTS = 1 << 20
@@ -141,8 +140,3 @@ def check_finite(responses: NDArray) -> None:
     infinite = int(np.isinf(responses).sum())
     if infinite:
         raise DataError(f"{infinite} responses are infinite; a missing response is NaN, everything else is finite.")
-
-
-def listed(names: Sequence[str], chosen: NDArray[np.bool_]) -> str:
-    """Join the chosen names [K] for a message."""
-    return listing([name for name, take in zip(names, chosen, strict=True) if take])

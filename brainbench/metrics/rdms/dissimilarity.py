@@ -252,7 +252,7 @@ def correlation_distances(patterns: Array, *, missing: bool = False, device: Any
         for _, part in slices(patterns, _SLICE_ELEMENTS, device):
             centred = part - mean[..., None]
             rest = rest + centred.sum(-1)
-            gram = _added(gram, centred @ centred.swapaxes(-1, -2))
+            gram = gram + centred @ centred.swapaxes(-1, -2)
         # The mean of a large offset is rounded; what it missed is a second mean.
         gram -= rest[..., :, None] * rest[..., None, :] / units
         return correlation_from_gram(gram, units * (_ROUNDING * abs(mean)) ** 2)
@@ -286,7 +286,7 @@ def product_distances(left: Array, right: Array, *, missing: bool = False, devic
         pairs = zip(slices(left, _SLICE_ELEMENTS, device), slices(right, _SLICE_ELEMENTS, device), strict=True)
         for (_, a), (_, b) in pairs:
             # Differences do not feel a shift per unit, products lose digits to it.
-            gram = _added(gram, without_shift(a) @ without_shift(b).swapaxes(-1, -2))
+            gram = gram + without_shift(a) @ without_shift(b).swapaxes(-1, -2)
         return products_from_gram(gram, units)
 
 
@@ -304,14 +304,6 @@ def products_from_gram(gram: Array, units: int) -> Array:
     squares = xp.where(xp.isfinite(squares), squares, np.nan)
     total = squares[..., :, None] + squares[..., None, :] - gram - gram.swapaxes(-1, -2)
     return upper(total) / units
-
-
-def _added(total: Array, part: Array) -> Array:
-    """Return the sum, in place after the first."""
-    if isinstance(total, float):
-        return part
-    total += part
-    return total
 
 
 def _products_of_present(left: Array, right: Array) -> Array:
@@ -363,14 +355,10 @@ class _Responses:
     responses: Array
     count: int
     codes: Ints | None
+    """Of trials, whose NaN means not recorded; a NaN activation makes its pattern useless instead."""
     folds: ArrayLike | None
     precision: ArrayLike | str | None
     device: Any  # torch device, or None for numpy
-
-    @property
-    def missing(self) -> bool:
-        """True when NaN means not recorded; a NaN activation makes its pattern useless instead."""
-        return self.codes is not None
 
     def patterns(self) -> Array:
         """Return patterns [K, U], unlabelled ones as given."""
@@ -465,7 +453,7 @@ def rdm(
 
 def _sqeuclidean(given: _Responses) -> Array:
     patterns = given.patterns()
-    return product_distances(patterns, patterns, missing=given.missing, device=given.device)
+    return product_distances(patterns, patterns, missing=given.codes is not None, device=given.device)
 
 
 def _mahalanobis(given: _Responses) -> Array:
@@ -534,7 +522,7 @@ def _poisson(given: _Responses) -> Array:
         raise DataError(f"method='poisson' needs rates or counts, which are never negative; the smallest is {low:g}.")
     # Σ (λ_i − λ_j)(log λ_i − log λ_j) / U, the divergence in both directions (Schütt 2023).
     rates = poisson_rates(patterns)
-    return product_distances(rates, library(rates).log(rates), missing=given.missing)
+    return product_distances(rates, library(rates).log(rates), missing=given.codes is not None)
 
 
 def poisson_rates(rates: Array) -> Array:
@@ -544,7 +532,9 @@ def poisson_rates(rates: Array) -> Array:
 
 
 _METHODS: dict[str, Callable[[_Responses], Array]] = {
-    "correlation": lambda given: correlation_distances(given.patterns(), missing=given.missing, device=given.device),
+    "correlation": lambda given: correlation_distances(
+        given.patterns(), missing=given.codes is not None, device=given.device
+    ),
     "sqeuclidean": _sqeuclidean,
     "mahalanobis": _mahalanobis,
     "crossnobis": _crossnobis,

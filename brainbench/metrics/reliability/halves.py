@@ -213,8 +213,7 @@ def time_members(session: SortedTrials) -> Floats:
 
 def first_halves(random: Hashes, session: SortedTrials) -> Floats:
     """Return 1 for the lower half of the numbers [S, R] of each stimulus' trials, and of those with the same units."""
-    if not session.complete:
-        # Halves of other units would differ by these, not by noise.
+    if len(session.groups):
         random = _by_groups(random, session.groups)
     first = np.empty(random.shape)
     sizes = np.bincount(session.labels)[session.labels]

@@ -19,6 +19,7 @@ a tenth of the residuals in turn.
 from __future__ import annotations
 
 import hashlib
+from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -28,10 +29,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.contracts import Trials
-from brainbench.core.errors import DataError, UsageError, check_name
+from brainbench.core.errors import DataError, UsageError, check_name, listing
 from brainbench.metrics.arrays import Floats, Ints
 from brainbench.metrics.rdms.dissimilarity import NOISE_METHODS, NoiseModel, estimate_noise
-from brainbench.metrics.stimulus_labels import check_finite, labelled_trials, listed, stimulus_means
+from brainbench.metrics.stimulus_labels import check_finite, labelled_trials, stimulus_means
 
 Hashes = NDArray[np.uint64]
 
@@ -103,6 +104,8 @@ class SortedTrials(Trials):
     """[R]"""
     inflation: float = 1.0
     """Noise variance of means, in units of the noise that the trials were divided by."""
+    groups: Ints = field(default_factory=lambda: np.empty(0, dtype=np.int64), repr=False)
+    """[R] numbers of the trials of one stimulus with the same units; empty where all of a stimulus have the same."""
 
     @classmethod
     def sort(
@@ -139,12 +142,6 @@ class SortedTrials(Trials):
     def complete(self) -> bool:
         """True when no response is missing."""
         return bool(np.isfinite(self.responses).all())
-
-    @cached_property
-    def groups(self) -> Ints:
-        """[R] numbers of the trials of one stimulus in which the same units were recorded."""
-        recorded = np.packbits(np.isfinite(self.responses), axis=1)
-        return np.unique(np.column_stack([self.labels, recorded]), axis=0, return_inverse=True)[1].ravel()
 
     @cached_property
     def factor(self) -> Floats:
@@ -209,10 +206,27 @@ def usable_sessions(
         notes.append(f"{dropped} units or bins left out: recorded in fewer than {least} trials of some stimulus")
     problem = None
     if (total == 0).any():
-        problem = f"no trials of {listed(names, total == 0)}"
+        problem = f"no trials of {listing(names[place] for place in np.flatnonzero(total == 0))}"
     elif not sessions:
         problem = f"no session can be split into halves: {'; '.join(sorted(set(lacking)))}"
-    return sessions, problem, tuple(notes)
+    return grouped_sessions(sessions), problem, tuple(notes)
+
+
+def grouped_sessions(sessions: list[SortedTrials]) -> list[SortedTrials]:
+    """Return sessions that know which trials have the same units, in all sessions that a trial stands in.
+
+    Halves of other units would differ by these, not by noise, and the noise of a trial stays in one half of all probes.
+    """
+    units, grouped = defaultdict[int, list[tuple[int, int]]](list), []
+    for place, session in enumerate(sessions):
+        for key, row in zip(session.hashes.tolist(), np.isfinite(session.responses), strict=True):
+            units[key].append((place, hash(row.tobytes())))
+    for session in sessions:
+        names = [(n, *units[key]) for key, n in zip(session.hashes.tolist(), session.labels.tolist(), strict=True)]
+        number = {name: place for place, name in enumerate(dict.fromkeys(names))}
+        different = len(number) > len(np.unique(session.labels))
+        grouped.append(replace(session, groups=np.array([number[name] for name in names])) if different else session)
+    return grouped
 
 
 def trial_hashes(block: Trials, responses: Floats, codes: Ints) -> Hashes:

@@ -16,7 +16,7 @@ from brainbench.metrics import compare, rdm
 from brainbench.metrics.rdms.comparison import permuted_pairs
 from brainbench.metrics.reliability.halves import SplitRDMs, members, reliable_units, split_members, unit_reliability
 from brainbench.metrics.reliability.noise_correction import spearman_brown
-from brainbench.metrics.reliability.sessions import SortedTrials, draws, key_hashes
+from brainbench.metrics.reliability.sessions import SortedTrials, draws, grouped_sessions, key_hashes
 from brainbench.metrics.reliability.subject_rdm import drift_within, subject_rdm
 from tests.factories.animals import STIMULI, make_block, make_latent
 
@@ -260,7 +260,8 @@ def test_trials_with_the_same_units_go_to_both_halves_alike():
     units = np.array([[0, 1, 2, 3, 4, 5], [0, 1, 2, 3, 6, 6], [2, 3, 4, 5, 6, 6]])[np.arange(42) % 3]
     for trial, present in enumerate(units):
         responses[trial, np.setdiff1d(np.arange(6), present)] = np.nan
-    session = SortedTrials.sort(responses, labels, key_hashes([str(trial) for trial in range(42)]))
+    hashes = key_hashes([str(trial) for trial in range(42)])
+    (session,) = grouped_sessions([SortedTrials.sort(responses, labels, hashes)])
     first = split_members(session, np.arange(200), 0)
     for stimulus in (0, 1):
         inside = session.labels == stimulus
@@ -269,3 +270,15 @@ def test_trials_with_the_same_units_go_to_both_halves_alike():
             rows = inside & (np.isfinite(session.responses) == units).all(axis=1)
             assert set(first[:, rows].sum(axis=1)) == {3.0, 4.0}
     np.testing.assert_allclose(first.mean(axis=0), 0.5, atol=0.12)
+
+
+def test_probes_of_one_session_have_equal_halves_where_one_lacks_units_in_some_trials():
+    random = np.random.default_rng(0)
+    labels, hashes = np.repeat([0, 1], 20), key_hashes([str(trial) for trial in range(40)])
+    first, second = random.normal(size=(2, 40, 5))
+    first[::2, 2:] = np.nan
+    sessions = [SortedTrials.sort(responses, labels, hashes) for responses in (first, second)]
+    halves = [split_members(session, np.arange(100), 0) for session in grouped_sessions(sessions)]
+    np.testing.assert_array_equal(*halves)
+    whole = [split_members(session, np.arange(100), 0) for session in grouped_sessions(sessions[1:])]
+    assert (whole[0] != halves[1]).any(), "by itself the second one is not split by the units of the first"
