@@ -88,8 +88,7 @@ def gather(metric: MetricHooks, subjects: Sequence[SubjectRDM], stimuli: int, *,
     # The published estimators knew no gate: they average whatever has a value.
     scored = good if good and estimator == "default" else usable
     # Whoever is not averaged is named, so no animal disappears in silence.
-    left_out = [i for i in range(len(ordered)) if i not in scored]
-    reasons = [f"animal {names[i]} left out: {corrections[i].reason}" for i in left_out]
+    reasons = [f"animal {names[i]} left out: {corrections[i].reason}" for i in range(len(ordered)) if i not in scored]
     # The study is gated, not the animal: see ``ANIMAL_GATE``.
     if estimator == "default" and good:
         # The mean of those that pass is too high where most do not: the median of all counts as well.
@@ -353,6 +352,8 @@ class LayerEvaluation:
     scale: CommonScale
     attainable: float
     """Value of a perfect model."""
+    attainable_error: float
+    """Standard error that the number of its draws leaves."""
 
 
 def defined_layers(metric: MetricHooks, layers: Mapping[str, Floats]) -> list[str]:
@@ -396,7 +397,7 @@ def evaluate(
             votes = _Votes.of_halves(compared, parts, factor)
     null, weights, counts = votes.null(seed), votes.weights, compared.defined.sum(axis=1)
     some = weights[: len(votes.permuted.animals)]
-    ceilings, competing = _ceilings(compared, animals, seed), np.flatnonzero(counts == counts.max())
+    (ceilings, errors), competing = _ceilings(compared, animals, seed), np.flatnonzero(counts == counts.max())
     scale = CommonScale(np.zeros(len(names)), np.ones(len(names)))
     if estimator == "default" and len(names) > 1 and not each:
         chance = finite_mean(np.concatenate([(r * some).mean(axis=-1) for r in null()]), axis=0) / some.mean()
@@ -426,7 +427,8 @@ def evaluate(
         values, chosen_r = values.mean(keepdims=True), chosen_r.mean(keepdims=True)
         chosen = np.array([most_chosen(chosen)])
     parts = values, chosen_r, chosen, whole(r) * factors, r, without, test, layer_null, competing, whole
-    return LayerEvaluation(rule, *parts, float(ceilings[scale.layer])), names, _partly(compared, names)
+    attained = float(ceilings[scale.layer]), float(errors[scale.layer])
+    return LayerEvaluation(rule, *parts, *attained), names, _partly(compared, names)
 
 
 @dataclass(frozen=True)
@@ -489,7 +491,7 @@ def without_scale(result: LayerEvaluation) -> str:
 
 
 def _ceilings(compared: LayerComparisons, animals: Animals, seed: int) -> Floats:
-    """Return the value [L] of a perfect model over the stimuli that each layer has a value for."""
+    """Return value and error [2, L] of a perfect model over the stimuli that each layer has a value for."""
     patterns, group = np.unique(compared.defined, axis=0, return_inverse=True)
     values = []
     for stimuli in (animals.order[present] for present in patterns):
@@ -497,8 +499,12 @@ def _ceilings(compared: LayerComparisons, animals: Animals, seed: int) -> Floats
         # The reliability of an RDM is stated for all stimuli.
         if len(stimuli) < len(animals.order) and not metric.of_rdms:
             metric, subjects = metric.among(stimuli), [subject.take(stimuli) for subject in subjects]
-        values.append(float((metric.attainable(subjects, seed) * animals.factors(animals.scored)).mean()))
-    return np.array(values)[group.ravel()]
+        draws, factors = metric.attainable(subjects, seed), animals.factors(animals.scored)
+        # Draws of all animals begin alike: their errors do not average out.
+        by_draw = (draws * factors[:, None]).mean(axis=0)
+        error = by_draw.std(ddof=1) / math.sqrt(len(by_draw)) if len(by_draw) > 1 else 0.0
+        values.append(((finite_mean(draws) * factors).mean(), error))
+    return np.array(values)[group.ravel()].T
 
 
 def _partly(compared: LayerComparisons, names: Sequence[str]) -> tuple[str, ...]:

@@ -122,15 +122,13 @@ class MetricHooks:
         return np.tile(factors, (animals[0].count, 1))
 
     def attainable(self, animals: Sequence[SubjectRDM], seed: int) -> Floats:
-        """Return the raw value [A] of a model that has each animal's own responses without their noise."""
+        """Return the raw values [A, S], by draws of noise, of a model with each animal's own responses without it."""
         # In the order in which stimuli are scored: folds and noise then do not depend on how they were listed.
-        order = canonical_order(np.stack([animal.rdm for animal in animals]))
-        means = []
+        order, draws = canonical_order(np.stack([animal.rdm for animal in animals])), []
         for animal in animals:
             truth, noisy = simulated_animals(animal.take(order), seed)
-            values = next(iter(self.compare_layers([truth], noisy, [np.arange(len(truth))[None]])))
-            means.append(float(np.nanmean(values)) if np.isfinite(values).any() else np.nan)
-        return np.array(means)
+            draws.append(next(iter(self.compare_layers([truth], noisy, [np.arange(len(truth))[None]])))[0, 0])
+        return np.stack(draws)
 
     def among(self, stimuli: Ints) -> MetricHooks:
         """Return the metric of some stimuli; itself where it knows nothing of single ones."""

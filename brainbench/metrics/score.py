@@ -118,6 +118,7 @@ def score_layers(
     layer, scored = layers[defined[chosen]], [animals.subjects[i] for i in animals.scored]
     hopeless = evaluation.without_scale(result)
     attainable = math.nan if hopeless else result.attainable
+    null = result.test.null[np.isfinite(result.test.null)]
     if hopeless:
         earlier = about["reasons"]
         about |= {"status": "unreliable", "reasons": (hopeless, *earlier) if status == "ok" else (*earlier, hopeless)}
@@ -125,6 +126,8 @@ def score_layers(
         "monte_carlo_error": {
             "value": _splits_error(result.values, scored, metric.comparison) if metric.of_rdms else 0.0,
             "p": result.test.monte_carlo_error,
+            "chance": 0.0 if result.test.exact else float(null[1:].std(ddof=1) / math.sqrt(len(null))),
+            "attainable": result.attainable_error,
         },
         **metric.statistics(metric.take(layer, animals.order), animals.sorted, seed),
     }
@@ -153,7 +156,7 @@ def score_layers(
         layers=tuple(_layer_score(label, rows.get(label), result, status) for label in names),
         subjects=_subjects(metric, layers, animals, result, defined),
         model_rdm=evaluation.recorded_rdm(layer) if metric.of_rdms else (),
-        chance=float(finite_mean(result.test.null)),
+        chance=float(finite_mean(null)),
         attainable=attainable,
         without_stimulus=tuple(result.without[np.argsort(animals.order)].tolist()),
         provenance=Provenance.of({"statistics": statistics, **stated}),
@@ -204,8 +207,7 @@ def _layer_score(label: str, row: int | None, result: evaluation.LayerEvaluation
     if row is None:
         return LayerScore(label, math.nan, math.nan, "undefined")
     values, r = result.layer_values[row], result.layer_r[row]
-    interval = t_interval(values, over="animals")
-    return LayerScore(label, float(values.mean()), float(r.mean()), status, interval)
+    return LayerScore(label, float(values.mean()), float(r.mean()), status, t_interval(values, over="animals"))
 
 
 def _subjects(
@@ -303,7 +305,7 @@ def score_agreement(
     reliability, reliability_interval = evaluation.mean_reliability(animals)
     value = float(parts.mean()) if valid else math.nan
     scored = [animals.subjects[i] for i in valid]
-    attainable = float(np.mean(metric.attainable(scored, seed) * animals.factors(valid))) if valid else math.nan
+    attained = finite_mean(metric.attainable(scored, seed)) * animals.factors(valid) if valid else np.full(1, math.nan)
     # The two values of two animals are one and the same.
     span = two_factor_interval(value, parts, without) if len(parts) > 2 and without.size else None
     score = Score(
@@ -337,7 +339,7 @@ def score_agreement(
         stimuli=tuple(map(str, stimuli)),
         brain_rdm=evaluation.mean_rdm(animals) if metric.of_rdms else (),
         chance=chance,
-        attainable=attainable,
+        attainable=float(attained.mean()),
         without_stimulus=tuple(without[np.argsort(animals.order)].tolist()) if without.size else (),
         provenance=Provenance.of({"seed": seed, "reliability_gate": RELIABILITY_GATE}),
     )

@@ -483,3 +483,17 @@ def test_the_error_of_random_splits_is_what_values_scatter_by_over_seeds(metric)
         error = score.provenance.statistics["monte_carlo_error"]
         errors.append(error["value"])
     assert np.mean(errors) == pytest.approx(np.std(values, ddof=1), rel=0.35)
+
+
+@pytest.mark.parametrize("metric", ["cka", "ridge"])
+def test_the_errors_of_chance_and_of_what_is_attainable_are_what_they_scatter_by_over_seeds(metric, monkeypatch):
+    latent, measure = make_latent(stimuli=10), get_metric(metric)
+    monkeypatch.setattr(type(measure), "orders", 60)
+    animals = [measure.animal(f"m{seed}", [make_block(latent, seed=seed, noise=3.0)], 10) for seed in range(3)]
+    scores = [
+        measure.score({"layer": latent}, animals, name="model", stimuli=list("abcdefghij"), seed=seed)
+        for seed in range(24)
+    ]
+    for part in ("chance", "attainable"):
+        errors = [score.provenance.statistics["monte_carlo_error"][part] for score in scores]
+        assert np.mean(errors) == pytest.approx(np.std([getattr(score, part) for score in scores], ddof=1), rel=0.4)

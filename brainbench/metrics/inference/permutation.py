@@ -123,7 +123,6 @@ def permutation_test(
         )
     stimuli = comparison.stimulus_count(len(model))
     exact, smallest = stimuli <= EXACT_STIMULI, smallest_p(stimuli)
-    count = math.factorial(stimuli) if exact else RANDOM_PERMUTATIONS + 1
     null, reason = np.empty(0), ""
     if stimuli < SMALLEST_STIMULI:
         reason = f"{stimuli} stimuli allow no p below {smallest:.3g}; at least {SMALLEST_STIMULI} are needed"
@@ -140,7 +139,7 @@ def permutation_test(
         if np.isfinite(null[0]):
             return make_test(null, exact=exact, smallest=smallest)
         reason = "the comparison is undefined (a constant RDM)"
-    return PermutationTest(math.nan, smallest, exact, count, math.nan, null, reason)
+    return PermutationTest(math.nan, smallest, exact, len(null), math.nan, null, reason)
 
 
 def layer_p(null: Floats, competing: Ints | None = None) -> tuple[Floats, Floats]:

@@ -308,9 +308,9 @@ class _BoundDecoding(LabelDecoding):
         return _BoundDecoding(_classes_of(self._classes, stimuli))
 
     def attainable(self, animals: Sequence[SubjectRDM], seed: int) -> Floats:
-        """Return the accuracy [A] of each animal's responses without their noise."""
+        """Return the accuracy [A, 1] of each animal's responses without their noise."""
         layers = [LabelledFeatures(denoised(animal.patterns, animal.noise), self._classes) for animal in animals]
-        return np.array([layer.right(np.arange(len(layer.features))).mean() for layer in layers])
+        return np.array([[layer.right(np.arange(len(layer.features))).mean()] for layer in layers])
 
     def partner(self, animal: SubjectRDM, others: Sequence[SubjectRDM]) -> Any:
         """Return the animal's own mean responses, whose accuracy needs no others."""

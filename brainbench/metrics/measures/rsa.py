@@ -362,8 +362,8 @@ class RSA(Metric):
         return without
 
     def attainable(self, animals: Sequence[SubjectRDM], seed: int) -> Floats:
-        """Return the raw comparison [A] that is corrected to 1."""
-        return np.array([1 / self.correction(animal, "default").value for animal in animals])
+        """Return the raw comparison [A, 1] that is corrected to 1."""
+        return np.array([[1 / self.correction(animal, "default").value] for animal in animals])
 
     def halves(self, animal: SubjectRDM, order: Ints) -> tuple[list[SubjectRDM], float]:
         """Return the halves of the animal's splits; their reliability is the raw split-half comparison."""
@@ -372,9 +372,8 @@ class RSA(Metric):
         pairs = permuted_pairs(order[None])[0]
         agreement = animal.split_half_by(self.comparison)
         factor = 1 / math.sqrt(float(agreement[np.isfinite(agreement)].mean()))
-        return [
-            replace(animal, rdm=half, halves=half[:0]) for half in halves.reshape(-1, halves.shape[-1])[:, pairs]
-        ], factor
+        halves = halves.reshape(-1, halves.shape[-1])[:, pairs]
+        return [replace(animal, rdm=half, halves=half[:0]) for half in halves], factor
 
     def partner(self, animal: SubjectRDM, others: Sequence[SubjectRDM]) -> Floats:
         """Return the mean RDM of the other animals."""

@@ -103,15 +103,14 @@ class SubjectRDM:
     def take(self, stimuli: Ints) -> SubjectRDM:
         """Return the animal with some stimuli [K'], in this order; the split halves' comparisons stay as they are."""
         pairs = permuted_pairs(np.asarray(stimuli)[None], self.count)[0]
-        prepared = len(self.patterns) > 0
         every = len(self.signal_without) == len(stimuli)
         return replace(
             self,
             rdm=self.rdm[pairs],
             halves=self.halves[:0],
             signal_without=self.signal_without[stimuli] if every else self.signal_without[:0],
-            patterns=self.patterns[stimuli] if prepared else self.patterns,
-            noise=self.noise[stimuli] if prepared else self.noise,
+            patterns=self.patterns[stimuli] if len(self.patterns) else self.patterns,
+            noise=self.noise[stimuli] if len(self.noise) else self.noise,
             nuisances={name: values[pairs] for name, values in self.nuisances.items()},
         )
 
