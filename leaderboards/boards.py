@@ -181,7 +181,8 @@ def _unranked(entry: Entry, lacks: str) -> str:
         return entry.standing
     if lacks:
         return f"ranks need {lacks}"
-    return "" if math.isfinite(entry.scaled) and len(entry.sample.without_stimulus) else NO_SCALE
+    scaled = math.isfinite(entry.scaled) and len(entry.sample.without_stimulus)
+    return entry.unranked_because or ("" if scaled else NO_SCALE)
 
 
 def _outcome(score: Score) -> tuple[str, float | None]:

@@ -174,7 +174,7 @@ def fold_seeds(
     """
     groups: dict[tuple[object, ...], list[ResultRecord]] = defaultdict(list)
     copies: dict[tuple[object, ...], int] = defaultdict(int)
-    # Of the same model and seed the newest is the entry's; older ones stay visible as entries of their own.
+    # Of the same model and seed the newest is the entry's; older ones stay visible, but push no other model back.
     by_age = sorted(records, key=lambda record: (record.score.provenance.time, record.identity))
     for record in reversed(by_age):
         kind, seed = _kind(record), record.card.seed if record.card else None
@@ -230,6 +230,5 @@ def _entry(
     notes = list(dict.fromkeys(note for record in records for note in remarks.get(record.identity, ())))
     if settings := unusual_settings(records[0].score.provenance.settings):
         notes.append(f"scored with {', '.join(f'{name} {value}' for name, value in settings.items())}")
-    if key[-1]:
-        notes.append("an earlier record of a model that stands above or below once more")
-    return Entry(tuple(records), page, tuple(notes))
+    earlier = "an earlier record of a model, which its newest one stands for" if key[-1] else ""
+    return Entry(tuple(records), page, tuple(notes), unranked_because=earlier)

@@ -114,6 +114,19 @@ def test_rows_of_one_computation_share_a_rank_and_count_once():
     }  # fmt: skip
 
 
+def test_a_model_that_was_scored_twice_has_one_rank_and_pushes_no_other_back():
+    best, *others = draw_board({"best": 0.9, "good": 0.6, "level": 0.2}, raw=0.1)
+    origin = best.score.provenance
+    later = replace(origin, time="2030-01-01T00:00:00+00:00", settings={**origin.settings, "seed": 5})
+    again = replace(best, score=replace(best.score, value=best.score.value + 0.02, provenance=later))
+    (before,), (after,) = rank([best, *others]), rank([again, best, *others])
+    assert {entry.name: entry.rank for entry in after.ranked} == {entry.name: entry.rank for entry in before.ranked}
+    assert [entry.value for entry in after.entries if entry.first is None] == [best.score.value]
+    assert after.leader is not None
+    assert after.leader.value == again.score.value
+    assert conclusions(after)[1:] == conclusions(before)[1:]
+
+
 def test_dissimilarities_taken_from_the_brain_stand_apart_whatever_they_score():
     records = draw_board(TRUTHS, spread=0.2)
     elsewhere = {"family": "features computed elsewhere", "seed": None}
