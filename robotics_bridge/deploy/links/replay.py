@@ -280,8 +280,8 @@ class TouchLog:
     joints: tuple[str, ...]
     position: NDArray[np.float64]
     """[T, J] measured (rad, m)."""
-    target: NDArray[np.float64]
-    """[T, J] of the drives on the way to each frame; the positions where the log has none."""
+    target: NDArray[np.float64] | None
+    """[T, J] of the drives on the way to each frame; None where the log has none."""
     points: TactilePoints
     force: NDArray[np.float64]
     """[T, N] along inward normals, in ``unit``."""
@@ -293,7 +293,7 @@ class TouchLog:
         object.__setattr__(self, "taxels", self.taxels or tuple(taxel_names(self.points.links)))
         for what in ("time", "position", "target", "force"):
             values = getattr(self, what)
-            if not np.isfinite(values).all():
+            if values is not None and not np.isfinite(values).all():
                 row = int(np.argwhere(~np.isfinite(values))[0][0])
                 raise DataError(f"{self.name}: {what} of frame {row} is no finite number; cut the log there.")
         if len(self.time) < 2 or (late := np.flatnonzero(np.diff(self.time) <= 0)).size:
@@ -372,7 +372,8 @@ def read_touch_log(path: str | os.PathLike[str], hand: Hand, layout: Layout, epi
             raise
         except (KeyError, IndexError, TypeError, AttributeError, ValueError) as error:
             raise DataError(f"{path.name}/meta is not as LeRobot writes it ({brief(repr(error))}).") from None
-    for name, positions in zip(log.joints, np.concatenate([log.position, log.target]).T, strict=True):
+    stated = log.position if log.target is None else np.concatenate([log.position, log.target])
+    for name, positions in zip(log.joints, stated.T, strict=True):
         joint = hand.model.joint(name)
         unit, wrong = ("rad", "degrees") if joint.type[0] == 3 else ("m", "millimetres")
         low, high = joint.range if hand.model.jnt_limited[joint.id] else (-np.pi, np.pi)
@@ -418,7 +419,7 @@ def _read_table(path: Path, hand: Hand, layout: Layout) -> TouchLog:
     force = table[:, [header.index(name) for name in taxels]]
     names = tuple(f"{link}:{number}" for link, number in zip(links, numbers, strict=True))
     time = table[:, header.index("time")]
-    return TouchLog(path.name, time, tuple(joints), position, position, points, force, taxels=names)
+    return TouchLog(path.name, time, tuple(joints), position, None, points, force, taxels=names)
 
 
 def _read_episode(folder: Path, hand: Hand, layout: Layout, episode: int) -> TouchLog:
@@ -445,7 +446,7 @@ def _read_episode(folder: Path, hand: Hand, layout: Layout, episode: int) -> Tou
     tactile = _stacked(frames, "observation.tactile", name)
     if position.shape[1:] != (len(joints),):
         raise DataError(f"{name}: observation.state has {position.shape[1:]} numbers and {len(joints)} joint names.")
-    target, driven = position, _joint_names(features.get("action", {}).get("names"))
+    target, driven = None, _joint_names(features.get("action", {}).get("names"))
     if sorted(driven) == sorted(joints):
         # An action is what follows its frame's state.
         actions = _stacked(frames, "action", name)[:, [driven.index(joint) for joint in joints]]
@@ -531,17 +532,21 @@ def replay(log: TouchLog, hand: str) -> Replay:
         sensors[link] = KinematicTaxel(link=link, probes=probes, total="engine", friction=1.0)
     suite = SensorSuite(body.engine.scene, sensors, num_envs=1)
     columns = [body.joints.index(joint) for joint in log.joints]
-    start = body.engine.data[0].qpos.copy()
-    start[[int(body.engine.model.joint(joint).qposadr[0]) for joint in log.joints]] = log.position[0]
-    body.engine.set(qpos=start)
     target = body.position
+    target[columns] = log.position[0]
+    body.place(target)
     simulated, position = np.zeros(log.force.shape), np.zeros(log.position.shape)
     # A gap in the log is waited for, and what is rounded away at a frame is made up for at the next.
     reports = np.diff(np.round(substeps * (log.time - log.time[0]) / step).astype(int), prepend=0)
     for frame, passed in enumerate(np.diff(log.time, prepend=log.time[0] - step)):
-        target[columns] = log.target[frame]
-        body.drive(target)
-        for _ in range(reports[frame]):
+        before, way = log.position[frame - 1], log.position[frame] - log.position[frame - 1]
+        for report in range(reports[frame]):
+            if log.target is None:
+                # A damped drive would stay behind joints that move.
+                target[columns] = before + (report + 1) / reports[frame] * way + body.lag[columns] * way / passed
+            else:
+                target[columns] = log.target[frame]
+            body.drive(target)
             body.step()
         suite.update(body.engine.state, passed)
         position[frame] = body.position[columns]

@@ -245,6 +245,18 @@ def test_an_action_moves_the_hand_after_the_state_of_its_frame(recorded, jaws, t
     assert result.tracking < 1e-6
 
 
+@pytest.mark.parametrize("fps", [20, 50])
+def test_joints_of_a_log_without_actions_are_followed_in_time(fps) -> None:
+    """The damped drives of a hand would stay .1 s behind what moves."""
+    time = np.arange(fps) / fps
+    position = np.zeros((fps, len(HAND.joints)))
+    moving = HAND.joints.index("right_hand_index_joint1")
+    position[:, moving] = 0.3 + 0.2 * np.sin(2 * np.pi * time)
+    log = TouchLog("wave", time, HAND.joints, position, None, POINTS, np.zeros((fps, len(LINKS))))
+    behind = replay(log, "xhand1").position[:, moving] - position[:, moving]
+    assert np.abs(behind[fps // 4 :]).max() < 0.01
+
+
 def test_a_joint_that_stands_in_a_log_twice_is_refused(recorded) -> None:
     with pytest.raises(DataError, match="the joint l stands in it 2 times"):
         replace(recorded.log, joints=("l", "l"))
