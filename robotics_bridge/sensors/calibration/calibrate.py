@@ -170,6 +170,7 @@ def find_quantum(values: NDArray[np.float64]) -> float:
 NOT_FITTED = ("radius", "crosstalk")  # knobs that a log of one signal cannot tell: they need known places
 _ROUNDS = 12
 _ROUGH = 0.5  # noise of the reference, as a part of the probes' in its unit, from which it is mentioned
+_SLOW = 1.05  # noise, in that at rest, up to which readings are explained without delays that vary
 _BETTER = 0.97  # part of the variance that must remain for readings to be called early
 ORDER = (
     "gain_low", "gain_high", "hysteresis", "hysteresis_tau", "walk", "white", "bias", "quantum", "dead_probability",
@@ -222,16 +223,14 @@ def calibrate(log: Log, *, max_delay: float = 0.5) -> Calibration:
     moving = log.reference is not None
     longest = round(max_delay / log.step)
     guess = _delays(living, log.step, longest) if moving else (0, 0)
-    fit = fit_dynamics(align(living, *guess, longest), log.step, quantum, moving=moving)
+    fit, guess = _first(living, guess, log.step, quantum, longest, moving)
     lags = np.zeros(0, int)
     if moving and guess[1]:
         # Hysteresis can stand for a part of a delay that varies, so lags are also sought without it.
         starts = [fit] + [replace(fit, dynamics=fit.dynamics._replace(hysteresis=0.0))] * bool(fit.dynamics.hysteresis)
         settled = [_settle(living, guess, log.step, quantum, start, longest) for start in starts]
         fit, lags = min(settled, key=lambda pair: _spread(pair[0]))
-        models = [fit.dynamics.response(x, log.step, own) for (x, _y), own in zip(living, fit.creep, strict=True)]
-        rest = [calm(model, y, 2 * guess[1]) for model, (_x, y) in zip(models, living, strict=True)]
-        if _spread(fit) > 2 * np.median(rest):
+        if _spread(fit) > 2 * _calm(living, fit, log.step, 2 * guess[1]):
             notes.append(
                 "Where the reference moves, readings differ more from the model than where it rests: delay, jitter, "
                 "hysteresis and white noise may be wrong; log more presses."
@@ -300,6 +299,24 @@ def _reference_notes(parts: list[Episode], fit: Fit) -> list[str]:
 
 def _spread(fit: Fit) -> float:
     return fit.dynamics.white**2 + fit.dynamics.walk**2
+
+
+def _first(
+    living: list[Episode], guess: tuple[int, int], step: float, quantum: float, longest: int, moving: bool
+) -> tuple[Fit, tuple[int, int]]:
+    """Return dynamics for a range of lags, and that range, of which only the first is left to slow readings."""
+    if guess[0] < guess[1]:
+        # Readings that follow slowly (a hysteresis below 0) look as if they were late by more or less.
+        fit = fit_dynamics(align(living, guess[0], guess[0], longest), step, quantum, moving=moving)
+        if fit.dynamics.hysteresis < 0 and _spread(fit) < _SLOW * _calm(living, fit, step, 2 * guess[1]):
+            return fit, (guess[0], guess[0])
+    return fit_dynamics(align(living, *guess, longest), step, quantum, moving=moving), guess
+
+
+def _calm(living: list[Episode], fit: Fit, step: float, longest: int) -> float:
+    """Return the noise's variance where lags of up to ``longest`` matter least."""
+    models = [fit.dynamics.response(x, step, own) for (x, _y), own in zip(living, fit.creep, strict=True)]
+    return float(np.median([calm(model, y, longest) for model, (_x, y) in zip(models, living, strict=True)]))
 
 
 def _settle(

@@ -54,6 +54,14 @@ def test_readings_before_their_reference_are_refused_and_hysteresis_is_not_taken
     assert springy.noise.hysteresis == pytest.approx(1.5, rel=0.05)
 
 
+@pytest.mark.parametrize(("hysteresis", "tau", "delay"), [(-0.9, 0.02, 0.02), (-0.7, 0.1, 0.0)])
+def test_readings_that_follow_slowly_are_not_taken_for_late_ones(hysteresis, tau, delay) -> None:
+    slow = Noise(white=0.02, hysteresis=hysteresis, hysteresis_tau=tau, read_delay=delay)
+    noise = calibrate(log_of(slow, 1200, 4), max_delay=0.1).noise
+    assert (noise.hysteresis, noise.hysteresis_tau) == pytest.approx((hysteresis, tau), rel=0.03)
+    assert (noise.read_delay, noise.jitter) == pytest.approx((delay, 0.0), abs=1e-9)
+
+
 def test_the_noise_of_a_reference_is_mentioned_or_refused() -> None:
     log, noise = log_of(Noise(white=0.02), 1200, 4), np.random.default_rng(1).normal(size=1200)
     assert log.reference is not None
