@@ -110,7 +110,9 @@ def wilson_interval(successes: float, count: int, *, over: str = "trials", level
     share = min(max(successes / count, 0.0), 1.0)
     middle = (share + z * z / (2 * count)) / (1 + z * z / count)
     half = z / (1 + z * z / count) * math.sqrt(share * (1 - share) / count + z * z / (4 * count * count))
-    return Interval(max(0.0, middle - half), min(1.0, middle + half), level, f"Wilson score over {count} {over}")
+    # Rounding leaves neither end short of all or none.
+    low, high = max(0.0, middle - half) if share else 0.0, min(1.0, middle + half) if share < 1 else 1.0
+    return Interval(low, high, level, f"Wilson score over {count} {over}")
 
 
 CONFOUNDED = 0.1
