@@ -198,7 +198,7 @@ def write_lerobot(folder: Path, frames: Mapping[str, NDArray[np.floating]], sess
     wrench = [f"{part}{axis}" for part in "FM" for axis in "xyz"]
     names = {"observation.tactile": ["point", "channel"], "observation.wrench": wrench, TIME: ["s"]}
     features: dict[str, Any] = {
-        name: {"dtype": "float32", "shape": list(shape), "names": names.get(name, list(joints))}
+        name: {"dtype": str(table[name].dtype), "shape": list(shape), "names": names.get(name, list(joints))}
         for name, shape in shapes.items()
     }
     features |= {
@@ -234,7 +234,8 @@ def _columns(
     length, columns = len(frames[PARTS[0]]), dict[str, NDArray]()
     for name, shape in shapes.items():
         try:
-            columns[name] = np.asarray(frames[name], dtype=np.float32)
+            # Single precision would round the clock of an hour to a quarter of a millisecond.
+            columns[name] = np.asarray(frames[name], dtype=np.float64 if name == TIME else np.float32)
         except (TypeError, ValueError, OverflowError) as error:
             raise UsageError(f"{name} is not an array of numbers of the shape {(length, *shape)}.") from error
         if not length or columns[name].shape != (length, *shape):

@@ -18,6 +18,7 @@ from robotics_bridge.deploy.controller import PressureCalibration
 from robotics_bridge.deploy.driver import HandReading
 from robotics_bridge.deploy.links.replay import (
     PARTS,
+    TIME,
     Replay,
     SessionFacts,
     SessionRecorder,
@@ -114,6 +115,13 @@ def test_a_session_states_forces_in_the_unit_of_the_hand(tmp_path) -> None:
     np.testing.assert_allclose(np.linalg.norm(log.points.normal, axis=1), 1)
     assert {*log.points.links} == {*TIPS}
     assert [log.points.links[row] for row in np.flatnonzero(log.force[0])] == [TIPS[0]]
+
+
+def test_the_clock_of_a_session_of_hours_keeps_its_microseconds(tmp_path) -> None:
+    clock = 36_000.0 + np.arange(4) * 0.025 + 1e-4
+    still = {name: 0 * values for name, values in _frames(4).items()} | {TIME: clock[:, None]}
+    log = read_touch_log(write_lerobot(tmp_path / "set", still, SESSION), HAND, PROBES)
+    np.testing.assert_allclose(log.time, clock, rtol=0, atol=1e-7)
 
 
 @pytest.mark.parametrize("fingers", [None, ("thumb", "pinky", "index"), ()])
