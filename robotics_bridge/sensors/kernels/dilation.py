@@ -74,8 +74,8 @@ class ElastomerArrays:
     """[S, 2] how many markers away they count."""
     stamp: wp.array2d(dtype=wp.int32)
     """[B, S] mark of an indentation."""
-    height: wp.array3d(dtype=wp.float32)
-    """[2 planes, B, N] indentation h (m), then its bulge h^α."""
+    indentation: wp.array3d(dtype=wp.float32)
+    """[2 planes, B, N] h (m), then its bulge h^α."""
     spread: wp.array3d(dtype=wp.float32)
     """[3 planes, B, N] sums over columns, or the full convolution."""
     tracked: wp.array(dtype=wp.int32)
@@ -150,9 +150,9 @@ def indent_kernel(kinds: frozenset[int], raycast: bool, planes: int, in_turn: bo
                 # A stamp in place of a flag needs no clearing: pads that nothing touches skip all later sums.
                 if h > 0.0 or noisy > 0.0:
                     pads.stamp[env, part] = mark_of(io, env)
-            pads.height[0, env, n] = h
+            pads.indentation[0, env, n] = h
             if wp.static(planes == 2):
-                pads.height[1, env, n] = noisy
+                pads.indentation[1, env, n] = noisy
             # The bulge h^α is asked for by many markers, so it is raised once.
             for plane in range(wp.static(planes)):
                 value = h
@@ -161,7 +161,7 @@ def indent_kernel(kinds: frozenset[int], raycast: bool, planes: int, in_turn: bo
                 raised = float(0.0)
                 if value > 0.0:
                     raised = wp.pow(value, pads.gels[part].exponent)
-                pads.height[wp.static(planes) + plane, env, n] = raised
+                pads.indentation[wp.static(planes) + plane, env, n] = raised
 
     return indent
 
@@ -202,13 +202,13 @@ def spread_kernel(planes: int, in_turn: bool = False) -> Any:
                 low = wp.max(place - pads.reach[part, 0], 0)
                 high = wp.min(place + pads.reach[part, 0] + 1, gel.columns)
                 for source in range(low, high):
-                    h = pads.height[plane, env, row + source]
+                    h = pads.indentation[plane, env, row + source]
                     if h > 0.0:
                         away = place - source
                         w = pads.weights[part, 0, wp.abs(away)]
                         plain += h * w
                         tilted += h * w * float(away) * gel.step_x
-                        raised += pads.height[wp.static(planes) + plane, env, row + source] * w
+                        raised += pads.indentation[wp.static(planes) + plane, env, row + source] * w
                 pads.spread[3 * plane, env, n] = plain
                 pads.spread[3 * plane + 1, env, n] = tilted
                 pads.spread[3 * plane + 2, env, n] = raised
@@ -323,7 +323,7 @@ def marker_kernel(
                         u = gel.dilate * (along * gel.along + across * gel.across + raised * normal)
                     else:
                         for source in range(gel.rows * gel.columns):
-                            h = pads.height[plane, env, gel.start + source]
+                            h = pads.indentation[plane, env, gel.start + source]
                             if h > 0.0:
                                 # 4.19 as written, source by source: for pads whose markers form no planar grid.
                                 away = across_plane(x - probes.position[gel.start + source], normal)
@@ -333,14 +333,14 @@ def marker_kernel(
                                     # Layer term 1 − κ λ_d r² (recoil κ): what is pushed outwards near an indenter is
                                     # drawn in farther off.
                                     away = (1.0 - gel.recoil * square) * away
-                                bulge = pads.height[wp.static(planes) + plane, env, gel.start + source]
+                                bulge = pads.indentation[wp.static(planes) + plane, env, gel.start + source]
                                 u += gel.dilate * w * (h * away + bulge * normal)
                     if wp.static(layered):
                         # Layer term: a layer that can hardly be compressed spreads in proportion to the mean
                         # indentation.
                         if gel.expansion_x != 0.0 or gel.expansion_y != 0.0:
                             for source in range(gel.rows * gel.columns):
-                                total += pads.height[plane, env, gel.start + source]
+                                total += pads.indentation[plane, env, gel.start + source]
                             local = x - gel.center
                             bx = wp.dot(local, gel.along)
                             by = wp.dot(local, gel.across)
@@ -441,7 +441,7 @@ def anchor_kernel(kinds: frozenset[int], raycast: bool, side_by_side: bool) -> A
     shape_of, distance_to, distance = shapes.shape_of, shapes.distance_to, shapes.distance
 
     @wp.func
-    def height_over(solids: SolidArrays, own: wp.array(dtype=wp.int32), gel: GelParams, row: int, z: wp.vec3f) -> float:
+    def pad_gap(solids: SolidArrays, own: wp.array(dtype=wp.int32), gel: GelParams, row: int, z: wp.vec3f) -> float:
         """Return the signed distance of a point to the pad's surface, negative inside."""
         # A pad without geometry of its own is the plane through its markers; otherwise the union of its solids.
         if gel.own_last == gel.own_first:
@@ -499,7 +499,7 @@ def anchor_kernel(kinds: frozenset[int], raycast: bool, side_by_side: bool) -> A
         solid_row = env % solids.kind.shape[0]
         # If even the bounding sphere lies above the release height, no point of the block can hold an anchor.
         middle = rotation @ (wp.vec3f(sphere[0], sphere[1], sphere[2]) - offset)
-        if height_over(solids, pads.own, gel, solid_row, middle) - sphere[3] > gel.leave:
+        if pad_gap(solids, pads.own, gel, solid_row, middle) - sphere[3] > gel.leave:
             pads.held[store, env] = 0
             return
         found = int(0)
@@ -533,7 +533,7 @@ def anchor_kernel(kinds: frozenset[int], raycast: bool, side_by_side: bool) -> A
                     if wp.static(not side_by_side):
                         phi = distance_to(solids.values, shape, turn @ p + shift, wp.vec3f(), 0.0, limit)[3]
                 else:
-                    phi = height_over(solids, pads.own, gel, solid_row, z)
+                    phi = pad_gap(solids, pads.own, gel, solid_row, z)
                 # Two heights as in a Schmitt trigger: an anchor set at −enter is lost only above +leave, so that a
                 # point that trembles at the surface keeps its history of shear.
                 if wp.isnan(kept):

@@ -70,7 +70,7 @@ class ElastomerRuntime(ProbeRuntime):
         pads.gels, pads.blocks = self._describe(pad_geometries), self._blocks
         pads.weights, pads.reach = self._weigh()
         pads.tracked, pads.own = context.array(tracked or [0], int), context.array(members or [0], int)
-        pads.height = context.zeros((2 * self._planes, envs, self.count))
+        pads.indentation = context.zeros((2 * self._planes, envs, self.count))
         pads.spread = context.zeros((3 * self._planes, envs, self.count) if self._way != "direct" else (1, 1, 1))
         pads.stamp, pads.dragged = (context.array(np.full((envs, count), -1), int) for _ in range(2))
         pads.held, pads.moved = (context.zeros((blocks, envs), int) for _ in range(2))
@@ -81,7 +81,7 @@ class ElastomerRuntime(ProbeRuntime):
             setattr(pads, name, context.zeros(shape if self.apart else (1,) * len(shape), dtype))
         self.pads = pads
         """Warp structure of gels, sums and anchors."""
-        self.lasting, self.scratch = [pads.stamp, pads.dragged], [pads.height]
+        self.lasting, self.scratch = [pads.stamp, pads.dragged], [pads.indentation]
         self.scratch += [pads.spread] if self._way != "direct" else []
         if total_points:
             self.lasting += [pads.anchor, pads.held]
@@ -163,7 +163,7 @@ class ElastomerRuntime(ProbeRuntime):
 
     def _transform(self) -> None:
         """Convolve h with the three dilation kernels in Fourier space, zero outside the grid."""
-        height, out = wp.to_torch(self.pads.height), wp.to_torch(self.pads.spread)
+        height, out = wp.to_torch(self.pads.indentation), wp.to_torch(self.pads.spread)
         if not self._spectra:
             self._spectra = [_spectrum(sensor, height.device) for sensor in self._sensors]
         for place, (size, spectrum) in zip(self.slices.values(), self._spectra, strict=True):
@@ -270,7 +270,7 @@ def _pressed(suite: SensorSuite, name: str) -> tuple[ElastomerTaxel, tuple[float
     if not sensor.planar or pitch is None or min(sensor.probes.shape) < 2:
         raise UsageError(f"The pressure on {name!r} needs a regular planar grid of markers (Probes.grid).")
     place = runtime.slices[name]
-    height = warp().to_torch(runtime.pads.height)[0, :, place.span].unflatten(1, place.layout).double()
+    height = warp().to_torch(runtime.pads.indentation)[0, :, place.span].unflatten(1, place.layout).double()
     kernel = torch.as_tensor(_love(place.layout, pitch), device=height.device)
     return sensor, pitch, kernel, _solve(_depth(height, pitch), kernel)
 
