@@ -223,7 +223,12 @@ def calibrate(log: Log, *, max_delay: float = 0.5) -> Calibration:
     moving = log.reference is not None
     longest = round(max_delay / log.step)
     guess = _delays(living, log.step, longest) if moving else (0, 0)
-    fit, guess = _first(living, guess, log.step, quantum, longest, moving)
+    fit = fit_dynamics(align(living, *guess, longest), log.step, quantum, moving=moving)
+    if guess[0] < guess[1]:
+        # Readings that follow slowly (a hysteresis below 0) look as if they were late by more or less.
+        slow = fit_dynamics(align(living, guess[0], guess[0], longest), log.step, quantum, moving=True)
+        if slow.dynamics.hysteresis < 0 and _spread(slow) < _SLOW * _calm(living, slow, log.step, 2 * guess[1]):
+            fit, guess = slow, (guess[0], guess[0])
     lags = np.zeros(0, int)
     if moving and guess[1]:
         # Hysteresis can stand for a part of a delay that varies, so lags are also sought without it.
@@ -235,12 +240,11 @@ def calibrate(log: Log, *, max_delay: float = 0.5) -> Calibration:
                 "Where the reference moves, readings differ more from the model than where it rests: delay, jitter, "
                 "hysteresis and white noise may be wrong; log more presses."
             )
-    if moving:
-        notes += _reference_notes(living, fit)
-    if log.reference is None:
+    if not moving:
         notes.append("Without a column 'reference' the true signal counts as 0: gain, delay, hysteresis and dead "
                      "probes were not fitted.")  # fmt: skip
     else:
+        notes += _reference_notes(living, fit)
         estimates |= delay_of(extent(lags, guess), len(lags), log.step) | _gain(fit)
         if len(fit.gains) < 20 and estimates["gain_high"].value > estimates["gain_low"].value:
             notes.append(
@@ -299,18 +303,6 @@ def _reference_notes(parts: list[Episode], fit: Fit) -> list[str]:
 
 def _spread(fit: Fit) -> float:
     return fit.dynamics.white**2 + fit.dynamics.walk**2
-
-
-def _first(
-    living: list[Episode], guess: tuple[int, int], step: float, quantum: float, longest: int, moving: bool
-) -> tuple[Fit, tuple[int, int]]:
-    """Return dynamics for a range of lags, and that range, of which only the first is left to slow readings."""
-    if guess[0] < guess[1]:
-        # Readings that follow slowly (a hysteresis below 0) look as if they were late by more or less.
-        fit = fit_dynamics(align(living, guess[0], guess[0], longest), step, quantum, moving=moving)
-        if fit.dynamics.hysteresis < 0 and _spread(fit) < _SLOW * _calm(living, fit, step, 2 * guess[1]):
-            return fit, (guess[0], guess[0])
-    return fit_dynamics(align(living, *guess, longest), step, quantum, moving=moving), guess
 
 
 def _calm(living: list[Episode], fit: Fit, step: float, longest: int) -> float:
