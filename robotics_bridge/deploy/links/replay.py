@@ -539,17 +539,18 @@ def replay(log: TouchLog, hand: str) -> Replay:
     simulated, position = np.zeros(log.force.shape), np.zeros(log.position.shape)
     # A gap in the log is waited for, and what is rounded away at a frame is made up for at the next.
     reports = np.diff(np.round(substeps * (log.time - log.time[0]) / step).astype(int), prepend=0)
-    for frame, passed in enumerate(np.diff(log.time, prepend=log.time[0] - step)):
-        before, way = log.position[frame - 1], log.position[frame] - log.position[frame - 1]
-        for report in range(reports[frame]):
-            if log.target is None:
-                # A damped drive would stay behind joints that move.
-                target[columns] = before + (report + 1) / reports[frame] * way + body.lag[columns] * way / passed
-            else:
-                target[columns] = log.target[frame]
-            body.drive(target)
+    passed = np.diff(log.time, prepend=log.time[0] - step)
+    targets = log.target
+    if targets is None:
+        # A damped drive stays behind joints that move, and a target that is held half a frame ahead of its mean.
+        way = np.diff(log.position, axis=0, prepend=log.position[:1])
+        targets = log.position + way * (body.lag[columns] / passed[:, None] - 0.5)
+    for frame in range(len(log.time)):
+        target[columns] = targets[frame]
+        body.drive(target)
+        for _ in range(reports[frame]):
             body.step()
-        suite.update(body.engine.state, passed)
+        suite.update(body.engine.state, passed[frame])
         position[frame] = body.position[columns]
         for link, rows in rows_of.items():
             force = suite.read(link)[0, :, :3].numpy()
