@@ -55,4 +55,5 @@ def replay(
     if record.unit != "N":
         text += f" Forces of the log are in {record.unit!r}: only the correlations compare."
     text += f"\nWrote {out}." if out is not None else ""
-    return Output({"taxels": rows, "tracking": result.tracking, "unit": record.unit, "out": out}, text)
+    data = {"hand": model.name, "frames": len(record.time), "joints": record.joints, "taxels": rows}
+    return Output({**data, "tracking": result.tracking, "unit": record.unit, "out": out}, text)

@@ -26,6 +26,7 @@ def test_replay_shows_real_beside_simulated_readings_and_writes_both(run, tmp_pa
     assert list(both.columns) == ["time", "left:0 real", "left:0 simulated", "right:1 real", "right:1 simulated"]
     assert (both["left:0 real"] == 1).all()
     data = json.loads(run(*arguments, "--json").out)
+    assert (data["hand"], data["frames"], data["joints"]) == ("jaws", 10, [*joints])
     assert [row["taxel"] for row in data["taxels"]] == ["left:0", "right:1"]
     assert run(*arguments, "--episode", "3").status == 0
     assert run("tactile", "replay", str(log), "--hand", "xhand1").status == 1
