@@ -57,18 +57,6 @@ def link_fails(state: StateArrays, env: int, link: int) -> bool:
     return wp.isnan(total) or wp.abs(wp.length(wp.transform_get_rotation(at)) - 1.0) > UNIT_TOLERANCE
 
 
-@wp.func
-def status_of(state: StateArrays, env: int) -> int:
-    """Return the status bits of an environment: 1 diverged (:func:`link_fails`), 2 more contacts than room."""
-    bits = int(0)
-    for link in range(state.pose.shape[1]):
-        if link_fails(state, env, link):
-            bits = 1
-    if state.contact_count[0] > state.contact_env.shape[0]:
-        bits = bits + 2
-    return bits
-
-
 @wp.kernel
 def fill_links(
     xpos: wp.array2d(dtype=wp.vec3f),

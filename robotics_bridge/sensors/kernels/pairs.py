@@ -11,7 +11,7 @@ from functools import cache
 from typing import Any
 
 from brainbench.core.devices import warp
-from robotics_bridge.physics.kernels.state import StateArrays, in_scene, link_fails, status_of
+from robotics_bridge.physics.kernels.state import StateArrays, in_scene, link_fails
 from robotics_bridge.sensors.kernels.distance import PLANE, SolidArrays
 
 wp = warp()
@@ -135,15 +135,11 @@ def mark(
 
 
 @cache
-def start_kernel(contacts: bool, apart: bool) -> Any:
-    """Return the kernel ``start`` of an update: counts it, checks the state and marks who touches whom.
+def start_kernel(contacts: bool) -> Any:
+    """Return the kernel ``start`` of an update: counts it, and marks who touches whom, if any slot looks at contacts.
 
-    One launch for three small tasks, since launches are what small updates cost. Thread: environments [B] and contacts
-    [C], ``stride`` apart.
-
-    Args:
-        contacts: whether any slot looks at them.
-        apart: whether :func:`pair_kernel` looks at the numbers of the state, a thread for each link.
+    One launch for both, since launches are what small updates cost. Thread: environments [B] and contacts [C],
+    ``stride`` apart.
     """
 
     @wp.kernel(module="unique", grid_stride=False)
@@ -163,8 +159,6 @@ def start_kernel(contacts: bool, apart: bool) -> Any:
         if tid < state.pose.shape[0]:
             age[tid] = age[tid] + 1
             flags = wp.where(count > room, 2, 0)
-            if wp.static(not apart):
-                flags = status_of(state, tid)
             # An environment that was lost once stays so until its reset: engines put it back in ways of their own, and
             # memories of sensors would mix what was before with what is now.
             if age[tid] > 0:
@@ -185,95 +179,93 @@ def start_kernel(contacts: bool, apart: bool) -> Any:
     return start
 
 
-@cache
-def pair_kernel(apart: bool) -> Any:
-    """Return the kernel ``pairs`` that lists what each slot meets, in the order of geometry numbers.
+@wp.kernel(module="unique", grid_stride=False)
+def list_pairs(
+    slots: SlotArrays,
+    solids: SolidArrays,
+    state: StateArrays,
+    words: int,
+    bits: wp.array2d(dtype=wp.int32),
+    pushes: wp.array3d(dtype=wp.int32),
+    out: PairArrays,
+    stride: int,
+    crowded: wp.array(dtype=wp.int32),
+    status: wp.array(dtype=wp.int32),
+):
+    """List what each slot meets, in the order of geometry numbers, and flag numbers of the state that are not finite.
 
-    Dim [B S], and ``apart`` B L more threads, which look for numbers of the state that are not finite.
+    Thread: slots [B S], then links [B L], ``stride`` apart.
     """
-
-    @wp.kernel(module="unique", grid_stride=False)
-    def pairs(
-        slots: SlotArrays,
-        solids: SolidArrays,
-        state: StateArrays,
-        words: int,
-        bits: wp.array2d(dtype=wp.int32),
-        pushes: wp.array3d(dtype=wp.int32),
-        out: PairArrays,
-        crowded: wp.array(dtype=wp.int32),
-        status: wp.array(dtype=wp.int32),
-    ):
-        tid = wp.tid()
-        listed = state.pose.shape[0] * slots.link.shape[0]
-        if wp.static(apart):
-            if tid >= listed:
-                owner = (tid - listed) // state.pose.shape[1]
-                if link_fails(state, owner, (tid - listed) % state.pose.shape[1]):
-                    wp.atomic_or(status, owner, 1)
-                return
-        env = tid // slots.link.shape[0]
-        slot = tid % slots.link.shape[0]
-        row = env % solids.kind.shape[0]
-        link = slots.link[slot]
-        here = state.pose[env, link]
-        origin = wp.transform_get_translation(here)
-        turn = wp.transform_get_rotation(here)
-        twist = state.velocity[env, link]
-        own_velocity = wp.vec3f(twist[0], twist[1], twist[2])
-        own_spin = wp.vec3f(twist[3], twist[4], twist[5])
-        first = slots.first[slot]
-        room = slots.room[slot]
-        members = slots.member_first[slot]
-        total = slots.member_first[slot + 1] - members
-        found = int(0)
-        word = int(0)
-        for place in range(total):
-            wanted = int(1)
-            if slots.contact[slot] == 1:
-                if place % 32 == 0:
-                    word = bits[env, slot * words + place // 32]
-                    if word != 0:
-                        bits[env, slot * words + place // 32] = 0
-                wanted = (word >> wp.int32(place % 32)) & 1
-            push = wp.vec3f()
-            if pushes.shape[2] == 4:
-                count = float(pushes[env, members + place, 3])
-                for axis in range(3):
-                    push[axis] = float(pushes[env, members + place, axis]) / wp.max(wp.static(UNIT) * count, 1.0)
-                for axis in range(4):
-                    pushes[env, members + place, axis] = 0
-            if wanted == 1:
-                geometry = slots.members[members + place]
-                there = state.pose[env, solids.link[geometry]]
-                frame = wp.transform_multiply(there, solids.frame[row, geometry])
-                relative = wp.transform_multiply(wp.transform_inverse(frame), here)
-                near = True
-                if slots.reach[slot] > 0.0 and solids.kind[row, geometry] != wp.static(PLANE):
-                    bound = solids.bound[row, geometry]
-                    center = wp.transform_point(relative, slots.center[slot])
-                    # Sphere around the probes against sphere around the geometry: planes have none and always count.
-                    gap = wp.length(center - wp.vec3f(bound[0], bound[1], bound[2]))
-                    near = gap < bound[3] + slots.reach[slot]
-                if near:
-                    if found < room:
-                        other = state.velocity[env, solids.link[geometry]]
-                        spin = wp.vec3f(other[3], other[4], other[5])
-                        # Velocity of the other body at the link's origin, less the link's own (4.4–4.6); each probe
-                        # adds ω × x itself.
-                        lever = origin - wp.transform_get_translation(there)
-                        speed = wp.vec3f(other[0], other[1], other[2]) + wp.cross(spin, lever) - own_velocity
-                        at = first + found
-                        out.geometry[env, at] = geometry
-                        out.rotation[env, at] = wp.quat_to_matrix(wp.transform_get_rotation(relative))
-                        out.offset[env, at] = wp.transform_get_translation(relative)
-                        out.velocity[env, at] = wp.quat_rotate_inv(turn, speed)
-                        out.spin[env, at] = wp.quat_rotate_inv(turn, spin - own_spin)
-                        if pushes.shape[2] == 4:
-                            out.push[env, at] = wp.quat_rotate_inv(turn, push)
-                    found += 1
-        if found > room:
-            wp.atomic_max(crowded, env, found)
-        out.count[env, slot] = wp.min(found, room)
-
-    return pairs
+    tid = wp.tid()
+    # Empty arrays have one unused element.
+    many = slots.first.shape[0] - 1
+    listed = state.pose.shape[0] * many
+    if tid >= listed:
+        owner = (tid - listed) // stride
+        for look in range((tid - listed) % stride, state.pose.shape[1], stride):
+            if link_fails(state, owner, look):
+                wp.atomic_or(status, owner, 1)
+        return
+    env = tid // many
+    slot = tid % many
+    row = env % solids.kind.shape[0]
+    link = slots.link[slot]
+    here = state.pose[env, link]
+    origin = wp.transform_get_translation(here)
+    turn = wp.transform_get_rotation(here)
+    twist = state.velocity[env, link]
+    own_velocity = wp.vec3f(twist[0], twist[1], twist[2])
+    own_spin = wp.vec3f(twist[3], twist[4], twist[5])
+    first = slots.first[slot]
+    room = slots.room[slot]
+    members = slots.member_first[slot]
+    total = slots.member_first[slot + 1] - members
+    found = int(0)
+    word = int(0)
+    for place in range(total):
+        wanted = int(1)
+        if slots.contact[slot] == 1:
+            if place % 32 == 0:
+                word = bits[env, slot * words + place // 32]
+                if word != 0:
+                    bits[env, slot * words + place // 32] = 0
+            wanted = (word >> wp.int32(place % 32)) & 1
+        push = wp.vec3f()
+        if pushes.shape[2] == 4:
+            count = float(pushes[env, members + place, 3])
+            for axis in range(3):
+                push[axis] = float(pushes[env, members + place, axis]) / wp.max(wp.static(UNIT) * count, 1.0)
+            for axis in range(4):
+                pushes[env, members + place, axis] = 0
+        if wanted == 1:
+            geometry = slots.members[members + place]
+            there = state.pose[env, solids.link[geometry]]
+            frame = wp.transform_multiply(there, solids.frame[row, geometry])
+            relative = wp.transform_multiply(wp.transform_inverse(frame), here)
+            near = True
+            if slots.reach[slot] > 0.0 and solids.kind[row, geometry] != wp.static(PLANE):
+                bound = solids.bound[row, geometry]
+                center = wp.transform_point(relative, slots.center[slot])
+                # Sphere around the probes against sphere around the geometry: planes have none and always count.
+                gap = wp.length(center - wp.vec3f(bound[0], bound[1], bound[2]))
+                near = gap < bound[3] + slots.reach[slot]
+            if near:
+                if found < room:
+                    other = state.velocity[env, solids.link[geometry]]
+                    spin = wp.vec3f(other[3], other[4], other[5])
+                    # Velocity of the other body at the link's origin, less the link's own (4.4–4.6); each probe
+                    # adds ω × x itself.
+                    lever = origin - wp.transform_get_translation(there)
+                    speed = wp.vec3f(other[0], other[1], other[2]) + wp.cross(spin, lever) - own_velocity
+                    at = first + found
+                    out.geometry[env, at] = geometry
+                    out.rotation[env, at] = wp.quat_to_matrix(wp.transform_get_rotation(relative))
+                    out.offset[env, at] = wp.transform_get_translation(relative)
+                    out.velocity[env, at] = wp.quat_rotate_inv(turn, speed)
+                    out.spin[env, at] = wp.quat_rotate_inv(turn, spin - own_spin)
+                    if pushes.shape[2] == 4:
+                        out.push[env, at] = wp.quat_rotate_inv(turn, push)
+                found += 1
+    if found > room:
+        wp.atomic_max(crowded, env, found)
+    out.count[env, slot] = wp.min(found, room)

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from brainbench.core.devices import to_struct, warp
 from robotics_bridge.physics.state import HandState
 from robotics_bridge.sensors.context import LaunchContext, memory_of
-from robotics_bridge.sensors.kernels.pairs import PairArrays, SlotArrays, pair_kernel, start_kernel
+from robotics_bridge.sensors.kernels.pairs import PairArrays, SlotArrays, list_pairs, start_kernel
 from robotics_bridge.sensors.queries.solids import Solids
 
 DIVERGED = 1
@@ -100,8 +100,6 @@ class PairTable:
         """Make the arrays."""
         c, slots, envs = self._context, self._slots, self._context.num_envs
         self._contacts = any(slot["contact"] for slot in slots)
-        # A processor gains nothing from more threads.
-        self._apart = self._contacts and bool(c.device.is_cuda)
         most = self._listed
         if most is None and envs * _PLACE_BYTES * sum(len(s["members"]) for s in slots) > _LIST_BYTES:
             most = _LISTED
@@ -145,10 +143,10 @@ class PairTable:
     def update(self, state: HandState) -> None:
         """Count an update, refresh the state's status, mark contacts, and list what every slot meets now."""
         c, envs, room = self._context, self._context.num_envs, state.contact_env.shape[0]
-        dim = max(envs, room) if self._apart else envs
+        # A processor gains nothing from more threads.
+        cuda = c.device.is_cuda
+        dim, looks = max(envs, room) if self._contacts and cuda else envs, state.num_links if cuda else 1
         inputs = [self.plan, state.arrays, self._words, self._bits, self._pushes, c.age, self.status, dim]
-        c.launch(start_kernel(self._contacts, self._apart), dim, *inputs)
-        if self._slots:
-            inputs = [self.plan, self._solids.struct, state.arrays, self._words, self._bits, self._pushes, self.struct]
-            dim = envs * (len(self._slots) + self._apart * state.num_links)
-            c.launch(pair_kernel(self._apart), dim, *inputs, self.crowded, self.status)
+        c.launch(start_kernel(self._contacts), dim, *inputs)
+        inputs = [self.plan, self._solids.struct, state.arrays, self._words, self._bits, self._pushes, self.struct]
+        c.launch(list_pairs, envs * (len(self._slots) + looks), *inputs, looks, self.crowded, self.status)
