@@ -70,17 +70,21 @@ def layouts(
         counts[resolution] = {place: layouts.active_count(layout[place]) for place in layouts.PLACEMENTS}
         rows.append([resolution, *(str(counts[resolution][place]) for place in layouts.PLACEMENTS)])
         for link, link_probes in layout["hand"].items():
-            shape = " × ".join(map(str, link_probes.shape))
-            radius = sorted({f"{1e3 * value:g}" for value in link_probes.radius[link_probes.active]})
-            detail.append([resolution, link, shape, str(int(link_probes.active.sum())), ", ".join(radius)])
+            radius = sorted({float(f"{value:g}") for value in link_probes.radius[link_probes.active]})
+            row = {"resolution": resolution, "link": link, "shape": link_probes.shape}
+            detail.append({**row, "active": int(link_probes.active.sum()), "radius": radius})
         if out is not None:
             layouts.write_probes(out / f"{chosen.name}_{resolution}.json", layout["hand"])
     text = table(f"{chosen.name}: {len(chosen.joints)} joints, {len(chosen.fingers)} fingers, palm {chosen.palm}",
                  ["resolution", *layouts.PLACEMENTS], rows, right=(1, 2, 3, 4))  # fmt: skip
-    if links:
-        text += "\n\n" + table("", ["resolution", "link", "grid", "active", "radius (mm)"], detail, right=(3,))
+    columns = {
+        "resolution": "{0[resolution]}", "link": "{0[link]}",
+        "grid": lambda row: " × ".join(map(str, row["shape"])), ">active": "{0[active]}",
+        "radius (mm)": lambda row: ", ".join(f"{1e3 * value:g}" for value in row["radius"]),
+    }  # fmt: skip
+    text += "\n\n" + table_of("", detail, columns) if links else ""
     about = {name: getattr(chosen, name) for name in ("palm", "joints", "fingers")}
-    data = {"hand": chosen.name, **about, "counts": counts}
+    data = {"hand": chosen.name, **about, "counts": counts} | ({"links": detail} if links else {})
     return Output(data, text)
 
 

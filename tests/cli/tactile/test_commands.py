@@ -8,6 +8,13 @@ def test_layouts_prints_the_counts_of_the_published_table(run):
     found = json.loads(run("tactile", "layouts", "--hand", "sharpa", "--json").out)
     assert found["counts"]["med"] == {"hand": 206, "tips": 70, "fingers": 190, "palm": 16}
     assert len(found["joints"]) == 22
+    (thumb,) = [
+        row
+        for row in json.loads(run("tactile", "layouts", "--links", "--json").out)["links"]
+        if (row["resolution"], row["link"]) == ("high", "right_hand_thumb_rota_link2")
+    ]
+    assert 0 < thumb["active"] <= thumb["shape"][0] * thumb["shape"][1]
+    assert all(0 < radius < 0.01 for radius in thumb["radius"])
     text = run("tactile", "layouts", "--links")
     assert text.status == 0
     assert "667" in text.out
