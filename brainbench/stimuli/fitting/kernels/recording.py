@@ -7,12 +7,13 @@ the digit.
 
 import warp as wp
 
-from brainbench.stimuli.engines.rod.limits import ANYWHERE, CAPSULE, CYLINDER, MESH, SPHERE, WIDE
+from brainbench.stimuli.engines.rod.limits import ANYWHERE, CAPSULE, CYLINDER, MESH, SPHERE
 
 from ..algebra import rotate, unrotate, vec3, vec6
 from ..articulated_body import ChainState
+from ..distances import triangle_corners, triangle_feature
 from ..motion import BodyMotion, pose_from
-from ..narrow_phase import corner, nearest_triangles
+from ..narrow_phase import nearest_triangles
 from ..parameters import real
 from ..state import (
     ContactCandidates,
@@ -128,33 +129,20 @@ def mesh_curvature(
         w = got.w
     if which >= 0:
         face = shapes.face[s] + which
-        low = real(1e-4)
-        on_p = int(1)
-        on_q = int(1)
-        on_r = int(1)
-        if real(1.0) - v - w <= low:
-            on_p = int(0)
-        if v <= low:
-            on_q = int(0)
-        if w <= low:
-            on_r = int(0)
+        feature = triangle_feature(v, w)
         # On an edge between coplanar faces the surface is flat.
         flat = share == real(1.0) and wp.abs(wp.dot(normal, shapes.outward[face, 0])) > real(0.99999)
-        if on_p + on_q + on_r < 3 and not flat:
-            leaf = face // wp.static(WIDE)
-            rank = face % wp.static(WIDE)
-            p = corner(shapes.corners, leaf, 0, rank)
-            q = corner(shapes.corners, leaf, 1, rank)
-            r = corner(shapes.corners, leaf, 2, rank)
+        if feature > 0 and not flat:
+            rows = triangle_corners(shapes.corners, face)
             found.second = real(1.0) / distance
-            if on_p + on_q + on_r == 1:
+            if feature < 4:
                 found.first = found.second
-            elif on_p == 0:
-                found.direction = wp.normalize(r - q)
-            elif on_q == 0:
-                found.direction = wp.normalize(r - p)
+            elif feature == 4:
+                found.direction = wp.normalize(rows[2] - rows[1])
+            elif feature == 5:
+                found.direction = wp.normalize(rows[2] - rows[0])
             else:
-                found.direction = wp.normalize(q - p)
+                found.direction = wp.normalize(rows[1] - rows[0])
     return found
 
 

@@ -342,15 +342,6 @@ def move_contact(
 
 
 @wp.func
-def spring_load(
-    stiffness: real, stiffness_d: real, angle: real, angle_d: real, rate: real, rate_d: real, lag: real, lag_d: real
-) -> real:
-    """Return the change of a joint's spring moment; rates are those at the end of the step."""
-    state = spring_state(angle, rate, lag)
-    return stiffness_d * state[0] + stiffness * state[1] * (angle_d + lag * rate_d + lag_d * rate)
-
-
-@wp.func
 def tangent_step(
     scene: SceneArrays,
     records: StepRecords,
@@ -529,7 +520,10 @@ def tangent_step(
                     if d == 2:
                         stiffness = inertia.torsion
                         stiffness_d = tangents.link[p, wp.static(TORSION), i, index]
-                due[d] = -spring_load(stiffness, stiffness_d, angle[d], angle_d[d], rate[d], rate_d[d], lag, lag_d) - (
+                # The change of the spring's moment; rates are those at the end of the step.
+                spring = spring_state(angle[d], rate[d], lag)
+                ahead_d = angle_d[d] + lag * rate_d[d] + lag_d * rate[d]
+                due[d] = -(stiffness_d * spring[0] + stiffness * spring[1] * ahead_d) - (
                     wp.dot(hinge_row(hinges_d.axis, j), row(fields.moment, i))
                     + wp.dot(hinge_row(links.axis, j), total_d.w)
                     + wp.dot(hinge_row(hinges_d.moment, j), row(fields.force, i))

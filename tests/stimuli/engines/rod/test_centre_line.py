@@ -11,6 +11,8 @@ from brainbench.stimuli.engines import get_engine
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.motion.jobs import Job, StillFollicle
 from brainbench.stimuli.objects.obstacle import Box, Capsule, ConvexPart, Cylinder, Obstacle, Sphere
+from brainbench.stimuli.validation.bench_tests import difference
+from tests.factories.contact_scenes import contact_jobs
 
 pytest.importorskip("warp")
 
@@ -130,6 +132,19 @@ def _slide(fidelity):
 
 def test_a_sliding_post_makes_no_sawtooth():
     assert _slide("balanced") < 0.007 < 0.04 < _slide("balanced,contact_line=links")
+
+
+def test_slip_reverses_when_that_of_many_links_does():
+    """Its speed is a small difference of large ones there: a tenth of a ms is a large part of one reading."""
+    job = contact_jobs(11, each=1, objects=("post",))[1]
+    job = dataclasses.replace(job, times=job.times[:34])
+    steps = "balanced,time_step=2e-5,steps_per_period=400"
+    fine, bent, straight = (
+        get_engine("rod").run([job], Fidelity.parse(f"{steps},links={links},contact_line={line}"), workers=1)[0]
+        for links, line in ((50, "rod"), (11, "rod"), (11, "links"))
+    )
+    assert difference(bent, fine) < 0.01
+    assert difference(straight, fine) > 0.03
 
 
 def test_meshes_gradients_and_other_backends_take_straight_links():

@@ -46,7 +46,7 @@ from .algebra import (
     vec6,
 )
 from .motion import BodyMotion, elapsed
-from .parameters import flows, hinges, real, rolls, yields
+from .parameters import flows, hinges, real, rolls, smooth, yields
 from .state import (
     ChainArrays,
     ContactCandidates,
@@ -125,6 +125,9 @@ class ProximityState:
     safe_until: PerLink1
     end_speed: PerLink1
     """Speed of the faster end."""
+    if smooth:
+        shorter: PerLink1
+        """By how much (mm) less than the chain the rod reached along itself to the far end (``centre_line``)."""
 
 
 @wp.func(inline=True)

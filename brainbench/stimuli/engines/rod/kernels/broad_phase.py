@@ -36,7 +36,7 @@ from brainbench.stimuli.motion.jobs import MILLI
 
 from .algebra import JointVector, Spatial, first_axis, rotate, vec3
 from .articulated_body import ChainState, ProximityState, hinge_direction
-from .centre_line import bent_link
+from .centre_line import bent_link, shortening
 from .distances import segments
 from .motion import BodyMotion, elapsed, instant, pose_at, pose_from
 from .narrow_phase import link_shape_distance
@@ -58,6 +58,7 @@ from .state import (
     WhiskerState,
     cone,
     line_place,
+    line_tangent,
     most_candidates,
     row,
 )
@@ -342,6 +343,8 @@ def find_candidates(
         if near.room - near.moved > enough:
             looked_at = near.count
             others = near.room - near.moved
+    shorter = real(0.0)
+    end_slide = real(0.0)
     for i in range(job.links):
         rate = row(chain.rate, i)
         joint = row(chain.node, i)
@@ -354,6 +357,12 @@ def find_candidates(
                 spun = spun + row(chain.axis3, i) * rate[2]
         angular = angular + spun
         linear = linear + wp.cross(joint, spun)
+        start_slide = end_slide
+        if wp.static(smooth):
+            shorter = shorter + shortening(scene.chains, job, chain, base, i)
+            if state.contacts > 0:
+                end_slide = (shorter - row(proximity.shorter, i)) / state.last_step
+            proximity.shorter[i] = shorter
         taper = scene.chains.taper[i, job.whisker]
         if row(proximity.clearance, i) <= margin + taper.start_radius:
             link_here = cone(joint, joint + link, taper)
@@ -429,6 +438,10 @@ def find_candidates(
                             candidates.friction[slot] = mu
                             candidates.point[slot] = point
                             candidates.arc[slot] = taper.arc + taper.arc_length * share
+                            if wp.static(smooth):
+                                # The rod slides along itself where the chain does not.
+                                slide = start_slide + (end_slide - start_slide) * share
+                                object_velocity = object_velocity + wp.normalize(line_tangent(link_here, share)) * slide
                             candidates.object_velocity[slot] = object_velocity
                             candidates.normal[slot] = normal
                             if wp.static(recorded):
@@ -464,6 +477,8 @@ def resume(
         chain.rate[i] = paused.link[i, index].rate
         proximity.clearance[i] = paused.link[i, index].clearance
         proximity.leaf[i] = paused.link[i, index].leaf
+        if wp.static(smooth):
+            proximity.shorter[i] = paused.link[i, index].shorter
 
 
 @wp.func(inline=True)
@@ -482,6 +497,8 @@ def keep(
         paused.link[i, index].rate = row(chain.rate, i)
         paused.link[i, index].clearance = row(proximity.clearance, i)
         paused.link[i, index].leaf = row(proximity.leaf, i)
+        if wp.static(smooth):
+            paused.link[i, index].shorter = row(proximity.shorter, i)
 
 
 @wp.func(inline=True)

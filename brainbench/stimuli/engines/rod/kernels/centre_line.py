@@ -7,6 +7,9 @@ carried there (:class:`.state.BeamErrors`). A force is what bends a link further
 contact on this link makes the same force wherever along it the contact is, so the moments of four joints tell it
 without knowing the place. Forces on other links are known from the last steps; without what they do to these moments
 two contacts could not be told from one. The rest shape adds its own bends, linear along the link as between two joints.
+
+Where slip reverses, its speed is a small difference of large ones: the chain, which is straighter than the rod, would
+reverse some tenths of a ms too early or too late (:func:`shortening`).
 """
 
 import warp as wp
@@ -34,12 +37,21 @@ def joint_moment(chains: ChainArrays, job: WhiskerJob, chain: wp.ref[ChainState]
     """Return the moment of a joint's spring (µN·m), as the way in which it turns the link; none beyond both ends."""
     moment = vec3()
     if j >= 0 and j < job.links:
-        along = wp.normalize(row(chain.node, j + 1) - row(chain.node, j))
         axis2 = row(chain.axis2, j)
         angle = row(chain.angle, j)
         turn = first_axis(axis2, hinge_direction(chain, j), angle[1]) * angle[0] + axis2 * angle[1]
-        moment = wp.cross(turn, along) * chains.inertia[j, job.whisker].stiffness
+        moment = wp.cross(turn, link_direction(job, chain, vec3(), j)) * chains.inertia[j, job.whisker].stiffness
     return moment
+
+
+@wp.func
+def link_direction(job: WhiskerJob, chain: wp.ref[ChainState], base: vec3, i: int) -> vec3:
+    """Return the direction of a link; before the first that of the base, beyond the last its own."""
+    along = base
+    if i >= 0:
+        last = wp.min(i, job.links - 1)
+        along = wp.normalize(row(chain.node, last + 1) - row(chain.node, last))
+    return along
 
 
 @wp.func
@@ -64,7 +76,8 @@ class LinkLoads:
     """Slope and deflection at the link's joint that chain and rod differ by because of contacts further in."""
     inner_offset: vec3
     crowd: wp.int32
-    """Contacts on the link itself."""
+    """Contacts on the link itself, and their moment at its joint."""
+    crowd_moment: vec3
 
 
 @wp.func
@@ -100,6 +113,7 @@ def take_off_contacts(
         push = steady_push(problems, job, c, along)
         if reach >= real(0.0) and reach < span:
             loads.crowd = loads.crowd + 1
+            loads.crowd_moment = loads.crowd_moment + push * reach
         if reach >= span:
             loads.before = loads.before - push * (reach + span)
             loads.here = loads.here - push * reach
@@ -144,20 +158,18 @@ def bent_link(
     most = wp.length(bend)
     first = linearity(bend)
     last = real(1.0)
-    start = vec3()
+    start = along - link_direction(job, chain, base, i - 1) - bend * (beam.trust * first)
     if i == 0:
         # The tangent at the base is given; half a turn leads from there to the first link.
-        start = (along - base - bend * (beam.trust * first)) * real(2.0)
+        start = start * real(2.0)
     else:
-        start = along - wp.normalize(at - row(chain.node, i - 1)) - bend * (beam.trust * first)
         bend = loads.before / chains.inertia[i - 1, job.whisker].stiffness
         most = most + wp.length(bend)
     end = start
     if i < job.links - 1:
         bend = loads.after / chains.inertia[i + 1, job.whisker].stiffness
         last = linearity(bend)
-        end = wp.normalize(row(chain.node, i + 2) - row(chain.node, i + 1)) - along
-        end = end - bend * (chains.beam[i + 1, job.whisker].trust * last)
+        end = link_direction(job, chain, base, i + 1) - along - bend * (chains.beam[i + 1, job.whisker].trust * last)
         most = most + wp.length(bend)
     take_off_contacts(chains, problems, job, contacts, i, along, loads)
     taper = chains.taper[i, job.whisker]
@@ -175,11 +187,7 @@ def bent_link(
         inner_offset = loads.inner_offset + loads.inner_slope * (length * place)
         if loads.crowd > 1:
             # Joints do not tell contacts of one link apart: the forces of all are those of the last steps.
-            here = loads.here
-            for c in range(contacts):
-                reach = problems.held[job.index, c].arc - taper.arc
-                if reach >= zero and reach < taper.arc_length:
-                    here = here - steady_push(problems, job, c, along) * reach
+            here = loads.here - loads.crowd_moment
             force = (here - loads.after) / length
             moment = loads.after + (here - loads.after) * left
             for c in range(contacts):
@@ -208,3 +216,21 @@ def bent_link(
     bent = cone(at, at + link, taper)
     bent.line = line
     return bent
+
+
+@wp.func
+def shortening(chains: ChainArrays, job: WhiskerJob, chain: wp.ref[ChainState], base: vec3, i: int) -> real:
+    """Return by how much less than link i the rod beside it reaches along itself.
+
+    An arc that turns by b from the middle of one link to that of the next is b²/24 of its length longer than its chord.
+    Where the chain turns by b, and rod and chain lie apart by e across, e b of the length goes into or out of the bend.
+    """
+    before = link_direction(job, chain, base, i - 1)
+    along = link_direction(job, chain, base, i)
+    after = link_direction(job, chain, base, i + 1)
+    beam = chains.beam[i, job.whisker]
+    length = chains.taper[i, job.whisker].arc_length
+    moment = joint_moment(chains, job, chain, i)
+    push = (moment - joint_moment(chains, job, chain, i + 1)) / length
+    apart = moment * beam.force_slope[0] + push * beam.force_deflection[0]
+    return wp.length_sq(after - before) * length / real(96.0) - wp.dot(apart, along - before)

@@ -11,11 +11,11 @@ are one thread's own. Every number is found by the same operations in the same o
 
 import warp as wp
 
-from brainbench.stimuli.engines.rod.limits import CAPSULE, CYLINDER, SPHERE
+from brainbench.stimuli.engines.rod.limits import CAPSULE, CYLINDER, SPHERE, WIDE
 
-from .algebra import vec2, vec3, vec4, vec5
+from .algebra import mat33, vec2, vec3, vec4, vec5
 from .parameters import real
-from .state import Cone, line_place, line_tangent
+from .state import Cone, LeafCorners, ShapeArrays, line_place, line_tangent
 
 # As fine as the numbers: 2⁻²⁰ is about 1e-6, 2⁻⁴⁴ about 6e-14 of a link.
 halvings = 20 if real is wp.float32 else 44
@@ -234,3 +234,64 @@ the former at both ends of the segment gives its distance."""
 def segments(a: vec3, d1: vec3, p: vec3, d2: vec3) -> vec2:
     """Return s and t of the closest points of the segments a + s d1 and p + t d2."""
     ...
+
+
+@wp.func_native(f"""
+wp::mat_t<3, 3, wp::{real.__name__}> rows;
+const auto& leaf = corners.data[face / {WIDE}].data;
+for (int i = 0; i < 9; i++) rows.data[i / 3][i % 3] = leaf[i][face % {WIDE}];
+return rows;
+""")
+def triangle_corners(corners: wp.array(dtype=LeafCorners), face: int) -> mat33:
+    """Return the corners of a triangle as rows, without a copy of its whole leaf."""
+    ...
+
+
+@wp.func
+def triangle_feature(v: real, w: real) -> int:
+    """Return what holds a point of a triangle: 0 its face, 1 to 3 a corner, 4 to 6 the edge opposite to that corner."""
+    u = real(1.0) - v - w
+    low = real(1e-4)
+    on_p = u > low
+    on_q = v > low
+    on_r = w > low
+    slot = 0
+    if on_p and not on_q and not on_r:
+        slot = 1
+    elif on_q and not on_p and not on_r:
+        slot = 2
+    elif on_r and not on_p and not on_q:
+        slot = 3
+    elif not on_p:
+        slot = 4
+    elif not on_q:
+        slot = 5
+    elif not on_r:
+        slot = 6
+    return slot
+
+
+@wp.func
+def pseudo_normal(shapes: ShapeArrays, face: int, v: real, w: real) -> vec3:
+    """Return the pseudo-normal of the corner, edge or face that holds a point of these barycentric coordinates.
+
+    The normal of one face tells the wrong side near a sharp edge or corner.
+    """
+    return shapes.outward[face, triangle_feature(v, w)]
+
+
+@wp.func
+def way_out(shapes: ShapeArrays, face: int, v: real, w: real, x: vec3, distance: real, radius: real) -> vec4:
+    """Return the direction out of a mesh and the signed distance at a point, given the place that is closest to it."""
+    outward = pseudo_normal(shapes, face, v, w)
+    # So near the surface, rounding would turn the way from it.
+    if distance < real(1e-3) * radius:
+        return vec4(outward[0], outward[1], outward[2], distance)
+    rows = triangle_corners(shapes.corners, face)
+    away = x - (rows[0] + (rows[1] - rows[0]) * v + (rows[2] - rows[0]) * w)
+    side = real(1.0) / distance
+    signed = distance
+    if wp.dot(away, outward) < real(0.0):
+        side = -side
+        signed = -distance
+    return vec4(away[0] * side, away[1] * side, away[2] * side, signed)

@@ -26,8 +26,8 @@ from brainbench.stimuli.engines.rod.limits import (
     WIDE,
 )
 
-from .algebra import maximum, minimum, unrotate, vec3, vec4
-from .distances import NUMBERS, TRIANGLES, primitive, segment_primitive
+from .algebra import maximum, minimum, unrotate, vec3, vec5
+from .distances import NUMBERS, TRIANGLES, primitive, pseudo_normal, segment_primitive, way_out
 from .motion import BodyMotion, pose_from
 from .parameters import against, cuda, group_size, module_options, real, smooth
 from .state import (
@@ -51,22 +51,6 @@ stride = 1 if children > 1 else 0
 Kept: Any = wp.types.matrix((LEVELS, children), real)
 beyond = 1e30
 none_left = 2**31 - 1
-
-
-@wp.func_native("return corners.data[leaf].data[row][rank];")
-def leaf_number(corners: wp.array(dtype=LeafCorners), leaf: int, row: int, rank: int) -> real:
-    """Return a coordinate of a triangle of a leaf, without a copy of the whole."""
-    ...
-
-
-@wp.func
-def corner(corners: wp.array(dtype=LeafCorners), leaf: int, which: int, rank: int) -> vec3:
-    """Return a corner of a triangle of a leaf."""
-    return vec3(
-        leaf_number(corners, leaf, 3 * which, rank),
-        leaf_number(corners, leaf, 3 * which + 1, rank),
-        leaf_number(corners, leaf, 3 * which + 2, rank),
-    )
 
 
 @wp.struct
@@ -408,52 +392,14 @@ def nearest_triangles(
 
 
 @wp.func
-def pseudo_normal(shapes: ShapeArrays, face: int, v: real, w: real) -> vec3:
-    """Return the pseudo-normal of the corner, edge or face that holds a point of these barycentric coordinates."""
-    u = real(1.0) - v - w
-    low = real(1e-4)
-    on_p = u > low
-    on_q = v > low
-    on_r = w > low
-    # Which feature holds the point decides: the normal of one face tells the wrong side near a sharp edge or corner.
-    # Slot 0 is the face, 1 to 3 its corners, 4 to 6 the edges opposite to them.
-    slot = 0
-    if on_p and not on_q and not on_r:
-        slot = 1
-    elif on_q and not on_p and not on_r:
-        slot = 2
-    elif on_r and not on_p and not on_q:
-        slot = 3
-    elif not on_p:
-        slot = 4
-    elif not on_q:
-        slot = 5
-    elif not on_r:
-        slot = 6
-    return shapes.outward[face, slot]
-
-
-@wp.func
-def surface_point(shapes: ShapeArrays, face: int, v: real, w: real) -> vec3:
-    """Return the point of a triangle with these barycentric coordinates."""
-    leaf = face // wp.static(WIDE)
-    rank = face % wp.static(WIDE)
-    p = corner(shapes.corners, leaf, 0, rank)
-    return p + (corner(shapes.corners, leaf, 1, rank) - p) * v + (corner(shapes.corners, leaf, 2, rank) - p) * w
-
-
-@wp.func
-def signed_direction(away: vec3, distance: real, outward: vec3, radius: real) -> vec4:
-    """Return the direction out of a mesh and the signed distance, given the way from the closest point."""
-    # So near the surface, rounding would turn the way from it.
-    if distance < real(1e-3) * radius:
-        return vec4(outward[0], outward[1], outward[2], distance)
-    side = real(1.0) / distance
-    signed = distance
-    if wp.dot(away, outward) < real(0.0):
-        side = -side
-        signed = -distance
-    return vec4(away[0] * side, away[1] * side, away[2] * side, signed)
+def touch_between(found: wp.ref[LinkDistance], nearest: vec5):
+    """Keep the place of a link that is nearest to a shape; places at its ends are handled apart."""
+    found.share = nearest[0]
+    found.gap = nearest[1]
+    found.normal = vec3(nearest[2], nearest[3], nearest[4])
+    found.between = 0
+    if nearest[0] > real(1e-3) and nearest[0] < real(1.0 - 1e-3):
+        found.between = 1
 
 
 @wp.func
@@ -484,9 +430,8 @@ def mesh_distance(shapes: ShapeArrays, s: int, link: Cone, within: real, got: Ne
         w = got.start_w
     if face >= 0:
         found.leaf = face // wp.static(WIDE) + 1
-        away = a + (b - a) * share - surface_point(shapes, first + face, v, w)
         radius = ra + (rb - ra) * share
-        out = signed_direction(away, found.clearance, pseudo_normal(shapes, first + face, v, w), radius)
+        out = way_out(shapes, first + face, v, w, a + (b - a) * share, found.clearance, radius)
         # The whole axis is on the side of its nearest point, or it crosses the surface there.
         if out[3] < real(1e-3) * radius:
             found.crossing = 1
@@ -511,30 +456,15 @@ def mesh_distance(shapes: ShapeArrays, s: int, link: Cone, within: real, got: Ne
         flat = wp.dot(out_here, shapes.outward[face, 0]) > real(0.99999)
         if got.share > real(1e-3) and got.share < real(1.0 - 1e-3) and not (flat and got.side > real(0.0)):
             radius = ra + (rb - ra) * got.share
-            away = a + (b - a) * got.share - surface_point(shapes, face, got.v, got.w)
-            out = signed_direction(away, wp.sqrt(got.side), out_here, radius)
-            found.between = 1
-            found.share = got.share
-            found.gap = out[3] - radius
-            found.normal = vec3(out[0], out[1], out[2])
+            out = way_out(shapes, face, got.v, got.w, a + (b - a) * got.share, wp.sqrt(got.side), radius)
+            touch_between(found, vec5(got.share, out[3] - radius, out[0], out[1], out[2]))
     if got.end_face >= 0 and got.end <= within * within:
         face = first + got.end_face
-        away = b - surface_point(shapes, face, got.end_v, got.end_w)
-        out = signed_direction(away, wp.sqrt(got.end), pseudo_normal(shapes, face, got.end_v, got.end_w), rb)
+        out = way_out(shapes, face, got.end_v, got.end_w, b, wp.sqrt(got.end), rb)
         found.end = 1
         found.end_gap = out[3] - rb
         found.end_normal = vec3(out[0], out[1], out[2])
     return found
-
-
-@wp.func
-def overlap_at(shapes: ShapeArrays, s: int, link: Cone, share: real, got: NearestTriangles) -> real:
-    """Return how deep a place of a link lies in a surface, given the triangle nearest to it."""
-    face = shapes.face[s] + got.end_face
-    away = link.a + (link.b - link.a) * share - surface_point(shapes, face, got.end_v, got.end_w)
-    radius = link.start_radius + (link.end_radius - link.start_radius) * share
-    out = pseudo_normal(shapes, face, got.end_v, got.end_w)
-    return radius - signed_direction(away, wp.sqrt(got.end), out, radius)[3]
 
 
 @wp.func
@@ -616,7 +546,9 @@ def link_shape_distance(
                 first_leaf = found.leaf
                 within = real(0.0)
             elif searching == 1 and got.end_face >= 0:
-                depth = overlap_at(shapes, s, link, share, got)
+                radius = ra + (rb - ra) * share
+                nearest_face = shapes.face[s] + got.end_face
+                depth = radius - way_out(shapes, nearest_face, got.end_v, got.end_w, a, wp.sqrt(got.end), radius)[3]
                 found.depth = wp.max(found.depth, depth)
                 if place == 0:
                     found.start_gap = -depth
@@ -626,12 +558,7 @@ def link_shape_distance(
         nearest = segment_primitive(shapes.kind[s], shapes.size[s] / scale, link)
         # The gap counts from the skin, the bound from the axis; the thinner end keeps it a lower bound.
         found.clearance = nearest[1] + wp.min(ra, rb)
-        found.share = nearest[0]
-        found.gap = nearest[1]
-        found.normal = vec3(nearest[2], nearest[3], nearest[4])
-        found.between = 0
-        if nearest[0] > real(1e-3) and nearest[0] < real(1.0 - 1e-3):
-            found.between = 1
+        touch_between(found, nearest)
         if wp.static(smooth):
             a = line_place(link, real(0.0))
             b = line_place(link, real(1.0))

@@ -527,12 +527,14 @@ class ContactProblems:
 
 @wp.struct
 class PausedLink:
-    """Joint, clearance and leaf of a link, see :class:`ChainState` and :class:`ProximityState`."""
+    """State of a link, see :class:`ChainState` and :class:`ProximityState`."""
 
     angle: JointVector
     rate: JointVector
     clearance: real
     leaf: wp.int32
+    if smooth:
+        shorter: real
 
 
 @wp.struct

@@ -111,16 +111,6 @@ def preferred_step(scene: SceneArrays, job: WhiskerJob, state: wp.ref[WhiskerSta
     return wanted
 
 
-@wp.func
-def write_displacement(scene: SceneArrays, results: ResultArrays, job: WhiskerJob, state: wp.ref[WhiskerState]):
-    """Write what the follicle gives, in m and rad."""
-    first = scene.jobs.row[job.index]
-    column = scene.jobs.column[job.index]
-    for d in range(3):
-        results.displacement[first, state.pending_reading, column, d] = state.slide.v[d] * real(1e-3)
-        results.displacement[first, state.pending_reading, column, 3 + d] = state.slide.w[d]
-
-
 @wp.func(inline=True)
 def write_reading(
     scene: SceneArrays,
@@ -302,7 +292,6 @@ def run(
                         state.top_speed = previous_speed
                         break
                     lower_clearance(job, proximity, near, reach)
-                    state.last_step = h
                     state.closes = 0
                     state.closing_speed = zero
                     if near_count > 0:
@@ -310,6 +299,7 @@ def run(
                         count = find_candidates(
                             scene, problems, paused, job, chain, proximity, near, candidates, state, step
                         )
+                    state.last_step = h
                 if wp.static(sliced or recorded):
                     state.waiting_for = 0
                     state.time_left = zero
@@ -378,7 +368,12 @@ def run(
                     integrate_follicle(scene.chains, job, chain, state, h, elapsed(now) + h, 1)
             if state.pending_reading >= 0:
                 if wp.static(yields):
-                    write_displacement(scene, results, job, state)
+                    # In m and rad.
+                    first = scene.jobs.row[job.index]
+                    column = scene.jobs.column[job.index]
+                    for d in range(3):
+                        results.displacement[first, state.pending_reading, column, d] = state.slide.v[d] * real(1e-3)
+                        results.displacement[first, state.pending_reading, column, 3 + d] = state.slide.w[d]
                 write_reading(scene, results, problems, job, chain, state.pending_reading, base_wrench, solved)
                 state.pending_reading = int(-1)
             if count > 0:
