@@ -142,10 +142,9 @@ def prepare(
 def resolve(
     backend: WhiskerEngine | str, fidelity: Fidelity | str | None, scenes: Iterable[Scene], *, errors: bool = False
 ) -> tuple[WhiskerEngine, Fidelity]:
-    """Return the engine of some scenes, one by name estimating ``errors``, and the fidelity as they resolve it."""
-    engine, scenes = get_engine(backend, errors=errors) if isinstance(backend, str) else backend, list(scenes)
-    line = engine.contact_line(item.solid for scene in scenes for item in scene.objects)
-    return engine, Fidelity.of(fidelity).resolved(engine.twists and any(scene.twist for scene in scenes), line)
+    """Return the engine of some scenes, one by name estimating ``errors``, and the fidelity with whether they twist."""
+    engine = get_engine(backend, errors=errors) if isinstance(backend, str) else backend
+    return engine, Fidelity.of(fidelity).resolved(engine.twists and any(scene.twist for scene in scenes))
 
 
 def _begin(
@@ -153,6 +152,7 @@ def _begin(
 ) -> threading.Thread:
     """Let an engine get ready in a thread."""
     lengths = {mount.whisker.arc_length for scene in scenes for mount in scene.mounts}
+    fidelity = fidelity.touching(item.solid for scene in scenes for item in scene.objects)
 
     def work() -> None:
         # What is wrong here is wrong again in the simulation, which says so; Python refuses a pool when it ends.

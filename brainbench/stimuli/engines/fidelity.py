@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
 from importlib import resources
@@ -17,10 +17,12 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from brainbench.core.errors import UsageError, brief, check_name, check_number
 from brainbench.core.limits import Limit, Positive, limited, read_pairs, read_value, with_changes
 from brainbench.core.tradeoffs import TradeoffPoint, cheapest
+from brainbench.stimuli.objects.obstacle import Capsule, Cylinder, Obstacle, Sphere
 from brainbench.stimuli.whiskers.whisker import Chain, Whisker, build_chain
 
 if TYPE_CHECKING:
     from brainbench.stimuli.motion.jobs import Job
+    from brainbench.stimuli.objects.solid import Solid
 
 logger = logging.getLogger(__name__)
 
@@ -54,12 +56,12 @@ class Fidelity:
     twist: bool | None = field(default=None, metadata={"later": True, "before": False})
     """True lets whiskers twist about their axis; one that stays in one plane is computed without in any case. None: as
     the scenes say (:attr:`brainbench.stimuli.scenes.scene.Scene.twist`), where the backend can."""
-    contact_line: Literal["links", "rod"] | None = field(default=None, metadata={"later": True, "before": "links"})
+    contact_line: Literal["links", "rod"] | None = field(default=None, metadata={"later": True})
     """What contacts touch: the straight links, whose direction jumps at each joint, or the centre line of the bent rod,
     as beam theory tells it between the joints: with the same links many times nearer where a whisker is held between
     contacts or slides past one. The backend ``rod`` alone knows it, for objects of spheres, capsules, cylinders and
-    boxes; gradients and fits take the links. None: the rod where all objects of the scenes are round, the links where
-    there is a box or a mesh, on whose flat faces the forces of a whisker that lies flush swing to and fro otherwise."""
+    boxes; gradients and fits take the links. None: the rod in scenes of round objects alone, the links in those with
+    a box or a mesh, on whose flat faces the forces of a whisker that lies flush swing to and fro otherwise."""
     contact_tolerance: Annotated[float, Limit(least=1e-12, most=1e-3)] | None = field(
         default=None, metadata={"later": True}
     )
@@ -117,10 +119,17 @@ class Fidelity:
         check_number("error (0.05 = 5 %)", error, above=0)
         return cls(**cheapest(measured(backend), error).settings, error=error)
 
-    def resolved(self, twist: bool, contact_line: Literal["links", "rod"] = "links") -> Fidelity:
-        """Return this fidelity with ``twist`` and ``contact_line`` where it leaves them open."""
-        line = contact_line if self.contact_line is None else self.contact_line
-        return replace(self, twist=twist if self.twist is None else self.twist, contact_line=line)
+    def resolved(self, twist: bool) -> Fidelity:
+        """Return this fidelity with ``twist`` where it leaves that open."""
+        return replace(self, twist=twist) if self.twist is None else self
+
+    def touching(self, bodies: Iterable[Obstacle | Solid]) -> Fidelity:
+        """Return this fidelity with what contacts with the bodies of a scene touch, where it leaves that open."""
+        if self.contact_line is not None:
+            return self
+        parts = [part for body in bodies for part in (body.surface, *body.parts) if part is not None]
+        rounded = bool(parts) and all(isinstance(part, Sphere | Capsule | Cylinder) for part in parts)
+        return replace(self, contact_line="rod" if rounded else "links")
 
     def chain(self, whisker: Whisker) -> Chain:
         """Return the chain of links that stands for a whisker; errors as for :meth:`link_count`."""

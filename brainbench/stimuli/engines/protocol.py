@@ -10,7 +10,7 @@ from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,10 +22,8 @@ from brainbench.stimuli.engines.air import check_air
 from brainbench.stimuli.engines.error_estimates import with_errors
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.motion.jobs import Job, StillFollicle, Trace  # noqa: F401, what a script gives an engine
-from brainbench.stimuli.objects.obstacle import are_round
 
 if TYPE_CHECKING:
-    from brainbench.stimuli.objects.obstacle import Obstacle
     from brainbench.stimuli.objects.solid import Solid
     from brainbench.stimuli.whiskers.array import WhiskerArray
 
@@ -196,10 +194,6 @@ class WhiskerEngine:
         """Return what surrounds a run; without the engine's package it is a :class:`MissingDependencyError`."""
         return nullcontext()
 
-    def contact_line(self, bodies: Iterable[Obstacle | Solid]) -> Literal["links", "rod"]:
-        """Return what contacts with these bodies touch where :attr:`Fidelity.contact_line` leaves it open."""
-        return "rod" if self.smooth and all(are_round(body.parts, body.surface) for body in bodies) else "links"
-
     def groups(self, jobs: Sequence[Job], fidelity: Fidelity, threads: int) -> list[list[int]]:
         """Return the jobs that are simulated together, by their index; ``threads`` groups are at a time."""
         return [[index] for index in range(len(jobs))]
@@ -275,9 +269,6 @@ class WhiskerEngine:
 
         with self.session():
             self.check(jobs, fidelity, workers)
-            if fidelity.contact_line is None:
-                bodies = {id(body): body for job in jobs for body in job.obstacles}
-                fidelity = replace(fidelity, contact_line=self.contact_line(bodies.values()))
             threads = self.threads(workers)
             return run_groups(self.groups(jobs, fidelity, threads), run, threads=threads, progress=progress)
 

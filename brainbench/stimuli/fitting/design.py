@@ -275,7 +275,8 @@ class _Evaluator:
     def __init__(self, scenes: Sequence[Scene], names: tuple[str, ...], options: DesignOptions, backend: str) -> None:
         self.scenes, self.names, self.options = list(scenes), names, options
         self.engine = get_engine(backend)
-        self.fidelity = Fidelity.of(options.fidelity).resolved(self.engine.twists and any(s.twist for s in scenes))
+        twist = self.engine.twists and any(scene.twist for scene in scenes)
+        self.fidelity = Fidelity.of(options.fidelity).resolved(twist).touching(())  # as gradients do
         self.noise = np.repeat([options.force_noise, options.moment_noise], 3)
         self.count = 0
 

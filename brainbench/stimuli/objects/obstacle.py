@@ -167,11 +167,6 @@ def bounds_of(parts: Iterable[Part], surface: Mesh | None) -> NDArray[np.float64
     return np.stack([corners[:, 0].min(axis=0), corners[:, 1].max(axis=0)])
 
 
-def are_round(parts: Iterable[Part], surface: Mesh | None) -> bool:
-    """Return whether spheres, capsules and cylinders are all that is touched."""
-    return surface is None and all(isinstance(part, Sphere | Capsule | Cylinder) for part in parts)
-
-
 @dataclass(frozen=True)
 @limited(of="{} of an obstacle")
 class Obstacle:

@@ -73,12 +73,17 @@ class JobTask:
     approach: Approach
     twists: bool
     """Whether it may leave its plane, and may twist at this fidelity."""
+    fidelity: Fidelity
+    """With what contacts of its scene touch."""
 
     @property
     def kind(self) -> tuple[bool, ...]:
-        """Whether it twists, feels air, has a follicle that gives way, bends in space: tasks of a launch are alike."""
-        whisker = self.job.whisker
-        return self.twists, self.job.air_flow is not None, whisker.follicle is not None, bool(whisker.bends)
+        """Whether it twists, feels air, has a follicle that gives way, bends in space, touches as the bent rod does.
+
+        Tasks of a launch are alike.
+        """
+        whisker, smooth = self.job.whisker, self.fidelity.contact_line == "rod"
+        return self.twists, self.job.air_flow is not None, whisker.follicle is not None, bool(whisker.bends), smooth
 
 
 def make_task(
@@ -134,7 +139,8 @@ def make_task(
         steps = limit[np.clip(((seen[:-1] - start) / KNOT).astype(int), 0, len(limit) - 1)]
     approach = _approach(job, reach, (position, euler), seen, steps, step)
     twists = fidelity.twist is not False and not stays_in_plane(job, reach, position, euler, seen)
-    return JobTask(job, chain, base, near, reach.indices, names, limit, approach, twists)
+    fine = fidelity.touching(job.obstacles)
+    return JobTask(job, chain, base, near, reach.indices, names, limit, approach, twists, fine)
 
 
 @dataclass(frozen=True, eq=False)
@@ -310,7 +316,7 @@ class RodEngine(WhiskerEngine):
                 tasks.setdefault(task.kind, {})[index] = task
         for _, alike in sorted(tasks.items()):
             spent = seconds[list(alike)]
-            traces |= _simulate(alike, spent, self.retry, fidelity, pick_device(self.device), record_shape)
+            traces |= _simulate(alike, spent, self.retry, pick_device(self.device), record_shape)
         return [traces[index] for index in range(len(jobs))]
 
     def prepare_sweeps(self, scenes: PassiveSweeps, fidelity: Fidelity) -> None:
@@ -351,10 +357,11 @@ class RodEngine(WhiskerEngine):
 
 
 def _simulate(
-    tasks: dict[int, JobTask], seconds: NDArray, retry: int, fidelity: Fidelity, device: Any, record_shape: bool
+    tasks: dict[int, JobTask], seconds: NDArray, retry: int, device: Any, record_shape: bool
 ) -> dict[int, Trace]:
     """Run tasks of one kind in one launch; ``seconds`` [task] is the processor time of each so far."""
     given = list(tasks.values())
+    fidelity = given[0].fidelity
 
     def launch(tries: Sequence[Try]) -> list[LaunchResult]:
         parts = [np.arange(len(given)) if which is None else np.flatnonzero(which[:, 0]) for which, _ in tries]
