@@ -11,8 +11,7 @@ from brainbench.stimuli.engines import get_engine
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.motion.jobs import Job, StillFollicle
 from brainbench.stimuli.objects.obstacle import Box, Capsule, ConvexPart, Cylinder, Obstacle, Sphere
-from brainbench.stimuli.validation.bench_tests import difference
-from tests.factories.contact_scenes import contact_jobs
+from tests.factories.contact_scenes import contact_jobs, difference
 
 pytest.importorskip("warp")
 
