@@ -11,8 +11,8 @@ import numpy as np
 
 from benchmarks.report import publish, script_parser, table
 from brainbench.core.runs.jobs import run_jobs
-from robotics_bridge.sensors.calibration.devices import TOLERANCES, DeviceFit, fit_device
-from tests.factories.pressed_devices import FAULTS, KINDS, Planted, outcomes, plant, tilts
+from robotics_bridge.sensors.calibration.devices import fit_device
+from tests.factories.pressed_devices import FAULTS, KINDS, false_faults, outcomes, plant, tilts
 
 STANDARD, *OTHERS = KINDS
 HEADS = ["device", "status ok", "law, median", "worst", "normal, median °", "worst °", "intervals hold", "accused",
@@ -26,20 +26,6 @@ def fitted(job: tuple[int, str, str]) -> dict[str, Any]:
     return {"holds": outcomes(planted, fit), "law": fit.held_out, "normal": float(tilts(planted, fit).max()),
             "doubts": fit.doubts, "faults": [entry.kind for entry in fit.faults],
             "false": false_faults(planted, fit)}  # fmt: skip
-
-
-def false_faults(planted: Planted, fit: DeviceFit) -> list[str]:
-    """Return the faults that a device is accused of, whose planted number lies within its tolerance."""
-    device = planted.device
-    shift = np.linalg.norm(device.place - planted.presses.probes.position, axis=1)
-    true = {"shifted": (shift, "place"), "turned": (device.turn.magnitude(), "turn"),
-            "gain": (np.abs(device.gain), "gain")}  # fmt: skip
-    return [
-        fault.text
-        for fault in fit.faults
-        if not fault.taxel or fault.kind not in true
-        or true[fault.kind][0][int(fault.taxel)] <= TOLERANCES[true[fault.kind][1]]
-    ]  # fmt: skip
 
 
 def main() -> None:

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from robotics_bridge.physics import Geometry, HandState, TouchScene
 from robotics_bridge.sensors.calibration.calibrate import Log
-from robotics_bridge.sensors.calibration.devices import DeviceFit
+from robotics_bridge.sensors.calibration.devices import TOLERANCES, DeviceFit
 from robotics_bridge.sensors.calibration.presses import SHARED, Device, Presses
 from robotics_bridge.sensors.noise.model import Noise
 from robotics_bridge.sensors.noise.stages import simulate
@@ -162,6 +162,20 @@ def outcomes(planted: Planted, fit: DeviceFit) -> dict[str, list[bool]]:
         off = abs(np.log(row["gain"]) - planted.device.gain[n])
         hits.setdefault("gain", []).append(bool(off <= row["gain_error"]))
     return hits
+
+
+def false_faults(planted: Planted, fit: DeviceFit) -> list[str]:
+    """Return the faults that a device is accused of, whose planted number lies within its tolerance."""
+    device = planted.device
+    shift = np.linalg.norm(device.place - planted.presses.probes.position, axis=1)
+    true = {"shifted": (shift, "place"), "turned": (device.turn.magnitude(), "turn"),
+            "gain": (np.abs(device.gain), "gain")}  # fmt: skip
+    return [
+        fault.text
+        for fault in fit.faults
+        if not fault.taxel or fault.kind not in true
+        or true[fault.kind][0][int(fault.taxel)] <= TOLERANCES[true[fault.kind][1]]
+    ]  # fmt: skip
 
 
 def tilts(planted: Planted, fit: DeviceFit) -> np.ndarray:
