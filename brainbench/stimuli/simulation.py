@@ -152,7 +152,8 @@ def _begin(
 ) -> threading.Thread:
     """Let an engine get ready in a thread."""
     lengths = {mount.whisker.arc_length for scene in scenes for mount in scene.mounts}
-    fidelity = fidelity.touching(item.solid for scene in scenes for item in scene.objects)
+    if engine.smooth:
+        fidelity = fidelity.touching(item.solid for scene in scenes for item in scene.objects)
 
     def work() -> None:
         # What is wrong here is wrong again in the simulation, which says so; Python refuses a pool when it ends.
