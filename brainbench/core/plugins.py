@@ -16,8 +16,9 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from importlib.machinery import EXTENSION_SUFFIXES, SOURCE_SUFFIXES, ExtensionFileLoader, FileFinder, SourceFileLoader
 from pathlib import Path
-from types import ModuleType
+from types import CodeType, ModuleType
 from typing import Any
 
 from brainbench.core.errors import (
@@ -34,6 +35,17 @@ _LOG = logging.getLogger(__name__)
 _beside: dict[str, Path] = {}
 """Modules that the last file imported from its own folder. The next file may mean others by these names."""
 _files: dict[Path, tuple[Path, ...]] = {}  # file of a user → that file, and those of its folder that it imported
+
+
+class _AsWritten(SourceFileLoader):
+    """Compiles a file as it stands: bytecode is kept by time in seconds and length, which an edit may leave alone."""
+
+    def get_code(self, fullname: str) -> CodeType:
+        path = self.get_filename(fullname)
+        return self.source_to_code(self.get_data(path), path)
+
+
+_finder_of = FileFinder.path_hook((ExtensionFileLoader, EXTENSION_SUFFIXES), (_AsWritten, SOURCE_SUFFIXES))
 
 
 def load_object(target: str, kind: str) -> Any:
@@ -212,14 +224,15 @@ def _assigns(node: ast.Assign, name: str) -> bool:
 def _import_file(path: Path) -> ModuleType:
     # The name is the file's own, so that classes defined there can be found again by their module.
     name = f"brainbench_user_{hashlib.sha256(str(path).encode()).hexdigest()[:12]}_{path.stem}"
-    spec = importlib.util.spec_from_file_location(name, path)
-    if spec is None or spec.loader is None:
+    loader = _AsWritten(name, str(path))
+    spec = importlib.util.spec_from_file_location(name, path, loader=loader)
+    if spec is None or path.suffix not in SOURCE_SUFFIXES:
         raise UsageError(f"{str(path)!r} is not a Python file.")
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module
     try:
         with _importable(path.parent):
-            spec.loader.exec_module(module)
+            loader.exec_module(module)
     except BaseException:
         del sys.modules[name]
         raise
@@ -234,14 +247,31 @@ def _importable(folder: Path) -> Iterator[None]:
         sys.modules.pop(name, None)
     _beside.clear()
     before = set(sys.modules)
+
+    def own_finder(path: str) -> Any:
+        # What is installed in an environment below the folder keeps its bytecode.
+        if "site-packages" in path or not Path(path).is_relative_to(folder):
+            raise ImportError
+        return _finder_of(path)
+
     sys.path.insert(0, str(folder))
-    importlib.invalidate_caches()
+    sys.path_hooks.insert(0, own_finder)
+    _forget_finders(folder)
     try:
         yield
     finally:
+        sys.path_hooks.remove(own_finder)
+        _forget_finders(folder)
         sys.path.remove(str(folder))
         for name in sys.modules.keys() - before:
             file, top = Path(getattr(sys.modules[name], "__file__", None) or ""), name.partition(".")[0]
             # What is installed in an environment below the folder is not its own.
             if file == folder / f"{top}.py" or file.is_relative_to(folder / top):
                 _beside[name] = file
+
+
+def _forget_finders(folder: Path) -> None:
+    """Let Python look anew for modules in a folder."""
+    importlib.invalidate_caches()
+    for path in [path for path in sys.path_importer_cache if Path(path).is_relative_to(folder)]:
+        del sys.path_importer_cache[path]

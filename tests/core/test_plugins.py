@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import sys
+
 import pytest
 
 from brainbench.core.errors import DataError, DataFileNotFoundError, MissingDependencyError, UsageError
@@ -22,6 +25,21 @@ def test_files_of_one_name_in_two_folders_do_not_meet(tmp_path):
         (tmp_path / name / "beside.py").write_text(f"VALUE = {name!r}\n")
         (tmp_path / name / "own.py").write_text("from beside import VALUE\n")
     assert [load_object(f"{tmp_path / name / 'own.py'}:VALUE", "model") for name in ("a", "b")] == ["a", "b"]
+
+
+def test_an_edit_that_leaves_time_and_length_alone_is_read(tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, "dont_write_bytecode", False)
+    (tmp_path / "inner").mkdir()
+    texts = {
+        "own.py": "from beside import WIDTH\nfrom inner.deep import DEPTH\nVALUE = WIDTH, DEPTH, 1\n",
+        "beside.py": "WIDTH = 1\n",
+        "inner/deep.py": "DEPTH = 1\n",
+    }
+    for number in (1, 2):
+        for name, text in texts.items():
+            (tmp_path / name).write_text(text.replace("1", str(number)))
+            os.utime(tmp_path / name, (1e9, 1e9))
+        assert load_object(f"{tmp_path / 'own.py'}:VALUE", "model") == (number,) * 3
 
 
 def test_an_object_of_a_package_is_found():
