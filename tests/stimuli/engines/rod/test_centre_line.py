@@ -12,6 +12,7 @@ from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.motion.jobs import Job, StillFollicle
 from brainbench.stimuli.objects.obstacle import Box, Capsule, ConvexPart, Cylinder, Obstacle, Sphere
 from tests.factories.contact_scenes import contact_jobs, difference
+from tests.factories.whiskers import C2
 
 pytest.importorskip("warp")
 
@@ -152,3 +153,32 @@ def test_meshes_gradients_and_other_backends_take_straight_links():
         _held("balanced,contact_line=rod", shape=ConvexPart(corners))
     with pytest.raises(UsageError, match="'mujoco' touch with straight links; leave contact_line out"):
         _held("balanced,contact_line=rod", backend="mujoco")
+
+
+@pytest.mark.parametrize(
+    ("shape", "most", "least"),
+    [
+        (Capsule((0, 0, -5e-3), (0, 0, 5e-3), 1e-3), 0.01, 0.0),
+        (Sphere((0, 0, 0), 2e-3), 0.01, 0.0),
+        (Cylinder((0, 0, -5e-3), (0, 0, 5e-3), 5e-4), 0.01, 0.0),
+        # Why boxes keep straight links: flush on their faces the forces of the bent line swing in steps however short.
+        (Box((0, 0, 0), (2e-3, 1e-3, 5e-3)), 0.03, 0.1),
+    ],
+)
+def test_blows_converge_with_the_step_on_the_line_of_the_default(shape, most, least):
+    def motion(times):
+        places = np.array([0.012, -3e-3, 0.0]) + np.outer(times, [0.0, 1.2, 0.0])
+        return places, np.tile([1.0, 0, 0, 0], (len(times), 1))
+
+    job = Job(C2, StillFollicle(), (Obstacle((shape,), motion, 0.4),), np.arange(1, 31) * 1e-3)
+
+    def change(line):
+        setting = f"balanced,precision=double,contact_tolerance=1e-8{line}"
+        coarse, fine = (
+            get_engine("rod", retry=1).run([job], Fidelity.parse(f"{setting},time_step={step}"), workers=1)[0]
+            for step in (1e-5, 1e-6)
+        )
+        return difference(coarse, fine)
+
+    assert change("") < most
+    assert change(",contact_line=rod") > least
