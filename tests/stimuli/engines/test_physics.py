@@ -3,6 +3,7 @@
 import math
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -297,11 +298,27 @@ def test_a_whisker_that_cannot_be_touched_or_moved_is_not_simulated(engine):
     np.testing.assert_allclose(trace.link_positions[-1, -1], [C2.arc_length, 0, 0], atol=1e-12)
 
 
-def test_objects_out_of_reach_change_nothing(engine):
-    times = np.arange(1.0, 31.0) * 1e-3
-    swing = Swing(angles=(0.3, 0, 0))
-    without, with_far = _run(engine, Job(C2, swing, (), times), Job(C2, swing, (post(0.03, 0.0),), times))
+@pytest.mark.parametrize("touched", [False, True])
+def test_objects_out_of_reach_change_nothing(engine, touched):
+    times, swing = np.arange(1.0, 31.0) * 1e-3, Swing(angles=(0.3, 0, 0))
+    near = (post(0.012, 0.0025, friction=0.0),) if touched else ()
+    far = (post(0.03, 0.0), Obstacle((Box((0.05, 0.0, 0.0), (1e-3, 1e-3, 1e-3)),)))
+    without, with_far = _run(engine, Job(C2, swing, near, times), Job(C2, swing, (*near, *far), times))
+    assert without.contact.any() == touched
     np.testing.assert_array_equal(without.wrench, with_far.wrench)
+
+
+@pytest.mark.parametrize("finest", [math.inf, None])
+def test_forces_are_those_of_a_frame_that_moves_along(engine, finest):
+    # Galilei: a whisker that drifts onto a post feels what one at rest feels of a post that drifts onto it.
+    rest = StillFollicle()
+    drift = SimpleNamespace(pose=lambda t: (np.outer(t, (0.0, 0.04, 0.0)), rest.pose(t)[1]), finest=finest)
+    times = np.arange(1.0, 41.0) * 1e-3
+    post = Capsule((0.012, 0.001, -0.01), (0.012, 0.001, 0.01), 4e-4)
+    comes = _flying(post, (0.0, 0.0, 0.0), (0.0, -0.04, 0.0))
+    there, here = _run(engine, Job(C2, rest, (comes,), times), Job(C2, drift, (replace(comes, motion=None),), times))
+    assert here.contact.any()
+    assert np.linalg.norm(here.wrench - there.wrench) < engine.path * np.linalg.norm(there.wrench)
 
 
 def test_the_recorded_shape_at_rest_is_the_rest_curve(engine):

@@ -74,7 +74,7 @@ class JobTask:
     twists: bool
     """Whether it may leave its plane, and may twist at this fidelity."""
     fidelity: Fidelity
-    """With what contacts of its scene touch."""
+    """With what contacts touch, by what is within reach: nothing else changes a force."""
 
     @property
     def kind(self) -> tuple[bool, ...]:
@@ -139,7 +139,7 @@ def make_task(
         steps = limit[np.clip(((seen[:-1] - start) / KNOT).astype(int), 0, len(limit) - 1)]
     approach = _approach(job, reach, (position, euler), seen, steps, step)
     twists = fidelity.twist is not False and not stays_in_plane(job, reach, position, euler, seen)
-    fine = fidelity.touching(job.obstacles)
+    fine = fidelity.touching(reach.obstacles)
     return JobTask(job, chain, base, near, reach.indices, names, limit, approach, twists, fine)
 
 

@@ -117,10 +117,12 @@ class Track:
 
 def follicle_track(follicle: Follicle, size: float, cutting: Cutting) -> Track:
     """Return the track of a follicle whose whisker has the arc length ``size`` (m)."""
-    # Looking for motion takes as long as simulating a short whisker.
+    # Looking for motion takes as long as simulating a short whisker; nothing finer than any time is rest or drift.
     if getattr(follicle, "finest", None) == math.inf:
-        place, euler = (np.asarray(values, dtype=float) for values in follicle.pose(np.array([cutting.start])))
-        return still_track(place[0], _still_quaternion(*euler[0].tolist()))
+        seen = np.linspace(cutting.start, cutting.stop, 5)
+        place, euler = (np.asarray(values, dtype=float) for values in follicle.pose(seen))
+        if (place == place[0]).all() and (euler == euler[0]).all():
+            return still_track(place[0], _still_quaternion(*euler[0].tolist()))
     return _track(follicle.pose, base_rotation, cutting.follicle(follicle, size), cutting.start)
 
 
