@@ -74,7 +74,7 @@ def simulate(
     ):
         if some:
             columns = {"stimulus": "{0[stimulus]}", "whisker": "{0[whisker]}", key: f"{{0[{key}]}}"}
-            text += "\n\n" + table_of(f"{len(some)} whiskers {words}", some, columns)
+            text += "\n\n" + table_of(f"{len(some)} of the whiskers {words}", some, columns)
     if explanation is not None:
         data["explanation"] = explanation
         text += f"\n\n{explanation}"
