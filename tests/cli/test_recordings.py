@@ -13,7 +13,7 @@ from brainbench.metrics import compare, get_metric, rdm
 from brainbench.models.features import read_features, write_features
 from brainbench.scoring.neural_responses import open_neural_responses
 from brainbench.scoring.options import ScoreOptions
-from tests.factories.published_recordings import make_zero_filled, write_published
+from tests.factories.published_files import make_zero_filled, write_published
 from tests.factories.recordings import quiet_design
 
 

@@ -6,7 +6,6 @@ import json
 import os
 import random
 import re
-import shutil
 import zipfile
 from collections.abc import Callable
 from functools import partial
@@ -277,11 +276,3 @@ def _checkpoint(path: Path, chance: random.Random) -> str:
         state[name] = state[name].to_sparse() if kind == "sparse" else state[name].to("meta")
     torch.save(content, path)
     return f"{kind} {name}"
-
-
-def remove(path: Path) -> None:
-    """Remove whatever :func:`damage` left at a path."""
-    if path.is_dir() and not path.is_symlink():
-        shutil.rmtree(path)
-    else:
-        path.unlink(missing_ok=True)

@@ -98,7 +98,8 @@ def _judge(door: Door, path: Path, place: Path, what: str) -> Outcome:
         return verdict("crash", detail=f"signal {-status}: {error[-400:]}")
     if "Traceback (most recent call last)" in err + out:
         return verdict("traceback")
-    if _leaks([out, err, *(file.read_bytes().decode(errors="replace") for file in written if file.is_file())]):
+    texts = [out, err, *(file.read_bytes().decode(errors="replace") for file in written if file.is_file())]
+    if any(SECRET in text or "root:x:0" in text for text in texts):
         return verdict("leaked")
     if status:
         if written:
@@ -119,17 +120,11 @@ def _run(door: Door, path: Path, place: Path) -> None:
         resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
         resource.setrlimit(resource.RLIMIT_CPU, (SECONDS, SECONDS + 5))
         faulthandler.enable(sys.stderr)
-        _call(door, path, place)
+        values = {"file": path, "folder": place, "stem": path.with_suffix("")}
+        sys.argv = ["brainbench", *(word.format(**values) for word in shlex.split(door.words))]
+        import_module("brainbench.cli").main()
     finally:
         (place.parent / "modules").write_text("\n".join(sys.modules))
-
-
-def _call(door: Door, path: Path, place: Path) -> None:
-    from brainbench.cli import main
-
-    values = {"file": path, "folder": place, "stem": path.with_suffix("")}
-    sys.argv = ["brainbench", *(word.format(**values) for word in shlex.split(door.words))]
-    main()
 
 
 def _wait(child: int) -> int | None:
@@ -148,10 +143,6 @@ def _wait(child: int) -> int | None:
 
 def _files(folder: Path) -> set[Path]:
     return {path for path in folder.rglob("*") if path.name != "__pycache__" and path.suffix != ".pyc"}
-
-
-def _leaks(texts: list[str]) -> bool:
-    return any(SECRET in text or "root:x:0" in text for text in texts)
 
 
 def _odd(out: str) -> bool:

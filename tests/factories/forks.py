@@ -5,11 +5,8 @@ from __future__ import annotations
 import os
 import sys
 import traceback
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
-
-from brainbench.core.errors import BrainbenchError
 
 
 def fork(work: Callable[[], None], out: Path, err: Path | None = None) -> int:
@@ -37,12 +34,3 @@ def fork(work: Callable[[], None], out: Path, err: Path | None = None) -> int:
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(status)
-
-
-@contextmanager
-def sentences() -> Iterator[None]:
-    """End a process with the sentence of an error, as the command line does."""
-    try:
-        yield
-    except BrainbenchError as error:
-        sys.exit(str(error))

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,23 +14,22 @@ from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.rod.engine import make_task
 from brainbench.stimuli.engines.rod.packing import knots_alike
 from brainbench.stimuli.fitting.gradients import GradientRun, JobParameters
-from brainbench.stimuli.motion.jobs import Job, StillFollicle, Trace
+from brainbench.stimuli.motion.jobs import Job, Trace
 from brainbench.stimuli.objects.obstacle import Obstacle, Part
 from brainbench.stimuli.whiskers.whisker import Whisker, build_chain
+from tests.factories.engine_scenes import Oscillation
 
 COARSE = Fidelity(links=8, time_step=1e-4)
 WHISKER = Whisker(0.02, 5e-5, 5e-6, 3e9, 1300.0, 0.3, curvature=10.0, friction=0.0)
 
 
-class Swing:
+@dataclass(frozen=True)
+class Swing(Oscillation):
     """A base that swings by .35 rad at 10 Hz about its rest, in all three angles."""
 
-    finest = 0.05
-
-    def pose(self, times: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return positions [n, 3] (m) and angles [n, 3] (rad)."""
-        position, euler = StillFollicle().pose(times)
-        return position, euler + 0.35 * np.sin(20 * np.pi * times)[:, None] * [1.0, 0.3, 0.4]
+    finest: ClassVar[float] = 0.05
+    angles: tuple[float, float, float] = (0.35, 0.105, 0.14)
+    frequency: float = 10.0
 
 
 def touching_job(solid: Part | Mesh, *, friction: float = 0.0, frames: int = 30) -> Job:
@@ -37,7 +37,9 @@ def touching_job(solid: Part | Mesh, *, friction: float = 0.0, frames: int = 30)
     whole = ((), solid) if isinstance(solid, Mesh) else ((solid,), None)
     obstacle = Obstacle(whole[0], surface=whole[1])
     whisker = replace(WHISKER, friction=friction)
-    return Job(whisker, Swing(), (obstacle,), np.linspace(1e-3, frames * 1e-3, frames))
+    return Job(
+        whisker, Swing((0.35, 0.105, 0.14), frequency=10.0), (obstacle,), np.linspace(1e-3, frames * 1e-3, frames)
+    )
 
 
 def gradient_errors(

@@ -25,7 +25,8 @@ from typing import Any
 
 import torch
 
-from tests.factories.forks import fork, sentences
+from brainbench.core.errors import BrainbenchError
+from tests.factories.forks import fork
 from tests.factories.sweep_batches import files_of
 
 PAUSE = 0.2
@@ -55,9 +56,11 @@ class KillJob:
     """Names of files that hold times, which are only there or not."""
 
     def do(self, inputs: Path, out: Path) -> None:
-        """Do the work; an error is a sentence."""
-        with sentences():
+        """Do the work; the process ends with the sentence of an error, as the command line does."""
+        try:
             self.run(inputs, out)
+        except BrainbenchError as error:
+            sys.exit(str(error))
 
 
 @dataclass
@@ -276,7 +279,7 @@ def _write_checkpoint(inputs: Path) -> None:
 
 
 def _write_tree(inputs: Path) -> None:
-    from tests.factories.published_sweeps import write_tree
+    from tests.factories.published_files import write_tree
 
     write_tree(inputs / "tree", sizes=(40, 20, 20))
 

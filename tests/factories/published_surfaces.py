@@ -22,9 +22,7 @@ from brainbench.published.checkpoint_import import (
 )
 from brainbench.published.conversion import SweepFile, open_sweep_tree, read_sweep
 from brainbench.published.estimator import explain_file
-from tests.factories.published_files import lightning_state
-from tests.factories.published_recordings import make_zero_filled, write_published
-from tests.factories.published_sweeps import write_sweep
+from tests.factories.published_files import lightning_state, make_zero_filled, write_published, write_sweep
 from tests.factories.reading_trials import Surface, bad_counts, not_finite, numbers, written
 
 SETTINGS = """

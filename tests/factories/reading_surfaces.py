@@ -13,7 +13,6 @@ from types import SimpleNamespace
 from typing import Any
 from unittest import mock
 
-import h5py
 import numpy as np
 import torch
 from safetensors.torch import save_file
@@ -48,14 +47,15 @@ from brainbench.stimuli.stimulus_set import hash_stimulus_set, write_stimulus_se
 from leaderboards import build_leaderboard, read_records
 from leaderboards.held_out import Commitment
 from leaderboards.site.build import MANIFEST, check_site
+from tests.factories.published_files import write_run
 from tests.factories.published_surfaces import PUBLISHED
-from tests.factories.published_sweeps import write_run
 from tests.factories.reading_trials import Surface, bad_counts, not_finite, numbers, typed, written, written_json
 from tests.factories.recording_files import write_nwb
 from tests.factories.recordings import make_simple_session, make_stimuli
 from tests.factories.records import make_record
 from tests.factories.robot_surfaces import ROBOTS
 from tests.factories.scene_files import POLE
+from tests.factories.scored_files import write_arrays
 from tests.factories.sweep_batches import small_set
 from tests.factories.training_sweeps import tiny
 
@@ -119,13 +119,6 @@ def _stimulus_set(folder: Path) -> Path:
     return write_stimulus_set(dataset.assign_attrs(content_hash=hash_stimulus_set(dataset)), folder / "set.h5")
 
 
-def _arrays(folder: Path) -> Path:
-    with h5py.File(folder / "arrays.h5", "w") as file:
-        file["stimuli"] = np.arange(24.0).reshape(4, 3, 2)
-        file.create_dataset("labels", data=list("abcd"), dtype=h5py.string_dtype())
-    return folder / "arrays.h5"
-
-
 def _activations(folder: Path) -> Path:
     layers = {"one": np.arange(8.0).reshape(4, 2), "two": np.ones((4, 3, 2), np.float32)}
     return write_features(folder / "features.h5", list("abcd"), layers)
@@ -159,15 +152,9 @@ def _bad_run(dataset: Any) -> bool:
     return not good.all()
 
 
-def _trajectory(folder: Path) -> Path:
-    values = np.random.default_rng(0).normal(size=(62, 12))
-    np.savetxt(folder / "whisking.csv", values, delimiter=",", fmt="%.4g")
-    return folder / "whisking.csv"
-
-
-def _angles(folder: Path) -> Path:
-    np.savetxt(folder / "angles.csv", np.zeros((62, 3)), delimiter=",", fmt="%.4g")
-    return folder / "angles.csv"
+def _table(columns: int, folder: Path) -> Path:
+    np.savetxt(folder / "table.csv", np.random.default_rng(0).normal(size=(62, columns)), delimiter=",", fmt="%.4g")
+    return folder / "table.csv"
 
 
 def _model() -> torch.nn.Module:
@@ -314,7 +301,10 @@ SURFACES = (
         lambda copies: not copies[0].is_file(),
     ),
     Surface("stimulus set", _stimulus_set, lambda path: load_stimuli(path).input),
-    Surface("stimulus arrays", _arrays, lambda path: load_stimuli(path).input),
+    Surface(
+        "stimulus arrays", lambda folder: write_arrays(folder / "arrays.h5", "abcd"),
+        lambda path: load_stimuli(path).input,
+    ),
     # NaN in activations is a missing value, and the score of such a layer has a status.
     Surface(
         "activations", _activations, read_features,
@@ -327,8 +317,8 @@ SURFACES = (
     ),
     Surface("WHISKiT names", partial(_run, "whisker_ID.csv"), _read_run, _bad_run),
     Surface("WHISKiT table", partial(_run, "dynamics/Fx.csv"), _read_run, _bad_run),
-    Surface("trajectory", _trajectory, load_trajectory),
-    Surface("starting angles", _angles, load_initial_angles),
+    Surface("trajectory", partial(_table, 12), load_trajectory),
+    Surface("starting angles", partial(_table, 3), load_initial_angles),
     Surface("network, JSON", written_json("graph.json", GRAPH), read_graph, _bad_graph),
     Surface("weights", _weights, _load),
     Surface("model configuration", written_json("config.json", MODEL), lambda path: read_config(path.parent)),

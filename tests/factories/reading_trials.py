@@ -20,7 +20,7 @@ import xarray as xr
 
 from brainbench.core.errors import BrainbenchError
 from brainbench.core.files import write_json
-from tests.factories.damage import damage, remove
+from tests.factories.damage import damage
 
 SECONDS = 10.0
 """Seconds of work after which a reader hangs; by the clock, what waits has three times as many on a busy machine."""
@@ -114,8 +114,6 @@ def attempt(surface: Surface, good: Path, seed: int, change: Callable[[Path, int
             return Outcome("memory", what, str(error))
         except (Exception, SystemExit) as error:  # noqa: BLE001 - to find them is the purpose
             return Outcome("traceback", what, f"{type(error).__name__}: {str(error)[:200]}")
-        finally:
-            remove(path)
         return Outcome("silent" if faulty else "accepted", what)
 
 

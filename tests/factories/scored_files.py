@@ -34,11 +34,12 @@ def _record(rng: np.random.Generator, folder: Path, animals: str, labels: Sequen
         write_recordings(folder / f"{animal}.h5", session)
 
 
-def _show(rng: np.random.Generator, path: Path, labels: Sequence[str]):
+def write_arrays(path: Path, labels: Sequence[str]) -> Path:
     """Write random arrays as stimuli."""
     with h5py.File(path, "w") as file:
-        file["stimuli"] = rng.normal(size=(len(labels), 3, 2, 2, 2)).astype(np.float32)
-        file["labels"] = np.array(labels, dtype=h5py.string_dtype())
+        file["stimuli"] = np.random.default_rng(1).normal(size=(len(labels), 3, 2, 2, 2)).astype(np.float32)
+        file["labels"] = np.array(list(labels), dtype=h5py.string_dtype())
+    return path
 
 
 def write_scored_files(tmp_path: Path) -> dict[str, str]:
@@ -46,7 +47,7 @@ def write_scored_files(tmp_path: Path) -> dict[str, str]:
     rng = np.random.default_rng(0)
     _record(rng, tmp_path / "data", "xy", LABELS, 10, 60.0)
     features = write_features(tmp_path / "features.h5", LABELS, {"fc": rng.normal(size=(4, 6))})
-    _show(rng, tmp_path / "arrays.h5", LABELS)
+    write_arrays(tmp_path / "arrays.h5", LABELS)
     (tmp_path / "mine.py").write_text(
         "from torch import nn\n\n\nclass Mine(nn.Module):\n"
         "    def __init__(self):\n        super().__init__()\n        self.gru = nn.GRU(8, 6, batch_first=True)\n\n"
@@ -65,7 +66,7 @@ def write_study(tmp_path: Path) -> dict[str, str]:
     """Write four animals and eight stimuli; features and a module for them."""
     rng = np.random.default_rng(0)
     _record(rng, tmp_path / "data", "wxyz", EIGHT, 8, 90.0)
-    _show(rng, tmp_path / "eight.h5", EIGHT)
+    write_arrays(tmp_path / "eight.h5", EIGHT)
     features = write_features(tmp_path / "features.h5", EIGHT, {"fc": rng.normal(size=(len(EIGHT), 6))})
     paths = {"data": "data", "arrays": "eight.h5", "board": "board", "secret": "secret", "out": "out"}
     return {name: str(tmp_path / path) for name, path in paths.items()} | {"features": str(features)}

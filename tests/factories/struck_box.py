@@ -8,6 +8,7 @@ from robotics_bridge.physics.scene import Geometry, TouchScene
 from robotics_bridge.physics.state import HandState
 from robotics_bridge.sensors.audio.sensors import ContactAudio, Modes
 from robotics_bridge.sensors.suite import SensorSuite
+from tests.factories.touch_scenes import pad_scene
 
 MODES = Modes((500.0, 1730.0, 4100.0), (8.0, 15.0, 40.0), (1.0, -0.7, 0.4))
 DT, K = 0.005, 160
@@ -16,11 +17,8 @@ RATE = K / DT
 
 def box_scene() -> TouchScene:
     """Return a box that a ball may strike."""
-    shapes = (
-        Geometry(name="box", link="box", kind="box", size=(0.1, 0.1, 0.01)),
-        Geometry(name="ball", link="ball", kind="sphere", size=(0.02,)),
-    )
-    return TouchScene(("world", "box", "ball"), shapes)
+    ball = Geometry(name="ball", link="ball", kind="sphere", size=(0.02,))
+    return pad_scene(ball, pad=Geometry(name="box", link="box", kind="box", size=(0.1, 0.1, 0.01)))
 
 
 def make_box(envs: int = 1, **knobs) -> tuple[SensorSuite, HandState]:

@@ -34,9 +34,8 @@ def falling(num_envs: int, dofs: int) -> np.ndarray:
 
 
 def pad_scene(*objects: Geometry, pad: Geometry = PAD) -> TouchScene:
-    """A pad on link ``hand`` (its top at z = 5 mm), and objects on links of their own."""
-    links = ("world", "hand", *dict.fromkeys(g.link for g in objects))
-    return TouchScene(links, (pad, *objects))
+    """A pad, by default on link ``hand`` (its top at z = 5 mm), and objects on links of their own."""
+    return TouchScene(("world", pad.link, *dict.fromkeys(g.link for g in objects)), (pad, *objects))
 
 
 def random_pose(rng: np.random.Generator, reach: float = 0.05) -> np.ndarray:
@@ -111,11 +110,8 @@ PLAIN = ThermalMaterial(2.0, 1000.0, 1000.0, 0.8)
 
 def make_grid(envs: int = 1, half: tuple[float, float, float] = (0.01, 0.02, 0.03), contacts: int = 0, **knobs):
     """Return a suite with one grid on a box, and a state; links are world, pad and object."""
-    geometries = (
-        Geometry(name="pad", link="pad", kind="box", size=half),
-        Geometry(name="object", link="object", kind="sphere", size=(0.04,)),
-    )
-    scene = TouchScene(("world", "pad", "object"), geometries)
+    ball = Geometry(name="object", link="object", kind="sphere", size=(0.04,))
+    scene = pad_scene(ball, pad=Geometry(name="pad", link="pad", kind="box", size=half))
     defaults = {"convection": 0.0, "radiates": False, "material": PLAIN}
     suite = SensorSuite(scene, {"grid": TemperatureGrid(link="pad", **{**defaults, **knobs})}, num_envs=envs)
     return suite, HandState.empty(envs, 3, contacts)

@@ -1,8 +1,69 @@
-"""Random sweeps in SI, and a tiny labelled data set: three classes that differ in which whiskers are loaded."""
+"""Random sweeps in SI, and labelled data sets in memory; classes differ in which whiskers are loaded."""
+
+import math
+from collections.abc import Iterator, Mapping
+from typing import Any
 
 import torch
 
-from tests.factories.array_data import ArrayData
+from brainbench.models.training.batches import BatchOptions
+
+
+class ArrayBatches:
+    """Batches of sweeps in memory [N, T, S·C, H, W] in SI with integer labels [N], in an order drawn in every epoch."""
+
+    def __init__(self, sweeps: Any, labels: Any, options: BatchOptions) -> None:
+        self.sweeps, self.labels, self.options = torch.as_tensor(sweeps), torch.as_tensor(labels).long(), options
+        self.epoch = self._batch = 0
+
+    def __len__(self) -> int:
+        parts = self.options.part[1]
+        # Every process gets equally many sweeps (the rest is left out), or one would wait for the others for ever.
+        return math.ceil(len(self.labels) // parts / (self.options.batch_size // parts))
+
+    def __iter__(self) -> Iterator[tuple[torch.Tensor, torch.Tensor]]:
+        if self._batch >= len(self):
+            self.epoch, self._batch = self.epoch + 1, 0
+        rank, parts = self.options.part
+        count, size = len(self.labels) // parts * parts, self.options.batch_size // parts
+        order = torch.arange(len(self.labels))
+        if self.options.shuffle:
+            # The order depends on seed and epoch alone, so going on in mid-epoch needs no state of a generator.
+            generator = torch.Generator().manual_seed(self.options.seed * 1_000_003 + self.epoch)
+            order = torch.randperm(len(self.labels), generator=generator)
+        # Every number-th sweep of one shuffled order: processes together see the batches that one process would.
+        mine = order[:count][rank::parts]
+        while self._batch < len(self):
+            chosen = mine[self._batch * size : (self._batch + 1) * size]
+            self._batch += 1
+            yield self.sweeps[chosen], self.labels[chosen]
+        self.epoch, self._batch = self.epoch + 1, 0
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return where the iteration stands."""
+        seed, size = self.options.seed, self.options.batch_size
+        return {"seed": seed, "batch_size": size, "epoch": self.epoch, "batch": self._batch}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go on where another iteration over the same sweeps stood."""
+        assert (state["seed"], state["batch_size"]) == (self.options.seed, self.options.batch_size)
+        self.epoch, self._batch = int(state["epoch"]), int(state["batch"])
+
+
+class ArrayData:
+    """A data set in memory: names of the classes, and the splits ``train``, ``validation`` and ``test``.
+
+    A split is (sweeps [N, T, S·C, H, W] in SI, labels [N]).
+    """
+
+    def __init__(self, classes: tuple[str, ...], **splits: tuple[Any, Any]) -> None:
+        self.classes, self.splits = tuple(classes), splits
+        self.summary: Mapping[str, Any] = {}
+
+    def batches(self, split: str, options: BatchOptions) -> ArrayBatches | None:
+        """Return a split's batches, None if there is no such split; they are moved by whoever reads them."""
+        return ArrayBatches(*self.splits[split], options) if split in self.splits else None
+
 
 CLASSES = ("front", "middle", "back")
 SCALE = torch.tensor(([1e-4] * 3 + [1e-6] * 3) * 5)[:, None, None]

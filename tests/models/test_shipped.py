@@ -10,8 +10,7 @@ from brainbench.models.recipes import Architecture
 from brainbench.models.registry import describe_model, load_model
 from brainbench.models.training.batches import BatchOptions
 from brainbench.models.training.checkpoints import CARD, WEIGHTS, read_config, shipped
-from tests.factories.array_data import ArrayBatches
-from tests.factories.training_sweeps import sweeps
+from tests.factories.training_sweeps import ArrayBatches, sweeps
 
 NAMES = sorted(shipped())
 CLASSES = 54

@@ -6,7 +6,7 @@ import pytest
 
 from brainbench.datasets import WhiskingDataset
 from brainbench.stimuli import load_stimuli
-from tests.factories.published_sweeps import sweep_data, write_run, write_sweep, write_tree
+from tests.factories.published_files import sweep_data, write_run, write_sweep, write_tree
 
 
 @pytest.fixture(scope="module")

@@ -17,7 +17,7 @@ from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError
 from brainbench.datasets.whisking.dataset import WhiskingDataset
 from brainbench.published import conversion
 from brainbench.published.conversion import CELLS, Listed, SweepTree, convert_sweeps, read_sweep
-from tests.factories.published_sweeps import sweep_data, write_sweep, write_tree
+from tests.factories.published_files import sweep_data, write_sweep, write_tree
 from tests.factories.sweep_batches import files_of
 
 ROOT = Path(__file__).parents[2]

@@ -36,7 +36,7 @@ from brainbench.published.estimator import (
 )
 from tests.factories.animals import STIMULI as LABELS
 from tests.factories.animals import make_rdm, make_subject
-from tests.factories.published_recordings import make_zero_filled
+from tests.factories.published_files import make_zero_filled
 from tests.factories.training_sweeps import random_sweeps
 
 SPLITS = 60

@@ -12,7 +12,7 @@ from brainbench.core.errors import UsageError
 from brainbench.published.estimator import POOL, make_targets, score_published
 from brainbench.scoring.neural_responses import open_neural_responses
 from brainbench.scoring.scores import score_record
-from tests.factories.published_recordings import make_zero_filled, write_published
+from tests.factories.published_files import make_zero_filled, write_published
 
 SLOTS = tuple(f"slot-{number}" for number in range(1, 7))
 

@@ -8,7 +8,7 @@ import pytest
 from brainbench.core.errors import DataError, UsageError
 from brainbench.datasets import check, inspect, open_recordings
 from brainbench.published.recordings import SILENT, read_published
-from tests.factories.published_recordings import make_zero_filled, write_published
+from tests.factories.published_files import make_zero_filled, write_published
 
 
 @pytest.fixture

@@ -31,7 +31,7 @@ from brainbench.stimuli.scenes.scene import Frames, Scene
 from brainbench.stimuli.simulation import simulate
 from brainbench.stimuli.whiskers.array import WhiskerArray
 from brainbench.stimuli.whiskers.whisker import build_chain
-from tests.factories.published_sweeps import write_run
+from tests.factories.published_files import write_run
 
 TABLES = ("param_name", "param_side_row_col", "param_s_a", "param_bp_pos", "param_bp_angles", "param_angles")
 

@@ -15,7 +15,7 @@ from brainbench.stimuli.scenes.recipes import get_recipe
 from brainbench.stimuli.scenes.scene import Frames, Head, Scene
 from brainbench.stimuli.simulation import simulate
 from brainbench.stimuli.whiskers.array import WhiskerArray
-from tests.factories.pushed_bar import AT, DEFLECTION, STRAIGHT, pushed_bar
+from tests.factories.engine_scenes import AT, DEFLECTION, STRAIGHT, pushed_bar
 
 
 def _wrench(scene):

@@ -14,8 +14,8 @@ from brainbench.stimuli.motion.trajectories import Still, Translation, Whisking
 from brainbench.stimuli.scenes.scene import Animal, Frames, Head, Scene
 from brainbench.stimuli.simulation import record, simulate
 from brainbench.stimuli.whiskers.array import WhiskerArray
+from tests.factories.engine_scenes import pushed_bar
 from tests.factories.engines import FakeEngine
-from tests.factories.pushed_bar import pushed_bar
 
 FAST = Fidelity.preset("fast")
 ARRAY = WhiskerArray.mouse(whiskers="C1,D4")

@@ -29,8 +29,7 @@ from brainbench.models.training.evaluation import (
     topk,
 )
 from brainbench.models.training.trainer import train
-from tests.factories.array_data import ArrayBatches
-from tests.factories.training_sweeps import sweeps, tiny
+from tests.factories.training_sweeps import ArrayBatches, sweeps, tiny
 
 
 class Fixed(nn.Module):

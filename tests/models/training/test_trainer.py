@@ -420,7 +420,7 @@ def test_silence_before_touch_explodes_the_gradient_of_layer_norm_unless_biases_
 
 
 def test_a_run_of_a_layer_normalised_network_on_late_touch_trains(tmp_path):
-    from tests.factories.array_data import ArrayData
+    from tests.factories.training_sweeps import ArrayData
 
     data = ArrayData(("front", "middle", "back"), train=_late_touch())
     config = _config(model="zhuang-intersection-ln-small", epochs=1, batch_size=4)

@@ -13,7 +13,7 @@ from brainbench.stimuli.engines.stepping import SteppedJob
 from brainbench.stimuli.motion.jobs import Job, StillFollicle
 from brainbench.stimuli.motion.trajectories import Whisking
 from brainbench.stimuli.objects.obstacle import Obstacle, Sphere
-from tests.factories.swing import FLAT, Oscillation
+from tests.factories.engine_scenes import FLAT, Oscillation
 from tests.factories.whiskers import C2
 
 

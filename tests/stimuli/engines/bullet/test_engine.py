@@ -31,8 +31,7 @@ from brainbench.stimuli.objects.obstacle import Box, Capsule, ConvexPart, Cylind
 from brainbench.stimuli.scenes.scene import Frames
 from brainbench.stimuli.validation import bench_tests
 from brainbench.stimuli.whiskers.whisker import Whisker, build_chain
-from tests.factories.obstacles import post
-from tests.factories.swing import Swing
+from tests.factories.engine_scenes import Swing, post
 from tests.factories.whiskers import C2
 
 needs_bullet = pytest.mark.skipif(find_spec("pybullet") is None, reason="PyBullet is made for Python below 3.12")
