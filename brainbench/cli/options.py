@@ -36,8 +36,11 @@ from brainbench.core.files import CACHE_VARIABLE, cache_dir, check_folder
 from brainbench.core.limits import bounds_of, check_value
 from brainbench.core.reading.hdf5 import LINKED_VARIABLE
 
-WorkersOption = Annotated[int | None, typer.Option(min=1, help="Processes. [default: as many as there are processors]")]
+WorkersOption = Annotated[
+    int | None, typer.Option(min=1, help="Processes. \\[default: as many as there are processors]")
+]
 SeedOption = Annotated[int, typer.Option(help="Seed of untrained weights.")]
+PlanOption = Annotated[Path | None, typer.Option(help="Seal the design in this JSON file, for 'score --plan'.")]
 SchedulerOption = Annotated[str | None, typer.Option(help="Let workers of a Dask scheduler (tcp://host:8786) do it.")]
 
 SCORE = "brainbench.scoring.options:ScoreOptions"
@@ -332,9 +335,9 @@ def part_of(text: str, what: str) -> tuple[int, int]:
 
 
 def _plain(text: str) -> str:
-    """Return a docstring without its markup."""
+    """Return a docstring without its markup; a unit in brackets is none of the terminal's."""
     text = re.sub(r":\w+:`~?(?:[\w.]*\.)?(\w+)`", r"\1", text).replace("``", "")
-    return " ".join(text.split())
+    return re.sub(r"\[(?=[a-z#/@])", r"\\[", " ".join(text.split()))
 
 
 def out_folder(option: typer.CallbackParam, path: Path | None) -> Path | None:

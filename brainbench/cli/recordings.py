@@ -206,9 +206,7 @@ def check(
     source: Annotated[
         str, typer.Argument(help="'demo', an NWB, HDF5 or published .npz file, a folder, a glob, or LAYOUT:PATH.")
     ],
-    conditions: Annotated[
-        str | None, typer.Option(help="TABLE:COLUMN[,COLUMN] whose labels are checked; the layout's by default.")
-    ] = None,
+    conditions: Annotated[str | None, option(SCORE, "conditions")] = None,
     strict: Annotated[bool, typer.Option("--strict", help="Fail on warnings too.")] = False,
 ) -> Output:
     """Look for what would make scores wrong: clock, coverage, labels, units, tables, times. Worst first.

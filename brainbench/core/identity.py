@@ -110,7 +110,7 @@ class SealedPlan:
     animals: Count
     metric: str = "rsa"
     layer: str | None = None
-    """Layer that is committed to; None for a choice on held-out animals."""
+    """Layer that is committed to; by default a choice on held-out animals."""
     layers: Count | None = None
     """Most layers among which is chosen; None where any number is."""
     names: tuple[str, ...] = ()

@@ -65,7 +65,8 @@ class ScoreOptions:
     whiskers: str = "all"
     """Whiskers to simulate: all, C0-C3, C2,D1, …"""
     fidelity: str | Fidelity | None = "balanced"
-    """Simulation preset: balanced, accurate, or fast (to try things out; coarse RDMs)."""
+    """Simulation preset: balanced, accurate, or fast (to try things out; coarse RDMs); single values may follow, as in
+    fast,links=12,time_step=5e-4."""
     layers: tuple[str, ...] | None = None
     """Comma-separated layers to compare; all by default."""
     layer: str | None = None

@@ -358,13 +358,10 @@ def record(
     progress: Progress | None = None,
     cache: bool = True,
 ) -> Recording:
-    """Simulate a scene and return the shapes of its whiskers.
+    """Simulate a scene and return the shapes of its whiskers at ``times`` [n] (s), increasing, not before t = 0.
 
-    Args:
-        scene: what to simulate; its frames do not matter.
-        times: instants [n] (s), increasing, not before t = 0.
-        fidelity, backend, progress, cache: as for :func:`brainbench.stimuli.simulate`; shapes have a cache of their
-            own.
+    Its frames do not matter. Other arguments are those of :func:`brainbench.stimuli.simulate`; shapes have a cache of
+    their own.
     """
     times = np.atleast_1d(np.asarray(times, dtype=float))
     engine, fidelity = resolve(backend, fidelity, [scene])

@@ -108,9 +108,9 @@ class DriverRequest:
     address: str = ""
     """Where the hand is, as HOST:PORT or :PORT."""
     key: Path | None = None
-    """File with the key that the hand holds too."""
+    """File with the key that a hand behind a socket holds too."""
     faults: tuple[str, ...] = ()
-    """Faults of a simulated hand, as ``drop=0.2``."""
+    """Faults of the simulated hand: drop=0.2, jitter=0.03, silent-after=2, …"""
     seconds: float = 60.0
     """For how long the hand is needed."""
 

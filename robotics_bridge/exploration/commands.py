@@ -10,6 +10,7 @@ import typer
 from brainbench.cli.options import needs, out_file_option, with_options
 from brainbench.cli.output import Output, progress_bar, table_of
 from brainbench.cli.policy.train import ENV, HandOption
+from brainbench.cli.stimuli.scenes import UnitOption
 
 if TYPE_CHECKING:
     from robotics_bridge.exploration.record import Explored
@@ -36,7 +37,7 @@ def hand(
     ] = None,
     hand: HandOption = "xhand1",
     diagonal: Annotated[float, typer.Option(help="Size of shapes and meshes (mm).")] = 55.0,
-    unit: Annotated[str | None, typer.Option(help="Length unit of mesh files.")] = None,
+    unit: UnitOption = None,
     frames: Annotated[int, typer.Option(help="Frames of 9 ms; a multiple of 5.")] = 110,
 ) -> Output:
     """Record exploratory procedures of a robot hand as a stimulus set that any model can be scored or probed on.

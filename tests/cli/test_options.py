@@ -7,6 +7,8 @@ from dataclasses import fields, replace
 from importlib.util import find_spec
 
 import pytest
+from rich.text import Text
+from typer.utils import get_params_from_function
 
 from brainbench.cli import app
 from brainbench.cli.options import (
@@ -285,3 +287,10 @@ def test_a_tolerance_below_nothing_is_refused(run):
 
 def test_every_command_is_guarded():
     assert all(getattr(command, "guarded", False) for _, command in commands(app))
+
+
+@pytest.mark.parametrize("name", [name for name, _ in commands(app)])
+def test_no_word_of_a_help_is_lost_as_markup(name):
+    parameters = get_params_from_function(dict(commands(app))[name].callback).values()
+    helps = [text for item in parameters if (text := getattr(item.default, "help", None))]
+    assert [text for text in helps if Text.from_markup(text).plain != text.replace("\\[", "[")] == []

@@ -8,13 +8,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from brainbench.cli.options import out_file, with_options
+from brainbench.cli.options import option, out_file, with_options
 from brainbench.cli.output import Output, progress_bar
 
 if TYPE_CHECKING:
     from robotics_bridge.deploy.controller import DeployedPolicy
 
 
+DRIVER = "robotics_bridge.deploy.driver:DriverRequest"
 LINKS = "robotics_bridge.links"
 """Entry points of what a hand's link adds: touch simulated beside it, and recorders of sessions."""
 
@@ -53,11 +54,9 @@ def deploy(
             help="sim: a simulated hand of its own process; HOST:PORT, or :PORT on this computer, of another."
         ),
     ] = "sim",
-    key: Annotated[Path | None, typer.Option(help="File with the key that a hand behind a socket holds too.")] = None,
+    key: Annotated[Path | None, option(DRIVER, "key")] = None,
     seconds: Annotated[float, typer.Option(help="How long.")] = 10.0,
-    fault: Annotated[
-        list[str] | None, typer.Option(help="Of the simulated hand: drop=0.2, jitter=0.03, silent-after=2, …")
-    ] = None,
+    fault: Annotated[list[str] | None, option(DRIVER, "faults")] = None,
     inputs: Annotated[
         list[str] | None,
         typer.Option("--input", help="Constant for what the hand cannot measure: NAME=NUMBER or NAME=NUMBER,…"),

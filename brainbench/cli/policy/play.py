@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -11,6 +12,7 @@ import typer
 from brainbench.cli.options import out_file, out_file_option, with_options
 from brainbench.cli.output import Output, facts, progress_bar, table_of
 from brainbench.cli.policy.train import ENV, ENVS_FLAG, TOUCH, World, agent_of, in_world, touch_of
+from brainbench.core.limits import Limit, Positive
 
 
 def list_tasks() -> Output:
@@ -51,24 +53,32 @@ def list_tasks() -> Output:
     return Output(rows, f"{table_of('', rows, columns)}\n\n{trained}")
 
 
+@dataclass(frozen=True)
+class Film:
+    """How long an agent acts, and the frames of a film of it."""
+
+    seconds: Positive = 4.0
+    """Simulated time."""
+    rate: Positive = 20.0
+    """Frames per simulated second of a film."""
+    width: Annotated[int, Limit(least=64)] = 480
+    """Width of a frame [pixels]."""
+
+
 @with_options(ENV, (*TOUCH, "device", "seed"), build=False)
+@with_options("brainbench.cli.policy.play:Film", parameter="film")
 @in_world
 def play(
     world: World,
     options: dict[str, Any],
+    film: Film,
     agent: Annotated[str, typer.Option(help="zero, random, a shipped policy, or a run's folder.")] = "random",
     video: Annotated[Path | None, typer.Option(callback=out_file, help="Write a film here (.mp4 or .gif).")] = None,
-    seconds: Annotated[float, typer.Option(help="Simulated time.")] = 4.0,
-    rate: Annotated[float, typer.Option(help="Frames per simulated second of a film.")] = 20.0,
-    width: Annotated[int, typer.Option(help="Of a frame [pixels].")] = 480,
 ) -> Output:
     """Run an agent in one environment of a task and show what happens, as numbers and as a film."""
-    from brainbench.core.errors import check_number
     from brainbench.core.figures import check_format
     from robotics_bridge.tasks.settings import contacts_name
 
-    for flag, number, bound in (("--seconds", seconds, 0), ("--rate", rate, 0), ("--width (pixels)", width, 63)):
-        check_number(flag, number, above=bound)
     world.check([agent])
     if video is not None:
         check_format(video, (".mp4", ".gif"))
@@ -79,16 +89,16 @@ def play(
     options |= touch_of([agent])
     env = world.make([agent], num_envs=1, threads=1, **options)
     act = agent_of(agent, env, seed=options["seed"])
-    steps = max(round(seconds / env.step_dt), 1)
+    steps = max(round(film.seconds / env.step_dt), 1)
     rewards: list[float] = []
     ended, dropped, goals, turned = 0, 0, 0, 0.0
     with progress_bar() as progress:
-        size, film = (width, round(width * 5 / 6)), []
+        size, frames = (film.width, round(film.width * 5 / 6)), []
         stage = None if video is None else Stage(env, size)
-        every = max(round(1 / (rate * env.step_dt)), 1)
+        every = max(round(1 / (film.rate * env.step_dt)), 1)
         for step in range(steps):
             if stage is not None and step % every == 0:
-                film.append(stage.frame())
+                frames.append(stage.frame())
             _, reward, terminated, truncated, info = env.step(act(env.observations))
             rewards.append(float(reward))
             over = bool(terminated | truncated)
@@ -100,7 +110,7 @@ def play(
                 goals, turned = goals + int(info["goals"]), turned + float(info["turned"])
             progress(step + 1, steps, "playing")
         if video is not None:
-            write_video(video, film, size, 1 / (every * env.step_dt))
+            write_video(video, frames, size, 1 / (every * env.step_dt))
     result = {
         "task": env.task.name, "hand": env.hand.name, "contacts": contacts_name(env.task.contacts), "agent": agent,
         "seconds": steps * env.step_dt, "reward": sum(rewards), "episodes_ended": ended,

@@ -16,10 +16,12 @@ from brainbench.cli.output import Output, facts, progress_bar, table, table_of
 
 if TYPE_CHECKING:
     from robotics_bridge.envs import Env
+    from robotics_bridge.policies.training.teacher import StudentRun
 
 
 TaskArgument = Annotated[str, typer.Argument(help="A task: in_palm_rotate, in_hand_repose, screwdriver, hot_ball.")]
-HandOption = Annotated[str, typer.Option(help="xhand1, sharpa, or a URDF or MJCF file.")]
+DISTILL = "robotics_bridge.policies.training.distill_config:DistillConfig"
+HandOption = Annotated[str, option(DISTILL, "hand")]
 TaskFileOption = Annotated[Path | None, typer.Option(help="Python file that registers a task of your own.")]
 ENV, ENVS_FLAG = "robotics_bridge.envs.simulation:EnvOptions", {"num_envs": ("--envs",)}
 DeviceOption = Annotated[str, option(ENV, "device")]
@@ -33,7 +35,7 @@ class World:
 
     task: TaskArgument
     hand: HandOption = "xhand1"
-    config: Annotated[str, typer.Option(help="Configuration of the task: default, published, …")] = "default"
+    config: Annotated[str, option(DISTILL, "variant")] = "default"
     change: Annotated[
         list[str] | None, typer.Option(help="Another number of the task: contacts=firm, is_dropped=-300, entropy=0, …")
     ] = None
@@ -174,8 +176,8 @@ def train(
     return Output(summary | {"last": last}, facts(lines))
 
 
-DISTILL = "robotics_bridge.policies.training.distill_config:DistillConfig"
 DISTILL_FLAGS = ENVS_FLAG | {"variant": ("--config",)}
+STUDENT = "robotics_bridge.policies.training.teacher:StudentRun"
 OFFERED = (
     "encoder", "observe", "placement", "resolution", "noisy", "contacts", "embedder", "hand", "variant", "num_envs",
     "iterations", "learning_rate", "epochs", "hidden", "teacher_share", "teacher_iterations", "aggregate", "precision",
@@ -184,6 +186,7 @@ OFFERED = (
 """Fields of a student's configuration that have a flag of their name."""
 
 
+@with_options(STUDENT, ("episodes", "device", "stop_after", "stop_at"), parameter="how", build=False)
 @with_options(DISTILL, OFFERED, flags=DISTILL_FLAGS, build=False)
 @with_options(
     "robotics_bridge.policies.encoders.arms:EncoderConfig",
@@ -194,25 +197,22 @@ OFFERED = (
 )
 def distill(
     task: TaskArgument,
-    teacher: Annotated[Path, typer.Option(help="A shipped teacher, or a folder of brainbench policy train.")],
+    teacher: Annotated[Path, option(DISTILL, "teacher")],
     options: dict[str, Any],
     of_encoder: dict[str, Any],
+    how: dict[str, Any],
     out: Annotated[
         Path | None, typer.Option(callback=out_folder, help="Folder of the run; by default students/<what it is>.")
     ] = None,
     unroll: Annotated[
         str | None, typer.Option(help="Of a graph model: full answers at once, biological after a step per layer.")
     ] = None,
-    episodes: Annotated[int, typer.Option(help="Of the evaluation, per seed; 0 for none.")] = 100,
-    device: DeviceOption = "cpu",
-    stop_after: Annotated[float | None, typer.Option(help="Save, stop and evaluate after so many seconds.")] = None,
-    stop_at: Annotated[int | None, typer.Option(help="Likewise after so many iterations in all.")] = None,
     task_file: TaskFileOption = None,
 ) -> Output:
     """Distil a teacher into a student that feels; a run that was interrupted goes on when it is started again."""
     from robotics_bridge.policies.encoders.arms import ARMS, AUTO
     from robotics_bridge.policies.training.distill_config import DistillConfig
-    from robotics_bridge.policies.training.teacher import train_student
+    from robotics_bridge.policies.training.teacher import StudentRun, train_student
 
     # The learning of a network is stated in the names and tables of students.
     network = options["encoder"] not in (AUTO, *ARMS)
@@ -222,9 +222,7 @@ def distill(
     config = DistillConfig(task=task, teacher=str(teacher), encoder_settings=settings, **options)
     folder = out or Path("students") / config.name
     with progress_bar() as progress:
-        student = train_student(
-            config, folder, device=device, episodes=episodes, stop_after=stop_after, stop_at=stop_at, progress=progress
-        )
+        student = train_student(config, folder, StudentRun(**how), progress=progress)
     result = {
         "folder": str(student.folder),
         **{name: getattr(student.result, name) for name in ("status", "reason", "iterations", "loss")},
@@ -238,8 +236,12 @@ def distill(
 
 
 @with_options(DISTILL, ("num_envs", "iterations"), parameter="changes", flags=DISTILL_FLAGS, given=True)
+@with_options(
+    STUDENT, ("episodes", "evaluations", "device", "stop_at"), parameter="how", flags={"evaluations": ("--seeds",)}
+)
 def sweep(
     changes: dict[str, Any],
+    how: StudentRun,
     file: Annotated[
         Path | None,
         typer.Argument(help="TOML file, or a shipped sweep: placement-and-type, … (docs/students.md); table-4.10."),
@@ -249,10 +251,6 @@ def sweep(
     names: Annotated[bool, typer.Option("--list", help="Print their names, and stop.")] = False,
     out: Annotated[Path, typer.Option(callback=out_folder, help="Folder of the runs.")] = Path("students"),
     shard: Annotated[str, typer.Option(help="Part of the students, as 0/4.")] = "0/1",
-    stop_at: Annotated[int | None, typer.Option(help="Stop each student, and evaluate it, after so many.")] = None,
-    episodes: Annotated[int, typer.Option(help="Of the evaluation, per seed.")] = 100,
-    evaluations: Annotated[int, typer.Option("--seeds", help="Seeds of the evaluation.", min=1, max=3)] = 3,
-    device: DeviceOption = "cpu",
     task_file: TaskFileOption = None,
 ) -> Output:
     """Distil every student of a sweep that is not finished yet; what was interrupted goes on.
@@ -288,14 +286,11 @@ def sweep(
             except UsageError:
                 results.append({"student": student.name, "status": "at another process", "success": None})
                 continue
-            if is_done(student, folder, stop_at):
+            if is_done(student, folder, how.stop_at):
                 status, success = "there already", success_of(read_json(folder / EVALUATION))
             else:
                 with progress_bar() as progress:
-                    done = train_student(
-                        student, folder, device=device, episodes=episodes, evaluations=evaluations, stop_at=stop_at,
-                        progress=progress,
-                    )  # fmt: skip
+                    done = train_student(student, folder, how, progress=progress)
                 status, success = done.result.status, done.success
             results.append({"student": student.name, "status": status, "success": success})
     columns = {

@@ -26,14 +26,13 @@ if TYPE_CHECKING:
 
 
 WhiskersOption = Annotated[str, option(SCORE, "whiskers")]
-FidelityOption = Annotated[
-    str,
-    typer.Option(
-        help="Simulation preset: fast, balanced or accurate; single values may follow, as in "
-        "fast,links=12,time_step=5e-4,solver=quasistatic."
-    ),
+FidelityOption = Annotated[str, option(SCORE, "fidelity")]
+BackendOption = Annotated[str, option("brainbench.stimuli.sweeps.plan:GenerationSettings", "backend")]
+UnitOption = Annotated[str | None, typer.Option(help="Length unit of mesh files: m, cm, mm, um or in.")]
+CollisionOption = Annotated[
+    str | None,
+    typer.Option(help="What whiskers touch: exact, hull, pieces or decomposition; default as in scene files."),
 ]
-BackendOption = Annotated[str, typer.Option(help="Physics engine: rod (our own), mujoco, or bullet.")]
 StimulusOption = Annotated[str | None, typer.Option("--stimulus", "-s", help="Its label, where there are several.")]
 
 _SHOWN = 20  # scenes that are printed in full; any number is written as JSON
@@ -221,14 +220,11 @@ def objects(
     source: Annotated[str | None, typer.Argument(help="A shape family or a mesh file; all families without.")] = None,
     seed: Annotated[int, typer.Option(help="Which member of the family.")] = 0,
     detail: Annotated[int, typer.Option(help="About how many triangles a family's member has, 2000 to 20000.")] = 4_000,
-    unit: Annotated[str | None, typer.Option(help="Length unit of a mesh file: m, cm, mm, um or in.")] = None,
+    unit: UnitOption = None,
     diagonal_mm: Annotated[
         float | None, typer.Option(help="Scale to this bounding-box diagonal; families have 40 mm by default.")
     ] = None,
-    collision: Annotated[
-        str | None,
-        typer.Option(help="What whiskers touch: exact, hull, pieces or decomposition; default as in scene files."),
-    ] = None,
+    collision: CollisionOption = None,
     export: Annotated[
         Path | None, typer.Option(callback=out_file, help="Write the repaired mesh, in mm (.obj .stl .ply .glb .off).")
     ] = None,
@@ -354,20 +350,18 @@ def render(
     out: Annotated[Path, out_file_option("File to write: .png for one instant, .mp4 or .gif.")],
     stimulus: StimulusOption = None,
     at: Annotated[
-        float | None, typer.Option(help="Instant of a picture, ms. [default: first full protraction]")
+        float | None, typer.Option(help="Instant of a picture, ms. \\[default: first full protraction]")
     ] = None,
     start: Annotated[float, typer.Option(help="First instant of a film, ms.")] = 0.0,
     stop: Annotated[
-        float | None, typer.Option(help="Last instant of a film, ms. [default: 150 ms after start]")
+        float | None, typer.Option(help="Last instant of a film, ms. \\[default: 150 ms after start]")
     ] = None,
     step: Annotated[float, typer.Option(help="Time between the frames of a film, ms.")] = 2.0,
-    view: Annotated[
-        str, typer.Option(help="top, bottom, side, left, front, back, oblique, or a direction x,y,z to the camera.")
-    ] = "oblique",
-    look_at: Annotated[str | None, typer.Option(help="Point x,y,z in the middle, mm. [default: all in view]")] = None,
+    view: Annotated[str, option("brainbench.stimuli.figures.surfaces:Camera", "view")] = "oblique",
+    look_at: Annotated[str | None, typer.Option(help="Point x,y,z in the middle, mm. \\[default: all in view]")] = None,
     width: Annotated[float | None, typer.Option(help="Width of the picture at that point, mm.")] = None,
     moment_limit: Annotated[float | None, typer.Option(help="Moment at the end of the colours, µN·m.")] = None,
-    size: Annotated[str | None, typer.Option(help="Pixels. [default: 1280x960, a film 800x600]")] = None,
+    size: Annotated[str | None, typer.Option(help="Pixels. \\[default: 1280x960, a film 800x600]")] = None,
     whiskers: WhiskersOption = "all",
     fidelity: FidelityOption = "balanced",
     backend: BackendOption = DEFAULT_ENGINE,

@@ -22,7 +22,7 @@ from brainbench.cli.options import (
     with_options,
 )
 from brainbench.cli.output import Output, facts, progress_bar, table_of
-from brainbench.cli.stimuli.scenes import BackendOption, FidelityOption, WhiskersOption
+from brainbench.cli.stimuli.scenes import BackendOption, CollisionOption, FidelityOption, UnitOption, WhiskersOption
 from brainbench.core.errors import UsageError, check_name, listing
 from brainbench.stimuli.engines.fidelity import DEFAULT_ENGINE
 
@@ -131,7 +131,7 @@ def _summary(dataset: Any) -> list[dict[str, Any]]:
 def separability(
     folder: Annotated[Path, typer.Argument(help="Data set of stimuli sweep, or published sweeps.")],
     classes: Annotated[
-        str | None, typer.Option(help="Classes, with commas between them. [default: the four with the most objects]")
+        str | None, typer.Option(help="Classes, with commas between them. \\[default: the four with the most objects]")
     ] = None,
     counts: Annotated[str, typer.Option(help="How many classes at a time, with commas between them.")] = "2,3,4",
     sweeps_per_class: Annotated[int, typer.Option(min=2, help="Sweeps drawn of each class.")] = 400,
@@ -194,8 +194,8 @@ def sweep(
     options: Any = None,
     workers: WorkersOption = None,
     scheduler: SchedulerOption = None,
-    unit: Annotated[str | None, typer.Option(help="Length unit of mesh files: m, cm, mm, …")] = None,
-    collision: Annotated[str | None, typer.Option(help="What whiskers touch: hull, exact, decomposition, …")] = None,
+    unit: UnitOption = None,
+    collision: CollisionOption = None,
     whiskers: WhiskersOption = "all",
     fidelity: FidelityOption = "balanced",
     backend: BackendOption = DEFAULT_ENGINE,

@@ -5,12 +5,11 @@ from __future__ import annotations
 import shlex
 import sys
 from dataclasses import replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from brainbench.cli.options import needs, option_fields, with_options
+from brainbench.cli.options import SCORE, PlanOption, needs, option, option_fields, with_options
 from brainbench.cli.output import Output, progress_bar, table_of, tracked
 from brainbench.core.errors import UsageError
 from brainbench.core.files import to_plain
@@ -38,19 +37,15 @@ def power(
     recordings: Annotated[
         str | None, typer.Option("--recordings", "-r", help="Pilot recordings from which 'auto' estimates them.")
     ] = None,
-    conditions: Annotated[
-        str | None, typer.Option(help="TABLE:COLUMN[,COLUMN] that labels the pilot's trials, where no layout says so.")
-    ] = None,
+    conditions: Annotated[str | None, option(SCORE, "conditions")] = None,
     model: Annotated[
         str | None, typer.Option(help="Model whose layers 'auto' estimates them from (median), without recordings.")
     ] = None,
     target: Annotated[float, typer.Option(help="Power that is wanted.")] = 0.8,
     simulations: Annotated[int, typer.Option(help="Simulated experiments per number.")] = 500,
     seed: Annotated[int, typer.Option(help="Seed of the experiments.")] = 0,
-    layer: Annotated[str | None, typer.Option(help="Layer that the plan commits to.")] = None,
-    plan: Annotated[
-        Path | None, typer.Option(help="Seal the design in this JSON file, for 'brainbench score --plan'.")
-    ] = None,
+    layer: Annotated[str | None, option("brainbench.core.identity:SealedPlan", "layer")] = None,
+    plan: PlanOption = None,
 ) -> Output:
     """Say how often a true effect would be found, and how many stimuli or animals are needed.
 

@@ -14,6 +14,7 @@ import typer
 
 from brainbench.cli.options import (
     SCORE,
+    PlanOption,
     Requirement,
     SchedulerOption,
     WorkersOption,
@@ -39,12 +40,14 @@ _DESIGN = "brainbench.scoring.recovery.boards:RecoveryDesign"
 
 @needs(_CLUSTER, _PICTURE, cache=True)
 @with_options(POPULATION, _NOISE, build=False)
+@with_options(_DESIGN, ("stimuli", "layer"), parameter="board", flags={"stimuli": ("--show",)}, build=False)
 def recovery(
     options: dict[str, Any],
+    board: dict[str, Any],
     models: Annotated[
         list[str] | None,
         typer.Argument(
-            help="Registry names or patterns, FILE.py:FUNCTION, or HDF5 files of activations. [default: all shipped "
+            help="Registry names or patterns, FILE.py:FUNCTION, or HDF5 files of activations. \\[default: all shipped "
             "trained networks]",
             show_default=False,
         ),
@@ -52,12 +55,8 @@ def recovery(
     stimuli: Annotated[
         str, typer.Option("--stimuli", "-s", help="A recipe, a scene file, a stimulus-set file, or an HDF5 array.")
     ] = "objects",
-    show: Annotated[
-        int | None, typer.Option(help="Stimuli of one board, drawn anew for each. [default: all]", show_default=False)
-    ] = None,
     trials: Annotated[str, typer.Option(help="Trials of each stimulus: 18, or the fewest and the most.")] = "16-20",
     metric: Annotated[str, option(SCORE, "metric")] = "rsa",
-    layer: Annotated[str, option(_DESIGN, "layer")] = "any",
     boards: Annotated[int, typer.Option(help="Boards of each network.")] = 10,
     want: Annotated[
         float | None,
@@ -73,9 +72,7 @@ def recovery(
     out: Annotated[
         Path | None, out_folder_option("Folder for result and picture, and for going on after an interruption.")
     ] = None,
-    plan: Annotated[
-        Path | None, typer.Option(help="Seal the design in this JSON file, for 'brainbench score --plan'.")
-    ] = None,
+    plan: PlanOption = None,
     workers: WorkersOption = None,
     scheduler: SchedulerOption = None,
 ) -> Output:
@@ -97,13 +94,13 @@ def recovery(
         )
     if (pool is None) is not (keep is None):
         raise UsageError("Stimuli are picked with both --pool STIMULI and --keep NUMBER; received one of them.")
-    if keep is not None and show is not None:
+    if keep is not None and board["stimuli"] is not None:
         raise UsageError("All stimuli that --keep picks are shown; leave out --show.")
     if want is not None:
         check_number("--want", want, above=0, below=1)
     started = time.perf_counter()
     population = PopulationDesign(**options, trials=parse_trials(trials))
-    design = RecoveryDesign(population, show, metric=metric, layer=layer, seed=seed)
+    design = RecoveryDesign(population, **board, metric=metric, seed=seed)
     chosen = ScoreOptions(stimuli=pool or stimuli, whiskers=whiskers, fidelity=fidelity, metric=metric, seed=seed)
     where: dict[str, Any] = {"workers": workers, "scheduler": scheduler}
     with progress_bar() as progress:

@@ -50,7 +50,7 @@ class Camera:
     """Viewpoint, projection and frame of a picture; what is unknown or out of range is a :class:`UsageError`."""
 
     view: str | Vector = "oblique"
-    """A name of :data:`VIEWS`, or the direction from the target to the camera (world)."""
+    """top, bottom, side, left, front, back, oblique, or the direction x,y,z to the camera (world)."""
     projection: Literal["perspective", "orthographic"] = "perspective"
     """``perspective``, or ``orthographic`` for measuring."""
     target: Point | None = None

@@ -48,11 +48,11 @@ def fit(
     whisker: Annotated[str, typer.Option(help="Whisker: mouse:C2, or C2 of the scene.")] = "mouse:C2",
     parameters: Annotated[str, typer.Option(help="Parameters to estimate, with commas between them.")] = _PARAMETERS,
     scene: Annotated[
-        str | None, typer.Option(help="Scene file (.toml) with the motion and the objects. [default: a ring-down]")
+        str | None, typer.Option(help="Scene file (.toml) with the motion and the objects. \\[default: a ring-down]")
     ] = None,
     stimulus: StimulusOption = None,
     deflection: Annotated[
-        float | None, typer.Option(help="Deflection of a ring-down before the release, mm, roughly. [default: 1]")
+        float | None, typer.Option(help="Deflection of a ring-down before the release, mm, roughly. \\[default: 1]")
     ] = None,
     contacts: Annotated[
         bool, typer.Option("--contacts", help="Estimate contact point and force in each frame of a track instead.")
@@ -72,7 +72,7 @@ def fit(
     frames: Annotated[int, option(_CONTACTS, "frames")] = 1,
     first_arc: Annotated[
         float | None,
-        typer.Option(help="Arc length of the first traced point, mm; nan for anywhere. [default: the base]"),
+        typer.Option(help="Arc length of the first traced point, mm; nan for anywhere. \\[default: the base]"),
     ] = None,
     out: Annotated[Path | None, out_file_option("Write the result as JSON.")] = None,
     picture: Annotated[

@@ -383,6 +383,7 @@ class GenerationSettings:
 
     fidelity: Fidelity
     backend: str = DEFAULT_ENGINE
+    """Physics engine: ``rod`` (our own), ``mujoco``, or ``bullet``."""
     device: str = "cpu"
     """``cpu``, or ``cuda`` with a backend that runs there."""
     split: SplitBy = "object"

@@ -7,22 +7,23 @@ from typing import Annotated
 
 import typer
 
-from brainbench.cli.options import out_file_option
+from brainbench.cli.options import option, out_file_option
 from brainbench.cli.output import Output, table_of
-from brainbench.cli.policy.train import HandOption
+from brainbench.cli.policy.train import ENV, HandOption
 
 
 def replay(
     log: Annotated[Path, typer.Argument(help="LeRobot data set (a folder), or CSV of time, joints and taxels.")],
     hand: HandOption = "xhand1",
     episode: Annotated[int, typer.Option(help="Episode of a data set.")] = 0,
-    placement: Annotated[str, typer.Option(help="Taxels of a log that does not place them: hand, tips, …")] = "tips",
-    resolution: Annotated[str, typer.Option(help="Of those: low, med or high.")] = "low",
+    placement: Annotated[str, option(ENV, "placement")] = "tips",
+    resolution: Annotated[str, option(ENV, "resolution")] = "low",
     out: Annotated[Path | None, out_file_option("Write both readings of every taxel here (.csv).")] = None,
 ) -> Output:
     """Let the simulated hand follow a real hand's log, and show real beside simulated readings of every taxel.
 
-    The simulated hand holds a ball, whatever lay in the real one. Forces are normal ones (N).
+    The simulated hand holds a ball, whatever lay in the real one. Forces are normal ones (N). Placement and resolution
+    are for a log that does not place its taxels.
     """
     import numpy as np
 

@@ -7,15 +7,14 @@ from typing import Annotated, Any
 
 import typer
 
-from brainbench.cli.options import out_file, out_file_option, with_options
+from brainbench.cli.options import option, out_file, out_file_option, with_options
 from brainbench.cli.output import Output, progress_bar, table_of
 from brainbench.cli.policy.train import ENV, ENVS_FLAG, World, agent_of, in_world, touch_of
 
+PROBE = "robotics_bridge.policies.readouts.probe:ProbeOptions"
 
-@with_options(
-    "robotics_bridge.policies.readouts.probe:ProbeOptions",
-    ("seconds", "reservoirs", "untrained", "place", "draws", "seed"),
-)
+
+@with_options(PROBE, ("seconds", "reservoirs", "untrained", "place", "draws", "seed"))
 @with_options(
     ENV, ("num_envs", "device"), parameter="simulation", flags=ENVS_FLAG, defaults={"num_envs": 48}, build=False
 )
@@ -25,10 +24,8 @@ def probe(
     options: Any,
     simulation: dict[str, Any],
     agent: Annotated[str, typer.Option(help="Policy that acts: a shipped teacher, or a run's folder.")],
-    arm: Annotated[list[str] | None, typer.Option(help="Only this arm; once for each.")] = None,
-    network: Annotated[
-        list[str] | None, typer.Option(help="One more network: a model, local-dir:FOLDER, …; once for each.")
-    ] = None,
+    arm: Annotated[list[str] | None, option(PROBE, "arms")] = None,
+    network: Annotated[list[str] | None, option(PROBE, "networks")] = None,
     layout: Annotated[
         Path | None, typer.Option(callback=out_file, help="Write the taxels that --place chose here, as a probe file.")
     ] = None,

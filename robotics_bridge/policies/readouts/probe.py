@@ -359,9 +359,9 @@ class ProbeOptions:
     seed: int = 0
     """Seed of the episodes, of the reservoirs and of random placements."""
     arms: tuple[str, ...] = ()
-    """Arms of :data:`ARMS`; all by default."""
+    """Arms of :data:`ARMS`, once for each; all by default."""
     networks: tuple[str, ...] = ()
-    """More networks, each an arm of its name: models of the registry, ``local-dir:FOLDER``."""
+    """More networks, each an arm of its name, once for each: models of the registry, ``local-dir:FOLDER``."""
     place: int | None = None
     """Choose so many taxels, and compare them with all and with others, in place of the arms."""
     draws: Count = 10

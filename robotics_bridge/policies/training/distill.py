@@ -279,18 +279,11 @@ def distill(
     stop_at: int | None = None,
     progress: Progress | None = None,
 ) -> DistillResult:
-    """Teach a student, or go on with a run that was interrupted.
+    """Teach a student in a folder, or go on with the run that the folder holds.
 
-    The state is saved after ``stop_after`` seconds or ``stop_at`` iterations in all. A loss that is not finite ends the
-    run as ``diverged``; the last saved state stays.
-
-    Args:
-        config: What is distilled.
-        out: The run's folder.
-        env: Environment of :func:`robotics_bridge.tasks.make` with the configuration's observation type.
-        teacher: Of :func:`robotics_bridge.policies.training.teacher.load_teacher`.
-        stop_after, stop_at: When to stop, where that is before the end.
-        progress: Called with (iterations done, iterations in all, what).
+    The environment (:func:`robotics_bridge.tasks.make`) has the configuration's observation type. The state is saved
+    after ``stop_after`` seconds or ``stop_at`` iterations in all, where that is before the end. A loss that is not
+    finite ends the run as ``diverged``; the last saved state stays.
     """
     stop = Stop(stop_after, stop_at, "iterations")
     # Without it a student can act, but not learn.

@@ -17,13 +17,13 @@ import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Annotated, Any, cast
 
 import torch
 
 from brainbench.core.errors import BrainbenchError, DataError, UsageError, brief, check_name, needing
 from brainbench.core.files import file_hash, provenance, read_json, read_mapping, to_plain, write_json, write_tensors
-from brainbench.core.limits import Count, Positive, Seed, limited
+from brainbench.core.limits import Count, Limit, NotNegative, Positive, Seed, limited
 from brainbench.core.progress import Progress, track
 from brainbench.core.reading.regular import readable
 from brainbench.core.reading.tensors import check_finite
@@ -95,29 +95,32 @@ def success_of(evaluations: Sequence[Mapping[str, Any]]) -> float | None:
     return sum(episodes) / len(episodes) if episodes else None
 
 
+@dataclass(frozen=True)
+@limited(of="'{}' of a student's run")
+class StudentRun:
+    """Where and how long a student is distilled, and how it is evaluated then."""
+
+    episodes: Annotated[int, Limit(least=0)] = 100
+    """Episodes of the evaluation, per seed; 0 for none."""
+    evaluations: Annotated[int, Limit(least=1, most=3)] = 3
+    """Seeds of the evaluation."""
+    device: str = "cpu"
+    """``cpu``, or ``cuda`` (``cuda:1``) for MuJoCo Warp."""
+    stop_after: NotNegative | None = None
+    """Save, stop and evaluate after so many seconds."""
+    stop_at: Count | None = None
+    """Likewise after so many iterations in all."""
+
+
 def train_student(
-    config: DistillConfig,
-    out: str | Path,
-    *,
-    device: str = "cpu",
-    episodes: int = 100,
-    evaluations: int = len(SEEDS),
-    stop_after: float | None = None,
-    stop_at: int | None = None,
-    progress: Progress | None = None,
+    config: DistillConfig, out: str | Path, options: StudentRun | None = None, *, progress: Progress | None = None
 ) -> Student:
     """Distil a student, or go on with an interrupted one, and evaluate it, also when its time is over.
 
-    Args:
-        config: What is distilled; ``teacher`` names a folder or a shipped one.
-        out: The run's folder; a finished and evaluated run is left as it is.
-        device: ``cpu``, or ``cuda`` for MuJoCo Warp.
-        episodes: Per evaluation seed; 0 evaluates nothing. An evaluation says how many iterations the student had.
-        evaluations: How many of :data:`SEEDS` it is evaluated with.
-        stop_after: Seconds; this and the next as of :func:`~robotics_bridge.policies.training.distill.distill`.
-        stop_at: Iterations.
-        progress: Called with (done, in all, what).
+    Its ``teacher`` is a folder or a shipped one. A run in the folder ``out`` that is finished and evaluated is left as
+    it is. An evaluation says how many iterations the student had.
     """
+    options = options or StudentRun()
     if not config.teacher:
         raise UsageError(
             "A student needs a teacher: the folder of a run of brainbench policy train, or a shipped one "
@@ -137,7 +140,7 @@ def train_student(
             f"{task.solver.timestep:g} s. Use time='native'."
         )
     env = tasks.make(
-        task, num_envs=config.num_envs, device=device, hand=config.hand, observe=config.observe,
+        task, num_envs=config.num_envs, device=options.device, hand=config.hand, observe=config.observe,
         placement=config.placement, resolution=config.resolution, noisy=config.noisy,
         seed=config.seed,
     )  # fmt: skip
@@ -145,10 +148,11 @@ def train_student(
     config = replace(config, contacts=contacts if contacts in CONTACTS else None)
     teacher = load_teacher(config.teacher, env)
     config = calibrated(config, env, teacher, out)
-    result = distill(config, out, env=env, teacher=teacher, stop_after=stop_after, stop_at=stop_at, progress=progress)
-    if result.status == "diverged" or not episodes:
+    stops = {"stop_after": options.stop_after, "stop_at": options.stop_at}
+    result = distill(config, out, env=env, teacher=teacher, **stops, progress=progress)
+    if result.status == "diverged" or not options.episodes:
         return Student(out, result, ())
-    return Student(out, result, evaluate_student(out, env, episodes, result.iterations, progress, evaluations))
+    return Student(out, result, evaluate_student(out, env, options, result.iterations, progress))
 
 
 def is_done(config: DistillConfig, out: Path, stop_at: int | None = None) -> bool:
@@ -202,9 +206,9 @@ def _measure(tactile: EncoderConfig, env: Any, teacher: Any) -> HandCalibration:
 
 
 def evaluate_student(
-    folder: str | Path, env: Any, episodes: int, iterations: int, progress: Progress | None, evaluations: int
+    folder: str | Path, env: Any, options: StudentRun, iterations: int, progress: Progress | None
 ) -> tuple[dict[str, Any], ...]:
-    """Run whole episodes with a student and write ``evaluation.json``, one entry per seed of the first ``evaluations``.
+    """Run whole episodes with a student and write ``evaluation.json``, one entry for each seed of :data:`SEEDS`.
 
     An entry lists per episode ``success``, ``metric``, ``returns``, ``goals``, ``turn_rate`` (rad/s), ``seconds`` and
     ``dropped`` (:class:`~robotics_bridge.policies.evaluate.PolicyEvaluation`), and holds the ``iterations`` learned
@@ -212,8 +216,8 @@ def evaluate_student(
     """
     student, _ = load_student(folder, device=str(env.device))
     policy, rows = Policy(student), []
-    for seed in track(SEEDS[:evaluations], "evaluating", progress):
-        result = evaluate(env, policy, episodes=episodes, seed=seed, name=Path(folder).name)
+    for seed in track(SEEDS[: options.evaluations], "evaluating", progress):
+        result = evaluate(env, policy, episodes=options.episodes, seed=seed, name=Path(folder).name)
         rows.append(
             {
                 "seed": seed, "success": [float(item) for item in result.success], "diverged": result.diverged,

@@ -3,26 +3,40 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from brainbench.cli.options import out_file_option
+from brainbench.cli.options import out_file_option, with_options
 from brainbench.cli.output import Output, table_of
-from brainbench.core.errors import UsageError, check_number, listing
+from brainbench.core.errors import UsageError, listing
+from brainbench.core.limits import Limit, NotNegative
 
 if TYPE_CHECKING:
     from robotics_bridge.sensors.calibration.calibrate import Log
 
 
+@dataclass(frozen=True)
+class CalibrationOptions:
+    """What is tried, and how a device was pressed."""
+
+    max_delay: NotNegative = 0.5
+    """Longest read delay that is tried (s)."""
+    probes: Path | None = None
+    """Probe file of the device that a ball pressed."""
+    ball: Annotated[float, Limit(above=0, most=0.1, unit="m")] = 5e-3
+    """Radius of that ball (m)."""
+    draws: Annotated[int, Limit(least=0, most=1000)] = 0
+    """Devices drawn from the posterior, written beside --out."""
+
+
+@with_options("robotics_bridge.sensors.calibration.commands:CalibrationOptions")
 def calibrate(
+    options: CalibrationOptions,
     log: Annotated[Path, typer.Argument(help="CSV with 'time' (s), probes, and optionally 'reference' and 'episode'.")],
     out: Annotated[Path | None, out_file_option("Write the preset here (.json).")] = None,
-    max_delay: Annotated[float, typer.Option(help="Longest read delay that is tried (s).")] = 0.5,
-    probes: Annotated[Path | None, typer.Option(help="Probe file of the device that a ball pressed.")] = None,
-    ball: Annotated[float, typer.Option(help="Radius of that ball (m).")] = 5e-3,
-    draws: Annotated[int, typer.Option(help="Devices drawn from the posterior, written beside --out.")] = 0,
 ) -> Output:
     """Fit the noise model to a recording of a real device, with 95 % intervals, and write a preset.
 
@@ -34,11 +48,10 @@ def calibrate(
     from robotics_bridge.sensors.calibration.calibrate import calibrate as fit
     from robotics_bridge.sensors.calibration.calibrate import read_log
 
-    check_number("--max-delay (s)", max_delay, least=0)
     record = read_log(log)
     if record.ball is not None:
-        return _device(log, record, probes, ball, max_delay, out, draws)
-    result = fit(record, max_delay=max_delay)
+        return _device(log, record, options, out)
+    result = fit(record, max_delay=options.max_delay)
     if out is not None:
         result.save(out, log=log.name)
     about = result.about
@@ -49,28 +62,24 @@ def calibrate(
     return Output({**data, "preset": out}, text)
 
 
-def _device(
-    path: Path, log: Log, probes: Path | None, ball: float, max_delay: float, out: Path | None, draws: int
-) -> Output:
+def _device(path: Path, log: Log, options: CalibrationOptions, out: Path | None) -> Output:
     """Fit a device to presses of a ball."""
     from robotics_bridge.hands.layouts import read_probes
     from robotics_bridge.sensors.calibration.devices import fit_device
     from robotics_bridge.sensors.calibration.presses import Presses
 
-    check_number("--ball (m)", ball, above=0, most=0.1)
-    check_number("--draws", draws, least=0, most=1000, whole=True)
-    if probes is None:
+    if options.probes is None:
         raise UsageError("A log of presses needs --probes, the probe file of the device (tactile layouts --out).")
-    layout = read_probes(probes)
+    layout = read_probes(options.probes)
     if len(layout) != 1:
-        raise UsageError(f"A device is the taxels of one link; {probes.name} has {listing(layout)}.")
+        raise UsageError(f"A device is the taxels of one link; {options.probes.name} has {listing(layout)}.")
     ((link, nominal),) = layout.items()
     names = tuple(dict.fromkeys(name.rsplit(":", 1)[0] if name[-2:] in (":x", ":y", ":z") else name
                                 for name in log.probes))  # fmt: skip
-    fit = fit_device(Presses(log, nominal, ball), max_delay=max_delay, names=names)
+    fit = fit_device(Presses(log, nominal, options.ball), max_delay=options.max_delay, names=names)
     if out is not None:
         fit.save(out, link, log=path.name)
-        for number, draw in enumerate(fit.draws(draws)):
+        for number, draw in enumerate(fit.draws(options.draws)):
             draw.save(out.with_name(f"{out.stem}-{number:03d}.json"), link, log=path.name)
     text = table_of(f"{path.name}: {len(names)} taxels of {link}", list(fit.estimates.items()), _COLUMNS)
     columns = {
@@ -88,13 +97,9 @@ def _device(
     return Output(data, text + (f"\nWrote {out}." if out is not None else ""))
 
 
-def _interval(estimate: Any) -> str:
-    return f"{estimate.low:.4g} … {estimate.high:.4g}" if math.isfinite(estimate.low + estimate.high) else ""
-
-
 _COLUMNS = {
     "knob": "{0[0]}",
     ">value": "{0[1].value:.4g}",
-    "95 % interval": lambda row: _interval(row[1]),
+    "95 % interval": lambda row: "{0.low:.4g} … {0.high:.4g}".format(row[1]) * math.isfinite(row[1].low + row[1].high),
     "from": "{0[1].how}",
 }

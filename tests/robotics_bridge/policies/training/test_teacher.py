@@ -30,6 +30,7 @@ from robotics_bridge.policies.shipped import FOLDER, SENSING, newest
 from robotics_bridge.policies.training.distill import load_student
 from robotics_bridge.policies.training.distill_config import DistillConfig
 from robotics_bridge.policies.training.teacher import (
+    StudentRun,
     TeacherRun,
     Trainer,
     calibrated,
@@ -404,7 +405,7 @@ def test_a_student_is_taught_in_the_contacts_of_its_teacher_unless_told_otherwis
         task="in_palm_rotate", teacher=str(teacher_in(teacher, tmp_path / "teacher")), observe="none", hidden=(8,),
         num_envs=2, steps_per_env=2, iterations=1, epochs=1, **changes,
     )  # fmt: skip
-    train_student(config, tmp_path / "run", episodes=0)
+    train_student(config, tmp_path / "run", StudentRun(episodes=0))
     described = read_json(tmp_path / "run" / "config.json")
     assert described["distill"]["contacts"] == contacts
     assert (described["deployment"]["twist"] is None) == (config.variant == "default")
@@ -437,12 +438,12 @@ def test_a_student_of_a_teacher_that_was_trained_anew_in_its_folder_is_another(t
     config = DistillConfig(
         task="in_palm_rotate", teacher=str(teacher), observe="none", num_envs=1, iterations=2, steps_per_env=2
     )
-    train_student(config, student, episodes=1, evaluations=1)
+    train_student(config, student, StudentRun(episodes=1, evaluations=1))
     assert is_done(config, student)
     train(_env(), teacher, settings=SMALL, iterations=2)
     assert not is_done(config, student)
     with pytest.raises(UsageError, match="holds another student: teacher_hash"):
-        train_student(config, student, episodes=0)
+        train_student(config, student, StudentRun(episodes=0))
     # Without the teacher, nothing says that it changed.
     shutil.rmtree(teacher)
     assert is_done(config, student)
