@@ -63,7 +63,7 @@ class Ledger:
         self.notes += [] if text in self.notes else [text]
 
     def apply(self, keep: NDArray[np.bool_], passes: Any, kind: str, rule: str) -> NDArray[np.bool_]:
-        """Return the rows of one kind that remain, and leave those that only now fell out by a rule."""
+        """Return which rows [n] of one kind remain, and enter those that only now fell out by a rule."""
         self.leave(kind, rule, int(np.sum(keep & ~passes)))
         return keep & passes
 

@@ -137,7 +137,7 @@ class SessionTable:
         return values.astype(np.float64)
 
     def ids(self) -> NDArray[Any]:
-        """Return the row identifiers, or the row numbers when the table has none."""
+        """Return the identifiers [rows], or the row numbers when the table has none."""
         return decode(self.data["id"][...]).ravel() if "id" in self.data else np.arange(len(self))
 
     def ends(self, name: str) -> NDArray[np.int64]:
@@ -161,7 +161,7 @@ class SessionTable:
         return ends
 
     def rows(self, name: str) -> list[NDArray[np.float64]]:
-        """Read a ragged column of numbers: one array per row."""
+        """Read a ragged column of numbers: an array [values] for each row, of spans [values, 2]."""
         ends = self.ends(name)
         flat = np.asarray(self.data[name][...])
         flat = self._exact(name, flat) if name == SPIKES else flat.astype(np.float64)
@@ -398,7 +398,7 @@ def make_session(
 
 
 def ragged(name: str, rows: Sequence[NDArray[Any]]) -> dict[str, NDArray[Any]]:
-    """Store one list per row as a ragged column: all values, and the end of each row."""
+    """Return rows of values as a ragged column, by name: all values [total], and the end of each row [rows]."""
     values = np.concatenate([np.asarray(row, dtype=np.float64) for row in rows]) if rows else np.zeros(0)
     return {name: values, f"{name}_index": np.cumsum([len(row) for row in rows], dtype=np.int64)}
 

@@ -75,7 +75,7 @@ def slices(values: Any, elements: int, device: Any) -> Iterator[tuple[slice, Arr
 
 
 def finite_mean(values: np.ndarray, axis: int | tuple[int, ...] = -1) -> np.ndarray:
-    """Return the mean over the finite values along axes; NaN where there is none."""
+    """Return the mean over the finite values along axes, which go; NaN where there is none."""
     present = np.isfinite(values)
     number = present.sum(axis=axis)
     return np.where(number > 0, np.where(present, values, 0.0).sum(axis=axis) / np.maximum(number, 1), np.nan)

@@ -120,7 +120,7 @@ def _complete_means(responses: NDArray, codes: Ints, numbers: Floats) -> Floats 
 
 
 def tensor_means(responses: Any, codes: Ints, count: int, device: Any) -> Array:
-    """Return what :func:`stimulus_means` does as a tensor on ``device``, by products with the trials' membership."""
+    """Return means [K, U] as :func:`stimulus_means` does, on ``device``, by products with the trials' membership."""
     member = place(membership(codes, count), device)
     xp, parts = library(member), []
     for _, part in slices(responses, _SLICE_ELEMENTS, device):

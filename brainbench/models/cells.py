@@ -287,7 +287,7 @@ class GRU(GatedCell):
         return torch.sigmoid(reset + FORGET_BIAS) * state, torch.sigmoid(keep)
 
     def update(self, fused: torch.Tensor, keep: torch.Tensor, state: torch.Tensor) -> torch.Tensor:
-        """Return the next state from the candidate's pre-activation and the update gate u."""
+        """Return the next state [B, C, H, W] from the candidate's pre-activation and the update gate u."""
         (candidate,) = self._normalised(fused, ("c",))
         # s ← u s + (1 − u) c (Cho et al. 2014): old state and candidate mix, so the state stays within ±1.
         return keep * state + (1 - keep) * torch.tanh(candidate)

@@ -87,7 +87,7 @@ class BasicBlock(nn.Module):
             self.shortcut.append(nn.BatchNorm2d(out_channels))
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """Return the rectified sum of the branch and the shortcut."""
+        """Return the rectified sum [B, C, H, W] of the branch and the shortcut."""
         # He et al. 2016: the branch learns the difference from the shortcut, so gradients pass by it undiminished.
         y = self.norm2(self.conv2(torch.relu(self.norm1(self.conv1(x)))))
         return torch.relu(y + self.shortcut(x))
@@ -280,7 +280,7 @@ class GPTBlock(nn.Module):
     def forward(
         self, x: torch.Tensor, past: tuple[torch.Tensor, torch.Tensor] | None = None
     ) -> tuple[torch.Tensor, tuple[torch.Tensor, torch.Tensor]]:
-        """Return the stream and the keys and values of all tokens so far."""
+        """Return the stream [B, T, F], and keys and values [B, heads, tokens, F / heads] of all tokens so far."""
         batch, tokens, width = x.shape
         fused = self.query_key_value(self.norm_attention(x)).view(batch, tokens, 3, self.heads, width // self.heads)
         query, key, value = fused.permute(2, 0, 3, 1, 4)

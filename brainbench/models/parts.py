@@ -184,7 +184,7 @@ class SimCLRHead(nn.Module):
         self.layers = perceptron(features, HIDDEN, 128, norms=2, use_bias=False)
 
     def forward(self, features: torch.Tensor) -> torch.Tensor:
-        """Return the embeddings, not normalised."""
+        """Return the embeddings [B, 128], not normalised."""
         return self.layers(features)
 
 
@@ -215,6 +215,6 @@ class AutoencoderHead(nn.Module):
             self.layers.extend((nn.ReLU(), nn.ConvTranspose2d(width, channels, 3, padding=1)))
 
     def forward(self, features: torch.Tensor) -> torch.Tensor:
-        """Return the reconstruction of every step, in normalised units."""
+        """Return the reconstruction [B, T, C, H, W] of every step, in normalised units."""
         hidden = self.dense(features.flatten(0, -2)).unflatten(-1, self.shape)
         return self.layers(hidden).unflatten(0, features.shape[:-1])

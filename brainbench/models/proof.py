@@ -251,7 +251,7 @@ def agree(left: np.ndarray, right: np.ndarray, kind: torch.dtype) -> bool:
 
 
 def draw_sample(count: int) -> np.ndarray:
-    """Return the stimuli of the second run in its order: an eighth, from everywhere, 3 to 128."""
+    """Return the stimuli [n] of the second run in its order, by number: an eighth, from everywhere, 3 to 128."""
     generator = np.random.default_rng(0)
     size = min(max(3, count // 8), 128)
     edges = np.linspace(0, count, size + 1).astype(int)

@@ -90,7 +90,7 @@ class ModelResponses:
         return LayerFeatures(self.activations, lambda values: reduce_time(values[rows], self.time))
 
     def baseline_features(self, rows: list[int], seed: int) -> dict[str, dict[str, NDArray[np.floating]]]:
-        """Return the raw input and random features of it; nothing without an input."""
+        """Return the raw input and random features of it [K, F], by name and layer; nothing without an input."""
         if self.model_input is None:
             return {}
         raw = self.model_input[rows].astype(np.float64)

@@ -109,7 +109,7 @@ class Env:
 
     @property
     def observations(self) -> dict[str, torch.Tensor]:
-        """Observations of the last step or reset, by group."""
+        """Observations [B, …] of the last step or reset, by group."""
         return self.state.observations
 
     @property
@@ -124,7 +124,7 @@ class Env:
 
     @property
     def lasting(self) -> list[torch.Tensor]:
-        """Observations that are the same tensors after every step."""
+        """Observations [B, …] that are the same tensors after every step."""
         return [self.state.extent] if self.touch is None else [self.state.extent, self.touch.reading]
 
     @property

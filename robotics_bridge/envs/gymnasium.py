@@ -106,7 +106,7 @@ class GymEnv(gymnasium.Env):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        """Start a new episode."""
+        """Start a new episode; return its observations by group, without an axis of environments."""
         super().reset(seed=seed)
         observations, _ = self.vector.reset(seed=seed, options=options)
         return {name: value[0] for name, value in observations.items()}, {}

@@ -92,7 +92,7 @@ class Hand:
 
     @property
     def joint_numbers(self) -> NDArray[np.intp]:
-        """Numbers of the hinges and slides among the model's joints."""
+        """Numbers [J] of the hinges and slides among the model's joints."""
         return np.flatnonzero(np.isin(self.model.jnt_type, (2, 3)))
 
     def lever(self, joints: Iterable[str]) -> NDArray[np.float64]:

@@ -189,7 +189,7 @@ def replace_drives(spec: Any) -> None:
 
 
 def leading_joints(model: Any) -> NDArray[np.intp]:
-    """Return the hinges and slides that do not follow from others through loops."""
+    """Return the numbers [J] of hinges and slides that do not follow from others through loops."""
     joints = np.flatnonzero(np.isin(model.jnt_type, (2, 3)))
     return joints[~np.isin(joints, list(Tree(model).followers - {each[0] for each in coupled(model)}))]
 

@@ -365,7 +365,7 @@ class StepPolicy(nn.Module):
         self.input_names, self.output_names = [*self.shapes, "h_in"], ["actions", "h_out"]
 
     def forward(self, *inputs: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Advance by one control step; groups come in the order of :attr:`input_names`."""
+        """Return actions [B, A] and memory [B, H] of a control step; groups stand as in :attr:`input_names`."""
         obs = dict(zip(self.shapes, inputs[:-1], strict=True))
         flat: list[torch.Tensor] = []
         if self.flat:
@@ -376,5 +376,5 @@ class StepPolicy(nn.Module):
         return self.output(self.mlp(latent)), h_out
 
     def get_dummy_inputs(self, batch: int = 1) -> tuple[torch.Tensor, ...]:
-        """Return inputs of zeros."""
+        """Return inputs [B, …] of zeros."""
         return (*(torch.zeros(batch, *shape) for shape in self.shapes.values()), torch.zeros(batch, self.state_size))

@@ -85,12 +85,12 @@ class SteppingRotation(Goal):
     limit: Count | None = 15
 
     def first(self, quat: torch.Tensor, draw: torch.Tensor) -> torch.Tensor:
-        """Return the goals one step from the start."""
+        """Return the goals [B, 4] (w, x, y, z) one step from the start."""
         axis = constant(self.axis or (0.0, 0.0, 1.0), quat)
         return super().first(twist_of(quat, axis.expand_as(quat[..., 1:])) if self.lying_flat else quat, draw)
 
     def following(self, quat: torch.Tensor, goal: torch.Tensor, draw: torch.Tensor) -> torch.Tensor:
-        """Return the goals one step further."""
+        """Return the goals [B, 4] (w, x, y, z) one step further."""
         del draw
         # A turn about a world axis multiplies from the left. The step starts from the last goal, not from the object,
         # so that errors of reached goals do not add up.
@@ -109,7 +109,7 @@ class TimedRotation(Goal):
     deadline: Factors | None = (4.0, 6.0)
 
     def following(self, quat: torch.Tensor, goal: torch.Tensor, draw: torch.Tensor) -> torch.Tensor:
-        """Return tilted orientations of the object."""
+        """Return tilted orientations [B, 4] (w, x, y, z) of the object."""
         del goal
         # Uniform in both angles and about world axes, hence from the left.
         angles = self.tilt[0] + (self.tilt[1] - self.tilt[0]) * draw

@@ -252,7 +252,7 @@ class SpikeTrains:
         return cls(session.units, spikes)
 
     def rule_out(self, keep: NDArray[np.bool_], selection: Selection, ledger: Ledger) -> NDArray[np.bool_]:
-        """Leave out units with too few spikes."""
+        """Return which units [U] remain without those of too few spikes."""
         if selection.min_spikes:
             few = "no spikes" if selection.min_spikes == 1 else f"fewer than {selection.min_spikes} spikes"
             numbers = np.array([len(times) for times in self.spikes], dtype=np.int64)
@@ -260,7 +260,7 @@ class SpikeTrains:
         return keep
 
     def covered(self, edges: NDArray[np.float64], ledger: Ledger) -> NDArray[np.bool_]:
-        """Return which windows lie in the observed spans, or, without any, between the first and the last spike."""
+        """Return which windows [R, 2] (s) lie in observed spans, else between first and last spike: [R, U]."""
         if (observed := inside_observed_spans(self.units, edges)) is not None:
             return observed
         covered = np.zeros((len(edges), len(self.spikes)), dtype=bool)

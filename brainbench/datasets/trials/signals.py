@@ -113,7 +113,7 @@ class Samples:
         return float(np.median(np.diff(self.times))) if len(self.times) > 1 else math.nan
 
     def rule_out(self, keep: NDArray[np.bool_], selection: Selection, ledger: Ledger) -> NDArray[np.bool_]:
-        """Leave out what the file calls no cell."""
+        """Return which units [U] remain without what the file calls no cell."""
         if "iscell" in self.units:
             keep = ledger.apply(keep, self.units.times("iscell") > 0, "units", "no cell (iscell)")
         return keep

@@ -422,7 +422,7 @@ class WhiskingDataset:
         self.epoch, self._batch = self.epoch + 1, 0
 
     def order(self, epoch: int) -> NDArray[np.int64]:
-        """Return the sweeps of this part of an epoch, numbers from 0 to N − 1, in their order."""
+        """Return the sweeps [n] of this part of an epoch, numbers from 0 to N − 1, in their order."""
         count = self.sweeps
         every = np.random.default_rng([self.seed, epoch]).permutation(count) if self.shuffle else np.arange(count)
         rank, parts = self.part

@@ -526,7 +526,7 @@ def _poisson(given: _Responses) -> Array:
 
 
 def poisson_rates(rates: Array) -> Array:
-    """Return rates under the gamma prior, which are never zero."""
+    """Return rates [K, U] under the gamma prior, in the unit given, which are never zero."""
     # Posterior mean after one observation under a gamma prior with this mean and weight.
     return (rates + POISSON_PRIOR_MEAN * POISSON_PRIOR_WEIGHT) / (1 + POISSON_PRIOR_WEIGHT)
 

@@ -252,7 +252,7 @@ class Conv2d(nn.Conv2d):
         return self._convolve(input, self.weight, self.bias)
 
     def conv_slice(self, input: torch.Tensor, start: int, *, use_bias: bool) -> torch.Tensor:
-        """Convolve some of the input channels, those from ``start`` on; the sum over all slices is the whole."""
+        """Convolve input channels from ``start`` on: [B, C, H, W], whose sum over all slices is the whole."""
         weight = self.weight[:, start : start + input.shape[1]]
         return self._convolve(input, weight, self.bias if use_bias else None)
 

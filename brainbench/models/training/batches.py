@@ -83,7 +83,7 @@ class SampledAugmentation:
         return every[self.rank :: self.parts]
 
     def coins(self, x: torch.Tensor, probability: float = 0.5) -> torch.Tensor:
-        """Return one truth value per sweep of ``x``, shaped to broadcast against it."""
+        """Return one truth value per sweep of ``x``, [B, 1, …] to broadcast against it."""
         return (self.uniform(len(x)) < probability).to(x.device).view(-1, *(1,) * (x.ndim - 1))
 
 
@@ -108,7 +108,7 @@ def flip(x: torch.Tensor, direction: str, cells: tuple[int, ...] = MOUSE, axes: 
 
 
 def reverse_time(x: torch.Tensor) -> torch.Tensor:
-    """Play sweeps backwards, sub-steps included; forces of slow contact do not know the direction of time."""
+    """Play sweeps [B, T, S·C, H, W] backwards, sub-steps too; slow contact does not know the direction of time."""
     samples = x.unflatten(2, (-1, len(CHANNELS))).flatten(1, 2)
     return samples.flip(1).reshape(x.shape)
 

@@ -100,7 +100,7 @@ class Supervised(Learner):
     supervised = True
 
     def forward(self, views: tuple[torch.Tensor, ...], labels: torch.Tensor) -> torch.Tensor:
-        """Return the loss."""
+        """Return the loss, a scalar of the batch (nats)."""
         return functional.cross_entropy(self.model(views[0]).float(), labels)
 
 

@@ -275,7 +275,7 @@ class Candidate:
         return ResponseGeometry(directions / (size or 1.0), tuple(self.stimuli[row] for row in rows))
 
     def layers(self, metric: Metric) -> dict[str, NDArray[np.float64]]:
-        """Return what a metric compares of every layer, computed once."""
+        """Return what a metric compares of every layer, such as an RDM [P], computed once."""
         key = (metric.name, str(metric))
         if key not in self._layers:
             self._layers[key] = {name: metric.layer(values) for name, values in self.features.items()}

@@ -25,7 +25,7 @@ LARGEST_REYNOLDS = 180.0
 
 
 def drag_coefficient(reynolds: ArrayLike) -> NDArray[np.float64]:
-    """Return C_d of a long cylinder across the flow; at Re = 0 it is infinite and the force zero."""
+    """Return C_d (1) of a long cylinder across the flow for each Re; at Re = 0 it is infinite and the force zero."""
     number = np.asarray(reynolds, dtype=float)
     slow = 6.8 * number**-0.89 + 1.96 * number**-0.5
     return 1.18 + slow - 0.0004 * number / (1 + 3.64e-7 * number**2)

@@ -327,7 +327,7 @@ def without_escape(reason: str, job: Job, time: float) -> str:
 def near_travel(
     whisker: Whisker, position: NDArray, euler: NDArray, obstacle: Obstacle, times: NDArray
 ) -> NDArray[np.float64]:
-    """Return :func:`step_travel` where the whisker can be, and 0 in steps in which the obstacle is out of its reach."""
+    """Return :func:`step_travel` [step] (m), 0 in steps in which the obstacle is out of the whisker's reach."""
     travel = step_travel(whisker, position, euler, obstacle, times)
     # Within its length of the base, and what both move in the step.
     near = distances(obstacle, obstacle.bounds, position, times)[:-1] <= whisker.arc_length + travel

@@ -56,7 +56,7 @@ class StillFollicle:
     """(θ, φ, ζ) [rad]; the default lays the base frame on the world frame."""
 
     def pose(self, times: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the same pose at every time."""
+        """Return positions [n, 3] (m) and angles [n, 3] (rad) that are the same at every time."""
         count = len(times)
         return np.tile(np.array(self.position, float), (count, 1)), np.tile(np.array(self.euler, float), (count, 1))
 

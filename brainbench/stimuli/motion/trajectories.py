@@ -348,7 +348,7 @@ class ArrayFollicle:
 
 
 def smooth_step(times: NDArray[np.float64], duration: float) -> NDArray[np.float64]:
-    """Return 6u⁵ − 15u⁴ + 10u³ with u = t/duration within 0 … 1; ones when ``duration`` is 0."""
+    """Return 6u⁵ − 15u⁴ + 10u³ at times [n] (s), u = t/duration within 0 … 1; ones when ``duration`` is 0."""
     if duration == 0:
         return np.ones_like(np.asarray(times, dtype=float))
     u = np.clip(np.asarray(times, dtype=float) / duration, 0.0, 1.0)

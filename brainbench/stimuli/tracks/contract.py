@@ -179,7 +179,7 @@ class TrackQuality:
 
 
 def every_frame(frames: NDArray[np.int_], path: str | os.PathLike[str]) -> NDArray[np.int_]:
-    """Return all frame numbers from the first to the last of some, before room is made for their shapes."""
+    """Return all frame numbers [n] from the first to the last of some, before room is made for their shapes."""
     first, last, seen = int(frames.min()), int(frames.max()), len(np.unique(frames))
     if (count := last - first + 1) - seen > MOST_GAPS * count:
         raise DataError(

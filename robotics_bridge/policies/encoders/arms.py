@@ -177,7 +177,7 @@ class FeatureNorm(nn.Module):
         self.register_buffer("square", torch.ones(features, dtype=torch.float64))
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """Return the standardised features; in training mode they are counted first."""
+        """Return the standardised features [B, F]; in training mode they are counted first."""
         if self.training:
             with torch.no_grad():
                 flat = x.detach().reshape(-1, x.shape[-1]).double()
@@ -361,7 +361,7 @@ class RunningScale(nn.Module):
             self.count += used.sum(0)
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """Return the scaled values."""
+        """Return the values divided by their root mean square, in their shape."""
         # Root mean square instead of a standard deviation: taxels rest at zero, and the zero must stay where it is.
         mean = torch.where(self.count > 0, self.total / self.count.clamp(min=1), 1.0).clamp(min=1e-24)
         return x / mean.sqrt().to(x.dtype)

@@ -95,7 +95,7 @@ def begins_loaded(x: NDArray[np.float64]) -> bool:
 
 
 def maxwell(x: NDArray[np.float64], keep: float) -> NDArray[np.float64]:
-    """Return ξ of 4.26 for a signal that had its first value before, as a device that was loaded for a while."""
+    """Return ξ [T, …] of 4.26 for a signal that had its first value before, as a device loaded for a while."""
     return np.asarray(lfilter([1.0, -1.0], [1.0, -keep], x - x[0]))
 
 
@@ -323,7 +323,7 @@ _WINDOW = 40  # readings to either side over which drift counts as a level
 
 
 def blur(x: NDArray[np.float64], first: int, last: int) -> NDArray[np.float64]:
-    """Return the mean of ``x`` over lags of ``first`` to ``last`` readings; before, it had its first value."""
+    """Return the mean [T] of ``x`` over lags of ``first`` to ``last`` readings; before, it had its first value."""
     # Running mean as a difference of two sums: its cost does not depend on the range of lags.
     total = np.cumsum(np.pad(x, (last + 1, 0), mode="edge"))
     end = np.arange(len(x)) + last + 1

@@ -269,7 +269,7 @@ class Lag:
         return values + self._share * self.creep(values, axis=axis)
 
     def delayed(self, values: NDArray[np.float64], more: int = 0, axis: int = 0) -> NDArray[np.float64]:
-        """Return signals as late as the device is, and ``more`` readings; before, they had their first value."""
+        """Return signals [T, …] as late as the device, and ``more`` readings; before, they had their first value."""
         whole = int(np.floor(self._delay))
         part = self._delay - whole
         near, far = (
@@ -281,7 +281,7 @@ class Lag:
         return (1 - part) * late + part * np.take(values, far, axis) if part else late
 
     def creep(self, values: NDArray[np.float64], axis: int = 0, factor: float = 1.0) -> NDArray[np.float64]:
-        """Return ξ of 4.26, with its time constant times a factor."""
+        """Return ξ [T, …] of 4.26, with its time constant times a factor."""
         keep, values = np.exp(-self._step / (factor * self._tau)), np.moveaxis(values, axis, 0)
         parts = [lfilter([1.0, -1.0], [1.0, -keep], values[span] - values[span][:1], axis=0) for span in self._spans]
         return np.moveaxis(np.concatenate(parts), 0, axis)

@@ -41,7 +41,7 @@ class ShapeSampler:
         return tuple(self.drawn[name] for name in ranges)
 
     def normals(self, *shape: int) -> NDArray[np.float64]:
-        """Draw standard normal numbers, too many to be named."""
+        """Draw standard normal numbers of a shape, too many to be named."""
         return self._rng.normal(size=shape)
 
 
