@@ -13,7 +13,7 @@ from brainbench.core.identity import content_hash
 from brainbench.scoring.options import ScoreOptions
 from robotics_bridge import hands
 from robotics_bridge.deploy.links.replay import PARTS, SessionFacts, TactilePoints, taxel_names, write_lerobot
-from tests.factories import policies, published_surfaces, reading_surfaces, robot_surfaces
+from tests.factories import policies, reading_surfaces
 from tests.factories.fitted_ringdown import write_ringdown
 from tests.factories.hand_gallery import GALLERY
 from tests.factories.scored_files import write_study
@@ -67,7 +67,7 @@ count = 5
 label = "played"
 """
 
-checkpoint, log = published_surfaces._checkpoint, robot_surfaces._log
+checkpoint, log = reading_surfaces._checkpoint, reading_surfaces._log
 
 
 def _pixels() -> np.ndarray:

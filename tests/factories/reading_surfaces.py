@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import json
 import math
 import shutil
@@ -23,6 +24,7 @@ from brainbench.core.contracts import read_match
 from brainbench.core.errors import DataError
 from brainbench.core.files import read_mapping
 from brainbench.core.identity import SealedPlan
+from brainbench.core.reading.tensors import read_tensors
 from brainbench.core.records import ResultRecord, record_identity
 from brainbench.core.runs.folder import STATE
 from brainbench.datasets import export, open_recordings, write_recordings
@@ -31,10 +33,20 @@ from brainbench.datasets.whisking.dataset import WhiskingDataset
 from brainbench.geometry.mesh import convex_hull, load_mesh, save_mesh
 from brainbench.models.features import read_features, write_features
 from brainbench.models.graph.tnn_import import read_graph
+from brainbench.models.registry import load_model
 from brainbench.models.training.batches import Processes
-from brainbench.models.training.checkpoints import find_folder, load_weights, read_config
+from brainbench.models.training.checkpoints import WEIGHTS, find_folder, load_weights, read_config
 from brainbench.models.training.config import TrainingConfig
 from brainbench.models.training.trainer import _Run
+from brainbench.published import conversion
+from brainbench.published.checkpoint_import import (
+    build_published,
+    import_checkpoint,
+    read_settings,
+    read_weights,
+    recognise,
+)
+from brainbench.published.estimator import explain_file
 from brainbench.published.whiskit import read_runs
 from brainbench.scoring.jobs import parse_seeds, read_batch
 from brainbench.scoring.recovery.boards import parse_trials
@@ -47,13 +59,23 @@ from brainbench.stimuli.stimulus_set import hash_stimulus_set, write_stimulus_se
 from leaderboards import build_leaderboard, read_records
 from leaderboards.held_out import Commitment
 from leaderboards.site.build import MANIFEST, check_site
-from tests.factories.published_files import write_run
-from tests.factories.published_surfaces import PUBLISHED
+from robotics_bridge import hands, tasks
+from robotics_bridge.deploy.links.simulated_hand import Faults
+from robotics_bridge.deploy.links.udp import KEY, read_key
+from robotics_bridge.hands.layouts import read_probes, write_probes
+from robotics_bridge.policies.contract import PolicyContract
+from robotics_bridge.policies.training.distill import load_student
+from robotics_bridge.policies.training.distill_config import StudentSweep, read_sweep
+from robotics_bridge.sensors.calibration.calibrate import read_log
+from robotics_bridge.sensors.noise.model import Noise
+from robotics_bridge.tasks.registry import apply_overrides
+from tests.factories.hand_gallery import GALLERY
+from tests.factories.policies import contract_of, student_folder
+from tests.factories.published_files import lightning_state, make_zero_filled, write_published, write_run, write_sweep
 from tests.factories.reading_trials import Surface, bad_counts, not_finite, numbers, typed, written, written_json
 from tests.factories.recording_files import write_nwb
 from tests.factories.recordings import make_simple_session, make_stimuli
 from tests.factories.records import make_record
-from tests.factories.robot_surfaces import ROBOTS
 from tests.factories.scene_files import POLE
 from tests.factories.scored_files import write_arrays
 from tests.factories.sweep_batches import small_set
@@ -289,6 +311,165 @@ def _bad_order(answer: tuple[Path, list[str]]) -> bool:
     return odd or ".." in folder.parts
 
 
+SETTINGS = """
+model:
+  encoder:
+    model_config_file: configs/rnn_fdb_converted_modern_ugrnn_ln.json
+train:
+  ssl: SimCLRLoss
+  epochs: 100
+  learning_rate: 0.01
+"""
+
+
+def _recordings(folder: Path) -> Path:
+    return write_published(folder / "rodgers6_data.npz", m1=make_zero_filled([14, 12], units=3)[0])
+
+
+def _tree(folder: Path) -> Path:
+    for name in ("train", "test"):
+        write_sweep(folder / name / "00000000.npz")
+    (folder / "categories.json").write_text('{"03211117/screen": 0, "04530566/boat": 2}')
+    return folder / "categories.json"
+
+
+def _halves(folder: Path) -> Path:
+    draw = np.random.default_rng(0)
+    np.savez(folder / "splits.npz", r_xy=draw.uniform(0, 1, 20), r_yy=draw.uniform(0, 1, 20))
+    return folder / "splits.npz"
+
+
+@functools.cache
+def _state() -> dict[str, torch.Tensor]:
+    with torch.random.fork_rng():
+        return lightning_state(load_model("zhuang-gru-small", classes=3))
+
+
+def _checkpoint(folder: Path) -> Path:
+    torch.save({"state_dict": dict(_state()), "epoch": 6, "global_step": 50}, folder / "best.ckpt")
+    return folder / "best.ckpt"
+
+
+def _import(path: Path) -> Any:
+    weights = read_weights(path)
+    return weights, build_published(weights.state, recognise(weights.state, architecture="zhuang-gru-small"))[
+        0
+    ].state_dict()
+
+
+def _import_to_folder(path: Path) -> dict[str, torch.Tensor]:
+    made = import_checkpoint(path, architecture="zhuang-gru-small", out=path.parent / "imported")
+    return read_tensors(made.folder / WEIGHTS)
+
+
+def _bad_published_sweep(sweep: conversion.SweepFile) -> bool:
+    """Forces are finite or missing, and stay within what is trusted; conditions and label are numbers."""
+    label = 0 if sweep.label is None else sweep.label
+    return not_finite(sweep.conditions) or np.isinf(sweep.wrench()).any() or not 0 <= label < 2**31
+
+
+CHANGES = (
+    "is_dropped=-300 rotation_progress.clip=2 episode=15 entropy=0 learning_rate_range=1e-4,1e-3 friction=0.8 "
+    "object_changes.friction=0.8,1 density=300 noise.position=0.01 hidden=64,32 copies=1 solver.timestep=0.004"
+)
+STUDENTS = """
+types = ["agg_force", "bool"]
+resolutions = ["low", "med"]
+noisy = [false, true]
+seeds = [0, 1]
+teacher = "teachers/{task}-{hand}"
+pinned = { resolution = "med", noisy = true }
+settings = { iterations = 300, num_envs = 16 }
+[encoders]
+types = ["agg_force"]
+arms = [{ encoder = "mlp" }]
+[[entries]]
+task = "in_palm_rotate"
+hand = "xhand1"
+placements = ["tips", "hand"]
+"""
+_OF_HAND = (
+    "body_pos", "body_quat", "body_mass", "body_inertia", "geom_size", "geom_pos", "geom_friction", "jnt_range",
+    "jnt_axis", "dof_damping", "dof_armature", "actuator_gainprm", "actuator_ctrlrange",
+)  # fmt: skip
+
+
+def _probes(folder: Path) -> Path:
+    write_probes(folder / "probes.json", hands.load("xhand1").layout("low", "tips"))
+    return folder / "probes.json"
+
+
+def _bad_layout(layout: Any) -> bool:
+    return not_finite(layout) or any((probes.radius < 0).any() for probes in layout.values())
+
+
+def _log(folder: Path) -> Path:
+    draw, times = np.random.default_rng(0), 0.01 * np.arange(60)
+    signal = np.where(np.sin(5 * times) > 0, np.sin(5 * times), 0.0)
+    table = np.column_stack([times, signal, signal[:, None] + 0.01 * draw.normal(size=(60, 3))])
+    np.savetxt(folder / "log.csv", table, delimiter=",", header="time,reference,p1,p2,p3", comments="", fmt="%.5f")
+    return folder / "log.csv"
+
+
+def _noise(folder: Path) -> Path:
+    Noise.preset("published-elastomer").save(folder / "noise.json", sensor="x")
+    return folder / "noise.json"
+
+
+def _bad_noise(noise: Noise) -> bool:
+    return not_finite(noise) or not 0 <= noise.dead_probability <= 1 or min(noise.white, noise.walk, noise.quantum) < 0
+
+
+def _read_hand(path: Path) -> Any:
+    hand = hands.load(path)
+    return {name: getattr(hand.model, name) for name in _OF_HAND} | {"probes": hand.layout("low")}
+
+
+def _bad_hand(values: Any) -> bool:
+    return not_finite(values) or (values["body_mass"] < 0).any() or (values["geom_friction"] < 0).any()
+
+
+def _change(text: str) -> Any:
+    return apply_overrides(tasks.load("in_palm_rotate"), text.split())
+
+
+def _bad_task(task: Any) -> bool:
+    counts = (task.teacher.num_envs, task.teacher.epochs, task.teacher.minibatches, *task.teacher.hidden, task.copies)
+    return (
+        not_finite(task)
+        or min(counts) < 1
+        or min(task.friction, task.noise.position, task.teacher.entropy, *task.object_changes.friction) < 0
+        or min(task.density, task.episode, task.solver.timestep) <= 0
+    )
+
+
+def _student(name: str) -> Any:
+    return lambda folder: student_folder(folder) / name
+
+
+def _load_student(path: Path) -> Any:
+    student, described = load_student(path.parent)
+    return dict(student.state_dict()), described
+
+
+def _bad_students(sweep: StudentSweep) -> bool:
+    students = sweep.students()
+    return not_finite([vars(one) for one in students]) or any(
+        one.seed < 0 or one.iterations < 1 or one.num_envs < 1 for one in students
+    )
+
+
+def _key(folder: Path) -> Path:
+    path = folder / "hand.key"
+    path.write_text("0f" * KEY)
+    path.chmod(0o600)
+    return path
+
+
+def _bad_contract(contract: PolicyContract) -> bool:
+    return any(not math.isfinite(n) for n in numbers(contract)) or contract.rate <= 0
+
+
 SURFACES = (
     Surface(
         "recordings, NWB", lambda folder: write_nwb(folder / "sub-m1_ses-s1.nwb"),
@@ -374,6 +555,33 @@ SURFACES = (
         "numbers text", written("numbers.txt", "0.5,1e-3,20"),
         typed(lambda text: option_numbers(text, "--steps", float)),
     ),
-    *PUBLISHED,
-    *ROBOTS,
+    Surface("published recordings, npz", _recordings, open_recordings, bad_counts),
+    Surface(
+        "published sweep, npz", lambda folder: write_sweep(folder / "0.npz"), conversion.read_sweep,
+        _bad_published_sweep,
+    ),
+    Surface(
+        "published sweeps, categories", _tree, lambda path: conversion.open_sweep_tree(path.parent).classes,
+        lambda names: len(names) > 1000,
+    ),
+    Surface("split halves, npz", _halves, explain_file, lambda steps: np.isinf([*numbers(steps)]).any()),
+    Surface("published weights, ckpt", _checkpoint, _import),
+    Surface("published weights, imported", _checkpoint, _import_to_folder),
+    Surface("published settings, YAML", written("config.yaml", SETTINGS), read_settings),
+    Surface("change text", written("change.txt", CHANGES), typed(_change), _bad_task),
+    Surface(
+        "fault text",
+        written("fault.txt", "drop=0.2 jitter=0.03 silent-after=2 seed=3"),
+        typed(lambda text: Faults.parse(text.split())),
+    ),
+    Surface("hand, URDF", written("hand.urdf", GALLERY["urdf-mimic"].text), _read_hand, _bad_hand),
+    Surface("hand, MJCF", written("hand.xml", GALLERY["coupled-jaws"].text), _read_hand, _bad_hand),
+    Surface("probe layout", _probes, read_probes, _bad_layout),
+    Surface("calibration log", _log, read_log),
+    Surface("noise preset", _noise, Noise.load, _bad_noise),
+    Surface("contract", written_json("policy.onnx.json", contract_of()), PolicyContract.read, _bad_contract),
+    Surface("student, configuration", _student("config.json"), _load_student),
+    Surface("student, weights", _student("model.safetensors"), _load_student),
+    Surface("sweep of students", written("students.toml", STUDENTS), read_sweep, _bad_students),
+    Surface("key of a hand", _key, read_key, lambda key: len(key) != KEY),
 )  # fmt: skip

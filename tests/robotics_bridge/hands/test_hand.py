@@ -21,7 +21,6 @@ URDF = {
     "xhand1": "hands/xhand1/xhand_right_updated_effort.urdf",
     "sharpa": "hands/sharpa/sharpa_right_updated_effort.urdf",
 }
-JSON = {("xhand1", "low"): "probes_90_hand_xhand1", ("xhand1", "med"): "probes_199_hand_xhand1"}
 
 # As the menagerie writes a hand: defaults, a wrist above the palm, mesh-free geometries, a tendon-free thumb.
 MENAGERIE_LIKE = """

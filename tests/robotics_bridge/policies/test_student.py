@@ -130,12 +130,6 @@ def test_kept_features_of_a_frozen_network_give_the_same_latent() -> None:
         torch.testing.assert_close(latent, kept)
 
 
-SLOWER = [
-    pytest.param(name, marks=pytest.mark.slow)
-    for name in (NETWORK, "tactile_convrnn", "tactile_canvas_cnn", "s4-small")
-]
-
-
 @pytest.mark.slow
 def test_a_policy_that_was_sampled_in_training_is_exported_and_never_as_a_program(tmp_path) -> None:
     policy = _make_policy("zhuang-small", distribution_cfg={"class_name": "GaussianDistribution", "init_std": 1.0})

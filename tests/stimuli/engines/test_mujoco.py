@@ -73,9 +73,6 @@ def test_the_follicle_follows_its_trajectory_to_a_millionth_against_apost():
     assert np.abs(followed - wanted).max() < 1e-6 * np.ptp(wanted, axis=0).max()
 
 
-STIFF = replace(C2, young_modulus=5e13, damping_ratio=6.0)
-
-
 def test_refining_step_and_links_converges():
     times = np.arange(1.0, 101.0) * 1e-3
     job = Job(C2, Oscillation(angles=(0.25, 0, 0)), (post(0.0107, 0.0025, friction=0.0),), times)

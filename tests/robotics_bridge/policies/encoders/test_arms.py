@@ -65,9 +65,6 @@ def test_the_arm_steps_remembers_and_takes_its_draw_from_the_student(name: str) 
     torch.testing.assert_close(arm(touch[0, :2], zeros[:2])[0], arm(touch[0], zeros)[0][:2])
 
 
-NETWORK = "zhuang-intersection-ln-small"
-
-
 ITEMS = 45
 
 
@@ -83,12 +80,6 @@ def _observations(batch: int, steps: int = 1, seed: int = 0) -> TensorDict:
     touch = values(5, ITEMS, 6) * torch.tensor([0.2] * 3 + [2e-3] * 3)
     groups = {"proprio": values(30), "goal": values(1), "tactile": touch}
     return TensorDict(groups, batch_size=[steps, batch])
-
-
-SLOWER = [
-    pytest.param(name, marks=pytest.mark.slow)
-    for name in (NETWORK, "tactile_convrnn", "tactile_canvas_cnn", "s4-small")
-]
 
 
 def test_running_scale_counts_only_what_touches() -> None:
