@@ -8,9 +8,6 @@ from robotics_bridge.sensors.calibration.calibrate import Log
 from robotics_bridge.sensors.noise.model import Noise
 from robotics_bridge.sensors.noise.stages import simulate
 
-TIME = np.arange(200) * 0.01
-SIGNAL = np.sin(3 * TIME)
-READINGS = SIGNAL[:, None] + 0.01 * np.random.default_rng(0).normal(size=(200, 2))
 DT = 0.005
 
 

@@ -1,24 +1,11 @@
-"""A parsed page, and texts that would do harm if they ran."""
+"""A parsed page."""
 
 from __future__ import annotations
 
-import json
 from html.parser import HTMLParser
 from pathlib import Path
-from typing import Any
-
-from brainbench.core.records import ResultRecord
 
 VOID = {"meta", "img", "br", "hr", "input", "link"}
-HOSTILE = (
-    "</script><script>document.title='pwned'</script>",
-    '"><img src=x onerror="document.title=\'pwned\'">',
-    "' onmouseover='document.title=1' x='",
-    "</style><svg onload=document.title='pwned'>",
-    "javascript:document.title='pwned'",
-    "{{ 7 * 7 }}{% raw %}",
-    "]]><!--<title>pwned</title>",
-)
 
 
 class Page(HTMLParser):
@@ -55,20 +42,3 @@ class Page(HTMLParser):
 
     def shape(self) -> list[tuple[str, tuple[str, ...]]]:
         return [(tag, tuple(attributes)) for tag, attributes in self.elements]
-
-
-def poison(data: Any, text: str) -> Any:
-    """Replace every string of a record but its status, keys of open mappings included."""
-    if isinstance(data, dict):
-        poisoned = {key: value if key == "status" else poison(value, text) for key, value in data.items()}
-        for key in ("baselines", "provenance"):
-            if key in poisoned:
-                poisoned[key] |= {text: next(iter(poisoned[key].values()))}
-        return poisoned
-    if isinstance(data, list):
-        return [poison(item, text) for item in data]
-    return text if isinstance(data, str) else data
-
-
-def poisoned(record: ResultRecord, text: str) -> ResultRecord:
-    return ResultRecord.from_json(poison(json.loads(record.to_json()), text))

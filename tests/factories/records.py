@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-import inspect
 import math
 from collections.abc import Mapping
 from dataclasses import replace
-from functools import cache
 from itertools import combinations
-from typing import Any
 
-import msgspec
 import numpy as np
 from jsonschema import Draft202012Validator
 from scipy.special import stdtrit
 
+from brainbench.core.files import read_json
 from brainbench.core.records import (
-    RECORD_SCHEMA,
     Ceiling,
     Interval,
     LayerScore,
@@ -26,27 +22,9 @@ from brainbench.core.records import (
     SubjectScore,
 )
 from brainbench.core.statistics import two_factor_error
+from leaderboards.store import SCHEMA_PATH
 
-
-@cache
-def record_schema() -> dict[str, Any]:
-    """Return the JSON Schema (draft 2020-12) of one record file. The result is shared."""
-    schema = msgspec.json.schema(ResultRecord)
-    for definition in schema["$defs"].values():
-        definition["description"] = inspect.cleandoc(definition["description"]).split("\n\n")[0].replace("\n", " ")
-        definition["additionalProperties"] = False
-        for described in definition["properties"].values():
-            described.pop("default", None)  # NaN among them, which JSON does not have
-    schema["$defs"]["ResultRecord"]["required"].append("schema")
-    return {
-        "$schema": "https://json-schema.org/draft/2020-12/schema",
-        "$id": f"urn:brainbench:result-record:{RECORD_SCHEMA}",
-        "title": "brainbench result record",
-        **schema,
-    }
-
-
-VALIDATOR = Draft202012Validator(record_schema())
+VALIDATOR = Draft202012Validator(read_json(SCHEMA_PATH))
 STIMULI = tuple(f"{shape}-{distance}" for shape in ("convex", "concave") for distance in ("close", "medium", "far"))
 MODEL_RDM = tuple((i * j + 1) / 31 for i, j in combinations(range(6), 2))
 BRAIN_RDM = tuple((i + j) / 9 for i, j in combinations(range(6), 2))

@@ -25,9 +25,37 @@ from leaderboards import text as words
 from leaderboards.boards import rank
 from leaderboards.ranking import STANDINGS
 from leaderboards.site.build import COLUMNS, FIELDS, MANIFEST
-from tests.factories.html_page import HOSTILE, Page, poisoned
+from tests.factories.html_page import Page
 from tests.factories.records import draw_board, make_record
 from tests.factories.sweep_batches import files_of
+
+HOSTILE = (
+    "</script><script>document.title='pwned'</script>",
+    '"><img src=x onerror="document.title=\'pwned\'">',
+    "' onmouseover='document.title=1' x='",
+    "</style><svg onload=document.title='pwned'>",
+    "javascript:document.title='pwned'",
+    "{{ 7 * 7 }}{% raw %}",
+    "]]><!--<title>pwned</title>",
+)
+"""Texts that would do harm if they ran."""
+
+
+def _poison(data: Any, text: str) -> Any:
+    """Replace every string of a record but its status, keys of open mappings included."""
+    if isinstance(data, dict):
+        poisoned = {key: value if key == "status" else _poison(value, text) for key, value in data.items()}
+        for key in ("baselines", "provenance"):
+            if key in poisoned:
+                poisoned[key] |= {text: next(iter(poisoned[key].values()))}
+        return poisoned
+    if isinstance(data, list):
+        return [_poison(item, text) for item in data]
+    return text if isinstance(data, str) else data
+
+
+def _poisoned(record: ResultRecord, text: str) -> ResultRecord:
+    return ResultRecord.from_json(_poison(json.loads(record.to_json()), text))
 
 
 @pytest.fixture
@@ -214,7 +242,7 @@ def test_nothing_to_show_and_foreign_folders_are_errors_that_say_what_to_do(make
 
 @pytest.mark.parametrize("text", HOSTILE)
 def test_hostile_text_cannot_leave_the_data_of_the_table(make_record, tmp_path, text):
-    record = poisoned(make_record(), text)
+    record = _poisoned(make_record(), text)
     bad = tmp_path / "store" / "bad.json"
     bad.parent.mkdir()
     bad.write_text(json.dumps({"schema": 2, "score": text}))
@@ -239,7 +267,9 @@ def chromium():
 @pytest.mark.slow
 @browser
 def test_nothing_hostile_runs_in_a_browser_and_our_script_does(make_record, tmp_path, chromium):
-    site = build([poisoned(make_record(value=0.1 * i), text) for i, text in enumerate(HOSTILE)], tmp_path, title="calm")
+    site = build(
+        [_poisoned(make_record(value=0.1 * i), text) for i, text in enumerate(HOSTILE)], tmp_path, title="calm"
+    )
     page = chromium.new_page()
     for path in (site / "index.html", site / "figures.html", *(site / "models").iterdir()):
         page.goto(path.as_uri())
@@ -594,13 +624,13 @@ def _every_page(record: ResultRecord, folder: Path) -> list[Page]:
 
 @pytest.fixture(scope="module")
 def harmless(tmp_path_factory) -> list[list[tuple[str, tuple[str, ...]]]]:
-    pages = _every_page(poisoned(make_record(), "harmless"), tmp_path_factory.mktemp("harmless"))
+    pages = _every_page(_poisoned(make_record(), "harmless"), tmp_path_factory.mktemp("harmless"))
     return [page.shape() for page in pages]
 
 
 @pytest.mark.parametrize("text", HOSTILE)
 def test_hostile_text_in_every_field_changes_no_element_of_the_pages(harmless, tmp_path, text):
-    pages = _every_page(poisoned(make_record(), text), tmp_path)
+    pages = _every_page(_poisoned(make_record(), text), tmp_path)
     assert [page.shape() for page in pages] == harmless
     for page in pages:
         assert len(page.all("script")) == 1

@@ -12,7 +12,11 @@ from brainbench.core.errors import DataError, UsageError
 from robotics_bridge.sensors.calibration.calibrate import Log, calibrate, delay_of, find_quantum, read_log
 from robotics_bridge.sensors.noise.model import Noise
 from robotics_bridge.sensors.noise.stages import simulate
-from tests.factories.calibration_logs import DT, READINGS, SIGNAL, TIME, log_of, presses
+from tests.factories.calibration_logs import DT, log_of, presses
+
+TIME = np.arange(200) * 0.01
+SIGNAL = np.sin(3 * TIME)
+READINGS = SIGNAL[:, None] + 0.01 * np.random.default_rng(0).normal(size=(200, 2))
 
 
 @pytest.mark.parametrize(
