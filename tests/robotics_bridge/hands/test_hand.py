@@ -13,7 +13,7 @@ import pytest
 from brainbench.core.errors import DataError, UsageError
 from brainbench.core.rotations import from_rpy
 from robotics_bridge import hands, tasks
-from robotics_bridge.hands.hand import UNKNOWN_SPEED
+from robotics_bridge.hands.hand import UNKNOWN_SPEED, palmar_directions
 from robotics_bridge.hands.layouts import active_count
 from robotics_bridge.tasks.scenes import build as build_task
 
@@ -105,6 +105,27 @@ def test_servo_gains_are_those_of_the_actuators_file(name, reference):
     assert -model.actuator_biasprm[:, 2] == pytest.approx(expected["kd"])
     dof = model.jnt_dofadr[model.actuator_trnid[:, 0]]
     assert model.dof_armature[dof] == pytest.approx(expected["armature"])
+
+
+def test_a_menagerie_like_file_becomes_a_hand_with_probes_on_its_palmar_sides(tmp_path):
+    path = tmp_path / "claw.xml"
+    path.write_text(MENAGERIE_LIKE)
+    hand = hands.load(path)
+    assert (hand.palm, set(hand.fingers)) == ("palm", {"f1_far", "f2_far"})
+    assert hand.joints == ("wrist", "f1_spread", "f1_a", "f1_b", "f2_a", "f2_b")
+    # A joint that spreads tells no side; its link faces as the finger does.
+    facing = palmar_directions(hand.model, hand.palm, hand.fingers)
+    assert facing["f1_knuckle"] == pytest.approx([1, 0, 0])
+    layout = hand.layout("low", "tips")
+    assert set(layout) == {"f1_far", "f2_far"}
+    for probes in layout.values():
+        assert probes.shape == (3, 3)
+        assert (probes.normal[probes.active][:, 0] > 0).all()
+        on_axis = np.clip(probes.position[probes.active][:, 2], 0.01, 0.03)
+        away = probes.position[probes.active] - np.outer(on_axis, [0, 0, 1])
+        assert np.linalg.norm(away, axis=1) == pytest.approx(0.008, abs=1e-9)
+    palm = hand.layout("low", "palm")["palm"]
+    assert palm.position[:, 0] == pytest.approx(0.02)
 
 
 def test_bodies_and_joints_without_a_name_are_told_apart(tmp_path):
