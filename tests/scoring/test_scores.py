@@ -17,8 +17,7 @@ from brainbench.cli.leaderboard.verify import Repetition, score_again
 from brainbench.core.contracts import Trials
 from brainbench.core.errors import UsageError
 from brainbench.core.records import Score, SubjectScore
-from brainbench.datasets import open_recordings, write_recordings
-from brainbench.datasets.sessions import make_session
+from brainbench.datasets import write_recordings
 from brainbench.datasets.trials.session_trials import pooled
 from brainbench.metrics import get_metric
 from brainbench.models.features import write_features
@@ -26,62 +25,11 @@ from brainbench.scoring.scores import effective_number, held_parts, influence_of
 from leaderboards.audit import differences
 
 LABELS = ("a", "b", "c", "d", "e", "f")
-TRIALS = 30
-
-
-def _rates(units: int, *, geometry: int = 0, tuning: int) -> np.ndarray:
-    """Rates [K, units] (Hz) of units with random tuning to five dimensions that the stimuli differ in."""
-    dimensions = np.random.default_rng(geometry).normal(size=(len(LABELS), 5))
-    return 12 * np.exp(0.4 * dimensions @ np.random.default_rng([8, tuning]).normal(size=(5, units)))
-
-
-def _geometry(seed: int = 0) -> np.ndarray:
-    """Features [K, 2000]: what very many noiseless units of that geometry would show."""
-    return _rates(2000, geometry=seed, tuning=99)
-
-
-def _make_recordings(
-    folder: Path, *, animals: int = 4, units: int = 80, trials: int = TRIALS, missing: str = ""
-) -> Path:
-    """Animals whose rates are random mixtures of one geometry, with Poisson spikes."""
-    for animal in range(animals):
-        rng = np.random.default_rng([7, animal])
-        rates = _rates(units, tuning=animal)
-        order = rng.permutation(np.repeat(np.arange(len(LABELS)), trials))
-        if animal == 0 and missing:
-            order = order[order != LABELS.index(missing)]
-        starts = 1.0 + 1.5 * np.arange(len(order))
-        spikes = [
-            np.sort(
-                np.concatenate(
-                    [
-                        start + rng.uniform(0, 1, rng.poisson(rates[k, unit]))
-                        for start, k in zip(starts, order, strict=True)
-                    ]
-                )
-            )
-            for unit in range(units)
-        ]
-        table = {"start_time": starts, "stop_time": starts + 1.0, "stimulus": [LABELS[k] for k in order]}
-        span = np.array([[0.0, starts[-1] + 2]])
-        session = make_session(f"m{animal}", "s", spikes, {"trials": table}, observed=[span] * units)
-        write_recordings(folder / f"m{animal}.h5", session)
-    return folder
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return _make_recordings(tmp_path_factory.mktemp("recordings"))
-
-
-@pytest.fixture(scope="module")
-def recordings(folder: Path) -> xr.Dataset:
-    return open_recordings(folder, conditions="trials:stimulus")
-
-
-@pytest.fixture(scope="module")
-def truth(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    layers = {"other": _geometry(9), "true": _geometry()}
+def truth(tmp_path_factory: pytest.TempPathFactory, geometry) -> Path:
+    layers = {"other": geometry(9), "true": geometry()}
     return write_features(tmp_path_factory.mktemp("features") / "model.h5", LABELS, layers)
 
 
@@ -108,14 +56,14 @@ def test_features_with_labels_of_their_own_state_no_stimuli(truth: Path, recordi
     assert "idelity" not in methods([record])
 
 
-def test_an_unrelated_geometry_does_not(recordings: xr.Dataset, tmp_path: Path):
-    path = write_features(tmp_path / "other.h5", LABELS, {"fc": _geometry(9)})
+def test_an_unrelated_geometry_does_not(recordings: xr.Dataset, tmp_path: Path, geometry):
+    path = write_features(tmp_path / "other.h5", LABELS, {"fc": geometry(9)})
     score = brainbench.score(str(path), recordings=recordings)
     assert score.scaled < 0.8
     assert score.p > 0.02
 
 
-def test_order_of_trials_and_labels_changes_nothing(truth: Path, recordings: xr.Dataset, tmp_path: Path):
+def test_order_of_trials_and_labels_changes_nothing(truth: Path, recordings: xr.Dataset, tmp_path: Path, geometry):
     first = brainbench.score(str(truth), recordings=recordings)
     order = np.random.default_rng(1).permutation(recordings.sizes["trial"])
     shuffled = recordings.isel(trial=order)
@@ -123,7 +71,7 @@ def test_order_of_trials_and_labels_changes_nothing(truth: Path, recordings: xr.
     turned = write_features(
         tmp_path / "turned.h5",
         [LABELS[row] for row in rows],
-        {"other": _geometry(9)[rows], "true": _geometry()[rows]},
+        {"other": geometry(9)[rows], "true": geometry()[rows]},
     )
     second = brainbench.score(str(turned), recordings=shuffled)
     assert second.value == pytest.approx(first.value, abs=1e-12)
@@ -155,8 +103,8 @@ def test_a_seed_reproduces_a_record_and_provenance_says_what_was_scored(truth: P
     assert not first.synthetic
 
 
-def test_a_subject_without_a_stimulus_is_named_and_the_others_still_count(truth: Path, tmp_path: Path):
-    folder = _make_recordings(tmp_path, missing="c", units=30, trials=12)
+def test_a_subject_without_a_stimulus_is_named_and_the_others_still_count(truth: Path, tmp_path: Path, make_recordings):
+    folder = make_recordings(tmp_path, missing="c", units=30, trials=12)
     score = brainbench.score(str(truth), recordings=str(folder), conditions="trials:stimulus")
     lost = score.subjects[0]
     assert lost.subject == "m0"
@@ -227,8 +175,8 @@ def test_a_choice_that_recordings_in_memory_cannot_follow_is_refused(truth: Path
         brainbench.score(str(truth), recordings=recordings, **choice)
 
 
-def test_unmatched_labels_are_an_error_that_lists_both_sides(recordings: xr.Dataset, tmp_path: Path):
-    path = write_features(tmp_path / "x.h5", [*LABELS[:5], "z"], {"fc": _geometry()})
+def test_unmatched_labels_are_an_error_that_lists_both_sides(recordings: xr.Dataset, tmp_path: Path, geometry):
+    path = write_features(tmp_path / "x.h5", [*LABELS[:5], "z"], {"fc": geometry()})
     with pytest.raises(UsageError, match=r"without a stimulus: 'f'; without recordings: 'z'.*--match"):
         brainbench.score(str(path), recordings=recordings)
 
@@ -245,9 +193,9 @@ def test_nan_or_constant_activations_give_an_undefined_score_with_a_reason(
     assert record.from_json(record.to_json()).to_json() == record.to_json()
 
 
-def test_a_layer_of_nan_is_never_chosen(recordings: xr.Dataset, tmp_path: Path):
-    bad = np.full_like(_geometry(), np.nan)
-    path = write_features(tmp_path / "x.h5", LABELS, {"bad": bad, "true": _geometry()})
+def test_a_layer_of_nan_is_never_chosen(recordings: xr.Dataset, tmp_path: Path, geometry):
+    bad = np.full_like(geometry(), np.nan)
+    path = write_features(tmp_path / "x.h5", LABELS, {"bad": bad, "true": geometry()})
     score = brainbench.score(str(path), recordings=recordings)
     assert score.layer == "true"
     assert next(item for item in score.layers if item.layer == "bad").status == "undefined"
@@ -323,10 +271,12 @@ def test_the_published_readout_scores_the_layers_of_the_study(recordings: xr.Dat
         score_record({"fc": np.ones((6, 2))}, **given)
 
 
-def test_scores_of_mappings_follow_the_order_of_the_stimuli(recordings: xr.Dataset, arrays: Path, truth: Path):
+def test_scores_of_mappings_follow_the_order_of_the_stimuli(
+    recordings: xr.Dataset, arrays: Path, truth: Path, geometry
+):
     by_file = brainbench.score(str(truth), recordings=recordings)
     by_mapping = brainbench.score(
-        {"other": _geometry(9), "true": _geometry()}, recordings=recordings, stimuli=str(arrays)
+        {"other": geometry(9), "true": geometry()}, recordings=recordings, stimuli=str(arrays)
     )
     assert by_mapping.value == pytest.approx(by_file.value, abs=1e-6)
     with pytest.raises(UsageError, match=r"expected \[6, F\]"):
