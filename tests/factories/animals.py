@@ -1,4 +1,4 @@
-"""Animals and models with a known geometry."""
+"""Animals and models with a known geometry, and names that rsatoolbox has for comparisons of their RDMs."""
 
 from __future__ import annotations
 
@@ -58,3 +58,15 @@ def make_layers(latent, count=4, seed=50):
 def score_of(layers, subjects, **options):
     """The score of a model of such layers."""
     return score_rdms(layers, subjects, name="model", stimuli=STIMULI, **options)
+
+
+THEIRS = {
+    "pearson": "corr",
+    "spearman": "spearman",
+    "rho-a": "rho-a",
+    "tau-a": "tau-a",
+    "tau-b": "tau-b",
+    "cosine": "cosine",
+    "whitened-cosine": "cosine_cov",
+    "whitened-pearson": "corr_cov",
+}

@@ -1,4 +1,4 @@
-"""A physics double: its forces are readable functions of the job, so that the plumbing can be checked exactly."""
+"""A physics double, whose forces are readable functions of the job, and facts of simulated whiskers to be judged."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import numpy as np
 
 from brainbench.core.rotations import base_rotation
 from brainbench.stimuli.engines.protocol import WhiskerEngine
+from brainbench.stimuli.engines.trust import OK, RunFacts
 from brainbench.stimuli.motion.jobs import Trace
 
 
@@ -54,3 +55,13 @@ class FakeEngine(WhiskerEngine):
             penetration=1e-6 * contact.any(),
             steps=len(job.times),
         )
+
+
+def facts(**changed):
+    """Facts of one whisker in good order but for what is changed."""
+    values = {
+        "status": OK, "failed": 0.0, "strength": 0.0, "strong_at": np.inf, "strongest": 30.0, "travel": 0.0,
+        "farthest": 8e-4, "fast_at": np.inf, "struck": False,
+        "residual": 0.01, "crowded": 0, "steps": 100, "depth": 1e-5, "peak": 1e-3, "third": 9e-4,
+    }  # fmt: skip
+    return RunFacts(**{name: np.array([value]) for name, value in (values | changed).items()})

@@ -1,4 +1,4 @@
-"""Contracts and small exported policies."""
+"""Contracts, small exported policies, and ``brainbench policy`` called as a user calls it."""
 
 from __future__ import annotations
 
@@ -9,7 +9,9 @@ from typing import Any
 
 import torch
 from tensordict import TensorDict
+from typer.testing import CliRunner
 
+from brainbench.cli import app
 from brainbench.core.files import read_json, to_plain, write_json, write_tensors
 from robotics_bridge import hands
 from robotics_bridge.policies.export import export_policy
@@ -81,3 +83,12 @@ def student_folder(folder: Path) -> Path:
     write_json(folder / "config.json", described)
     write_tensors(folder / "model.safetensors", student.state_dict())
     return folder
+
+
+def run_policy(*arguments: object, code: int = 0) -> str:
+    """Return what ``brainbench policy`` prints; what it raises is raised here too."""
+    result = CliRunner().invoke(app, ["policy", *map(str, arguments)])
+    if result.exception is not None and not isinstance(result.exception, SystemExit):
+        raise result.exception
+    assert result.exit_code == code, result.output
+    return result.stdout

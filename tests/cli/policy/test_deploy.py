@@ -9,8 +9,7 @@ import pytest
 
 from brainbench.core.errors import BrainbenchError, UsageError
 from brainbench.core.files import write_json
-from tests.factories.policies import export_small
-from tests.factories.policy_commands import run_policy
+from tests.factories.policies import export_small, run_policy
 
 TOLD = ("--input", "command=1")
 

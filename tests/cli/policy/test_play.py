@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from tests.factories.policy_commands import run_policy
+from tests.factories.policies import run_policy
 
 
 def test_tasks_are_listed() -> None:

@@ -11,8 +11,7 @@ from brainbench.core.errors import DataError, UsageError
 from brainbench.core.files import lock_folder, read_json
 from robotics_bridge import hands
 from robotics_bridge.hands.layouts import write_probes
-from tests.factories.policies import teacher_in
-from tests.factories.policy_commands import run_policy
+from tests.factories.policies import run_policy, teacher_in
 
 
 @pytest.mark.slow

@@ -10,7 +10,7 @@ import pytest
 from brainbench.cli.tactile import scenes
 from brainbench.core.errors import MissingDependencyError
 from brainbench.stimuli.figures.surfaces import Triangles
-from tests.factories.policy_commands import run_policy
+from tests.factories.policies import run_policy
 
 
 def test_triangles_of_a_link_are_carried_with_it():

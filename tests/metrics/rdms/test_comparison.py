@@ -21,7 +21,7 @@ from brainbench.metrics.rdms.comparison import (
     products,
     products_without,
 )
-from tests.factories.rsatoolbox_names import THEIRS
+from tests.factories.animals import THEIRS
 
 
 def _make_rdms(count, stimuli=6, seed=0, ties=False):

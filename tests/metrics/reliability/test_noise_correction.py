@@ -18,8 +18,7 @@ from brainbench.metrics.reliability.noise_correction import (
     spearman_brown,
 )
 from brainbench.metrics.reliability.subject_rdm import subject_rdm
-from tests.factories.animals import make_block, make_latent
-from tests.factories.rsatoolbox_names import THEIRS
+from tests.factories.animals import THEIRS, make_block, make_latent
 
 
 @pytest.fixture(scope="module")

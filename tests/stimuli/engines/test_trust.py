@@ -30,7 +30,7 @@ from brainbench.stimuli.engines.trust import (
 from brainbench.stimuli.motion.jobs import Job, StillFollicle
 from brainbench.stimuli.objects.obstacle import Capsule, Obstacle, Sphere
 from brainbench.stimuli.whiskers.whisker import Whisker
-from tests.factories.trust import facts
+from tests.factories.engines import facts
 
 WHISKER = Whisker(0.02, 50e-6, 5e-6, young_modulus=4e9, density=1260.0, damping_ratio=0.3)
 TIMES = np.linspace(0.0, 0.01, 11)

@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-from tests.factories.policy_commands import run_policy
+from tests.factories.policies import run_policy
 
 
 @pytest.mark.slow
