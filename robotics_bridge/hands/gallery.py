@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from brainbench.core.devices import mujoco_module
-from brainbench.core.errors import BrainbenchError, DataError
+from brainbench.core.errors import BrainbenchError
 from robotics_bridge.hands import load_all
-from robotics_bridge.hands.hand import Hand
+from robotics_bridge.hands.hand import Hand, unit_doubts
 from robotics_bridge.hands.layouts import Layout, active_count
 from robotics_bridge.hands.tree import link_points
 
@@ -23,7 +23,6 @@ _DEPTH = 3e-4  # depth to which they press (m)
 _AWAY = 10.0  # where a ball waits (m)
 WRONG = 0.01  # part of a load that taxels may lack without a word
 OFF = 1e-4  # how far from its place they may show it without a word (m)
-_SPANS = (0.01, 5.0)  # from the smallest gripper to a hand on an arm (m)
 
 
 @dataclass(frozen=True)
@@ -69,13 +68,13 @@ def check_hand(hand: Hand, pictures: Path | None = None, resolution: str = "low"
     """Place taxels on a hand, press a ball on every pad, and compare their sums with the engine's forces."""
     file = str(hand.path)
     try:
-        _check_span(hand)
         layout = hand.layout(resolution)
         loads = press(hand, layout)
     except BrainbenchError as error:
         return HandCheck(hand.name, file, hand.palm, hand.tips, errors=(str(error),))
     bare = tuple(link for link in hand.links() if link not in layout and link not in hand.couplers)
-    errors = [f"no taxels on the tip {tip!r}" for tip in hand.tips if tip not in layout]
+    errors = [*unit_doubts(hand, hand.model)]
+    errors += [f"no taxels on the tip {tip!r}" for tip in hand.tips if tip not in layout]
     errors += [f"no ball can press the tip {tip!r}" for tip in hand.tips if tip in layout and tip not in loads]
     parts, levers = [0.0], [0.0]
     for link, (load, felt, missing, _) in loads.items():
@@ -95,21 +94,6 @@ def check_hand(hand: Hand, pictures: Path | None = None, resolution: str = "low"
         hand.name, file, hand.palm, hand.tips, len(layout), active_count(layout), bare, len(loads), max(parts),
         max(levers), tuple(link for link, numbers in loads.items() if numbers[3]), tuple(errors),
     )  # fmt: skip
-
-
-def _check_span(hand: Hand) -> None:
-    """Raise DataError for a hand whose lengths are hardly metres: pads of a size of their own would not fit it."""
-    data = mujoco.MjData(hand.model)
-    mujoco.mj_kinematics(hand.model, data)
-    points = [
-        data.xpos[body] + link_points(hand.model, body) @ data.xmat[body].reshape(3, 3).T
-        for body in range(1, hand.model.nbody)
-    ]
-    if not _SPANS[0] <= (span := float(np.ptp(np.concatenate(points), axis=0).max(initial=0.0))) <= _SPANS[1]:
-        raise DataError(
-            f"The solids of hand {hand.name!r} span {span:.3g} m, and hands span {_SPANS[0]:g} to {_SPANS[1]:g} m: "
-            'lengths are in metres (a mesh in millimetres takes scale=".001 .001 .001").'
-        )
 
 
 def press(hand: Hand, layout: Layout) -> dict[str, tuple[np.ndarray, np.ndarray, np.ndarray, bool]]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import math
 import os
@@ -21,7 +20,7 @@ from brainbench.core.files import content_hash
 from brainbench.core.reading.regular import readable
 from robotics_bridge.hands.files import read_mjspec, stated_speeds
 from robotics_bridge.hands.layouts import Layout, Pad, check_names, is_probe_file, pad_probes, read_probes, select
-from robotics_bridge.hands.tree import Tree, cast_grid, geoms_of, palmar_directions
+from robotics_bridge.hands.tree import Tree, cast_grid, geoms_of, half_open, link_points, palmar_directions
 from robotics_bridge.sensors.probes.placement import Probes
 
 _log = logging.getLogger(__name__)
@@ -33,6 +32,10 @@ _AUTO_GRIDS = {
 }
 """Rows, columns and radius (m) on a link of a hand without a layout of its own."""
 UNKNOWN_SPEED = 5.0  # speed (rad/s) that counts as the largest of a hinge whose data states none
+_SPANS = (0.01, 2.0)  # from the smallest gripper to a hand with all that is fixed to its palm (m)
+_SMALLEST = 1e-3  # half of the links of any hand are larger (m)
+_LARGE = 2.0  # spans of a hand within which the mass of each link lies
+_HEAVIEST = 50.0  # kg
 LEVER = 0.05
 """Length of a finger (m) whose tip moves as a slide, where a number is stated for hinges alone: 1 rad is .05 m."""
 _PHYSICS = (
@@ -172,11 +175,13 @@ class Hand:
             else:
                 settings = {"facing": facing[link], "radius": radius}
                 for extent in (0.8, 0.4):
-                    with contextlib.suppress(UsageError):
+                    try:
                         layout[link] = cast_grid(self.model, link, rows, columns, **settings, extent=extent)
                         break
+                    except UsageError as error:
+                        reason = f"{link!r}: {str(error).rstrip('.')}"
                 else:
-                    reasons.append(f"{link!r} has no surface on its inner side")
+                    reasons.append(reason)
         if not layout:
             raise UsageError(
                 f"Hand {self.name!r} gets no taxels on {', '.join(links)}: {'; '.join(reasons)}. Place them with "
@@ -185,6 +190,41 @@ class Hand:
         if reasons:
             _log.warning("Hand %s gets no taxels on some links: %s.", brief(self.name), "; ".join(reasons))
         return layout
+
+
+def unit_doubts(hand: Hand, model: Any) -> tuple[str, ...]:
+    """Return what no bodies of the size of a hand in a model have, in words; DataError if lengths are no metres."""
+    data = half_open(model)
+    solids, far = {}, {}
+    for link in hand.links():
+        body = model.body(link)
+        if len(points := link_points(model, body.id)):
+            solids[link] = data.xpos[body.id] + points @ data.xmat[body.id].reshape(3, 3).T
+    if not solids:
+        return ()
+    span = float(np.ptp(np.concatenate([*solids.values()]), axis=0).max())
+    half = float(np.median([np.ptp(points, axis=0).max() for points in solids.values()]))
+    if not _SPANS[0] <= span <= _SPANS[1] or half < _SMALLEST:
+        raise DataError(
+            f"The solids of hand {brief(hand.name)} span {span:.3g} m, those of one link {half:.3g} m (median); "
+            f"hands span {_SPANS[0]:g} to {_SPANS[1]:g} m, and links more than {_SMALLEST:g} m: lengths are in "
+            'metres (a mesh in millimetres takes scale=".001 .001 .001").'
+        )
+    for link, points in solids.items():
+        # No body spreads its mass wider than it is, nor beside itself.
+        body = model.body(link)
+        aside = np.linalg.norm(data.xipos[body.id] - (points.min(axis=0) + points.max(axis=0)) / 2)
+        wide = max(float(aside), math.sqrt(body.inertia.max() / body.mass[0]))
+        far |= {link: wide} if wide > _LARGE * span else {}
+    doubts = []
+    if far:
+        doubts.append(
+            f"the inertia of {listing(far)} is that of mass {max(far.values()):.3g} m away, and the hand spans "
+            f"{span:.3g} m: inertias are in kg·m², places in m"
+        )
+    if (mass := float(sum(model.body(link).mass[0] for link in hand.links()))) > _HEAVIEST:
+        doubts.append(f"palm and fingers weigh {mass:.3g} kg: masses are in kg")
+    return tuple(doubts)
 
 
 def all_from_file(path: Path) -> tuple[Hand, ...]:
@@ -219,6 +259,8 @@ def all_from_file(path: Path) -> tuple[Hand, ...]:
         couplers = frozenset(names(hand.couplers))
         name = path.stem if len(branches) == 1 else f"{path.stem}-{model.body(hand.palm).name}"
         hands.append(Hand(name, model.body(hand.palm).name, fingers, path=path, couplers=couplers))
+        for doubt in unit_doubts(hands[-1], model):
+            _log.warning("Hand %s: %s.", brief(name), doubt)
     return tuple(hands)
 
 

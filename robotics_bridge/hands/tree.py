@@ -6,6 +6,7 @@ it as a bundle of parallel rays.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -127,9 +128,9 @@ def _nearest(model: Any, geoms: list[int], origin: NDArray, direction: NDArray) 
         else:
             place, size = model.geom_pos[geom], model.geom_size[geom]
             distance = mujoco.mju_rayGeom(place, matrix, size, origin, direction, kind, normal)
-        # A ray that misses has the distance −1.
+        # A ray that misses has the distance −1. Triangles of a mesh that is inside out face inward.
         if distance >= 0 and (best is None or distance < best[0]):
-            best = (distance, normal)
+            best = (distance, -math.copysign(1.0, float(normal @ direction)) * normal)
     return best
 
 

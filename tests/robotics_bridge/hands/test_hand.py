@@ -5,14 +5,17 @@ from __future__ import annotations
 import os
 import re
 from dataclasses import replace
+from pathlib import Path
 
 import mujoco
 import numpy as np
 import pytest
+import trimesh
 
 from brainbench.core.errors import DataError, UsageError
 from brainbench.core.rotations import from_rpy
 from robotics_bridge import hands, tasks
+from robotics_bridge.hands.gallery import check_file
 from robotics_bridge.hands.hand import UNKNOWN_SPEED, palmar_directions
 from robotics_bridge.hands.layouts import active_count
 from robotics_bridge.tasks.scenes import build as build_task
@@ -211,3 +214,58 @@ def test_degrees_for_radians_and_the_reverse_are_told(tmp_path, caplog, unit, up
     )
     hands.load(str(tmp_path / "claw.xml"))
     assert ("unit of the angles" in caplog.text) == told
+
+
+def _box_hand(folder: Path, unit: float = 1.0, *, inertia: float = 1e-5, mass: float = 0.1, mesh: bool = False) -> Path:
+    """Write a palm with two fingers as URDF: lengths times ``unit``, as boxes, or as a box that is inside out."""
+    box = trimesh.creation.box((2, 2, 2))
+    box.invert()
+    box.export(folder / "box.stl")
+
+    def link(name: str, size: tuple[float, ...], at: float) -> str:
+        sides = " ".join(str(unit * side / (2 if mesh else 1)) for side in size)
+        solid = f'<mesh filename="box.stl" scale="{sides}"/>' if mesh else f'<box size="{sides}"/>'
+        moments = " ".join(
+            f'i{axes}="{inertia if axes[0] == axes[1] else 0}"' for axes in ("xx", "yy", "zz", "xy", "xz", "yz")
+        )
+        return (
+            f'<link name="{name}"><inertial><origin xyz="{unit * at} 0 0"/><mass value="{mass}"/><inertia {moments}/>'
+            f'</inertial><collision><origin xyz="{unit * at} 0 0"/><geometry>{solid}</geometry></collision></link>'
+        )
+
+    text = '<robot name="h">' + link("palm", (0.08, 0.08, 0.02), 0)
+    for name, y in (("index", -0.03), ("thumb", 0.03)):
+        text += link(name, (0.04, 0.016, 0.014), 0.022)
+        text += (
+            f'<joint name="{name}" type="revolute"><origin xyz="{0.045 * unit} {y * unit} 0"/><parent link="palm"/>'
+            f'<child link="{name}"/><axis xyz="0 -1 0"/><limit lower="0" upper="1.5" effort="1" velocity="3"/></joint>'
+        )
+    path = folder / "box.urdf"
+    path.write_text(text + "</robot>")
+    return path
+
+
+@pytest.mark.parametrize("unit", [100.0, 1 / 0.0254, 1e-3])
+def test_a_hand_whose_lengths_are_no_metres_is_refused(unit, tmp_path):
+    with pytest.raises(DataError, match="lengths are in metres"):
+        hands.load(_box_hand(tmp_path, unit))
+
+
+@pytest.mark.parametrize(("settings", "words"), [({"inertia": 10.0}, "kg·m²"), ({"mass": 100.0}, "masses are in kg")])
+def test_masses_and_inertias_in_other_units_are_named(settings, words, tmp_path, caplog):
+    path = _box_hand(tmp_path, **settings)
+    hands.load(path)
+    assert words in caplog.text
+    (check,) = check_file(path)
+    assert words in check.errors[0]
+
+
+def test_a_sound_hand_raises_no_doubt_about_units(tmp_path, caplog):
+    hands.load(_box_hand(tmp_path))
+    assert not caplog.text
+
+
+def test_taxels_of_a_mesh_that_is_inside_out_face_outward(tmp_path):
+    layout, plain = (hands.load(_box_hand(tmp_path, mesh=mesh)).layout("low") for mesh in (True, False))
+    for link, probes in plain.items():
+        np.testing.assert_allclose(layout[link].normal, probes.normal, atol=1e-6)
