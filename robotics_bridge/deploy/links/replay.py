@@ -52,6 +52,7 @@ VERSION = "v3.0"
 PARTS = ("observation.state", "observation.velocity", "action", "observation.tactile", "observation.wrench")
 """What is recorded in each frame."""
 TIME = "observation.time"
+RADIUS = 4e-3  # sensing radius of a point that no layout places (m)
 _DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 
 
@@ -65,6 +66,8 @@ class TactilePoints:
     """[N, 3] in the link's frame (m)."""
     normal: NDArray[np.float64]
     """[N, 3] outward, link frame."""
+    radius: NDArray[np.float64] | float = RADIUS
+    """[N] sensing radius (m)."""
 
 
 def total_wrench(points: NDArray[np.floating], links: Sequence[str], axes: FingerAxes) -> NDArray:
@@ -262,7 +265,6 @@ def _write_frames(path: Path, table: Mapping[str, NDArray], shapes: Mapping[str,
         parquet.write_table(pa.table(columns), temporary, compression="snappy")
 
 
-RADIUS = 4e-3  # sensing radius of a taxel whose log does not say (m)
 _LARGEST = 1.0  # distance of a taxel from the origin of its link above which it looks like millimetres (m)
 _STRONGEST = 1e9  # largest reading of a taxel, in any unit; beyond it the number is damaged
 _RATE = 200.0  # least physics reports per second
@@ -399,8 +401,10 @@ def _placed(links: Sequence[str], numbers: Sequence[int], layout: Layout, name: 
             count = len(active.get(link, ()))
             raise DataError(f"{name}: the layout has {count} taxels on {link!r}; the log has a number {number}.")
     rows = [(layout[link], active[link][number]) for link, number in zip(links, numbers, strict=True)]
-    position = np.array([probes.position[row] for probes, row in rows]).reshape(-1, 3)
-    return TactilePoints(tuple(links), position, np.array([probes.normal[row] for probes, row in rows]).reshape(-1, 3))
+    columns = [
+        np.array([getattr(probes, key)[row] for probes, row in rows]) for key in ("position", "normal", "radius")
+    ]
+    return TactilePoints(tuple(links), columns[0].reshape(-1, 3), columns[1].reshape(-1, 3), columns[2])
 
 
 def _read_table(path: Path, hand: Hand, layout: Layout) -> TouchLog:
@@ -470,6 +474,11 @@ def _read_episode(folder: Path, hand: Hand, layout: Layout, episode: int) -> Tou
             f"{name} is a log of another hand: it has {tactile.shape[1]} taxels, {hand.name!r} {len(links)}; write "
             "their places into meta/tactile.json, or choose --placement and --resolution."
         )
+    if tactile.shape[2:] not in ((), (3,), (6,)):
+        raise DataError(
+            f"{name}: observation.tactile is [N] (along inward normals), [N, 3] or [N, 6] (force and torque, frame of "
+            f"the link) in each frame; received {list(tactile.shape[1:])}."
+        )
     force = tactile if tactile.ndim == 2 else -(tactile[..., :3] * points.normal).sum(axis=-1)
     return TouchLog(name, time, tuple(joints), position, target, points, force, unit)
 
@@ -529,7 +538,8 @@ def replay(log: TouchLog, hand: str) -> Replay:
     sensors = {}
     rows_of = {link: np.array(log.points.links) == link for link in log.points.links}
     for link, rows in rows_of.items():
-        probes = Probes(log.points.position[rows], log.points.normal[rows], np.full(rows.sum(), RADIUS))
+        radius = np.broadcast_to(log.points.radius, rows.shape)[rows]
+        probes = Probes(log.points.position[rows], log.points.normal[rows], radius)
         sensors[link] = KinematicTaxel(link=link, probes=probes, total="engine", friction=1.0)
     suite = SensorSuite(body.engine.scene, sensors, num_envs=1)
     columns = [body.joints.index(joint) for joint in log.joints]

@@ -365,3 +365,32 @@ def test_an_episode_in_two_files_is_read_whole(recorded, jaws, tmp_path) -> None
     frames[:12].to_parquet(first)
     log = read_touch_log(folder, hand, hand.layout("low", "tips"))
     np.testing.assert_allclose(log.force, recorded.log.force, atol=1e-6)
+
+
+@pytest.mark.parametrize("channels", [1, 2, 4, 5])
+def test_touch_of_other_channels_than_a_force_is_refused(channels, recorded, jaws, tmp_path) -> None:
+    folder, hand = _episode(tmp_path / "v3", recorded.log), hands.load(jaws)
+    path = folder / "data" / "chunk-000" / "file-000.parquet"
+    table = pd.read_parquet(path)
+    table["observation.tactile"] = [[row[:channels] for row in frame] for frame in table["observation.tactile"]]
+    table.to_parquet(path)
+    with pytest.raises(DataError, match=rf"received \[\d+, {channels}\]"):
+        read_touch_log(folder, hand, hand.layout("low", "tips"))
+
+
+def test_taxels_that_a_layout_places_have_its_sensing_radius(tmp_path) -> None:
+    layout = HAND.layout("high", "tips")
+    index, thumb = (next(link for link in TIPS if name in link) for name in ("index", "thumb"))
+    path = tmp_path / "log.csv"
+    names = ["time", HAND.joints[0], f"{index}:0", f"{thumb}:3"]
+    pd.DataFrame([[0.0, 0, 0, 0], [0.02, 0, 0, 0]], columns=names).to_csv(path, index=False)
+    log = read_touch_log(path, HAND, layout)
+    np.testing.assert_array_equal(log.points.radius, [layout[link].radius.max() for link in (index, thumb)])
+
+
+def test_the_radius_of_a_log_is_that_of_the_simulated_taxels(recorded, jaws) -> None:
+    narrow = replace(recorded.log.points, radius=np.full(len(recorded.log.taxels), 1.5e-3))
+    result = replay(replace(recorded.log, points=narrow), str(jaws))
+    # The same load lies on fewer taxels.
+    assert (result.simulated[-1] > 1e-3).sum() < (recorded.simulated[-1] > 1e-3).sum()
+    assert result.simulated[-1].max() > 1.2 * recorded.simulated[-1].max()
