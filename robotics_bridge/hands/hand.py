@@ -20,7 +20,16 @@ from brainbench.core.files import content_hash
 from brainbench.core.reading.regular import readable
 from robotics_bridge.hands.files import read_mjspec, stated_speeds
 from robotics_bridge.hands.layouts import Layout, Pad, check_names, is_probe_file, pad_probes, read_probes, select
-from robotics_bridge.hands.tree import Tree, cast_grid, geoms_of, half_open, link_points, palmar_directions
+from robotics_bridge.hands.tree import (
+    Tree,
+    cast_grid,
+    geoms_of,
+    half_open,
+    held,
+    link_points,
+    overlaps,
+    palmar_directions,
+)
 from robotics_bridge.sensors.probes.placement import Probes
 
 _log = logging.getLogger(__name__)
@@ -36,6 +45,7 @@ _SPANS = (0.01, 2.0)  # from the smallest gripper to a hand with all that is fix
 _SMALLEST = 1e-3  # half of the links of any hand are larger (m)
 _LARGE = 2.0  # spans of a hand within which the mass of each link lies
 _HEAVIEST = 50.0  # kg
+_TOUCHING, _DEEPEST = 1e-4, 1e-3  # overlaps at rest of neighbours that is meant, and of other links that is none (m)
 LEVER = 0.05
 """Length of a finger (m) whose tip moves as a slide, where a number is stated for hinges alone: 1 rad is .05 m."""
 _PHYSICS = (
@@ -65,10 +75,16 @@ class Hand:
     """Probes of :meth:`with_probes`, the resolution ``custom``."""
     couplers: frozenset[str] = frozenset()
     """Links of fingers that only move others, such as the rods of a linkage; they get no taxels."""
+    nested: frozenset[tuple[str, ...]] = frozenset()
+    """Pairs of links held by the world, and links that they carry, which lie in one another at rest: as all other
+    neighbours along a joint, they do not collide."""
 
     def mjspec(self) -> Any:
         """Return a new ``mujoco.MjSpec`` of the hand, for scenes to attach; the palm is fixed to the world."""
-        return read_mjspec(self.path)
+        spec = read_mjspec(self.path)
+        for below, above in sorted(self.nested):
+            spec.add_exclude(bodyname1=below, bodyname2=above)
+        return spec
 
     @property
     def source(self) -> str:
@@ -192,11 +208,15 @@ class Hand:
         return layout
 
 
-def unit_doubts(hand: Hand, model: Any) -> tuple[str, ...]:
-    """Return what no bodies of the size of a hand in a model have, in words; DataError if lengths are no metres."""
-    data = half_open(model)
+def _names(model: Any, bodies: Iterable[int]) -> tuple[str, ...]:
+    return tuple(model.body(body).name for body in bodies)
+
+
+def doubts_of(hand: Hand, model: Any) -> tuple[str, ...]:
+    """Return what no real hand is like of a hand in a model, in words; DataError if lengths are no metres."""
+    data, links = half_open(model), hand.links()
     solids, far = {}, {}
-    for link in hand.links():
+    for link in links:
         body = model.body(link)
         if len(points := link_points(model, body.id)):
             solids[link] = data.xpos[body.id] + points @ data.xmat[body.id].reshape(3, 3).T
@@ -222,8 +242,14 @@ def unit_doubts(hand: Hand, model: Any) -> tuple[str, ...]:
             f"the inertia of {listing(far)} is that of mass {max(far.values()):.3g} m away, and the hand spans "
             f"{span:.3g} m: inertias are in kg·m², places in m"
         )
-    if (mass := float(sum(model.body(link).mass[0] for link in hand.links()))) > _HEAVIEST:
+    if (mass := float(sum(model.body(link).mass[0] for link in links))) > _HEAVIEST:
         doubts.append(f"palm and fingers weigh {mass:.3g} kg: masses are in kg")
+    deep = {_names(model, pair) for pair, depth in overlaps(model).items() if depth > _DEEPEST} - hand.nested
+    if jammed := sorted(" and ".join(pair) for pair in deep if {*pair} <= {*links}):
+        doubts.append(
+            f"{listing(jammed)} lie more than {1e3 * _DEEPEST:g} mm in each other at rest and push each other: exclude "
+            "their collision"
+        )
     return tuple(doubts)
 
 
@@ -250,16 +276,16 @@ def all_from_file(path: Path) -> tuple[Hand, ...]:
     if not branches:
         raise DataError(f"{str(path)!r} holds no hand: it has no joints.")
 
-    def names(bodies: Iterable[int]) -> tuple[str, ...]:
-        return tuple(model.body(body).name for body in bodies)
-
+    nested = frozenset(
+        _names(model, pair) for pair, depth in overlaps(model).items() if depth > _TOUCHING and held(model, *pair)
+    )
     hands = []
     for hand in branches:
-        fingers = {model.body(tip).name: names(chain) for tip, chain in hand.fingers.items()}
-        couplers = frozenset(names(hand.couplers))
+        fingers = {model.body(tip).name: _names(model, chain) for tip, chain in hand.fingers.items()}
+        couplers = frozenset(_names(model, hand.couplers))
         name = path.stem if len(branches) == 1 else f"{path.stem}-{model.body(hand.palm).name}"
-        hands.append(Hand(name, model.body(hand.palm).name, fingers, path=path, couplers=couplers))
-        for doubt in unit_doubts(hands[-1], model):
+        hands.append(Hand(name, model.body(hand.palm).name, fingers, path, couplers=couplers, nested=nested))
+        for doubt in doubts_of(hands[-1], model):
             _log.warning("Hand %s: %s.", brief(name), doubt)
     return tuple(hands)
 

@@ -214,6 +214,22 @@ def half_open(model: Any) -> Any:
     return data
 
 
+def overlaps(model: Any) -> dict[tuple[int, int], float]:
+    """Return pairs of bodies (low, high) that collide in the pose of :func:`half_open`, and how deep they lie (m)."""
+    data, depths = half_open(model), dict[tuple[int, int], float]()
+    mujoco.mj_fwdPosition(model, data)
+    for bodies, distance in zip(model.geom_bodyid[data.contact.geom].tolist(), data.contact.dist, strict=True):
+        pair = (min(bodies), max(bodies))
+        depths[pair] = max(depths.get(pair, 0.0), -float(distance))
+    return depths
+
+
+def held(model: Any, below: int, above: int) -> bool:
+    """Return whether a body is held by the world and carries another by one joint: MuJoCo lets only such collide."""
+    weld = model.body_weldid
+    return bool(below and not weld[below] and weld[above] and not weld[model.body_parentid[weld[above]]])
+
+
 def link_middle(model: Any, data: Any, body: int) -> NDArray[np.float64]:
     """Return the middle of a body's solids [3] (world, m), its origin where it has none."""
     points = link_points(model, body)

@@ -18,6 +18,9 @@ from robotics_bridge import hands, tasks
 from robotics_bridge.hands.gallery import check_file
 from robotics_bridge.hands.hand import UNKNOWN_SPEED, palmar_directions
 from robotics_bridge.hands.layouts import active_count
+from robotics_bridge.hands.scenes import holding
+from robotics_bridge.physics import MujocoEngine
+from robotics_bridge.sensors import KinematicTaxel, SensorSuite
 from robotics_bridge.tasks.scenes import build as build_task
 
 URDF = {
@@ -216,8 +219,14 @@ def test_degrees_for_radians_and_the_reverse_are_told(tmp_path, caplog, unit, up
     assert ("unit of the angles" in caplog.text) == told
 
 
-def _box_hand(folder: Path, unit: float = 1.0, *, inertia: float = 1e-5, mass: float = 0.1, mesh: bool = False) -> Path:
-    """Write a palm with two fingers as URDF: lengths times ``unit``, as boxes, or as a box that is inside out."""
+def _box_hand(
+    folder: Path, unit: float = 1.0, *, inertia: float = 1e-5, mass: float = 0.1, mesh: bool = False,
+    root: float = 0.045, apart: float = 0.06,
+) -> Path:  # fmt: skip
+    """Write a palm with two fingers as URDF: lengths times ``unit``, as boxes, or as a box that is inside out.
+
+    The fingers begin at ``root`` (m, the palm ends at .04), ``apart`` from one another.
+    """
     box = trimesh.creation.box((2, 2, 2))
     box.invert()
     box.export(folder / "box.stl")
@@ -234,10 +243,10 @@ def _box_hand(folder: Path, unit: float = 1.0, *, inertia: float = 1e-5, mass: f
         )
 
     text = '<robot name="h">' + link("palm", (0.08, 0.08, 0.02), 0)
-    for name, y in (("index", -0.03), ("thumb", 0.03)):
+    for name, y in (("index", -apart / 2), ("thumb", apart / 2)):
         text += link(name, (0.04, 0.016, 0.014), 0.022)
         text += (
-            f'<joint name="{name}" type="revolute"><origin xyz="{0.045 * unit} {y * unit} 0"/><parent link="palm"/>'
+            f'<joint name="{name}" type="revolute"><origin xyz="{root * unit} {y * unit} 0"/><parent link="palm"/>'
             f'<child link="{name}"/><axis xyz="0 -1 0"/><limit lower="0" upper="1.5" effort="1" velocity="3"/></joint>'
         )
     path = folder / "box.urdf"
@@ -269,3 +278,27 @@ def test_taxels_of_a_mesh_that_is_inside_out_face_outward(tmp_path):
     layout, plain = (hands.load(_box_hand(tmp_path, mesh=mesh)).layout("low") for mesh in (True, False))
     for link, probes in plain.items():
         np.testing.assert_allclose(layout[link].normal, probes.normal, atol=1e-6)
+
+
+def test_fingers_that_begin_inside_the_palm_move_and_feel_nothing_of_it(tmp_path):
+    hand = hands.load(_box_hand(tmp_path, root=0.03))
+    assert hand.nested == {("palm", "index"), ("palm", "thumb")}
+    engine = MujocoEngine(holding(hand, radius=0.02), 1)
+    sensors = {link: KinematicTaxel(link=link, probes=probes) for link, probes in hand.layout("low").items()}
+    suite = SensorSuite(engine.scene, sensors, num_envs=1)
+    ball = engine.model.joint(engine.model.body("object").jntadr[0]).qposadr[0]
+    engine.data[0].qpos[ball + 2] += 1.0
+    engine.set(ctrl=[[0.5, 0.5]])
+    for _ in range(150):
+        engine.step()
+        suite.update(engine.state, engine.timestep)
+    np.testing.assert_allclose([engine.data[0].joint(name).qpos[0] for name in hand.joints], 0.5, atol=0.05)
+    assert all(not suite.read(link).any() for link in sensors)
+
+
+def test_fingers_that_lie_in_each_other_at_rest_are_named(tmp_path, caplog):
+    path = _box_hand(tmp_path, apart=0.01)
+    hands.load(path)
+    assert "'index and thumb' lie more than 1 mm in each other" in caplog.text
+    (check,) = check_file(path)
+    assert not check.passed
