@@ -251,13 +251,14 @@ class Controller:
             action = np.clip(action, -limit, limit)
         self._action = action.astype(np.float32)
         moved = zip(self.contract.moved, self.actions.targets(action).tolist(), strict=True)
-        targets = self._limit({**self.contract.frozen, **dict(moved)}, reading)
+        targets, limited = self._limit({**self.contract.frozen, **dict(moved)}, reading)
         # Whatever took its time since the report was read: sources, the policy, or this computer.
         if (reason := self.link.send(Command(targets, reading, deadline))) is not None:
             return reason
         self.latency.append(self.clock() - begun)
         self.processor.append(time.thread_time() - busy)
         self.ticks += 1
+        self.limited += limited
         if self.record is not None:
             self.record(reading, obs, action, targets)
         return None
@@ -268,8 +269,11 @@ class Controller:
         groups = {name: np.asarray(source(reading), np.float32) for name, source in self.sources.items()}
         return {name: groups.get(name, proprio) for name in self.contract.inputs}
 
-    def _limit(self, targets: Mapping[str, float], reading: HandReading) -> NDArray[np.float64]:
-        """Return the targets [J] within the limits of speed and position; joints without one stay."""
+    def _limit(self, targets: Mapping[str, float], reading: HandReading) -> tuple[NDArray[np.float64], bool]:
+        """Return the targets [J] within the limits of speed and position, and whether these changed any.
+
+        Joints without a target stay.
+        """
         wanted = np.array([targets.get(name, reading.position[i]) for i, name in enumerate(self.driver.joints)])
         # The speed limit runs from target to target: measured from the joints, a load that holds them would slow the
         # targets.
@@ -278,8 +282,7 @@ class Controller:
         now = self.clock()
         self._targets = self.limits.limit(wanted, before, min(1 / self.rate, max(0.0, now - self._limited)))
         self._limited = now
-        self.limited += bool(np.any(np.abs(self._targets - wanted) > 1e-9))
-        return self._targets
+        return self._targets, bool(np.any(np.abs(self._targets - wanted) > 1e-9))
 
 
 REAL_TYPES = ("agg_bool", "agg_force")  # observation types that a real hand can measure

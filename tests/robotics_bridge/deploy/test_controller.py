@@ -193,6 +193,18 @@ def test_a_policy_that_gives_no_numbers_or_fails_leaves_the_hand_holding() -> No
     assert hand.stops == 1
 
 
+def test_a_command_that_comes_too_late_to_be_sent_is_no_limited_tick() -> None:
+    clock, calls = OwnClock(), iter(range(100))
+
+    def policy(obs, forget):
+        clock.now += 0.2 if next(calls) == 2 else 0.0
+        return np.array([9.0, 9.0])
+
+    report = Controller(policy, PaperHand(clock), make_contract(), make_limits(), clock=clock).run(1.0)
+    assert "after the report" in report.reason
+    assert report.limited == report.ticks == 2
+
+
 def test_slow_control_is_noticed() -> None:
     clock = OwnClock()
 
