@@ -146,8 +146,9 @@ def press(hand: Hand, layout: Layout) -> dict[str, tuple[np.ndarray, np.ndarray,
                 links = [int(model.geom_bodyid[geom]) for geom in contact.geom]
                 if sorted(links) == sorted((body, model.body(name).id)):
                     sign = 1.0 if links[1] == body else -1.0
-                    force = sign * contact.frame.reshape(3, 3).T @ six[:3]
-                    wrench += np.concatenate([force, np.cross(contact.pos - data.body(link).xpos, force)])
+                    force, couple = sign * six.reshape(2, 3) @ contact.frame.reshape(3, 3)
+                    lever = contact.pos - data.body(link).xpos
+                    wrench += np.concatenate([force, np.cross(lever, force) + couple])
             if np.linalg.norm(wrench[:3]) > 1e-9:
                 local = (wrench.reshape(2, 3) @ data.body(link).xmat.reshape(3, 3)).ravel()
                 missing = np.array([suite.missing[0, body], suite.missing_moment[0, body]])

@@ -208,13 +208,13 @@ class _Gatherer:
         self._contacts[env] = ()
         if data.ncon:
             c = data.contact
-            tangents = c.frame[:, 3:].reshape(-1, 2, 3)
-            parts = (c.geom, c.dist, c.pos, c.frame[:, :3], c.efc_address, c.dim, data.efc_force, tangents)
-            self._contacts[env] = tuple(part.copy() for part in (*parts, c.friction[:, :2]))
+            frames = c.frame.reshape(-1, 3, 3)
+            parts = (c.geom, c.dist, c.pos, frames[:, 0], c.efc_address, c.dim, data.efc_force, frames)
+            self._contacts[env] = tuple(part.copy() for part in (*parts, c.friction))
 
-    def _forces(self, contacts: Sequence[tuple[NDArray[Any], ...]]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return normal force [C] and friction [C, 3] of every contact, by its rows among the constraint forces."""
-        address, dim, tangent, cone = (np.concatenate([parts[i] for parts in contacts]) for i in (4, 5, 7, 8))
+    def _forces(self, contacts: Sequence[tuple[NDArray[Any], ...]]) -> tuple[NDArray[np.float64], ...]:
+        """Return normal force [C], friction and torque [C, 3] of every contact, by its rows of constraint forces."""
+        address, dim, frame, cone = (np.concatenate([parts[i] for parts in contacts]) for i in (4, 5, 7, 8))
         before = np.cumsum([0, *(len(parts[6]) for parts in contacts)])
         rows = np.concatenate([*(parts[6] for parts in contacts), np.zeros(1)])
         first = np.maximum(address, 0) + np.repeat(before[:-1], [len(parts[4]) for parts in contacts])
@@ -223,15 +223,16 @@ class _Gatherer:
             return rows[np.where(valid & (address >= 0), first + offset, len(rows) - 1)]
 
         if self._model.opt.cone:
-            # An elliptic cone has a row for the normal force and one for each tangent.
-            normal, slip = row(0, dim > 0), np.stack([row(1, dim > 1), row(2, dim > 1)], axis=1)
+            # An elliptic cone has a row for the normal force, one for each tangent, and one for each torque.
+            normal, slip = row(0, dim > 0), np.stack([row(axis, axis < dim) for axis in range(1, 6)], axis=1)
         else:
             # A pyramid has two edges for each tangent (and for each torque): their sum is the normal force, their
             # difference by the coefficient the friction.
             edges = np.stack([row(edge, edge < np.maximum(2 * (dim - 1), 1)) for edge in range(10)], axis=1)
             normal = edges.sum(axis=1)
-            slip = np.where(dim[:, None] > 1, cone * (edges[:, [0, 2]] - edges[:, [1, 3]]), 0.0)
-        return normal, (slip[:, :, None] * tangent).sum(axis=1)
+            slip = np.where(np.arange(1, 6) < dim[:, None], cone * (edges[:, ::2] - edges[:, 1::2]), 0.0)
+        # Along both tangents; about the normal and about both tangents.
+        return normal, np.einsum("ca,caj->cj", slip[:, :2], frame[:, 1:]), np.einsum("ca,caj->cj", slip[:, 2:], frame)
 
     def finish(self) -> None:
         """Turn what was gathered into velocities of link origins and the contacts of all environments."""
@@ -251,7 +252,7 @@ class _Gatherer:
             columns += [force[:room] for force in self._forces(contacts)]
             keep = len(columns[0])
             state.contact_env.numpy()[:keep] = env[:keep]
-            names = ("geom", "distance", "position", "normal", "force", "friction")
+            names = ("geom", "distance", "position", "normal", "force", "friction", "couple")
             for name, column in zip(names, columns, strict=True):
                 getattr(state, f"contact_{name}").numpy()[:keep] = column
         state.contact_count.fill_(total)
@@ -305,9 +306,11 @@ class MujocoWarpEngine:
         with wp.ScopedDevice(self._device):
             self._m = _put_model(self._engine, self.model, varied, num_envs)
             contacts = contacts or 16 + 9 * int(np.count_nonzero(self.model.body_weldid))
-            # Room for constraint rows: four per contact (two tangents in a pyramid), limits, equalities, tendons,
-            # friction of joints.
-            rows = 4 * contacts + 2 * self.model.njnt + 6 * self.model.neq + 2 * self.model.ntendon + self.model.nv
+            # Room for constraint rows: two per tangent and torque of a contact (in a pyramid), limits, equalities,
+            # tendons, friction of joints.
+            dim = max(int(sizes.max(initial=3)) for sizes in (self.model.geom_condim, self.model.pair_dim))
+            m = self.model
+            rows = 2 * (dim - 1) * contacts + 2 * m.njnt + 6 * m.neq + 2 * m.ntendon + m.nv
             room = {"nconmax": contacts, "njmax": rows}
             self.data: Any = self._engine.make_data(self.model, nworld=num_envs, **room)
             """The ``mujoco_warp.Data`` behind the state."""
@@ -419,7 +422,7 @@ class MujocoWarpEngine:
         pyramidal = int(self.model.opt.cone == 0)
         c = d.contact
         inputs = [d.nacon, c.worldid, c.frame, c.dim, c.efc_address, d.efc.force, c.friction, pyramidal]
-        inputs += [state.contact_normal, state.contact_force, state.contact_friction]
+        inputs += [state.contact_normal, state.contact_force, state.contact_friction, state.contact_couple]
         wp.launch(fill_contacts, dim=c.worldid.shape[0], inputs=inputs, device=self._device)
 
 

@@ -19,7 +19,7 @@ from brainbench.core.devices import pick_device, warp
 from brainbench.core.errors import UsageError, check_each, check_number
 from robotics_bridge.physics.kernels.state import StateArrays
 
-_CONTACT = {"distance": 0.0, "force": float("nan"), "position": 0.0, "normal": 0.0, "friction": 0.0}
+_CONTACT = {"distance": 0.0, "force": float("nan"), "position": 0.0, "normal": 0.0, "friction": 0.0, "couple": 0.0}
 """Quantities of a contact, and their values where nobody tells them."""
 MOST_ENVS = 1_000_000  # most environments at once; more is a slip of the keys that would fill the memory
 
@@ -47,6 +47,9 @@ class HandState:
     contact_friction: Any
     """Warp array [C] of vec3: tangential force on the second geometry (N), world axes; 0 where the engine does not
     tell."""
+    contact_couple: Any
+    """Warp array [C] of vec3: torque on the second geometry about the point (N·m), world axes, of what resists turning
+    and rolling; 0 where the engine does not tell."""
     contact_count: Any
     """Warp array [1] int32: contacts found, which may exceed the room C."""
     time: Any
@@ -67,7 +70,7 @@ class HandState:
             "velocity": ((num_envs, num_links), wp.spatial_vectorf), "time": (num_envs, wp.float32),
             "contact_count": (1, wp.int32), "contact_env": (room, wp.int32),
             "contact_geom": (room, wp.vec2i), "contact_distance": (room, wp.float32),
-            **{f"contact_{name}": (room, wp.vec3f) for name in ("position", "normal", "friction")},
+            **{f"contact_{name}": (room, wp.vec3f) for name in ("position", "normal", "friction", "couple")},
         }  # fmt: skip
         return cls(
             pose=wp.array(pose, dtype=wp.transformf, device=device),
@@ -135,8 +138,8 @@ class HandState:
         Args:
             env: environment [n] of each contact.
             geometries: pairs [n, 2] of geometry numbers.
-            **optional: ``distance``, ``force`` [n], ``position``, ``normal``, ``friction`` [n, 3]. What is not given
-                is set to 0, and forces to NaN: nothing is left of earlier contacts.
+            **optional: ``distance``, ``force`` [n], ``position``, ``normal``, ``friction``, ``couple`` [n, 3]. What is
+                not given is set to 0, and forces to NaN: nothing is left of earlier contacts.
         """
         wp = warp()
         environments, pairs = (np.asarray(values, dtype=np.float64).reshape(-1) for values in (env, geometries))

@@ -34,6 +34,8 @@ class StateArrays:
     """[C] from the first geometry to the second."""
     contact_force: wp.array(dtype=wp.float32)
     """[C] normal force; NaN where the engine does not tell."""
+    contact_couple: wp.array(dtype=wp.vec3f)
+    """[C] torque on the second geometry about the point (N·m)."""
 
 
 @wp.func
@@ -96,11 +98,12 @@ def fill_contacts(
     normal: wp.array(dtype=wp.vec3f),
     force: wp.array(dtype=wp.float32),
     friction: wp.array(dtype=wp.vec3f),
+    couple: wp.array(dtype=wp.vec3f),
 ):
-    """Read normal, normal force and friction (N) of every contact. Thread: contact [C].
+    """Read normal, normal force, friction (N) and torque (N·m) of every contact. Thread: contact [C].
 
-    With a pyramidal cone the normal force is the sum of the forces along its edges, and friction along a tangent is the
-    difference of its two edges by the coefficient ``cone``.
+    With a pyramidal cone the normal force is the sum of the forces along its edges, and friction along a tangent, or
+    about an axis, the difference of its two edges by the coefficient ``cone``.
     """
     c = wp.tid()
     if c >= count[0]:
@@ -119,15 +122,23 @@ def fill_contacts(
             total += efc_force[env[c], row]
     force[c] = total
     slip = wp.vec3f(0.0)
-    if dim[c] > 1:
-        for axis in range(2):
-            tangent = wp.vec3f(rows[axis + 1, 0], rows[axis + 1, 1], rows[axis + 1, 2])
-            one = address[c, axis + 1]
-            if pyramidal == 1:
-                one = address[c, 2 * axis]
-                two = address[c, 2 * axis + 1]
-                if one >= 0 and two >= 0:
-                    slip += cone[c][axis] * (efc_force[env[c], one] - efc_force[env[c], two]) * tangent
-            elif one >= 0:
-                slip += efc_force[env[c], one] * tangent
+    spin = wp.vec3f(0.0)
+    # Along two tangents, then about the normal and about both tangents.
+    for axis in range(dim[c] - 1):
+        side = (axis + 1) % 3
+        share = float(0.0)
+        first = address[c, axis + 1]
+        if pyramidal == 1:
+            first = address[c, 2 * axis]
+            second = address[c, 2 * axis + 1]
+            if first >= 0 and second >= 0:
+                share = cone[c][axis] * (efc_force[env[c], first] - efc_force[env[c], second])
+        elif first >= 0:
+            share = efc_force[env[c], first]
+        along = share * wp.vec3f(rows[side, 0], rows[side, 1], rows[side, 2])
+        if axis < 2:
+            slip += along
+        else:
+            spin += along
     friction[c] = slip
+    couple[c] = spin

@@ -14,9 +14,8 @@ a load beyond the outermost of them has the rest as its missing moment, since ta
 The carriers of a face are, by source: :data:`TOUCH`, taxels that the body
 gives their depth, from that side; else :data:`BEHIND`, those that overlap it behind what is nearer (a block on a card);
 else :data:`NEAR`, contact by contact, those near its point that face it (a flex, a height field). What is left is
-missing. A node is one side of a contact: 2c of the first geometry, 2c + 1 of the second. Vectors are in the frame of
-the sensor link (m, N). Letters: B environment, L link, M link with sensors, S sensor, C contact, N taxel, K sensor of
-one link.
+missing. A node is one side of a contact: 2c of the first geometry, 2c + 1 of the second. Vectors are in the link's
+frame (m, N). Letters: B environment, L link, M link with sensors, S sensor, C contact, N taxel, K sensor of a link.
 """
 
 from __future__ import annotations
@@ -104,7 +103,7 @@ class Face:
     force: wp.vec3f
     """Sum of forces on the link, friction included."""
     moment: wp.vec3f
-    """Of these about the origin (N·m)."""
+    """Of these about the origin, torques of contacts included (N·m)."""
 
 
 @wp.struct
@@ -138,6 +137,7 @@ class ContactPush:
     normal: wp.vec3f
     load: wp.float32
     force: wp.vec3f
+    couple: wp.vec3f
     overlap: wp.float32
     lean: wp.vec3f
     """λ of the weights that carry it (1/m)."""
@@ -177,6 +177,7 @@ def push_of(
     push.normal = wp.quat_rotate_inv(turn, sign * state.contact_normal[c])
     push.load = state.contact_force[c]
     push.force = push.load * push.normal + plan.slip * wp.quat_rotate_inv(turn, sign * friction[c])
+    push.couple = plan.slip * wp.quat_rotate_inv(turn, sign * state.contact_couple[c])
     push.overlap = wp.max(-state.contact_distance[c], 0.0)
     return push
 
@@ -300,7 +301,7 @@ def join_faces(
             face.overlap = wp.max(face.overlap, push.overlap)
             face.load = face.load + push.load
             face.force = face.force + push.force
-            face.moment = face.moment + wp.cross(push.point - face.origin, push.force)
+            face.moment = face.moment + push.couple + wp.cross(push.point - face.origin, push.force)
             for k in range(wp.static(SORTED - 1)):
                 least[k] = least[k + 1]
             least[wp.static(SORTED - 1)] = wp.static(BEYOND)
@@ -570,7 +571,7 @@ def spread_kernel(kinds: frozenset[int], raycast: bool, mode: int, sticky: bool,
                             more = False
                             if whole > 0.0 and (near or source == wp.static(NEAR)):
                                 carried = True
-                                moment = wp.vec3f()
+                                moment = push.couple
                                 if source != wp.static(NEAR):
                                     face = faces.face[here]
                                     push.load = face.load

@@ -17,8 +17,9 @@ TWO = """<mujoco><option timestep="0.005"/><worldbody><geom name="floor" type="p
 <body name="b" pos=".03 .01 .31"><freejoint/><geom name="b" type="sphere" size=".1"/></body></worldbody></mujoco>"""
 
 
-def test_state_holds_what_mujoco_computed() -> None:
-    model = mujoco.MjModel.from_xml_string(TWO)
+@pytest.mark.parametrize("condim", [3, 4, 6])
+def test_state_holds_what_mujoco_computed(condim: int) -> None:
+    model = mujoco.MjModel.from_xml_string(TWO.replace("<geom", f'<geom condim="{condim}"'))
     engine = MujocoEngine(model, 3, threads=2)
     engine.set(qvel=0.3 * np.random.default_rng(0).normal(size=(3, model.nv)))
     engine.step(20)
@@ -38,6 +39,8 @@ def test_state_holds_what_mujoco_computed() -> None:
             assert engine.state.contact_force.numpy()[total] == pytest.approx(wrench[0], abs=1e-4)
             slip = data.contact[c].frame.reshape(3, 3)[1:].T @ wrench[1:3]
             np.testing.assert_allclose(engine.state.contact_friction.numpy()[total], slip, atol=1e-4)
+            couple = data.contact[c].frame.reshape(3, 3).T @ wrench[3:]
+            np.testing.assert_allclose(engine.state.contact_couple.numpy()[total], couple, atol=1e-5)
             assert engine.state.contact_geom.numpy()[total].tolist() == data.contact.geom[c].tolist()
             assert engine.state.contact_env.numpy()[total] == env
             total += 1
@@ -144,15 +147,17 @@ def test_an_engine_leaves_the_model_that_it_is_given_as_it_is() -> None:
     assert engine.model.opt.disableflags != flags
 
 
+@pytest.mark.parametrize("condim", [3, 4, 6])
 @pytest.mark.parametrize("cone", ["pyramidal", "elliptic"])
-def test_the_kernel_of_the_gpu_engine_reads_forces_as_mujoco_does(cone: str) -> None:
+def test_the_kernel_of_the_gpu_engine_reads_forces_as_mujoco_does(cone: str, condim: int) -> None:
     """Constraint forces of C MuJoCo in the arrays of MuJoCo Warp, whose own type of five numbers is derived."""
     import warp as wp
 
     class Five(wp.types.vector(length=5, dtype=wp.float32)):
         pass
 
-    model = mujoco.MjModel.from_xml_string(TWO.replace("<option", f'<option cone="{cone}"', 1))
+    text = TWO.replace("<option", f'<option cone="{cone}"', 1)
+    model = mujoco.MjModel.from_xml_string(text.replace("<geom", f'<geom condim="{condim}"'))
     assert model.opt.cone == (cone == "elliptic")
     engine = MujocoEngine(model, 1)
     engine.set(qvel=np.random.default_rng(0).normal(size=(1, model.nv)))
@@ -163,13 +168,13 @@ def test_the_kernel_of_the_gpu_engine_reads_forces_as_mujoco_does(cone: str) -> 
     contact, many = data.contact, 10
     rows = np.where(np.arange(many) < np.where(contact.dim > 1, 2 * (contact.dim - 1), 1)[:, None], np.arange(many), -1)
     address = np.where((rows >= 0) & (contact.efc_address[:, None] >= 0), contact.efc_address[:, None] + rows, -1)
-    normal, friction = (wp.zeros(count, dtype=wp.vec3f) for _ in range(2))
+    normal, friction, couple = (wp.zeros(count, dtype=wp.vec3f) for _ in range(3))
     force = wp.zeros(count, dtype=float)
     inputs = [
         wp.array([count], dtype=int), wp.zeros(count, dtype=int),
         wp.array(contact.frame.reshape(-1, 3, 3), dtype=wp.mat33f),
         wp.array(contact.dim, dtype=int), wp.array(address, dtype=int), wp.array(data.efc_force[None], dtype=float),
-        wp.array(contact.friction, dtype=Five), int(model.opt.cone == 0), normal, force, friction,
+        wp.array(contact.friction, dtype=Five), int(model.opt.cone == 0), normal, force, friction, couple,
     ]  # fmt: skip
     wp.launch(fill_contacts, dim=count, inputs=inputs)
     state = engine.state
@@ -177,6 +182,8 @@ def test_the_kernel_of_the_gpu_engine_reads_forces_as_mujoco_does(cone: str) -> 
         np.testing.assert_allclose(found.numpy(), known.numpy()[:count], rtol=1e-5, atol=1e-4)
     np.testing.assert_allclose(friction.numpy(), state.contact_friction.numpy()[:count], rtol=1e-5, atol=1e-4)
     assert np.abs(friction.numpy()).max() > 0.1
+    np.testing.assert_allclose(couple.numpy(), state.contact_couple.numpy()[:count], rtol=1e-5, atol=1e-6)
+    assert (np.abs(couple.numpy()).max() > 1e-4) == (condim > 3)
 
 
 @pytest.mark.slow

@@ -10,6 +10,7 @@ from brainbench.core.devices import warp
 from brainbench.core.errors import UsageError
 from robotics_bridge import hands
 from robotics_bridge.envs.kernels.actuation import add_contact_forces
+from robotics_bridge.hands.observations import observe
 from robotics_bridge.hands.scenes import closing, holding
 from robotics_bridge.physics import MujocoEngine
 from robotics_bridge.sensors import (
@@ -54,10 +55,10 @@ def _each_on(engine: MujocoEngine, link: str) -> list[np.ndarray]:
     wrenches = [np.zeros(6)]
     for index, contact in enumerate(data.contact):
         mujoco.mj_contactForce(model, data, index, six)
-        force = contact.frame.reshape(3, 3).T @ six[:3]
+        force, couple = six.reshape(2, 3) @ contact.frame.reshape(3, 3)
         for geom, sign in zip(contact.geom, (-1, 1), strict=True):
             if geom >= 0 and model.body(model.geom_bodyid[geom]).name == link:
-                wrenches.append(sign * np.concatenate([force, np.cross(contact.pos, force)]))
+                wrenches.append(sign * np.concatenate([force, np.cross(contact.pos, force) + couple]))
     return wrenches
 
 
@@ -552,3 +553,40 @@ def test_suites_at_several_rates_read_one_engine_as_each_would_alone() -> None:
     for name, stride in (("fast", 1), ("slow", 3)):
         for left, right in zip(together[name], course({name: stride})[name], strict=True):
             np.testing.assert_array_equal(left, right)
+
+
+def _twisted(torque: float, probes: Probes) -> tuple[SensorSuite, np.ndarray]:
+    """Return a suite that felt a ball pressed on a turned pad by 2 N and twisted by a torque (N·m), and its reading."""
+    joints = '<joint type="slide" axis="0 0 1"/><joint axis="0 0 1"/>'
+    ball = f'<body pos=".002 .001 .0099">{joints}<geom size=".01" mass=".05" condim="4" friction="1 .05 .0001"/></body>'
+    model = mujoco.MjModel.from_xml_string(
+        '<mujoco><option timestep=".001" gravity="0 0 0" cone="elliptic" impratio="100"/><worldbody>'
+        f'<body name="pad" euler="30 40 50"><geom type="box" size=".01 .01 .005" pos="0 0 -.005"/>{ball}</body>'
+        "</worldbody></mujoco>"
+    )
+    engine = MujocoEngine(model, 1)
+    engine.data[0].qfrc_applied[:] = -2.0, torque
+    suite = SensorSuite(engine.scene, {"pad": KinematicTaxel(link="pad", probes=probes)}, num_envs=1)
+    engine.step(500)
+    suite.update(engine.state, engine.timestep)
+    return suite, suite.read("pad")[0].reshape(-1, 6).double().numpy()
+
+
+@pytest.mark.parametrize("torque", [0.0, 2e-3, -4e-3])
+def test_the_torque_by_which_a_contact_resists_turning_is_felt(torque: float) -> None:
+    probes = Probes.grid(9, 9, size=(0.016, 0.016), radius=0.002)
+    suite, taxels = _twisted(torque, probes)
+    felt = observe("center_of_pressure", {"pad": suite.read("pad")}, {"pad": probes})[0]
+    np.testing.assert_allclose(felt[2], -2.0, rtol=0.01)
+    np.testing.assert_allclose(felt[3:5], [0.002, 0.001], atol=1e-5)
+    np.testing.assert_allclose(felt[6], torque, atol=2e-5)
+    # About the origin of the link, nothing else turns it than the press beside its middle.
+    np.testing.assert_allclose(taxels[:, 3:].sum(axis=0), [-2 * 0.001, 2 * 0.002, torque], atol=3e-5)
+    assert not suite.unbalanced.any()
+
+
+def test_a_torque_that_a_single_taxel_cannot_show_is_missing() -> None:
+    suite, taxels = _twisted(3e-3, Probes([[0.002, 0.001, 0.0]], [[0, 0, 1.0]], [0.001]))
+    np.testing.assert_allclose(taxels[:, 5].sum(), 0.0, atol=1e-6)
+    np.testing.assert_allclose(suite.missing_moment[0, suite.scene.link_index("pad")], 3e-3, rtol=0.02)
+    assert suite.unbalanced.all()
