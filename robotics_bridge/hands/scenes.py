@@ -66,7 +66,8 @@ def holding_spec(
 def place_palm(hand: Hand, spec: Any, place: ArrayLike, turn: ArrayLike) -> Any:
     """Put the palm to a place [3] (m) and orientation (w, x, y, z) of the world; return the body that was moved.
 
-    That is the palm, or what carries it: a wrist and forearm stay attached.
+    That is the palm, or what carries it: a wrist and forearm stay attached. The world has gravity along −z and
+    contacts, whatever the hand's file says of its own.
     """
     model, palm = hand.model, hand.model.body(hand.palm).id
     body = spec.body(model.body(model.body_rootid[palm]).name)
@@ -80,6 +81,9 @@ def place_palm(hand: Hand, spec: Any, place: ArrayLike, turn: ArrayLike) -> Any:
     # An orientation that the file gives as angles would come before the quaternion.
     body.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
     body.pos, body.quat = place, turn
+    # The file's world, whose axes may be others, ends here.
+    spec.option.gravity = (0.0, 0.0, -9.81)
+    spec.option.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_GRAVITY | mujoco.mjtDisableBit.mjDSBL_CONTACT)
     return body
 
 

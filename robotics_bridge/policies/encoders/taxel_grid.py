@@ -25,6 +25,7 @@ K sub-steps remembered, V values of a sub-step.
 
 from __future__ import annotations
 
+import logging
 import os
 import re
 from collections.abc import Mapping, Sequence
@@ -42,7 +43,7 @@ from torch import nn
 
 from brainbench.core.contracts import CHANNELS, GRID_SHAPE, SUB_STEP_SECONDS
 from brainbench.core.devices import mujoco_module
-from brainbench.core.errors import DataError, UsageError, check_name
+from brainbench.core.errors import DataError, UsageError, check_name, listing
 from brainbench.core.limits import Positive, limited
 from brainbench.models.export import StreamingStep
 from brainbench.models.network import FORCE_SCALE, MOMENT_SCALE, EncoderAttenderDecoder
@@ -63,6 +64,7 @@ _WORDS = {
     "ring": ("ring", "rf"),
     "pinky": ("pinky", "little", "lf", "small"),
 }
+_log = logging.getLogger(__name__)
 _SAME = 1e-4  # points nearer along a finger axis than this (m) are never parted
 
 
@@ -83,6 +85,10 @@ def finger_rows(fingers: Mapping[str, Sequence[str]]) -> dict[str, int]:
         parts = [part.removesuffix("distal").removesuffix("tip") for part in re.findall("[a-z]+", finger.lower())]
         matches = [row for row, name in enumerate(FINGERS) if any(word in parts for word in _WORDS[name])]
         if len(matches) != 1 or matches[0] in rows.values():
+            _log.warning(
+                "The names of the fingers %s do not all tell which they are: they take the rows of the grid, thumb first, "
+                "in their own order, where networks may expect other fingers.", listing([*fingers]),
+            )  # fmt: skip
             return {name: row for row, name in enumerate(fingers)}
         rows[finger] = matches[0]
     return rows

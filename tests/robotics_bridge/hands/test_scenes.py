@@ -12,6 +12,7 @@ from brainbench.core.errors import UsageError
 from robotics_bridge import hands, tasks
 from robotics_bridge.hands.scenes import OBJECT, closing, holding
 from robotics_bridge.tasks.scenes import build
+from tests.factories.hand_gallery import GALLERY
 
 
 @pytest.mark.parametrize("name", hands.list_hands())
@@ -150,3 +151,17 @@ def test_a_urdf_without_drives_gets_servos_and_closes_too(reference):
     assert np.linalg.norm(data.xpos[model.body(OBJECT).id]) < 0.15
     bent = model.joint("right_middle_PIP").qposadr
     assert data.qpos[bent] > 0.4
+
+
+@pytest.mark.parametrize("option", ['gravity="0 -9.81 0"/>', '><flag gravity="disable" contact="disable"/></option>'])
+def test_scenes_have_gravity_and_contacts_whatever_the_file_of_a_hand_says(option, tmp_path) -> None:
+    model = GALLERY["three-fingers-box"]
+    path = tmp_path / "hand.xml"
+    path.write_text(model.text.replace("<worldbody>", f"<option {option}<worldbody>", 1))
+    task = tasks.load("in_hand_repose")
+    for scene in (holding(hands.load(path)), build(task, hands.load(path)).models[0]):
+        np.testing.assert_array_equal(scene.opt.gravity, [0, 0, -9.81])
+        data = mujoco.MjData(scene)
+        mujoco.mj_step(scene, data, 500)
+        # The ball came to rest on the palm.
+        assert data.ncon

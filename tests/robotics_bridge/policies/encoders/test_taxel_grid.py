@@ -192,10 +192,13 @@ def test_a_hand_of_a_file_and_a_layout_of_ones_own_have_grids(tmp_path) -> None:
     assert TaxelGrid(own, resolution="custom").items == 4
 
 
-def test_unreadable_finger_names_take_rows_in_their_order() -> None:
+def test_unreadable_finger_names_take_rows_in_their_order(caplog) -> None:
     assert finger_rows({"mf": (), "th": (), "ff": ()}) == {"mf": 2, "th": 0, "ff": 1}
     assert finger_rows({"rh_ffdistal": (), "rh_thdistal": ()}) == {"rh_ffdistal": 1, "rh_thdistal": 0}
+    assert not caplog.text
     assert finger_rows({"fingertip": (), "fingertip_2": ()}) == {"fingertip": 0, "fingertip_2": 1}
+    assert finger_rows({"Zeigefinger": (), "Daumen": ()}) == {"Zeigefinger": 0, "Daumen": 1}
+    assert "'Zeigefinger', 'Daumen' do not all tell which they are" in caplog.text
     with pytest.raises(UsageError, match=r"5 fingers; .*\b6\b"):
         finger_rows({f"finger{i}": () for i in range(6)})
 
