@@ -20,16 +20,7 @@ from brainbench.core.files import content_hash
 from brainbench.core.reading.regular import readable
 from robotics_bridge.hands.files import read_mjspec, stated_speeds
 from robotics_bridge.hands.layouts import Layout, Pad, check_names, is_probe_file, pad_probes, read_probes, select
-from robotics_bridge.hands.tree import (
-    Tree,
-    cast_grid,
-    geoms_of,
-    half_open,
-    held,
-    link_points,
-    overlaps,
-    palmar_directions,
-)
+from robotics_bridge.hands.tree import Tree, cast_grid, doubts_of, geoms_of, nested_links, palmar_directions
 from robotics_bridge.sensors.probes.placement import Probes
 
 _log = logging.getLogger(__name__)
@@ -41,11 +32,6 @@ _AUTO_GRIDS = {
 }
 """Rows, columns and radius (m) on a link of a hand without a layout of its own."""
 UNKNOWN_SPEED = 5.0  # speed (rad/s) that counts as the largest of a hinge whose data states none
-_SPANS = (0.01, 2.0)  # from the smallest gripper to a hand with all that is fixed to its palm (m)
-_SMALLEST = 1e-3  # half of the links of any hand are larger (m)
-_LARGE = 2.0  # spans of a hand within which the mass of each link lies
-_HEAVIEST = 50.0  # kg
-_TOUCHING, _DEEPEST = 1e-4, 1e-3  # overlaps at rest of neighbours that is meant, and of other links that is none (m)
 LEVER = 0.05
 """Length of a finger (m) whose tip moves as a slide, where a number is stated for hinges alone: 1 rad is .05 m."""
 _PHYSICS = (
@@ -75,7 +61,7 @@ class Hand:
     """Probes of :meth:`with_probes`, the resolution ``custom``."""
     couplers: frozenset[str] = frozenset()
     """Links of fingers that only move others, such as the rods of a linkage; they get no taxels."""
-    nested: frozenset[tuple[str, ...]] = frozenset()
+    nested: frozenset[tuple[str, str]] = frozenset()
     """Pairs of links held by the world, and links that they carry, which lie in one another at rest: as all other
     neighbours along a joint, they do not collide."""
 
@@ -208,51 +194,6 @@ class Hand:
         return layout
 
 
-def _names(model: Any, bodies: Iterable[int]) -> tuple[str, ...]:
-    return tuple(model.body(body).name for body in bodies)
-
-
-def doubts_of(hand: Hand, model: Any) -> tuple[str, ...]:
-    """Return what no real hand is like of a hand in a model, in words; DataError if lengths are no metres."""
-    data, links = half_open(model), hand.links()
-    solids, far = {}, {}
-    for link in links:
-        body = model.body(link)
-        if len(points := link_points(model, body.id)):
-            solids[link] = data.xpos[body.id] + points @ data.xmat[body.id].reshape(3, 3).T
-    if not solids:
-        return ()
-    span = float(np.ptp(np.concatenate([*solids.values()]), axis=0).max())
-    half = float(np.median([np.ptp(points, axis=0).max() for points in solids.values()]))
-    if not _SPANS[0] <= span <= _SPANS[1] or half < _SMALLEST:
-        raise DataError(
-            f"The solids of hand {brief(hand.name)} span {span:.3g} m, those of one link {half:.3g} m (median); "
-            f"hands span {_SPANS[0]:g} to {_SPANS[1]:g} m, and links more than {_SMALLEST:g} m: lengths are in "
-            'metres (a mesh in millimetres takes scale=".001 .001 .001").'
-        )
-    for link, points in solids.items():
-        # No body spreads its mass wider than it is, nor beside itself.
-        body = model.body(link)
-        aside = np.linalg.norm(data.xipos[body.id] - (points.min(axis=0) + points.max(axis=0)) / 2)
-        wide = max(float(aside), math.sqrt(body.inertia.max() / body.mass[0]))
-        far |= {link: wide} if wide > _LARGE * span else {}
-    doubts = []
-    if far:
-        doubts.append(
-            f"the inertia of {listing(far)} is that of mass {max(far.values()):.3g} m away, and the hand spans "
-            f"{span:.3g} m: inertias are in kg·m², places in m"
-        )
-    if (mass := float(sum(model.body(link).mass[0] for link in links))) > _HEAVIEST:
-        doubts.append(f"palm and fingers weigh {mass:.3g} kg: masses are in kg")
-    deep = {_names(model, pair) for pair, depth in overlaps(model).items() if depth > _DEEPEST} - hand.nested
-    if jammed := sorted(" and ".join(pair) for pair in deep if {*pair} <= {*links}):
-        doubts.append(
-            f"{listing(jammed)} lie more than {1e3 * _DEEPEST:g} mm in each other at rest and push each other: exclude "
-            "their collision"
-        )
-    return tuple(doubts)
-
-
 def all_from_file(path: Path) -> tuple[Hand, ...]:
     """Return the hands of a file, that with most fingers first; palms and fingers follow from its tree.
 
@@ -276,16 +217,16 @@ def all_from_file(path: Path) -> tuple[Hand, ...]:
     if not branches:
         raise DataError(f"{str(path)!r} holds no hand: it has no joints.")
 
-    nested = frozenset(
-        _names(model, pair) for pair, depth in overlaps(model).items() if depth > _TOUCHING and held(model, *pair)
-    )
-    hands = []
+    def names(bodies: Iterable[int]) -> tuple[str, ...]:
+        return tuple(model.body(body).name for body in bodies)
+
+    nested, hands = nested_links(model), []
     for hand in branches:
-        fingers = {model.body(tip).name: _names(model, chain) for tip, chain in hand.fingers.items()}
-        couplers = frozenset(_names(model, hand.couplers))
+        fingers = {model.body(tip).name: names(chain) for tip, chain in hand.fingers.items()}
+        couplers = frozenset(names(hand.couplers))
         name = path.stem if len(branches) == 1 else f"{path.stem}-{model.body(hand.palm).name}"
         hands.append(Hand(name, model.body(hand.palm).name, fingers, path, couplers=couplers, nested=nested))
-        for doubt in doubts_of(hands[-1], model):
+        for doubt in doubts_of(model, hands[-1].links(), nested):
             _log.warning("Hand %s: %s.", brief(name), doubt)
     return tuple(hands)
 

@@ -7,7 +7,7 @@ it as a bundle of parallel rays.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.devices import mujoco_module
-from brainbench.core.errors import UsageError, check_number, check_numbers
+from brainbench.core.errors import DataError, UsageError, check_number, check_numbers, listing
 from brainbench.core.rotations import to_matrices
 from robotics_bridge.sensors.probes.placement import Probes
 
@@ -138,6 +138,11 @@ _CROSSED = 0.012  # joints nearer to each other (m) act on a link together
 _SNAP = 0.9  # cosine from which a direction counts as that of an axis of its link: jaws have flat faces
 _JAWS = 0.4
 """Length of the mean direction of finger tips up to which they go towards each other: .8 and more of hands."""
+_SPANS = (0.01, 2.0)  # from the smallest gripper to a hand with all that is fixed to its palm (m)
+_SMALLEST = 1e-3  # half of the links of any hand are larger (m)
+_LARGE = 2.0  # spans of a hand within which the mass of each link lies
+_HEAVIEST = 50.0  # kg
+_TOUCHING, _DEEPEST = 1e-4, 1e-3  # overlaps at rest of neighbours that is meant, and of other links that is none (m)
 _APART = -0.5  # cosine to the other tips below which a tip goes away from them
 
 
@@ -224,10 +229,57 @@ def overlaps(model: Any) -> dict[tuple[int, int], float]:
     return depths
 
 
-def held(model: Any, below: int, above: int) -> bool:
-    """Return whether a body is held by the world and carries another by one joint: MuJoCo lets only such collide."""
-    weld = model.body_weldid
-    return bool(below and not weld[below] and weld[above] and not weld[model.body_parentid[weld[above]]])
+def nested_links(model: Any) -> frozenset[tuple[str, str]]:
+    """Return pairs of a link held by the world and one that it carries by a joint, which lie in one another at rest.
+
+    Of all neighbours along a joint MuJoCo lets only such pairs collide.
+    """
+    weld, parent = model.body_weldid, model.body_parentid
+    deep = [pair for pair, depth in overlaps(model).items() if depth > _TOUCHING and pair[0] and not weld[pair[0]]]
+    return frozenset(
+        (model.body(low).name, model.body(high).name)
+        for low, high in deep
+        if weld[high] and not weld[parent[weld[high]]]
+    )
+
+
+def doubts_of(model: Any, links: Sequence[str], nested: frozenset[tuple[str, str]] = frozenset()) -> tuple[str, ...]:
+    """Return what no real hand of these links is like, in words; DataError if its lengths are no metres."""
+    data, solids, far = half_open(model), {}, {}
+    for link in links:
+        body = model.body(link).id
+        if len(points := link_points(model, body)):
+            solids[link] = data.xpos[body] + points @ data.xmat[body].reshape(3, 3).T
+    if not solids:
+        return ()
+    span = float(np.ptp(np.concatenate([*solids.values()]), axis=0).max())
+    half = float(np.median([np.ptp(points, axis=0).max() for points in solids.values()]))
+    if not _SPANS[0] <= span <= _SPANS[1] or half < _SMALLEST:
+        raise DataError(
+            f"The solids of the hand span {span:.3g} m, those of one link {half:.3g} m (median); hands span "
+            f"{_SPANS[0]:g} to {_SPANS[1]:g} m, and links more than {_SMALLEST:g} m: lengths are in metres (a mesh in "
+            'millimetres takes scale=".001 .001 .001").'
+        )
+    for link in solids:
+        # No body spreads its mass wider than it is.
+        body = model.body(link)
+        wide = float(np.sqrt(body.inertia.max() / body.mass[0]))
+        far |= {link: wide} if wide > _LARGE * span else {}
+    doubts = []
+    if far:
+        doubts.append(
+            f"the inertia of {listing(far)} is that of mass {max(far.values()):.3g} m away, and the hand spans "
+            f"{span:.3g} m: inertias are in kg·m²"
+        )
+    if (mass := float(sum(model.body(link).mass[0] for link in links))) > _HEAVIEST:
+        doubts.append(f"palm and fingers weigh {mass:.3g} kg: masses are in kg")
+    deep = {(model.body(a).name, model.body(b).name) for (a, b), depth in overlaps(model).items() if depth > _DEEPEST}
+    if jammed := sorted(" and ".join(pair) for pair in deep - nested if {*pair} <= {*links}):
+        doubts.append(
+            f"{listing(jammed)} lie more than {1e3 * _DEEPEST:g} mm in each other at rest and push each other: exclude "
+            "their collision"
+        )
+    return tuple(doubts)
 
 
 def link_middle(model: Any, data: Any, body: int) -> NDArray[np.float64]:

@@ -86,8 +86,8 @@ def finger_rows(fingers: Mapping[str, Sequence[str]]) -> dict[str, int]:
         matches = [row for row, name in enumerate(FINGERS) if any(word in parts for word in _WORDS[name])]
         if len(matches) != 1 or matches[0] in rows.values():
             _log.warning(
-                "The names of the fingers %s do not all tell which they are: they take the rows of the grid, thumb first,"
-                " in their own order, where networks may expect other fingers.", listing([*fingers]),
+                "The names of the fingers %s do not all tell which they are: they take the rows of the grid in their "
+                "order, the thumb's first, where networks may expect other fingers.", listing([*fingers]),
             )  # fmt: skip
             return {name: row for row, name in enumerate(fingers)}
         rows[finger] = matches[0]
