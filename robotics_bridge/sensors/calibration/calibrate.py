@@ -26,6 +26,7 @@ from brainbench.core.errors import DataError, UsageError, check_number, listing
 from brainbench.core.reading.tables import read_columns
 from robotics_bridge.sensors.calibration.likelihood import (
     MOST_HYSTERESIS,
+    SIGNIFICANT,
     Z95,
     Episode,
     Estimate,
@@ -223,12 +224,8 @@ def calibrate(log: Log, *, max_delay: float = 0.5) -> Calibration:
     moving = log.reference is not None
     longest = round(max_delay / log.step)
     guess = _delays(living, log.step, longest) if moving else (0, 0)
-    fit = fit_dynamics(align(living, *guess, longest), log.step, quantum, moving=moving)
-    if guess[0] < guess[1]:
-        # Readings that follow slowly (a hysteresis below 0) look as if they were late by more or less.
-        slow = fit_dynamics(align(living, guess[0], guess[0], longest), log.step, quantum, moving=True)
-        if slow.dynamics.hysteresis < 0 and _spread(slow) < _SLOW * _calm(living, slow, log.step, 2 * guess[1]):
-            fit, guess = slow, (guess[0], guess[0])
+    fit, guess, doubts = _fit_delayed(living, guess, log.step, quantum, longest, moving=moving)
+    notes += doubts
     lags = np.zeros(0, int)
     if moving and guess[1]:
         # Hysteresis can stand for a part of a delay that varies, so lags are also sought without it.
@@ -256,6 +253,25 @@ def calibrate(log: Log, *, max_delay: float = 0.5) -> Calibration:
     estimates = {name: estimates[name] for name in ORDER if name in estimates}
     about = {"readings": int(log.readings.size), "probes": list(log.probes), "episodes": len(parts), "step": log.step}
     return Calibration(_noise(estimates), estimates, tuple(notes), about)
+
+
+def _fit_delayed(
+    living: list[Episode], guess: tuple[int, int], step: float, quantum: float, longest: int, *, moving: bool
+) -> tuple[Fit, tuple[int, int], list[str]]:
+    """Return a fit at a range of lags, that range or what explains as much without it, and what is to be said of it."""
+    fit = fit_dynamics(align(living, *guess, longest), step, quantum, moving=moving)
+    if guess[1]:
+        # A delay must earn its place, too: where a reference hardly bends it is hysteresis of the other sign.
+        prompt = fit_dynamics(align(living, 0, 0, longest), step, quantum, moving=True)
+        if 2 * (prompt.cost - fit.cost) <= SIGNIFICANT:
+            note = f"A delay of {guess[1] * step:g} s fits no better than none, which is written: log faster presses."
+            return prompt, (0, 0), [note]
+    if guess[0] < guess[1]:
+        # Readings that follow slowly (a hysteresis below 0) look as if they were late by more or less.
+        slow = fit_dynamics(align(living, guess[0], guess[0], longest), step, quantum, moving=True)
+        if slow.dynamics.hysteresis < 0 and _spread(slow) < _SLOW * _calm(living, slow, step, 2 * guess[1]):
+            return slow, (guess[0], guess[0]), []
+    return fit, guess, []
 
 
 def _delays(parts: list[Episode], step: float, longest: int) -> tuple[int, int]:

@@ -26,7 +26,7 @@ Aligned = tuple["NDArray[np.float64]", "NDArray[np.float64]", "NDArray[np.int64]
 """x [T'] from the start of the episode, readings y [T, N], and for each reading the index of x that it shows."""
 
 Z95 = 1.959963984540054  # half width of a 95 % interval in standard errors
-_SIGNIFICANT = 6.63
+SIGNIFICANT = 6.63
 """Twice the gain in log-likelihood (χ², one degree, 1 %) that drift or hysteresis must bring to be kept."""
 _UNTOLD = 7.0
 """Half width of the interval of a logarithm, a factor of a thousand, at which a log does not tell a number."""
@@ -87,6 +87,8 @@ class Fit:
     dynamics: Dynamics
     creep: list[float]
     """ξ before each episode [unit of the sensor]; 0 of those that begin without load."""
+    cost: float
+    """Negative logarithm of the likelihood."""
 
 
 def begins_loaded(x: NDArray[np.float64]) -> bool:
@@ -219,7 +221,7 @@ def fit_dynamics(parts: list[Aligned], dt: float, quantum: float, *, moving: boo
     # Likelihood-ratio tests: a knob must earn its place, or every log would have a little drift and hysteresis.
     # Each unknown ξ before an episode under load is one number more.
     more = float(chi2.isf(0.01, 2 + sum(target.loaded)) - chi2.isf(0.01, 2))
-    hysteresis = moving and 2 * (plain_cost - cost) > _SIGNIFICANT + 2.6 + more
+    hysteresis = moving and 2 * (plain_cost - cost) > SIGNIFICANT + 2.6 + more
     if not hysteresis:
         best, cost = plain, plain_cost
     tiny = math.log(1e-6) + best.log_white
@@ -228,16 +230,16 @@ def fit_dynamics(parts: list[Aligned], dt: float, quantum: float, *, moving: boo
         return dynamics_of(p[0], tiny, p[1] if hysteresis else 0.0, p[2])
 
     point, value = minimum(without_drift, [best.log_white, best.hysteresis, best.log_tau])
-    drifts = 2 * (value - cost) > _SIGNIFICANT
+    drifts = 2 * (value - cost) > SIGNIFICANT
     if not drifts:
-        best = without_drift(point)
+        best, cost = without_drift(point), value
     free = ["log_white"] + ["log_walk"] * drifts + ["hysteresis", "log_tau"] * hysteresis
     estimates = _estimates(best, _errors(target, best, free), quantum)
     gains, gain_errors = target.gains(best) if moving else (np.ones(1), np.ones(1))
     creep = [own for _, own in target.models(best)] if moving else [0.0] * len(parts)
     bias, error = _bias(parts, dt, best, creep, drifts, gains, moving)
     estimates["bias"] = Estimate(bias, bias - Z95 * error, bias + Z95 * error, "level of the residuals")
-    return Fit(estimates, gains, gain_errors, best, creep)
+    return Fit(estimates, gains, gain_errors, best, creep, cost)
 
 
 def _errors(target: _Likelihood, best: Dynamics, free: list[str]) -> dict[str, float]:

@@ -241,3 +241,15 @@ def test_lists_are_a_log_and_short_episodes_are_told() -> None:
     assert any("1 episode" in note for note in calibrate(Log(TIME, READINGS, SIGNAL, short)).notes)
     with pytest.raises(DataError, match="fewer than 10"):
         calibrate(Log(TIME, READINGS, SIGNAL, np.arange(200) // 8))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_slow_reference_gives_a_prompt_device_no_delay_and_no_hysteresis(seed: int) -> None:
+    """A delay and a hysteresis of a reading cancel where the reference hardly bends."""
+    time, rng = 0.01 * np.arange(4000), np.random.default_rng(seed)
+    reference = 2 * np.maximum(0, np.sin(time / 3 + seed))
+    readings = np.stack([gain * reference + 0.02 * rng.normal(size=4000) for gain in (1.1, 0.9, 1.0)], axis=1)
+    result = calibrate(Log(time, readings, reference))
+    assert result.estimates["hysteresis"].value == 0
+    assert result.estimates["read_delay"].value == 0
+    assert any("no better than none" in note for note in result.notes) or seed == 2
