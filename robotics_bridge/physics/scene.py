@@ -242,15 +242,10 @@ def _form(shape: Geometry) -> tuple[Any, ...]:
     return shape.kind, shape.size, shape.position, shape.quaternion, mesh
 
 
-def excluded_links(model: Any) -> set[tuple[int, int]]:
-    """Return the pairs of body numbers (low, high) that a model excludes by name from collisions."""
-    pairs = ((int(signature) >> 16, int(signature) & 0xFFFF) for signature in model.exclude_signature)
-    return {(min(pair), max(pair)) for pair in pairs}
-
-
 def _never(model: Any) -> frozenset[tuple[int, int]]:
     """Return the pairs of links that MuJoCo excludes: named ones, parents with children, links welded together."""
-    pairs = excluded_links(model)
+    named = ((int(signature) >> 16, int(signature) & 0xFFFF) for signature in model.exclude_signature)
+    pairs = {(min(pair), max(pair)) for pair in named}
     weld, parent = model.body_weldid, model.body_parentid
     filtering = not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_FILTERPARENT
     for body in range(model.nbody):

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -16,7 +15,6 @@ from brainbench.core.errors import UsageError, brief, check_each, listing
 from robotics_bridge.hands.hand import LEVER, Hand
 from robotics_bridge.hands.scenes import ARMATURE, WEAK_PUSH, WEAK_SERVO, flexed, palm_surface, place_palm
 from robotics_bridge.hands.tree import Tree, driven, pulled
-from robotics_bridge.physics.scene import excluded_links
 from robotics_bridge.tasks.objects import ObjectShape, add_object, slots, with_sizes
 from robotics_bridge.tasks.settings import ContactModel, set_contacts
 from robotics_bridge.tasks.task import Pose, Task
@@ -181,8 +179,6 @@ def _hand_spec(task: Task, hand: Hand) -> tuple[Any, dict[str, tuple[float, floa
             biastype=mujoco.mjtBias.mjBIAS_NONE, gainprm=[gain] + [0.0] * 9, forcelimited=True,
             forcerange=(-effort * abs(gain), effort * abs(gain)),
         )  # fmt: skip
-    for first, second in _apart(spec):
-        spec.add_exclude(bodyname1=first, bodyname2=second)
     if task.furniture is not None:
         task.furniture(spec)
     return spec, drives
@@ -290,30 +286,3 @@ def palm_up(hand: Hand) -> Pose:
     x, y, z = (np.array([0.0, 0.0, _PALM_TOP]) - matrix @ (surface + 0.4 * step)).tolist()
     w, a, b, c = quaternion.tolist()
     return (x, y, z), (w, a, b, c)
-
-
-def _apart(spec: Any) -> list[tuple[str, str]]:
-    """Return pairs of the hand's bodies that never come within 2 mm, found in 1,500 random poses."""
-    trial = spec.copy()
-    for geom in trial.geoms:
-        geom.margin = 2e-3
-    model = trial.compile()
-    data = mujoco.MjData(model)
-    rng = np.random.default_rng(0)
-    low = np.where(model.jnt_limited, model.jnt_range[:, 0], -np.pi)
-    high = np.where(model.jnt_limited, model.jnt_range[:, 1], np.pi)
-    hinges = np.isin(model.jnt_type, (2, 3))
-    address = model.jnt_qposadr[hinges]
-    met = excluded_links(model)
-    for sample in range(1500):
-        share = rng.random(hinges.sum())
-        # Fingers meet most when bent far: half of the poses are at the ends of the ranges.
-        share = np.round(share * 2) / 2 if sample % 2 else share
-        data.qpos[address] = low[hinges] + (high - low)[hinges] * share
-        mujoco.mj_kinematics(model, data)
-        mujoco.mj_comPos(model, data)
-        mujoco.mj_collision(model, data)
-        met |= {(min(pair), max(pair)) for pair in model.geom_bodyid[data.contact.geom].tolist()}
-    bodies = [body for body in range(1, model.nbody) if model.body_geomnum[body]]
-    apart = [pair for pair in combinations(bodies, 2) if pair not in met]
-    return [(model.body(first).name, model.body(second).name) for first, second in apart]

@@ -14,6 +14,7 @@ from brainbench.core.errors import UsageError
 from brainbench.core.rotations import angle_of, multiply
 from robotics_bridge import hands, tasks
 from robotics_bridge.tasks.scenes import TaskModel, build, drives_of, palm_up
+from tests.factories.hand_gallery import GALLERY
 
 LEAKS = (
     '<general ctrllimited="true"/>', '<general gear="3" dyntype="filter"/>', '<geom contype="0" conaffinity="0"/>',
@@ -75,6 +76,12 @@ def test_only_links_that_can_meet_collide() -> None:
     assert tuple(sorted((thumb, index))) not in left_out
     palm, base = model.body("right_hand_link").id, model.body("right_hand_mid_link1").id
     assert tuple(sorted((palm, base))) in left_out
+
+
+def test_links_of_a_file_collide_unless_the_file_excludes_them(tmp_path: Path) -> None:
+    """Whether slender links ever meet shows in no few thousand random poses."""
+    hand = hands.load(GALLERY["three-fingers-box"].write(tmp_path, "hand"))
+    assert build(tasks.load("in_hand_repose"), hand).models[0].nexclude == hand.model.nexclude == len(hand.nested)
 
 
 def test_a_finger_that_the_hand_lacks_is_named() -> None:
