@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import math
 import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
@@ -205,14 +204,6 @@ def all_from_file(path: Path) -> tuple[Hand, ...]:
         for name in ("geom_friction", "dof_damping", "dof_armature"):
             if (getattr(model, name) < 0).any():
                 raise DataError(f"{brief(str(path))} has a {name} below 0; give 0 or more.")
-    hinges = (model.jnt_type == mujoco_module().mjtJoint.mjJNT_HINGE) & (model.jnt_limited != 0)
-    widest = float(np.abs(model.jnt_range[hinges]).max(initial=0.0))
-    # Radians that are read as degrees end at π°, degrees that are read as radians turn many times.
-    if hinges.any() and not math.radians(math.pi) < widest < 4 * math.pi:
-        _log.warning(
-            "Limits of the hinges of hand %s end at %.4g rad: is the unit of the angles right (MJCF: degrees "
-            "unless <compiler angle='radian'/>; URDF: rad)?", brief(path.stem), widest,
-        )  # fmt: skip
     branches = Tree(model).hands()
     if not branches:
         raise DataError(f"{str(path)!r} holds no hand: it has no joints.")

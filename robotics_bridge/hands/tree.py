@@ -266,6 +266,14 @@ def doubts_of(model: Any, links: Sequence[str], nested: frozenset[tuple[str, str
         wide = float(np.sqrt(body.inertia.max() / body.mass[0]))
         far |= {link: wide} if wide > _LARGE * span else {}
     doubts = []
+    hinges = (model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE) & (model.jnt_limited != 0)
+    widest = float(np.abs(model.jnt_range[hinges]).max(initial=0.0))
+    # Radians that are read as degrees end at π°, degrees that are read as radians turn many times.
+    if hinges.any() and not math.radians(math.pi) < widest < 4 * math.pi:
+        doubts.append(
+            f"the unit of the angles seems wrong: hinges end at {widest:.4g} rad (MJCF: degrees unless <compiler "
+            "angle='radian'/>; URDF: rad)"
+        )
     if far:
         doubts.append(
             f"the inertia of {listing(far)} is that of mass {max(far.values()):.3g} m away, and the hand spans "
