@@ -22,6 +22,7 @@ from brainbench.core.files import to_plain
 from brainbench.core.identity import ScoreIdentity, plan_note
 from brainbench.core.records import ESTIMATOR_VERSION, ResultRecord, Score
 from leaderboards.boards import rank
+from leaderboards.entries import moment
 from leaderboards.store import StoredRecord, read_records
 
 TOLERANCE = 1e-3
@@ -75,12 +76,12 @@ def conflicting(record: ResultRecord, others: Iterable[ResultRecord]) -> Iterato
     return (rival for rival in rivals if ScoreIdentity.of(rival) == ScoreIdentity.of(record))
 
 
-def _stale(record: ResultRecord, newest: dict[tuple[Any, ...], tuple[str, str]]) -> list[str]:
+def _stale(record: ResultRecord, newest: dict[tuple[Any, ...], str]) -> list[str]:
     score, settings, reasons = record.score, record.score.provenance.settings, []
     estimator = settings.get("estimator_version")
     if score.estimator == "default" and isinstance(estimator, int) and estimator < ESTIMATOR_VERSION:
         reasons.append(f"version {estimator} of the default estimator, now {ESTIMATOR_VERSION}")
-    latest = newest.get(_wording(record), ("", ""))[1]
+    latest = newest.get(_wording(record))
     if latest and latest != score.provenance.stimuli_hash:
         reasons.append(
             f"its stimuli ({score.provenance.stimuli_hash}) were made by another engine or an earlier definition of "
@@ -95,14 +96,13 @@ def _wording(record: ResultRecord) -> tuple[Any, ...]:
     return (origin.stimuli_name, *(str(origin.settings.get(name)) for name in ("stimuli", "whiskers", "fidelity")))
 
 
-def _newest_stimuli(records: list[ResultRecord]) -> dict[tuple[Any, ...], tuple[str, str]]:
-    """Return for each wording of the stimuli the time and the hash of the newest record."""
-    newest: dict[tuple[Any, ...], tuple[str, str]] = {}
-    for record in records:
+def _newest_stimuli(records: list[ResultRecord]) -> dict[tuple[Any, ...], str]:
+    """Return for each wording of the stimuli the hash of the newest record."""
+    newest: dict[tuple[Any, ...], str] = {}
+    for record in sorted(records, key=lambda record: (moment(record), record.score.provenance.stimuli_hash or "")):
         origin = record.score.provenance
         if origin.stimuli_hash and origin.settings.get("fidelity"):
-            key = _wording(record)
-            newest[key] = max(newest.get(key, ("", "")), (origin.time, origin.stimuli_hash))
+            newest[_wording(record)] = origin.stimuli_hash
     return newest
 
 
@@ -243,7 +243,7 @@ def _by_model(stored: Iterable[StoredRecord]) -> dict[tuple[Any, ...], dict[str,
             name = f"{entry.name} (seed {seed})" if seed is not None else entry.name
             # What a score is worth may change with the other records, though neither score nor rank does.
             state = f"{'' if math.isnan(value) else f'{value:.3f}, '}{entry.standing}, rank {entry.rank}"
-            key = (entry.name, seed, board.recordings, board.metric, board.estimator, board.time)
+            key = (entry.name, seed, board.recordings, board.metric, record.score.estimator, board.time)
             placed[key][record.identity] = _Placed(label, name, state, record)
     return placed
 

@@ -27,9 +27,9 @@ from brainbench.core.contracts import natural_key
 from brainbench.core.errors import listing, visible_name
 from brainbench.core.files import content_hash
 from brainbench.core.identity import unusual_settings
-from brainbench.core.records import Interval, ResultRecord, Score
+from brainbench.core.records import ESTIMATOR_VERSION, Interval, ResultRecord, Score
 from brainbench.core.statistics import LEVEL
-from leaderboards.entries import Entry, fold_seeds, same_computation
+from leaderboards.entries import Entry, fold_seeds, moment, same_computation
 from leaderboards.ranking import DOUBTFUL, Sample, apart, differences, lacking, rank_in_print, rank_ranges, told_apart
 from leaderboards.text import number, plural, span
 
@@ -94,12 +94,16 @@ def rank(records: Iterable[ResultRecord], remarks: Mapping[str, Sequence[str]] |
     Remarks are doubts about records by identity (:func:`leaderboards.audit.remarks`), kept as notes of entries.
     """
     groups: dict[tuple[Any, ...], list[ResultRecord]] = defaultdict(list)
-    for record in records:
+    # The newest first, whatever folders they came from: of two values of a baseline that are as common it is shown.
+    for record in sorted(records, key=lambda record: (moment(record), record.identity), reverse=True):
         score = record.score
         origin, estimator = score.provenance, score.estimator
         # Other units make other RDMs of the same recordings.
         if (least := origin.settings.get("units_reliability")) is not None:
             estimator += f", units of reliability {least} and more"
+        version = origin.settings.get("estimator_version")
+        if score.estimator == "default" and version not in (None, ESTIMATOR_VERSION):
+            estimator += f", version {version}"
         if origin.pairing:
             estimator += f", labels paired otherwise ({origin.pairing})"
         brain, stimuli = origin.recordings_hash, origin.stimuli_hash

@@ -11,6 +11,7 @@ import statistics
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
 from functools import cached_property
 
 import numpy as np
@@ -175,13 +176,21 @@ def fold_seeds(
     groups: dict[tuple[object, ...], list[ResultRecord]] = defaultdict(list)
     copies: dict[tuple[object, ...], int] = defaultdict(int)
     # Of the same model and seed the newest is the entry's; older ones stay visible, but push no other model back.
-    by_age = sorted(records, key=lambda record: (record.score.provenance.time, record.identity))
-    for record in reversed(by_age):
+    for record in sorted(records, key=lambda record: (moment(record), record.identity), reverse=True):
         kind, seed = _kind(record), record.card.seed if record.card else None
         copy = copies[*kind, seed]
         copies[*kind, seed] += 1
         groups[*kind, copy].append(record)
     return [_entry(key, found, board, remarks) for key, found in groups.items()]
+
+
+def moment(record: ResultRecord) -> datetime:
+    """Return when a record was made: machines state it in zones of their own. What states no time is the oldest."""
+    try:
+        stated = datetime.fromisoformat(record.score.provenance.time)
+        return stated.astimezone(UTC) if stated.tzinfo else stated.replace(tzinfo=UTC)
+    except (ValueError, OverflowError):
+        return datetime.min.replace(tzinfo=UTC)
 
 
 def twins(entries: Sequence[Entry]) -> dict[str, Entry]:

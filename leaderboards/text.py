@@ -72,16 +72,13 @@ def group_rows(statistics: Mapping[str, Any]) -> dict[str, Any] | None:
         board = statistics["groups"]
         rows = []
         for group in board["groups"]:
-            numbers = {
-                name: math.nan if group[name] is None else float(group[name]) for name in ("scaled", "p_corrected")
-            }
-            ends = group["interval"]
+            ends, scaled, p = (group[name] for name in ("interval", "scaled", "p_corrected"))
             rows.append(
                 {
                     **{name: str(group[name] or "") for name in ("group", "status", "rank", "layer")},
                     **{name: int(group[name]) for name in ("units", "animals")},
-                    "scaled": numbers["scaled"],
-                    "p": numbers["p_corrected"],
+                    "scaled": math.nan if scaled is None else float(scaled),
+                    "p": math.nan if p is None else float(p),
                     "interval": Interval(float(ends["low"]), float(ends["high"])) if ends else None,
                 }
             )

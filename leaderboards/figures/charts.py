@@ -154,7 +154,6 @@ def _trusted(entry: Entry) -> bool:
 _Told = Callable[[Entry], str]
 
 
-_PANELS = 4  # panels side by side in the figure of layers
 _PANEL_NAME = 23
 """Characters of a name above a panel: bold letters of 10.5 pixels take about 6.7 each, the panel leaves 158."""
 
@@ -228,10 +227,9 @@ def layer_fit(entries: Sequence[Entry]) -> svg.Figure:
     if not rows:
         return svg.Figure(key, title, lacking="no record holds scores of layers")
     many, rows = len(rows), rows[:24]
-    columns, w, h = _PANELS, svg.WIDTH / _PANELS, 112.0
-    drawing = svg.Drawing(
-        svg.WIDTH, math.ceil(len(rows) / columns) * h + 6, f"Score of every layer of {len(rows)} models"
-    )
+    columns, w, h = 4, svg.WIDTH / 4, 112.0
+    height = math.ceil(len(rows) / columns) * h + 6
+    drawing = svg.Drawing(svg.WIDTH, height, f"Score of every layer of {len(rows)} models")
     values = [layer.value for entry in rows for layer in entry.score.layers]
     for index, entry in enumerate(rows):
         x0, y0 = (index % columns) * w, (index // columns) * h
@@ -338,9 +336,9 @@ def _any_masking(entry: Entry) -> str:
 def _twin_points(entry: Entry, untrained: Mapping[str, Entry], size: float) -> tuple[svg.ChartPoint, ...]:
     """Return the mark of a model's untrained twin, if its score is on the board."""
     twin = untrained.get(entry.architecture)
-    return (
-        () if twin is None else (svg.ChartPoint(twin.scaled, "c0 open", f"untrained twin {number(twin.scaled)}", size),)
-    )
+    if twin is None:
+        return ()
+    return (svg.ChartPoint(twin.scaled, "c0 open", f"untrained twin {number(twin.scaled)}", size),)
 
 
 def _twin_accuracy(entry: Entry, untrained: Mapping[str, Entry]) -> float | None:

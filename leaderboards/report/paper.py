@@ -171,9 +171,7 @@ def write_paper(
         "synthetic": any(board.synthetic for board in boards),
         "sections": [*_over_benchmarks(boards, path), *sections],
         "references": cited,
-        "commands": list(
-            dict.fromkeys(visible(text) for record in usable if (text := record.score.provenance.command))
-        ),
+        "commands": [*filter(None, dict.fromkeys(visible(item.score.provenance.command) for item in usable))],
         "bib": path.with_suffix(".bib").name,
     }
     if kind == "md":
@@ -270,14 +268,8 @@ def _models(entries: Sequence[Entry]) -> PaperTable:
 
 
 def _baselines(board: Board) -> PaperTable:
-    rows = [
-        (
-            baseline.name,
-            *map(words.number, (baseline.score.scaled, baseline.score.value)),
-            words.span(baseline.score.scaled_interval),
-        )
-        for baseline in board.baselines
-    ]
+    pairs = ((baseline.name, baseline.score) for baseline in board.baselines)
+    rows = ((name, words.number(s.scaled), words.number(s.value), words.span(s.scaled_interval)) for name, s in pairs)
     return PaperTable("Baselines and animal-to-animal.", ("baseline", "score", "value", "interval"), tuple(rows))
 
 

@@ -55,7 +55,6 @@ from brainbench.core.reading.values import typed_values
 from brainbench.core.records import ResultRecord, Score
 from brainbench.core.statistics import compare_scores
 from leaderboards import text
-from leaderboards import text as words
 from leaderboards.audit import remarks
 from leaderboards.boards import RAW_INPUT, Baseline, Board, conclusions, means_over, rank, table_of
 from leaderboards.entries import Entry
@@ -135,9 +134,9 @@ def _environment() -> Environment:
         loader=FileSystemLoader(_TEMPLATES), autoescape=True, undefined=StrictUndefined, trim_blocks=True,
         lstrip_blocks=True, finalize=_visible_texts,
     )  # fmt: skip
-    helpers = (words.number, words.probability, words.count, words.span, words.level)
+    helpers = (text.number, text.probability, text.count, text.span, text.level)
     environment.filters |= {helper.__name__: helper for helper in helpers}
-    environment.globals |= {"STANDING": MEANINGS, "SYNTHETIC": words.SYNTHETIC, "p_sentence": words.p_sentence}
+    environment.globals |= {"STANDING": MEANINGS, "SYNTHETIC": text.SYNTHETIC, "p_sentence": text.p_sentence}
     environment.globals["colour_stops"] = colour_stops()
     return environment
 
@@ -641,6 +640,6 @@ def _pages(stored: Sequence[StoredRecord], title: str) -> Iterator[tuple[str, _C
 def _count(boards: Sequence[Board]) -> str:
     models = sum(len(board.entries) for board in boards)
     results = sum(entry.seeds for board in boards for entry in board.entries)
-    text = f"{words.plural(models, 'model')}"
-    text += f", {words.plural(results, 'record')}" if results != models else ""
-    return text + (f" on {words.plural(len(boards), 'board')}." if len(boards) != 1 else ".")
+    counts = f"{text.plural(models, 'model')}"
+    counts += f", {text.plural(results, 'record')}" if results != models else ""
+    return counts + (f" on {text.plural(len(boards), 'board')}." if len(boards) != 1 else ".")

@@ -186,7 +186,7 @@ def _named(truths, **design):
 def test_builds_show_what_came_went_changed_and_moved(tmp_path):
     drawn = _named({"stays": 0.2, "changes": 0.9, "goes": 0.55, "comes": 0.6})
     changed = _named({"stays": 0.2, "changes": 0.4}, seed=1)["changes"]
-    settings = {**changed.score.provenance.settings, "estimator_version": 9}
+    settings = {**changed.score.provenance.settings, "estimator_version": records.ESTIMATOR_VERSION}
     provenance = {**changed.score.provenance, "settings": settings}
     changed = replace(changed, score=replace(changed.score, provenance=provenance))
     old = _build([drawn["stays"], drawn["goes"], drawn["changes"]], tmp_path / "old")
@@ -198,7 +198,7 @@ def test_builds_show_what_came_went_changed_and_moved(tmp_path):
         "goes (seed 0)": "removed",
         "changes (seed 0)": "changed",
     }
-    assert found["changes (seed 0)"].causes[0] == "estimator version: none → 9"
+    assert found["changes (seed 0)"].causes[0] == f"estimator version: none → {records.ESTIMATOR_VERSION}"
     assert found["changes (seed 0)"].before.endswith("rank 1")
     assert found["changes (seed 0)"].after.endswith("rank 2")
     moved = {change.name: change for change in compare_builds(old, new) if change.kind == "moved"}
@@ -221,6 +221,25 @@ def test_scores_of_a_name_on_several_stimuli_are_compared_each_with_its_own(tmp_
     builds = ([StoredRecord(tmp_path / str(place), record) for place, record in enumerate(one)] for one in (old, new))
     changed = [change for change in compare_builds(*builds) if change.kind == "changed" and change.name.startswith("m")]
     assert [change.causes for change in changed] == [(), ()]
+
+
+def test_a_record_of_an_earlier_estimator_changes_when_it_is_scored_again(tmp_path):
+    record = _named({"net": 0.5})["net"]
+    stated = record.score.provenance.settings
+    old, new = (_with(record, settings={**stated, "estimator_version": version}) for version in (3, 4))
+    new = replace(new, score=replace(new.score, value=new.score.value + 0.01))
+    (change,) = compare_builds(_build([old], tmp_path / "old"), _build([new], tmp_path / "new"))
+    assert (change.kind, change.causes) == ("changed", ("estimator version: 3 → 4",))
+
+
+def test_the_newest_stimuli_are_those_of_the_latest_moment_in_any_zone(make_record, tmp_path):
+    settings = {"fidelity": "balanced"}
+    described = {"description": "rodgers, mouse"}
+    early, late = (
+        _with(make_record(name), settings=settings, stimuli={**described, "content_hash": name}, time=time)
+        for name, time in (("early", "2026-11-30T12:00:00+02:00"), ("late", "2026-11-30T11:00:00+00:00"))
+    )
+    assert list(remarks([_stored(early, tmp_path), _stored(late, tmp_path)])) == [early.identity]
 
 
 def test_a_standing_that_changes_alone_is_told(make_record, tmp_path):

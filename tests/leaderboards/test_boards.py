@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from brainbench.core.records import ResultRecord
+from brainbench.core.records import ESTIMATOR_VERSION, ResultRecord
 from brainbench.core.statistics import two_factor_error
 from leaderboards.boards import NO_SCALE, _combined, conclusions, means_over, rank, table_of
 from leaderboards.report.paper import references, write_paper
@@ -146,6 +146,7 @@ def test_dissimilarities_taken_from_the_brain_stand_apart_whatever_they_score():
         {"recordings": {"source": "demo", "content_hash": "other"}},
         {"stimuli": {"description": "rodgers", "content_hash": "other"}},
         {"settings": {"time": "concatenate"}},
+        {"settings": {"time": "mean", "estimator_version": ESTIMATOR_VERSION - 1}},
     ],
 )
 def test_other_recordings_stimuli_or_time_rule_make_another_board(change):
@@ -157,6 +158,24 @@ def test_other_recordings_stimuli_or_time_rule_make_another_board(change):
 def test_other_estimators_and_metrics_make_other_boards():
     records = [make_record("a"), make_record("b", estimator="thesis"), make_record("c", metric="crossnobis")]
     assert [len(board.entries) for board in rank(records)] == [1, 1, 1]
+
+
+def test_the_published_estimators_have_one_board_whatever_version_made_them():
+    settings = {"time": "mean", "estimator_version": ESTIMATOR_VERSION - 1}
+    here, there = make_record("a", estimator="thesis"), make_record("b", estimator="thesis")
+    there = replace(there, score=replace(there.score, provenance={**there.score.provenance, "settings": settings}))
+    assert [board.estimator for board in rank([here, there])] == ["thesis"]
+
+
+def test_of_two_values_of_a_baseline_that_are_as_common_the_newest_is_shown_in_any_order():
+    early, late = make_record("early"), make_record("late")
+    late = replace(late, baselines={"raw input": replace(late.baselines["raw input"], value=0.4)})
+    late = replace(
+        late, score=replace(late.score, provenance={**late.score.provenance, "time": "2026-11-21T06:00-03:00"})
+    )
+    for records in ([early, late], [late, early]):
+        (shown,) = [item for item in _board(records).baselines if item.name == "raw input"]
+        assert shown.score.value == 0.4
 
 
 def test_records_that_do_not_say_what_they_used_have_no_rank():

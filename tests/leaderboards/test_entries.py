@@ -32,6 +32,21 @@ def test_every_layer_that_a_seed_was_scored_at_is_named():
     assert entry.layer == f"{record.score.layer}, another"
 
 
+@pytest.mark.parametrize("unknown", ["", "yesterday"])
+def test_the_newest_record_of_a_model_is_that_of_the_latest_moment_in_any_zone(unknown):
+    (record,) = draw_board({"net": 0.6})
+
+    def made(time, weights):
+        card = replace(record.card, weights=weights)
+        return replace(
+            record, card=card, score=replace(record.score, provenance={**record.score.provenance, "time": time})
+        )
+
+    east, west = made("2026-11-30T12:00:00+02:00", "east"), made("2026-11-30T11:00:00+00:00", "west")
+    ranked = {entry.card.weights: not entry.unranked_because for entry in _entries(east, west, made(unknown, "none"))}
+    assert ranked == {"west": True, "east": False, "none": False}
+
+
 def test_one_seed_without_a_test_leaves_the_entry_untested():
     (record,) = draw_board({"net": 0.6})
     untested = replace(record, score=replace(record.score, p=math.nan))
