@@ -270,16 +270,13 @@ class LocatedModel:
 
     def build(self, seed: int = 0, **options: Any) -> nn.Module:
         """Build the model with its weights, in evaluation mode; untrained weights follow from the seed alone."""
-        from brainbench.models.ops.layers import seeded
-
         if self.weights is None and self.architecture.tag is not None:
             raise UsageError(
                 f"There are no weights for {self.name!r} yet; train them with: brainbench train "
                 f"{self.architecture.untrained} --objective {self.architecture.tag}; or load the untrained model "
                 f"{self.architecture.untrained!r}."
             )
-        with seeded(seed):
-            model = self._make(options)
+        model = self._drawn(seed, options)
         if self.weights is not None:
             load_weights(model, self.weights, what=self.name)
         data: Any = (self.trained or {}).get("data")
@@ -290,16 +287,19 @@ class LocatedModel:
 
     def outline(self) -> nn.Module:
         """Build the model without allocating its weights, to count them."""
+        try:
+            return self._drawn(0, {}, "meta")
+        except (RuntimeError, NotImplementedError):  # a model that computes with values while it is built
+            return self._drawn(0, {})
+
+    def _drawn(self, seed: int, options: Mapping[str, Any], device: str = "cpu") -> nn.Module:
         import torch
 
         from brainbench.models.ops.layers import seeded
 
-        with seeded(0):
-            try:
-                with torch.device("meta"):
-                    return self._make({})
-            except (RuntimeError, NotImplementedError):  # a model that computes with values while it is built
-                return self._make({})
+        # A program's own default device would draw other numbers.
+        with seeded(seed), torch.device(device):
+            return self._make(options)
 
     def _make(self, options: Mapping[str, Any]) -> nn.Module:
         options = {**(self.trained["options"] if self.trained else {}), **options}

@@ -88,6 +88,33 @@ def test_equal_seeds_give_equal_weights_and_disturb_nobody():
     assert any(not torch.equal(value, third[name]) for name, value in first.items())
 
 
+@pytest.mark.parametrize("precision", [torch.float64, torch.float16])
+def test_defaults_of_the_program_change_no_weights_and_stay(precision, tmp_path):
+    target = f"{_file(tmp_path, 'def make_model(): return nn.Linear(3, 4)')}:make_model"
+    expected = [*load_model(SMALL, seed=3).parameters(), *load_user_model(target, seed=3).parameters()]
+    try:
+        torch.set_default_dtype(precision)
+        torch.set_default_device("meta")
+        network = load_model(SMALL, seed=3)
+        torch.set_default_device(None)
+        drawn = [*network.parameters(), *load_user_model(target, seed=3).parameters()]
+        assert torch.get_default_dtype() == precision
+    finally:
+        torch.set_default_device(None)
+        torch.set_default_dtype(torch.float32)
+    assert all(torch.equal(left, right) for left, right in zip(drawn, expected, strict=True))
+    assert {value.dtype for value in drawn} == {torch.float32}
+
+
+def test_a_precision_that_a_file_of_code_chooses_stays(tmp_path):
+    code = "torch.set_default_dtype(torch.float64)\ndef make_model(): return nn.Linear(3, 4)"
+    target = f"{_file(tmp_path, code)}:make_model"
+    try:
+        assert load_user_model(target).weight.dtype == torch.get_default_dtype() == torch.float64
+    finally:
+        torch.set_default_dtype(torch.float32)
+
+
 @pytest.mark.parametrize("seed", [-1, 1.5, True, "0", 2**63])
 def test_a_seed_is_a_whole_number(seed):
     with pytest.raises(UsageError, match=r"seed .*received"):

@@ -25,12 +25,19 @@ from brainbench.core.files import content_hash
 
 @contextmanager
 def seeded(seed: int) -> Iterator[None]:
-    """Run a block with PyTorch's CPU generator at ``seed``; its state is put back afterwards."""
+    """Run a block with PyTorch's CPU generator at ``seed`` and in single precision; both are put back afterwards."""
     # PyTorch keeps seeds as signed 64-bit numbers.
     check_number("seed", seed, least=0, below=2**63, whole=True)
+    precision = torch.get_default_dtype()
     with torch.random.fork_rng(devices=[]):
         torch.default_generator.manual_seed(seed)
-        yield
+        # A program that computes in double precision would draw other numbers.
+        torch.set_default_dtype(torch.float32)
+        try:
+            yield
+        finally:
+            if torch.get_default_dtype() == torch.float32:  # else the code in the block chose another
+                torch.set_default_dtype(precision)
 
 
 def load_named(targets: Mapping[str, torch.Tensor], state: Mapping[str, Any], *, what: str) -> None:

@@ -332,10 +332,9 @@ def checkpoint_info(
 ) -> dict[str, Any]:
     """Return what a checkpoint's configuration says beside the architecture, in plain values.
 
-    ``twin`` is what :func:`describe_twin` told of the network before its training,
-    ``controls`` are evaluations of :data:`CONTROLS`, ``data`` the
-    :attr:`~brainbench.models.training.batches.Data.summary` of the sweeps, ``split`` the part of them that the
-    evaluation is of.
+    ``twin`` is what :func:`describe_twin` told of the network before its training, ``controls`` are evaluations of
+    :data:`CONTROLS`, ``data`` the :attr:`~brainbench.models.training.batches.Data.summary` of the sweeps, ``split`` the
+    part of them that the evaluation is of.
     """
     compared = {name: to_plain(found) for name, found in (controls or {}).items()}
     return {

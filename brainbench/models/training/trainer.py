@@ -372,9 +372,8 @@ class _Run:
         if not reason:
             fit_probe(twin.to(device), train, **probe)
             evaluations[TWIN] = evaluate(twin, test, device=device)
-        write_json(
-            self.controls_file, {"of": key, "controls": {name: asdict(item) for name, item in evaluations.items()}}
-        )
+        plain = {name: asdict(evaluation) for name, evaluation in evaluations.items()}
+        write_json(self.controls_file, {"of": key, "controls": plain})
         return evaluations
 
     @property
@@ -385,13 +384,9 @@ class _Run:
         config, reached = self.config, {"epochs_done": self.at.epoch, "best_epoch": self.at.best_epoch}
         facts = {"twin": self.twin, "controls": self.controls, "data": self.data.summary, "split": split}
         info = checkpoint_info(config, self.data.classes, evaluation=result, **reached, **facts)
-        contents = {
-            "options": self.options,
-            "info": info,
-            "card": model_card(config, info),
-            "dtype": config.stored_dtype,
-        }
-        save_checkpoint(self.out / BEST, self.model, architecture=config.model, **contents)
+        contents = {"options": self.options, "info": info, "card": model_card(config, info)}
+        stored = {"architecture": config.model, "dtype": config.stored_dtype}
+        save_checkpoint(self.out / BEST, self.model, **stored, **contents)
 
     def _save(self) -> None:
         self.saved = time.monotonic()
