@@ -143,7 +143,8 @@ def subset(
         columns = select_rows(cells, selection.units, "units", ledger)
         values = values[passing[series.table]] if series.table else values
         stamps = None if series.timestamps is None else np.asarray(series.timestamps[...])
-        more = {"timestamps": stamps, "columns": _plain(cells, columns)}
+        conversion = np.broadcast_to(np.asarray(series.conversion, np.float64), len(cells))[columns]
+        more = {"timestamps": stamps, "columns": _plain(cells, columns), "conversion": conversion}
         populations[place] = replace(series, name=place, data=values[..., columns], **more)
     return replace(session, units=units, tables=tables, series={}, populations=populations)
 

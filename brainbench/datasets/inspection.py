@@ -247,6 +247,9 @@ def _summary(session: Session, usable: bool, ledger: Ledger) -> SessionSummary:
         lost = session.tables[table.name].fault
         ledger.find("tables", read=not lost)
         ledger.leave("tables", lost, int(bool(lost)), lost=bool(lost))
+    for reason in session.unread:
+        ledger.find("tables")
+        ledger.leave("tables", reason, lost=True)
     if units is not None:
         ledger.find("units", units.units, 0 if units.problem else units.units)
         ledger.leave("units", units.problem, units.units if units.problem else 0, lost=bool(units.problem))
@@ -265,9 +268,7 @@ def _summary(session: Session, usable: bool, ledger: Ledger) -> SessionSummary:
         units=units,
         tables=tables,
         modules=tuple(session.modules.items()),
-        acquired=tuple(
-            AcquiredSummary(entry.name, entry.kind, tuple(entry.data.shape), entry.gigabytes) for entry in series
-        ),
+        acquired=tuple(AcquiredSummary(s.name, s.kind, tuple(s.data.shape), s.gigabytes) for s in series),
         missing=tuple(missing),
         notes=session.notes,
     )

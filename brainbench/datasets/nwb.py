@@ -66,7 +66,7 @@ def read_nwb(file: h5py.File, path: Path) -> Session:
     return Session(
         subject=subject,
         session=session,
-        units=next(iter(units.values())) if len(units) == 1 else None,
+        units=units["units"] if "units" in units else next(iter(units.values())) if len(units) == 1 else None,
         tables=tables,
         source=str(path),
         identifier=_string(file, "identifier"),
@@ -114,7 +114,7 @@ def _tables(
         if not _is_table(place, group):
             continue
         if kind == "Units" or place == "units":
-            if "units" not in units:
+            if group != every.get("units") or place == "units":  # a link to a table is none of its own
                 units[place] = _with_areas(_table(group, "units", path), group)
             continue
         if kind in _SIGNALS:
@@ -134,7 +134,7 @@ def _tables(
 
 
 def _with_areas(units: SessionTable, group: h5py.Group) -> SessionTable:
-    """Return units with the column ``area``, from the location of each one's first electrode where none states it."""
+    """Return units with the column ``area``, where none states it: the location that all electrodes of a unit share."""
     import h5py
 
     electrodes, rows = group.file.get("general/extracellular_ephys/electrodes"), units.data.get("electrodes")
@@ -144,15 +144,13 @@ def _with_areas(units: SessionTable, group: h5py.Group) -> SessionTable:
         return units
     location = electrodes["location"]
     assert isinstance(location, h5py.Dataset)
-    locations, numbers = as_labels(decode(location[...])), np.asarray(rows[...]).ravel()
+    locations = dict(enumerate(as_labels(decode(location[...])).tolist()))
     try:
         ends = units.ends("electrodes") if "electrodes" in units.index else np.arange(1, len(units) + 1)
-        begins = [0, *ends[:-1].tolist()]
-        spans = zip(begins, ends, strict=True)
-        first = [int(numbers[begin]) if begin < end else len(locations) for begin, end in spans]
-    except (DataError, IndexError):  # electrodes are no part of a score
+        every = [{locations.get(row, "") for row in part.tolist()} for part in np.split(np.ravel(rows[...]), ends[:-1])]
+        return units.with_columns(area=np.array([min(names) if len(names) == 1 else "" for names in every]))
+    except DataError:  # electrodes are no part of a score
         return units
-    return units.with_columns(area=np.array([*locations, ""])[np.clip(first, 0, len(locations)).astype(np.int64)])
 
 
 _SIGNALS = {"RoiResponseSeries": "rois", "ElectricalSeries": "electrodes"}
@@ -212,7 +210,8 @@ def _one_series(group: h5py.Group) -> Series:
     conversion: Any = data.attrs.get("conversion", 1.0)
     if isinstance(channels := group.get("channel_conversion"), h5py.Dataset):
         conversion = conversion * channels[...]
-    return Series(path, neurodata_type(group), data, group.get("timestamps"), start, rate, conversion=conversion)
+    scale = {"conversion": conversion, "offset": data.attrs.get("offset", 0.0)}
+    return Series(path, neurodata_type(group), data, group.get("timestamps"), start, rate, **scale)
 
 
 def _string(file: h5py.Group, name: str) -> str:

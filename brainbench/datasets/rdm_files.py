@@ -141,9 +141,6 @@ def _names(columns: Mapping[str, list[Any]], wanted: str, number: int) -> tuple[
         return tuple(map(str, range(1, number + 1))), note
     others = sorted({*texts} - {chosen})
     note = f"stimuli are called by {chosen!r} of {listing([chosen, *others])}" if others and chosen != wanted else ""
-    note = (
-        f"stimuli are called by {chosen!r}, since {wanted!r} does not tell all of them apart"
-        if wanted in {*labels} - {*distinct}
-        else note
-    )
+    if wanted in {*labels} - {*distinct}:
+        note = f"stimuli are called by {chosen!r}, since {wanted!r} does not tell all of them apart"
     return distinct[chosen], note

@@ -70,10 +70,8 @@ class SessionTable:
             elif base in self.data and not (base in (SPIKES, OBSERVED) or isinstance(values, LostColumn)):
                 # Without a type, what has a value for each row is a column of its own.
                 rows = next((self.data[key] for key in ("id", "start_time") if key in self.data), values)
-                if (
-                    _length(self.data[base]) == _length(rows)
-                    or getattr(values, "dtype", np.dtype("f8")).kind not in "iu"
-                ):
+                whole = getattr(values, "dtype", np.dtype("f8")).kind in "iu"
+                if _length(self.data[base]) == _length(rows) or not whole:
                     continue
             if base in self.data:
                 index[base] = name
@@ -250,7 +248,9 @@ class Series:
     unit: str = ""
     """Unit of the samples, where the file states one; ``spikes`` for counts."""
     conversion: Any = 1.0
-    """Factor to volts of each sample, or [units] of each column."""
+    """Factor from samples to their unit, such as volts, or [units] of each column."""
+    offset: Any = 0.0
+    """What is added to samples × conversion."""
     table: str = ""
     """Table of the rows of ``data`` [trial, time, unit]; times then count from the start of each."""
     columns: Mapping[str, Any] = field(default_factory=dict)
@@ -320,6 +320,13 @@ class Session:
     """True when the file does not name its subject, and another name stands for it."""
     populations: Mapping[str, Any] = field(default_factory=dict)
     """All tables of units by place, and other responses; ``units`` is the one that is read."""
+
+    @property
+    def unread(self) -> list[str]:
+        """Why each table of units beside the one that is read, which has the usual name, is not read."""
+        places = [place for place, item in self.populations.items() if isinstance(item, SessionTable)]
+        main = next((place for place in places if place in ("units", "spikes")), "")
+        return [f"{place} has units that are not read, since {main} is" for place in places if main and place != main]
 
     @property
     def has_spikes(self) -> bool:

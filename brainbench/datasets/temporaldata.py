@@ -76,7 +76,7 @@ def read_temporaldata(file: h5py.File, path: Path) -> Session:
     return Session(
         subject=name,
         session=session or named_by_file(path, "ses"),
-        units=units.get("spikes") or (next(iter(units.values())) if len(units) == 1 else None),
+        units=units["spikes"] if "spikes" in units else next(iter(units.values())) if len(units) == 1 else None,
         tables=tables,
         source=str(path),
         start=text(about["session"].get("recording_date", "")),
@@ -115,10 +115,9 @@ def _units(group: Any, place: str, dicts: dict[str, dict[str, Any]], observed: A
         elif "domain" in group:
             spans = [np.stack([group[f"domain/{name}"][...] for name in ("start", "end")], axis=1)] * number
         columns = {**columns, **ragged(SPIKES, spikes)} | ({} if spans is None else ragged(OBSERVED, spans))
-    except KeyError as error:
-        return SessionTable("units", {}, str(path), f"{where} lacks a part: {error.args[0]}.")
-    except DataError as error:
-        return SessionTable("units", {}, str(path), str(error))
+    except (KeyError, DataError) as error:
+        fault = str(error) if isinstance(error, DataError) else f"{where} lacks a part: {error.args[0]}."
+        return SessionTable("units", {}, str(path), fault)
     return SessionTable("units", {"id": np.arange(number), **columns}, str(path))
 
 
@@ -138,8 +137,8 @@ def _series(group: Any, place: str, path: Path) -> Iterator[Series]:
     for name, data in (columns or {place: stamps}).items():
         unit, kind = (text(data.attrs.get(key, "")) for key in ("unit", "kind"))
         name = place if name in (place, place.rpartition("/")[2]) else f"{place}/{name}"
-        conversion = data.attrs.get("conversion", 1.0)
-        yield Series(name, kind or _class(group), data, stamps, start, rate, unit, conversion)
+        scale = {key: data.attrs.get(key, default) for key, default in (("conversion", 1.0), ("offset", 0.0))}
+        yield Series(name, kind or _class(group), data, stamps, start, rate, unit, **scale)
 
 
 def _cells_of(series: Series, dicts: dict[str, dict[str, Any]]) -> dict[str, Any]:
@@ -235,7 +234,8 @@ def _write_signal(file: h5py.File, series: Series) -> NDArray[np.float64]:
     group, values, times = _group(file, series.name, IRREGULAR), np.asarray(series.data[...]), series.times()
     name = series.name.rpartition("/")[2]
     data = group.create_dataset(name, data=values if values.ndim > 1 else values[:, None])
-    data.attrs.update({"unit": series.unit, "kind": series.kind, "conversion": series.conversion})
+    scale = {"conversion": series.conversion, "offset": series.offset}
+    data.attrs.update({"unit": series.unit, "kind": series.kind, **scale})
     _columns(group, {"timestamps": times}, ["timestamps"])
     _grid(group, times, edges := times[[[0, -1]]])
     _columns(_group(file, f"{series.name}_cells", "ArrayDict"), _cells(series))

@@ -252,14 +252,18 @@ def test_sessions_are_built_from_arrays_with_ids():
     assert session.units.ids().tolist() == [99]
 
 
-def test_units_without_an_area_have_that_of_their_first_electrode(tmp_path):
+def test_units_without_an_area_have_the_one_that_all_their_electrodes_share(tmp_path):
     path = write_nwb(tmp_path / "a.nwb")
     with h5py.File(path, "a") as file:
-        file["general/extracellular_ephys/electrodes/location"] = ["M1", "S1", "S2"]
+        file["general/extracellular_ephys/electrodes/location"] = ["M1", "S1", "S1"]
         file["units/electrodes"] = [1, 2]
         file["units/electrodes_index"] = [2]
         file["units/electrodes_index"].attrs["neurodata_type"] = "VectorIndex"
     assert open_recordings(path, conditions="trials:texture")["area"].values.tolist() == ["S1"]
+    for electrodes in ([0, 1], [1, -1], [1, 7]):
+        with h5py.File(path, "a") as file:
+            file["units/electrodes"][...] = electrodes
+        assert open_recordings(path, conditions="trials:texture")["area"].values.tolist() == [""]
     with h5py.File(path, "a") as file:
         file["units/electrodes_index"][...] = 5
     assert open_recordings(path, conditions="trials:texture")["area"].values.tolist() == [""]

@@ -84,6 +84,14 @@ def second_units(file):
     file.move("units", "processing/two/units")
 
 
+def more_units(file):
+    file.copy("units", "processing/one/units")
+
+
+def linked_units(file):
+    file["processing/one/units"] = h5py.SoftLink("/units")
+
+
 def packed(code):
     def edit(file):
         values = file["units/spike_times"][...]
@@ -191,6 +199,8 @@ FILE = {
     "units in ecephys": (moved("units", "processing/ecephys/units"), "same"),
     "units by type": (moved("units", "processing/ecephys/sorted"), "same"),
     "two tables of units": (second_units, r"2 tables of units.*processing/one/units"),
+    "units beside the usual ones": (more_units, r"1 of 3 tables: processing/one/units has units that are not read"),
+    "units twice by a link": (linked_units, "same"),
     **{f"trials in {place}": (moved(TRIALS, f"{place}/trials"), "same") for place in PLACES},
     "events": (as_events, "same"),
     **{f"dead {place}": (linked(place), r"elsewhere\.h5") for place in NEEDED},

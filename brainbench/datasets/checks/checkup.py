@@ -207,9 +207,8 @@ def _check_signal(session: Session, conditions: Conditions, layout: RecordingLay
     try:
         part = count_session(session, ReadingOptions(conditions, None, *rules))
     except BrainbenchError as error:
-        yield Finding(
-            "error", "signals", str(error), "Or name another signal or window: --window 'FROM..TO of SIGNAL'."
-        )
+        advice = "Or name another signal or window: --window 'FROM..TO of SIGNAL'."
+        yield Finding("error", "signals", str(error), advice)
         return
     for doubt in part.ledger.doubts:
         yield Finding("warning", "signals", doubt)

@@ -172,8 +172,9 @@ _GAP = 30.0  # a silence of all units this long (s) is a break in the recording
 def check_tables(session: Session) -> Iterator[Finding]:
     """Yield the findings about the interval tables of one session."""
     if not session.tables:
-        message = "there are no interval tables: nothing says when which stimulus was presented"
-        yield Finding("error", "tables", message)
+        yield Finding("error", "tables", "there are no interval tables: nothing says when which stimulus was presented")
+    for reason in session.unread:
+        yield Finding("warning", "units", reason, "Put all units into one table, or remove those that are not wanted.")
     for reason in [] if session.units is None or session.units.fault else session.units.lost:
         yield Finding("warning", "units", reason, "Scores that ask for this column are refused.")
     for table in session.tables.values():
@@ -202,8 +203,7 @@ def _damaged(table: SessionTable) -> Iterator[Finding]:
             elif len(table.data[name]) != len(table):
                 table.column(name)
         except BrainbenchError as error:
-            advice = "Rows no longer belong together: write the table again."
-            yield Finding("error", "tables", str(error), advice)
+            yield Finding("error", "tables", str(error), "Rows no longer belong together: write the table again.")
     if repeated := repeats(as_labels(table.ids()).tolist()):
         yield Finding("warning", "tables", f"table {table.name!r} has ids more than once ({some(repeated)})")
 
@@ -306,9 +306,8 @@ def check_coverage(
         advice = "Name the end of the window: --window start..+SECONDS."
         yield Finding("warning", "coverage", f"{table.label} has no stop_time, and by default it ends windows", advice)
     # Without ends of trials only their beginnings can be held against the recorded span.
-    window = (
-        layout.window if layout else selection.WHOLE if "stop_time" in table else selection.Window("start", length=1e-3)
-    )
+    whole = selection.WHOLE if "stop_time" in table else selection.Window("start", length=1e-3)
+    window = layout.window if layout else whole
     try:
         edges = window.edges(session, table, [])
     except BrainbenchError:
@@ -316,8 +315,7 @@ def check_coverage(
     edges = edges[np.isfinite(edges).all(axis=1)]
     start, stop = edges.T
     if not len(start):
-        message = f"none of {len(table)} trials has the events of the window {window}"
-        yield Finding("error", "coverage", message)
+        yield Finding("error", "coverage", f"none of {len(table)} trials has the events of the window {window}")
         return
     low, high = span
     assert session.units is not None
@@ -339,9 +337,8 @@ def check_coverage(
     if gaps:
         hit = sum(bool(np.any((start < end) & (stop > begin))) for begin, end in gaps)
         examples = some([f"{begin:.0f}–{end:.0f} s" for begin, end in gaps], 3)
-        message = (
-            f"no unit fires for more than {_GAP:g} s in {len(gaps)} places ({examples}), {hit} of them during trials"
-        )
+        places = f"{len(gaps)} places ({examples}), {hit} of them during trials"
+        message = f"no unit fires for more than {_GAP:g} s in {places}"
         advice = "If recording stopped, put these spans into an invalid_times table or leave them out of obs_intervals."
         yield Finding("warning" if hit else "note", "coverage", message, advice, {"gaps": gaps})
 
@@ -567,9 +564,8 @@ def _refractory(spikes: Spikes, names: list[str]) -> Iterator[Finding]:
     for severity, low, high, advice in bands:
         bad = {name: rate for name, rate in rates.items() if low <= rate < high}
         if bad:
-            examples = some(
-                [f"{name}: {100 * bad[name]:.1f} %" for name in sorted(bad, key=lambda name: -bad[name])], 3
-            )
+            worst_first = sorted(bad, key=lambda name: -bad[name])
+            examples = some([f"{name}: {100 * bad[name]:.1f} %" for name in worst_first], 3)
             message = f"{share(len(bad), len(names))} units fire again within {1e3 * REFRACTORY:g} ms ({examples})"
             yield Finding(severity, "refractory", message, advice, {"share": bad})
 

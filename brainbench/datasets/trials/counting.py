@@ -309,7 +309,9 @@ class SpikeTrains:
 
 def _enter_tables(ledger: Ledger, session: Session, conditions: str) -> None:
     used = {name for name in session.tables if name in (conditions, "invalid_times", LICKS) or CONTACTS.match(name)}
-    ledger.find("tables", len(session.tables), len(used))
+    ledger.find("tables", len(session.tables) + len(session.unread), len(used))
+    for reason in session.unread:
+        ledger.leave("tables", reason, lost=True)
     for name, table in session.tables.items():
         if name not in used:
             ledger.leave("tables", table.fault or "not asked for", lost=bool(table.fault))

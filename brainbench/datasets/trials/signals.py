@@ -164,10 +164,11 @@ class Samples:
         first, last = np.searchsorted(self.times, [begin - settling, end + settling], side="left")
         values = np.asarray(self.series.data[first:last], dtype=np.float32)
         values = (values[:, None] if values.ndim == 1 else values)[:, units]
+        scale = np.broadcast_to(np.asarray(self.series.conversion, np.float64), len(self.units))[units]
         if self.band is None:
-            return self.times[first:last], values
-        microvolts = 1e6 * np.broadcast_to(np.asarray(self.series.conversion, np.float64), len(self.units))[units]
-        return self.times[first:last], self._power(self.times[first:last], values * microvolts)
+            return self.times[first:last], values * scale + self.series.offset
+        # A band has no part of the offset.
+        return self.times[first:last], self._power(self.times[first:last], values * (1e6 * scale))
 
     def _power(self, times: Floats, values: NDArray[Any]) -> NDArray[Any]:
         """Return the power (µV²) of voltages [F, U] in the band; NaN for channels and times that have gaps."""

@@ -383,10 +383,8 @@ class WhiskingDataset:
             unusual["axes"] = self.axes
         used = self._splits[self._where].tolist()
         sizes = {name: used.count(name) for name in SPLITS[:3]}
-        return {
-            "hash": self.manifest["content_hash"], "classes": len(self.classes), "left_out": self.skipped, **sizes,
-            **unusual,
-        }  # fmt: skip
+        about = {"hash": self.manifest["content_hash"], "classes": len(self.classes), "left_out": self.skipped}
+        return {**about, **sizes, **unusual}
 
     def __len__(self) -> int:
         """Count the batches of an epoch."""

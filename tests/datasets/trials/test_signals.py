@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from brainbench.core.errors import DataError, UsageError
-from brainbench.datasets import check, inspect, open_recordings, write_recordings
+from brainbench.datasets import check, export, inspect, open_recordings, write_recordings
 from brainbench.datasets.sessions import make_session
 from brainbench.datasets.trials.signals import fading, time_lost
 from tests.factories.recording_files import write_nwb
@@ -110,6 +110,27 @@ def test_of_several_signals_the_only_dff_is_read_and_others_are_asked_for(tmp_pa
     imaged(path, np.ones((70, 3)), place="processing/ophys/DfOverF/second")
     with pytest.raises(DataError, match="several signals"):
         means(path)
+
+
+def test_stored_numbers_are_scaled_to_the_unit_of_the_file(tmp_path):
+    data = np.random.default_rng(0).normal(size=(70, 3))
+    path = imaged(tmp_path / "a.nwb", np.round((data + 8) * 1000).astype(np.uint16))
+    with h5py.File(path, "a") as file:
+        file[f"{SERIES}/data"].attrs.update({"conversion": 0.001, "offset": -8.0})
+    _, values = means(path)
+    expected = [data[10 * trial : 10 * trial + 5].mean(axis=0) for trial in range(6)]
+    np.testing.assert_allclose(values[:, 0], expected, atol=1e-3)
+    (copy,) = export(path, tmp_path / "copy", format="temporaldata")
+    np.testing.assert_allclose(means(copy)[1], values, atol=1e-6)
+
+
+def test_a_copy_of_some_channels_keeps_the_conversion_of_each(tmp_path):
+    path = voltages(tmp_path / "a.nwb", tones([1.0, 2.0, 4.0], 100.0))
+    with h5py.File(path, "a") as file:
+        file["processing/ecephys/LFP/lfp/channel_conversion"] = [1.0, 10.0, 100.0]
+    (copy,) = export(path, tmp_path / "copy", format="temporaldata", select="units.id=2")
+    _, values = means(copy, window="start..stop of @70..150")
+    np.testing.assert_allclose(values[:, 0], 80_000.0, rtol=0.02)
 
 
 def segmented(path, iscell):
