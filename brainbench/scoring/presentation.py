@@ -63,10 +63,8 @@ class Presentation:
     @property
     def _drifts(self) -> str:
         assert self.within is not None
-        times = f"halves by time have a reliability of {self.within.by_time:.2f}"
-        return (
-            f"responses drift within sessions: {times}, random ones {self.within.random:.2f} (p = {self.within.p:.2g})"
-        )
+        times = f"halves by time have a reliability of {self.within.by_time:.2f}, random ones {self.within.random:.2f}"
+        return f"responses drift within sessions: {times} (p = {self.within.p:.2g})"
 
     @property
     def _confounded(self) -> str:

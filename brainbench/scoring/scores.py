@@ -279,6 +279,9 @@ def _compare(
         # That the times alone explain something is no doubt about the times.
         scores.append(doubted(presentation.control, *recorded))
     doubts = (*network.doubts, *brain.doubts)
+    steps = max(values.shape[1] for values in network.activations.values())
+    if options.time == "concatenate" and brain.dataset.sizes["time"] == 1 < steps:
+        doubts += (f"{steps} time steps of the network are compared with one bin of the recordings: give a --bin",)
     unfelt = [label for row, label in enumerate(network.labels) if row not in inputs.rows]
     if unfelt and options.match is None:
         names = listing(unfelt, limit=6, quoted=False)

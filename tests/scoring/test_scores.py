@@ -291,6 +291,17 @@ def test_both_time_rules_agree_when_there_is_one_step(truth: Path, recordings: x
     assert dataclasses.asdict(mean)["stimuli"] == LABELS
 
 
+def test_steps_that_are_compared_with_one_bin_of_the_recordings_are_said(recordings: xr.Dataset, tmp_path: Path):
+    steps = np.random.default_rng(0).normal(size=(len(LABELS), 5, 3))
+    path = str(write_features(tmp_path / "steps.h5", LABELS, {"fc": steps}))
+    told = {
+        rule: " ".join(brainbench.score(path, recordings=recordings, time=rule).reasons)
+        for rule in ("mean", "concatenate")
+    }
+    assert "5 time steps of the network are compared with one bin of the recordings" in told["concatenate"]
+    assert "one bin" not in told["mean"]
+
+
 def test_a_layer_can_be_committed_to_and_a_typo_is_corrected(truth: Path, recordings: xr.Dataset):
     record = score_record(str(truth), recordings=recordings, layer="other", baselines=False)
     assert (record.score.layer, record.score.layer_rule) == ("other", "committed to beforehand")
