@@ -43,7 +43,7 @@ def make(
         benchmark = make_benchmark(options, out, **about, **origin)
     write_text(out, benchmark.to_toml())
     text = f"{_text(benchmark)}\n\nfile       {out}\nnext       brainbench benchmark pack {out} --out {out.stem}.zip"
-    return Output({"benchmark": benchmark.plain, "path": out}, text)
+    return Output({"benchmark": benchmark.plain, "hash": benchmark.identity, "path": out}, text)
 
 
 @app.command("check")

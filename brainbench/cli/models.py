@@ -161,7 +161,7 @@ def show(
 
     recipe = find_recipe(name) if name in list_recipes() else None
     record = describe_model(recipe.model if recipe else name)
-    data = to_plain(record)
+    data = {**to_plain(record), "trained_as": [*_tagged(record.name)]}
     if recipe:
         data["recipe"] = to_plain(recipe)
     twin = (record.trained or {}).get("twin")

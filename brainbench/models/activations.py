@@ -101,8 +101,8 @@ def extract(
     at its parts that have no parts or have weights of their own, and at its output under the name ``output``. A tensor
     counts as a layer if its rows are proven to follow the stimuli, wherever they lie in it; its time axis is the one
     that is proven to follow time, else T = 1. Calls of one module are ``name[0]``, ``name[1]``, …, or the time steps of
-    one layer if they are proven to be. Of a tuple or mapping the first tensor counts. The result's ``report`` names
-    what was not read, and why.
+    one layer if they are proven to be. Of a tuple or mapping the first tensor counts, of a list of one shape all. The
+    result's ``report`` names what was not read, and why.
 
     The model runs in evaluation mode without gradients on copies of the stimuli; modes are put back and no hook stays.
     The proof runs a copy of it on 8 probes and an eighth of the stimuli, and at the end itself on two of these again;

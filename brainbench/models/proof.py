@@ -325,7 +325,7 @@ def layer_modules(model: nn.Module) -> dict[str, nn.Module]:
 
 
 def first_tensor(value: Any) -> torch.Tensor | None:
-    """Return the first tensor in what a module returned, as numbers that lie densely."""
+    """Return the first tensor in what a module returned, as numbers that lie densely; a list of one shape is one."""
     if isinstance(value, torch.Tensor):
         if value.is_meta or value.is_nested:
             return None
@@ -335,6 +335,11 @@ def first_tensor(value: Any) -> torch.Tensor | None:
         # Real and imaginary parts are features of their own.
         dense = torch.view_as_real(dense.resolve_conj()) if dense.is_complex() else dense
         return dense if dense.is_floating_point() else dense.double()
+    tensors = isinstance(value, list) and all(isinstance(part, torch.Tensor) and not part.is_nested for part in value)
+    kinds = {(part.shape, part.dtype, part.layout) for part in value} if tensors else ()
+    if len(kinds) == 1 < len(value) and value[0].ndim:
+        # Parts of one layer, such as the steps of a loop over time.
+        return first_tensor(torch.stack(value, dim=1))
     if isinstance(value, dict):
         value = tuple(value.values())
     elif hasattr(value, "__dataclass_fields__"):

@@ -39,7 +39,9 @@ def test_a_stranger_gets_the_labs_score_byte_for_byte_from_one_file(run, study, 
     )
     result = run("benchmark", "make", *how, *about, "--out", "lab.toml", "--json")
     assert result.status == 0, result.err
-    assert json.loads(result.out)["benchmark"]["citation"] == "Doe (2026)"
+    stated = json.loads(result.out)
+    assert stated["benchmark"]["citation"] == "Doe (2026)"
+    assert f'hash = "{stated["hash"]}"' in Path("lab.toml").read_text()
     assert run("benchmark", "pack", "lab.toml", "--out", "lab.zip").status == 0
     assert run("score", study["features"], *how, "--out", "ours").status == 0
 

@@ -15,6 +15,9 @@ def test_a_card_says_what_the_weights_are(run):
 
     assert "weights trained: simclr" in shown("zhuang-small.simclr")
     assert "weights untrained" in shown("zhuang-small")
+    plain = json.loads(run("models", "show", "zhuang-small", "--json").out)
+    assert plain["trained_as"] == ["zhuang-small.simclr", "zhuang-small.supervised"]
+    assert "trained as " + ", ".join(plain["trained_as"]) in shown("zhuang-small")
     assert "brainbench train zhuang-gru --objective simclr" in shown("zhuang-gru.simclr")
 
 

@@ -27,6 +27,27 @@ def stimuli():
     return (np.random.default_rng(0).standard_normal((K, T, 30, 5, 7)) * scale).astype(np.float32)
 
 
+class Listed(nn.Module):
+    """A loop over time that returns its steps, in a list or as one tensor."""
+
+    def __init__(self, whole):
+        super().__init__()
+        self.whole, self.linear = whole, nn.Linear(1050, 6)
+
+    def forward(self, x):
+        steps = [torch.tanh(self.linear(x[:, step].flatten(1))) for step in range(x.shape[1])]
+        return torch.stack(steps, dim=1) if self.whole else steps
+
+
+def test_a_list_of_steps_is_the_layer_with_its_time_axis(stimuli):
+    torch.manual_seed(0)
+    listed, whole = Listed(whole=False), Listed(whole=True)
+    whole.load_state_dict(listed.state_dict())
+    values, expected = (extract(model, stimuli * 1e4)["output"] for model in (listed, whole))
+    assert values.shape == (K, T, 6)
+    np.testing.assert_array_equal(values, expected)
+
+
 class Recurrent(nn.Module):
     """What a user writes: a cell in a loop, a normalisation, dropout and a head."""
 

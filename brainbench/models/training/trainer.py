@@ -330,9 +330,8 @@ class _Run:
                     self.controls = self._compare(result, batches)
                     break
             if result is not None and split != "test":
-                _log.warning(
-                    "There is no split 'test': the accuracy is that of %s sweeps, which chose the weights.", split
-                )
+                advice = "There is no split 'test': the accuracy is that of %s sweeps, which chose the weights."
+                _log.warning(advice, split)
             self._publish(result, split)
             if result is not None:
                 # A run that was killed after this line, and before it is marked as finished, has it already.
@@ -341,12 +340,8 @@ class _Run:
                 if result.collapsed:
                     _log.warning("%s has collapsed: %s.", self.config.model, result.reason)
             controls = {name: asdict(item) for name, item in self.controls.items()}
-            folder.mark(
-                self.out / folder.RUN,
-                evaluation=asdict(result) if result else None,
-                controls=controls,
-                status="finished",
-            )
+            stated = asdict(result) if result else None
+            folder.mark(self.out / folder.RUN, evaluation=stated, controls=controls, status="finished")
         self.where.wait()
         return self._result("finished", "", result)
 
