@@ -62,12 +62,8 @@ def pooled(dataset: xr.Dataset, by: str = "subject") -> xr.Dataset:
             changed[f"{prefix}subject"] = (subject.dims, np.full(subject.shape, ALL))
             changed[f"{prefix}session"] = (session.dims, both)
     result = dataset.assign_coords(changed)
-    result.attrs = {
-        **dataset.attrs,
-        "pool": by,
-        "missing": missing_labels(result),
-        "content_hash": content_hash(dataset.attrs["content_hash"], by),
-    }
+    pool = {"pool": by, "content_hash": content_hash(dataset.attrs["content_hash"], by)}
+    result.attrs = {**dataset.attrs, **pool, "missing": missing_labels(result)}
     if dataset.attrs.get("fingerprint") == fingerprint(dataset):  # else it was edited, which must still show
         result.attrs["fingerprint"] = fingerprint(result)
     return result
@@ -120,6 +116,9 @@ def trials_by_subject(dataset: xr.Dataset, *, averaged: bool = False) -> dict[st
         seconds = np.where(duration[rows] > 0, duration[rows], np.nan)
         rates = part_counts / seconds[:, :, None]
         keys = [f"{subject}/{session}/{ids[row]}" for row in rows]
+        twice = len(rows) - len({*zip(keys, start[rows].tolist(), labels[rows].tolist(), strict=True)})
+        if twice and np.isfinite(start[rows]).all():
+            raise DataError(f"{twice} trials of session {session} of {subject} stand twice; they would count twice.")
         for earlier, names in before.setdefault(subject, []):
             # Probes of one session in files of their own share the noise of their trials, so the same trials must go
             # into the same half: noise in both halves would pass for what is reliable.

@@ -44,6 +44,15 @@ def test_a_session_holds_one_response_label_and_key_per_trial(tmp_path):
     assert trials.keys[0] == "m2/1/5"
 
 
+def test_trials_that_stand_twice_are_refused(tmp_path):
+    dataset = make_dataset(tmp_path)
+    again = dataset.isel(trial=np.r_[np.arange(dataset.sizes["trial"]), 0])
+    with pytest.raises(DataError, match="1 trials of session 1 of m1 stand twice"):
+        trials_by_subject(again)
+    # Rows of a table may share an id.
+    assert len(trials_by_subject(dataset.assign_coords(trial_id=("trial", ["0"] * dataset.sizes["trial"])))) == 2
+
+
 def test_units_lost_in_some_trials_stay_missing_there(tmp_path):
     observed = [[[0, 100]], [[0, 10.5]], [[0, 100]]]
     responses = trials_by_subject(make_dataset(tmp_path, observed=observed))["m1"][0].responses[:, 0]
