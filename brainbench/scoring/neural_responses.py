@@ -228,12 +228,8 @@ class NeuralResponses:
             trials = tuple(_flat(session, share) for session in chosen)
             animal = metric.animal(subject, trials, len(labels), stimuli=labels, seed=options.seed)
             bins = max((item.responses.shape[1] for item in chosen), default=1)
-            animal = replace(animal, units=-(-animal.units // bins))
-            if not trials and note:
-                animal = replace(animal, problem=note)
-            elif note:
-                animal = replace(animal, notes=(note, *animal.notes))
-            animals.append(animal)
+            stated = {"notes": (note, *animal.notes)} if trials else {"problem": note}
+            animals.append(replace(animal, units=-(-animal.units // bins), **(stated if note else {})))
         return tuple(animals)
 
     def trials(self, labels: tuple[str, ...], *, averaged: bool = False) -> dict[str, tuple[Trials, ...]]:

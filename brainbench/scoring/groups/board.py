@@ -132,8 +132,10 @@ def add_groups(inputs: ScoreInputs, *, progress: Progress | None = None) -> dict
     for name in track(list(parts), "groups of units", progress):
         animals[name] = parts[name].animals(inputs.labels, inputs.metric, options)
     how: dict[str, Any] = {"estimator": options.estimator, "seed": options.seed, "layer": inputs.network.card.layer}
-    by = str(options.by).partition("=")[0]
-    board = score_groups(
-        inputs.metric, inputs.features, animals, by=by, stimuli=inputs.labels, doubts=inputs.doubts, **how
-    )
+    how |= {"by": str(options.by).partition("=")[0], "stimuli": inputs.labels, "doubts": inputs.doubts}
+    board = score_groups(inputs.metric, inputs.features, animals, **how)
+    values = inputs.brain.dataset[how["by"]].values.astype(str)
+    if (unknown := int((values == "").sum())) and "=" not in str(options.by):
+        reason = f"{board.reason}; {unknown} of {len(values)} units state no {board.by} and are in none"
+        board = replace(board, reason=reason)
     return {"groups": to_plain(board)}
