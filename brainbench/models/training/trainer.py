@@ -53,6 +53,7 @@ _log = logging.getLogger(__name__)
 
 BEST, FAILED, CONTROLS_FILE = "best", "failed-batch.safetensors", "controls.json"
 _LOG_STEPS = 50
+_OF_SEVERAL = ("simclr", "simsiam")  # objectives that compare the sweeps of a batch
 
 
 @dataclass(frozen=True)
@@ -221,8 +222,8 @@ class _Run:
     def _advance(self, x: torch.Tensor, labels: torch.Tensor, steps: int) -> str:
         """Take one optimiser step; return why it could not be taken, or ''."""
         config = self.config
-        if len(x) < 2 and config.objective == "simsiam":
-            # The rest of an epoch: the batch norms of the head have no statistics of a single sweep.
+        if len(x) < 2 and config.objective in _OF_SEVERAL:
+            # The rest of an epoch: a single sweep has no others to compare with, nor batch norms their statistics.
             self.at.step += 1
             return ""
         x, labels = x.to(self.where.device, non_blocking=True), labels.to(self.where.device, non_blocking=True)
@@ -257,7 +258,9 @@ class _Run:
         return tuple(views)
 
     def _end_epoch(self) -> None:
-        loss = self.at.total / max(self.at.count, 1)
+        if not self.at.count:
+            raise DataError(f"No batch of the training sweeps has two of them, which {self.config.objective} compares.")
+        loss = self.at.total / self.at.count
         self.at.total, self.at.count = 0.0, 0
         # Of the part of the epoch that this session trained, without its validation.
         seconds = time.monotonic() - self.began
@@ -285,9 +288,8 @@ class _Run:
         if self.config.objective == "supervised":
             with self._precision():
                 evaluation = evaluate(self.model, batches, device=self.where.device)
-            self.log.write(
-                "validation", self.at.step, top1=evaluation.top1, top5=evaluation.top5, spread=evaluation.spread
-            )
+            accuracy = {name: getattr(evaluation, name) for name in ("top1", "top5", "spread")}
+            self.log.write("validation", self.at.step, **accuracy)
             return 1.0 - evaluation.top1
         total, count = 0.0, 0
         with evaluating(self.learner), torch.no_grad(), self._precision():
@@ -295,9 +297,11 @@ class _Run:
                 x, labels = x.to(self.where.device), labels.to(self.where.device)
                 # The same views in every epoch, so that losses can be compared.
                 views = self._views(x, -1 - index)
-                if len(x) > 1:
+                if len(x) > 1 or self.config.objective not in _OF_SEVERAL:
                     total, count = total + float(self.learner(views, labels)), count + 1
-        mean = self.where.mean(total / max(count, 1))
+        if not count:  # as without a validation: nothing can be compared
+            return loss
+        mean = self.where.mean(total / count)
         self.log.write("validation", self.at.step, loss=mean)
         return mean if math.isfinite(mean) else math.inf
 
@@ -379,9 +383,8 @@ class _Run:
         config, reached = self.config, {"epochs_done": self.at.epoch, "best_epoch": self.at.best_epoch}
         facts = {"twin": self.twin, "controls": self.controls, "data": self.data.summary, "split": split}
         info = checkpoint_info(config, self.data.classes, evaluation=result, **reached, **facts)
-        contents = {"options": self.options, "info": info, "card": model_card(config, info)}
-        stored = {"architecture": config.model, "dtype": config.stored_dtype}
-        save_checkpoint(self.out / BEST, self.model, **stored, **contents)
+        stated = {"options": self.options, "info": info, "card": model_card(config, info), "dtype": config.stored_dtype}
+        save_checkpoint(self.out / BEST, self.model, architecture=config.model, **stated)
 
     def _save(self) -> None:
         self.saved = time.monotonic()

@@ -93,6 +93,25 @@ def test_an_epoch_may_end_with_a_single_sweep(tmp_path):
     assert "top-1" not in (result.folder / "README.md").read_text()
 
 
+@pytest.mark.parametrize("objective", ["simclr", "simsiam"])
+def test_a_sweep_alone_has_nothing_to_be_compared_with(tmp_path, objective):
+    """Its loss is 0 by definition: it lowered the mean of an epoch, and made a validation of one sweep the best."""
+    config = _config(objective, epochs=1, augmentation="physical", probe_epochs=0)
+    with pytest.raises(DataError, match=f"No batch of the training sweeps has two of them, which {objective} compares"):
+        train(config, tiny(train=1), out=tmp_path / "one", device="cpu")
+    train(config, tiny(train=8, validation=1), out=tmp_path / "whole", device="cpu")
+    train(config, tiny(train=9, validation=1), out=tmp_path / "rest", device="cpu")
+    for name in ("whole", "rest"):
+        assert not read_log(tmp_path / name, "validation")
+        assert read_log(tmp_path / name, "epoch")[0]["loss"] != pytest.approx(0.0, abs=1e-9)
+
+
+def test_an_autoencoder_is_validated_on_every_sweep(tmp_path):
+    config = _config("ae", epochs=1, probe_epochs=0)
+    train(config, tiny(validation=1), out=tmp_path, device="cpu")
+    assert read_log(tmp_path, "validation")[0]["loss"] > 0
+
+
 @pytest.mark.parametrize("objective", ["simclr", pytest.param("simsiam", marks=pytest.mark.slow), "ae"])
 def test_self_supervised_runs_end_with_a_linear_probe(objective, tmp_path):
     result = train(_config(objective, augmentation="physical"), tiny(), out=tmp_path, device="cpu")
