@@ -22,12 +22,9 @@ from brainbench.core.files import to_plain
 from brainbench.core.identity import ScoreIdentity, plan_note
 from brainbench.core.records import ESTIMATOR_VERSION, ResultRecord, Score
 from leaderboards.boards import rank
-from leaderboards.entries import moment
+from leaderboards.entries import TOLERANCE, moment
 from leaderboards.store import StoredRecord, read_records
 
-TOLERANCE = 1e-3
-"""Two runs of one computation agree within this on every machine, distances in shares of the largest of their RDM:
-processors differ in the last digits of single precision, which move scores by 1e-5."""
 MOST_NAMED = 3  # most contradicting records that are named for one
 
 

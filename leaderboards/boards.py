@@ -29,7 +29,7 @@ from brainbench.core.files import content_hash
 from brainbench.core.identity import unusual_settings
 from brainbench.core.records import ESTIMATOR_VERSION, Interval, ResultRecord, Score
 from brainbench.core.statistics import LEVEL
-from leaderboards.entries import Entry, fold_seeds, moment, same_computation
+from leaderboards.entries import TOLERANCE, Entry, fold_seeds, moment, same_computation
 from leaderboards.ranking import DOUBTFUL, Sample, apart, differences, lacking, rank_in_print, rank_ranges, told_apart
 from leaderboards.text import number, plural, span
 
@@ -208,9 +208,10 @@ def _baselines(records: list[ResultRecord]) -> list[Baseline]:
         common = counts.most_common(1)[0][0]
         score = next(score for score in scores if _outcome(score) == common)
         values = [value for _, value in counts if value is not None]
+        differ = len({status for status, _ in counts}) > 1 or np.ptp(values or [0.0]) > TOLERANCE
         span = f" from {min(values):.3f} to {max(values):.3f}" if values else ""
         note = f"the records disagree: {len(counts)} different values{span}; shown is that of {counts[common]} of "
-        baselines.append(Baseline(name, score, kind, (f"{note}{len(scores)} records",) if len(counts) > 1 else ()))
+        baselines.append(Baseline(name, score, kind, (f"{note}{len(scores)} records",) if differ else ()))
     return baselines
 
 

@@ -24,6 +24,9 @@ from brainbench.core.statistics import is_finite
 from leaderboards.ranking import CHANCE_LEVEL, STANDINGS, Sample, Standing, not_repeatable, rank_in_print, standing_of
 
 UNTRAINED = "untrained"
+TOLERANCE = 1e-3
+"""Two runs of one computation agree within this on every machine, distances in shares of the largest of their RDM:
+processors differ in the last digits of single precision, which move scores by 1e-5."""
 _SAME = 1e-6  # largest difference of values, and of RDMs scaled to length 1, of one computation (float32 sums differ)
 
 

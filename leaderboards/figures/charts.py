@@ -194,9 +194,8 @@ def fit_per_model(board: Board) -> svg.Figure:
         seeds = [svg.ChartPoint(value, f"{kind} faint", size=2) for value in entry.sample.seeds]
         twin = _twin_points(entry, untrained, 3.5) if entry.trained else ()
         hollow = " open" if not entry.above_chance or entry.standing in DOUBTFUL else ""
-        mark = svg.ChartPoint(
-            entry.scaled, kind + hollow, f"{entry.name}: {number(entry.scaled)} {span(entry.interval)}"
-        )
+        words = f"{entry.name}: {number(entry.scaled)} {span(entry.interval)}"
+        mark = svg.ChartPoint(entry.scaled, kind + hollow, words)
         points = (*(seeds if entry.seeds > 1 else ()), *twin, mark)
         label_kind = "end" if not entry.unranked_because else "end quiet"
         rows.append(svg.ChartRow(svg.cut_name(entry.name, 36), points, entry.interval, kind, label_kind))
