@@ -172,9 +172,8 @@ class _Run:
     def _claim(self, *, write: bool) -> None:
         identity = {**self.config.identity, "classes": list(self.data.classes)}
         begin = {"run": identity, "status": "running"}
-        folder.claim(
-            self.out / folder.RUN, identity, lambda: begin, stated=lambda document: document.get("run"), write=write
-        )
+        stated = {"stated": lambda document: document.get("run"), "write": write}
+        folder.claim(self.out / folder.RUN, identity, lambda: begin, **stated)
 
     def _twin(self, now: dict[str, Any]) -> dict[str, Any]:
         """Return what is told of the network that the run started from, which may have been drawn elsewhere."""
@@ -393,10 +392,8 @@ class _Run:
         progress = {"position": asdict(self.at), "batches": self.batches.state_dict()}
         # Dropout draws random numbers; augmentation does not, its numbers depend on seed, step and view alone.
         random = folder.random_state(self.where.device)
-        folder.save_state(
-            self.out / folder.STATE,
-            {**folder.learner_state(self.learner, self.optimizer), **progress, "random": random},
-        )
+        learner = folder.learner_state(self.learner, self.optimizer)
+        folder.save_state(self.out / folder.STATE, {**learner, **progress, "random": random})
 
     def _restore(self) -> None:
         state = folder.load_state(self.out / folder.STATE)
@@ -419,10 +416,9 @@ class _Run:
             tensors = {f"view{index}": view for index, view in enumerate(views)}
             write_tensors(self.out / FAILED, {**tensors, "labels": labels}, step=str(self.at.step))
             # Before the first validation there is no best model: the last saved state takes its place.
-            if not (self.out / BEST / WEIGHTS).is_file() and (self.out / folder.STATE).is_file():
-                folder.restore_learner(
-                    folder.load_state(self.out / folder.STATE), self.learner, self.optimizer, self.out / folder.STATE
-                )
+            state = self.out / folder.STATE
+            if not (self.out / BEST / WEIGHTS).is_file() and state.is_file():
+                folder.restore_learner(folder.load_state(state), self.learner, self.optimizer, state)
                 self._publish(None)
             folder.mark(self.out / folder.RUN, status="diverged", reason=reason)
         return reason
