@@ -308,8 +308,11 @@ class WhiskerSolver:
         self.yields = any(chain.whisker.follicle is not None for chain in self.chains)
         rolls = any(chain.rest_rolls.any() for chain in self.chains)
         smooth = fidelity.contact_line == "rod" and (needs > NOTHING or device.is_cpu)
-        if smooth and options.get("recorder"):
-            raise UsageError("contact_line=rod knows no gradients or fits; leave it out.")
+        if smooth and (needs == MESHES or options.get("recorder")):
+            raise UsageError(
+                "contact_line=rod knows spheres, capsules, cylinders and boxes, but no meshes, gradients or fits; leave"
+                " it out, or build the objects of these."
+            )
         uses = {"yields": self.yields, "rolls": rolls, "flows": flows, "smooth": smooth}
         features = tuple(name for name, used in uses.items() if used)
         self.kernels = load_kernels(

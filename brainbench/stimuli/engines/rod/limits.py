@@ -57,10 +57,6 @@ ANYWHERE = 1e6
 """The same (mm) for a link that may have got inside unseen: the nearest triangle tells inside from outside."""
 PARTS = 8
 """Parts of a link at whose ends its overlap with a surface is measured."""
-TRIANGLES_TRIED = 9
-"""Times that a triangle is sought that is nearer to the centre line of a link, where the last is nearest or beside."""
-ASIDE = 1 / 32
-"""How far beside, as a share of the link: at an edge of the face with which a line is flush no triangle is nearer."""
 BITS = 3
 WIDE = 1 << BITS
 """Children of a node of a search tree, and triangles of a leaf."""

@@ -46,7 +46,6 @@ from .state import (
     WAIT_FORCES,
     WAIT_REST,
     WAIT_SLICE,
-    CentreLine,
     ContactCandidates,
     ContactProblems,
     LinkDistance,
@@ -217,7 +216,6 @@ def list_shapes(scene: SceneArrays, job: WhiskerJob, chain: wp.ref[ChainState], 
 @wp.func(inline=True)
 def query_distances(
     scene: SceneArrays,
-    problems: ContactProblems,
     paused: PausedWhiskers,
     job: WhiskerJob,
     chain: wp.ref[ChainState],
@@ -232,16 +230,12 @@ def query_distances(
     if state.first_query + near_count > paused.query.shape[0]:
         return WAIT_SLICE
     place = state.first_query
-    base = rotate(step.pose.quaternion, vec3(real(1.0), real(0.0), real(0.0)))
     for i in range(job.links):
         if may_be_near(scene, job, proximity, reach, i):
             paused.query[place].job = job.index
             paused.query[place].link = i
             paused.query[place].start = row(chain.node, i)
             paused.query[place].stop = row(chain.node, i + 1)
-            if wp.static(smooth):
-                bent = bent_link(scene.chains, problems, job, chain, base, state.contacts, i)
-                paused.query[place].line = bent.line
             nearer = reach.time * (row(proximity.end_speed, i) + reach.unknown_speed)
             paused.query[place].bound = row(proximity.clearance, i) - nearer
             place = place + 1
@@ -621,8 +615,6 @@ def check_rest(
                     paused.query[place].link = i
                     paused.query[place].start = at
                     paused.query[place].stop = end_at
-                    if wp.static(smooth):
-                        paused.query[place].line = CentreLine()
                     paused.query[place].bound = bound
                 else:
                     slack = real(1e30)

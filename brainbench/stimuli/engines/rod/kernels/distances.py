@@ -11,10 +11,10 @@ are one thread's own. Every number is found by the same operations in the same o
 
 import warp as wp
 
-from brainbench.stimuli.engines.rod.limits import CAPSULE, CYLINDER, MESHES, SPHERE, WIDE
+from brainbench.stimuli.engines.rod.limits import CAPSULE, CYLINDER, SPHERE, WIDE
 
 from .algebra import mat33, vec2, vec3, vec4, vec5
-from .parameters import against, real, smooth
+from .parameters import real
 from .state import Cone, LeafCorners, ShapeArrays, line_place, line_tangent
 
 # As fine as the numbers: 2⁻²⁰ is about 1e-6, 2⁻⁴⁴ about 6e-14 of a link.
@@ -76,6 +76,36 @@ def primitive(kind: int, size: vec3, x: vec3) -> vec4:
     return out
 
 
+@wp.func
+def segment_primitive(kind: int, size: vec3, link: Cone) -> vec5:
+    """Return the place along a link (0 to 1) of the least gap, that gap (negative inside) and the normal.
+
+    The gap is convex along a segment, and hardly less along its centre line: its slope is halved to zero.
+    """
+    low = real(0.0)
+    high = real(1.0)
+    ra = link.start_radius
+    rb = link.end_radius
+    for _ in range(wp.static(halvings)):
+        middle = real(0.5) * (low + high)
+        here = primitive(kind, size, line_place(link, middle))
+        along = line_tangent(link, middle)
+        # Derivative of the gap along a–b: of the distance, less that of the radius.
+        slope = here[0] * along[0] + here[1] * along[1] + here[2] * along[2] - (rb - ra)
+        if slope > real(0.0):
+            high = middle
+        else:
+            low = middle
+    share = real(0.5) * (low + high)
+    # A minimum at an end is put exactly there, because contacts at ends are handled apart.
+    if low == real(0.0):
+        share = real(0.0)
+    if high == real(1.0):
+        share = real(1.0)
+    found = primitive(kind, size, line_place(link, share))
+    return vec5(share, found[3] - (ra + (rb - ra) * share), found[0], found[1], found[2])
+
+
 NUMBERS = f"""
 using real = wp::{real.__name__};
 #if defined(__CUDA_ARCH__)
@@ -120,14 +150,6 @@ const auto segments = [&](const real* a, const real* d1, const real* p, const re
 )
 """Closest points of two segments."""
 
-AREAS = "const real vc = d1 * d4 - d3 * d2, vb = d5 * d2 - d1 * d6, va = d3 * d6 - d5 * d4;"
-if smooth:
-    # The same without products of four lengths, whose rounding moves a place on a slender triangle by a radius.
-    AREAS = """real normal[3], part[3];
-    cross(pq, pr, normal);
-    cross(qx, rx, part); const real va = dot(normal, part);
-    cross(rx, px, part); const real vb = dot(normal, part);
-    cross(px, qx, part); const real vc = dot(normal, part);"""
 TRIANGLES = (
     SEGMENTS
     + f"""
@@ -138,9 +160,8 @@ const auto point_triangle = [&](const real* x, const real* p, const real* q, con
         pq[d] = q[d] - p[d]; pr[d] = r[d] - p[d]; px[d] = x[d] - p[d]; qx[d] = x[d] - q[d]; rx[d] = x[d] - r[d];
     }}
     const real d1 = dot(pq, px), d2 = dot(pr, px), d3 = dot(pq, qx), d4 = dot(pr, qx), d5 = dot(pq, rx);
-    const real d6 = dot(pr, rx), share = (d4 - d3) / (d4 - d3 + d5 - d6);
-    {AREAS}
-    const real whole = va + vb + vc;
+    const real d6 = dot(pr, rx), vc = d1 * d4 - d3 * d2, vb = d5 * d2 - d1 * d6, va = d3 * d6 - d5 * d4;
+    const real whole = va + vb + vc, share = (d4 - d3) / (d4 - d3 + d5 - d6);
     // Voronoi regions of the face, then from the last to the first of p, q, pq, r, pr, qr: the first counts.
     v = vb / whole; w = vc / whole;
     const bool at_qr = (va <= zero) & (d4 - d3 >= zero) & (d5 - d6 >= zero);
@@ -274,74 +295,3 @@ def way_out(shapes: ShapeArrays, face: int, v: real, w: real, x: vec3, distance:
         side = -side
         signed = -distance
     return vec4(away[0] * side, away[1] * side, away[2] * side, signed)
-
-
-@wp.func_native(TRIANGLES + "wp::vec_t<2, real> at; point_triangle(x.c, p.c, q.c, r.c, at.c[0], at.c[1]); return at;")
-def triangle_place(x: vec3, p: vec3, q: vec3, r: vec3) -> vec2:
-    """Return barycentric v and w of q and r of the point of a triangle that is closest to x."""
-    ...
-
-
-@wp.func
-def beside_triangle(shapes: ShapeArrays, face: int, x: vec3, normal: vec3) -> int:
-    """Return −1 where a point, ``normal`` away from a triangle, is inside, and 1 where none beside it may be nearer.
-
-    0: the point is over the face beyond an edge, as nearly as rounding tells, and its line flush with that face.
-    """
-    rows = triangle_corners(shapes.corners, face)
-    at = triangle_place(x, rows[0], rows[1], rows[2])
-    outward = pseudo_normal(shapes, face, at[0], at[1])
-    over = wp.dot(outward, normal)
-    if over < real(0.0):
-        return -1
-    return int(over >= wp.dot(outward, shapes.outward[face, 0]) - real(1e-6))
-
-
-@wp.func
-def shape_distance(shapes: ShapeArrays, s: int, face: int, rows: mat33, x: vec3) -> vec4:
-    """Return the outward direction at a point and its signed distance from a primitive.
-
-    Triangles have no inside: a point beyond an edge may lie below their plane.
-    """
-    if wp.static(smooth and against == MESHES):
-        if face >= 0:
-            at = triangle_place(x, rows[0], rows[1], rows[2])
-            away = x - rows[0] - (rows[1] - rows[0]) * at[0] - (rows[2] - rows[0]) * at[1]
-            far = wp.max(wp.length(away), real(tiny))
-            return vec4(away[0] / far, away[1] / far, away[2] / far, far)
-    return primitive(shapes.kind[s], shapes.size[s] / shapes.scale[s], x)
-
-
-@wp.func
-def segment_primitive(shapes: ShapeArrays, s: int, face: int, link: Cone) -> vec5:
-    """Return the place along a link (0 to 1) of the least gap, that gap (negative inside) and the normal.
-
-    ``face`` is the triangle of a surface that is looked at, −1 for a primitive.
-    The gap is convex along a segment, and hardly less along its centre line: its slope is halved to zero.
-    """
-    rows = mat33()
-    if wp.static(smooth and against == MESHES):
-        if face >= 0:
-            rows = triangle_corners(shapes.corners, face)
-    low = real(0.0)
-    high = real(1.0)
-    ra = link.start_radius
-    rb = link.end_radius
-    for _ in range(wp.static(halvings)):
-        middle = real(0.5) * (low + high)
-        here = shape_distance(shapes, s, face, rows, line_place(link, middle))
-        along = line_tangent(link, middle)
-        # Derivative of the gap along a–b: of the distance, less that of the radius.
-        slope = here[0] * along[0] + here[1] * along[1] + here[2] * along[2] - (rb - ra)
-        if slope > real(0.0):
-            high = middle
-        else:
-            low = middle
-    share = real(0.5) * (low + high)
-    # A minimum at an end is put exactly there, because contacts at ends are handled apart.
-    if low == real(0.0):
-        share = real(0.0)
-    if high == real(1.0):
-        share = real(1.0)
-    found = shape_distance(shapes, s, face, rows, line_place(link, share))
-    return vec5(share, found[3] - (ra + (rb - ra) * share), found[0], found[1], found[2])

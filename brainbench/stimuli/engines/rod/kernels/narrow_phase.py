@@ -15,7 +15,6 @@ import warp as wp
 
 from brainbench.stimuli.engines.rod.limits import (
     ANYWHERE,
-    ASIDE,
     BITS,
     DISTANCE_BOUNDS,
     FAR,
@@ -23,13 +22,12 @@ from brainbench.stimuli.engines.rod.limits import (
     MESH,
     MESHES,
     PARTS,
-    TRIANGLES_TRIED,
     WARP,
     WIDE,
 )
 
 from .algebra import maximum, minimum, unrotate, vec3, vec5
-from .distances import NUMBERS, TRIANGLES, beside_triangle, primitive, pseudo_normal, segment_primitive, way_out
+from .distances import NUMBERS, TRIANGLES, primitive, pseudo_normal, segment_primitive, way_out
 from .motion import BodyMotion, pose_from
 from .parameters import against, cuda, group_size, module_options, real, smooth
 from .state import (
@@ -432,8 +430,6 @@ def mesh_distance(shapes: ShapeArrays, s: int, link: Cone, within: real, got: Ne
         w = got.start_w
     if face >= 0:
         found.leaf = face // wp.static(WIDE) + 1
-        if wp.static(smooth):
-            found.face = face
         radius = ra + (rb - ra) * share
         out = way_out(shapes, first + face, v, w, a + (b - a) * share, found.clearance, radius)
         # The whole axis is on the side of its nearest point, or it crosses the surface there.
@@ -524,108 +520,45 @@ def link_shape_distance(
         if margin < real(0.0):
             within = real(0.0)
             radius = -margin / scale
-        chord = link
-        bow = real(0.0)
-        if wp.static(smooth):
-            # The centre line lies no further than this from the chord between its ends.
-            a = line_place(link, real(0.0))
-            b = line_place(link, real(1.0))
-            chord.a = a
-            chord.b = b
-            for k in range(1, 3):
-                third = real(k) / real(3.0)
-                bow = wp.max(bow, real(1.2) * wp.length(line_place(link, third) - a - (b - a) * third))
-            within = within + bow
-            radius = radius + bow
         farthest = radius
         # Without a bound, nothing found within a radius means outside or deep inside: the nearest of all tells.
         if bound <= real(0.0):
             farthest = real(wp.static(ANYWHERE)) / scale
         first_leaf = leaf
-        # The link, then places of its centre line, and where it lies inside then places along it: one search, which
-        # would be written out for each.
-        first = wp.static(-1 - smooth * TRIANGLES_TRIED)
-        place = int(first)
+        # The link, and where it lies inside then places along it: one search, which would be written out for each.
+        place = int(-1)
         places = int(0)
-        face = int(-1)
-        looked = int(3)
-        side = int(0)
-        nearest = vec5()
-        far = real(wp.static(beyond))
         while place < places:
-            asked = searching
             share = real(place) / real(wp.static(PARTS))
-            if wp.static(smooth):
-                if place > first and place < 0:
-                    asked = int(looked < 3)
-                    aside = real(wp.static(ASIDE)) * real((looked + 1) % 3 - 1)
-                    a = line_place(link, wp.clamp(nearest[0] + aside, real(0.0), real(1.0)))
-                    b = a
-                    farthest = real(1.0 - 3e-6) * far
-                    if looked > 0:
-                        farthest = far + real(wp.static(ASIDE)) * wp.length(link.b - link.a)
             if place >= 0:
-                a = line_place(link, share)
+                a = link.a + (link.b - link.a) * share
                 b = a
                 farthest = real(wp.static(ANYWHERE))
-            got = nearest_triangles(shapes, s, a, b, farthest, within, first_leaf - 1, part, asked)
-            if place == first:
-                found = mesh_distance(shapes, s, chord, within, got)
-                if wp.static(smooth):
-                    if searching == 1 and margin >= real(0.0) and found.clearance <= within and found.leaf > 0:
-                        looked = -1
-                        got.end_face = found.face
-                    found.clearance = wp.max(found.clearance - bow, real(0.0))
-                found.clearance = wp.min(found.clearance, radius - bow)
-                first_leaf = found.leaf
-                within = real(0.0)
-            elif place >= 0 and searching == 1 and got.end_face >= 0:
-                here = ra + (rb - ra) * share
-                nearest_face = shapes.face[s] + got.end_face
-                out = way_out(shapes, nearest_face, got.end_v, got.end_w, a, wp.sqrt(got.end), here)
-                depth = here - out[3]
-                found.depth = wp.max(found.depth, depth)
-                if place == 0:
-                    found.start_gap = -depth
-            if wp.static(smooth):
-                if place < 0 and looked < 3:
-                    looked = looked + 1
-                    triangle = shapes.face[s] + got.end_face
-                    if got.end_face >= 0 and triangle != face:
-                        tried = segment_primitive(shapes, s, triangle, link)
-                        off = tried[1] + ra + (rb - ra) * tried[0]
-                        if off < real(1.0 - 3e-6) * far:
-                            nearest = tried
-                            far = off
-                            face = triangle
-                            looked = 0
-                            away = vec3(tried[2], tried[3], tried[4])
-                            side = beside_triangle(shapes, face, line_place(link, tried[0]), away)
-                            # A line that pierces the face has no way out there that rounding would not turn.
-                            if off < real(0.03) * rb:
-                                side = int(-1)
-                    if looked > 0 and side == 1:
-                        looked = 3
-                if place < -1 and warp_max(int(looked < 3)) == 0:
-                    place = int(-1)
-            if place == -1:
-                if wp.static(smooth):
-                    if face >= 0:
-                        found.crossing = int(side < 0)
-                        if side >= 0:
-                            touch_between(found, nearest)
+            got = nearest_triangles(shapes, s, a, b, farthest, within, first_leaf - 1, part, searching)
+            if place < 0:
+                found = mesh_distance(shapes, s, link, within, got)
+                found.clearance = wp.min(found.clearance, radius)
                 if found.crossing == 0 or margin < real(0.0):
                     searching = int(0)
                 places = wp.static(PARTS + 1) * warp_max(searching)
                 if searching == 1:
                     found.start = 1
+                first_leaf = found.leaf
+                within = real(0.0)
+            elif searching == 1 and got.end_face >= 0:
+                radius = ra + (rb - ra) * share
+                nearest_face = shapes.face[s] + got.end_face
+                depth = radius - way_out(shapes, nearest_face, got.end_v, got.end_w, a, wp.sqrt(got.end), radius)[3]
+                found.depth = wp.max(found.depth, depth)
+                if place == 0:
+                    found.start_gap = -depth
             place = place + 1
     # Primitives: what lies between the ends, and the far end on its own.
     if meshed == 0:
-        beside = segment_primitive(shapes, s, -1, link)
+        nearest = segment_primitive(shapes.kind[s], shapes.size[s] / scale, link)
         # The gap counts from the skin, the bound from the axis; the thinner end keeps it a lower bound.
-        found.clearance = beside[1] + wp.min(ra, rb)
-        touch_between(found, beside)
+        found.clearance = nearest[1] + wp.min(ra, rb)
+        touch_between(found, nearest)
         if wp.static(smooth):
             a = line_place(link, real(0.0))
             b = line_place(link, real(1.0))
@@ -637,7 +570,7 @@ def link_shape_distance(
         found.start = 1
         found.start_gap = near[3] - ra
         found.start_normal = vec3(near[0], near[1], near[2])
-        found.depth = wp.max(-beside[1], real(0.0))
+        found.depth = wp.max(-nearest[1], real(0.0))
         # Even where the whisker is thickest, its axis is inside.
         if found.depth > wp.max(ra, rb):
             found.crossing = 1
@@ -688,8 +621,6 @@ def measure_distances(
         leaf = paused.link[i, index].leaf
         taper = chains.taper[i, jobs.whisker[index]]
         link = cone(paused.query[which].start, paused.query[which].stop, taper)
-        if wp.static(smooth):
-            link.line = paused.query[which].line
         bound = paused.query[which].bound
         found = link_shape_distance(shapes, s, body, link, margin, bound, leaf, part, live)
         if live == 1 and part == 0:
