@@ -9,7 +9,6 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -271,39 +270,35 @@ def pack_chains(
 
 
 def _pack_beams(capacity: int, chains: Sequence[Chain]) -> NDArray[np.void]:
-    names = "moment_slope", "force_slope", "force_deflection"
+    names = "near_turn", "there_turn", "near_deflection", "there_deflection"
     beams = np.zeros((capacity, len(chains)), dtype=[*((name, "f8", 4) for name in names), ("trust", "f8")])
-    places = np.arange(4) / 3
     for w, chain in enumerate(chains):
         # Joints that are far softer than the one before fold before beam theory says anything.
         steep = np.append(1.0, chain.stiffness[:-1] / chain.stiffness[1:])
         steep[1] = 1.0
-        trust = np.interp(steep, limits.STEEP, (1.0, 0.0))
-        beams["trust"][: chain.links, w] = trust
-        along = trust[:, None] * (1 - places) + np.append(trust[1:], trust[-1])[:, None] * places
-        for order, name in enumerate(names):
-            # 1/(N·m) to 1/(µN·m), m to mm.
-            beams[name][: chain.links, w] = along * beam_errors(chain)[order] * (MILLI**order / MICRO)
+        beams["trust"][: chain.links, w] = np.interp(steep, limits.STEEP, (1.0, 0.0))
+        for name, values in zip(names, beam_compliance(chain), strict=True):
+            beams[name][: chain.links, w] = values / MICRO
     return beams
 
 
 @lru_cache(256)
-def beam_errors(chain: Chain) -> NDArray[np.float64]:
-    """Return [3, link, 4] what the joints before a place lack of the rod: ∫ (s − x)ᵏ/(E I) dx − Σ c (s − x)ᵏ, SI.
+def beam_compliance(chain: Chain) -> NDArray[np.float64]:
+    """Return [4, link, 4] how the rod turns and deflects from the start of each link to 0, 1/3, 2/3 and 1 along it.
 
-    Orders k = 0, 1 and 2; places s at 0, 1/3, 2/3 and 1 along each link; x are arc lengths, in the sum those of joints
-    of compliance c. Under a moment M and a force V across at s the joints miss (Euler-Bernoulli) the slope there by
-    order 0 · M + order 1 · V, the deflection by order 1 · M + order 2 · V.
+    Turns ∫ M/(E I) dx (rad/(N·m)) of a moment M that falls linearly from 1 at the start to 0 at the place, and that
+    grows from 0 to 1; then the deflections ∫ M (s − x)/(E I) dx of both, in lengths of the link (Euler-Bernoulli).
     """
-    whisker, nodes, orders = chain.whisker, chain.nodes, np.arange(3)[:, None]
-    compliance, errors = 1 / chain.stiffness, np.zeros((3, chain.links, 4))
+    nodes, compliance = chain.nodes, np.zeros((4, chain.links, 4))
     for link, k in np.ndindex(chain.links, 4):
-        s = nodes[link] + (nodes[link + 1] - nodes[link]) * k / 3
-        parts = [quadrature(low, high, whisker.breaks) for low, high in pairwise([*nodes[: link + 1], s])]
-        x, weights = (np.concatenate(values) for values in zip(*parts, strict=True))
-        rod = (s - x) ** orders @ (weights / whisker.bending_stiffness(x))
-        errors[:, link, k] = rod - (s - nodes[: link + 1]) ** orders @ compliance[: link + 1]
-    return errors
+        start, length = nodes[link], nodes[link + 1] - nodes[link]
+        s = start + length * k / 3
+        x, weights = quadrature(start, s, chain.whisker.breaks)
+        weights = weights / chain.whisker.bending_stiffness(x)
+        share = (x - start) / max(s - start, 1e-30)
+        moments = np.stack([1 - share, share])
+        compliance[:, link, k] = np.concatenate([moments @ weights, moments @ (weights * (s - x) / length)])
+    return compliance
 
 
 def pack_follicles(chains: Sequence[Chain], quasistatic: bool) -> NDArray[np.void]:

@@ -17,7 +17,7 @@ from brainbench.stimuli.engines.rod.packing import (
     KNOT,
     PackedMotions,
     PackedSurface,
-    beam_errors,
+    beam_compliance,
     capacity_for,
     follicle_track,
     knots_alike,
@@ -27,7 +27,7 @@ from brainbench.stimuli.engines.rod.packing import (
 )
 from brainbench.stimuli.motion.jobs import StillFollicle
 from brainbench.stimuli.scenes.recipes import get_recipe
-from brainbench.stimuli.whiskers.whisker import build_chain
+from brainbench.stimuli.whiskers.whisker import build_chain, quadrature
 from tests.factories.gradients import Swing
 from tests.factories.whiskers import C2
 
@@ -107,15 +107,23 @@ def test_hulls_with_such_triangles_have_no_whisker_inside_before_they_arrive(lab
     assert [trace.reason for trace in traces if trace.reason] == []
 
 
-@pytest.mark.parametrize("links", [5, 11])
-def test_joints_and_what_they_lack_are_the_beam(links):
-    """Deflection and slope of a uniform cantilever under a force and a moment at its end s: s³/3EI, s²/2EI, s/EI."""
-    whisker = replace(C2, curvature=0.0, tip_radius=C2.base_radius)
-    chain = build_chain(whisker, links)
-    errors, stiffness = beam_errors(chain), float(whisker.bending_stiffness(0.0))
-    for link, k in np.ndindex(links, 4):
-        s = whisker.arc_length * (link + k / 3) / links
-        levers = s - chain.nodes[: link + 1]
-        joints = [np.sum(levers**order / chain.stiffness[: link + 1]) for order in range(3)]
-        beam = [s ** (order + 1) / (order + 1) / stiffness for order in range(3)]
-        np.testing.assert_allclose(joints + errors[:, link, k], beam, rtol=1e-9, atol=1e-12 * beam[0])
+@pytest.mark.parametrize("tip", [1.0, 0.2])
+def test_joints_and_the_rod_between_them_are_the_beam(tip):
+    """Deflection and slope of a cantilever at its end s under a force there: ∫ (s − x)²/EI dx and ∫ (s − x)/EI dx."""
+    whisker = replace(C2, curvature=0.0, tip_radius=tip * C2.base_radius)
+    chain = build_chain(whisker, 11)
+    near, there, near_offset, there_offset = beam_compliance(chain)
+    for link, k in np.ndindex(11, 4):
+        s = whisker.arc_length * (link + k / 3) / 11
+        length, moments = chain.nodes[1], s - chain.nodes[: link + 1]
+        turn = offset = 0.0
+        for i in range(link + 1):
+            turn -= moments[i] / chain.stiffness[i]
+            place, far = (3, moments[i + 1]) if i < link else (k, 0.0)
+            share = place / 3
+            offset += length * (turn * share + moments[i] * near_offset[i, place] + far * there_offset[i, place])
+            turn += moments[i] * near[i, place] + far * there[i, place]
+        joints = [np.sum(moments**order / chain.stiffness[: link + 1]) for order in (1, 2)]
+        x, weights = quadrature(0.0, s, whisker.breaks)
+        beam = [np.sum(weights * (s - x) ** order / whisker.bending_stiffness(x)) for order in (1, 2)]
+        np.testing.assert_allclose(np.add(joints, (turn, offset)), beam, rtol=1e-6, atol=1e-12 * beam[0])

@@ -36,7 +36,7 @@ from brainbench.stimuli.motion.jobs import MILLI
 
 from .algebra import JointVector, Spatial, first_axis, rotate, vec3
 from .articulated_body import ChainState, ProximityState, hinge_direction
-from .centre_line import bent_link, shortening
+from .centre_line import begin_rod, bent_link, enter_link, pass_link, shortening
 from .distances import segments
 from .motion import BodyMotion, elapsed, instant, pose_at, pose_from
 from .narrow_phase import link_shape_distance
@@ -345,6 +345,8 @@ def find_candidates(
             others = near.room - near.moved
     shorter = real(0.0)
     end_slide = real(0.0)
+    if wp.static(smooth):
+        rod = begin_rod(scene.chains, job, chain)
     for i in range(job.links):
         rate = row(chain.rate, i)
         joint = row(chain.node, i)
@@ -359,7 +361,8 @@ def find_candidates(
         linear = linear + wp.cross(joint, spun)
         start_slide = end_slide
         if wp.static(smooth):
-            shorter = shorter + shortening(scene.chains, job, chain, base, i)
+            enter_link(scene.chains, problems, job, chain, state.contacts, i, rod)
+            shorter = shorter + shortening(scene.chains, job, chain, base, i, rod)
             if state.contacts > 0:
                 end_slide = (shorter - row(proximity.shorter, i)) / state.last_step
             proximity.shorter[i] = shorter
@@ -367,7 +370,7 @@ def find_candidates(
         if row(proximity.clearance, i) <= margin + taper.start_radius:
             link_here = cone(joint, joint + link, taper)
             if wp.static(smooth):
-                link_here = bent_link(scene.chains, problems, job, chain, base, state.contacts, i)
+                link_here = bent_link(scene.chains, problems, job, chain, base, state.contacts, i, rod)
             # One shape after the other, each at two places: between the ends, and at the far end.
             closest = others
             for place in range(looked_at):
@@ -448,6 +451,8 @@ def find_candidates(
                                 candidates.shape[slot] = s
                                 candidates.share[slot] = share
             proximity.clearance[i] = closest
+        if wp.static(smooth):
+            pass_link(scene.chains, problems, job, chain, state.contacts, i, rod)
     judge_overlap(state, deepest, crossing, base_gap, elapsed(now))
     return count
 

@@ -1,12 +1,15 @@
 """Centre line of the bent rod beside a straight link of its chain, which contacts touch.
 
-A chain bends at its joints alone: a link is straight, and turns by a whole bend where a contact passes a joint. Beam
-theory tells what the rod does in between. A force F on the whisker at s bends it by F (s − x)/(E I) at x < s, so what
-the joints before a place miss of its slope and deflection is linear in the moment and in the force across that are
-carried there (:class:`.state.BeamErrors`). A force is what bends a link further in than the moment of its end tells; a
-contact on this link makes the same force wherever along it the contact is, so the moments of four joints tell it
-without knowing the place. Forces on other links are known from the last steps; without what they do to these moments
-two contacts could not be told from one. The rest shape adds its own bends, linear along the link as between two joints.
+A chain bends at its joints alone: a link is straight, and turns by a whole bend where a contact passes a joint. A rod
+bends all along, by M/(E I) under a moment M that is linear between joints without a contact there. The moments of the
+joints' springs, walked from the base on, tell how rod and chain part (:class:`RodPlace`). Each joint adds what lies
+next to it: contacts that lie flush over many links do not answer to each other's forces.
+
+A contact between two joints breaks that line. Where it is alone, the moments of the two joints behind it go on to it in
+a straight line, wherever along the link it is. Otherwise, and for what it does to the rod further out, its force counts
+as averaged twice: rod and contact are rigid, so a force answers at once to a change of its gap, and a gap that answered
+to the force of the last step, or to its simple mean, would swing where a link is lighter than steps are long. The rest
+shape adds its own bends, linear along the link as between two joints.
 
 Where slip reverses, its speed is a small difference of large ones: the chain, which is straighter than the rod, would
 reverse some tenths of a ms too early or too late (:func:`shortening`).
@@ -16,15 +19,16 @@ import warp as wp
 
 from brainbench.stimuli.engines.rod.limits import LARGE_BEND
 
-from .algebra import Spatial, first_axis, spatial, vec3
+from .algebra import Spatial, first_axis, plus, spatial, vec3
 from .articulated_body import ChainState, hinge_direction
 from .parameters import real
 from .state import (
-    BeamErrors,
+    BeamCompliance,
     CentreLine,
     ChainArrays,
     Cone,
     ContactProblems,
+    LinkTaper,
     WhiskerJob,
     cone,
     cubic_weights,
@@ -34,13 +38,13 @@ from .state import (
 
 @wp.func
 def joint_moment(chains: ChainArrays, job: WhiskerJob, chain: wp.ref[ChainState], j: int) -> vec3:
-    """Return the moment of a joint's spring (µN·m), as the way in which it turns the link; none beyond both ends."""
+    """Return the moment of a joint's spring (µN·m); none beyond the last."""
     moment = vec3()
-    if j >= 0 and j < job.links:
+    if j < job.links:
         axis2 = row(chain.axis2, j)
         angle = row(chain.angle, j)
         turn = first_axis(axis2, hinge_direction(chain, j), angle[1]) * angle[0] + axis2 * angle[1]
-        moment = wp.cross(turn, link_direction(job, chain, vec3(), j)) * chains.inertia[j, job.whisker].stiffness
+        moment = turn * chains.inertia[j, job.whisker].stiffness
     return moment
 
 
@@ -62,72 +66,131 @@ def linearity(bend: vec3) -> real:
 
 
 @wp.struct
-class LinkLoads:
-    """Moments of joints around a link, as one contact on it would make them, and what other contacts do along it."""
+class RodPlace:
+    """How the rod lies beside a link, walked from link to link from the base on."""
 
+    turn: vec3
+    """Rotation (rad) from the link to the rod's tangent at its start, and how far (mm) the rod lies from that."""
+    offset: vec3
     before: vec3
-    here: vec3
-    after: vec3
+    """Turn (rad) of the joint before, and those of the joints at both ends of the link."""
+    near_turn: vec3
+    far_turn: vec3
+    near: vec3
+    """Moments (µN·m) of the joints at both ends of the link, and of the next."""
+    far: vec3
     beyond: vec3
-    outer_force: vec3
-    """Force across, and moment at the link's joint, of contacts further out."""
-    outer_moment: vec3
-    inner_slope: vec3
-    """Slope and deflection at the link's joint that chain and rod differ by because of contacts further in."""
-    inner_offset: vec3
-    crowd: wp.int32
-    """Contacts on the link itself, and their moment at its joint."""
-    crowd_moment: vec3
+    here: vec3
+    """What contacts on the link add to the first of these, by their mean forces."""
+    touched: wp.int32
+    """Contacts on the link; 1: there is one, and none on the next."""
+    alone: wp.int32
 
 
 @wp.func
-def steady_push(problems: ContactProblems, job: WhiskerJob, c: int, along: vec3) -> vec3:
-    """Return the force across a link by which a contact of the last steps bends the whisker."""
-    push = problems.held[job.index, c].steady
-    return push - along * wp.dot(push, along)
+def begin_rod(chains: ChainArrays, job: WhiskerJob, chain: wp.ref[ChainState]) -> RodPlace:
+    """Return where the rod begins: at the base, along it."""
+    rod = RodPlace()
+    rod.far = joint_moment(chains, job, chain, 0)
+    rod.far_turn = rod.far / chains.inertia[0, job.whisker].stiffness
+    rod.beyond = joint_moment(chains, job, chain, 1)
+    return rod
 
 
 @wp.func
-def inner_error(beam: BeamErrors, place: real, push: vec3, ahead: real) -> Spatial:
-    """Return the slope and the deflection that joints miss of a force further in, ``ahead`` (mm, negative) of here."""
+def contact_share(problems: ContactProblems, job: WhiskerJob, c: int, taper: LinkTaper) -> real:
+    """Return where along a link (0 to 1 on it) a contact of the last step was."""
+    return (problems.held[job.index, c].arc - taper.arc) / taper.arc_length
+
+
+@wp.func
+def enter_link(
+    chains: ChainArrays,
+    problems: ContactProblems,
+    job: WhiskerJob,
+    chain: wp.ref[ChainState],
+    contacts: int,
+    i: int,
+    rod: wp.ref[RodPlace],
+):
+    """Pass the joint at the start of link i."""
+    rod.before = rod.near_turn
+    rod.near_turn = rod.far_turn
+    rod.turn = rod.turn - rod.near_turn
+    rod.near = rod.far
+    rod.far = rod.beyond
+    rod.far_turn = vec3()
+    if i < job.links - 1:
+        rod.far_turn = rod.far / chains.inertia[i + 1, job.whisker].stiffness
+    rod.beyond = joint_moment(chains, job, chain, i + 2)
+    link = row(chain.node, i + 1) - row(chain.node, i)
+    rod.here = vec3()
+    rod.touched = 0
+    next_touched = int(0)
+    for c in range(contacts):
+        share = contact_share(problems, job, c, chains.taper[i, job.whisker])
+        if share >= real(0.0) and share < real(1.0):
+            rod.touched = rod.touched + 1
+            rod.here = rod.here + wp.cross(link, problems.held[job.index, c].steady) * share
+        elif share >= real(1.0) and share < real(2.0):
+            next_touched = 1
+    rod.alone = 0
+    if rod.touched == 1 and next_touched == 0:
+        rod.alone = 1
+
+
+@wp.func
+def bend_between(beam: BeamCompliance, place: real, near: vec3, there: vec3) -> Spatial:
+    """Return turn and deflection, as rotation of the link, of a moment linear from a link's start to a place on it."""
     weights = cubic_weights(place)
-    slope = push * wp.dot(weights, beam.force_slope)
-    return spatial(slope, push * wp.dot(weights, beam.force_deflection) - slope * ahead)
+    return spatial(
+        near * wp.dot(weights, beam.near_turn) + there * wp.dot(weights, beam.there_turn),
+        near * wp.dot(weights, beam.near_deflection) + there * wp.dot(weights, beam.there_deflection),
+    )
 
 
 @wp.func
-def take_off_contacts(
+def bend_of_contacts(
     chains: ChainArrays,
     problems: ContactProblems,
     job: WhiskerJob,
     contacts: int,
     i: int,
-    along: vec3,
-    loads: wp.ref[LinkLoads],
+    link: vec3,
+    rod: RodPlace,
+    place: real,
+) -> Spatial:
+    """Return turn and deflection from the start of link i to a place, with all contacts by their mean forces."""
+    beam = chains.beam[i, job.whisker]
+    near = rod.near - rod.here
+    bend = bend_between(beam, place, near, near * (real(1.0) - place) + rod.far * place)
+    if rod.touched > 0:
+        for c in range(contacts):
+            share = contact_share(problems, job, c, chains.taper[i, job.whisker])
+            if share >= real(0.0) and share < real(1.0):
+                push = wp.cross(link, problems.held[job.index, c].steady)
+                upto = wp.min(place, share)
+                mine = bend_between(beam, upto, push * share, push * (share - upto))
+                mine.v = mine.v + mine.w * (place - upto)
+                bend = plus(bend, mine, real(1.0))
+    return bend
+
+
+@wp.func
+def pass_link(
+    chains: ChainArrays,
+    problems: ContactProblems,
+    job: WhiskerJob,
+    chain: wp.ref[ChainState],
+    contacts: int,
+    i: int,
+    rod: wp.ref[RodPlace],
 ):
-    """Take what contacts of the last step on other links do off the moments around a link of direction ``along``."""
-    taper = chains.taper[i, job.whisker]
-    span = taper.arc_length
-    for c in range(contacts):
-        reach = problems.held[job.index, c].arc - taper.arc
-        push = steady_push(problems, job, c, along)
-        if reach >= real(0.0) and reach < span:
-            loads.crowd = loads.crowd + 1
-            loads.crowd_moment = loads.crowd_moment + push * reach
-        if reach >= span:
-            loads.before = loads.before - push * (reach + span)
-            loads.here = loads.here - push * reach
-            loads.after = loads.after - push * (reach - span)
-            loads.beyond = loads.beyond - push * wp.max(reach - real(2.0) * span, real(0.0))
-            loads.outer_force = loads.outer_force + push
-            loads.outer_moment = loads.outer_moment + push * reach
-        elif reach < real(0.0):
-            loads.before = loads.before - push * wp.max(reach + span, real(0.0))
-            inner = wp.max(i + int(wp.floor(reach / span)), 0)
-            place = (reach + span * real(i - inner)) / span
-            error = inner_error(chains.beam[inner, job.whisker], place, push, reach)
-            loads.inner_slope = loads.inner_slope + error.w
-            loads.inner_offset = loads.inner_offset + error.v
+    """Go on to the end of link i."""
+    link = row(chain.node, i + 1) - row(chain.node, i)
+    bend = bend_of_contacts(chains, problems, job, contacts, i, link, rod, real(1.0))
+    rod.offset = rod.offset + wp.cross(rod.turn + bend.v, link)
+    rod.turn = rod.turn + bend.w
 
 
 @wp.func
@@ -139,73 +202,40 @@ def bent_link(
     base: vec3,
     contacts: int,
     i: int,
+    rod: RodPlace,
 ) -> Cone:
     """Return a link with its centre line; ``base`` is the direction in which the whisker leaves its base."""
-    zero = real(0.0)
     half = real(0.5)
     at = row(chain.node, i)
     link = row(chain.node, i + 1) - at
     length = wp.length(link)
     along = link / length
-    loads = LinkLoads()
-    loads.before = joint_moment(chains, job, chain, i - 1)
-    loads.here = joint_moment(chains, job, chain, i)
-    loads.after = joint_moment(chains, job, chain, i + 1)
-    loads.beyond = joint_moment(chains, job, chain, i + 2)
-    # Bends of the joints at both ends, and what of their turns is rest shape.
     beam = chains.beam[i, job.whisker]
-    bend = loads.here / chains.inertia[i, job.whisker].stiffness
-    most = wp.length(bend)
-    first = linearity(bend)
-    last = real(1.0)
-    start = along - link_direction(job, chain, base, i - 1) - bend * (beam.trust * first)
+    # Bends of the joints around, and what of their turns is rest shape.
+    most = wp.length(rod.before) + wp.length(rod.near_turn) + wp.length(rod.far_turn)
+    first = linearity(rod.near_turn) * beam.trust
+    start = along - link_direction(job, chain, base, i - 1) - wp.cross(rod.near_turn, along) * first
     if i == 0:
         # The tangent at the base is given; half a turn leads from there to the first link.
         start = start * real(2.0)
-    else:
-        bend = loads.before / chains.inertia[i - 1, job.whisker].stiffness
-        most = most + wp.length(bend)
     end = start
+    last = beam.trust
     if i < job.links - 1:
-        bend = loads.after / chains.inertia[i + 1, job.whisker].stiffness
-        last = linearity(bend)
-        end = link_direction(job, chain, base, i + 1) - along - bend * (chains.beam[i + 1, job.whisker].trust * last)
-        most = most + wp.length(bend)
-    take_off_contacts(chains, problems, job, contacts, i, along, loads)
-    taper = chains.taper[i, job.whisker]
+        after = link_direction(job, chain, base, i + 1)
+        last = linearity(rod.far_turn) * chains.beam[i + 1, job.whisker].trust
+        end = after - along - wp.cross(rod.far_turn, after) * last
     line = CentreLine()
     places = int(4)
     for k in range(places):
         place = real(k) / real(3.0)
         left = real(1.0) - place
-        # The moment at this place goes on from further out, and the force is by what it grows further in.
-        moment = loads.after + (loads.after - loads.beyond) * left
-        force = (loads.here - moment + (loads.before - loads.here) * left) / length
-        if i == 0:
-            force = (loads.here - moment) / (length * wp.max(place, real(0.1)))
-        inner_slope = loads.inner_slope
-        inner_offset = loads.inner_offset + loads.inner_slope * (length * place)
-        if loads.crowd > 1:
-            # Joints do not tell contacts of one link apart: the forces of all are those of the last steps.
-            here = loads.here - loads.crowd_moment
-            force = (here - loads.after) / length
-            moment = loads.after + (here - loads.after) * left
-            for c in range(contacts):
-                reach = problems.held[job.index, c].arc - taper.arc
-                if reach >= zero and reach < taper.arc_length:
-                    push = steady_push(problems, job, c, along)
-                    ahead = reach - length * place
-                    if ahead >= zero:
-                        force = force + push
-                        moment = moment + push * ahead
-                    else:
-                        error = inner_error(beam, reach / taper.arc_length, push, ahead)
-                        inner_slope = inner_slope + error.w
-                        inner_offset = inner_offset + error.v
-        moment = moment + loads.outer_moment - loads.outer_force * (length * place)
-        force = force + loads.outer_force
-        slope = moment * beam.moment_slope[k] + force * beam.force_slope[k] + inner_slope
-        offset = moment * beam.force_slope[k] + force * beam.force_deflection[k] + inner_offset
+        bend = Spatial()
+        if rod.alone == 1:
+            bend = bend_between(beam, place, rod.near, rod.far + (rod.far - rod.beyond) * left)
+        else:
+            bend = bend_of_contacts(chains, problems, job, contacts, i, link, rod, place)
+        slope = wp.cross(rod.turn + bend.w, along)
+        offset = rod.offset + wp.cross(rod.turn * place + bend.v, link)
         # Beams bend little: what they say of a soft tip that is folded over is no more than part of the bends around.
         held = wp.min(first * left + last * place, half * most / wp.max(wp.length(slope), real(1e-12)))
         slope = slope * held - start * (half * left * left) + end * (half * place * place)
@@ -213,13 +243,15 @@ def bent_link(
         for d in range(3):
             line.turn[d, k] = slope[d] * length
             line.offset[d, k] = offset[d]
-    bent = cone(at, at + link, taper)
+    bent = cone(at, at + link, chains.taper[i, job.whisker])
     bent.line = line
     return bent
 
 
 @wp.func
-def shortening(chains: ChainArrays, job: WhiskerJob, chain: wp.ref[ChainState], base: vec3, i: int) -> real:
+def shortening(
+    chains: ChainArrays, job: WhiskerJob, chain: wp.ref[ChainState], base: vec3, i: int, rod: RodPlace
+) -> real:
     """Return by how much less than link i the rod beside it reaches along itself.
 
     An arc that turns by b from the middle of one link to that of the next is b²/24 of its length longer than its chord.
@@ -228,9 +260,5 @@ def shortening(chains: ChainArrays, job: WhiskerJob, chain: wp.ref[ChainState], 
     before = link_direction(job, chain, base, i - 1)
     along = link_direction(job, chain, base, i)
     after = link_direction(job, chain, base, i + 1)
-    beam = chains.beam[i, job.whisker]
     length = chains.taper[i, job.whisker].arc_length
-    moment = joint_moment(chains, job, chain, i)
-    push = (moment - joint_moment(chains, job, chain, i + 1)) / length
-    apart = moment * beam.force_slope[0] + push * beam.force_deflection[0]
-    return wp.length_sq(after - before) * length / real(96.0) - wp.dot(apart, along - before)
+    return wp.length_sq(after - before) * length / real(96.0) - wp.dot(rod.offset, along - before)

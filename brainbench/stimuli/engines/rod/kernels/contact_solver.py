@@ -509,9 +509,12 @@ def store_forces(problems: ContactProblems, solver: wp.ref[SolverState], own: wp
             problems.held[solver.job, solver.thread + k].arc = arc
             problems.held[solver.job, solver.thread + k].force = force_k
             if wp.static(smooth):
+                mean = row(own.mean, k)
                 steady = row(own.steady, k)
                 weight = solver.step / (solver.step + real(wp.static(STEADY)))
-                problems.held[solver.job, solver.thread + k].steady = steady + (force_k - steady) * weight
+                mean = mean + (force_k - mean) * weight
+                problems.held[solver.job, solver.thread + k].mean = mean
+                problems.held[solver.job, solver.thread + k].steady = steady + (mean - steady) * weight
             if wp.static(recorded):
                 problems.held[solver.job, solver.thread + k].slot = row(own.slot, k)
             force = force + force_k

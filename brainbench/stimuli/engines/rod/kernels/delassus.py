@@ -59,6 +59,7 @@ class ThreadContacts:
     if recorded:
         slot: PerContactInt
     if smooth:
+        mean: PerContact3
         steady: PerContact3
 
 
@@ -143,12 +144,14 @@ def add_contact(problems: ContactProblems, solver: wp.ref[SolverState], own: wp.
     # They are kept in world axes, because the tangents turn from step to step.
     guess = vec3(zero, zero, zero)
     if wp.static(smooth):
+        own.mean[k] = guess
         own.steady[k] = guess
     for e in range(solver.previous_contacts):
         held = problems.held[index, e]
         if wp.abs(held.arc - candidate.arc) < real(0.3) * candidate.link_arc:
             guess = held.force
             if wp.static(smooth):
+                own.mean[k] = held.mean
                 own.steady[k] = held.steady
     for a in range(3):
         own.free_rate[3 * k + a] = wp.dot(row(own.axis, 3 * k + a), candidate.free_velocity)

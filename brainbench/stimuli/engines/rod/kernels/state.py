@@ -85,19 +85,19 @@ class LinkTaper:
 
 
 @wp.struct
-class BeamErrors:
-    """What the joints before a place of a link lack of the rod (:func:`.packing.beam_errors`).
+class BeamCompliance:
+    """How the rod bends from the start of a link to a place on it (:func:`.packing.beam_compliance`).
 
-    Places 0, 1/3, 2/3 and 1 along the link."""
+    Of a moment that is linear between both: by that at the start, and by that at the place. Places 0, 1/3, 2/3 and 1.
+    """
 
-    moment_slope: vec4
-    """Slope (1/µN·m) under a moment."""
-    force_slope: vec4
-    """Slope (1/mN) under a force across, and deflection (mm/µN·m) under a moment."""
-    force_deflection: vec4
-    """Deflection (mm/mN) under a force across."""
+    near_turn: vec4
+    """Turn, and deflection in lengths of the link (1/µN·m)."""
+    there_turn: vec4
+    near_deflection: vec4
+    there_deflection: vec4
     trust: real
-    """How far beam theory is followed at the joint of the link (0 to 1); the errors contain it."""
+    """How far beam theory is followed at the joint of the link (0 to 1)."""
 
 
 @wp.struct
@@ -128,7 +128,7 @@ class ChainArrays:
     """[link, whisker]"""
     taper: wp.array2d(dtype=LinkTaper)
     if smooth:
-        beam: wp.array2d(dtype=BeamErrors)
+        beam: wp.array2d(dtype=BeamCompliance)
     """[link, whisker]"""
     if yields:
         follicle: wp.array(dtype=FollicleConstants)
@@ -471,8 +471,9 @@ class HeldContact:
     if recorded:
         slot: wp.int32  # its candidate
     if smooth:
+        mean: vec3
+        """Mean of the force over :data:`.limits.STEADY`, and that of the mean."""
         steady: vec3
-        """Mean of the force over :data:`.limits.STEADY`."""
 
 
 @wp.struct
