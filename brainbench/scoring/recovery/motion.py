@@ -198,7 +198,7 @@ class _Evaluator:
         self.scenes, self.names, self.networks, self.backend = list(scenes), names, networks, backend
         self.search, self.engine = _search(), get_engine(backend)
         twist = self.engine.twists and any(scene.twist for scene in scenes)
-        self.fidelity = Fidelity.of(fidelity).resolved(twist).touching(())  # as gradients do
+        self.fidelity = Fidelity.of(fidelity).resolved(twist)
         frames = scenes[0].frames
         plain = frames.lowpass is None and frames.clip is None and frames.axes == "world" and not scenes[0].others
         self.differentiable = plain and all(network.read for network in networks)

@@ -60,8 +60,8 @@ class Fidelity:
     """What contacts touch: the straight links, whose direction jumps at each joint, or the centre line of the bent rod,
     as beam theory tells it between the joints: with the same links many times nearer where a whisker is held between
     contacts or slides past one. The backend ``rod`` alone knows it, for objects of spheres, capsules, cylinders and
-    boxes; gradients and fits take the links. None: the rod in scenes of round objects alone, the links in those with
-    a box or a mesh, on whose flat faces the forces of a whisker that lies flush swing to and fro otherwise."""
+    boxes. None: the rod in scenes of round objects alone, the links in those with a box or a mesh, on whose flat faces
+    the forces of a whisker that lies flush swing to and fro otherwise."""
     contact_tolerance: Annotated[float, Limit(least=1e-12, most=1e-3)] | None = field(
         default=None, metadata={"later": True}
     )

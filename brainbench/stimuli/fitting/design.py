@@ -276,7 +276,7 @@ class _Evaluator:
         self.scenes, self.names, self.options = list(scenes), names, options
         self.engine = get_engine(backend)
         twist = self.engine.twists and any(scene.twist for scene in scenes)
-        self.fidelity = Fidelity.of(options.fidelity).resolved(twist).touching(())  # as gradients do
+        self.fidelity = Fidelity.of(options.fidelity).resolved(twist)
         self.noise = np.repeat([options.force_noise, options.moment_noise], 3)
         self.count = 0
 

@@ -39,7 +39,7 @@ from brainbench.stimuli.engines.rod.packing import (
     rotation_vectors,
 )
 from brainbench.stimuli.fitting.parameters import JobParameters
-from brainbench.stimuli.fitting.recorded_run import RecordingSolver
+from brainbench.stimuli.fitting.recorded_run import LINK_ROWS, RecordingSolver
 from brainbench.stimuli.motion.jobs import MILLI, Job, Trace
 from brainbench.stimuli.objects.obstacle import ConvexPart, Obstacle
 from brainbench.stimuli.whiskers.whisker import build_chain
@@ -122,12 +122,17 @@ def packed_change(task: JobTask, low: Job, high: Job, width: float, quasistatic:
 
 def _whisker(task: JobTask, job: Job, quasistatic: bool) -> Numbers:
     chain = build_chain(job.whisker, task.chain.links)
-    packed = pack_chains(chain.links, [chain], quasistatic, 2 + task.twists)
+    packed = pack_chains(chain.links, [chain], quasistatic, 2 + task.twists, smooth=task.kind[-1])
     build, inertia, taper = (packed[name][:, 0] for name in ("build", "inertia", "taper"))
     torsion = inertia["torsion"] if task.twists else np.zeros(chain.links)
     bend = np.arctan2(build["bend_sine"], build["bend_cosine"])
     numbers = [build["length"], bend, build["mass"], *(inertia[name] for name in ("centre", "axial", "transverse"))]
     numbers += [inertia["stiffness"], torsion, taper["start_radius"], taper["end_radius"]]
+    if task.kind[-1]:
+        beam, names = packed["beam"][:, 0], ("moment_slope", "force_slope", "force_deflection")
+        numbers += [taper["arc"], taper["arc_length"], beam["trust"], *np.hstack([beam[name] for name in names]).T]
+    else:
+        numbers += [np.zeros(chain.links)] * (LINK_ROWS - len(numbers))
     return {"link": np.stack(numbers), "beta": packed["beta"][0], "friction": packed["friction"][0]}
 
 
@@ -433,7 +438,7 @@ class GradientRun:
         alike: dict[Any, list[int]] = {}
         for index, task in enumerate(tasks):
             job = task.job
-            key = (capacity_for(task.chain.links), job.times.tobytes(), job.start, tuple(job.gravity), task.twists)
+            key = (capacity_for(task.chain.links), job.times.tobytes(), job.start, tuple(job.gravity), task.kind)
             alike.setdefault(key, []).append(index)
         # A processor takes the jobs of a launch one by one, so that each of its threads has a launch of its own.
         threads = 1 if self.device.is_cuda else usable_processors()
@@ -443,7 +448,7 @@ class GradientRun:
             some = [tasks[index] for index in indices]
             packed = PackedTasks.of(some, shared=False)
             needs = packed.shapes.needs
-            solver = RecordingSolver(packed.chains, self.fidelity, self.device, needs, twists=some[0].twists)
+            solver = RecordingSolver(packed.chains, some[0].fidelity, self.device, needs, twists=some[0].twists)
             if self.device.is_cuda:
                 solver.room = CUDA_ROOM
             if steps is not None:

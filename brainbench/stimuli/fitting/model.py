@@ -133,7 +133,6 @@ class FitModel:
             precision="double",
             solver=options.solver,
             twist=options.twist,
-            contact_line="links",
         )
 
     def least_damping(self, u: Array) -> float:

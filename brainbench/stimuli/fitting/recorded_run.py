@@ -50,6 +50,8 @@ from brainbench.stimuli.engines.rod.slices import SceneParts, allocate, lock_of
 from brainbench.stimuli.motion.jobs import MICRO, MILLI
 from brainbench.stimuli.whiskers.whisker import Chain
 
+LINK_ROWS = 25
+"""Numbers of a link, see ``kernels.chain.PackedTangents``."""
 KERNELS = f"{__package__}.kernels"  # package that writes steps down
 ROOM = 2**26  # bytes that records of the steps of a launch may take; beyond them they are written down in parts
 
@@ -95,6 +97,8 @@ class RecordingSolver(WhiskerSolver):
         links, contacts = (steps, self.capacity, count), (steps, contacts_for(self.capacity), count)
         shapes = {"step": (steps, count), "count": count, "contact": contacts}
         shapes |= dict.fromkeys(("angle", "rate", "acceleration"), links)
+        if self.smooth:
+            shapes["steady"] = contacts
         return allocate(self.kernels.structs.StepRecords, self.device, **shapes)
 
     def _run(self) -> None:
@@ -126,7 +130,7 @@ class RecordingSolver(WhiskerSolver):
         scene = self.scene
         loads, solids = int(scene.jobs.load_force.shape[0]), int(scene.shapes.kind.shape[0])
         return {
-            "link": (10, self.capacity, self.count),
+            "link": (LINK_ROWS, self.capacity, self.count),
             **dict.fromkeys(("beta", "friction"), (self.count,)),
             "gravity": (self.count, 3),
             "knots": (int(scene.motions.place.shape[0]), 16),
@@ -156,7 +160,9 @@ class RecordingSolver(WhiskerSolver):
         frames = int(self.scene.readings.row.numpy().max()) + 1
         with lock_of(device):
             state = (some, self.capacity, count)
-            tangents = allocate(kernels.PackedTangents, device, angle=state, rate=state)
+            held = (some, contacts_for(self.capacity), count)
+            lasting = {"steady": held, "arc": held, "shorter": state, "last": count} if self.smooth else {}
+            tangents = allocate(kernels.PackedTangents, device, angle=state, rate=state, **lasting)
             for name, values in changes.items():
                 setattr(
                     tangents, name, wp.array(values, dtype=kernels.PackedTangents.vars[name].type.dtype, device=device)

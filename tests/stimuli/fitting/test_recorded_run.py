@@ -21,7 +21,7 @@ POST = Capsule((11e-3, 2.2e-3, -8e-3), (11e-3, 2.7e-3, 8e-3), 5e-4)
 def _record(job, fidelity=FINE):
     task = make_task(job, fidelity, {}, silent=True)
     packed = PackedTasks.of([task], shared=False)
-    solver = RecordingSolver(packed.chains, fidelity, pick_device("cpu"), packed.shapes.needs, twists=task.twists)
+    solver = RecordingSolver(packed.chains, task.fidelity, pick_device("cpu"), packed.shapes.needs, twists=task.twists)
     return solver, packed.launch(solver, record_shape=True)
 
 
@@ -37,7 +37,7 @@ def _forward(solver):
 def test_a_recorded_run_takes_the_steps_of_the_ordinary_one():
     job = touching_job(POST)
     _, result = _record(job)
-    ordinary = RodEngine(retry=1).run([job], replace(FINE, contact_line="links"), record_shape=True)[0]
+    ordinary = RodEngine(retry=1).run([job], FINE, record_shape=True)[0]
     assert ordinary.contact.any()
     assert result.steps[0, 0] == ordinary.steps
     # One frictionless contact is solved exactly by both.

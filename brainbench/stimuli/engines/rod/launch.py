@@ -307,11 +307,11 @@ class WhiskerSolver:
             options["sliced"] = sliced
         self.yields = any(chain.whisker.follicle is not None for chain in self.chains)
         rolls = any(chain.rest_rolls.any() for chain in self.chains)
-        smooth = fidelity.contact_line == "rod" and (needs > NOTHING or device.is_cpu)
-        if smooth and (needs == MESHES or options.get("recorder")):
+        self.smooth = smooth = fidelity.contact_line == "rod" and (needs > NOTHING or device.is_cpu)
+        if smooth and needs == MESHES:
             raise UsageError(
-                "contact_line=rod knows spheres, capsules, cylinders and boxes, but no meshes, gradients or fits; leave"
-                " it out, or build the objects of these."
+                "contact_line=rod knows spheres, capsules, cylinders and boxes, but no meshes; leave it out, or build "
+                "the objects of these."
             )
         uses = {"yields": self.yields, "rolls": rolls, "flows": flows, "smooth": smooth}
         features = tuple(name for name, used in uses.items() if used)

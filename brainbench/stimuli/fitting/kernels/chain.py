@@ -21,10 +21,14 @@ from ..articulated_body import (
 )
 from ..delassus import PerContact3
 from ..motion import Instant, instant, pose_from
-from ..parameters import capacity, hinges, real
+from ..parameters import capacity, hinges, real, smooth
 from ..state import PerLink3, PerLinkJoint, SceneArrays, Step, WhiskerJob, WhiskerState, begin_step, row
 from .contacts import StepContacts, contact_row, set_state
 from .records import StepRecords
+
+LENGTH, BEND, MASS, CENTRE, AXIAL, TRANSVERSE, STIFFNESS, TORSION, START_RADIUS, END_RADIUS = range(10)
+ARC, ARC_LENGTH, TRUST, MOMENT_SLOPE, FORCE_SLOPE, FORCE_DEFLECTION = 10, 11, 12, 13, 17, 21
+"""Rows of :attr:`PackedTangents.link`; of the last three each begins with that of the first of four places."""
 
 PerHinge3: Any = wp.types.matrix((hinges * capacity, 3), real)
 hinge_row = reader((PerHinge3, vec3))
@@ -44,6 +48,47 @@ class StepLinks:
     """Axis z before the hinges, about which the link bends at rest."""
     behind: PerLink3
     """The same behind them, where the joint twists."""
+
+
+@wp.struct
+class PackedTangents:
+    """Changes of the packed arrays with each parameter p, and of the state."""
+
+    angle: wp.array3d(dtype=JointVector)
+    """[p, link, job] of the state at the beginning of the next step."""
+    rate: wp.array3d(dtype=JointVector)
+    """[p, link, job]"""
+    link: wp.array4d(dtype=real)
+    """[p, row, link, job] length, angle at rest, mass, centre, axial and transverse inertia, stiffness, torsion, radius
+    at start and end; where contacts touch the bent rod also arc, arc length, and what ``state.BeamErrors`` holds."""
+    if smooth:
+        steady: wp.array3d(dtype=vec3)
+        """[p, contact, job] of the mean force of each contact of the last step, and of its arc."""
+        arc: wp.array3d(dtype=real)
+        shorter: wp.array3d(dtype=real)
+        """[p, link, job] of how much less than the chain the rod reached along itself."""
+        last: wp.array(dtype=real)
+        """[job] length of the last step."""
+    beta: wp.array2d(dtype=real)
+    """[p, job]"""
+    friction: wp.array2d(dtype=real)
+    """[p, job]"""
+    gravity: wp.array2d(dtype=vec3)
+    """[p, job]"""
+    knots: wp.array3d(dtype=real)
+    """[p, knot, 16] place, velocity, quaternion, angular velocity, angular acceleration."""
+    load_force: wp.array2d(dtype=vec3)
+    """[p, load]"""
+    load_share: wp.array2d(dtype=real)
+    """[p, load]"""
+    shape_place: wp.array2d(dtype=vec3)
+    """[p, shape] in the frame of its body."""
+    shape_turn: wp.array2d(dtype=vec3)
+    """[p, shape] small turn about its origin, in the frame of its body."""
+    shape_size: wp.array2d(dtype=vec3)
+    """[p, shape]"""
+    shape_friction: wp.array2d(dtype=real)
+    """[p, shape]"""
 
 
 @wp.struct
@@ -215,11 +260,14 @@ def restore_step(
 
     # Twists and accelerations down the chain, with those of the contacts at the end of the step.
     contacts.count = record.contacts
+    taken = record.contacts
+    if wp.static(smooth):
+        taken = record.taken
     on.vw = pose.spin
     on.vv = pose.velocity
     on.aw = frame.step.base.w
     on.av = frame.step.base.v
-    for k in range(contacts.count):
+    for k in range(taken):
         contacts.link[k] = records.contact[place, k, index].link
     for i in range(job.links):
         at = row(chain.node, i)
@@ -246,9 +294,7 @@ def restore_step(
         for k in range(contacts.count):
             if contact_row(contacts.link, k) == i:
                 contact = records.contact[place, k, index]
-                taper = scene.chains.taper[i, job.whisker]
-                radius = taper.start_radius + (taper.end_radius - taper.start_radius) * contact.share
-                point = at + (row(chain.node, i + 1) - at) * contact.share - contact.normal * radius
+                point = contact.point
                 half = pose_from(scene.motions, scene.shapes.track[contact.shape], frame.middle, pose)
                 velocity = (
                     on.vv
@@ -257,6 +303,9 @@ def restore_step(
                     - half.velocity
                     - wp.cross(half.spin, point - half.place)
                 )
+                if wp.static(smooth):
+                    slide = contact.start_slide + (contact.end_slide - contact.start_slide) * contact.share
+                    velocity = velocity - wp.normalize(contact.tangent) * slide
                 contacts.point[k] = point
                 set_state(contacts, k, contact, velocity)
     return frame

@@ -9,13 +9,14 @@ import warp as wp
 
 from brainbench.stimuli.engines.rod.limits import ANYWHERE, CAPSULE, CYLINDER, MESH, SPHERE
 
-from ..algebra import rotate, unrotate, vec3, vec6
+from ..algebra import rotate, unrotate, vec3, vec4, vec6
 from ..articulated_body import ChainState
 from ..distances import triangle_corners, triangle_feature
 from ..motion import BodyMotion, pose_from
 from ..narrow_phase import nearest_triangles
-from ..parameters import real
+from ..parameters import real, smooth
 from ..state import (
+    Cone,
     ContactCandidates,
     ContactProblems,
     Instant,
@@ -25,6 +26,7 @@ from ..state import (
     Step,
     WhiskerJob,
     WhiskerState,
+    line_tangent,
     most_candidates,
     row,
 )
@@ -148,22 +150,24 @@ def mesh_curvature(
 
 @wp.func
 def curvature_at(
-    shapes: ShapeArrays, s: int, body: BodyMotion, start: vec3, stop: vec3, share: real, normal: vec3, distance: real
-) -> vec6:
-    """Return the second derivatives of the distance from a shape at a place of a link, in world axes.
+    shapes: ShapeArrays, s: int, body: BodyMotion, start: vec3, stop: vec3, share: real, x: vec3, normal: vec3,
+    distance: real,
+) -> vec6:  # fmt: skip
+    """Return the second derivatives of the distance from a shape at a place x beside a link, in world axes.
 
     ``normal`` is its gradient there and ``distance`` its value; places count from the base.
     """
     local_quaternion = shapes.quaternion[s]
     scale = shapes.scale[s]
-    a = unrotate(local_quaternion, unrotate(body.quaternion, start - body.place) - shapes.place[s]) / scale
-    b = unrotate(local_quaternion, unrotate(body.quaternion, stop - body.place) - shapes.place[s]) / scale
     n = unrotate(local_quaternion, unrotate(body.quaternion, normal))
     found = PrincipalCurvature()
     if shapes.kind[s] == wp.static(MESH):
+        a = unrotate(local_quaternion, unrotate(body.quaternion, start - body.place) - shapes.place[s]) / scale
+        b = unrotate(local_quaternion, unrotate(body.quaternion, stop - body.place) - shapes.place[s]) / scale
         found = mesh_curvature(shapes, s, a, b, share, n, distance / scale)
     else:
-        found = primitive_curvature(shapes.kind[s], shapes.size[s] / scale, a + (b - a) * share, n)
+        local = unrotate(local_quaternion, unrotate(body.quaternion, x - body.place) - shapes.place[s]) / scale
+        found = primitive_curvature(shapes.kind[s], shapes.size[s] / scale, local, n)
     k1 = found.first / scale
     k2 = found.second / scale
     t = rotate(body.quaternion, rotate(local_quaternion, found.direction))
@@ -179,8 +183,37 @@ def curvature_at(
 
 
 @wp.func
+def cubic_slopes(place: real) -> vec4:
+    """Return the derivatives of ``state.cubic_weights``."""
+    rest = real(1.0) - place
+    ends = real(1.0) + real(4.5) * place * (place - real(1.0))
+    tilt = real(4.5) * (place - rest)
+    middle = real(4.5) * place * rest
+    return vec4(
+        tilt * rest - ends,
+        -tilt * (real(2.0) - real(3.0) * place) - real(3.0) * middle,
+        -tilt * (real(3.0) * place - real(1.0)) + real(3.0) * middle,
+        tilt * place + ends,
+    )
+
+
+@wp.func
+def record_line(
+    candidates: wp.ref[ContactCandidates], slot: int, link: Cone, share: real, start_slide: real, end_slide: real
+):
+    """Note how the centre line runs at a candidate."""
+    slopes = cubic_slopes(share)
+    candidates.along[slot] = link.b - link.a + link.line.offset * slopes
+    candidates.bending[slot] = link.line.turn * slopes
+    candidates.tangent[slot] = line_tangent(link, share)
+    candidates.start_slide[slot] = start_slide
+    candidates.end_slide[slot] = end_slide
+
+
+@wp.func
 def record_state(
     paused: PausedWhiskers,
+    problems: ContactProblems,
     job: WhiskerJob,
     chain: wp.ref[ChainState],
     state: wp.ref[WhiskerState],
@@ -195,6 +228,11 @@ def record_state(
     record.reading = state.pending_reading
     record.open_gap = real(1e30)
     record.lead = real(1e30)
+    if wp.static(smooth):
+        record.held = state.contacts
+        for k in range(state.contacts):
+            paused.records.steady[place, k, job.index].arc = problems.held[job.index, k].arc
+            paused.records.steady[place, k, job.index].push = problems.held[job.index, k].steady
     for i in range(job.links):
         paused.records.angle[place, i, job.index] = row(chain.angle, i)
         paused.records.rate[place, i, job.index] = row(chain.rate, i)
@@ -214,10 +252,11 @@ def record_contacts(
     place: int,
     solved: int,
 ):
-    """Write the contacts of the step that press, and how far the others are from closing."""
+    """Write the contacts of the step, those that press first, and how far the others are from closing."""
     index = job.index
     first = index * wp.static(most_candidates)
     pressing = int(0)
+    resting = int(0)
     taken = int(0)
     lead = real(1e30)
     if solved == 1:
@@ -228,26 +267,41 @@ def record_contacts(
             given = problems.candidate[first + held.slot]
             shape = row(candidates.shape, held.slot)
             share = row(candidates.share, held.slot)
+            i = problems.candidate_link[first + held.slot]
+            taper = scene.chains.taper[i, job.whisker]
+            radius = taper.start_radius + (taper.end_radius - taper.start_radius) * share
+            record = ContactRecord()
+            record.link = i
+            record.shape = shape
+            record.share = share
+            record.gap = given.gap
+            record.friction = given.friction
+            record.point = given.point
+            record.normal = given.normal
+            record.force = held.force
+            body = pose_from(scene.motions, scene.shapes.track[shape], step.now, step.pose)
+            x = given.point + given.normal * radius
+            start = row(chain.node, i)
+            stop = row(chain.node, i + 1)
+            record.curvature = curvature_at(
+                scene.shapes, shape, body, start, stop, share, x, given.normal, given.gap + radius
+            )
+            if wp.static(smooth):
+                record.rank = k
+                record.arc = given.arc
+                record.along = row(candidates.along, held.slot)
+                record.bending = row(candidates.bending, held.slot)
+                record.tangent = row(candidates.tangent, held.slot)
+                record.start_slide = row(candidates.start_slide, held.slot)
+                record.end_slide = row(candidates.end_slide, held.slot)
+            slot = pressing
             if wp.dot(held.force, given.normal) > real(0.0):
-                i = problems.candidate_link[first + held.slot]
-                taper = scene.chains.taper[i, job.whisker]
-                radius = taper.start_radius + (taper.end_radius - taper.start_radius) * share
-                start = row(chain.node, i)
                 lead = wp.min(lead, row(candidates.lead, held.slot))
-                record = ContactRecord()
-                record.link = i
-                record.shape = shape
-                record.share = share
-                record.gap = given.gap
-                record.friction = given.friction
-                record.normal = given.normal
-                record.force = held.force
-                body = pose_from(scene.motions, scene.shapes.track[shape], step.now, step.pose)
-                record.curvature = curvature_at(
-                    scene.shapes, shape, body, start, row(chain.node, i + 1), share, given.normal, given.gap + radius
-                )
-                paused.records.contact[place, pressing, index] = record
                 pressing = pressing + 1
+            else:
+                resting = resting + 1
+                slot = problems.solution[index].contacts - resting
+            paused.records.contact[place, slot, index] = record
     least = real(1e30)
     for j in range(candidates.count):
         if (taken >> j) % 2 == 0:
@@ -256,6 +310,8 @@ def record_contacts(
                 ahead = problems.predicted_gap[first + j]
             least = wp.min(least, ahead)
     paused.records.step[place, index].contacts = pressing
+    if wp.static(smooth):
+        paused.records.step[place, index].taken = pressing + resting
     paused.records.step[place, index].open_gap = least
     paused.records.step[place, index].lead = lead
 

@@ -4,7 +4,7 @@ import warp as wp
 
 from ..algebra import JointVector, vec3, vec6
 from ..motion import Instant
-from ..parameters import real
+from ..parameters import real, smooth
 
 
 @wp.struct
@@ -24,6 +24,11 @@ class StepRecord:
     """Least gap at the end of the step of what could touch and does not press."""
     lead: real
     """Least distance by which a link that presses was chosen before the next one, which touches the same."""
+    if smooth:
+        held: wp.int32
+        """Contacts of the last step."""
+        taken: wp.int32
+        """Contacts of this step: those that press, then those that do not."""
 
 
 @wp.struct
@@ -36,10 +41,30 @@ class ContactRecord:
     """Place along the link, 0 to 1; at 1 its end touches."""
     gap: real
     friction: real
+    point: vec3
+    """Place on the skin, from the base point."""
     normal: vec3
     force: vec3
     curvature: vec6
     """Second derivatives of the distance from the object at the axis (xx yy zz xy xz yz; 1/mm)."""
+    if smooth:
+        rank: wp.int32
+        """Place among the contacts of the step."""
+        arc: real
+        along: vec3
+        """As in ``state.ContactCandidates``."""
+        bending: vec3
+        tangent: vec3
+        start_slide: real
+        end_slide: real
+
+
+@wp.struct
+class SteadyRecord:
+    """A contact of the last step: arc, and mean of its force."""
+
+    arc: real
+    push: vec3
 
 
 @wp.struct
@@ -56,5 +81,8 @@ class StepRecords:
     """[step, link, job] that the step found."""
     contact: wp.array3d(dtype=ContactRecord)
     """[step, contact, job]"""
+    if smooth:
+        steady: wp.array3d(dtype=SteadyRecord)
+        """[step, contact, job] of the step before, in the order in which the solver has them."""
     count: wp.array(dtype=wp.int32)
     """[job] steps of the segment."""

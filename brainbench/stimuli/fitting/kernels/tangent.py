@@ -16,15 +16,27 @@ from brainbench.stimuli.engines.rod.limits import CAPSULE, CREVICE, CYLINDER, ME
 
 from ..algebra import JointVector, Spatial, rotate, symmetric_times, unrotate, vec3, vec4
 from ..articulated_body import ChainState, ProximityState, spring_state
-from ..delassus import PerContact3
+from ..delassus import PerContact1, PerContact3
 from ..motion import Instant, MotionArrays, elapsed, piece_at, pose_from, quaternion_rate, raw_turn
-from ..parameters import hinges, module_options, real
-from ..state import PerLink3, PerLinkJoint, SceneArrays, WhiskerJob, row
+from ..parameters import hinges, module_options, real, smooth
+from ..state import PerLink1, PerLink3, PerLinkJoint, SceneArrays, WhiskerJob, row
 from ..step import load_job
+from .centre_line import RodBend, begin_rod, keep_contacts, move_line, move_rod, move_shortening
 from .chain import (
+    AXIAL,
+    BEND,
+    CENTRE,
+    END_RADIUS,
+    LENGTH,
+    MASS,
+    START_RADIUS,
+    STIFFNESS,
+    TORSION,
+    TRANSVERSE,
     Fields,
     FieldTangents,
     HingeTangents,
+    PackedTangents,
     StepFrame,
     StepLinks,
     add_hinge,
@@ -46,9 +58,6 @@ from .contacts import (
 )
 from .newton import DenseSystem
 from .records import ContactRecord, StepRecords
-
-LENGTH, BEND, MASS, CENTRE, AXIAL, TRANSVERSE, STIFFNESS, TORSION, START_RADIUS, END_RADIUS = range(10)
-"""Rows of :attr:`PackedTangents.link`."""
 
 
 @wp.struct
@@ -124,39 +133,6 @@ def move_pose(motions: MotionArrays, knots: wp.array3d(dtype=real), p: int, inde
 
 
 @wp.struct
-class PackedTangents:
-    """Changes of the packed arrays with each parameter p, and of the state."""
-
-    angle: wp.array3d(dtype=JointVector)
-    """[p, link, job] of the state at the beginning of the next step."""
-    rate: wp.array3d(dtype=JointVector)
-    """[p, link, job]"""
-    link: wp.array4d(dtype=real)
-    """[p, 10, link, job] length, angle at rest, mass, centre, axial and transverse inertia, stiffness, torsion, radius
-    at start and end."""
-    beta: wp.array2d(dtype=real)
-    """[p, job]"""
-    friction: wp.array2d(dtype=real)
-    """[p, job]"""
-    gravity: wp.array2d(dtype=vec3)
-    """[p, job]"""
-    knots: wp.array3d(dtype=real)
-    """[p, knot, 16] place, velocity, quaternion, angular velocity, angular acceleration."""
-    load_force: wp.array2d(dtype=vec3)
-    """[p, load]"""
-    load_share: wp.array2d(dtype=real)
-    """[p, load]"""
-    shape_place: wp.array2d(dtype=vec3)
-    """[p, shape] in the frame of its body."""
-    shape_turn: wp.array2d(dtype=vec3)
-    """[p, shape] small turn about its origin, in the frame of its body."""
-    shape_size: wp.array2d(dtype=vec3)
-    """[p, shape]"""
-    shape_friction: wp.array2d(dtype=real)
-    """[p, shape]"""
-
-
-@wp.struct
 class OutputTangents:
     """Changes of what the steps wrote with each parameter, in the units of the kernels."""
 
@@ -189,22 +165,27 @@ class LinkFields:
 class MovingLink:
     """A link with a contact in a step, and its change with a parameter."""
 
-    at: vec3
-    """Its joint."""
     span: vec3
-    """From there to its far end."""
+    """From its joint to its far end."""
     span_d: vec3
     turning: vec3
     """Its angular velocity at the end of the step."""
     base_place: vec3
     """Change of the base's place."""
     fields: FieldTangents
+    if smooth:
+        line: Spatial
+        """Change of the centre line at the contact, beside that of the link: of its tangent, and of its place."""
+        start_slide: real
+        """Change of how fast the rod slides along itself at both ends."""
+        end_slide: real
 
 
 @wp.struct
 class ContactTangent:
     """Change of a contact at fixed accelerations and forces."""
 
+    share: real
     point: vec3
     condition: vec3
 
@@ -261,9 +242,11 @@ def move_contact(
     shapes = scene.shapes
     index = job.index
     h = frame.step.length
-    at = moving.at
     link = moving.span
     link_d = moving.span_d
+    along = link
+    tangent = link
+    tangent_d = link_d
     moved = moving.fields
     base_place = moving.base_place
     taper = scene.chains.taper[contact.link, job.whisker]
@@ -274,10 +257,17 @@ def move_contact(
     n = contact.normal
     f = contact.force
     s = contact.share
+    radius = taper.start_radius + slope_r * s
+    place_d = moving.fields.at + link_d * s
+    if wp.static(smooth):
+        along = contact.along
+        tangent = contact.tangent
+        tangent_d = link_d + moving.line.w
+        place_d = place_d + moving.line.v
     # The object: its shift at the place x of the axis, and its turn.
     body = pose_from(motions, shapes.track[shape], frame.step.now, frame.step.pose)
     body_d = move_pose(motions, tangents.knots, p, shapes.track[shape], frame.step.now)
-    x = at + link * s
+    x = contact.point + n * radius
     origin = body.place + rotate(body.quaternion, shapes.place[shape])
     turn_in = rotate(body.quaternion, tangents.shape_turn[p, shape])
     turned = body_d.turn + turn_in
@@ -292,22 +282,24 @@ def move_contact(
         shift = shift + rotate(body.quaternion, rotate(shapes.quaternion[shape], vec3(grown[0], grown[1], grown[2])))
 
     # The place on the axis, gap and normal there.
-    away = moved.at + link_d * s - shift
+    away = place_d - shift
     n_d = symmetric_times(contact.curvature, away) + wp.cross(turned, n)
-    bent = symmetric_times(contact.curvature, link)
-    curved = wp.dot(link, bent)
+    bent = symmetric_times(contact.curvature, along)
+    curved = wp.dot(tangent, bent)
+    if wp.static(smooth):
+        curved = curved + wp.dot(n, contact.bending)
     share_d = zero
     if s < real(1.0) and curved > real(1e-9) * wp.length_sq(link):
-        slope = wp.dot(n, link_d) + wp.dot(n_d, link)
+        slope = wp.dot(n, tangent_d) + wp.dot(n_d, tangent)
         if shapes.kind[shape] != wp.static(MESH):
             slope = slope - (end_d - start_d)
         share_d = -slope / curved
     n_d = n_d + bent * share_d
-    radius = taper.start_radius + slope_r * s
     radius_d = start_d * (real(1.0) - s) + end_d * s + slope_r * share_d
-    gap_d = gap_d + wp.dot(n, away + link * share_d) - radius_d
+    gap_d = gap_d + wp.dot(n, away + along * share_d) - radius_d
     found = ContactTangent()
-    found.point = moved.at + link_d * s + link * share_d - n_d * radius - n * radius_d
+    found.share = share_d
+    found.point = place_d + along * share_d - n_d * radius - n * radius_d
 
     # The velocity against the object at the end of the step.
     point = contact_row(contacts.point, k)
@@ -318,6 +310,15 @@ def move_contact(
     v_d = v_d + wp.cross(moved.vw + moved.aw * h, point) + wp.cross(moving.turning, found.point)
     v_d = v_d - half_d.velocity - wp.cross(half_d.spin, point - half.place)
     v_d = v_d - wp.cross(half.spin, found.point - (half_d.place - base_place))
+    if wp.static(smooth):
+        # Along the rod, which slides along itself where the chain does not.
+        slid = contact.end_slide - contact.start_slide
+        slide = contact.start_slide + slid * s
+        slide_d = moving.start_slide + (moving.end_slide - moving.start_slide) * s + slid * share_d
+        size = wp.length(tangent)
+        onward = tangent / size
+        tangent_d = tangent_d + contact.bending * share_d
+        v_d = v_d - onward * slide_d - (tangent_d - onward * wp.dot(onward, tangent_d)) * (slide / size)
 
     closing_d = zero
     if -contact.gap < real(wp.static(CREVICE)):
@@ -418,6 +419,15 @@ def tangent_step(
     asked = PerLinkJoint()
     acceleration_d = PerLinkJoint()
     point_d = PerContact3()
+    share_d = PerContact1()
+    rod = RodBend()
+    shorter_d = PerLink1()
+    taken = contacts.count
+    if wp.static(smooth):
+        taken = records.step[place, index].taken
+        if taken > 0:
+            base = rotate(pose.quaternion, vec3(real(1.0), zero, zero))
+            begin_rod(chains, records, tangents, job, chain, base, place, rod)
     missed = PerContact3()
     there = PerContact3()
     for p in range(tangents.angle.shape[0]):
@@ -433,6 +443,10 @@ def tangent_step(
         moved.aw = (after_d.spin - pose_d.spin) / h
         moved.av = (after_d.velocity - pose_d.velocity) / h - tangents.gravity[p, index]
         moved.av = moved.av - wp.cross(pose_d.spin, pose.velocity) - wp.cross(pose.spin, pose_d.velocity)
+        if wp.static(smooth):
+            if taken > 0:
+                move_rod(chain, links, p, pose_d.turn, rod)
+                move_shortening(rod, shorter_d)
 
         # Down the chain: fields, and the load on each link.
         for i in range(job.links):
@@ -480,20 +494,29 @@ def tangent_step(
                     reach_d = moved.at + span_d * share + span * tangents.load_share[p, load]
                     f_d = f_d - pull_d
                     m_d = m_d - wp.cross(at + span * share, pull_d) - wp.cross(reach_d, pull)
-            for k in range(contacts.count):
+            for k in range(taken):
                 if contact_row(contacts.link, k) == i:
                     contact = records.contact[place, k, index]
                     moving = MovingLink()
-                    moving.at = at
                     moving.span = span
                     moving.span_d = span_d
                     moving.turning = vw + aw * h
                     moving.base_place = pose_d.place
                     moving.fields = moved
+                    if wp.static(smooth):
+                        moving.line = move_line(rod, i, contact.share)
+                        # A step that was taken again, shorter, has no slide.
+                        last = tangents.last[index]
+                        if contact.end_slide != zero:
+                            moving.end_slide = (row(shorter_d, i) - tangents.shorter[p, i, index]) / last
+                        if contact.start_slide != zero:
+                            moving.start_slide = (row(shorter_d, i - 1) - tangents.shorter[p, i - 1, index]) / last
                     changed = move_contact(scene, tangents, contacts, k, contact, frame, p, job, moving)
                     point_d[k] = changed.point
+                    share_d[k] = changed.share
                     missed[k] = changed.condition
-                    m_d = m_d - wp.cross(changed.point, contact.force)
+                    if k < contacts.count:
+                        m_d = m_d - wp.cross(changed.point, contact.force)
             moment_d[i] = m_d
             force_d[i] = f_d
             moved.at = moved.at + span_d
@@ -553,12 +576,19 @@ def tangent_step(
             outputs.wrench[p, frame.reading, 1, index] = total_d.v - held.v
             outputs.contact[p, frame.reading, 0, index] = contact_d.v
             outputs.contact[p, frame.reading, 1, index] = contact_d.w
+        if wp.static(smooth):
+            if taken > 0:
+                keep_contacts(contacts, rod, h, share_d)
+                for i in range(job.links):
+                    tangents.shorter[p, i, index] = row(shorter_d, i)
         for i in range(job.links):
             rate_d = tangents.rate[p, i, index] + row(acceleration_d, i) * h
             tangents.angle[p, i, index] = tangents.angle[p, i, index] + rate_d * h
             if scene.options.quasistatic == 1:
                 rate_d = JointVector()
             tangents.rate[p, i, index] = rate_d
+    if wp.static(smooth):
+        tangents.last[index] = h
     outputs.contacts[index] = summary
 
 

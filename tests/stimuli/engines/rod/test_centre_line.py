@@ -6,53 +6,27 @@ import numpy as np
 import pytest
 
 from brainbench.core.errors import UsageError
-from brainbench.stimuli import WhiskerArray
 from brainbench.stimuli.engines import get_engine
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.motion.jobs import Job, StillFollicle
 from brainbench.stimuli.objects.obstacle import Box, Capsule, ConvexPart, Cylinder, Obstacle, Sphere
 from tests.factories.contact_scenes import contact_jobs, difference
+from tests.factories.pressed_whiskers import held_job, sliding_job, turned_about_x
 from tests.factories.whiskers import C2
 
 pytest.importorskip("warp")
 
-WHISKER = dataclasses.replace(WhiskerArray.of("rat")["C2"].whisker, curvature=0.0, friction=0.0)
-MIDDLE = WHISKER.arc_length / 2
 ELASTICA = np.array([-0.022566, -0.085888])
 """Force (mN) on the base of the whisker that two posts hold, by shooting: each post pushes along its normal at one arc
 length of a tapered rod without extension, clamped along x; unknown are forces, directions, arc lengths and moment."""
 
 
-def _smooth(share):
-    return share**3 * (10 - 15 * share + 6 * share**2)
-
-
-def _held(fidelity, *, radius=1e-4, apart=2e-3, turn=0.3, shape=None, about_x=0.0, backend="rod"):
-    """Two posts on opposite sides of the whisker, turned together; the last reading's force (mN)."""
-    away = float(WHISKER.radius(MIDDLE)) + 5e-5 + radius
-    c, s = np.cos(about_x), np.sin(about_x)
-    tilt = np.array([[1, 0, 0], [0, c, -s], [0, s, c]])
-
-    def post(side):
-        def motion(times):
-            angle = turn * _smooth(np.clip(np.asarray(times, float) / 0.04, 0, 1))
-            x, y = side * apart / 2, -side * away
-            place = np.stack([MIDDLE + np.cos(angle) * x - np.sin(angle) * y, np.sin(angle) * x + np.cos(angle) * y])
-            turned = np.stack([np.cos(angle / 2), 0 * angle, 0 * angle, np.sin(angle / 2)], axis=-1)
-            w, z = turned[:, 0], turned[:, 3]
-            half_c, half_s = np.cos(about_x / 2), np.sin(about_x / 2)
-            return (
-                np.pad(place.T, ((0, 0), (0, 1))) @ tilt.T,
-                np.stack([half_c * w, half_s * w, -half_s * z, half_c * z], axis=-1),
-            )
-
-        motion.finest = 0.04
-        return Obstacle((shape or Capsule((0, 0, -4e-3), (0, 0, 4e-3), radius),), motion, 0.0)
-
-    job = Job(WHISKER, StillFollicle(), (post(-1), post(1)), np.arange(1, 101) * 1e-3)
+def _held(fidelity, *, backend="rod", about_x=0.0, **how):
+    """The last reading's force (mN) of a whisker between two posts, turned back about x."""
+    job = held_job(about_x=about_x, **how)
     trace = get_engine(backend).run([job], Fidelity.parse(fidelity), workers=1)[0]
     assert trace.status == "ok"
-    return trace.wrench[-1, :3] @ tilt * 1e3
+    return trace.wrench[-1, :3] @ turned_about_x(about_x) * 1e3
 
 
 def _miss(fidelity, **how):
@@ -112,19 +86,7 @@ def test_a_plane_of_bending_is_like_any_other():
 
 def _slide(fidelity):
     """Ripple of Fx, peak to peak, under a post that slides along the pressed whisker at constant depth."""
-    length, radius = WHISKER.arc_length, 3e-4
-
-    def motion(times):
-        times = np.asarray(times, float)
-        risen = _smooth(np.clip(times / 0.06, 0, 1))
-        x = (0.45 + 0.3 * np.clip((times - 0.06) / 0.4, 0, 1)) * length
-        low = -(radius + WHISKER.base_radius + 1e-4)
-        return np.stack([x, low * (1 - risen) + 0.1 * length * risen, 0 * x], -1), np.tile([1.0, 0, 0, 0], (len(x), 1))
-
-    motion.finest = 0.06
-    post = Obstacle((Capsule((0, 0, -4e-3), (0, 0, 4e-3), radius),), motion, 0.0)
-    job = Job(WHISKER, StillFollicle(), (post,), np.arange(1, 461) * 1e-3)
-    trace = get_engine("rod").run([job], Fidelity.parse(fidelity), workers=1)[0]
+    trace = get_engine("rod").run([sliding_job()], Fidelity.parse(fidelity), workers=1)[0]
     # The last readings stand apart: the post stops.
     force, t = trace.wrench[90:450, 0], np.linspace(-1, 1, 360)
     return np.ptp(force - np.polyval(np.polyfit(t, force, 6), t)) / np.abs(force).mean()
@@ -147,7 +109,7 @@ def test_slip_reverses_when_that_of_many_links_does():
     assert difference(straight, fine) > 0.03
 
 
-def test_meshes_gradients_and_other_backends_take_straight_links():
+def test_meshes_and_other_backends_take_straight_links():
     corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * 1e-4
     with pytest.raises(UsageError, match=r"contact_line=rod knows spheres, .* but no meshes"):
         _held("balanced,contact_line=rod", shape=ConvexPart(corners))

@@ -63,6 +63,9 @@ from .state import (
     row,
 )
 
+if recorded:
+    from .recorder.recording import record_line
+
 
 @wp.struct
 class NearShapes:
@@ -450,6 +453,8 @@ def find_candidates(
                             if wp.static(recorded):
                                 candidates.shape[slot] = s
                                 candidates.share[slot] = share
+                                if wp.static(smooth):
+                                    record_line(candidates, slot, link_here, share, start_slide, end_slide)
             proximity.clearance[i] = closest
         if wp.static(smooth):
             pass_link(scene.chains, problems, job, chain, state.contacts, i, rod)

@@ -379,6 +379,12 @@ class ContactCandidates:
         shape: PerCandidateInt
         share: PerCandidate1  # place along the link, 0 to 1
         lead: PerCandidate1  # how much nearer (mm) than the neighbouring link it is, if that touches the same
+    if recorded and smooth:
+        along: PerCandidate3  # rate of the centre line's place along the link, that of its tangent, and its tangent
+        bending: PerCandidate3
+        tangent: PerCandidate3
+        start_slide: PerCandidate1  # how fast the rod slides along itself at both ends of the link
+        end_slide: PerCandidate1
 
 
 @wp.struct

@@ -322,7 +322,7 @@ def run(
                             state.near_speed = zero
                 if wp.static(recorded):
                     if paused.keep == 1:
-                        record_state(paused, job, chain, state, state.steps - first_step, now, h)
+                        record_state(paused, problems, job, chain, state, state.steps - first_step, now, h)
                 base_wrench = articulated_inertia(scene, job, chain, proximity, step, tip, count)
                 tip_acceleration = joint_accelerations(scene, job, chain, candidates, state, step, count)
                 if wp.static(against > NOTHING) and count > 0:
