@@ -129,7 +129,7 @@ def _whisker(task: JobTask, job: Job, quasistatic: bool) -> Numbers:
     numbers = [build["length"], bend, build["mass"], *(inertia[name] for name in ("centre", "axial", "transverse"))]
     numbers += [inertia["stiffness"], torsion, taper["start_radius"], taper["end_radius"]]
     if task.kind[-1]:
-        beam, names = packed["beam"][:, 0], ("moment_slope", "force_slope", "force_deflection")
+        beam, names = packed["beam"][:, 0], ("near_turn", "there_turn", "near_deflection", "there_deflection")
         numbers += [taper["arc"], taper["arc_length"], beam["trust"], *np.hstack([beam[name] for name in names]).T]
     else:
         numbers += [np.zeros(chain.links)] * (LINK_ROWS - len(numbers))

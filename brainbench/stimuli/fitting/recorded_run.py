@@ -50,7 +50,7 @@ from brainbench.stimuli.engines.rod.slices import SceneParts, allocate, lock_of
 from brainbench.stimuli.motion.jobs import MICRO, MILLI
 from brainbench.stimuli.whiskers.whisker import Chain
 
-LINK_ROWS = 25
+LINK_ROWS = 29
 """Numbers of a link, see ``kernels.chain.PackedTangents``."""
 KERNELS = f"{__package__}.kernels"  # package that writes steps down
 ROOM = 2**26  # bytes that records of the steps of a launch may take; beyond them they are written down in parts
@@ -161,8 +161,10 @@ class RecordingSolver(WhiskerSolver):
         with lock_of(device):
             state = (some, self.capacity, count)
             held = (some, contacts_for(self.capacity), count)
-            lasting = {"steady": held, "arc": held, "shorter": state, "last": count} if self.smooth else {}
-            tangents = allocate(kernels.PackedTangents, device, angle=state, rate=state, **lasting)
+            shapes: dict[str, Any] = dict.fromkeys(("angle", "rate"), state)
+            if self.smooth:
+                shapes |= {**dict.fromkeys(("mean", "steady", "arc"), held), "shorter": state, "last": count}
+            tangents = allocate(kernels.PackedTangents, device, **shapes)
             for name, values in changes.items():
                 setattr(
                     tangents, name, wp.array(values, dtype=kernels.PackedTangents.vars[name].type.dtype, device=device)

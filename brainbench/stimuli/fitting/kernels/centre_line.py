@@ -1,6 +1,6 @@
-"""Change of the centre line that contacts touch, and of what bends it: ``..centre_line`` with its derivative.
+"""Change of the centre line that contacts touch: ``..centre_line``, walked with its derivative by a parameter.
 
-Numbers are pairs (value, change), vectors matrices of two such rows; names are those of ``bent_link``.
+Numbers are pairs (value, change), vectors matrices of two such rows; names are those of ``..centre_line``.
 """
 
 from typing import Any
@@ -11,20 +11,21 @@ from brainbench.stimuli.engines.rod.limits import LARGE_BEND, STEADY
 
 from ..algebra import Spatial, spatial, vec2, vec3, vec4
 from ..articulated_body import ChainState
-from ..centre_line import joint_moment, link_direction
+from ..centre_line import link_direction
 from ..delassus import PerContact1, PerContact3
 from ..delassus import row as contact_row
 from ..parameters import hinges, real
-from ..state import ChainArrays, PerLink1, PerLink3, WhiskerJob, cubic_weights, row
+from ..state import ChainArrays, PerLink3, WhiskerJob, cubic_weights, row
 from .chain import (
     ARC,
     ARC_LENGTH,
     BEND,
-    FORCE_DEFLECTION,
-    FORCE_SLOPE,
     LENGTH,
-    MOMENT_SLOPE,
+    NEAR_DEFLECTION,
+    NEAR_TURN,
     STIFFNESS,
+    THERE_DEFLECTION,
+    THERE_TURN,
     TRUST,
     PackedTangents,
     StepLinks,
@@ -41,6 +42,12 @@ Pair3: Any = wp.types.matrix((2, 3), real)
 def pair3(value: vec3, change: vec3) -> Pair3:
     """Return a vector and its change."""
     return wp.matrix_from_rows(value, change)
+
+
+@wp.func
+def fixed(value: real) -> vec2:
+    """Return a number that does not change."""
+    return vec2(value, real(0.0))
 
 
 @wp.func
@@ -69,6 +76,12 @@ def inner(a: Pair3, b: Pair3) -> vec2:
 
 
 @wp.func
+def cross(a: Pair3, b: Pair3) -> Pair3:
+    """Return the vector product of two vectors."""
+    return pair3(wp.cross(a[0], b[0]), wp.cross(a[1], b[0]) + wp.cross(a[0], b[1]))
+
+
+@wp.func
 def size(a: Pair3) -> vec2:
     """Return the length of a vector."""
     length = wp.max(wp.length(a[0]), real(1e-12))
@@ -76,8 +89,8 @@ def size(a: Pair3) -> vec2:
 
 
 @wp.struct
-class RodBend:
-    """What bends the rod in a step, and its change with a parameter."""
+class RodWalk:
+    """What bends the rod in a step, and how it lies beside a link; all with their change with a parameter."""
 
     chains: ChainArrays
     records: StepRecords
@@ -91,15 +104,25 @@ class RodBend:
     direction: PerLink3
     """Of each link."""
     direction_d: PerLink3
-    moment: PerLink3
-    """Of the spring of its joint, as the way in which it turns the link."""
-    moment_d: PerLink3
+    bend: PerLink3
+    """Turn of the joint of each link."""
+    bend_d: PerLink3
+    link: wp.int32
+    """Where the walk is: a link, from its joint to its end, and how the rod lies there."""
+    along: Pair3
+    turn: Pair3
+    offset: Pair3
+    here: Pair3
+    touched: wp.int32
+    alone: wp.int32
+    shorter: vec2
+    """By how much less than the chain the rod reaches along itself, up to the end of the link."""
 
 
 @wp.func
 def begin_rod(
     chains: ChainArrays, records: StepRecords, tangents: PackedTangents, job: WhiskerJob, chain: wp.ref[ChainState],
-    base: vec3, place: int, rod: wp.ref[RodBend],
+    links: wp.ref[StepLinks], base: vec3, place: int, rod: wp.ref[RodWalk],
 ):  # fmt: skip
     """Find what bends the rod in a step."""
     rod.chains = chains
@@ -110,44 +133,46 @@ def begin_rod(
     rod.base = pair3(base, base)
     for i in range(job.links):
         rod.direction[i] = link_direction(job, chain, base, i)
-        rod.moment[i] = joint_moment(chains, job, chain, i)
+        angle = row(chain.angle, i)
+        s1 = hinge_row(links.axis, wp.static(hinges) * i)
+        rod.bend[i] = s1 * angle[0] + hinge_row(links.axis, wp.static(hinges) * i + 1) * angle[1]
 
 
 @wp.func
-def move_rod(chain: wp.ref[ChainState], links: wp.ref[StepLinks], p: int, base_turn: vec3, rod: wp.ref[RodBend]):
-    """Find its change with a parameter; ``base_turn`` is the turn of the base."""
+def move_rod(chain: wp.ref[ChainState], links: wp.ref[StepLinks], p: int, base_turn: vec3, rod: wp.ref[RodWalk]):
+    """Find its change with a parameter, and go to the base; ``base_turn`` is the turn of the base."""
     rod.parameter = p
     index = rod.job.index
     turn = base_turn
     rod.base = pair3(rod.base[0], wp.cross(turn, rod.base[0]))
     for i in range(rod.job.links):
-        bend_d = rod.tangents.link[p, wp.static(BEND), i, index]
+        rest_d = rod.tangents.link[p, wp.static(BEND), i, index]
         angle = row(chain.angle, i)
         angle_d = rod.tangents.angle[p, i, index]
-        s1 = hinge_row(links.axis, wp.static(hinges) * i)
-        s2 = hinge_row(links.axis, wp.static(hinges) * i + 1)
-        bent = s1 * angle[0] + s2 * angle[1]
-        turn = turn + row(links.before, i) * bend_d
-        bent_d = wp.cross(turn, s1) * angle[0] + s1 * angle_d[0]
-        turn = turn + s1 * angle_d[0]
-        bent_d = bent_d + wp.cross(turn, s2) * angle[1] + s2 * angle_d[1]
-        turn = turn + s2 * angle_d[1]
+        turn = turn + row(links.before, i) * rest_d
+        bend_d = vec3()
+        for d in range(wp.static(hinges)):
+            s = hinge_row(links.axis, wp.static(hinges) * i + d)
+            if d < 2:
+                bend_d = bend_d + wp.cross(turn, s) * angle[d] + s * angle_d[d]
+            turn = turn + s * angle_d[d]
         if wp.static(hinges == 3):
-            if i % 2 == 1:
-                turn = turn + hinge_row(links.axis, wp.static(hinges) * i + 2) * angle_d[2]
-            turn = turn + row(links.behind, i) * bend_d
-        along = row(rod.direction, i)
-        along_d = wp.cross(turn, along)
-        moment_d = wp.cross(bent_d, along) + wp.cross(bent, along_d)
-        stiffness_d = rod.tangents.link[p, wp.static(STIFFNESS), i, index]
-        rod.direction_d[i] = along_d
-        rod.moment_d[i] = (
-            moment_d * rod.chains.inertia[i, rod.job.whisker].stiffness + wp.cross(bent, along) * stiffness_d
-        )
+            turn = turn + row(links.behind, i) * rest_d
+        rod.direction_d[i] = wp.cross(turn, row(rod.direction, i))
+        rod.bend_d[i] = bend_d
+    rod.turn = Pair3()
+    rod.offset = Pair3()
+    rod.shorter = vec2()
 
 
 @wp.func
-def direction_at(rod: wp.ref[RodBend], i: int) -> Pair3:
+def packed(rod: wp.ref[RodWalk], which: int, i: int, value: real) -> vec2:
+    """Return a number of a link; ``which`` is its row in :attr:`PackedTangents.link`."""
+    return vec2(value, rod.tangents.link[rod.parameter, which, i, rod.job.index])
+
+
+@wp.func
+def direction_at(rod: wp.ref[RodWalk], i: int) -> Pair3:
     """Return the direction of a link as ``..centre_line.link_direction``."""
     along = rod.base
     if i >= 0:
@@ -157,174 +182,168 @@ def direction_at(rod: wp.ref[RodBend], i: int) -> Pair3:
 
 
 @wp.func
-def moment_at(rod: wp.ref[RodBend], i: int) -> Pair3:
-    """Return the moment of a joint as ``..centre_line.joint_moment``."""
-    moment = Pair3()
-    if i >= 0 and i < rod.job.links:
-        moment = pair3(row(rod.moment, i), row(rod.moment_d, i))
-    return moment
-
-
-@wp.func
-def packed(rod: wp.ref[RodBend], which: int, i: int, value: real) -> vec2:
-    """Return a number of a link; ``which`` is its row in :attr:`PackedTangents.link`."""
-    return vec2(value, rod.tangents.link[rod.parameter, which, i, rod.job.index])
-
-
-@wp.func
-def move_shortening(rod: wp.ref[RodBend], shorter_d: wp.ref[PerLink1]):
-    """Find the change of how much less than the chain the rod reaches along itself, up to the end of each link."""
-    total = vec2()
-    for i in range(rod.job.links):
-        beam = rod.chains.beam[i, rod.job.whisker]
-        length = packed(rod, wp.static(ARC_LENGTH), i, rod.chains.taper[i, rod.job.whisker].arc_length)
-        slope = packed(rod, wp.static(FORCE_SLOPE), i, beam.force_slope[0])
-        deflection = packed(rod, wp.static(FORCE_DEFLECTION), i, beam.force_deflection[0])
-        half = direction_at(rod, i) - direction_at(rod, i - 1)
-        turn = direction_at(rod, i + 1) - direction_at(rod, i - 1)
-        moment = moment_at(rod, i)
-        apart = times(moment, slope) + times(moment - moment_at(rod, i + 1), quotient(deflection, length))
-        total = total + product(inner(turn, turn), length) / real(96.0) - inner(apart, half)
-        shorter_d[i] = total[1]
-
-
-@wp.struct
-class JointTurn:
-    """Turn of the chain at a joint less what beam theory makes of it; its bend, and how far that is followed."""
-
-    rest: Pair3
-    size: vec2
-    share: vec2
-
-
-@wp.func
-def joint_turn(rod: wp.ref[RodBend], j: int) -> JointTurn:
-    """Return the turn at a joint; nothing turns beyond both ends."""
-    one = vec2(real(1.0), real(0.0))
-    found = JointTurn()
-    found.share = one
+def bend_at(rod: wp.ref[RodWalk], j: int) -> Pair3:
+    """Return the turn of a joint; nothing turns beyond both ends."""
+    bend = Pair3()
     if j >= 0 and j < rod.job.links:
-        stiffness = packed(rod, wp.static(STIFFNESS), j, rod.chains.inertia[j, rod.job.whisker].stiffness)
-        trust = packed(rod, wp.static(TRUST), j, rod.chains.beam[j, rod.job.whisker].trust)
-        bend = times(moment_at(rod, j), quotient(one, stiffness))
-        square = inner(bend, bend) * real(wp.static(LARGE_BEND**-2))
-        found.share = quotient(one, one + product(square, square))
-        found.size = size(bend)
-        found.rest = direction_at(rod, j) - direction_at(rod, j - 1) - times(bend, product(trust, found.share))
-    return found
+        bend = pair3(row(rod.bend, j), row(rod.bend_d, j))
+    return bend
+
+
+@wp.func
+def moment_at(rod: wp.ref[RodWalk], j: int) -> Pair3:
+    """Return the moment of a joint as ``..centre_line.joint_moment``."""
+    last = wp.min(j, rod.job.links - 1)
+    stiffness = packed(rod, wp.static(STIFFNESS), last, rod.chains.inertia[last, rod.job.whisker].stiffness)
+    return times(bend_at(rod, j), stiffness)
+
+
+@wp.func
+def linearity(bend: Pair3) -> vec2:
+    """Return how far beam theory is followed where a joint bends so much."""
+    square = inner(bend, bend) * real(wp.static(LARGE_BEND**-2))
+    return quotient(fixed(real(1.0)), fixed(real(1.0)) + product(square, square))
 
 
 @wp.struct
-class SteadyPush:
-    """Mean force across a link of a contact of the last step, and its place from the joint of the link."""
+class SteadyContact:
+    """A contact of the last step: where along a link it was, and its mean force times the link."""
 
+    share: vec2
     push: Pair3
-    reach: vec2
 
 
 @wp.func
-def steady_push(rod: wp.ref[RodBend], i: int, c: int) -> SteadyPush:
-    """Return the c-th contact of the last step as link i feels it."""
-    steady = rod.records.steady[rod.place, c, rod.job.index]
-    push = pair3(steady.push, rod.tangents.steady[rod.parameter, c, rod.job.index])
-    along = direction_at(rod, i)
-    found = SteadyPush()
-    found.push = push - times(along, inner(push, along))
-    arc = packed(rod, wp.static(ARC), i, rod.chains.taper[i, rod.job.whisker].arc)
-    found.reach = vec2(steady.arc, rod.tangents.arc[rod.parameter, c, rod.job.index]) - arc
-    return found
+def steady_contact(rod: wp.ref[RodWalk], c: int) -> SteadyContact:
+    """Return the c-th contact of the last step as the link feels it where the walk is."""
+    i = rod.link
+    record = rod.records.steady[rod.place, c, rod.job.index]
+    taper = rod.chains.taper[i, rod.job.whisker]
+    arc = vec2(record.arc, rod.tangents.arc[rod.parameter, c, rod.job.index])
+    contact = SteadyContact()
+    contact.share = quotient(
+        arc - packed(rod, wp.static(ARC), i, taper.arc), packed(rod, wp.static(ARC_LENGTH), i, taper.arc_length)
+    )
+    contact.push = cross(rod.along, pair3(record.push, rod.tangents.steady[rod.parameter, c, rod.job.index]))
+    return contact
 
 
 @wp.func
-def weighted(rod: wp.ref[RodBend], which: int, i: int, values: vec4, place: vec2) -> vec2:
-    """Return what joints lack at a place of a link, of which four are packed from row ``which`` on."""
-    weights = cubic_weights(place[0])
-    total = vec2(wp.dot(weights, values), wp.dot(cubic_slopes(place[0]), values) * place[1])
-    for k in range(4):
-        total = total + vec2(real(0.0), weights[k] * rod.tangents.link[rod.parameter, which + k, i, rod.job.index])
-    return total
+def enter_link(rod: wp.ref[RodWalk], i: int):
+    """Pass the joint at the start of link i."""
+    build = rod.chains.build[i, rod.job.whisker]
+    before = direction_at(rod, i - 1)
+    rod.link = i
+    rod.along = times(direction_at(rod, i), packed(rod, wp.static(LENGTH), i, build.length))
+    rod.turn = rod.turn - bend_at(rod, i)
+    rod.here = Pair3()
+    rod.touched = 0
+    next_touched = int(0)
+    for c in range(rod.records.step[rod.place, rod.job.index].held):
+        contact = steady_contact(rod, c)
+        share = contact.share[0]
+        if share >= real(0.0) and share < real(1.0):
+            rod.touched = rod.touched + 1
+            rod.here = rod.here + times(contact.push, contact.share)
+        elif share >= real(1.0) and share < real(2.0):
+            next_touched = 1
+    rod.alone = 0
+    if rod.touched == 1 and next_touched == 0:
+        rod.alone = 1
+    length = packed(rod, wp.static(ARC_LENGTH), i, rod.chains.taper[i, rod.job.whisker].arc_length)
+    turn = direction_at(rod, i + 1) - before
+    rod.shorter = rod.shorter + product(inner(turn, turn), length) / real(96.0)
+    rod.shorter = rod.shorter - inner(rod.offset, direction_at(rod, i) - before)
 
 
 @wp.struct
-class LineLoads:
-    """Moments of joints around a link, and loads along it, as ``..centre_line.LinkLoads``."""
+class Bend:
+    """Turn and deflection, as rotation of the link, from its start to a place on it."""
 
-    before: Pair3
-    here: Pair3
-    after: Pair3
-    beyond: Pair3
-    outer_force: Pair3
-    outer_moment: Pair3
-    slope: Pair3
-    offset: Pair3
+    turn: Pair3
+    deflection: Pair3
 
 
 @wp.func
-def add_inner(rod: wp.ref[RodBend], i: int, place: vec2, push: Pair3, ahead: vec2, loads: wp.ref[LineLoads]):
-    """Add what the joints miss of a force on link i, as ``..centre_line.inner_error``."""
-    beam = rod.chains.beam[i, rod.job.whisker]
-    slope = weighted(rod, wp.static(FORCE_SLOPE), i, beam.force_slope, place)
-    offset = weighted(rod, wp.static(FORCE_DEFLECTION), i, beam.force_deflection, place)
-    loads.slope = loads.slope + times(push, slope)
-    loads.offset = loads.offset + times(push, offset - product(slope, ahead))
+def compliance(rod: wp.ref[RodWalk], which: int, values: vec4, place: vec2) -> vec2:
+    """Return a number of ``state.BeamCompliance`` at a place, of which four are packed from row ``which`` on."""
+    weights = cubic_weights(place[0])
+    change = wp.dot(cubic_slopes(place[0]), values) * place[1]
+    for k in range(4):
+        change = change + weights[k] * rod.tangents.link[rod.parameter, which + k, rod.link, rod.job.index]
+    return vec2(wp.dot(weights, values), change)
 
 
 @wp.func
-def move_line(rod: wp.ref[RodBend], i: int, share: real) -> Spatial:
-    """Return the change of the centre line beside a link at a place along it, 0 to 1: of its tangent and its offset.
+def bend_between(rod: wp.ref[RodWalk], place: vec2, near: Pair3, there: Pair3) -> Bend:
+    """Return the bend of a moment linear from the link's start to a place on it."""
+    beam = rod.chains.beam[rod.link, rod.job.whisker]
+    bend = Bend()
+    bend.turn = times(near, compliance(rod, wp.static(NEAR_TURN), beam.near_turn, place))
+    bend.turn = bend.turn + times(there, compliance(rod, wp.static(THERE_TURN), beam.there_turn, place))
+    bend.deflection = times(near, compliance(rod, wp.static(NEAR_DEFLECTION), beam.near_deflection, place))
+    bend.deflection = bend.deflection + times(
+        there, compliance(rod, wp.static(THERE_DEFLECTION), beam.there_deflection, place)
+    )
+    return bend
+
+
+@wp.func
+def bend_of_contacts(rod: wp.ref[RodWalk], x: real) -> Bend:
+    """Return the bend from the link's start to a place, with all contacts by their mean forces."""
+    place = fixed(x)
+    near = moment_at(rod, rod.link) - rod.here
+    bend = bend_between(rod, place, near, near * (real(1.0) - x) + moment_at(rod, rod.link + 1) * x)
+    if rod.touched > 0:
+        for c in range(rod.records.step[rod.place, rod.job.index].held):
+            contact = steady_contact(rod, c)
+            share = contact.share
+            if share[0] >= real(0.0) and share[0] < real(1.0):
+                upto = place
+                if share[0] < x:
+                    upto = share
+                mine = bend_between(rod, upto, times(contact.push, share), times(contact.push, share - upto))
+                bend.turn = bend.turn + mine.turn
+                bend.deflection = bend.deflection + mine.deflection + times(mine.turn, place - upto)
+    return bend
+
+
+@wp.func
+def pass_link(rod: wp.ref[RodWalk]):
+    """Go on to the end of the link."""
+    bend = bend_of_contacts(rod, real(1.0))
+    rod.offset = rod.offset + cross(rod.turn + bend.deflection, rod.along)
+    rod.turn = rod.turn + bend.turn
+
+
+@wp.func
+def move_line(rod: wp.ref[RodWalk], share: real) -> Spatial:
+    """Return the change of the centre line beside the link at a place along it, 0 to 1: of its tangent and its offset.
 
     The link itself, and the place, stay.
     """
-    zero = real(0.0)
     half = real(0.5)
-    one = vec2(real(1.0), zero)
-    held = rod.records.step[rod.place, rod.job.index].held
-    beam = rod.chains.beam[i, rod.job.whisker]
-    length = packed(rod, wp.static(LENGTH), i, rod.chains.build[i, rod.job.whisker].length)
-    span = packed(rod, wp.static(ARC_LENGTH), i, rod.chains.taper[i, rod.job.whisker].arc_length)
-    before = joint_turn(rod, i - 1)
-    here = joint_turn(rod, i)
-    after = joint_turn(rod, i + 1)
+    i = rod.link
+    whisker = rod.job.whisker
+    here = bend_at(rod, i)
+    after = bend_at(rod, i + 1)
+    most = size(bend_at(rod, i - 1)) + size(here) + size(after)
+    along = direction_at(rod, i)
+    first = product(linearity(here), packed(rod, wp.static(TRUST), i, rod.chains.beam[i, whisker].trust))
+    start = along - direction_at(rod, i - 1) - times(cross(here, along), first)
     if i == 0:
-        here.rest = here.rest * real(2.0)
-    if i == rod.job.links - 1:
-        after.rest = here.rest
-    loads = LineLoads()
-    loads.before = moment_at(rod, i - 1)
-    loads.here = moment_at(rod, i)
-    loads.after = moment_at(rod, i + 1)
-    loads.beyond = moment_at(rod, i + 2)
-    crowd = int(0)
-    crowd_moment = Pair3()
-    for c in range(held):
-        steady = steady_push(rod, i, c)
-        push = steady.push
-        reach = steady.reach
-        if reach[0] >= span[0]:
-            far = reach - span * real(2.0)
-            if far[0] < zero:
-                far = vec2()
-            loads.before = loads.before - times(push, reach + span)
-            loads.here = loads.here - times(push, reach)
-            loads.after = loads.after - times(push, reach - span)
-            loads.beyond = loads.beyond - times(push, far)
-            loads.outer_force = loads.outer_force + push
-            loads.outer_moment = loads.outer_moment + times(push, reach)
-        elif reach[0] >= zero:
-            crowd = crowd + 1
-            crowd_moment = crowd_moment + times(push, reach)
-        else:
-            if reach[0] + span[0] > zero:
-                loads.before = loads.before - times(push, reach + span)
-            further = wp.max(i + int(wp.floor(reach[0] / span[0])), 0)
-            place = quotient(reach, span) + one * real(i - further)
-            add_inner(rod, further, place, push, reach, loads)
-    if crowd > 1:
-        loads.here = loads.here - crowd_moment
-    if i == 0:
-        loads.before = loads.here
-    slope_here = loads.slope
-    offset_here = loads.offset
+        start = start * real(2.0)
+    end = start
+    last = packed(rod, wp.static(TRUST), i, rod.chains.beam[i, whisker].trust)
+    if i < rod.job.links - 1:
+        onward = direction_at(rod, i + 1)
+        trust = packed(rod, wp.static(TRUST), i + 1, rod.chains.beam[i + 1, whisker].trust)
+        last = product(linearity(after), trust)
+        end = onward - along - times(cross(after, onward), last)
+    length = packed(rod, wp.static(LENGTH), i, rod.chains.build[i, whisker].length)
+    near = moment_at(rod, i)
+    far = moment_at(rod, i + 1)
+    beyond = moment_at(rod, i + 2)
     weights = cubic_weights(share)
     turn = Pair3()
     moved = Pair3()
@@ -332,67 +351,55 @@ def move_line(rod: wp.ref[RodBend], i: int, share: real) -> Spatial:
     for k in range(places):
         x = real(k) / real(3.0)
         left = real(1.0) - x
-        moment = loads.after + (loads.after - loads.beyond) * left
-        force = times(loads.here - moment + (loads.before - loads.here) * left, quotient(one, length))
-        if i == 0:
-            force = force / wp.max(x, real(0.1))
-        loads.slope = slope_here
-        loads.offset = offset_here + times(slope_here, length * x)
-        if crowd > 1:
-            force = times(loads.here - loads.after, quotient(one, length))
-            moment = loads.after + (loads.here - loads.after) * left
-            for c in range(held):
-                steady = steady_push(rod, i, c)
-                if steady.reach[0] >= zero and steady.reach[0] < span[0]:
-                    ahead = steady.reach - length * x
-                    if ahead[0] >= zero:
-                        force = force + steady.push
-                        moment = moment + times(steady.push, ahead)
-                    else:
-                        place = quotient(steady.reach, span)
-                        add_inner(rod, i, place, steady.push, ahead, loads)
-        moment = moment + loads.outer_moment - times(loads.outer_force, length * x)
-        force = force + loads.outer_force
-        bending = packed(rod, wp.static(MOMENT_SLOPE) + k, i, beam.moment_slope[k])
-        shear = packed(rod, wp.static(FORCE_SLOPE) + k, i, beam.force_slope[k])
-        deflection = packed(rod, wp.static(FORCE_DEFLECTION) + k, i, beam.force_deflection[k])
-        slope = times(moment, bending) + times(force, shear) + loads.slope
-        offset = times(moment, shear) + times(force, deflection) + loads.offset
-        part = here.share * left + after.share * x
-        most = quotient((before.size + here.size + after.size) * half, size(slope))
-        if most[0] < part[0]:
-            part = most
-        slope = times(slope, part) - here.rest * (half * left * left) + after.rest * (half * x * x)
+        bend = Bend()
+        if rod.alone == 1:
+            bend = bend_between(rod, fixed(x), near, far + (far - beyond) * left)
+        else:
+            bend = bend_of_contacts(rod, x)
+        slope = cross(rod.turn + bend.turn, along)
+        offset = rod.offset + cross(rod.turn * x + bend.deflection, rod.along)
+        held = first * left + last * x
+        bound = quotient(most * half, size(slope))
+        if bound[0] < held[0]:
+            held = bound
+        slope = times(slope, held) - start * (half * left * left) + end * (half * x * x)
         bow = length * (half * x * left)
-        offset = times(offset, part) - times(here.rest * left + after.rest * x, bow)
+        offset = times(offset, held) - times(start * left + end * x, bow)
         turn = turn + times(slope, length) * weights[k]
         moved = moved + offset * weights[k]
     return spatial(turn[1], moved[1])
 
 
 @wp.func
-def keep_contacts(contacts: wp.ref[StepContacts], rod: wp.ref[RodBend], h: real, share_d: wp.ref[PerContact1]):
-    """Write the change of the mean force of each contact, and of its arc, for the next step."""
+def keep_contacts(contacts: wp.ref[StepContacts], rod: wp.ref[RodWalk], h: real, share_d: wp.ref[PerContact1]):
+    """Write the change of the mean forces of each contact, and of its arc, for the next step."""
     index = rod.job.index
     p = rod.parameter
     record = rod.records.step[rod.place, index]
     weight = h / (h + real(wp.static(STEADY)))
     mean_d = PerContact3()
+    steady_d = PerContact3()
     for k in range(record.taken):
         contact = rod.records.contact[rod.place, k, index]
         taper = rod.chains.taper[contact.link, rod.job.whisker]
         # As ``delassus.add_contact``: it goes on with the last that is so near.
-        before_d = vec3()
+        mean = vec3()
+        steady = vec3()
         for e in range(record.held):
             if wp.abs(rod.records.steady[rod.place, e, index].arc - contact.arc) < real(0.3) * taper.arc_length:
-                before_d = rod.tangents.steady[p, e, index]
-        change = vec3()
+                mean = rod.tangents.mean[p, e, index]
+                steady = rod.tangents.steady[p, e, index]
+        force = vec3()
         if k < record.contacts:
-            change = contact_row(contacts.change, k)
-        mean_d[k] = before_d + (change - before_d) * weight
+            force = contact_row(contacts.change, k)
+        mean = mean + (force - mean) * weight
+        mean_d[k] = mean
+        steady_d[k] = steady + (mean - steady) * weight
+    for k in range(record.taken):
+        contact = rod.records.contact[rod.place, k, index]
+        span = rod.chains.taper[contact.link, rod.job.whisker].arc_length
         span_d = rod.tangents.link[p, wp.static(ARC_LENGTH), contact.link, index] * contact.share
         arc_d = rod.tangents.link[p, wp.static(ARC), contact.link, index] + span_d
-        rod.tangents.arc[p, contact.rank, index] = arc_d + taper.arc_length * contact_row(share_d, k)
-    for k in range(record.taken):
-        rank = rod.records.contact[rod.place, k, index].rank
-        rod.tangents.steady[p, rank, index] = contact_row(mean_d, k)
+        rod.tangents.arc[p, contact.rank, index] = arc_d + span * contact_row(share_d, k)
+        rod.tangents.mean[p, contact.rank, index] = contact_row(mean_d, k)
+        rod.tangents.steady[p, contact.rank, index] = contact_row(steady_d, k)

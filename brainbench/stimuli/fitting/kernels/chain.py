@@ -27,8 +27,8 @@ from .contacts import StepContacts, contact_row, set_state
 from .records import StepRecords
 
 LENGTH, BEND, MASS, CENTRE, AXIAL, TRANSVERSE, STIFFNESS, TORSION, START_RADIUS, END_RADIUS = range(10)
-ARC, ARC_LENGTH, TRUST, MOMENT_SLOPE, FORCE_SLOPE, FORCE_DEFLECTION = 10, 11, 12, 13, 17, 21
-"""Rows of :attr:`PackedTangents.link`; of the last three each begins with that of the first of four places."""
+ARC, ARC_LENGTH, TRUST, NEAR_TURN, THERE_TURN, NEAR_DEFLECTION, THERE_DEFLECTION = 10, 11, 12, 13, 17, 21, 25
+"""Rows of :attr:`PackedTangents.link`; of the last four each begins with that of the first of four places."""
 
 PerHinge3: Any = wp.types.matrix((hinges * capacity, 3), real)
 hinge_row = reader((PerHinge3, vec3))
@@ -60,10 +60,11 @@ class PackedTangents:
     """[p, link, job]"""
     link: wp.array4d(dtype=real)
     """[p, row, link, job] length, angle at rest, mass, centre, axial and transverse inertia, stiffness, torsion, radius
-    at start and end; where contacts touch the bent rod also arc, arc length, and what ``state.BeamErrors`` holds."""
+    at start and end; where contacts touch the bent rod also arc, arc length, and what ``state.BeamCompliance`` holds."""
     if smooth:
+        mean: wp.array3d(dtype=vec3)
+        """[p, contact, job] of the mean force of each contact of the last step, of the mean of that, and of its arc."""
         steady: wp.array3d(dtype=vec3)
-        """[p, contact, job] of the mean force of each contact of the last step, and of its arc."""
         arc: wp.array3d(dtype=real)
         shorter: wp.array3d(dtype=real)
         """[p, link, job] of how much less than the chain the rod reached along itself."""

@@ -21,7 +21,7 @@ from ..motion import Instant, MotionArrays, elapsed, piece_at, pose_from, quater
 from ..parameters import hinges, module_options, real, smooth
 from ..state import PerLink1, PerLink3, PerLinkJoint, SceneArrays, WhiskerJob, row
 from ..step import load_job
-from .centre_line import RodBend, begin_rod, keep_contacts, move_line, move_rod, move_shortening
+from .centre_line import RodWalk, begin_rod, enter_link, keep_contacts, move_line, move_rod, pass_link
 from .chain import (
     AXIAL,
     BEND,
@@ -420,14 +420,14 @@ def tangent_step(
     acceleration_d = PerLinkJoint()
     point_d = PerContact3()
     share_d = PerContact1()
-    rod = RodBend()
+    rod = RodWalk()
     shorter_d = PerLink1()
     taken = contacts.count
     if wp.static(smooth):
         taken = records.step[place, index].taken
         if taken > 0:
             base = rotate(pose.quaternion, vec3(real(1.0), zero, zero))
-            begin_rod(chains, records, tangents, job, chain, base, place, rod)
+            begin_rod(chains, records, tangents, job, chain, links, base, place, rod)
     missed = PerContact3()
     there = PerContact3()
     for p in range(tangents.angle.shape[0]):
@@ -446,7 +446,6 @@ def tangent_step(
         if wp.static(smooth):
             if taken > 0:
                 move_rod(chain, links, p, pose_d.turn, rod)
-                move_shortening(rod, shorter_d)
 
         # Down the chain: fields, and the load on each link.
         for i in range(job.links):
@@ -494,6 +493,10 @@ def tangent_step(
                     reach_d = moved.at + span_d * share + span * tangents.load_share[p, load]
                     f_d = f_d - pull_d
                     m_d = m_d - wp.cross(at + span * share, pull_d) - wp.cross(reach_d, pull)
+            if wp.static(smooth):
+                if taken > 0:
+                    enter_link(rod, i)
+                    shorter_d[i] = rod.shorter[1]
             for k in range(taken):
                 if contact_row(contacts.link, k) == i:
                     contact = records.contact[place, k, index]
@@ -504,7 +507,7 @@ def tangent_step(
                     moving.base_place = pose_d.place
                     moving.fields = moved
                     if wp.static(smooth):
-                        moving.line = move_line(rod, i, contact.share)
+                        moving.line = move_line(rod, contact.share)
                         # A step that was taken again, shorter, has no slide.
                         last = tangents.last[index]
                         if contact.end_slide != zero:
@@ -517,6 +520,9 @@ def tangent_step(
                     missed[k] = changed.condition
                     if k < contacts.count:
                         m_d = m_d - wp.cross(changed.point, contact.force)
+            if wp.static(smooth):
+                if taken > 0:
+                    pass_link(rod)
             moment_d[i] = m_d
             force_d[i] = f_d
             moved.at = moved.at + span_d
