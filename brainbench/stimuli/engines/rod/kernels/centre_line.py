@@ -135,7 +135,7 @@ def enter_link(
         elif share >= real(1.0) and share < real(2.0):
             next_touched = 1
     rod.alone = 0
-    if rod.touched == 1 and next_touched == 0:
+    if rod.touched <= 1 and next_touched == 0:
         rod.alone = 1
 
 
