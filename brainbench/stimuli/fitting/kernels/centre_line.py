@@ -248,7 +248,7 @@ def enter_link(rod: wp.ref[RodWalk], i: int):
         elif share >= real(1.0) and share < real(2.0):
             next_touched = 1
     rod.alone = 0
-    if rod.touched == 1 and next_touched == 0:
+    if rod.touched <= 1 and next_touched == 0:
         rod.alone = 1
     length = packed(rod, wp.static(ARC_LENGTH), i, rod.chains.taper[i, rod.job.whisker].arc_length)
     turn = direction_at(rod, i + 1) - before

@@ -60,7 +60,7 @@ class PackedTangents:
     """[p, link, job]"""
     link: wp.array4d(dtype=real)
     """[p, row, link, job] length, angle at rest, mass, centre, axial and transverse inertia, stiffness, torsion, radius
-    at start and end; where contacts touch the bent rod also arc, arc length, and what ``state.BeamCompliance`` holds."""
+    at start and end; for the bent rod also arc, arc length, trust, and what else ``state.BeamCompliance`` holds."""
     if smooth:
         mean: wp.array3d(dtype=vec3)
         """[p, contact, job] of the mean force of each contact of the last step, of the mean of that, and of its arc."""
