@@ -11,7 +11,7 @@ from brainbench.stimuli.engines.rod.limits import LARGE_BEND, STEADY
 
 from ..algebra import Spatial, spatial, vec2, vec3, vec4
 from ..articulated_body import ChainState
-from ..centre_line import link_direction
+from ..centre_line import link_direction, place_of
 from ..delassus import PerContact1, PerContact3
 from ..delassus import row as contact_row
 from ..parameters import hinges, real
@@ -224,6 +224,7 @@ def steady_contact(rod: wp.ref[RodWalk], c: int) -> SteadyContact:
     contact.share = quotient(
         arc - packed(rod, wp.static(ARC), i, taper.arc), packed(rod, wp.static(ARC_LENGTH), i, taper.arc_length)
     )
+    contact.share[0] = place_of(contact.share[0])
     contact.push = cross(rod.along, pair3(record.push, rod.tangents.steady[rod.parameter, c, rod.job.index]))
     return contact
 

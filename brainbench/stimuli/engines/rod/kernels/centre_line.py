@@ -98,9 +98,16 @@ def begin_rod(chains: ChainArrays, job: WhiskerJob, chain: wp.ref[ChainState]) -
 
 
 @wp.func
+def place_of(share: real) -> real:
+    """Return a place along a link (0 to 1 on it); one at a joint is on the link behind it, however arcs are rounded."""
+    joint = wp.round(share)
+    return wp.where(wp.abs(share - joint) < real(1e-5), joint, share)
+
+
+@wp.func
 def contact_share(problems: ContactProblems, job: WhiskerJob, c: int, taper: LinkTaper) -> real:
     """Return where along a link (0 to 1 on it) a contact of the last step was."""
-    return (problems.held[job.index, c].arc - taper.arc) / taper.arc_length
+    return place_of((problems.held[job.index, c].arc - taper.arc) / taper.arc_length)
 
 
 @wp.func
