@@ -16,19 +16,20 @@ from benchmarks.report import publish, script_parser, table
 from brainbench.core.statistics import wilson_interval
 from brainbench.stimuli.engines import get_engine
 from brainbench.stimuli.engines.fidelity import Fidelity
-from tests.factories.contact_scenes import HARD_OBJECTS, contact_jobs, difference
+from tests.factories.contact_scenes import FLAT_OBJECTS, HARD_OBJECTS, contact_jobs, difference
 
 TRUTH = "accurate,links=50,time_step=2e-5,steps_per_period=400,contact_tolerance=1e-6"
 LINES = "links", "rod"
-KINDS = ("post", "ball", "edge", *HARD_OBJECTS)
+KINDS = ("post", "ball", "edge", *FLAT_OBJECTS, *HARD_OBJECTS)
 
 
 def main() -> None:
     parser = script_parser(__doc__)
     parser.add_argument("--seeds", default="11,12")
+    parser.add_argument("--kinds", default=",".join(KINDS))
     options = parser.parse_args()
     engine, rows = get_engine("rod"), []
-    for kind in KINDS:
+    for kind in options.kinds.split(","):
         jobs = [job for seed in options.seeds.split(",") for job in contact_jobs(int(seed), each=1, objects=(kind,))]
         truth, straight = (
             engine.run(jobs, Fidelity.parse(f"{TRUTH},contact_line={line}")) for line in ("rod", "links")

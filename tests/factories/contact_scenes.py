@@ -21,6 +21,8 @@ from brainbench.stimuli.whiskers.array import SPECIES, MountedWhisker, WhiskerAr
 
 OBJECTS = ("post", "ball", "edge", "hollow")
 """One object on one side of a whisker, which stays in contact until it retracts."""
+FLAT_OBJECTS = ("face",)
+"""A box whose face lies along the whisker where it touches, so that it lies flush and slides over the edges."""
 HARD_OBJECTS = ("opposed", "slot", "comb", "slip-off", "release")
 """Contacts from both sides (two posts, the second farther out; two bars; six posts), a post that the whisker slips past
 with its tip, and one that is pulled away from it."""
@@ -41,7 +43,7 @@ def contact_jobs(
     of the object are drawn. Read every ms. Other seeds are other scenes of the same kinds.
 
     Args:
-        objects: kinds of objects, of :data:`OBJECTS` and :data:`HARD_OBJECTS`.
+        objects: kinds of objects, of :data:`OBJECTS`, :data:`FLAT_OBJECTS` and :data:`HARD_OBJECTS`.
         hollow: another solid of the shape and size of :func:`rodgers_solid`, touched in its place.
     """
     random = np.random.default_rng(seed)
@@ -153,6 +155,9 @@ def _object(
         width = 6e-3 * size
         turn = turn @ euler_matrix((0.0, 0.0, math.pi / 4))
         return box((width, width, 0.03 * scale)), turn, np.array([-width / 2, -width / 2, 0.0])
+    if kind == "face":
+        width = 6e-3 * size
+        return box((width, width, 0.03 * scale)), turn, width / 2 * np.array([random.uniform(-0.8, 0.8), -1.0, 0.0])
     # The trough lies along the whisker: its axis z becomes the contact's −x.
     factor = 0.36 * size
     turn = euler_matrix((0.0, roll - math.pi / 2, 0.0))

@@ -21,11 +21,8 @@ SPARE = 4
 CONTACT_ROUNDS = 4
 """Times that contacts are added to a step because the others press the whisker onto them."""
 STEADY = 1.0
-"""Time (ms) over which the forces are averaged by which contacts bend the centre line between the joints. Those of one
-step would answer to the very bends that they make, and swing."""
-STEEP = 2.0, 4.0
-"""Times that a joint is softer than the one before, up to which beam theory is followed between them in full, and from
-which on not at all."""
+"""Time (ms) of both means of the forces by which contacts bend the centre line between the joints. Those of one step
+would answer to the very bends that they make, and swing."""
 LARGE_BEND = 0.4
 """Bend (rad) of a joint at which it is followed by half."""
 CLOSED = 1e-3

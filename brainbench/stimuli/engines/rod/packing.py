@@ -271,12 +271,8 @@ def pack_chains(
 
 def _pack_beams(capacity: int, chains: Sequence[Chain]) -> NDArray[np.void]:
     names = "near_turn", "there_turn", "near_deflection", "there_deflection"
-    beams = np.zeros((capacity, len(chains)), dtype=[*((name, "f8", 4) for name in names), ("trust", "f8")])
+    beams = np.zeros((capacity, len(chains)), dtype=[(name, "f8", 4) for name in names])
     for w, chain in enumerate(chains):
-        # Joints that are far softer than the one before fold before beam theory says anything.
-        steep = np.append(1.0, chain.stiffness[:-1] / chain.stiffness[1:])
-        steep[1] = 1.0
-        beams["trust"][: chain.links, w] = np.interp(steep, limits.STEEP, (1.0, 0.0))
         for name, values in zip(names, beam_compliance(chain), strict=True):
             beams[name][: chain.links, w] = values / MICRO
     return beams

@@ -220,16 +220,16 @@ def bent_link(
     beam = chains.beam[i, job.whisker]
     # Bends of the joints around, and what of their turns is rest shape.
     most = wp.length(rod.before) + wp.length(rod.near_turn) + wp.length(rod.far_turn)
-    first = linearity(rod.near_turn) * beam.trust
+    first = linearity(rod.near_turn)
     start = along - link_direction(job, chain, base, i - 1) - wp.cross(rod.near_turn, along) * first
     if i == 0:
         # The tangent at the base is given; half a turn leads from there to the first link.
         start = start * real(2.0)
     end = start
-    last = beam.trust
+    last = real(1.0)
     if i < job.links - 1:
         after = link_direction(job, chain, base, i + 1)
-        last = linearity(rod.far_turn) * chains.beam[i + 1, job.whisker].trust
+        last = linearity(rod.far_turn)
         end = after - along - wp.cross(rod.far_turn, after) * last
     line = CentreLine()
     places = int(4)

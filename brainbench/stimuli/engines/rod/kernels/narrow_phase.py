@@ -49,6 +49,8 @@ children = WIDE // group_size
 stride = 1 if children > 1 else 0
 """Child k of the node stands at stride · k among its thread's own."""
 Kept: Any = wp.types.matrix((LEVELS, children), real)
+end_part = 1e-5 if smooth else 1e-3
+"""Part of a link at its ends where a place counts as the end; a force on the rod would turn where it passes there."""
 beyond = 1e30
 none_left = 2**31 - 1
 
@@ -398,7 +400,7 @@ def touch_between(found: wp.ref[LinkDistance], nearest: vec5):
     found.gap = nearest[1]
     found.normal = vec3(nearest[2], nearest[3], nearest[4])
     found.between = 0
-    if nearest[0] > real(1e-3) and nearest[0] < real(1.0 - 1e-3):
+    if nearest[0] > real(wp.static(end_part)) and nearest[0] < real(wp.static(1.0 - end_part)):
         found.between = 1
 
 

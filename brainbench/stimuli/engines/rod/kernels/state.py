@@ -96,8 +96,6 @@ class BeamCompliance:
     there_turn: vec4
     near_deflection: vec4
     there_deflection: vec4
-    trust: real
-    """How far beam theory is followed at the joint of the link (0 to 1)."""
 
 
 @wp.struct
