@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from brainbench.core.errors import UsageError, brief, check_name, check_number
 from brainbench.core.limits import Limit, Positive, limited, read_pairs, read_value, with_changes
 from brainbench.core.tradeoffs import TradeoffPoint, cheapest
-from brainbench.stimuli.objects.obstacle import Capsule, Cylinder, Obstacle, Sphere
+from brainbench.stimuli.objects.obstacle import Box, Capsule, Cylinder, Obstacle, Sphere
 from brainbench.stimuli.whiskers.whisker import Chain, Whisker, build_chain
 
 if TYPE_CHECKING:
@@ -60,8 +60,7 @@ class Fidelity:
     """What contacts touch: the straight links, whose direction jumps at each joint, or the centre line of the bent rod,
     as beam theory tells it between the joints: with the same links many times nearer where a whisker is held between
     contacts or slides past one. The backend ``rod`` alone knows it, for objects of spheres, capsules, cylinders and
-    boxes. None: the rod in scenes of round objects alone, the links in those with a box or a mesh, on whose flat faces
-    the forces of a whisker that lies flush swing to and fro otherwise."""
+    boxes. None: the rod in scenes of these alone, the links in those with a mesh."""
     contact_tolerance: Annotated[float, Limit(least=1e-12, most=1e-3)] | None = field(
         default=None, metadata={"later": True}
     )
@@ -128,8 +127,8 @@ class Fidelity:
         if self.contact_line is not None:
             return self
         parts = [part for body in bodies for part in (body.surface, *body.parts) if part is not None]
-        rounded = bool(parts) and all(isinstance(part, Sphere | Capsule | Cylinder) for part in parts)
-        return replace(self, contact_line="rod" if rounded else "links")
+        primitive = bool(parts) and all(isinstance(part, Sphere | Capsule | Cylinder | Box) for part in parts)
+        return replace(self, contact_line="rod" if primitive else "links")
 
     def chain(self, whisker: Whisker) -> Chain:
         """Return the chain of links that stands for a whisker; errors as for :meth:`link_count`."""

@@ -36,7 +36,7 @@ from brainbench.stimuli.motion.jobs import MILLI
 
 from .algebra import JointVector, Spatial, first_axis, rotate, vec3
 from .articulated_body import ChainState, ProximityState, hinge_direction
-from .centre_line import begin_rod, bent_link, enter_link, pass_link, shortening
+from .centre_line import RodPlace, bent_link, enter_link, shortening
 from .distances import segments
 from .motion import BodyMotion, elapsed, instant, pose_at, pose_from
 from .narrow_phase import link_shape_distance
@@ -349,7 +349,7 @@ def find_candidates(
     shorter = real(0.0)
     end_slide = real(0.0)
     if wp.static(smooth):
-        rod = begin_rod(scene.chains, job, chain)
+        rod = RodPlace()
     for i in range(job.links):
         rate = row(chain.rate, i)
         joint = row(chain.node, i)
@@ -456,8 +456,6 @@ def find_candidates(
                                 if wp.static(smooth):
                                     record_line(candidates, slot, link_here, share, start_slide, end_slide)
             proximity.clearance[i] = closest
-        if wp.static(smooth):
-            pass_link(scene.chains, problems, job, chain, state.contacts, i, rod)
     judge_overlap(state, deepest, crossing, base_gap, elapsed(now))
     return count
 

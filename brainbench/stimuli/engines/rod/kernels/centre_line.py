@@ -1,15 +1,11 @@
 """Centre line of the bent rod beside a straight link of its chain, which contacts touch.
 
 A chain bends at its joints alone: a link is straight, and turns by a whole bend where a contact passes a joint. A rod
-bends all along, by M/(E I) under a moment M that is linear between joints without a contact there. The moments of the
-joints' springs, walked from the base on, tell how rod and chain part (:class:`RodPlace`). Each joint adds what lies
-next to it: contacts that lie flush over many links do not answer to each other's forces.
-
-A contact between two joints breaks that line. Where it is alone, the moments of the two joints behind it go on to it in
-a straight line, wherever along the link it is. Otherwise, and for what it does to the rod further out, its force counts
-as averaged twice: rod and contact are rigid, so a force answers at once to a change of its gap, and a gap that answered
-to the force of the last step, or to its simple mean, would swing where a link is lighter than steps are long. The rest
-shape adds its own bends, linear along the link as between two joints.
+bends all along, by M/(E I) under a moment M that is linear where nothing touches. Walked from the base on, the moments
+of the joints tell how rod and chain part (:class:`RodPlace`), by what lies next to each. Contacts on a link break that
+line. To one that is alone the moments further out go on in a straight line, wherever it is. Otherwise, and for what it
+bends further out, its force counts as averaged twice: a gap that answered to the force of the last step, or to its
+simple mean, would swing where a link is light. The rest shape adds its own bends, linear as between two joints.
 
 Where slip reverses, its speed is a small difference of large ones: the chain, which is straighter than the rod, would
 reverse some tenths of a ms too early or too late (:func:`shortening`).
@@ -83,18 +79,8 @@ class RodPlace:
     here: vec3
     """What contacts on the link add to the first of these, by their mean forces."""
     touched: wp.int32
-    """Contacts on the link; 1: there is one, and none on the next."""
+    """Contacts on the link; 1: there is at most one, and none on the next."""
     alone: wp.int32
-
-
-@wp.func
-def begin_rod(chains: ChainArrays, job: WhiskerJob, chain: wp.ref[ChainState]) -> RodPlace:
-    """Return where the rod begins: at the base, along it."""
-    rod = RodPlace()
-    rod.far = joint_moment(chains, job, chain, 0)
-    rod.far_turn = rod.far / chains.inertia[0, job.whisker].stiffness
-    rod.beyond = joint_moment(chains, job, chain, 1)
-    return rod
 
 
 @wp.func
@@ -108,42 +94,6 @@ def place_of(share: real) -> real:
 def contact_share(problems: ContactProblems, job: WhiskerJob, c: int, taper: LinkTaper) -> real:
     """Return where along a link (0 to 1 on it) a contact of the last step was."""
     return place_of((problems.held[job.index, c].arc - taper.arc) / taper.arc_length)
-
-
-@wp.func
-def enter_link(
-    chains: ChainArrays,
-    problems: ContactProblems,
-    job: WhiskerJob,
-    chain: wp.ref[ChainState],
-    contacts: int,
-    i: int,
-    rod: wp.ref[RodPlace],
-):
-    """Pass the joint at the start of link i."""
-    rod.before = rod.near_turn
-    rod.near_turn = rod.far_turn
-    rod.turn = rod.turn - rod.near_turn
-    rod.near = rod.far
-    rod.far = rod.beyond
-    rod.far_turn = vec3()
-    if i < job.links - 1:
-        rod.far_turn = rod.far / chains.inertia[i + 1, job.whisker].stiffness
-    rod.beyond = joint_moment(chains, job, chain, i + 2)
-    link = row(chain.node, i + 1) - row(chain.node, i)
-    rod.here = vec3()
-    rod.touched = 0
-    next_touched = int(0)
-    for c in range(contacts):
-        share = contact_share(problems, job, c, chains.taper[i, job.whisker])
-        if share >= real(0.0) and share < real(1.0):
-            rod.touched = rod.touched + 1
-            rod.here = rod.here + wp.cross(link, problems.held[job.index, c].steady) * share
-        elif share >= real(1.0) and share < real(2.0):
-            next_touched = 1
-    rod.alone = 0
-    if rod.touched <= 1 and next_touched == 0:
-        rod.alone = 1
 
 
 @wp.func
@@ -184,7 +134,7 @@ def bend_of_contacts(
 
 
 @wp.func
-def pass_link(
+def enter_link(
     chains: ChainArrays,
     problems: ContactProblems,
     job: WhiskerJob,
@@ -193,11 +143,36 @@ def pass_link(
     i: int,
     rod: wp.ref[RodPlace],
 ):
-    """Go on to the end of link i."""
+    """Go on from the start of the link before to that of link i, the next."""
     link = row(chain.node, i + 1) - row(chain.node, i)
-    bend = bend_of_contacts(chains, problems, job, contacts, i, link, rod, real(1.0))
-    rod.offset = rod.offset + wp.cross(rod.turn + bend.v, link)
-    rod.turn = rod.turn + bend.w
+    if i == 0:
+        rod.near = joint_moment(chains, job, chain, 0)
+        rod.far = joint_moment(chains, job, chain, 1)
+    else:
+        before = row(chain.node, i) - row(chain.node, i - 1)
+        bend = bend_of_contacts(chains, problems, job, contacts, i - 1, before, rod, real(1.0))
+        rod.offset = rod.offset + wp.cross(rod.turn + bend.v, before)
+        rod.turn = rod.turn + bend.w
+        rod.before = rod.near_turn
+        rod.near = rod.far
+        rod.far = rod.beyond
+    rod.beyond = joint_moment(chains, job, chain, i + 2)
+    rod.near_turn = rod.near / chains.inertia[i, job.whisker].stiffness
+    rod.far_turn = rod.far / chains.inertia[wp.min(i + 1, job.links - 1), job.whisker].stiffness
+    rod.turn = rod.turn - rod.near_turn
+    rod.here = vec3()
+    rod.touched = 0
+    next_touched = int(0)
+    for c in range(contacts):
+        share = contact_share(problems, job, c, chains.taper[i, job.whisker])
+        if share >= real(0.0) and share < real(1.0):
+            rod.touched = rod.touched + 1
+            rod.here = rod.here + wp.cross(link, problems.held[job.index, c].steady) * share
+        elif share >= real(1.0) and share < real(2.0):
+            next_touched = 1
+    rod.alone = 0
+    if rod.touched <= 1 and next_touched == 0:
+        rod.alone = 1
 
 
 @wp.func
