@@ -34,7 +34,7 @@ def _miss(fidelity, **how):
 
 
 @pytest.mark.parametrize(
-    ("preset", "most", "straight"), [("fast", 0.05, 0.4), ("balanced", 0.01, 0.2), ("accurate", 0.003, 0.04)]
+    ("preset", "most", "straight"), [("fast", 0.02, 0.4), ("balanced", 0.005, 0.2), ("accurate", 0.002, 0.04)]
 )
 def test_a_whisker_between_opposed_posts_is_the_elastica(preset, most, straight):
     assert _miss(preset) < most
@@ -88,7 +88,7 @@ def _slide(fidelity):
 
 
 def test_a_sliding_post_makes_no_sawtooth():
-    assert _slide("balanced") < 0.007 < 0.04 < _slide("balanced,contact_line=links")
+    assert _slide("balanced") < 0.003 < 0.04 < _slide("balanced,contact_line=links")
 
 
 def test_slip_reverses_when_that_of_many_links_does():
