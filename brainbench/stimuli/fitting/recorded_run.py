@@ -23,8 +23,9 @@ change of q, q̇ and the packed numbers θ solve the linear system ∂R/∂(a, f
 fixed a and f. How the forces were iterated plays no part; contacts keep the state that the solution has. The chain's
 part of the system is symmetric: the factorised chain solves it in O(links). The contacts' part is a dense system of
 3 × contacts. Contact points move over spheres, cylinders, faces, edges and corners by the second derivatives of the
-distance (``kernels.recording``). So one pass over the steps gives the changes of all readings, at one solution a step
-for each parameter (``kernels.tangent``). Forces of recorded steps are solved to rounding, which those of the ordinary
+distance (``kernels.recording``), and with the bent rod (``kernels.centre_line``), whose state also holds mean forces of
+contacts and its shortening. So one pass over the steps gives the changes of all readings, at one solution a step for
+each parameter (``kernels.tangent``). Forces of recorded steps are solved to rounding, which those of the ordinary
 engine are not: the theorem holds at the solution.
 
 **Memory.** Runs whose steps take at most ``ROOM`` are written down as they go. Longer ones pause after every √steps

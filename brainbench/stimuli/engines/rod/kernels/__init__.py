@@ -94,8 +94,8 @@ def build_kernels(
         hinges: hinges of a joint, 2 for bending alone or 3 for bending and twist.
         recorder: package of the kernels that write steps down (``recording``, ``records``) and solve their contact
             forces to rounding (``newton``); whiskers then pause after some steps. Not with ``sliced``.
-        features: those of ``smooth``, ``yields``, ``rolls`` and ``flows`` that a scene uses; with a ``recorder`` only the
-            first.
+        features: those of ``smooth``, ``yields``, ``rolls`` and ``flows`` that a scene uses; a ``recorder`` knows only
+            the first.
     """
     most = contacts_for(capacity)
     common = {"real": real, "capacity": capacity, "against": against, "sliced": sliced, "cuda": cuda, "hinges": hinges}
