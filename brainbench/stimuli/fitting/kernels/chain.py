@@ -20,7 +20,7 @@ from ..articulated_body import (
     joint_record,
 )
 from ..delassus import PerContact3
-from ..motion import Instant, instant, pose_from
+from ..motion import Instant, elapsed, instant, pose_from
 from ..parameters import capacity, hinges, real, smooth
 from ..state import PerLink3, PerLinkJoint, SceneArrays, Step, WhiskerJob, WhiskerState, begin_step, row
 from .contacts import StepContacts, contact_row, set_state
@@ -108,6 +108,21 @@ class Fields:
     vv: vec3
     aw: vec3
     av: vec3
+
+
+@wp.struct
+class LinkFields:
+    """Angular velocity and acceleration of each link, velocity and acceleration of its centre, and loads."""
+
+    vw: PerLink3
+    aw: PerLink3
+    vc: PerLink3
+    ac: PerLink3
+    own: PerLink3
+    """Moment of its thin part about its centre, over axial less transverse inertia."""
+    moment: PerLink3
+    """Moment and force on it and on all behind it."""
+    force: PerLink3
 
 
 @wp.struct
@@ -239,9 +254,9 @@ def restore_step(
     proximity: wp.ref[ProximityState],
     links: wp.ref[StepLinks],
     contacts: wp.ref[StepContacts],
-    on: wp.ref[Fields],
+    fields: wp.ref[LinkFields],
 ) -> StepFrame:
-    """Factorise the chain of a recorded step; find its hinges and contacts, and ``on`` the fields of its last link."""
+    """Factorise the chain of a recorded step; find its hinges and contacts, and the fields and load of each link."""
     index = job.index
     record = records.step[place, index]
     now = record.time
@@ -264,6 +279,7 @@ def restore_step(
     taken = record.contacts
     if wp.static(smooth):
         taken = record.taken
+    on = Fields()
     on.vw = pose.spin
     on.vv = pose.velocity
     on.aw = frame.step.base.w
@@ -292,10 +308,27 @@ def restore_step(
             links.vv[j] = on.vv
             links.moment[j] = wp.cross(at, hinge_row(links.axis, j))
             add_hinge(on, at, hinge_row(links.axis, j), rate[d], a[d])
+        build = scene.chains.build[i, job.whisker]
+        inertia = scene.chains.inertia[i, job.whisker]
+        span = row(chain.node, i + 1) - at
+        x = span / build.length
+        com = at + x * inertia.centre
+        vc = on.vv + wp.cross(on.vw, com)
+        ac = on.av + wp.cross(on.aw, com) + wp.cross(on.vw, vc)
+        own = x * wp.dot(x, on.aw) + wp.cross(on.vw, x) * wp.dot(x, on.vw)
+        f = ac * build.mass
+        m = wp.cross(com, f) + on.aw * inertia.transverse + own * (inertia.axial - inertia.transverse)
+        for load in range(job.first_load, job.end_load):
+            if scene.jobs.load_link[load] == i and elapsed(now) < scene.jobs.load_stop[load]:
+                pull = scene.jobs.load_force[load]
+                f = f - pull
+                m = m - wp.cross(at + span * scene.jobs.load_share[load], pull)
         for k in range(contacts.count):
             if contact_row(contacts.link, k) == i:
                 contact = records.contact[place, k, index]
                 point = contact.point
+                f = f - contact.force
+                m = m - wp.cross(point, contact.force)
                 half = pose_from(scene.motions, scene.shapes.track[contact.shape], frame.middle, pose)
                 velocity = (
                     on.vv
@@ -309,4 +342,11 @@ def restore_step(
                     velocity = velocity - wp.normalize(contact.tangent) * slide
                 contacts.point[k] = point
                 set_state(contacts, k, contact, velocity)
+        fields.vw[i] = on.vw
+        fields.aw[i] = on.aw
+        fields.vc[i] = vc
+        fields.ac[i] = ac
+        fields.own[i] = own
+        fields.force[i] = f
+        fields.moment[i] = m
     return frame

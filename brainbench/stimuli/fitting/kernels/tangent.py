@@ -33,13 +33,12 @@ from .chain import (
     STIFFNESS,
     TORSION,
     TRANSVERSE,
-    Fields,
     FieldTangents,
     HingeTangents,
+    LinkFields,
     PackedTangents,
     StepFrame,
     StepLinks,
-    add_hinge,
     hinge_row,
     hinges_of,
     move_hinge,
@@ -144,21 +143,6 @@ class OutputTangents:
     """[p, reading, 2, job] force and moment about the base point of all contacts."""
     contacts: wp.array(dtype=ContactSummary)
     """[job]"""
-
-
-@wp.struct
-class LinkFields:
-    """Angular velocity and acceleration of each link, velocity and acceleration of its centre, and loads."""
-
-    vw: PerLink3
-    aw: PerLink3
-    vc: PerLink3
-    ac: PerLink3
-    own: PerLink3
-    """Moment of its thin part about its centre, over axial less transverse inertia."""
-    moment: PerLink3
-    """Moment and force on it and on all behind it."""
-    force: PerLink3
 
 
 @wp.struct
@@ -362,8 +346,8 @@ def tangent_step(
     proximity = ProximityState()
     links = StepLinks()
     contacts = StepContacts()
-    on = Fields()
-    frame = restore_step(scene, records, job, place, chain, proximity, links, contacts, on)
+    fields = LinkFields()
+    frame = restore_step(scene, records, job, place, chain, proximity, links, contacts, fields)
     h = frame.step.length
     pose = frame.step.pose
     matrix = DenseSystem()
@@ -372,43 +356,7 @@ def tangent_step(
     summary = outputs.contacts[index]
     summarize(summary, contacts, records.step[place, index])
     lag = wp.max(h, job.beta)
-    # What the changes of all parameters share: fields of each link, and the load on and behind it.
-    fields = LinkFields()
-    on.vw = pose.spin
-    on.vv = pose.velocity
-    on.aw = frame.step.base.w
-    on.av = frame.step.base.v
-    for i in range(job.links):
-        inertia = chains.inertia[i, job.whisker]
-        at = row(chain.node, i)
-        rate = row(chain.rate, i)
-        a = records.acceleration[place, i, index]
-        for d in range(hinges_of(i)):
-            add_hinge(on, at, hinge_row(links.axis, wp.static(hinges) * i + d), rate[d], a[d])
-        x = (row(chain.node, i + 1) - at) / chains.build[i, job.whisker].length
-        com = at + x * inertia.centre
-        vc = on.vv + wp.cross(on.vw, com)
-        ac = on.av + wp.cross(on.aw, com) + wp.cross(on.vw, vc)
-        whirl = wp.cross(on.vw, x)
-        own = x * wp.dot(x, on.aw) + whirl * wp.dot(x, on.vw)
-        fields.vw[i] = on.vw
-        fields.aw[i] = on.aw
-        fields.vc[i] = vc
-        fields.ac[i] = ac
-        fields.own[i] = own
-        f = ac * chains.build[i, job.whisker].mass
-        m = wp.cross(com, f) + on.aw * inertia.transverse + own * (inertia.axial - inertia.transverse)
-        for load in range(job.first_load, job.end_load):
-            if jobs.load_link[load] == i and elapsed(frame.step.now) < jobs.load_stop[load]:
-                pull = jobs.load_force[load]
-                f = f - pull
-                m = m - wp.cross(at + (row(chain.node, i + 1) - at) * jobs.load_share[load], pull)
-        for k in range(contacts.count):
-            if contact_row(contacts.link, k) == i:
-                f = f - contact_row(contacts.force, k)
-                m = m - wp.cross(contact_row(contacts.point, k), contact_row(contacts.force, k))
-        fields.force[i] = f
-        fields.moment[i] = m
+    # Loads on each link and on all behind it.
     for back in range(1, job.links):
         i = job.links - 1 - back
         fields.force[i] = row(fields.force, i) + row(fields.force, i + 1)
