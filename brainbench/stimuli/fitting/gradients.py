@@ -130,7 +130,7 @@ def _whisker(task: JobTask, job: Job, quasistatic: bool) -> Numbers:
     numbers += [inertia["stiffness"], torsion, taper["start_radius"], taper["end_radius"]]
     if task.kind[-1]:
         beam, names = packed["beam"][:, 0], ("near_turn", "there_turn", "near_deflection", "there_deflection")
-        numbers += [taper["arc"], taper["arc_length"], beam["trust"], *np.hstack([beam[name] for name in names]).T]
+        numbers += [taper["arc"], taper["arc_length"], *np.hstack([beam[name] for name in names]).T]
     else:
         numbers += [np.zeros(chain.links)] * (LINK_ROWS - len(numbers))
     return {"link": np.stack(numbers), "beta": packed["beta"][0], "friction": packed["friction"][0]}

@@ -51,7 +51,7 @@ from brainbench.stimuli.engines.rod.slices import SceneParts, allocate, lock_of
 from brainbench.stimuli.motion.jobs import MICRO, MILLI
 from brainbench.stimuli.whiskers.whisker import Chain
 
-LINK_ROWS = 29
+LINK_ROWS = 28
 """Numbers of a link, see ``kernels.chain.PackedTangents``."""
 KERNELS = f"{__package__}.kernels"  # package that writes steps down
 ROOM = 2**26  # bytes that records of the steps of a launch may take; beyond them they are written down in parts

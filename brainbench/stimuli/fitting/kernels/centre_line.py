@@ -26,7 +26,6 @@ from .chain import (
     STIFFNESS,
     THERE_DEFLECTION,
     THERE_TURN,
-    TRUST,
     PackedTangents,
     StepLinks,
     hinge_row,
@@ -229,34 +228,6 @@ def steady_contact(rod: wp.ref[RodWalk], c: int) -> SteadyContact:
     return contact
 
 
-@wp.func
-def enter_link(rod: wp.ref[RodWalk], i: int):
-    """Pass the joint at the start of link i."""
-    build = rod.chains.build[i, rod.job.whisker]
-    before = direction_at(rod, i - 1)
-    rod.link = i
-    rod.along = times(direction_at(rod, i), packed(rod, wp.static(LENGTH), i, build.length))
-    rod.turn = rod.turn - bend_at(rod, i)
-    rod.here = Pair3()
-    rod.touched = 0
-    next_touched = int(0)
-    for c in range(rod.records.step[rod.place, rod.job.index].held):
-        contact = steady_contact(rod, c)
-        share = contact.share[0]
-        if share >= real(0.0) and share < real(1.0):
-            rod.touched = rod.touched + 1
-            rod.here = rod.here + times(contact.push, contact.share)
-        elif share >= real(1.0) and share < real(2.0):
-            next_touched = 1
-    rod.alone = 0
-    if rod.touched <= 1 and next_touched == 0:
-        rod.alone = 1
-    length = packed(rod, wp.static(ARC_LENGTH), i, rod.chains.taper[i, rod.job.whisker].arc_length)
-    turn = direction_at(rod, i + 1) - before
-    rod.shorter = rod.shorter + product(inner(turn, turn), length) / real(96.0)
-    rod.shorter = rod.shorter - inner(rod.offset, direction_at(rod, i) - before)
-
-
 @wp.struct
 class Bend:
     """Turn and deflection, as rotation of the link, from its start to a place on it."""
@@ -310,11 +281,35 @@ def bend_of_contacts(rod: wp.ref[RodWalk], x: real) -> Bend:
 
 
 @wp.func
-def pass_link(rod: wp.ref[RodWalk]):
-    """Go on to the end of the link."""
-    bend = bend_of_contacts(rod, real(1.0))
-    rod.offset = rod.offset + cross(rod.turn + bend.deflection, rod.along)
-    rod.turn = rod.turn + bend.turn
+def enter_link(rod: wp.ref[RodWalk], i: int):
+    """Go on from the start of the link before to that of link i, the next."""
+    if i > 0:
+        bend = bend_of_contacts(rod, real(1.0))
+        rod.offset = rod.offset + cross(rod.turn + bend.deflection, rod.along)
+        rod.turn = rod.turn + bend.turn
+    build = rod.chains.build[i, rod.job.whisker]
+    before = direction_at(rod, i - 1)
+    rod.link = i
+    rod.along = times(direction_at(rod, i), packed(rod, wp.static(LENGTH), i, build.length))
+    rod.turn = rod.turn - bend_at(rod, i)
+    rod.here = Pair3()
+    rod.touched = 0
+    next_touched = int(0)
+    for c in range(rod.records.step[rod.place, rod.job.index].held):
+        contact = steady_contact(rod, c)
+        share = contact.share[0]
+        if share >= real(0.0) and share < real(1.0):
+            rod.touched = rod.touched + 1
+            rod.here = rod.here + times(contact.push, contact.share)
+        elif share >= real(1.0) and share < real(2.0):
+            next_touched = 1
+    rod.alone = 0
+    if rod.touched <= 1 and next_touched == 0:
+        rod.alone = 1
+    length = packed(rod, wp.static(ARC_LENGTH), i, rod.chains.taper[i, rod.job.whisker].arc_length)
+    turn = direction_at(rod, i + 1) - before
+    rod.shorter = rod.shorter + product(inner(turn, turn), length) / real(96.0)
+    rod.shorter = rod.shorter - inner(rod.offset, direction_at(rod, i) - before)
 
 
 @wp.func
@@ -325,23 +320,21 @@ def move_line(rod: wp.ref[RodWalk], share: real) -> Spatial:
     """
     half = real(0.5)
     i = rod.link
-    whisker = rod.job.whisker
     here = bend_at(rod, i)
     after = bend_at(rod, i + 1)
     most = size(bend_at(rod, i - 1)) + size(here) + size(after)
     along = direction_at(rod, i)
-    first = product(linearity(here), packed(rod, wp.static(TRUST), i, rod.chains.beam[i, whisker].trust))
+    first = linearity(here)
     start = along - direction_at(rod, i - 1) - times(cross(here, along), first)
     if i == 0:
         start = start * real(2.0)
     end = start
-    last = packed(rod, wp.static(TRUST), i, rod.chains.beam[i, whisker].trust)
+    last = fixed(real(1.0))
     if i < rod.job.links - 1:
         onward = direction_at(rod, i + 1)
-        trust = packed(rod, wp.static(TRUST), i + 1, rod.chains.beam[i + 1, whisker].trust)
-        last = product(linearity(after), trust)
+        last = linearity(after)
         end = onward - along - times(cross(after, onward), last)
-    length = packed(rod, wp.static(LENGTH), i, rod.chains.build[i, whisker].length)
+    length = packed(rod, wp.static(LENGTH), i, rod.chains.build[i, rod.job.whisker].length)
     near = moment_at(rod, i)
     far = moment_at(rod, i + 1)
     beyond = moment_at(rod, i + 2)

@@ -27,7 +27,7 @@ from .contacts import StepContacts, contact_row, set_state
 from .records import StepRecords
 
 LENGTH, BEND, MASS, CENTRE, AXIAL, TRANSVERSE, STIFFNESS, TORSION, START_RADIUS, END_RADIUS = range(10)
-ARC, ARC_LENGTH, TRUST, NEAR_TURN, THERE_TURN, NEAR_DEFLECTION, THERE_DEFLECTION = 10, 11, 12, 13, 17, 21, 25
+ARC, ARC_LENGTH, NEAR_TURN, THERE_TURN, NEAR_DEFLECTION, THERE_DEFLECTION = 10, 11, 12, 16, 20, 24
 """Rows of :attr:`PackedTangents.link`; of the last four each begins with that of the first of four places."""
 
 PerHinge3: Any = wp.types.matrix((hinges * capacity, 3), real)
@@ -60,7 +60,7 @@ class PackedTangents:
     """[p, link, job]"""
     link: wp.array4d(dtype=real)
     """[p, row, link, job] length, angle at rest, mass, centre, axial and transverse inertia, stiffness, torsion, radius
-    at start and end; for the bent rod also arc, arc length, trust, and what else ``state.BeamCompliance`` holds."""
+    at start and end; for the bent rod also arc, arc length, and what ``state.BeamCompliance`` holds."""
     if smooth:
         mean: wp.array3d(dtype=vec3)
         """[p, contact, job] of the mean force of each contact of the last step, of the mean of that, and of its arc."""

@@ -21,7 +21,7 @@ from ..motion import Instant, MotionArrays, elapsed, piece_at, pose_from, quater
 from ..parameters import hinges, module_options, real, smooth
 from ..state import PerLink1, PerLink3, PerLinkJoint, SceneArrays, WhiskerJob, row
 from ..step import load_job
-from .centre_line import RodWalk, begin_rod, enter_link, keep_contacts, move_line, move_rod, pass_link
+from .centre_line import RodWalk, begin_rod, enter_link, keep_contacts, move_line, move_rod
 from .chain import (
     AXIAL,
     BEND,
@@ -468,9 +468,6 @@ def tangent_step(
                     missed[k] = changed.condition
                     if k < contacts.count:
                         m_d = m_d - wp.cross(changed.point, contact.force)
-            if wp.static(smooth):
-                if taken > 0:
-                    pass_link(rod)
             moment_d[i] = m_d
             force_d[i] = f_d
             moved.at = moved.at + span_d
