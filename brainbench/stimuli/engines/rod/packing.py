@@ -287,7 +287,7 @@ def beam_compliance(chain: Chain) -> NDArray[np.float64]:
     """
     nodes, compliance = chain.nodes, np.zeros((4, chain.links, 4))
     for link, k in np.ndindex(chain.links, 4):
-        start, length = nodes[link], nodes[link + 1] - nodes[link]
+        start, length = float(nodes[link]), float(nodes[link + 1] - nodes[link])
         s = start + length * k / 3
         x, weights = quadrature(start, s, chain.whisker.breaks)
         weights = weights / chain.whisker.bending_stiffness(x)

@@ -100,7 +100,7 @@ def test_slip_reverses_when_that_of_many_links_does():
         get_engine("rod").run([job], Fidelity.parse(f"{steps},links={links},contact_line={line}"), workers=1)[0]
         for links, line in ((50, "rod"), (11, "rod"), (11, "links"))
     )
-    assert difference(bent, fine) < 0.01
+    assert difference(bent, fine) < 0.02
     assert difference(straight, fine) > 0.03
 
 
