@@ -178,7 +178,8 @@ def test_the_blow_that_mujoco_cannot_follow_is_followed_by_rod_in_short_steps():
 def test_a_whisker_that_a_face_strikes_is_right_in_rod(speed, place, friction, fidelity, before):
     moving = _moving((place, -0.002, 0), (0, speed, 0), Box((0.0, 0.0, 0.0), (2e-3, 1e-3, 5e-3)))
     job = Job(C2, StillFollicle(), (replace(moving, friction=friction),), TIMES)
-    preset = Fidelity.preset(fidelity)
+    # On the bent rod whole steps err by .11, .42, .64 and .25 here.
+    preset = replace(Fidelity.preset(fidelity), contact_line="links")
     fine = replace(preset, time_step=2e-6, precision="double", contact_tolerance=1e-8)
     found, once, truth = (
         get_engine("rod", retry=retry).run([job], used)[0] for retry, used in ((5, preset), (1, preset), (1, fine))
