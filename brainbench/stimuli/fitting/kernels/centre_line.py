@@ -120,45 +120,31 @@ class RodWalk:
 
 @wp.func
 def begin_rod(
-    chains: ChainArrays, records: StepRecords, tangents: PackedTangents, job: WhiskerJob, chain: wp.ref[ChainState],
-    links: wp.ref[StepLinks], base: vec3, place: int, rod: wp.ref[RodWalk],
-):  # fmt: skip
-    """Find what bends the rod in a step."""
-    rod.chains = chains
-    rod.records = records
-    rod.tangents = tangents
-    rod.job = job
-    rod.place = place
-    rod.base = pair3(base, base)
-    for i in range(job.links):
-        rod.direction[i] = link_direction(job, chain, base, i)
-        angle = row(chain.angle, i)
-        s1 = hinge_row(links.axis, wp.static(hinges) * i)
-        rod.bend[i] = s1 * angle[0] + hinge_row(links.axis, wp.static(hinges) * i + 1) * angle[1]
-
-
-@wp.func
-def move_rod(chain: wp.ref[ChainState], links: wp.ref[StepLinks], p: int, base_turn: vec3, rod: wp.ref[RodWalk]):
-    """Find its change with a parameter, and go to the base; ``base_turn`` is the turn of the base."""
+    chain: wp.ref[ChainState], links: wp.ref[StepLinks], p: int, base: vec3, base_turn: vec3, rod: wp.ref[RodWalk]
+):
+    """Go to the base; find what bends the rod and its change with a parameter, with which the base turns."""
     rod.parameter = p
     index = rod.job.index
     turn = base_turn
-    rod.base = pair3(rod.base[0], wp.cross(turn, rod.base[0]))
+    rod.base = pair3(base, wp.cross(turn, base))
     for i in range(rod.job.links):
         rest_d = rod.tangents.link[p, wp.static(BEND), i, index]
         angle = row(chain.angle, i)
         angle_d = rod.tangents.angle[p, i, index]
         turn = turn + row(links.before, i) * rest_d
-        bend_d = vec3()
+        bend = Pair3()
         for d in range(wp.static(hinges)):
             s = hinge_row(links.axis, wp.static(hinges) * i + d)
             if d < 2:
-                bend_d = bend_d + wp.cross(turn, s) * angle[d] + s * angle_d[d]
+                bend = bend + pair3(s * angle[d], wp.cross(turn, s) * angle[d] + s * angle_d[d])
             turn = turn + s * angle_d[d]
         if wp.static(hinges == 3):
             turn = turn + row(links.behind, i) * rest_d
-        rod.direction_d[i] = wp.cross(turn, row(rod.direction, i))
-        rod.bend_d[i] = bend_d
+        along = link_direction(rod.job, chain, base, i)
+        rod.direction[i] = along
+        rod.direction_d[i] = wp.cross(turn, along)
+        rod.bend[i] = bend[0]
+        rod.bend_d[i] = bend[1]
     rod.turn = Pair3()
     rod.offset = Pair3()
     rod.shorter = vec2()
@@ -239,6 +225,9 @@ class Bend:
 @wp.func
 def compliance(rod: wp.ref[RodWalk], which: int, values: vec4, place: vec2) -> vec2:
     """Return a number of ``state.BeamCompliance`` at a place, of which four are packed from row ``which`` on."""
+    third = int(wp.round(place[0] * real(3.0)))
+    if place[0] == real(third) / real(3.0) and place[1] == real(0.0):
+        return packed(rod, which + third, rod.link, values[third])
     weights = cubic_weights(place[0])
     change = wp.dot(cubic_slopes(place[0]), values) * place[1]
     for k in range(4):
@@ -343,6 +332,8 @@ def move_line(rod: wp.ref[RodWalk], share: real) -> Spatial:
     moved = Pair3()
     places = int(4)
     for k in range(places):
+        if weights[k] == real(0.0):
+            continue
         x = real(k) / real(3.0)
         left = real(1.0) - x
         bend = Bend()

@@ -21,7 +21,7 @@ from ..motion import Instant, MotionArrays, elapsed, piece_at, pose_from, quater
 from ..parameters import hinges, module_options, real, smooth
 from ..state import PerLink1, PerLink3, PerLinkJoint, SceneArrays, WhiskerJob, row
 from ..step import load_job
-from .centre_line import RodWalk, begin_rod, enter_link, keep_contacts, move_line, move_rod
+from .centre_line import RodWalk, begin_rod, enter_link, keep_contacts, move_line
 from .chain import (
     AXIAL,
     BEND,
@@ -373,9 +373,11 @@ def tangent_step(
     taken = contacts.count
     if wp.static(smooth):
         taken = records.step[place, index].taken
-        if taken > 0:
-            base = rotate(pose.quaternion, vec3(real(1.0), zero, zero))
-            begin_rod(chains, records, tangents, job, chain, links, base, place, rod)
+        rod.chains = chains
+        rod.records = records
+        rod.tangents = tangents
+        rod.job = job
+        rod.place = place
     missed = PerContact3()
     there = PerContact3()
     for p in range(tangents.angle.shape[0]):
@@ -393,7 +395,8 @@ def tangent_step(
         moved.av = moved.av - wp.cross(pose_d.spin, pose.velocity) - wp.cross(pose.spin, pose_d.velocity)
         if wp.static(smooth):
             if taken > 0:
-                move_rod(chain, links, p, pose_d.turn, rod)
+                base = rotate(pose.quaternion, vec3(real(1.0), zero, zero))
+                begin_rod(chain, links, p, base, pose_d.turn, rod)
 
         # Down the chain: fields, and the load on each link.
         for i in range(job.links):
