@@ -202,11 +202,13 @@ def _check_contact(kind: str, friction: float) -> None:
     ("job", "links"),
     [
         (held_job(frames=30), 14),
-        # Both posts press on one link: the joints tell their forces apart by those of the last steps alone.
+        # Both posts press on one link, so that each bends the rod as its mean force does.
         (held_job(frames=30, friction=0.1), 15),
         (sliding_job(friction=0.3, frames=70), 14),
+        # It lies flush: contacts begin and end at joints and between them.
+        (touching_job(Box((11e-3, 3.2e-3, 0.3e-3), (3e-3, 1e-3, 8e-3)), friction=0.4), 8),
     ],
-    ids=["held", "held by one link", "sliding"],
+    ids=["held", "held by one link", "sliding", "flush"],
 )
 def test_contacts_on_the_bent_rod_have_the_gradients_of_central_differences(job, links):
     names = ("young_modulus", "tip_radius", "arc_length", "base.x", "base.theta", "object.x", "object.y")

@@ -12,9 +12,10 @@ from brainbench.stimuli.motion.jobs import Job, StillFollicle
 from brainbench.stimuli.objects.obstacle import Box, Capsule, ConvexPart, Cylinder, Obstacle, Sphere
 from tests.factories.contact_scenes import contact_jobs, difference
 from tests.factories.pressed_whiskers import held_job, sliding_job, turned_about_x
+from tests.factories.rod_chain import in_double
 from tests.factories.whiskers import C2
 
-pytest.importorskip("warp")
+wp = pytest.importorskip("warp")
 
 ELASTICA = np.array([-0.022566, -0.085888])
 """Force (mN) on the base of the whisker that two posts hold, by shooting: each post pushes along its normal at one arc
@@ -110,6 +111,20 @@ def test_meshes_and_other_backends_take_straight_links():
         _held("balanced,contact_line=rod", shape=ConvexPart(corners))
     with pytest.raises(UsageError, match="'mujoco' touch with straight links; leave contact_line out"):
         _held("balanced,contact_line=rod", backend="mujoco")
+
+
+def test_a_contact_at_a_joint_is_on_the_link_behind_it_however_its_arc_is_rounded():
+    place_of = in_double("centre_line").place_of
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def place(shares: wp.array(dtype=wp.float64)):
+        i = wp.tid()
+        shares[i] = place_of(shares[i])
+
+    given = [1 - 1e-12, 1 + 1e-12, -1e-12, 0.3, 1 - 1e-4]
+    shares = wp.array(given, dtype=wp.float64, device="cpu")
+    wp.launch(place, len(given), [shares], device="cpu")
+    assert shares.numpy().tolist() == [1, 1, 0, 0.3, 1 - 1e-4]
 
 
 def _struck(shape, speed, settings, times):
