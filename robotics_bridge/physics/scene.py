@@ -244,8 +244,8 @@ def _form(shape: Geometry) -> tuple[Any, ...]:
 
 def _never(model: Any) -> frozenset[tuple[int, int]]:
     """Return the pairs of links that MuJoCo excludes: named ones, parents with children, links welded together."""
-    named = ((int(signature) >> 16, int(signature) & 0xFFFF) for signature in model.exclude_signature)
-    pairs = {(min(pair), max(pair)) for pair in named}
+    excluded = ((int(signature) >> 16, int(signature) & 0xFFFF) for signature in model.exclude_signature)
+    pairs = {(min(pair), max(pair)) for pair in excluded}
     weld, parent = model.body_weldid, model.body_parentid
     filtering = not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_FILTERPARENT
     for body in range(model.nbody):

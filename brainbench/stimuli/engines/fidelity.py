@@ -60,7 +60,7 @@ class Fidelity:
     """What contacts touch: the straight links, whose direction jumps at each joint, or the centre line of the bent rod,
     as beam theory tells it between the joints: with the same links many times nearer where a whisker is held between
     contacts or slides past one. The backend ``rod`` alone knows it, for objects of spheres, capsules, cylinders and
-    boxes. None: the rod in scenes of these alone, the links in those with a mesh."""
+    boxes. None: the rod where nothing else is in reach of a whisker, the links where a mesh is."""
     contact_tolerance: Annotated[float, Limit(least=1e-12, most=1e-3)] | None = field(
         default=None, metadata={"later": True}
     )
