@@ -135,7 +135,7 @@ def test_half_the_step_is_half_where_a_blow_cuts_it_too():
     start = middle - velocity * ((radius + whisker.base_radius) / 1.5 + 2.3e-3)
     ball = PlacedObject(sphere(radius), tuple(start), motion=Translation(tuple(velocity), 0), friction=0.0).obstacle()
     job = Job(whisker, StillFollicle(), (ball,), np.arange(1, 21) * 1e-3)
-    fidelity = Fidelity(links=10, time_step=5e-4, contact_tolerance=1e-6)
+    fidelity = Fidelity(links=10, time_step=5e-4, contact_tolerance=1e-6, contact_line="links")
     half = halved_step(fidelity, whisker, job.spacing)
     asked = [fidelity, half, replace(half, contact_travel=fidelity.contact_travel), replace(half, time_step=1e-5)]
     engine = get_engine("rod", retry=1)
@@ -145,7 +145,7 @@ def test_half_the_step_is_half_where_a_blow_cuts_it_too():
         touching = trace.contact | finer.contact
         return _difference(trace.wrench, finer.wrench, touching, whisker.arc_length).max()
 
-    assert 2 * change(halved) > change(finest) > 0.015
+    assert 2 * change(halved) > change(finest) > 0.03
     assert 2 * change(uncut) < 0.01
 
 
