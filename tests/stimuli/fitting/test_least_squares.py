@@ -202,10 +202,11 @@ def test_intervals_contain_the_error_of_links_and_steps():
     scene, trial = _pole()
     trace = simulate_trial(trial)
     for seed in range(2):
-        measured = measure_wrenches(trial, trace, 0.001, np.random.default_rng(seed)).measured
+        measured = measure_wrenches(trial, trace, 0.0002, np.random.default_rng(seed)).measured
         result = fit(Trial.of_scene(scene, measured, "C2"), ["young_modulus", "object_y"], options=QUICK)
         one = result["young_modulus"]
-        assert abs(np.log(one.value / 5e9)) > 4 * one.relative_deviation
+        # The interval of noise alone (1.96 deviations) misses the truth.
+        assert abs(np.log(one.value / 5e9)) > 2 * one.relative_deviation
         for name, truth in (("young_modulus", 5e9), ("object_y", 0.0)):
             assert result[name].interval.low <= truth <= result[name].interval.high, (name, seed)
 
