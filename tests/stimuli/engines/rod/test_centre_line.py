@@ -11,6 +11,7 @@ from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.motion.jobs import Job, StillFollicle
 from brainbench.stimuli.objects.obstacle import Box, Capsule, ConvexPart, Cylinder, Obstacle, Sphere
 from tests.factories.contact_scenes import contact_jobs, difference
+from tests.factories.gradients import touching_job
 from tests.factories.pressed_whiskers import held_job, sliding_job, turned_about_x
 from tests.factories.rod_chain import in_double
 from tests.factories.whiskers import C2
@@ -142,6 +143,21 @@ def _struck(shape, speed, settings, times):
 FACE = Box((0, 0, 0), (2e-3, 1e-3, 5e-3))
 """A whisker that it strikes lies flush on its face, over one or two links, and bends around its edges."""
 WIDE = Box((0, 0, 0), (6e-3, 1e-3, 5e-3))
+
+
+@pytest.mark.parametrize(("preset", "most"), [("fast", 0.04), ("balanced", 0.02), ("accurate", 0.01)])
+@pytest.mark.parametrize("friction", [0.0, 0.4])
+def test_a_whisker_flush_on_a_face_swings_little(preset, most, friction):
+    """Forces off their course, a polynomial, root mean square, as a share of their mean: docs/whisker-accuracy.md."""
+    job = touching_job(Box((11e-3, 3.2e-3, 0.3e-3), (3e-3, 1e-3, 8e-3)), friction=friction)
+    job = dataclasses.replace(job, times=np.arange(1, 601) * 5e-5)
+    swings = []
+    for line in ("links", "rod"):
+        trace = get_engine("rod").run([job], Fidelity.parse(f"{preset},contact_line={line}"), workers=1)[0]
+        assert trace.status == "ok"
+        force, time = trace.wrench[300:, 1], np.linspace(-1, 1, 300)
+        swings.append((force - np.polyval(np.polyfit(time, force, 8), time)).std() / np.abs(force).mean())
+    assert swings[0] < swings[1] < most
 
 
 @pytest.mark.parametrize(
