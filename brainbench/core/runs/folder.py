@@ -27,7 +27,6 @@ if TYPE_CHECKING:
 
 RUN, CONFIG = "run.json", "config.json"
 RESTART = "Delete it to start anew."
-EARLIER_STATE = "resume.safetensors"  # state of a teacher before all runs had one format
 
 
 @dataclass(frozen=True)
@@ -61,8 +60,6 @@ def claim(
         write: Off in all processes but one: a folder without a run stays so.
     """
     if document.is_file():
-        if document.with_name(EARLIER_STATE).exists():
-            raise earlier_state(document.with_name(EARLIER_STATE))
         check_same(document.parent, stated(read_mapping(document)), to_plain(identity), what)
     elif write:
         document.parent.mkdir(parents=True, exist_ok=True)
@@ -72,14 +69,6 @@ def claim(
 def mark(document: Path, **values: Any) -> None:
     """Add to what a document says of its run."""
     write_json(document, {**read_mapping(document), **values})
-
-
-def earlier_state(path: Path) -> DataError:
-    """Return the error for a state of another format."""
-    return DataError(
-        f"{brief(str(path))} was saved by an earlier brainbench, and this one cannot go on from it: end the run with "
-        "that one, or delete its folder to start anew."
-    )
 
 
 def check_same(folder: Path, stated: object, identity: Mapping[str, Any], what: str = "run") -> None:
@@ -175,8 +164,6 @@ def load_state(path: str | os.PathLike[str]) -> Any:
         with safe_open(str(path), framework="pt") as file:
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
             metadata = file.metadata() or {}
-        if "tree" not in metadata and "state" in metadata:
-            raise earlier_state(Path(path))
         tree = restore(json.loads(metadata["tree"]), tensors)
     if not isinstance(tree, dict):
         raise DataError(f"{str(path)!r} is damaged or not one of ours: it holds no names and values.")

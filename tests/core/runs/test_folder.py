@@ -11,7 +11,6 @@ from safetensors.torch import save_file
 
 from brainbench.core.errors import DataError, UsageError
 from brainbench.core.runs.folder import (
-    EARLIER_STATE,
     Stop,
     begin_run,
     claim,
@@ -49,13 +48,6 @@ def test_more_can_be_said_of_a_run(tmp_path):
     _claim(tmp_path, {"seed": 0})
     mark(tmp_path / "run.json", status="finished")
     assert json.loads((tmp_path / "run.json").read_text()) == {"run": {"seed": 0}, "status": "finished"}
-
-
-def test_a_run_of_an_earlier_format_is_refused(tmp_path):
-    _claim(tmp_path, {"seed": 0})
-    (tmp_path / EARLIER_STATE).touch()
-    with pytest.raises(DataError, match=r"resume\.safetensors' was saved by an earlier brainbench"):
-        _claim(tmp_path, {"seed": 0})
 
 
 def test_a_folder_of_something_else_is_not_taken_for_a_run(tmp_path):
@@ -121,9 +113,9 @@ def test_states_that_do_not_fit_or_are_damaged_are_refused(tmp_path):
         load_state(path)
 
 
-def test_the_format_of_earlier_states_is_refused_in_one_sentence(tmp_path):
+def test_a_state_of_another_format_is_refused_in_one_sentence(tmp_path):
     save_file({"learner.weight": torch.zeros(2)}, tmp_path / "state.safetensors", {"state": json.dumps({"plain": {}})})
-    with pytest.raises(DataError, match="was saved by an earlier brainbench, and this one cannot go on from it"):
+    with pytest.raises(DataError, match=r"state\.safetensors.*Delete it to start anew"):
         load_state(tmp_path / "state.safetensors")
 
 
