@@ -18,7 +18,7 @@ import msgspec
 from brainbench.core.errors import DataError, brief, listing
 from brainbench.core.files import content_hash, to_json, to_plain
 from brainbench.core.provenance import Provenance
-from brainbench.core.reading.texts import parse_json
+from brainbench.core.reading.texts import check_values, parse_json
 from brainbench.core.reading.values import typed_values
 
 Status = Literal["ok", "unreliable", "undefined"]
@@ -148,7 +148,7 @@ class _Document:
     @classmethod
     def from_json(cls, source: str | Mapping[str, Any]) -> Self:
         """Rebuild it from :meth:`to_json` or from the mapping inside it."""
-        data = parse_json(source, "This text") if isinstance(source, str) else source
+        data = parse_json(source, "This text") if isinstance(source, str) else check_values(source, "the record")
         cls._check_version(data)
         choices = {"status": get_args(Status), "schema": (RECORD_SCHEMA,)}
         document = typed_values(cls, data, "the record", choices=choices)
@@ -485,23 +485,15 @@ def _names(kind: Any) -> tuple[str, ...]:
 
 
 def _check_rest(data: Any, built: Any, place: str) -> None:
-    """Refuse fields that a dataclass does not have, which msgspec leaves out without a word, and infinity."""
+    """Refuse fields that a dataclass does not have, which msgspec leaves out without a word."""
     if names := _names(type(built)):
         for name, value in data.items():
             if name not in names:
                 raise DataError(f"{place or 'the record'} has no field {name!r}; it has {listing(names, limit=40)}.")
-            inner = getattr(built, name)
-            kind = type(inner)
-            if inner is not None and kind not in (str, int, bool) and (kind is not float or math.isinf(inner)):
-                _check_rest(value, inner, f"{place}.{name}".lstrip("."))
-    elif isinstance(built, tuple):
-        # Most of a record are the numbers of its RDMs: none of these is looked at alone.
-        if built and (type(built[0]) is not float or math.inf in built or -math.inf in built):
-            for index, (value, inner) in enumerate(zip(data, built, strict=True)):
-                _check_rest(value, inner, f"{place}[{index}]")
-    elif isinstance(built, float):
-        if math.isinf(built):
-            raise DataError(f"{place} is {built}; expected a number or null.")
+            _check_rest(value, getattr(built, name), f"{place}.{name}".lstrip("."))
+    elif isinstance(built, tuple) and built and _names(type(built[0])):
+        for index, (value, inner) in enumerate(zip(data, built, strict=True)):
+            _check_rest(value, inner, f"{place}[{index}]")
     elif isinstance(built, Mapping) and not isinstance(built, Provenance):
         for name, inner in built.items():
             _check_rest(data[name], inner, f"{place}.{name}")

@@ -81,8 +81,8 @@ def test_a_written_record_fits_the_schema(make_record, status):
         (("baselines", "raw input"), None, "entry of baselines", "an object"),
         (("score", "colour"), "red", "score has no field 'colour'", "'ceiling'"),
         (("schema",), True, "schema version True", "version 2"),
-        (("score", "p"), float("inf"), "score.p is inf", "<= 1"),
-        (("score", "value"), float("inf"), "score.value is inf", "a number or null"),
+        (("score", "p"), float("inf"), "'score.p' in 'the record' is inf", "a finite number"),
+        (("score", "value"), float("inf"), "'score.value' in 'the record' is inf", "a finite number"),
         (("score", "subjects", 0, "units"), -1, "score.subjects[0].units is -1", ">= 0"),
     ],
 )
