@@ -32,8 +32,6 @@ ESTIMATOR_VERSION = 4
 
 _ROUNDING = 1e-6
 _LARGEST = 1e100  # largest absolute number of a score: squares and sums of such are still finite
-_ORDERS = re.compile(r"(?P<all>all )?\b(?P<number>\d[\d,]{0,18}) (?:random orders|orders|times)")
-"""Number of orders that a test took, in the words of its method."""
 
 if TYPE_CHECKING:
     Number = Share = float
@@ -513,19 +511,9 @@ def _contradiction(score: Score) -> str | None:
     for name, _, interval in score.intervals:
         if interval.low > interval.high:
             return f"{name} runs from {interval.low} down to {interval.high}"
-    return _impossible_p(score) or _out_of_range(score)
-
-
-def _impossible_p(score: Score) -> str | None:
-    """Return why a test cannot have given the stated p, or None."""
-    smallest = score.p_smallest
-    if counted := _ORDERS.search(score.p_method):
-        # The order that was observed counts among the random ones; all orders hold it.
-        number = int(counted["number"].replace(",", "")) + (counted["all"] is None)
-        smallest = max(1 / max(number, 1), 0.0 if math.isnan(smallest) else smallest)
-    if score.p <= 0 or score.p < smallest * (1 - 1e-9):
-        return f"p is {score.p} but the smallest possible is {smallest}"
-    return None
+    if score.p <= 0 or score.p < score.p_smallest * (1 - 1e-9):
+        return f"p is {score.p} but the smallest possible is {score.p_smallest}"
+    return _out_of_range(score)
 
 
 def _out_of_range(score: Score) -> str | None:

@@ -169,9 +169,10 @@ def test_a_record_is_added_known_and_confirmed_by_scoring_again(run, scored, tmp
 
 
 def _forge(path: Path) -> Path:
-    """Raise the value and give the file the name that fits it, as a careful cheat would."""
+    """Raise the value, lower its p and give the file the name that fits it, as a careful cheat would."""
     data = json.loads(path.read_text())
     data["score"]["value"] += 0.2
+    data["score"] |= {"p": 1e-6, "p_smallest": 1e-6, "p_method": "of labels, 999,999 random orders"}
     forged = path.parent / "forged" / ResultRecord.from_json(data).file_name
     forged.parent.mkdir(exist_ok=True)
     forged.write_text(json.dumps(data))
@@ -192,6 +193,7 @@ def test_an_edited_record_is_refused_and_a_renamed_forgery_does_not_repeat(run, 
     assert checked.status == 1
     assert "differs: scored again with another result" in checked.out
     assert "score.value" in checked.out
+    assert "score.p " in checked.out
     edited = shutil.copy(forged, tmp_path / path.name)
     refused = run("leaderboard", "add", str(edited), "--to", str(board))
     assert refused.status == 1
