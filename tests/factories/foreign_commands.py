@@ -20,18 +20,41 @@ import shutil
 import signal
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from functools import partial
 from importlib import import_module
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import torch
 
+from brainbench.benchmarks.opening import make, pack
+from brainbench.core.files import write_json
+from brainbench.core.identity import content_hash
+from brainbench.scoring.options import ScoreOptions
+from robotics_bridge import hands
+from robotics_bridge.deploy.links.replay import PARTS, SessionFacts, TactilePoints, taxel_names, write_lerobot
+from tests.factories.fitted_ringdown import write_ringdown
 from tests.factories.forks import fork
-from tests.factories.reading_trials import LONGEST, Outcome, numbers
+from tests.factories.hand_gallery import GALLERY
+from tests.factories.policies import export_small
+from tests.factories.reading_surfaces import GRAPH, _checkpoint, _log
+from tests.factories.reading_trials import LONGEST, Outcome, numbers, written
+from tests.factories.scored_files import write_study
 from tests.factories.structures import restructure
+from tests.factories.whisker_tracks import (
+    bent_shapes,
+    write_deeplabcut_csv,
+    write_deeplabcut_table,
+    write_measurements,
+    write_points,
+    write_whiskerman,
+    write_whiskers,
+    write_whiskiwrap,
+)
 
 FAILURES = ("traceback", "hang", "crash", "silent", "leaked", "half-written", "wordy")
 SECONDS = 60
@@ -51,9 +74,8 @@ class Door:
     """An entrance for files or words of others."""
 
     name: str
-    make: str
-    """Function of :mod:`tests.factories.foreign_goods` that writes a good input into a folder, and returns the file to
-    be changed."""
+    make: Callable[[Path], Path]
+    """Writes a good input into a folder, and returns the file to be changed."""
     words: str
     """Words of the command line, with ``{file}`` and ``{folder}``."""
 
@@ -64,7 +86,7 @@ def cases(door: Door, folder: Path, seeds: range) -> Iterator[Outcome]:
     What the first case imports is loaded for all.
     """
     (folder / "good").mkdir(parents=True)
-    good = getattr(import_module("tests.factories.foreign_goods"), door.make)(folder / "good")
+    good = door.make(folder / "good")
     root = folder / "cases"
     for seed in (None, *seeds):
         (root / "etc").mkdir(parents=True)
@@ -154,47 +176,179 @@ def _odd(out: str) -> bool:
     return any(abs(number) > LARGEST for number in numbers(value, depth=99))
 
 
+PIXEL = 5e-5
+"""m"""
+MODEL = """import torch
+
+
+class Mine(torch.nn.Module):
+    def __init__(self):
+        super().__init__()
+        self.read = torch.nn.Linear(6, 3)
+
+    def forward(self, x):
+        return self.read(x.flatten(3).mean(dim=(1, 3)))
+"""
+TASK = """from dataclasses import replace
+
+from robotics_bridge import tasks
+
+TASK = replace(tasks.load("in_palm_rotate"), name="foreign")
+
+
+@tasks.register("foreign")
+def foreign():
+    return TASK
+"""
+SCENE = """[array]
+whiskers = "C2"
+[whisking]
+kind = "track"
+path = "angles.csv"
+layout = "angles"
+whiskers = { C2 = "RC2" }
+[frames]
+first_ms = 10
+interval_ms = 10
+count = 5
+[[scene]]
+label = "played"
+"""
+
+_SHAPES = bent_shapes() / PIXEL * (1, -1)
+_SEEN = np.ones(_SHAPES.shape[:2])
+_TRACES = {(frame, 0): shape for frame, shape in enumerate(_SHAPES)}
+_FOLLICLES = dict.fromkeys(_TRACES, (0.0, 0.0))
+
+
+def _whiskerman(folder: Path) -> Path:
+    control = np.zeros((12, 3, 3))
+    control[:, :2] = _SHAPES[:, [0, 4, 9]].transpose(0, 2, 1)
+    return write_whiskerman(folder / "track.tr4", control, control[:, :, 0], np.ones(12, bool))
+
+
+def _labels(folder: Path) -> Path:
+    write_whiskers(folder / "track.whiskers", _TRACES)
+    return write_measurements(folder / "labels.csv", dict.fromkeys(_TRACES, 0), _FOLLICLES)
+
+
+def _angles(folder: Path) -> Path:
+    (folder / "scene.toml").write_text(SCENE)
+    times = 0.002 * np.arange(60)
+    table = np.column_stack([times, 90 + 20 * np.sin(50 * times), 5 * np.cos(50 * times)])
+    np.savetxt(
+        folder / "angles.csv", table, delimiter=",", header="time_s,RC2.theta_deg,RC2.phi_deg", comments="", fmt="%.6g"
+    )
+    return folder / "angles.csv"
+
+
+def _recorded(folder: Path) -> tuple[Any, Any, np.ndarray, Any]:
+    hand = hands.load(GALLERY["urdf-mimic"].write(folder, "jaws"))
+    probes = hand.layout("low", "tips")
+    place, normal = ([getattr(each, name)[each.active] for each in probes.values()] for name in ("position", "normal"))
+    links = np.repeat(list(probes), [len(each) for each in place])
+    places = TactilePoints(tuple(links.tolist()), np.concatenate(place), np.concatenate(normal))
+    closing = np.linspace(0.03, 0.0, 10)[:, None].repeat(len(hand.joints), axis=1)
+    return hand, probes, closing, places
+
+
+def _replayed(folder: Path) -> Path:
+    hand, _, closing, places = _recorded(folder)
+    names = ["time", *hand.joints, *taxel_names(places.links)]
+    table = np.c_[np.arange(10) / 50, closing, np.ones((10, len(places.links)))]
+    np.savetxt(folder / "log.csv", table, delimiter=",", header=",".join(names), comments="", fmt="%.6g")
+    return folder / "log.csv"
+
+
+def _lerobot(folder: Path) -> Path:
+    hand, _, closing, places = _recorded(folder)
+    touch = np.zeros((10, len(places.links), 6))
+    frames = dict(zip(PARTS, (closing, 0 * closing, closing, touch, np.zeros((10, 6))), strict=True))
+    facts = SessionFacts(task="close", fps=50, joints=hand.joints, points=places, robot="jaws", unit="N")
+    return write_lerobot(folder / "set", frames, facts) / "meta" / "info.json"
+
+
+def _settings(folder: Path) -> Path:
+    model = written("mine.py", MODEL)(folder)
+    return write_json(folder / "models.json", {"mine": {"target": "mine.py:Mine", "hash": content_hash(model)}})
+
+
+def _graph(folder: Path) -> Path:
+    _checkpoint(folder)
+    return write_json(folder / "graph.json", GRAPH)
+
+
+def _run_settings(folder: Path) -> Path:
+    _graph(folder)
+    encoder = {"model_config_file": "configs/rnn_fdb_converted_modern_gru.json"}
+    return write_json(folder / "config.json", {"model": {"encoder": encoder}, "train": {"ssl": "SimCLRLoss"}})
+
+
+def benchmark(folder: Path) -> Path:
+    write_study(folder)
+    options = ScoreOptions(
+        recordings=str(folder / "data"), conditions="trials:texture", stimuli=str(folder / "eight.h5"), seed=1
+    )
+    words = {"name": "lab", "citation": "Doe J., A Journal 1:2 (2026)", "doi": "10.1/2"}
+    (folder / "lab.toml").write_text(make(options, folder / "lab.toml", **words).to_toml())
+    return folder / "lab.toml"
+
+
+def _packed(folder: Path) -> Path:
+    pack(benchmark(folder), folder / "lab.zip")
+    return folder / "lab.zip"
+
+
 _FIT = "stimuli fit {file} --most-iterations 1 --links 4 --steps-per-period 20 --json"
 _TRACK = f"{_FIT} --whisker mouse:C2 --metres-per-pixel 5e-5 --frame-rate 500"
 _REPLAY = "tactile replay {folder}/set --hand {folder}/jaws.urdf --json"
 _IMPORT = "--out {folder}/imported --json"
 
 DOORS = (
-    Door("contract", "contract", "policy deploy {stem} --seconds 0.05 --input command=0 --json"),
-    Door("calibration log", "log", "tactile calibrate {file} --out {folder}/preset.json --json"),
-    Door("fit table", "wrenches", f"{_FIT} --whisker mouse:C2 --parameters young_modulus"),
-    Door("track, points", "points", _TRACK),
-    Door("track, DeepLabCut", "deeplabcut", _TRACK),
-    Door("track, DeepLabCut HDF5", "deeplabcut_hdf5", _TRACK),
-    Door("track, whisk", "whisk", _TRACK),
     Door(
-        "track, whisk's measurements", "whisk_labels",
+        "contract", lambda folder: export_small(folder).with_name("policy.onnx.json"),
+        "policy deploy {stem} --seconds 0.05 --input command=0 --json",
+    ),
+    Door("calibration log", _log, "tactile calibrate {file} --out {folder}/preset.json --json"),
+    Door(
+        "fit table", lambda folder: write_ringdown(folder / "ringdown.csv"),
+        f"{_FIT} --whisker mouse:C2 --parameters young_modulus",
+    ),
+    Door("track, points", lambda folder: write_points(folder / "track.csv", bent_shapes()), _TRACK),
+    Door("track, DeepLabCut", lambda folder: write_deeplabcut_csv(folder / "track.csv", _SHAPES, _SEEN), _TRACK),
+    Door("track, DeepLabCut HDF5", lambda folder: write_deeplabcut_table(folder / "track.h5", _SHAPES, _SEEN), _TRACK),
+    Door("track, whisk", lambda folder: write_whiskers(folder / "track.whiskers", _TRACES), _TRACK),
+    Door(
+        "track, whisk's measurements", _labels,
         f"{_TRACK} --track 0 --identities {{file}}".replace("{file}", "{folder}/track.whiskers", 1),
     ),
-    Door("track, WhiskiWrap", "whiskiwrap", _TRACK),
-    Door("track, WhiskerMan", "whiskerman", f"{_TRACK} --track 1"),
-    Door("track, angles", "angles", "stimuli show {folder}/scene.toml --json"),
-    Door("episode, table", "replayed", "tactile replay {file} --hand {folder}/jaws.urdf --json"),
-    Door("episode, LeRobot", "lerobot", _REPLAY),
-    Door("episode, places", "lerobot_places", _REPLAY),
-    Door("episode, frames", "lerobot_frames", _REPLAY),
-    Door("models add, file", "model", "models add {file}:Mine --name mine --json"),
-    Door("models add, settings", "settings", "models show mine --json"),
-    Door("models import", "checkpoint", f"models import {{file}} --architecture zhuang-gru-small {_IMPORT}"),
+    Door("track, WhiskiWrap", lambda folder: write_whiskiwrap(folder / "track.h5", _TRACES, _FOLLICLES), _TRACK),
+    Door("track, WhiskerMan", _whiskerman, f"{_TRACK} --track 1"),
+    Door("track, angles", _angles, "stimuli show {folder}/scene.toml --json"),
+    Door("episode, table", _replayed, "tactile replay {file} --hand {folder}/jaws.urdf --json"),
+    Door("episode, LeRobot", _lerobot, _REPLAY),
+    Door("episode, places", lambda folder: _lerobot(folder).with_name("tactile.json"), _REPLAY),
     Door(
-        "models import, graph", "graph",
+        "episode, frames", lambda folder: _lerobot(folder).parents[1] / "data" / "chunk-000" / "file-000.parquet",
+        _REPLAY,
+    ),
+    Door("models add, file", written("mine.py", MODEL), "models add {file}:Mine --name mine --json"),
+    Door("models add, settings", _settings, "models show mine --json"),
+    Door("models import", _checkpoint, f"models import {{file}} --architecture zhuang-gru-small {_IMPORT}"),
+    Door(
+        "models import, graph", _graph,
         f"models import {{folder}}/best.ckpt --architecture zhuang-gru-small --config {{file}} {_IMPORT}",
     ),
     Door(
-        "models import, settings", "run_settings",
+        "models import, settings", _run_settings,
         f"models import {{folder}}/best.ckpt --architecture zhuang-gru-small --config {{file}} {_IMPORT}",
     ),
     Door(
-        "task file", "task",
+        "task file", written("task.py", TASK),
         "policy evaluate foreign --task-file {file} --envs 1 --episodes 1 --seeds 1 --change episode=0.2 --json",
     ),
-    Door("benchmark", "benchmark", "benchmark check {file} --json"),
-    Door("benchmark, packed", "packed", "benchmark check {file} --json"),
+    Door("benchmark", benchmark, "benchmark check {file} --json"),
+    Door("benchmark, packed", _packed, "benchmark check {file} --json"),
 )  # fmt: skip
 
 

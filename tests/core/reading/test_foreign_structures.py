@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from tests.factories.foreign_commands import DOORS, FAILURES, Door, cases
-from tests.factories.reading_surfaces import SURFACES
+from tests.factories.reading_surfaces import SURFACES, _log
 from tests.factories.reading_trials import attempt
 from tests.factories.structures import restructure
 
@@ -55,7 +55,7 @@ def test_each_kind_of_failure_is_seen(tmp_path, monkeypatch):
     def verdict(work):
         monkeypatch.setattr("brainbench.cli.main", lambda: sys.stdout.write(json.dumps(work(Path(sys.argv[1])))))
         with tempfile.TemporaryDirectory(dir=tmp_path) as folder:
-            (only,) = cases(Door("tried", "log", "{file}"), Path(folder), range(0))
+            (only,) = cases(Door("tried", _log, "{file}"), Path(folder), range(0))
         return only.kind
 
     assert verdict(lambda path: 1.0) == "accepted"
