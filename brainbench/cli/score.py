@@ -144,16 +144,11 @@ def _notes(record: ResultRecord, others: Mapping[str, Score | None]) -> Iterator
 
 
 def left_out(recordings: Mapping[str, Any]) -> Iterator[str]:
-    """Yield what was not used of recordings, by their provenance: one line of their balance, or of an older record."""
-    if ledger := recordings.get("ledger"):
-        from brainbench.datasets.ledger import balance_line
+    """Yield what was not used of recordings in one line, by the balance in their provenance."""
+    from brainbench.datasets.ledger import balance_line
 
-        yield from (f"Left out: {line}." for line in (balance_line(ledger),) if line)
-        return
-    removed = recordings.get("removed") or {}
-    if removals := [f"{rule} ({number:,})" for rule, number in removed.items() if number]:
-        yield f"Left out: {'; '.join(removals)}."
-    yield from (f"Skipped: {reason}" for reason in recordings.get("skipped") or ())
+    if line := balance_line(recordings.get("ledger") or {}):
+        yield f"Left out: {line}."
 
 
 def walk_text(steps: list[dict[str, Any]]) -> str:

@@ -8,7 +8,6 @@ are not stored.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise, permutations
@@ -141,6 +140,10 @@ def open_published(path: Path, **options: object) -> xr.Dataset:
     parts = [_session_counts(item, path) for item in sessions]
     dataset = join_sessions(parts, reading, source=str(path), layout=LAYOUT.name, notes=list(LAYOUT.remarks[1:]))
     total, animals = sum(len(item.slots) for item in sessions), len({item.subject for item in sessions})
+    whole = Ledger()
+    for part in parts:
+        whole.add(part.ledger)
+    dataset.attrs["ledger"] = whole.stated()
     dataset.attrs["label_doubt"] = (
         f"labels cannot be trusted: every session of {path.name} numbers its stimuli by their first appearance and "
         "their names are not stored, so slots taken as stimuli in the file's order are a guess (recovered: the slot of "
@@ -152,7 +155,9 @@ def open_published(path: Path, **options: object) -> xr.Dataset:
 def _session_counts(session: ZeroFilledSession, path: Path) -> SessionCounts:
     recorded = np.flatnonzero(session.slots >= 0)
     labels = tuple(SLOTS[slot] for slot in session.slots[recorded].tolist())
-    ledger = Ledger(totals=Counter(trials=len(session.slots), units=session.units))
+    ledger = Ledger()
+    ledger.find("trials", len(session.slots), len(recorded))
+    ledger.find("units", session.units, session.units)
     ledger.leave("trials", SILENT, len(session.slots) - len(recorded))
     return SessionCounts(
         subject=session.subject,

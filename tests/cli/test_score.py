@@ -10,6 +10,7 @@ import pytest
 from brainbench.cli.score import left_out, score_text
 from brainbench.core.records import Interval, ModelCard, ResultRecord
 from brainbench.core.statistics import compare_scores
+from brainbench.datasets.ledger import Ledger
 from brainbench.models.features import write_features
 from tests.factories.records import draw_board, make_record, make_score
 
@@ -55,9 +56,12 @@ def test_an_interval_past_what_can_exist_is_cut_and_noted():
 
 
 def test_what_was_not_used_is_told():
-    told = "\n".join(left_out({"removed": {"trials: outside the recorded span": 1, "units: no spikes": 0}}))
-    assert "outside the recorded span (1)" in told
-    assert "no spikes" not in told
+    ledger = Ledger()
+    ledger.find("trials", 5, 4)
+    ledger.leave("trials", "outside the recorded span")
+    ledger.leave("units", "no spikes", 0)
+    assert [*left_out({"ledger": ledger.stated()})] == ["Left out: 1 of 5 trials: outside the recorded span."]
+    assert not [*left_out({})]
 
 
 def test_a_title_of_the_user_replaces_the_name_of_the_file(run, files):

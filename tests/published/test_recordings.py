@@ -7,6 +7,7 @@ import pytest
 
 from brainbench.core.errors import DataError, UsageError
 from brainbench.datasets import check, inspect, open_recordings
+from brainbench.datasets.ledger import balance_line
 from brainbench.published.recordings import SILENT, read_published
 from tests.factories.published_files import make_zero_filled, write_published
 
@@ -71,6 +72,7 @@ def test_zeros_of_other_slots_are_missing_and_silent_trials_are_counted(tmp_path
     dataset = open_recordings(write_published(tmp_path / "a.npz", m1=array))
     kept = np.delete(np.arange(24), 5)
     assert dataset.attrs["removed"] == {f"trials: {SILENT}": 1}
+    assert balance_line(dataset.attrs["ledger"]) == f"1 of 24 trials: {SILENT}"
     assert dataset["stimulus"].values.tolist() == [f"slot-{slot + 1}" for slot in slots[0][kept]]
     np.testing.assert_allclose(dataset["counts"].values[:, 0], array[kept, slots[0][kept]], rtol=1e-6)
 
