@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from brainbench.core.errors import MissingDependencyError, UsageError, brief
+from brainbench.core.errors import UsageError, brief
 from brainbench.core.files import cache_dir, check_folder, user_folder
 from brainbench.core.reading.regular import temporary_folder
 
@@ -34,12 +34,8 @@ def warp() -> Any:
 
 @cache
 def _start() -> Any:
-    try:
-        import warp as wp
-    except ImportError as error:
-        raise MissingDependencyError(
-            "Whisker and tactile simulation need warp-lang; install it with: pip install 'warp-lang>=1.19'"
-        ) from error
+    import warp as wp
+
     # Only errors: a user need not hear which devices there are, nor that kernels were compiled.
     wp.config.log_level = wp.LOG_ERROR
     wp.config.enable_backward = False
