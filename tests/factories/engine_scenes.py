@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from brainbench.stimuli.motion.trajectories import Still, Translation
+from brainbench.stimuli.motion.trajectories import Still, Translation, smooth_step
 from brainbench.stimuli.objects.obstacle import Capsule, Obstacle
 from brainbench.stimuli.objects.solid import PlacedObject, capsule
 from brainbench.stimuli.scenes.scene import Frames, Head, Scene
@@ -37,8 +37,7 @@ class Swing(_Motion):
     duration: float = 0.04
 
     def pose(self, times):
-        u = np.clip(times / self.duration, 0, 1)[:, None]
-        ramp = u**3 * (10 - 15 * u + 6 * u**2)
+        ramp = smooth_step(times, self.duration)[:, None]
         return ramp * np.array(self.shift), ramp * np.array(self.angles) + np.array(self.rest)
 
 

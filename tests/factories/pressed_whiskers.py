@@ -6,22 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from brainbench.stimuli import WhiskerArray
 from brainbench.stimuli.motion.jobs import Job, StillFollicle
+from brainbench.stimuli.motion.trajectories import smooth_step
 from brainbench.stimuli.objects.obstacle import Capsule, Obstacle, Part
 
 STRAIGHT = replace(WhiskerArray.of("rat")["C2"].whisker, curvature=0.0, friction=0.0)
-
-
-def _risen(share: NDArray[np.float64]) -> NDArray[np.float64]:
-    return share**3 * (10 - 15 * share + 6 * share**2)
-
-
-def turned_about_x(angle: float) -> NDArray[np.float64]:
-    """Return the rotation matrix [3, 3]."""
-    c, s = np.cos(angle), np.sin(angle)
-    return np.array([[1, 0, 0], [0, c, -s], [0, s, c]])
 
 
 def held_job(
@@ -40,15 +32,12 @@ def held_job(
 
     def post(side: int) -> Obstacle:
         def motion(times: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-            angle = turn * _risen(np.clip(np.asarray(times, float) / 0.04, 0, 1))
+            angle = turn * smooth_step(times, 0.04)
             x, y = side * apart / 2, -side * away
             place = np.stack([middle + np.cos(angle) * x - np.sin(angle) * y, np.sin(angle) * x + np.cos(angle) * y])
-            w, z = np.cos(angle / 2), np.sin(angle / 2)
-            half_c, half_s = np.cos(about_x / 2), np.sin(about_x / 2)
-            return (
-                np.pad(place.T, ((0, 0), (0, 1))) @ turned_about_x(about_x).T,
-                np.stack([half_c * w, half_s * w, -half_s * z, half_c * z], axis=-1),
-            )
+            tilt = Rotation.from_rotvec([about_x, 0, 0])
+            turned = (tilt * Rotation.from_rotvec(np.outer(angle, [0, 0, 1]))).as_quat()
+            return tilt.apply(np.pad(place.T, ((0, 0), (0, 1)))), np.roll(turned, 1, axis=-1)
 
         motion.finest = 0.04  # type: ignore[attr-defined]
         return Obstacle((shape or Capsule((0, 0, -4e-3), (0, 0, 4e-3), radius),), motion, friction)
@@ -62,7 +51,7 @@ def sliding_job(*, friction: float = 0.0, frames: int = 460) -> Job:
 
     def motion(times: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         times = np.asarray(times, float)
-        risen = _risen(np.clip(times / 0.06, 0, 1))
+        risen = smooth_step(times, 0.06)
         x = (0.45 + 0.3 * np.clip((times - 0.06) / 0.4, 0, 1)) * length
         low = -(radius + STRAIGHT.base_radius + 1e-4)
         return np.stack([x, low * (1 - risen) + 0.1 * length * risen, 0 * x], -1), np.tile([1.0, 0, 0, 0], (len(x), 1))

@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 
 from brainbench.core.errors import UsageError
+from brainbench.core.rotations import euler_matrix
 from brainbench.stimuli.engines import get_engine
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.motion.jobs import Job, StillFollicle
 from brainbench.stimuli.objects.obstacle import Box, Capsule, ConvexPart, Cylinder, Obstacle, Sphere
 from tests.factories.contact_scenes import contact_jobs, difference
 from tests.factories.gradients import touching_job
-from tests.factories.pressed_whiskers import held_job, sliding_job, turned_about_x
+from tests.factories.pressed_whiskers import held_job, sliding_job
 from tests.factories.rod_chain import in_double
 from tests.factories.whiskers import C2
 
@@ -28,7 +29,7 @@ def _held(fidelity, *, backend="rod", about_x=0.0, **how):
     job = held_job(about_x=about_x, **how)
     trace = get_engine(backend).run([job], Fidelity.parse(fidelity), workers=1)[0]
     assert trace.status == "ok"
-    return trace.wrench[-1, :3] @ turned_about_x(about_x) * 1e3
+    return trace.wrench[-1, :3] @ euler_matrix((about_x, 0.0, 0.0)) * 1e3
 
 
 def _miss(fidelity, **how):
