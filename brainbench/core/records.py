@@ -37,14 +37,14 @@ if TYPE_CHECKING:
     Number = Share = float
     Count = int
 else:
-    # JSON has no NaN: a number without value is written as null, and read back as NaN (_NullIsNaN).
+    # JSON has no NaN: a number without value is written as null, and read back as NaN (NullIsNaN).
     Number = float | None
     Share = Annotated[float, msgspec.Meta(ge=0, le=1)] | None
     Count = Annotated[int, msgspec.Meta(ge=0)]
 
 
-class _NullIsNaN:
-    """Base of the dataclasses here that hold numbers."""
+class NullIsNaN:
+    """Base of dataclasses that hold numbers and are read from JSON."""
 
     def __post_init__(self) -> None:
         for name, alone in _numbers(type(self)):
@@ -63,7 +63,7 @@ def _numbers(kind: Any) -> list[tuple[str, bool]]:
 
 
 @dataclass(frozen=True)
-class Interval(_NullIsNaN):
+class Interval(NullIsNaN):
     """A confidence interval with the method that made it."""
 
     low: Number
@@ -92,7 +92,7 @@ def spanned(value: float, interval: Interval | None = None, *, most: float = mat
 
 
 @dataclass(frozen=True)
-class Ceiling(_NullIsNaN):
+class Ceiling(NullIsNaN):
     """Noise ceiling of the raw (uncorrected) comparison: what a perfect model could reach."""
 
     lower: Number
@@ -103,7 +103,7 @@ class Ceiling(_NullIsNaN):
 
 
 @dataclass(frozen=True)
-class SubjectScore(_NullIsNaN):
+class SubjectScore(NullIsNaN):
     """One animal's part of a score."""
 
     subject: str
@@ -123,7 +123,7 @@ class SubjectScore(_NullIsNaN):
 
 
 @dataclass(frozen=True)
-class LayerScore(_NullIsNaN):
+class LayerScore(NullIsNaN):
     """One layer compared with every animal; shown for reading, never picked from."""
 
     layer: str
@@ -173,7 +173,7 @@ else:
 
 
 @dataclass(frozen=True)
-class Score(_NullIsNaN, _Document):
+class Score(NullIsNaN, _Document):
     """One model's match to one set of recordings, with its statistics.
 
     Everything printed or published comes from this object. ``value`` is NaN exactly when

@@ -10,11 +10,10 @@ value, chance and what is attainable need no p. Letters: A animal, C candidate, 
 from __future__ import annotations
 
 import copy
-import math
 import os
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from itertools import combinations, product
 from pathlib import Path
@@ -28,8 +27,8 @@ from brainbench.core.figures import INK, PALE, check_format, new_figure, save_fi
 from brainbench.core.files import content_hash, read_json, to_plain, write_json
 from brainbench.core.limits import Count, Limit, Seed, limited
 from brainbench.core.progress import Progress, track
-from brainbench.core.reading.regular import readable
-from brainbench.core.records import Interval, Score
+from brainbench.core.reading.values import typed_values
+from brainbench.core.records import Interval, NullIsNaN, Number, Score
 from brainbench.core.runs.folder import begin_run
 from brainbench.core.runs.jobs import run_jobs
 from brainbench.core.statistics import FEWEST_ANIMALS, FEWEST_STIMULI, compare_scores, wilson_interval
@@ -332,7 +331,7 @@ LEVEL = 0.05  # false discovery rate over all pairs of a board
 
 
 @dataclass(frozen=True)
-class RecoveryBoard:
+class RecoveryBoard(NullIsNaN):
     """Result of one board that a recovery keeps."""
 
     true: int
@@ -340,25 +339,12 @@ class RecoveryBoard:
     number: int
     layer: str
     """Layer whose units they mix."""
-    scaled: tuple[float, ...]
+    scaled: tuple[Number, ...]
     """[C] scores between chance (0) and all that is reliable (1)."""
     verdicts: tuple[int, ...]
     """[C] 1 where the true candidate is told apart above this one, −1 below, 0 where they tie."""
-    reliability: float
+    reliability: Number
     """Mean split-half reliability of the animals."""
-
-    @classmethod
-    def of(cls, data: Mapping[str, Any]) -> RecoveryBoard:
-        """Rebuild a board from its JSON, where a missing number is null."""
-        scaled = tuple(math.nan if value is None else float(value) for value in data["scaled"])
-        reliability = math.nan if data["reliability"] is None else float(data["reliability"])
-        return cls(data["true"], data["number"], data["layer"], scaled, tuple(data["told"]), reliability)
-
-    @property
-    def stored(self) -> dict[str, Any]:
-        """The board as files hold it: :meth:`of` reads it."""
-        values = {item.name: getattr(self, item.name) for item in fields(self)}
-        return {("told" if name == "verdicts" else name): value for name, value in values.items()}
 
     @property
     def first(self) -> int | None:
@@ -478,8 +464,9 @@ def recover(
         begin_run(folder, config, "recovery", results="boards-*.json")
         for job in jobs:
             if (folder / job.file).is_file():
-                with readable(folder / job.file, "part of a recovery", "Delete it to make it again."):
-                    stored = [RecoveryBoard.of(item) for item in read_json(folder / job.file)]
+                stated = read_json(folder / job.file, "part of a recovery")
+                name = repr(str(folder / job.file))
+                stored = typed_values(list[RecoveryBoard], stated, name, advice=" Delete it to make it again.")
                 if [item.number for item in stored] == list(job.numbers):
                     results[job] = stored
     missing = [job for job in jobs if job not in results]
@@ -491,7 +478,7 @@ def recover(
         results[job] = finished
         done += len(finished)
         if folder is not None:
-            write_json(folder / job.file, to_plain([board.stored for board in finished]))
+            write_json(folder / job.file, to_plain(finished))
         if progress is not None:
             progress(done, total, "scoring boards")
     every = sorted((board for job in jobs for board in results[job]), key=lambda board: (board.true, board.number))

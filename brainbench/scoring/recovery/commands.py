@@ -197,7 +197,10 @@ def _facts(recovery: Recovery, want: float | None) -> dict[str, Any]:
         "interval": recovery.wins(),
         "made": recovery.counts,
         "told_apart": recovery.won,
-        "boards": [board.stored for board in recovery.boards],
+        "boards": [
+            {("told" if name == "verdicts" else name): value for name, value in vars(board).items()}
+            for board in recovery.boards
+        ],
         "intervals": {name: recovery.wins(place) for place, name in enumerate(recovery.names)},
         "hardest": recovery.hardest(10),
     }

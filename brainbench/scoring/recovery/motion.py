@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.contracts import GRID_SHAPE
+from brainbench.core.contracts import GRID_SHAPE, SUB_STEPS
 from brainbench.core.errors import DataError, UsageError, check_number
 from brainbench.core.plugins import OptionalPart
 from brainbench.core.records import Interval, Status
@@ -35,7 +35,6 @@ from brainbench.stimuli.engines import get_engine
 from brainbench.stimuli.engines.fidelity import DEFAULT_ENGINE, Fidelity
 
 Array = NDArray[np.float64]
-SUBSTEPS = 5  # frames of a time step of the input, as in to_grid
 FINER = 5  # divisor of the time step for a gradient of whiskers that cannot be trusted
 BOARDS = 10  # boards of each network on which motions are compared
 
@@ -294,4 +293,4 @@ class _Evaluator:
         cells = torch.tensor([mount.row * GRID_SHAPE[1] + mount.col for mount in scene.mounts])
         grid = torch.zeros(count, frames.count, 6, GRID_SHAPE[0] * GRID_SHAPE[1], dtype=wrench.dtype)
         grid = grid.index_copy(3, cells, means.flatten(3).permute(0, 2, 3, 1))
-        return grid.reshape(count, frames.count // SUBSTEPS, SUBSTEPS * 6, *GRID_SHAPE)
+        return grid.reshape(count, frames.count // SUB_STEPS, SUB_STEPS * 6, *GRID_SHAPE)

@@ -6,7 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from brainbench.core.errors import UsageError
+from brainbench.core.errors import DataError, UsageError
+from brainbench.core.files import to_plain
+from brainbench.core.reading.values import typed_values
 from brainbench.metrics import get_metric, rdm
 from brainbench.models.features import write_features
 from brainbench.scoring.options import ScoreOptions
@@ -110,7 +112,14 @@ def test_a_board_is_the_same_again_and_others_differ():
     once = make_board(candidates, DESIGN, 0, 4)
     assert make_board(make_candidates(), DESIGN, 0, 4) == once
     assert make_board(candidates, DESIGN, 0, 5).scaled != once.scaled
-    assert RecoveryBoard.of({**once.stored, "scaled": [None, *once.scaled[1:]]}).scaled[1:] == once.scaled[1:]
+
+
+def test_a_score_that_a_board_lacks_is_null_in_its_file():
+    board = RecoveryBoard(0, 4, "x", (math.nan, 0.5), (0, 1), math.nan)
+    stored = to_plain(board)
+    assert stored["scaled"] == [None, 0.5]
+    assert stored["reliability"] is None
+    assert repr(typed_values(RecoveryBoard, stored, "a board")) == repr(board)
 
 
 def test_some_of_the_stimuli_are_drawn_anew_for_each_board():
@@ -160,6 +169,9 @@ def test_an_interrupted_recovery_goes_on(tmp_path, monkeypatch):
     assert again == whole
     assert made == [(1, 0)]
     assert told == [(3, 3, "scoring boards")]
+    (tmp_path / "boards-001-00000.json").write_text('[{"true": 1}]')
+    with pytest.raises(DataError, match=r"lacks 'number'\. Delete it to make it again"):
+        recover(candidates, DESIGN, boards=1, workers=1, folder=tmp_path)
 
 
 def test_a_folder_of_another_recovery_is_refused(tmp_path):
