@@ -67,7 +67,7 @@ def level(interval: Interval) -> str:
 
 
 def group_rows(statistics: Mapping[str, Any]) -> dict[str, Any] | None:
-    """Return what a page shows of the board of groups of units; None without a usable one."""
+    """Return what is shown of the board of groups of units; None without a usable one."""
     try:
         board = statistics["groups"]
         rows = []
@@ -77,6 +77,7 @@ def group_rows(statistics: Mapping[str, Any]) -> dict[str, Any] | None:
                 {
                     **{name: str(group[name] or "") for name in ("group", "status", "rank", "layer")},
                     **{name: int(group[name]) for name in ("units", "animals")},
+                    "reasons": [*map(str, group["reasons"])],
                     "scaled": math.nan if scaled is None else float(scaled),
                     "p": math.nan if p is None else float(p),
                     "interval": Interval(float(ends["low"]), float(ends["high"])) if ends else None,

@@ -16,7 +16,7 @@ from brainbench.cli.options import SCORE, SCORE_FLAGS, out_folder_option, report
 from brainbench.cli.output import Output, progress_bar, table, table_of
 from brainbench.core.errors import UsageError
 from brainbench.core.identity import plan_note
-from brainbench.core.records import Interval, ResultRecord, Score, spanned
+from brainbench.core.records import ResultRecord, Score, spanned
 
 if TYPE_CHECKING:
     from brainbench.scoring.options import ScoreOptions
@@ -164,10 +164,12 @@ def walk_text(steps: list[dict[str, Any]]) -> str:
 
 def _details(statistics: Mapping[str, Any]) -> list[str]:
     """Lay out what single metrics and options add: accuracies by property, shares of variance, times."""
+    from leaderboards.text import group_rows
+
     parts = []
     if course := statistics.get("time_course"):
         parts.append(_over_time(course))
-    if board := statistics.get("groups"):
+    if board := group_rows(statistics):
         parts.append(_groups(board))
     if accuracies := statistics.get("decoding"):
         columns = {
@@ -189,17 +191,10 @@ def _details(statistics: Mapping[str, Any]) -> list[str]:
 
 def _groups(board: Mapping[str, Any]) -> str:
     """Lay out the scores of groups of units, and which is told apart."""
-
-    def scaled(row: Mapping[str, Any]) -> str:
-        value, interval = row["scaled"], row["interval"]
-        return spanned(
-            math.nan if value is None else value, Interval(interval["low"], interval["high"]) if interval else None
-        )
-
     columns = {
         "group": "{0[group]}",
-        ">score": scaled,
-        ">p": lambda row: "–" if row["p_corrected"] is None else f"{row['p_corrected']:.2g}",
+        ">score": lambda row: spanned(row["scaled"], row["interval"]),
+        ">p": lambda row: _p(row["p"]),
         "rank": "{0[rank]}",
         ">units": "{0[units]:,}",
         ">animals": "{0[animals]}",
@@ -207,7 +202,7 @@ def _groups(board: Mapping[str, Any]) -> str:
         "": lambda row: row["status"] if row["status"] == "ok" else "; ".join([row["status"], *row["reasons"][:1]]),
     }
     reason = board["reason"]
-    text = table_of(f"By {board['by']}; p and ranks are corrected for the number of groups", board["groups"], columns)
+    text = table_of(f"By {board['by']}; p and ranks are corrected for the number of groups", board["rows"], columns)
     return f"{text}\n{reason[:1].upper()}{reason[1:]}."
 
 
