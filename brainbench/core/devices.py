@@ -187,8 +187,8 @@ class CudaGraphStep:
         warm_up: Calls before the recording.
         aside: Make these calls on a stream of their own, as recordings are.
         generators: Random numbers that the work draws, beside torch's own.
-        kept: Tensors of the result that last anyway and are returned themselves; others are returned as copies. None
-            copies nothing: the next call overwrites what was returned.
+        retained: Tensors of the result that last anyway and are returned themselves; others are returned as copies.
+            None copies nothing: the next call overwrites what was returned.
         required: A recording that fails is an error; otherwise a warning, and the work runs launch by launch.
     """
 

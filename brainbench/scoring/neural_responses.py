@@ -219,7 +219,7 @@ class NeuralResponses:
     def animals(
         self, labels: tuple[str, ...], metric: Metric, options: ScoreOptions, *, progress: Progress | None = None
     ) -> tuple[Any, ...]:
-        """Prepare every animal by a metric over the labels ``kept``, in that order."""
+        """Prepare every animal by a metric over ``labels``, in that order."""
         animals = []
         longest = self.dataset["duration"].values.max(axis=0)
         share = np.where(longest > (1 - 1e-6) * longest.max(), 1.0, longest / longest.max())
@@ -233,7 +233,7 @@ class NeuralResponses:
         return tuple(animals)
 
     def trials(self, labels: tuple[str, ...], *, averaged: bool = False) -> dict[str, tuple[Trials, ...]]:
-        """Return the sessions of each animal with trials of the labels ``kept``, numbered in that order.
+        """Return the sessions of each animal with trials of ``labels``, numbered in that order.
 
         ``averaged`` rates are those of the whole window.
         """

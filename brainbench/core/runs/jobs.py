@@ -131,7 +131,7 @@ def stop_pool(pool: ProcessPoolExecutor) -> None:
 
 
 def pool_died(finished: str) -> str:
-    """Return the sentence about a process that ended; ``kept`` names what is not lost."""
+    """Return the sentence about a process that ended; ``finished`` names what is not lost."""
     return (
         "A process of the pool ended unexpectedly, perhaps for want of memory, or because the script that started "
         f"it works outside of: if __name__ == '__main__':. {finished} is kept: run the same again, with fewer "

@@ -241,8 +241,8 @@ def expected_rates(
 ) -> NDArray[np.float64]:
     """Draw units and return their expected rates [K, U], Hz.
 
-    ``own`` is the random stream of the animal, fresh: all of its sessions draw the same differences from it; ``random``
-    is that of the session.
+    ``traits`` is the random stream of the animal, fresh: all of its sessions draw the same differences from it;
+    ``random`` is that of the session.
     """
     stimuli = len(geometry.labels)
     # Log-normal weights of the axes; their mean square is one, so that the depth of tuning does not depend on them.
