@@ -37,9 +37,7 @@ def touching_job(solid: Part | Mesh, *, friction: float = 0.0, frames: int = 30)
     whole = ((), solid) if isinstance(solid, Mesh) else ((solid,), None)
     obstacle = Obstacle(whole[0], surface=whole[1])
     whisker = replace(WHISKER, friction=friction)
-    return Job(
-        whisker, Swing((0.35, 0.105, 0.14), frequency=10.0), (obstacle,), np.linspace(1e-3, frames * 1e-3, frames)
-    )
+    return Job(whisker, Swing(), (obstacle,), np.linspace(1e-3, frames * 1e-3, frames))
 
 
 def gradient_errors(
