@@ -14,6 +14,7 @@ from functools import partial
 from types import FunctionType, ModuleType, SimpleNamespace
 
 import numpy as np
+from scipy.optimize import lsq_linear
 
 from brainbench.geometry.mesh import point_triangle_distance
 from brainbench.stimuli.engines.rod.kernels import specialize
@@ -23,19 +24,8 @@ NONE_LEFT = 2**31 - 1
 
 
 def _segments_apart(a, b, p, q):
-    """Least squared distance of two segments: of an end of one from the other, or between their lines."""
-
-    def from_segment(x, start, stop):
-        along = stop - start
-        share = np.clip((x - start) @ along / max(along @ along, 1e-300), 0, 1)
-        return float(np.sum((x - start - share * along) ** 2))
-
-    ends = [from_segment(a, p, q), from_segment(b, p, q), from_segment(p, a, b), from_segment(q, a, b)]
-    matrix = np.stack([b - a, p - q], axis=1)
-    places, _, rank, _ = np.linalg.lstsq(matrix, p - a, rcond=None)
-    if rank == 2 and (places >= 0).all() and (places <= 1).all():
-        ends.append(float(np.sum((matrix @ places - (p - a)) ** 2)))
-    return min(ends)
+    """Least squared distance of two segments."""
+    return 2 * lsq_linear(np.stack([b - a, p - q], axis=1), p - a, bounds=(0, 1), method="bvls").cost
 
 
 def _segment_triangle(a, b, corners):
