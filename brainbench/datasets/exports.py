@@ -69,11 +69,11 @@ def export(
     check_name("format", kind, _FORMATS)
     if ending and ending not in (endings := _FORMATS[kind]):
         raise UsageError(f"Files of {kind} end in {listing(endings)}, or name a folder; received {target.name!r}.")
-    ledger = Ledger()
+    ledger, rules = Ledger(), Ledger()
     layout, paths = find_recordings(source, ledger)
     paths = suitable_files(paths, ledger)
     chosen = EVERYTHING if select is None else resolve_selection(select)
-    sessions, subjects, ledgers = [], set(), []
+    sessions, subjects = [], set()
     for path in paths:
         with open_file(path) as file:
             for session, session_layout in each_session(file, path, layout):
@@ -83,15 +83,14 @@ def export(
                     reason = f"{session.source} holds {listing(held)}, for which copies in {kind} have no place"
                     ledger.leave("sessions", reason if held else no_units(session), lost=True)
                 elif session.subject in (chosen.subjects or subjects):
-                    ledgers.append(Ledger())
                     table = session_layout.conditions.table if session_layout else "trials"
                     if not session.has_spikes:
                         session = replace(session, units=None, populations=signals)
-                    sessions.append(subset(session, chosen, table, ledgers[-1]))
+                    sessions.append(subset(session, chosen, table, rules))
                     for fault in time_faults(session):
                         _LOG.warning("%s: %s", session.source, fault)
     check_each("subject", chosen.subjects, sorted(subjects))
-    check_values(ledgers)
+    check_values(rules)
     for reason in ledger.skipped:
         _LOG.warning("Not copied: %s", reason)
     if not sessions:

@@ -46,6 +46,8 @@ class Ledger:
     """Notes that every result must state."""
     seen: dict[Hashable, set[str]] = field(default_factory=dict)
     """Rule → the values that its column has."""
+    forms: dict[tuple[str, str], set[str]] = field(default_factory=dict)
+    """Column and label → how files write the value."""
 
     def find(self, kind: str, number: int = 1, read: int = 0) -> None:
         """Note that so many were found, and perhaps how many of them were read."""
@@ -83,8 +85,9 @@ class Ledger:
         self.read += part.read
         self.notes += part.notes
         self.doubts += part.doubts
-        for rule, values in part.seen.items():
-            self.seen.setdefault(rule, set()).update(values)
+        for name in ("seen", "forms"):
+            for key, values in getattr(part, name).items():
+                getattr(self, name).setdefault(key, set()).update(values)
         for entry in part.left:
             self.leave(entry.kind, entry.reason, entry.number, lost=entry.lost)
         return self

@@ -140,10 +140,6 @@ def open_published(path: Path, **options: object) -> xr.Dataset:
     parts = [_session_counts(item, path) for item in sessions]
     dataset = join_sessions(parts, reading, source=str(path), layout=LAYOUT.name, notes=list(LAYOUT.remarks[1:]))
     total, animals = sum(len(item.slots) for item in sessions), len({item.subject for item in sessions})
-    whole = Ledger()
-    for part in parts:
-        whole.add(part.ledger)
-    dataset.attrs["ledger"] = whole.stated()
     dataset.attrs["label_doubt"] = (
         f"labels cannot be trusted: every session of {path.name} numbers its stimuli by their first appearance and "
         "their names are not stored, so slots taken as stimuli in the file's order are a guess (recovered: the slot of "

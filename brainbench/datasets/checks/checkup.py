@@ -112,7 +112,7 @@ def check(source: Source, *, conditions: str | Conditions | None = None, progres
             severity: Severity = "note" if beside and path.suffix != ".nwb" else "error"
             findings.append(Finding(severity, "file", str(error), where=path.name))
     singly = {finding.message for finding in findings}
-    doubts = [*label_doubts(every.forms, {label for _, label in every.labels}), *divided_labels(every.labels)]
+    doubts = [*label_doubts(every.ledger.forms, {label for _, label in every.labels}), *divided_labels(every.labels)]
     across = (doubt for doubt in doubts if doubt not in singly)
     findings += [Finding("warning", "labels", doubt, _LABELS, where="all sessions") for doubt in across]
     place = str(source) if not isinstance(source, (list, tuple)) else ", ".join(map(str, source))
@@ -128,7 +128,8 @@ class _Everything:
     """What is compared across sessions: spikes, and the values that label trials."""
 
     copies: Copies = field(default_factory=Copies)
-    forms: dict[tuple[str, str], set[str]] = field(default_factory=dict)
+    ledger: Ledger = field(default_factory=Ledger)
+    """How files write the labels."""
     labels: set[tuple[str, str]] = field(default_factory=set)
     """Each animal with each of its labels."""
 
@@ -175,8 +176,7 @@ def check_session(
     table = session.tables.get(conditions.table if conditions else "trials")
     with contextlib.suppress(BrainbenchError):
         if table is not None and conditions is not None:
-            for key, written in conditions.forms(table).items():
-                every.forms.setdefault(key, set()).update(written)
+            every.ledger.add(Ledger(forms=conditions.forms(table)))
             fixed = layout is not None and layout.vocabulary(conditions) is not None
             labels = set() if fixed else {*joined_labels(conditions.values(table))} - {""}
             every.labels |= {(session.subject, label) for label in labels}

@@ -117,8 +117,6 @@ class SessionCounts:
     """Recipe of the stimuli, where the file names one."""
     guessed: bool = False
     """True when the file does not name its subject."""
-    forms: dict[tuple[str, str], set[str]] = field(default_factory=dict)
-    """Column and label → how the file writes the value."""
     ledger: Ledger = field(default_factory=Ledger)
     """Balance of the file: tables, trials, units, spikes."""
     measure: str = "spikes"
@@ -140,7 +138,7 @@ def count_session(
     table = session.table(options.conditions.table)
     if "start_time" not in table:
         raise DataError(f"{table.label} has no start_time; conditions need a table of time intervals.")
-    values = options.conditions.values(table)
+    values, ledger.forms = options.conditions.values(table), options.conditions.forms(table)
     labels = np.array(joined_labels(values), dtype=str)
     keep, parts = _windows(session, table, labels, options, ledger)
     edges, *before = parts
@@ -192,7 +190,6 @@ def count_session(
         columns={name: _unit_column(source.units, name, kind, units, ledger.notes) for name, kind in columns},
         covariates=trial_covariates(session, table, rows, edges[rows]),
         measure=measure,
-        forms=options.conditions.forms(table),
         found_labels=frozenset(labels.tolist()) - {""},
         ledger=ledger,
     )

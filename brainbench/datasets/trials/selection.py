@@ -289,17 +289,14 @@ def select_rows(table: SessionTable, rules: Sequence[Rule], kind: str, ledger: L
     return keep
 
 
-def check_values(ledgers: Iterable[Ledger]) -> list[str]:
-    """Check the values of rules against those of all sessions.
+def check_values(ledger: Ledger) -> list[str]:
+    """Check the values of rules against those of all sessions, whose balance a ledger is.
 
     Returns:
         A note for each value to remove that no row has but that is spelt nearly as one that rows have.
     """
-    seen = Ledger()
-    for ledger in ledgers:
-        seen.add(ledger)
     notes = []
-    for rule, values in seen.seen.items():
+    for rule, values in ledger.seen.items():
         assert isinstance(rule, Rule)
         present = sorted(values - {""}, key=contracts.natural_key)
         for value in (*rule.allow, *rule.refuse):

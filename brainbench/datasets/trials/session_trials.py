@@ -210,14 +210,13 @@ def join_sessions(
 
     # The order must not depend on that of the files: equal data then have equal content hashes.
     parts = sorted(parts, key=lambda part: (natural_key(part.subject), natural_key(part.session)))
-    doubts = [*doubts, *check_values(part.ledger for part in parts), *_doubtful_names(parts)]
-    doubts += [doubt for part in parts for doubt in part.ledger.doubts]
+    whole = Ledger()
+    for part in parts:
+        whole.add(part.ledger)
+    doubts = [*doubts, *check_values(whole), *_doubtful_names(parts), *whole.doubts]
     measure = listing(sorted({part.measure for part in parts}), quoted=False)
     if measure != "spikes":
         doubts.append(f"responses are means over the window of {measure}, not spike counts")
-    removed: Counter[str] = Counter()
-    for part in parts:
-        removed.update(part.ledger.removed)
     # A session without trials would add units that are missing in every row.
     everything, parts = parts, [part for part in parts if part.labels] or parts
     empty = [part for part in everything if not part.labels]
@@ -226,7 +225,7 @@ def join_sessions(
     trials, units = sum(len(part.labels) for part in parts), sum(len(part.unit_ids) for part in parts)
     if not trials or not units:
         what = "trial" if not trials else "unit"
-        reasons = "; ".join(f"{rule} removed {number}" for rule, number in removed.items() if number)
+        reasons = "; ".join(f"{rule} removed {number}" for rule, number in whole.removed.items() if number)
         raise DataError(f"No {what} remains of {source}: {reasons or 'the tables are empty'}.")
     overlapping, alike = np.sum([_overlaps(part) for part in parts], axis=0).tolist()
     if overlapping:
@@ -236,11 +235,7 @@ def join_sessions(
         )
     vocabulary = options.vocabulary or natural_vocabulary(row for part in parts for row in part.values)
     present = {label for part in parts for label in part.labels}
-    forms: dict[tuple[str, str], set[str]] = {}
-    for part in parts:
-        for key, written in part.forms.items():
-            forms.setdefault(key, set()).update(written)
-    doubts += label_doubts(forms, vocabulary)
+    doubts += label_doubts(whole.forms, vocabulary)
     doubts += divided_labels((part.subject, label) for part in parts for label in {*part.labels})
     if len(present) < 2:
         raise DataError(
@@ -291,9 +286,10 @@ def join_sessions(
         "window": str(options.window),
         "bin": options.bin,
         "selection": {"name": options.selection.name, "rules": list(options.selection.lines())},
-        "removed": dict(removed),
+        "removed": whole.removed,
+        "ledger": whole.stated(),
         "sessions": [_about(part) for part in everything],
-        "notes": [*notes, *doubts, *(note for part in everything for note in part.ledger.notes)],
+        "notes": [*notes, *doubts, *whole.notes],
         "doubts": doubts,
         "overlap": alike / trials,
         "source": source,
@@ -510,7 +506,6 @@ def _joined(first: SessionCounts, second: SessionCounts, same: dict[int, int]) -
         covariates={name: values[order] for name, values in covariates.items()},
         ledger=_joined_ledger(first.ledger, second.ledger, trials, len(more)),
         found_labels=first.found_labels | second.found_labels,
-        forms={key: {*first.forms.get(key, ()), *second.forms.get(key, ())} for key in {**first.forms, **second.forms}},
     )
 
 

@@ -90,7 +90,7 @@ def test_a_number_is_recognised_however_the_rule_spells_it(value, column):
     ledger = Ledger()
     assert Rule("a", refuse=(value,)).keep(make_table(a=column), ledger.seen).tolist() == [False, True]
     assert Rule("a", allow=(value,)).keep(make_table(a=column), ledger.seen).tolist() == [True, False]
-    assert check_values([ledger]) == []
+    assert check_values(ledger) == []
 
 
 def test_texts_and_numbers_out_of_range_are_compared_as_they_are():
