@@ -309,7 +309,7 @@ def page_board(key: str, board: Board, rows: Sequence[dict[str, Any]]) -> dict[s
         if entry is not None:
             cells |= {"apart": entry.not_repeatable or None, "seed": entry.card.seed}
             cells |= {"runs": [record.score.scaled for record in entry.records] if entry.seeds > 1 else None}
-        columns.append({name: with_floats(value, _six_decimals) for name, value in cells.items()})
+        columns.append({name: with_floats(value, lambda cell: _known(round(cell, 6))) for name, value in cells.items()})
     trusted = [row for row in columns if row["standing"] != "unreliable"]
     values = [row[name] for row in trusted for name in ("score", "score_low", "score_high") if row[name] is not None]
     axis = score_scale(values, [], 0, 1)
@@ -387,10 +387,6 @@ def _score_row(score: Score) -> dict[str, Any]:
 
 def _known(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def _six_decimals(value: float) -> float | None:
-    return round(value, 6) if math.isfinite(value) else None
 
 
 def _cell(value: Any) -> Any:
