@@ -138,7 +138,7 @@ def extract(
     model = proof.unwrapped(model)
     check_weights(model, type(model).__name__)
     rooms = _Rooms(len(values), folder, int(memory * 2**30), reduce)
-    with evaluating(model), torch.no_grad(), proof.uncompiled(model):
+    with _surroundings(model), evaluating(model), torch.no_grad(), proof.uncompiled(model):
         run = _Run(model, values)
         if readout != "default":
             reader = partial(find_readout(readout).activations, model, layers=layers)
@@ -186,6 +186,23 @@ def evaluating(model: nn.Module) -> Iterator[None]:
     finally:
         for module, mode in modes.items():
             module.training = mode
+
+
+@contextmanager
+def _surroundings(model: nn.Module) -> Iterator[None]:
+    """Keep the caller's autocast, inference mode, default device and default precision out of a reading."""
+    import torch
+
+    kind, double = torch.get_default_dtype(), any(p.dtype == torch.float64 for p in model.parameters())
+    with ExitStack() as scope:
+        scope.enter_context(torch.inference_mode(False))
+        for device in ("cpu", "cuda"):
+            scope.enter_context(torch.autocast(device, enabled=False))
+        if torch.get_default_device().type != "cpu":
+            scope.enter_context(torch.device("cpu"))
+        torch.set_default_dtype(torch.float64 if double else torch.float32)
+        scope.callback(torch.set_default_dtype, kind)
+        yield
 
 
 def _is_ours(model: nn.Module) -> bool:

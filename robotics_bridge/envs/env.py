@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from tensordict import TensorDict
 
 _NOISE_SEED = "noise_seed"  # name in kept states of the seed of tactile noise
+_SENSED = (_NOISE_SEED, "touch.", "task_state.")  # beginnings of the names of what sensors remember
 _ADVICE = (
     "Terms and the state of a task may not copy from the processor or wait for it (brainbench.core.rotations.constant "
     "keeps constants on the device); change them, or make the environment with graphs=False."
@@ -213,15 +214,15 @@ class Env:
         return tensors | {f"observations.{name}": value for name, value in state.observations.items()}
 
     def state_dict(self) -> dict[str, torch.Tensor]:
-        """Return copies of all that the future depends on, but for the memory of noisy or slow tactile sensors."""
+        """Return copies of all that the future depends on."""
         return {name: value.clone() for name, value in self._memory().items()}
 
     def load_state_dict(self, values: Mapping[str, torch.Tensor]) -> None:
         """Take up what :meth:`state_dict` returned."""
         state = self.state
         for name, present in self._memory().items():
-            # States that were kept before the noise could be seeded anew have the seed of the options.
-            if name == _NOISE_SEED and name not in values:
+            # Sensors that an earlier version stored nothing of begin anew.
+            if name.startswith(_SENSED) and name not in values:
                 continue
             if name not in values or (name != "generator" and values[name].shape != present.shape):
                 shape = tuple(values[name].shape) if name in values else "none"
@@ -236,11 +237,9 @@ class Env:
         if self.touch is not None and _NOISE_SEED in values:
             self.touch.suite.seed(int(values[_NOISE_SEED]))
         for name, value in state.memory().items():
-            value.copy_(values[name])
+            value.copy_(values.get(name, value))
         state.generator.set_state(values["generator"].cpu())
         state.simulation.restored(under("simulation."))
-        if state.task_state is not None:
-            state.task_state.restored()
         state.started = True
         state.observations = {name: value.to(state.device) for name, value in under("observations.").items()}
 

@@ -12,7 +12,6 @@ import numpy as np
 import torch
 from torch import nn
 
-from brainbench.core.devices import warp
 from brainbench.core.errors import UsageError
 from brainbench.core.rotations import angle_of, conjugate, from_xyzw, multiply, rotate, twist_and_swing, twist_of
 from robotics_bridge.envs.simulation import Actuators, Contacts, EnvOptions, Simulation, TactileObservation
@@ -301,9 +300,8 @@ class EnvState:
         tensors: dict[str, torch.Tensor] = dict(vars(self.episode))
         tensors |= {f"{part}.{name}": value for part, owner in parts.items() for name, value in owner.memory().items()}
         if self.touch is not None:
-            clock, wp = self.touch.suite.context, warp()
-            tensors |= {"touch.age": wp.to_torch(clock.age), "touch.episode": wp.to_torch(clock.episode)}
-            tensors["touch.reading"] = self.touch.reading
+            felt = self.touch.suite.memory(self.simulation.timestep)
+            tensors |= {"touch.reading": self.touch.reading, **{f"touch.{name}": value for name, value in felt.items()}}
         return tensors
 
     def draw(self, count: int, low: float, high: float) -> torch.Tensor:

@@ -10,8 +10,8 @@ from __future__ import annotations
 import json
 import logging
 import math
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, is_dataclass, replace
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, fields, is_dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
@@ -19,7 +19,7 @@ import msgspec
 from msgspec import Meta
 
 from brainbench.core.errors import DataError, UsageError, brief, check_each, listing, repeats
-from brainbench.core.files import read_mapping, to_json
+from brainbench.core.files import read_mapping, to_json, to_plain
 from brainbench.core.reading.values import typed_values
 from robotics_bridge.hands.observations import OBSERVATIONS
 from robotics_bridge.policies.shipped import stored
@@ -238,15 +238,43 @@ def check_contract(contract: Mapping[str, Any], name: str) -> None:
 
 _LOG = logging.getLogger(__name__)
 _RATE = 40.0  # control steps per second of teachers that do not state it
+_LEARNING = (
+    "rewards", "groups", "decoders", "auxiliary", "goal_terms", "start_threshold", "mastered", "narrowing",
+)  # fmt: skip
 _SAME_ANGLE = 1e-4  # difference of two positions that is rounding [rad]
 
 
+def world_of(task: Task) -> dict[str, Any]:
+    """Return what makes a task as plain values, terms by name, without what the other facts of a run state."""
+    stated = ("name", "text", "contacts", "teacher", "student")
+    parts = {item.name: getattr(task, item.name) for item in fields(task) if item.name not in stated}
+    return json.loads(json.dumps(to_plain(parts), default=lambda term: getattr(term, "__qualname__", str(term))))
+
+
+def differences(trained: Mapping[str, Any], here: Mapping[str, Any], place: str = "") -> Iterator[str]:
+    """Yield what differs between two worlds, by dotted names, but for what learning alone reads."""
+    for name in (name for name in here if name in trained and name not in _LEARNING):
+        theirs, ours = trained[name], here[name]
+        if isinstance(theirs, dict) and isinstance(ours, dict):
+            yield from differences(theirs, ours, f"{place}{name}.")
+        elif theirs != ours:
+            yield f"{place}{name} (trained with {brief(theirs, most=40)}, here {brief(ours, most=40)})"
+
+
 def with_contacts_of(task: Task, policies: Iterable[str]) -> Task:
-    """Return a task with the contacts in which some policies were trained; unchanged without any.
+    """Return a task with the contacts, and of students the law of forces, of some policies; unchanged without any.
 
     A policy is a shipped one or the folder of a run; ``zero`` and ``random`` were trained in none.
     """
-    contacts = {name: trained_contacts(described) for name in policies if (described := stored(name))}
+    facts = {name: described for name in policies if (described := stored(name))}
+    contacts = {name: trained_contacts(described) for name, described in facts.items()}
+    deployments = [from_json(dict, described.get("deployment", {}), "deployment") for described in facts.values()]
+    law: Any = float | None
+    laws = {from_json(law, stated["twist"], "twist of a policy") for stated in deployments if "twist" in stated}
+    if len(laws) > 1:
+        raise UsageError(f"The students {', '.join(facts)} learned from forces of different laws; take one at a time.")
+    if laws:
+        task = replace(task, taxel_twist=laws.pop())
     models = {*contacts.values()} or {task.contacts}
     if len(models) > 1:
         names = ", ".join(f"{name} ({contacts_name(model)})" for name, model in contacts.items())
@@ -335,6 +363,12 @@ def check_fit(described: Mapping[str, Any], env: Env, name: str) -> None:
             )
     if unmeasured := [group for group, _ in groups if group not in MEASURED]:
         _LOG.warning("The student %r reads %s, which only the simulation knows.", name, ", ".join(unmeasured))
+    trained = from_json(dict, described.get("world", {}), f"world of {name}")
+    if trained and (changes := [*differences(trained, world_of(env.task))]):
+        _LOG.warning(
+            "The policy %r acts in another world than that of its training: %s. Take the --config and --change of its "
+            "training, or read the result as one of this world.", name, listing(changes, limit=3, quoted=False),
+        )  # fmt: skip
     if (contacts := trained_contacts(described)) != env.task.contacts:
         _LOG.warning(
             "The policy %r was trained with contacts %s; these are %s.", name, contacts_name(contacts),

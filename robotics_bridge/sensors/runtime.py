@@ -122,6 +122,11 @@ class Runtime(abc.ABC):
         """Draw from the context's present seed from now on."""
         self._noise.seed()
 
+    def memory(self, dt: float) -> list[Any]:
+        """Return the Warp arrays that later updates, ``dt`` seconds apart, depend on."""
+        self._noise.make_room(dt)
+        return [array for array in (*self.readings, *self.lasting, *self.rings) if array.size]
+
     @abc.abstractmethod
     def run_kernels(self, state: HandState, dt: float) -> None:
         """Run the sensor's own kernels; ``io`` knows of this update."""

@@ -267,6 +267,12 @@ class SensorSuite:
         for runtime in self.runtimes:
             runtime.seed()
 
+    def memory(self, dt: float) -> dict[str, torch.Tensor]:
+        """Return the tensors themselves that updates ``dt`` seconds (s) apart depend on, by name; without histories."""
+        arrays = [self.context.age, self.context.episode, self.pairs.status]
+        arrays += [array for runtime in self.runtimes for array in runtime.memory(dt)]
+        return {str(number): wp.to_torch(array) for number, array in enumerate(arrays)}
+
     @property
     def diverged(self) -> torch.Tensor:
         """Mask [B] of environments that held numbers that are not finite since their reset; their readings are NaN."""

@@ -205,13 +205,11 @@ class Thermometers:
         return torch.cat((progress(self.temperature(), t).nan_to_num().float(), flags), dim=1)
 
     def memory(self) -> dict[str, torch.Tensor]:
-        """Return the tensors themselves of latch and metric; the temperatures begin anew."""
+        """Return the tensors themselves of latch, metric and temperatures."""
         tensors = {"latched": self.latched, "latch_time": self.latch_time, "contact": self.contact}
-        return {**tensors, "touching": self.touching, "age": self.age}
-
-    def restored(self) -> None:
-        """Make the target ball hot that a loaded state has, and the fingers cold: their temperatures are not kept."""
-        self._begin_anew(self.latched | True)
+        tensors |= {"touching": self.touching, "age": self.age}
+        heat = self.suite.memory(self._env.simulation.timestep)
+        return tensors | {f"heat.{name}": value for name, value in heat.items()}
 
     def _begin_anew(self, mask: torch.Tensor) -> None:
         """Make the target ball hot and the fingers cold."""

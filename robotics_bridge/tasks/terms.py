@@ -139,9 +139,6 @@ class TaskState(Protocol):
         """Return the tensors themselves that the future depends on, by name."""
         ...
 
-    def restored(self) -> None:
-        """Take note that other values were written to :meth:`memory`."""
-
 
 def goal_reached(m: StepContext) -> torch.Tensor:
     """Return 1 in the step in which the goal is reached."""

@@ -3,6 +3,8 @@ import logging
 import re
 import tracemalloc
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -109,6 +111,54 @@ def test_a_loops_calls_become_time(stimuli):
         "output": (K, 1, 3),
     }
     np.testing.assert_array_equal(activations["cell"][:, -1], activations["drop"][:, 0])
+
+
+class _Making(nn.Module):
+    """A network that makes its first state without saying of what precision or where."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.read, self.cell = nn.Linear(30 * 35, 12), nn.GRUCell(12, 8)
+
+    def forward(self, x):
+        state, states = torch.zeros(len(x), 8), []
+        for step in x.unbind(1):
+            state = self.cell(self.read(step.flatten(1)), state)
+            states.append(state)
+        return torch.stack(states, 1)
+
+
+@contextmanager
+def _default_precision(kind: torch.dtype) -> Iterator[None]:
+    torch.set_default_dtype(kind)
+    try:
+        yield
+    finally:
+        torch.set_default_dtype(torch.float32)
+
+
+@pytest.mark.parametrize("ours", [True, False])
+@pytest.mark.parametrize(
+    "program",
+    [
+        lambda: torch.autocast("cpu", torch.bfloat16),
+        torch.inference_mode,
+        lambda: torch.device("meta"),
+        lambda: _default_precision(torch.float64),
+    ],
+    ids=["autocast", "inference", "device", "precision"],
+)
+def test_the_program_around_a_reading_has_no_part_in_it(stimuli, program, ours):
+    torch.manual_seed(0)
+    model = load_model("zhuang-small", seed=0) if ours else _Making()
+    before = extract(model, stimuli)
+    with program():
+        place = torch.get_default_device(), torch.get_default_dtype(), torch.is_inference_mode_enabled()
+        within = extract(model, stimuli)
+        assert place == (torch.get_default_device(), torch.get_default_dtype(), torch.is_inference_mode_enabled())
+    assert list(within) == list(before)
+    for layer, values in before.items():
+        np.testing.assert_array_equal(within[layer], values)
 
 
 def test_the_model_is_left_as_it_was(stimuli):

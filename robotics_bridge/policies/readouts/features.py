@@ -25,7 +25,7 @@ from robotics_bridge.policies.evaluate import Acting, forget
 from robotics_bridge.sensors.noise.model import PRESETS
 
 TARGETS = ("position", "velocity", "spin", "contact")
-"""Object (m, m/s, rad/s), and the centre of the contact forces on it (m), [3] each, world axes."""
+"""Object that counts (m, m/s, rad/s), and the centre of the contact forces on it (m), [3] each, world axes."""
 CALIBRATION_SECONDS = 2.0  # length of the episodes of a calibration
 _SETTLING = 10  # control steps after an episode's start that are left out: the object falls onto the palm
 
@@ -97,13 +97,14 @@ def calibrate(env: Env, policy: Acting, grid: TaxelGrid, seed: int) -> HandCalib
 
 
 def _centre(env: Env, age: torch.Tensor) -> torch.Tensor:
-    """Return the centre [B, 3] of the contact forces on the object in the last physics step, NaN without contact."""
+    """Return the centre [B, 3] of the contact forces on the object that counts, in the last physics step, else NaN."""
     state, scene = env.simulation.state, env.simulation.engine.scene
     count = min(int(state.contact_count.numpy()[0]), state.contact_env.shape[0])
     names = ("env", "geom", "position", "force")
     row, geometries, position, force = (getattr(state, f"contact_{name}").numpy()[:count] for name in names)
-    link = scene.link_index(env.state.model.objects[0])
-    mine = (np.asarray(scene.link_of)[geometries] == link).any(axis=1) & (force > 0)
+    links = np.array([scene.link_index(name) for name in env.state.model.objects])
+    link = links[env.state.episode.target.cpu().numpy()[row]]
+    mine = (np.asarray(scene.link_of)[geometries] == link[:, None]).any(axis=1) & (force > 0)
     sums, total = np.zeros((env.num_envs, 3)), np.zeros(env.num_envs)
     np.add.at(sums, row[mine], position[mine] * force[mine, None])
     np.add.at(total, row[mine], force[mine])

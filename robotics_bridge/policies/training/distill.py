@@ -49,7 +49,7 @@ from brainbench.core.runs.folder import (
 )
 from brainbench.core.runs.log import RunLog
 from robotics_bridge.hands.layouts import check_probes, is_probe_file
-from robotics_bridge.policies.contract import JOINTS, Groups, check_hand, check_version, from_json, shapes_of
+from robotics_bridge.policies.contract import JOINTS, Groups, check_hand, check_version, from_json, shapes_of, world_of
 from robotics_bridge.policies.encoders.arms import EncoderConfig, elu_perceptron
 from robotics_bridge.policies.evaluate import Policy
 from robotics_bridge.policies.shipped import model_file, policy_path, student_folder
@@ -484,10 +484,6 @@ class _Run:
 
     def _save(self) -> None:
         """Write the state, the rollouts that are learned from again, and the student."""
-        # The memory of noisy sensors is in no file, so such a run starts new episodes at every state it saves.
-        if self.config.noisy:
-            self.observations = self.env.reset()
-            self.memory, self.touched = torch.zeros_like(self.memory), torch.zeros_like(self.touched)
         numbers = [number for number, _ in self.kept]
         for number, rollout in self.kept:
             # A file of this number from before the last state was left by a run that ended while it saved.
@@ -532,6 +528,7 @@ def describe_run(config: DistillConfig, student: TactilePolicy, env: Any) -> dic
         "brainbench_student": 1,
         "task_version": TASK_VERSION,
         "contacts": asdict(env.task.contacts),
+        "world": world_of(env.task),
         "hand_physics": env.hand.physics,
         "distill": asdict(config),
         "network": student.config,

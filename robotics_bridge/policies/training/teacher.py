@@ -15,7 +15,7 @@ import logging
 import math
 import time
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, cast
 
@@ -43,7 +43,7 @@ from brainbench.core.runs.folder import (
 from brainbench.core.runs.log import RunLog, check_sinks
 from robotics_bridge import tasks
 from robotics_bridge.envs.env import Env, RslRlEnv
-from robotics_bridge.policies.contract import check_fit, check_version, from_json, with_contacts_of
+from robotics_bridge.policies.contract import check_fit, check_version, from_json, with_contacts_of, world_of
 from robotics_bridge.policies.encoders.arms import ARMS, EncoderConfig
 from robotics_bridge.policies.encoders.taxel_grid import CONTROL_SUB_STEP, HandCalibration
 from robotics_bridge.policies.evaluate import Policy, evaluate
@@ -60,7 +60,7 @@ from robotics_bridge.policies.training.distill import (
 )
 from robotics_bridge.policies.training.distill_config import DistillConfig
 from robotics_bridge.tasks.settings import CONTACTS, TeacherSettings, contacts_name
-from robotics_bridge.tasks.task import GROUPS, TASK_VERSION, Task, check_measured
+from robotics_bridge.tasks.task import GROUPS, TASK_VERSION, check_measured
 
 _log = logging.getLogger(__name__)
 
@@ -510,7 +510,7 @@ def train(
             "observation_shapes": {name: list(shape) for name, shape in env.observation_shapes.items()},
             "action_names": list(env.action_names), "action_map": env.action_map.plain(), "start": origin,
             "task_version": TASK_VERSION, "contacts": asdict(env.task.contacts), "observe": list(options.observe),
-            "rate": 1 / env.step_dt, "world": _plain(env.task), "sensing": to_plain(trainer.sensing),
+            "rate": 1 / env.step_dt, "world": world_of(env.task), "sensing": to_plain(trainer.sensing),
         }  # fmt: skip
         _resume(trainer, run, facts)
         # Iterations after the last checkpoint are done again.
@@ -550,13 +550,6 @@ def _resume(trainer: Trainer, run: Path, facts: dict[str, Any]) -> None:
     state = load_state(run / STATE)
     with readable(run / STATE, "training state", RESTART):
         trainer.load(state)
-
-
-def _plain(task: Task) -> dict[str, Any]:
-    """Return what makes a task as plain values, terms by name, without what the other facts of a run state."""
-    stated = ("name", "text", "contacts", "teacher", "student")
-    parts = {item.name: getattr(task, item.name) for item in fields(task) if item.name not in stated}
-    return json.loads(json.dumps(to_plain(parts), default=lambda term: getattr(term, "__qualname__", str(term))))
 
 
 def _save(trainer: Trainer, run: Path) -> None:

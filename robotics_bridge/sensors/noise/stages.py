@@ -119,18 +119,22 @@ class ReadingNoise:
             inputs = [*knobs, self.probe, self._active, *now, int(self._gained), x, self._hysteresis, self._walk, out]
             context.launch(measure, self._shape[1:], *inputs)
         if self._longest > 0:
-            # The small amount less than a slot keeps a delay of exactly n steps at n despite rounding of the quotient.
-            slots = math.ceil(self._longest / dt - 1e-4) + 1
-            if self._ring is None:
-                self._ring = self._zeros(True, (slots,))
-                self.rings.append(self._ring)
-            if slots > self._ring.shape[0]:
-                raise UsageError(
-                    f"A delay of {self._longest:g} s needs {slots} readings at a time step of {dt:g} s, but the first "
-                    f"update made room for {self._ring.shape[0]}; build the sensors anew for the shorter step."
-                )
-            inputs = [*knobs, self._delay, self._jitter, *now, out, self._ring, self.late]
+            inputs = [*knobs, self._delay, self._jitter, *now, out, self.make_room(dt), self.late]
             context.launch(delay_line, self._shape[1:], *inputs)
+
+    def make_room(self, dt: float) -> Any:
+        """Return the ring of readings that are late, made for steps of ``dt`` (s) the first time; None without any."""
+        # The small amount less than a slot keeps a delay of exactly n steps at n despite rounding of the quotient.
+        slots = math.ceil(self._longest / dt - 1e-4) + 1
+        if self._ring is None and self._longest > 0:
+            self._ring = self._zeros(True, (slots,))
+            self.rings.append(self._ring)
+        if self._ring is not None and slots > self._ring.shape[0]:
+            raise UsageError(
+                f"A delay of {self._longest:g} s needs {slots} readings at a time step of {dt:g} s, but the first "
+                f"update made room for {self._ring.shape[0]}; build the sensors anew for the shorter step."
+            )
+        return self._ring
 
     def read(self, measured: Any) -> Any:
         """Return what is read where ``measured`` [C, B, N] is newest: an earlier reading if there is a delay."""

@@ -139,6 +139,7 @@ class ContactLoadRuntime(KinematicRuntime):
         faces.head, faces.listed = (context.array(np.full((envs, len(places)), -1), int) for _ in range(2))
         faces.items, faces.count = context.zeros((2, items), wp.vec2i), context.zeros(2, int)
         press.filled = context.zeros(shape, wp.uint8)
+        self.lasting.append(press.filled)
         # Launches that were packed or recorded for other states go on with what they had.
         self._rooms = list[Any]()
         self._room(0)

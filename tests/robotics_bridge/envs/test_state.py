@@ -12,6 +12,7 @@ import torch
 from brainbench.core.rotations import to_matrices
 from robotics_bridge import tasks
 from robotics_bridge.envs import Env
+from robotics_bridge.sensors import Noise
 from robotics_bridge.tasks.goals import SteppingRotation
 from robotics_bridge.tasks.task import ObjectRandomisation
 
@@ -70,13 +71,27 @@ def test_poses_of_links_and_objects_are_quaternions_with_the_scalar_first() -> N
         np.testing.assert_allclose(env.object_pose[number, 0, 3:], data.body("object").xquat, atol=1e-5)
 
 
-def test_a_saved_state_goes_on_exactly() -> None:
-    one = _make(3, seed=2)
-    for a in _actions(one, 6):
+_LATE = {"noise": Noise(read_delay=0.021, jitter=0.01, hysteresis=0.4, walk=1e-4)}
+
+
+@pytest.mark.parametrize(
+    ("task", "options"),
+    [
+        ("in_palm_rotate", {}),
+        ("in_palm_rotate", {"observe": "force_torque", "resolution": "low"}),
+        ("in_palm_rotate", {"observe": "elastomer", "resolution": "low"}),
+        ("in_palm_rotate", {"observe": "depth", "resolution": "low", "knobs": _LATE}),
+        ("hot_ball", {}),
+    ],
+    ids=["joints", "taxels-that-hold", "gel", "late-and-drifting", "heat"],
+)
+def test_a_saved_state_goes_on_exactly(task, options) -> None:
+    one, two = (tasks.make(task, num_envs=3, seed=seed, threads=1, **options) for seed in (2, 7))
+    for a in _actions(one, 40):
         one.step(a)
-    state = {name: value.clone() for name, value in one.state_dict().items()}
-    two = _make(3, seed=7)
-    two.load_state_dict(state)
+    for a in _actions(two, 9):
+        two.step(a)
+    two.load_state_dict(one.state_dict())
     for a in _actions(one, 6, seed=4):
         first, second = one.step(a), two.step(a)
         assert torch.equal(first[1], second[1])

@@ -19,7 +19,14 @@ import pytest
 from brainbench.core.errors import BrainbenchError, DataError, UsageError
 from brainbench.core.files import to_plain, write_json
 from robotics_bridge import hands, tasks
-from robotics_bridge.policies.contract import PolicyContract, check_fit, check_hand, trained_contacts, with_contacts_of
+from robotics_bridge.policies.contract import (
+    PolicyContract,
+    check_fit,
+    check_hand,
+    trained_contacts,
+    with_contacts_of,
+    world_of,
+)
 from robotics_bridge.policies.shipped import stored
 from robotics_bridge.tasks.registry import apply_overrides
 from robotics_bridge.tasks.settings import CONTACTS, ContactModel
@@ -224,6 +231,41 @@ def test_policies_act_in_the_contacts_that_they_were_trained_in(tmp_path: Path) 
         UsageError, match=r"other \(published\), in_palm_rotate.teacher \(firm\).*--change contacts=firm"
     ):
         with_contacts_of(task, (other, "in_palm_rotate.teacher"))
+
+
+def test_another_world_than_that_of_training_is_told(caplog: pytest.LogCaptureFixture) -> None:
+    changes = ["goal.threshold=0.4", "rated_speed=false", "is_dropped=-1", "goal.start_threshold=0.5"]
+    trained = apply_overrides(tasks.load("in_palm_rotate"), changes)
+    described = {**stored("in_palm_rotate.teacher"), "world": json.loads(json.dumps(world_of(trained)))}
+    with caplog.at_level(logging.WARNING):
+        check_fit(described, tasks.make(trained, num_envs=1, threads=1), "mine")
+        # Rewards and curricula are of learning alone.
+        check_fit({**described, "world": world_of(tasks.load("in_palm_rotate", "careful"))}, _made(), "mine")
+        assert not caplog.records
+        check_fit(described, _made(), "mine")
+    (record,) = caplog.records
+    said = record.getMessage()
+    assert "goal.threshold (trained with 0.4, here 0.1)" in said
+    assert "rated_speed (trained with False, here True)" in said
+    assert "dropped" not in said
+    assert "start_threshold" not in said
+
+
+def test_students_feel_by_the_law_of_forces_that_they_learned_with(tmp_path: Path) -> None:
+    task = tasks.load("in_palm_rotate")
+    for name, twist in (("own", 2.0), ("other", None)):
+        write_json(tmp_path / name / "config.json", {"deployment": {"twist": twist}})
+    assert with_contacts_of(task, [str(tmp_path / "own")]).taxel_twist == 2.0
+    assert with_contacts_of(task, ["zero", "in_palm_rotate.student"]).taxel_twist is None
+    with pytest.raises(UsageError, match=r"other learned from forces of different laws; take one at a time"):
+        with_contacts_of(task, [str(tmp_path / "own"), str(tmp_path / "other")])
+    write_json(tmp_path / "own" / "config.json", {"deployment": {"twist": [2]}})
+    with pytest.raises(DataError, match="twist"):
+        with_contacts_of(task, [str(tmp_path / "own")])
+
+
+def _made() -> Any:
+    return tasks.make("in_palm_rotate", num_envs=1, threads=1)
 
 
 def test_a_student_that_reads_other_taxels_is_refused() -> None:
