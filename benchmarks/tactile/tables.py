@@ -39,14 +39,11 @@ def _sensors(rows: Rows) -> tuple[str, str]:
         ratios = ("–" if row.get(key) is None else f"{row[key]:.2f}" for key in ("roofline_ratio", "moved_ratio"))
         cells.append([
             row["case"], f"{row['ms']:.3f}", f"{row['ns']:.3g}", *ratios,
-            f"{row['bytes']:.0f}", f"{row.get('scratch', 0):.0f}", f"{row['first_s']:.2f}",
+            f"{row['bytes']:.0f}", f"{row['first_s']:.2f}",
         ])  # fmt: skip
     columns = ["sensor", "ms / update", "ns / number", "time / roofline", "time / own bytes"]
-    columns += ["bytes / taxel", "scratch", "first (s)"]
-    note = (
-        "A taxel of temperature is a cell, of audio a sample. Scratch (bytes / taxel) is written anew by every update; "
-    )
-    note += "the first update loads or compiles the kernels."
+    columns += ["bytes / taxel", "first (s)"]
+    note = "A taxel of temperature is a cell, of audio a sample. The first update loads or compiles the kernels."
     if any(row.get("roofline_ratio") is not None for row in rows):
         note += (
             " Roofline: .018 ms clean and .085 ms with noise per 100 taxels and 16,384 environments on an H200;"

@@ -119,16 +119,14 @@ def part_sensors(options: argparse.Namespace) -> Iterable[Row]:
         label = name if name in CELLS else f"{name} {count}"
         label += (" noisy" if noise else "") + (" mesh 5k" if where is meshed else "")
         seconds, first, suite = timed(where, sensors(name, count, noise=noise), state, options.device)
-        held, numbers = suite.state_bytes, CELLS.get(name, 0) or count
+        numbers = CELLS.get(name, 0) or count
         ratio = own = None
         if name == "kinematic" and faster:
             taxels = options.envs * count
             ratio = seconds / (ROOFLINE[noise is not None] * faster * taxels / (100 * 16384))
             own = seconds / (MOVED[noise is not None] * faster * taxels / H200_BYTES)
-        per = (held["sensors"] + held["shared"]) / numbers
         row = {"case": label, "envs": options.envs, "ms": seconds * 1e3, "roofline_ratio": ratio, "moved_ratio": own}
-        row["bytes"] = per
-        row["scratch"] = held["scratch"] / numbers
+        row["bytes"] = suite.state_bytes / numbers
         yield row | {"ns": seconds / options.envs / numbers * 1e9, "first_s": first}
         del suite
 

@@ -12,7 +12,7 @@ import logging
 import os
 import weakref
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -138,14 +138,16 @@ def extract(
     model = proof.unwrapped(model)
     check_weights(model, type(model).__name__)
     rooms = _Rooms(len(values), folder, int(memory * 2**30), reduce)
-    with _surroundings(model), evaluating(model), torch.no_grad(), proof.uncompiled(model):
-        run = _Run(model, values)
+    with _surroundings(model) as device, evaluating(model), torch.no_grad(), proof.uncompiled(model):
+        run = _Run(model, values, device)
         if readout != "default":
             reader = partial(find_readout(readout).activations, model, layers=layers)
         else:
             reader = named_reader(model, layers)
         if reader is not None:
-            _read_named(run, reader, rooms, chunk, proven=readout != "default" or _is_ours(model))
+            # The tests of this package prove the layers of its own networks.
+            ours = type(model).__module__.startswith("brainbench.")
+            _read_named(run, reader, rooms, chunk, proven=ours or readout != "default")
         else:
             _HookedReader(run, layers, rooms).read(chunk)
     result = rooms.close(run.notes)
@@ -189,36 +191,32 @@ def evaluating(model: nn.Module) -> Iterator[None]:
 
 
 @contextmanager
-def _surroundings(model: nn.Module) -> Iterator[None]:
-    """Keep the caller's autocast, inference mode, default device and default precision out of a reading."""
+def _surroundings(model: nn.Module) -> Iterator[Any]:
+    """Keep the caller's autocast, inference mode, default device (yielded) and default precision out of a reading."""
     import torch
 
-    kind, double = torch.get_default_dtype(), any(p.dtype == torch.float64 for p in model.parameters())
+    where, kind = torch.get_default_device(), torch.get_default_dtype()
+    double = any(weight.dtype == torch.float64 for weight in model.parameters())
     with ExitStack() as scope:
         scope.enter_context(torch.inference_mode(False))
         for device in ("cpu", "cuda"):
             scope.enter_context(torch.autocast(device, enabled=False))
-        if torch.get_default_device().type != "cpu":
+        if where.type != "cpu":
             scope.enter_context(torch.device("cpu"))
         torch.set_default_dtype(torch.float64 if double else torch.float32)
         scope.callback(torch.set_default_dtype, kind)
-        yield
-
-
-def _is_ours(model: nn.Module) -> bool:
-    """Return whether a network is one of this package, whose tests prove its layers."""
-    return type(model).__module__.startswith("brainbench.")
+        yield where
 
 
 class _Run:
     """A model and its stimuli, of which it gets copies."""
 
-    def __init__(self, model: nn.Module, values: Any) -> None:
+    def __init__(self, model: nn.Module, values: Any, device: Any) -> None:
         import torch
 
         from brainbench.models import proof
 
-        self.model, self.values = model, values
+        self.model, self.values, self.device = model, values, device
         self.count, self.steps = values.shape[:2]
         self.like = next((p for p in model.parameters() if p.is_floating_point()), torch.zeros(()))
         self.sample = proof.draw_sample(self.count)
@@ -241,7 +239,9 @@ class _Run:
 
         version = part._version
         try:
-            result = reader(part)
+            # A model on a GPU may rely on the program's default device for the states that it makes.
+            with nullcontext() if self.device.type == "cpu" else torch.device(part.device):
+                result = reader(part)
         except torch.OutOfMemoryError:
             raise
         except Exception as error:

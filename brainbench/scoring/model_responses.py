@@ -283,7 +283,8 @@ def _network_input(module: torch.nn.Module, stimuli: Stimuli, normalize: bool) -
 
         from brainbench.models.network import Normaliser
 
-        scaled = Normaliser.physical(given.shape[2] // len(CHANNELS))(torch.from_numpy(given)).numpy()
+        with torch.device("cpu"):  # whatever device the program works on
+            scaled = Normaliser.physical(given.shape[2] // len(CHANNELS))(torch.from_numpy(given)).numpy()
     if takes_si(module):
         return given, scaled, "SI (N, N·m); normalised inside the model"
     if stimuli.dataset is None:

@@ -153,7 +153,7 @@ def palmar_directions(model: Any, palm: str, fingers: Mapping[str, tuple[str, ..
     counts), or where it comes from if that opens a gripper (:func:`opens`). A joint that swings as far to both sides
     spreads or twists the finger and tells nothing: such links face as the next one towards the tip does. What slides,
     and tips of which no joint tells, face the other fingers. The palm faces where the finger tips go, along the nearest
-    axis of its frame, or the tips of jaws.
+    axis of its largest solid, or the tips of jaws.
     """
     data = half_open(model)
     sign = -1.0 if opens(model, fingers) else 1.0
@@ -189,11 +189,23 @@ def palmar_directions(model: Any, palm: str, fingers: Mapping[str, tuple[str, ..
             # A single jaw closes on the palm itself.
             mean = -mean
         if np.linalg.norm(mean) > 1e-6:
-            # In the palm's frame, snapped to the nearest of its axes.
-            turned = data.xmat[body].reshape(3, 3).T @ mean
+            # Snapped to the nearest axis of its largest solid: a palm that is fixed askew to a base keeps its faces.
+            axes = _solid_axes(model, body)
+            turned = axes.T @ data.xmat[body].reshape(3, 3).T @ mean
             face = np.argmax(np.abs(turned))
-            towards[palm] = np.sign(turned[face]) * np.eye(3)[face]
+            towards[palm] = np.sign(turned[face]) * axes[:, face]
     return towards
+
+
+def _solid_axes(model: Any, body: int) -> NDArray[np.float64]:
+    """Return the axes [3, 3], as columns, in which the largest box or mesh of a body was drawn; the body's without."""
+    sided = mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_MESH
+    solids = [geom for geom in geoms_of(model, body) if int(model.geom_type[geom]) in sided]
+    geom = max(solids, key=lambda geom: float(np.prod(model.geom_aabb[geom, 3:])), default=None)
+    axes = np.eye(3) if geom is None else to_matrices(model.geom_quat[geom])
+    # MuJoCo turns meshes to their principal axes.
+    meshed = geom is not None and int(model.geom_type[geom]) == mujoco.mjtGeom.mjGEOM_MESH
+    return axes @ to_matrices(model.mesh_quat[int(model.geom_dataid[geom])]).T if meshed else axes
 
 
 def opens(model: Any, fingers: Mapping[str, tuple[str, ...]]) -> bool:

@@ -340,8 +340,8 @@ def check_hand(described: Mapping[str, Any], env: Env, name: str) -> None:
 def check_fit(described: Mapping[str, Any], env: Env, name: str) -> None:
     """Check what the ``config.json`` of a teacher or student says against an environment.
 
-    Other contacts than those of training are told as a warning: how a policy bears them is a question one may ask. So
-    are a hand whose file was changed, and a student that reads the goal, as published ones do.
+    What else differs from the world of training is told as a warning: how a policy bears it is a question one may ask.
+    So are a hand whose file was changed, and a student that reads the goal, as published ones do.
     """
     check_version(described, name)
     student = described.get("distill")
@@ -363,14 +363,11 @@ def check_fit(described: Mapping[str, Any], env: Env, name: str) -> None:
             )
     if unmeasured := [group for group, _ in groups if group not in MEASURED]:
         _LOG.warning("The student %r reads %s, which only the simulation knows.", name, ", ".join(unmeasured))
-    trained = from_json(dict, described.get("world", {}), f"world of {name}")
-    if trained and (changes := [*differences(trained, world_of(env.task))]):
+    world = from_json(dict, described.get("world", {}), f"world of {name}")
+    trained = {**world, "contacts": contacts_name(trained_contacts(described))}
+    here = {**(world_of(env.task) if world else {}), "contacts": contacts_name(env.task.contacts)}
+    if changes := [*differences(trained, here)]:
         _LOG.warning(
             "The policy %r acts in another world than that of its training: %s. Take the --config and --change of its "
             "training, or read the result as one of this world.", name, listing(changes, limit=3, quoted=False),
-        )  # fmt: skip
-    if (contacts := trained_contacts(described)) != env.task.contacts:
-        _LOG.warning(
-            "The policy %r was trained with contacts %s; these are %s.", name, contacts_name(contacts),
-            contacts_name(env.task.contacts),
         )  # fmt: skip

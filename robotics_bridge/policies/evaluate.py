@@ -92,9 +92,9 @@ class PolicyEvaluation:
 
 
 def mean_of_episodes(values: ArrayLike) -> tuple[float, float]:
-    """Return the mean of a quantity of episodes [n], and the half width of its 95 % interval (0 for one episode)."""
+    """Return the mean of a quantity of episodes [n], and the half width of its 95 % interval (NaN for one episode)."""
     array = np.asarray(values, dtype=float)
-    spread = array.std(ddof=1) if len(array) > 1 else 0.0
+    spread = array.std(ddof=1) if len(array) > 1 else math.nan
     return float(array.mean()), float(_Z * spread / math.sqrt(len(array)))
 
 

@@ -6,7 +6,7 @@ Letters: B environment, N probe, C channel; readings are stored planar [C, B, N]
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,11 +17,6 @@ from brainbench.core.devices import warp
 from robotics_bridge.sensors.noise.model import Noise
 
 _MOST = 512  # packed launches that are kept
-
-
-def memory_of(arrays: Iterable[Any], num_envs: int) -> int:
-    """Return the memory of Warp arrays per environment [bytes]."""
-    return sum(array.size * warp().types.type_size_in_bytes(array.dtype) for array in arrays) // num_envs
 
 
 def fill(kind: Any, source: Any, **fields: Any) -> Any:

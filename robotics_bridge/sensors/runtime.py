@@ -66,8 +66,6 @@ class Runtime(abc.ABC):
         """Place of the reading of each sensor, by name."""
         self.lasting: list[Any] = []
         """Further Warp arrays of environments that later updates read; the runtime of a class enters its own."""
-        self.scratch: list[Any] = []
-        """Those that every update writes anew."""
         self.count = 0
         """Probes N of all sensors."""
         for name, sensor in sensors.items():
@@ -94,7 +92,7 @@ class Runtime(abc.ABC):
             return context.zeros(shape if wanted else (1, 1, 1))
 
         self._noise = ReadingNoise(list(self.slices.values()), channels, context, staged=staged)
-        self.part, self.probe = self._noise.part, self._noise.probe
+        self.part, self.probe, self.make_room = self._noise.part, self._noise.probe, self._noise.make_room
         io = ReadoutArrays()
         io.truth = planes(True)
         io.measured = planes(True) if self.noisy else io.truth
@@ -122,9 +120,8 @@ class Runtime(abc.ABC):
         """Draw from the context's present seed from now on."""
         self._noise.seed()
 
-    def memory(self, dt: float) -> list[Any]:
-        """Return the Warp arrays that later updates, ``dt`` seconds apart, depend on."""
-        self._noise.make_room(dt)
+    def memory(self) -> list[Any]:
+        """Return the Warp arrays of environments that later updates depend on."""
         return [array for array in (*self.readings, *self.lasting, *self.rings) if array.size]
 
     @abc.abstractmethod

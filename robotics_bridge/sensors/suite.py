@@ -16,7 +16,6 @@ from brainbench.core.plugins import load_object
 from brainbench.core.rotations import to_matrices
 from robotics_bridge.physics.scene import TouchScene
 from robotics_bridge.physics.state import MOST_ENVS, EnvIds, HandState, select_envs
-from robotics_bridge.sensors.context import memory_of
 from robotics_bridge.sensors.kernels.pairs import clear_readings, count_update, reset_clock
 from robotics_bridge.sensors.probes.placement import Probes, enclosing_sphere
 from robotics_bridge.sensors.probes.sensors import ContactProbe, SurfaceDistanceProbe
@@ -269,8 +268,10 @@ class SensorSuite:
 
     def memory(self, dt: float) -> dict[str, torch.Tensor]:
         """Return the tensors themselves that updates ``dt`` seconds (s) apart depend on, by name; without histories."""
+        for runtime in self.runtimes:
+            runtime.make_room(dt)
         arrays = [self.context.age, self.context.episode, self.pairs.status]
-        arrays += [array for runtime in self.runtimes for array in runtime.memory(dt)]
+        arrays += [array for runtime in self.runtimes for array in runtime.memory()]
         return {str(number): wp.to_torch(array) for number, array in enumerate(arrays)}
 
     @property
@@ -361,16 +362,10 @@ class SensorSuite:
             self._by_depth = []
 
     @property
-    def state_bytes(self) -> dict[str, int]:
-        """Memory per environment [bytes]: ``sensors``, ``shared`` lists of contacts, ``rings`` that users asked for,
-        and ``scratch`` that every update writes anew."""
-        owners = {
-            "sensors": [(*runtime.readings, *runtime.lasting) for runtime in self.runtimes],
-            "rings": [owner.rings for owner in (*self.runtimes, *self._histories.values())],
-            "scratch": [runtime.scratch for runtime in self.runtimes],
-        }
-        sizes = {name: sum(memory_of(held, self.num_envs) for held in lists) for name, lists in owners.items()}
-        return {**sizes, "shared": 8 + self.pairs.state_bytes}
+    def state_bytes(self) -> int:
+        """Memory per environment of what sensors read and remember [bytes]."""
+        arrays = (array for runtime in self.runtimes for array in runtime.memory())
+        return sum(array.size * wp.types.type_size_in_bytes(array.dtype) for array in arrays) // self.num_envs
 
     def _launch(self, state: HandState, dt: float) -> None:
         self.pairs.update(state)

@@ -151,7 +151,12 @@ class Thermometers:
             balls = len(self._balls)
             drawn = (self._env.draw(1, 0.0, 1.0)[:, 0] * balls).long().clamp(max=balls - 1)
             self._env.episode.target.copy_(torch.where(mask, drawn, self._env.episode.target))
-        self._begin_anew(mask)
+        # Another ball is hot, and the fingers are cold.
+        self._apply(mask)
+        self.suite.reset(mask)
+        for cells in self._cells:
+            # Until their next update, readings are those of the episode before.
+            cells.masked_fill_(mask.view(-1, 1, 1, 1), self.thermal.ambient)
         self.latched &= ~mask
         self.touching &= ~mask
         self.latch_time.masked_fill_(mask, float("inf"))
@@ -206,18 +211,9 @@ class Thermometers:
 
     def memory(self) -> dict[str, torch.Tensor]:
         """Return the tensors themselves of latch, metric and temperatures."""
-        tensors = {"latched": self.latched, "latch_time": self.latch_time, "contact": self.contact}
-        tensors |= {"touching": self.touching, "age": self.age}
+        tensors = {name: getattr(self, name) for name in ("latched", "latch_time", "contact", "touching", "age")}
         heat = self.suite.memory(self._env.simulation.timestep)
         return tensors | {f"heat.{name}": value for name, value in heat.items()}
-
-    def _begin_anew(self, mask: torch.Tensor) -> None:
-        """Make the target ball hot and the fingers cold."""
-        self._apply(mask)
-        self.suite.reset(mask)
-        for cells in self._cells:
-            # Until their next update, readings are those of the episode before.
-            cells.masked_fill_(mask.view(-1, 1, 1, 1), self.thermal.ambient)
 
     def _apply(self, mask: torch.Tensor) -> None:
         """Make the target ball hot."""

@@ -189,17 +189,14 @@ def bits(rollout: TouchRollout, links: Sequence[int]) -> Features:
     return torch.stack(parts, -1).float().flatten(2)
 
 
-def without_latency(model: str) -> dict[str, str]:
-    """Return the options with which a network answers at once; only temporal graphs add latency."""
-    graph = isinstance(getattr(locate_model(model).outline(), "encoder", None), TemporalGraph)
-    return {"unroll": "full"} if graph else {}
-
-
 def network(
     rollout: TouchRollout, grid: TaxelGrid, calibration: HandCalibration, *, model: str, time: Time, seed: int
 ) -> Features:
     """Return the features of a network that steps through the rollout, its memory forgotten where episodes begin."""
-    front = FrontEnd(model, grid, time=time, calibration=calibration, seed=seed, options=without_latency(model))
+    # Networks answer at once here; only temporal graphs add latency.
+    graph = isinstance(getattr(locate_model(model).outline(), "encoder", None), TemporalGraph)
+    options = {"unroll": "full"} if graph else {}
+    front = FrontEnd(model, grid, time=time, calibration=calibration, seed=seed, options=options)
     front = front.to(rollout.taxels.device)
     state, answers = front.init_state(rollout.taxels.shape[1]), []
     for reading, first in zip(rollout.taxels, rollout.begun, strict=True):

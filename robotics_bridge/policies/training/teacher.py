@@ -377,10 +377,6 @@ class Trainer:
                 "another encoder."
             ) from cause
 
-    def policy(self) -> Policy:
-        """Return the present actor."""
-        return Policy(self.algorithm.get_policy())
-
     @property
     def _curriculum(self) -> dict[str, torch.Tensor]:
         return {f"curriculum_{name}": value for name, value in self.env.unwrapped.goals.curriculum().items()}

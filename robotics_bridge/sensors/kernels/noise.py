@@ -244,13 +244,6 @@ def apply_drawn(
     return wp.vec3(wp.where(finite, y, x), wp.where(finite, lag, hysteresis_state), wp.where(finite, drift, walk_state))
 
 
-@wp.func
-def delay_jitter(p: NoiseParams, env: int, age: int, episode: int) -> float:
-    """Return a number in [−1, 1) for the delay of a sensor in this update."""
-    w0, _w1, _w2, _w3 = draw(p, env, -1, age, episode, wp.static(JITTER))
-    return float(2.0) * uniform(w0) - float(1.0)
-
-
 @wp.kernel
 def measure(
     p: wp.array(dtype=NoiseParams),
@@ -367,7 +360,8 @@ def delay_line(
     i = part[n]
     wait = delay[i]
     if jitter[i] > float(0.0):
-        wait = wait + jitter[i] * delay_jitter(p[i], env_offset + env, age[env], episode[env])
+        w0, _w1, _w2, _w3 = draw(p[i], env_offset + env, -1, age[env], episode[env], wp.static(JITTER))
+        wait = wait + jitter[i] * (float(2.0) * uniform(w0) - float(1.0))
     size = ring.shape[0]
     # The last reading at or before the moment; before the first has arrived, the first.
     back = wp.min(wp.min(int(wp.ceil(wait / dt - float(1.0e-4))), age[env]), size - 1)

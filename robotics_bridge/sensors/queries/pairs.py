@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from brainbench.core.devices import to_struct, warp
 from robotics_bridge.physics.state import HandState
-from robotics_bridge.sensors.context import LaunchContext, memory_of
+from robotics_bridge.sensors.context import LaunchContext
 from robotics_bridge.sensors.kernels.pairs import PairArrays, SlotArrays, list_pairs, start_kernel
 from robotics_bridge.sensors.queries.solids import Solids
 
@@ -89,12 +89,6 @@ class PairTable:
         fresh = [link not in self._loaded for link in links]
         self._loaded.update(links)
         return self.loads, fresh
-
-    @property
-    def state_bytes(self) -> int:
-        """Memory per environment [bytes]."""
-        sided = memory_of([self.struct.push, self._pushes], self._context.num_envs)
-        return _PLACE_BYTES * sum(self._rooms) + 4 * len(self._slots) * (1 + self._words) + 4 + sided
 
     def freeze(self) -> None:
         """Make the arrays."""

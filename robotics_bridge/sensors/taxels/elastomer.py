@@ -81,12 +81,7 @@ class ElastomerRuntime(ProbeRuntime):
             setattr(pads, name, context.zeros(shape if self.apart else (1,) * len(shape), dtype))
         self.pads = pads
         """Warp structure of gels, sums and anchors."""
-        self.lasting, self.scratch = [pads.stamp, pads.dragged], [pads.indentation]
-        self.scratch += [pads.spread] if self._way != "direct" else []
-        if total_points:
-            self.lasting += [pads.anchor, pads.held]
-            self.scratch += [pads.drive, pads.order, pads.moved]
-        self.scratch += [pads.drag, pads.along, pads.across] if self.apart else []
+        self.lasting = [pads.stamp, pads.dragged, *([pads.anchor, pads.held] if total_points else [])]
         self._spectra: list[Any] = []
 
     def _by_point(self, shape: tuple[int, ...], dtype: Any) -> Any:

@@ -133,8 +133,6 @@ class ContactLoadRuntime(KinematicRuntime):
         press.listed, press.end = context.zeros(shape, int), context.zeros((envs, len(configs)), int)
         press.noisy = context.zeros(shape if self.noisy else (1, 1))
         press.sigma = context.zeros(shape if sticky else (1, 1), wp.vec3f)
-        self.scratch = [press.touch, press.body, press.listed, press.end]
-        self.scratch += [press.noisy] * self.noisy + [press.sigma] * sticky
         faces = self.faces
         faces.head, faces.listed = (context.array(np.full((envs, len(places)), -1), int) for _ in range(2))
         faces.items, faces.count = context.zeros((2, items), wp.vec2i), context.zeros(2, int)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 
+import numpy as np
 import pytest
 
 from brainbench.core.errors import UsageError
@@ -95,3 +96,38 @@ def test_both_hands_of_a_file_carry_a_board_in_one_scene(tmp_path) -> None:
 def test_followers_of_a_model_without_loops_are_those_that_mimic(tmp_path) -> None:
     hand = hands.load(GALLERY["mimic-hand"].write(tmp_path, "hand"))
     assert {hand.model.joint(joint).name for joint in Tree(hand.model).followers} == set(hand.tips)
+
+
+_ASKEW = """<robot name="askew"><link name="base"/>
+<joint name="mount" type="fixed"><parent link="base"/><child link="palm"/><origin rpy="{turn} 0 0"/></joint>
+<link name="palm"><inertial><mass value=".3"/><inertia ixx="1e-3" iyy="1e-3" izz="1e-3" ixy="0" ixz="0" iyz="0"/>
+</inertial><collision><geometry><box size=".08 .1 .024"/></geometry></collision></link>{fingers}</robot>"""
+_PHALANX = """<link name="{name}"><inertial><mass value=".05"/><inertia ixx="1e-4" iyy="1e-4" izz="1e-4" ixy="0" ixz="0"
+iyz="0"/></inertial><collision><origin xyz="0 .02 0"/><geometry><box size=".016 .04 .016"/></geometry></collision>
+</link>
+<joint name="to_{name}" type="revolute"><parent link="{parent}"/><child link="{name}"/><origin xyz="{x} .05 0"/>
+<axis xyz="1 0 0"/><limit lower="0" upper="1.5" effort="1" velocity="3"/></joint>"""
+
+
+@pytest.mark.parametrize("turn", [0.4, 0.7, 0.9, 2.0])
+def test_taxels_of_a_palm_that_is_mounted_askew_turn_with_it(turn: float, tmp_path) -> None:
+    fingers = "".join(
+        _PHALANX.format(name=f"{name}{part}", parent="palm" if part == "a" else f"{name}a", x=x if part == "a" else 0)
+        for name, x in (("index", -0.03), ("middle", 0.0), ("ring", 0.03))
+        for part in "ab"
+    )
+    palms = []
+    for number, angle in enumerate((0.0, turn)):
+        file = tmp_path / f"hand{number}.urdf"
+        file.write_text(_ASKEW.format(turn=angle, fingers=fingers))
+        hand = hands.load(file)
+        palms.append(hand.layout("low", "palm")[hand.palm])
+    straight, askew = palms
+    c, s = np.cos(turn), np.sin(turn)
+    about_x = np.array([[1, 0, 0], [0, c, -s], [0, s, c]])
+    assert straight.active.sum() == askew.active.sum() > 10
+    np.testing.assert_allclose(askew.normal[askew.active], straight.normal[straight.active] @ about_x.T, atol=1e-6)
+    # The grid may count its rows from the other side.
+    there = straight.position[straight.active] @ about_x.T
+    apart = np.linalg.norm(askew.position[askew.active][:, None] - there, axis=2).min(axis=1)
+    assert apart.max() < 0.012

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -11,7 +12,7 @@ from brainbench.core.errors import UsageError
 from brainbench.core.rotations import about, multiply
 from robotics_bridge import tasks
 from robotics_bridge.envs import Env
-from robotics_bridge.policies.evaluate import PolicyEvaluation, agent, evaluate
+from robotics_bridge.policies.evaluate import PolicyEvaluation, agent, evaluate, mean_of_episodes
 from robotics_bridge.tasks.registry import apply_overrides
 from robotics_bridge.tasks.task import Placement
 
@@ -35,6 +36,11 @@ def test_every_environment_contributes_equally_many_episodes_of_every_seed() -> 
     assert found.success_rate == 0.0
     assert len(found.per_seed) == 3
     assert found.summary()["episodes"] == 18
+
+
+def test_one_episode_has_no_interval() -> None:
+    assert math.isnan(mean_of_episodes([3.0])[1])
+    assert mean_of_episodes([3.0, 5.0]) == (4.0, pytest.approx(1.959964))
 
 
 def test_an_episode_that_diverged_is_no_success_whatever_it_reached() -> None:

@@ -114,3 +114,14 @@ def test_a_policy_forgets_what_it_did_before_the_rollout() -> None:
         env.seed(0)
         found.append(collect(env, policy, 0.2).proprio[..., -env.num_actions :])
     assert torch.equal(*found)
+
+
+def test_of_several_objects_the_contacts_on_the_one_that_counts_are_read() -> None:
+    env = tasks.make("hot_ball", num_envs=4, observe="force_torque", placement="tips", resolution="low", threads=1)
+    env.seed(1)
+    rollout = collect(env, agent("zero", env), 0.5)
+    assert len(set(env.state.episode.target.tolist())) > 1
+    apart = (rollout.targets["contact"] - rollout.targets["position"]).norm(dim=-1)
+    touching = ~apart.isnan()
+    assert touching.float().mean() > 0.3
+    assert float(apart[touching].max()) < 0.042  # the balls have a radius of 40 mm
