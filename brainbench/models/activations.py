@@ -138,15 +138,14 @@ def extract(
     model = proof.unwrapped(model)
     check_weights(model, type(model).__name__)
     rooms = _Rooms(len(values), folder, int(memory * 2**30), reduce)
-    with _surroundings(model) as device, evaluating(model), torch.no_grad(), proof.uncompiled(model):
+    with _surroundings(model) as device, evaluating(model), torch.no_grad():
         run = _Run(model, values, device)
         if readout != "default":
             reader = partial(find_readout(readout).activations, model, layers=layers)
         else:
             reader = named_reader(model, layers)
         if reader is not None:
-            # The tests of this package prove the layers of its own networks.
-            ours = type(model).__module__.startswith("brainbench.")
+            ours = type(model).__module__.startswith("brainbench.")  # whose layers our tests prove
             _read_named(run, reader, rooms, chunk, proven=ours or readout != "default")
         else:
             _HookedReader(run, layers, rooms).read(chunk)
@@ -203,6 +202,9 @@ def _surroundings(model: nn.Module) -> Iterator[Any]:
             scope.enter_context(torch.autocast(device, enabled=False))
         if where.type != "cpu":
             scope.enter_context(torch.device("cpu"))
+        if any("_orig_mod" in part._modules or getattr(part, "_compiled_call_impl", None) for part in model.modules()):
+            # Parts that were compiled run as written, since only those call hooks.
+            scope.enter_context(torch.compiler.set_stance("force_eager"))
         torch.set_default_dtype(torch.float64 if double else torch.float32)
         scope.callback(torch.set_default_dtype, kind)
         yield where

@@ -14,7 +14,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager, nullcontext
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
@@ -293,13 +293,6 @@ def fresh_copy(model: nn.Module) -> nn.Module | None:
 def unwrapped(model: Any) -> Any:
     """Return the module inside a compiled one."""
     return getattr(model, "_orig_mod", model)
-
-
-def uncompiled(model: nn.Module) -> Any:
-    """Return a context in which parts that were compiled run as written, since only those call hooks."""
-    if any("_orig_mod" in part._modules or getattr(part, "_compiled_call_impl", None) for part in model.modules()):
-        return torch.compiler.set_stance("force_eager")
-    return nullcontext()
 
 
 def layer_modules(model: nn.Module) -> dict[str, nn.Module]:

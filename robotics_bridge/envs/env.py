@@ -282,8 +282,3 @@ class RslRlEnv:
         _, reward, terminated, truncated, info = self.unwrapped.step(actions)
         extras = {"time_outs": truncated, "log": info["log"], "info": info}
         return self.get_observations(), reward, terminated | truncated, extras
-
-    def reset(self) -> tuple[TensorDict, dict[str, Any]]:
-        """Start new episodes everywhere (rsl_rl itself never calls this)."""
-        self.unwrapped.reset()
-        return self.get_observations(), {}

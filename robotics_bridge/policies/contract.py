@@ -13,7 +13,7 @@ import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, fields, is_dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, cast
 
 import msgspec
 from msgspec import Meta
@@ -269,8 +269,7 @@ def with_contacts_of(task: Task, policies: Iterable[str]) -> Task:
     facts = {name: described for name in policies if (described := stored(name))}
     contacts = {name: trained_contacts(described) for name, described in facts.items()}
     deployments = [from_json(dict, described.get("deployment", {}), "deployment") for described in facts.values()]
-    law: Any = float | None
-    laws = {from_json(law, stated["twist"], "twist of a policy") for stated in deployments if "twist" in stated}
+    laws = {from_json(cast(Any, float | None), facts["twist"], "twist") for facts in deployments if "twist" in facts}
     if len(laws) > 1:
         raise UsageError(f"The students {', '.join(facts)} learned from forces of different laws; take one at a time.")
     if laws:
