@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import make_dataclass
 from types import SimpleNamespace
 from typing import Any
 
@@ -27,18 +28,19 @@ class TouchWorld:
         if observation_type(observe).sensor is not None:
             self.touch = SimpleNamespace(links=tuple(f"tip{i}" for i in range(5)))
         student = ("proprio", "goal", "tactile") if self.touch else ("proprio", "goal")
-        self.task = SimpleNamespace(
-            groups={"student": student},
-            taxel_twist=None,
-            action_limit=None,
-            starts=None,
-            command=("on",),
-            contacts=ContactModel(),
-            decoders=(SimpleNamespace(target="aux_aim", weight=0.5, scale=2.0, hidden=(16,)),),
-            student=SimpleNamespace(
+        facts: dict[str, Any] = {
+            "groups": {"student": student},
+            "taxel_twist": None,
+            "action_limit": None,
+            "starts": None,
+            "command": ("on",),
+            "contacts": ContactModel(),
+            "decoders": (SimpleNamespace(target="aux_aim", weight=0.5, scale=2.0, hidden=(16,)),),
+            "student": SimpleNamespace(
                 iterations=4, learning_rate=1e-3, epochs=2, gradient_length=2, clip=None, max_grad_norm=None, loss="mse"
             ),
-        )
+        }
+        self.task: Any = make_dataclass("Task", facts)(**facts)
         if self.touch:
             config = EncoderConfig(placement="tips", resolution="low", observe=observe, name="mlp")
             self.shape = config.build().shape
