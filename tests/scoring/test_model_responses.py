@@ -49,6 +49,18 @@ def test_a_network_of_ours_inside_a_module_of_the_users_sees_si_values(normalize
     assert card.input == "SI (N, N·m); normalised inside the model"
 
 
+def test_the_default_device_of_the_program_has_no_part_in_responses():
+    network, array = load_model("zhuang-small"), WhiskerArray.of("mouse").select("C2")
+    stimuli = simulate([Scene("free", array)], fidelity="fast", cache=False)
+    options = ScoreOptions(stimuli=stimuli, layers=("output",))
+    usual = resolve_model(nn.Sequential(network)).respond(options)
+    with torch.device("meta"):
+        responses = resolve_model(nn.Sequential(network)).respond(options)
+    assert list(responses.activations) == list(usual.activations)
+    for name, values in usual.activations.items():
+        np.testing.assert_array_equal(responses.activations[name], values)
+
+
 def test_a_module_with_any_spec_is_plain():
     class Spectrum(nn.Module):
         def __init__(self):
