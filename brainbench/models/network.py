@@ -49,6 +49,10 @@ class Normaliser(nn.Module):
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """Return the normalised stimulus, same shape."""
+        if torch.float16 in (x.dtype, self.scale.dtype):
+            raise UsageError(
+                "Half precision (float16) is too coarse for moments about 1e-6 N·m: take bfloat16, or single precision."
+            )
         return (x - self.offset) / self.scale
 
 

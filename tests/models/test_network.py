@@ -11,6 +11,7 @@ from brainbench.models.encoders import GPTAttender, zhuang_graph
 from brainbench.models.graph.temporal_graph import TemporalGraph
 from brainbench.models.network import EncoderAttenderDecoder, Normaliser
 from brainbench.models.parts import make_decoder
+from brainbench.models.registry import load_model
 from tests.factories.training_sweeps import SCALE, random_sweeps
 
 
@@ -131,3 +132,15 @@ def test_a_wrong_step_is_told_what_is_expected_and_received():
     network = _network()
     with pytest.raises(UsageError, match=r"received \[2, 6, 30, 5, 7\]"):
         network.step(random_sweeps(2, 6), network.init_state(2))
+
+
+def test_a_network_in_half_precision_is_refused_which_loses_small_moments():
+    stimuli = torch.randn(2, 4, 30, 5, 7, generator=torch.Generator().manual_seed(0))
+    stimuli *= torch.tensor(([1e-5] * 3 + [1e-7] * 3) * 5)[:, None, None]
+    network = load_model("zhuang-small", seed=0).eval()
+    with torch.no_grad():
+        expected = network(stimuli)
+        rounded = network.to(torch.bfloat16)(stimuli.bfloat16()).float()
+        assert float((rounded - expected).abs().max() / expected.abs().max()) < 0.02
+        with pytest.raises(UsageError, match=r"\(float16\) is too coarse.*take bfloat16"):
+            network.to(torch.float16)(stimuli.half())

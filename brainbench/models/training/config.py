@@ -99,13 +99,6 @@ class TrainingConfig:
         return cls(**values)
 
     @property
-    def stored_dtype(self) -> str:
-        """Precision in which the weights are published, once ``precision`` is no longer ``auto``."""
-        if self.weights_dtype != "auto":
-            return self.weights_dtype
-        return "bfloat16" if self.precision == "bf16" else "float32"
-
-    @property
     def identity(self) -> dict[str, Any]:
         """Options that must be equal for a run to be resumed: all but how often and how exactly results are stored."""
         free = ("checkpoint_seconds", "weights_dtype")

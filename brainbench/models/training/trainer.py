@@ -382,7 +382,9 @@ class _Run:
         config, reached = self.config, {"epochs_done": self.at.epoch, "best_epoch": self.at.best_epoch}
         facts = {"twin": self.twin, "controls": self.controls, "data": self.data.summary, "split": split}
         info = checkpoint_info(config, self.data.classes, evaluation=result, **reached, **facts)
-        stated = {"options": self.options, "info": info, "card": model_card(config, info), "dtype": config.stored_dtype}
+        dtype = "bfloat16" if config.precision == "bf16" else "float32"
+        dtype = dtype if config.weights_dtype == "auto" else config.weights_dtype
+        stated = {"options": self.options, "info": info, "card": model_card(config, info), "dtype": dtype}
         save_checkpoint(self.out / BEST, self.model, architecture=config.model, **stated)
 
     def _save(self) -> None:
