@@ -14,7 +14,7 @@ from brainbench.core.errors import BrainbenchError
 from robotics_bridge.hands import load_all
 from robotics_bridge.hands.hand import Hand
 from robotics_bridge.hands.layouts import Layout, active_count
-from robotics_bridge.hands.tree import doubts_of, link_points
+from robotics_bridge.hands.tree import doubts_of, link_points, overlaps
 
 mujoco = mujoco_module()
 
@@ -73,7 +73,7 @@ def check_hand(hand: Hand, pictures: Path | None = None, resolution: str = "low"
     except BrainbenchError as error:
         return HandCheck(hand.name, file, hand.palm, hand.tips, errors=(str(error),))
     bare = tuple(link for link in hand.links() if link not in layout and link not in hand.couplers)
-    errors = [*doubts_of(hand.model, hand.links())]
+    errors = [*doubts_of(hand.model, hand.links(), overlaps(hand.model)[1])]
     errors += [f"no taxels on the tip {tip!r}" for tip in hand.tips if tip not in layout]
     errors += [f"no ball can press the tip {tip!r}" for tip in hand.tips if tip in layout and tip not in loads]
     parts, levers = [0.0], [0.0]

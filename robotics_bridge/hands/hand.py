@@ -19,7 +19,7 @@ from brainbench.core.files import content_hash
 from brainbench.core.reading.regular import readable
 from robotics_bridge.hands.files import read_mjspec, stated_speeds
 from robotics_bridge.hands.layouts import Layout, Pad, check_names, is_probe_file, pad_probes, read_probes, select
-from robotics_bridge.hands.tree import Tree, cast_grid, doubts_of, geoms_of, nested_links, palmar_directions
+from robotics_bridge.hands.tree import Tree, cast_grid, doubts_of, geoms_of, overlaps, palmar_directions
 from robotics_bridge.sensors.probes.placement import Probes
 
 _log = logging.getLogger(__name__)
@@ -211,13 +211,13 @@ def all_from_file(path: Path) -> tuple[Hand, ...]:
     def names(bodies: Iterable[int]) -> tuple[str, ...]:
         return tuple(model.body(body).name for body in bodies)
 
-    nested, hands = nested_links(model), []
+    (nested, jammed), hands = overlaps(model), []
     for hand in branches:
         fingers = {model.body(tip).name: names(chain) for tip, chain in hand.fingers.items()}
         couplers = frozenset(names(hand.couplers))
         name = path.stem if len(branches) == 1 else f"{path.stem}-{model.body(hand.palm).name}"
         hands.append(Hand(name, model.body(hand.palm).name, fingers, path, couplers=couplers, nested=nested))
-        for doubt in doubts_of(model, hands[-1].links(), nested):
+        for doubt in doubts_of(model, hands[-1].links(), jammed):
             _log.warning("Hand %s: %s.", brief(name), doubt)
     return tuple(hands)
 

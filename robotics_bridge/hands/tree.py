@@ -134,6 +134,7 @@ def _nearest(model: Any, geoms: list[int], origin: NDArray, direction: NDArray) 
     return best
 
 
+Pairs = frozenset[tuple[str, str]]
 _CROSSED = 0.012  # joints nearer to each other (m) act on a link together
 _SNAP = 0.9  # cosine from which a direction counts as that of an axis of its link: jaws have flat faces
 _JAWS = 0.4
@@ -231,32 +232,31 @@ def half_open(model: Any) -> Any:
     return data
 
 
-def overlaps(model: Any) -> dict[tuple[int, int], float]:
-    """Return pairs of bodies (low, high) that collide in the pose of :func:`half_open`, and how deep they lie (m)."""
-    data, depths = half_open(model), dict[tuple[int, int], float]()
-    mujoco.mj_fwdPosition(model, data)
-    for bodies, distance in zip(model.geom_bodyid[data.contact.geom].tolist(), data.contact.dist, strict=True):
-        pair = (min(bodies), max(bodies))
-        depths[pair] = max(depths.get(pair, 0.0), -float(distance))
-    return depths
+def overlaps(model: Any) -> tuple[Pairs, Pairs]:
+    """Return pairs of links that lie in one another in the pose of :func:`half_open`: nested ones, and others too deep.
 
-
-def nested_links(model: Any) -> frozenset[tuple[str, str]]:
-    """Return pairs of a link held by the world and one that it carries by a joint, which lie in one another at rest.
-
-    Of all neighbours along a joint MuJoCo lets only such pairs collide.
+    Nested are a link held by the world and one that it carries by a joint: of all neighbours along a joint MuJoCo lets
+    only such pairs collide.
     """
-    weld, parent = model.body_weldid, model.body_parentid
-    deep = [pair for pair, depth in overlaps(model).items() if depth > _TOUCHING and pair[0] and not weld[pair[0]]]
-    return frozenset(
-        (model.body(low).name, model.body(high).name)
-        for low, high in deep
-        if weld[high] and not weld[parent[weld[high]]]
-    )
+    data, weld, parent = half_open(model), model.body_weldid, model.body_parentid
+    mujoco.mj_fwdPosition(model, data)
+    nested, jammed = set[tuple[str, str]](), set[tuple[str, str]]()
+    for bodies, distance in zip(model.geom_bodyid[data.contact.geom].tolist(), data.contact.dist, strict=True):
+        low, high = sorted(bodies)
+        held = low and not weld[low] and weld[high] and not weld[parent[weld[high]]]
+        if -distance > (_TOUCHING if held else _DEEPEST):
+            (nested if held else jammed).add((model.body(low).name, model.body(high).name))
+    return frozenset(nested), frozenset(jammed)
 
 
-def doubts_of(model: Any, links: Sequence[str], nested: frozenset[tuple[str, str]] = frozenset()) -> tuple[str, ...]:
-    """Return what no real hand of these links is like, in words; DataError if its lengths are no metres."""
+def doubts_of(model: Any, links: Sequence[str], jammed: Pairs) -> tuple[str, ...]:
+    """Return what no real hand of these links is like, in words; DataError if its lengths are no metres.
+
+    Args:
+        model: The compiled hand.
+        links: Palm and fingers.
+        jammed: Pairs that lie too deep in one another, from :func:`overlaps`.
+    """
     data, solids, far = half_open(model), {}, {}
     for link in links:
         body = model.body(link).id
@@ -293,10 +293,9 @@ def doubts_of(model: Any, links: Sequence[str], nested: frozenset[tuple[str, str
         )
     if (mass := float(sum(model.body(link).mass[0] for link in links))) > _HEAVIEST:
         doubts.append(f"palm and fingers weigh {mass:.3g} kg: masses are in kg")
-    deep = {(model.body(a).name, model.body(b).name) for (a, b), depth in overlaps(model).items() if depth > _DEEPEST}
-    if jammed := sorted(" and ".join(pair) for pair in deep - nested if {*pair} <= {*links}):
+    if own := sorted(" and ".join(pair) for pair in jammed if {*pair} <= {*links}):
         doubts.append(
-            f"{listing(jammed)} lie more than {1e3 * _DEEPEST:g} mm in each other at rest and push each other: exclude "
+            f"{listing(own)} lie more than {1e3 * _DEEPEST:g} mm in each other at rest and push each other: exclude "
             "their collision"
         )
     return tuple(doubts)
