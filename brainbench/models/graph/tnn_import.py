@@ -8,9 +8,10 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from graphlib import CycleError, TopologicalSorter
-from typing import Any
+from typing import Annotated, Any, Literal
 
-from brainbench.core.errors import DataError, brief, check_name, check_number, listing, unknown_name
+from brainbench.core.errors import DataError, brief, check_name, listing
+from brainbench.core.limits import Limit, Share, check_value
 from brainbench.core.reading.regular import readable
 from brainbench.core.reading.texts import read_json, read_mapping
 from brainbench.models.graph.spec import Convolution, Dense, Edge, GraphSpec, Memory, Node, Operation, Pool
@@ -23,7 +24,9 @@ _MEMORIES = {
     "LSTMCell": "lstm",
 }
 _REQUIRED = object()
-_LARGEST = 10**6  # largest number of channels, features, rows or columns
+_Size = Annotated[int, Limit(least=1, most=10**6)]  # channels, features, rows or columns
+_Margin = Annotated[int, Limit(least=0, most=10**6)]
+_Sizes, _Margins = tuple[_Size, _Size], tuple[_Margin, _Margin]
 # Keys that PyTorchTNN accepts and overwrites while it builds the graph.
 _OVERWRITTEN = ("in_channels", "input_in_channels", "input_shape", "num_timesteps", "state_shape")
 
@@ -37,11 +40,21 @@ class _Section:
         self.data = dict(data)
         self.where = where
 
-    def take(self, key: str, default: Any = _REQUIRED) -> Any:
-        """Remove a key and return its value, or the default; without either raise :class:`DataError`."""
+    def take(self, key: str, default: Any = _REQUIRED, kind: Any = None) -> Any:
+        """Remove a key and return its value, checked as a kind, or the default; without either, refuse."""
         if key not in self.data and default is _REQUIRED:
             raise DataError(f"The graph configuration lacks {key!r} in {self.where}.")
-        return self.data.pop(key, default)
+        value = self.data.pop(key, default)
+        check_value(f"{key!r} in {self.where}", value, kind)
+        return value
+
+    def size(self, key: str, default: Any = _REQUIRED, kind: Any = _Sizes) -> Any:
+        """Take a pair of whole numbers, of which one may stand for both, or what else the kind allows."""
+        value = self.data.get(key, default)
+        if type(value) is int:
+            self.data[key] = (value, value)
+        value = self.take(key, default, kind)
+        return tuple(value) if isinstance(value, list) else value
 
     def only(self, **allowed: Any) -> None:
         """Take keys that must be absent or have the allowed value, or one of a tuple of them."""
@@ -54,45 +67,11 @@ class _Section:
                     f"{choices[0]!r} is supported."
                 )
 
-    def flag(self, key: str, default: bool) -> bool:
-        """Take true or false."""
-        value = self.take(key, default)
-        if not isinstance(value, bool):
-            raise DataError(f"{key!r} in {self.where} must be true or false; found {brief(value)}.")
-        return value
-
-    def number(self, key: str, default: Any = _REQUIRED, **bounds: Any) -> Any:
-        """Take a number within bounds; None passes where it is the default."""
-        value = self.take(key, default)
-        if value is not None or default is not None:
-            check_number(f"{key!r} in {self.where}", value, **bounds)
-        return value
-
-    def size(self, key: str, default: Any = _REQUIRED, *, or_else: tuple[Any, ...] = ()) -> Any:
-        """Take a pair of whole numbers (or one for both), or one of other values."""
-        value = self.take(key, default)
-        if value in or_else:
-            return value
-        if or_else and isinstance(value, str):
-            raise unknown_name(f"{key} in {self.where}", value, or_else)
-        numbers = [value, value] if type(value) is int else value
-        least = 0 if key == "padding" else 1
-        if not isinstance(numbers, (list, tuple)) or len(numbers) != 2 or not all(_is_size(n, least) for n in numbers):
-            raise DataError(
-                f"{key!r} in {self.where} must be a whole number from {least} to {_LARGEST:,}, or a pair of them; "
-                f"found {brief(value)}."
-            )
-        return (numbers[0], numbers[1])
-
     def done(self, *ignored: str) -> None:
         """Raise :class:`DataError` if keys are left that nobody took, the ``ignored`` ones aside."""
         left = [key for key in self.data if key not in ignored]
         if left:
             raise DataError(f"The graph configuration has the unsupported key {listing(left)} in {self.where}.")
-
-
-def _is_size(value: Any, least: int = 1) -> bool:
-    return type(value) is int and least <= value <= _LARGEST
 
 
 def read_graph(source: Mapping[str, Any] | str | os.PathLike[str]) -> GraphSpec:
@@ -118,9 +97,7 @@ def _graph(source: Mapping[str, Any]) -> GraphSpec:
         ends.append((str(edge.take("from")), str(edge.take("to"))))
         edge.done()
     inputs, output = tuple(config.take("input_nodes")), config.take("output_node")
-    shape, order = tuple(config.take("input_shape")), config.take("ff_order", None)
-    if not all(map(_is_size, shape)):
-        raise DataError(f"'input_shape' must be whole numbers from 1 to {_LARGEST:,}; found {brief(shape)}.")
+    shape, order = tuple(config.take("input_shape", kind=tuple[_Size, ...])), config.take("ff_order", None)
     # The number of steps is that of the stimulus; the decoder stands beside the graph.
     config.done("num_timesteps", "sep_num", "addnet")
     if not isinstance(output, str):
@@ -146,7 +123,7 @@ def _node(entry: Any) -> Node:
     name = str(node.take("name"))
     node.where = f"node {name!r}"
     node.only(residual=(None, False))
-    channels = node.number("out_channels", least=1, most=_LARGEST, whole=True)
+    channels = node.take("out_channels", kind=_Size)
     harbor = _Section(node.take("harbor_policy"), f"the harbor policy of {name!r}")
     policy = harbor.take("name")
     check_name(f"harbor policy of node {name!r}", policy, ("ResizeConcat", "Identity"))
@@ -170,15 +147,15 @@ def _operation(part: _Section) -> Convolution | Dense | None:
         return None
     check_name(f"module in {part.where}", kind, ("Conv2dCell", "FullyConnected", "Identity"))
     common = {
-        "use_bias": part.flag("use_bias", True),
-        "bias": part.number("bias", None),
-        "dropout": part.number("dropout", 0.0, least=0, most=1),
+        "use_bias": part.take("use_bias", True, bool),
+        "bias": part.take("bias", None, float | None),
+        "dropout": part.take("dropout", 0.0, Share),
         # Left out, PyTorchTNN's dense layers rectify and its convolutions do not.
         "activation": part.take("activation", "ReLU" if kind == "FullyConnected" else None),
         "initialiser": _initialiser(part),
     }
     part.only(activation_func_kwargs=({}, None), batchnorm_timevary=False)
-    channels = part.number("out_channels", least=1, most=_LARGEST, whole=True)
+    channels = part.take("out_channels", kind=_Size)
     norm = part.take("batchnorm", None)
     # PyTorchTNN's dense layers ask whether there is one, its convolutions how many channels it has.
     common["batch_norm"] = norm is not None and norm is not False
@@ -188,7 +165,7 @@ def _operation(part: _Section) -> Convolution | Dense | None:
     if kind == "FullyConnected":
         operation: Convolution | Dense = Dense(channels, **common)
     else:
-        padding = part.size("padding", 0, or_else=("same", "valid"))
+        padding = part.size("padding", 0, Literal["same", "valid"] | _Margins)
         part.only(dilation=1, groups=1, padding_mode="zeros")
         operation = Convolution(channels, part.size("ksize"), part.size("stride", 1), padding, **common)
         if operation.padding == "same" and operation.stride != (1, 1):
@@ -216,13 +193,13 @@ def _memory(part: _Section) -> Memory | None:
     check_name(f"cell in {part.where}", kind, ("IdentityCell", *_MEMORIES))
     part.only(init_dict=None)
     if kind == "TimeDecayRecurrentCell":
-        memory = Memory("time-decay", tau=part.number("tau", 0.0), trainable=part.flag("trainable", True))
+        memory = Memory("time-decay", tau=part.take("tau", 0.0, float), trainable=part.take("trainable", True, bool))
     else:
         part.only(stride=1, padding="same", dilation=1, groups=1, padding_mode="zeros")
         part.only(use_bias=True, forget_bias=1.0, activation="Tanh", activation_func_kwargs={})
         # Only the initial value of a bias that load_tnn_state or training replaces.
         part.only(bias=(None, 0, 0.0))
-        memory = Memory(_MEMORIES[kind], part.size("ksize"), part.flag("layernorm", False))
+        memory = Memory(_MEMORIES[kind], part.size("ksize"), part.take("layernorm", False, bool))
     part.done(*_OVERWRITTEN, "out_channels")
     return memory
 
@@ -250,10 +227,10 @@ def _layer(part: _Section) -> tuple[str | None, Pool | None]:
         activation = part.take("activation", "ReLU")
         part.only(activation_func_kwargs=({}, None))
     elif kind == "MaxPool":
-        size, stride = part.size("ksize"), part.size("stride", None, or_else=(None,))
+        size, stride = part.size("ksize"), part.size("stride", None, _Sizes | None)
         part.only(dilation=1, return_indices=False)
-        pool = Pool("max", size, stride, part.size("padding", 0), part.flag("ceil_mode", False))
+        pool = Pool("max", size, stride, part.size("padding", 0, _Margins), part.take("ceil_mode", False, bool))
     elif kind == "AdaptiveAvgPool":
-        pool = Pool("average", part.size("output_size", 6), flatten=part.flag("flatten", False))
+        pool = Pool("average", part.size("output_size", 6), flatten=part.take("flatten", False, bool))
     part.done(*_OVERWRITTEN)
     return activation, pool

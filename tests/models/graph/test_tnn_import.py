@@ -108,7 +108,7 @@ def test_an_unsupported_node_is_refused_in_one_sentence(change, message):
     [
         ("batchnorm", 5, r"'batchnorm' in the pre-memory of 'a' .* 4; found 5"),
         ("batchnorm", True, r"'batchnorm' .*'a' .* 4; found True"),
-        ("use_bias", "false", r"'use_bias' .*'a' must be true or false; found 'false'"),
+        ("use_bias", "false", r"'use_bias' .*'a' must be True or False; received 'false'"),
         ("bias", float("nan"), r"'bias' .*'a' must be a finite number; received nan"),
         ("dropout", True, r"'dropout' .*'a' .*at least 0 and at most 1; received True"),
         ("dropout", -1, r"'dropout' .*'a' .*; received -1"),
@@ -116,7 +116,7 @@ def test_an_unsupported_node_is_refused_in_one_sentence(change, message):
         ("batchnorm_timevary", True, r"'batchnorm_timevary': True .*'a'"),
         ("dilation", 2, "'dilation': 2"),
         ("ksize", "3", r"'ksize' .*'a' .*'3'"),
-        ("padding", "reflect", "Unknown padding in the pre-memory of 'a' 'reflect'"),
+        ("padding", "reflect", "Unknown 'padding' in the pre-memory of 'a' 'reflect'"),
         ("stride", 2, "'same' in the pre-memory of 'a' needs stride 1"),
         ("init_dict", {"method": "kaiming"}, "'kaiming'; did you mean 'kaiming_normal_'"),
         ("colour", 1, "unsupported key 'colour' in the pre-memory of 'a'"),
