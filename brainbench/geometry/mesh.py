@@ -593,21 +593,14 @@ class _Surface:
 
 def point_triangle_distance(points: NDArray[np.float64], triangles: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the distances [n] of points [n, 3] from one triangle each [n, 3, 3]."""
-    # trimesh's closest_point (5.2.0) compares with tolerances in metres, and is wrong for triangles of a millimetre.
-    edges = np.roll(triangles, -1, axis=1) - triangles
-    there = points[:, None] - triangles
-    square = np.einsum("nei,nei->ne", edges, edges)
-    # The nearest point of an edge of no length is its end.
-    share = np.einsum("nei,nei->ne", there, edges) / np.where(square > 0, square, 1.0)
-    border = np.linalg.norm(there - share.clip(0, 1)[..., None] * edges, axis=2).min(axis=1)
-    normal = np.cross(edges[:, 0], edges[:, 1])
-    length = np.linalg.norm(normal, axis=1)
-    # The foot of the perpendicular lies inside where it lies on the inner side of all edges, (e × (p − a)) · n ≥ 0. The
-    # normal of a triangle without an area is rounding; such a triangle is its edges.
-    inner = np.einsum("nei,ni->ne", np.cross(edges, there), normal) >= 0
-    over = inner.all(axis=1) & (length > 1e-12 * square.max(axis=1))
-    height = np.abs(np.einsum("ni,ni->n", there[:, 0], normal)) / np.where(over, length, 1.0)
-    return np.where(over, height, border)
+    from trimesh.triangles import closest_point
+
+    # trimesh compares with tolerances in metres, which are wrong for triangles of a millimetre: each is made one long.
+    size = np.ptp(triangles, axis=1).max(axis=1)
+    size[size == 0] = 1.0
+    origin, scale = triangles[:, :1], size[:, None]
+    there = (points - origin[:, 0]) / scale
+    return size * np.linalg.norm(there - closest_point((triangles - origin) / scale[:, None], there), axis=1)
 
 
 def _farthest_outside(solid: Mesh, inside: Mesh, points: NDArray, rng: np.random.Generator) -> float:
