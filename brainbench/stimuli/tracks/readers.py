@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.errors import DataError, UsageError, brief, check_each, choose_name, listing
-from brainbench.core.limits import Limit, Positive, Share, limited
+from brainbench.core.limits import Limit, Share, limited
 from brainbench.core.reading.apart import read_apart
 from brainbench.core.reading.hdf5 import open_hdf5
 from brainbench.core.reading.regular import MOST_TABLE, MOST_TEXT, check_file, readable
@@ -40,9 +40,9 @@ _MOST_POINTS = 100_000
 class TrackOptions:
     """Scale, frame rate and identity of a track; a value that cannot be is a :class:`UsageError`."""
 
-    metres_per_pixel: Positive | None = None
+    metres_per_pixel: Annotated[float, Limit(least=1e-8, most=1e-2, unit="m")] | None = None
     """Length of a pixel (or of the unit of the file) in m."""
-    frame_rate: Positive | None = None
+    frame_rate: Annotated[float, Limit(least=10, most=1e6, unit="frames per second")] | None = None
     """Frames per second of the video (Hz)."""
     track: str | None = None
     """Which whisker of the file: a label of whisk, a number of WhiskerMan (from 1), or an individual of DeepLabCut."""
@@ -66,19 +66,8 @@ class TrackOptions:
             ("metres_per_pixel", "the scale: metres per pixel (5e-5 for 50 µm)"),
             ("frame_rate", "the frames per second of the video"),
         ):
-            value = getattr(self, name)
-            if value is None:
+            if getattr(self, name) is None:
                 raise UsageError(f"A track holds pixels and frame numbers; give {what} as {name}.")
-        if not 1e-8 <= float(self.metres_per_pixel or math.nan) <= 1e-2:
-            raise UsageError(
-                f"metres_per_pixel is {self.metres_per_pixel:g} m; a pixel of a whisker video is between 1e-8 and "
-                "1e-2 m (50 µm = 5e-5)."
-            )
-        if not 10 <= float(self.frame_rate or math.nan) <= 1e6:
-            raise UsageError(
-                f"frame_rate is {self.frame_rate:g} Hz; videos of whiskers have 10 to 1e6 frames per second: give "
-                "frames per second, not the time of a frame."
-            )
 
 
 def _need(wanted: tuple[str, ...], held: Iterable[str], path: str | os.PathLike[str], kind: str) -> None:

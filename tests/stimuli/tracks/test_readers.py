@@ -227,7 +227,7 @@ def test_names_of_columns_that_differ_in_number_are_refused(tmp_path):
     [
         ({"metres_per_pixel": None}, "metres_per_pixel"),
         ({"frame_rate": None}, "frame_rate"),
-        ({"metres_per_pixel": 50.0}, "between 1e-8 and 1e-2"),
+        ({"metres_per_pixel": 50.0}, "at least 1e-08 and at most 0.01"),
         ({"frame_rate": 0.002}, "frames per second"),
         ({"layout": "whiskermann"}, "whiskerman"),
     ],
